@@ -1,0 +1,109 @@
+"""The exception tree. Errors know no HTTP and no console; the layers above map them.
+
+```
+GableworkError
+├── InputError            a file or folder that cannot be used: names the file, the value and the fix
+│   ├── UnreadableInputError     not the format that it claims, truncated, no permission, empty folder
+│   ├── InconsistentInputError   header and data disagree, or coordinates are not finite
+│   ├── EmptyInputError          no usable point left
+│   └── CrsError                 geographic, contradictory or unknown coordinate reference system
+├── SettingsError         one or more settings are out of range: lists all faults at once
+├── RunError              a run directory that cannot be written, read or resumed
+└── BuildingError         one building could not be modelled; becomes its record's status and reason
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.model import Reason
+
+
+class GableworkError(Exception):
+    """Base of all errors that are raised on purpose."""
+
+
+class InputError(GableworkError):
+    """A file or folder that cannot be used.
+
+    Parameters
+    ----------
+    path : str
+        The file or folder at fault.
+    problem : str
+        What is wrong, with the offending value.
+    fix : str
+        What the user can do about it.
+    """
+
+    def __init__(self, path: str, problem: str, fix: str) -> None:
+        self.path = str(path)
+        self.problem = problem
+        self.fix = fix
+        super().__init__(f"{self.path}: {problem}. {fix}")
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        """Survive pickling between Dask processes."""
+        return type(self), (self.path, self.problem, self.fix)
+
+
+class UnreadableInputError(InputError):
+    """Not the format that it claims to be, truncated, or no permission to read it."""
+
+
+class InconsistentInputError(InputError):
+    """Header and data disagree, or coordinates are NaN or infinite."""
+
+
+class EmptyInputError(InputError):
+    """No usable point is left."""
+
+
+class CrsError(InputError):
+    """The coordinate reference system is geographic, contradictory or cannot be understood."""
+
+
+class SettingsError(GableworkError):
+    """One or more settings are out of range; the message lists every fault.
+
+    Parameters
+    ----------
+    faults : sequence of str
+        One sentence a fault, each naming the setting, its value and what is allowed.
+    """
+
+    def __init__(self, faults: Sequence[str]) -> None:
+        self.faults = tuple(faults)
+        super().__init__("; ".join(self.faults))
+
+    def __reduce__(self) -> tuple[type[SettingsError], tuple[tuple[str, ...]]]:
+        """Survive pickling between Dask processes."""
+        return type(self), (self.faults,)
+
+
+class RunError(GableworkError):
+    """A run directory that cannot be written, read or resumed."""
+
+
+class BuildingError(GableworkError):
+    """One building could not be modelled.
+
+    Parameters
+    ----------
+    reason : Reason
+        The entry of the closed list that goes into the building's record.
+    detail : str
+        The measured figure and the threshold.
+    """
+
+    def __init__(self, reason: Reason, detail: str) -> None:
+        self.reason = reason
+        self.detail = detail
+        super().__init__(f"{reason}: {detail}")
+
+    def __reduce__(self) -> tuple[type[BuildingError], tuple[Reason, str]]:
+        """Survive pickling between Dask processes."""
+        return type(self), (self.reason, self.detail)

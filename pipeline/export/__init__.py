@@ -1,0 +1,1 @@
+"""Results as GeoParquet, OBJ and CityJSON."""

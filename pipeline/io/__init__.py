@@ -1,0 +1,1 @@
+"""Reading points and footprints, and where bytes live."""

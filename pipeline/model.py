@@ -1,0 +1,280 @@
+"""Frozen data that the stages hand to one another. Data are nouns; functions that make them are verbs elsewhere."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from shapely import MultiPolygon, Polygon
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+LabelArray = npt.NDArray[np.int32]
+BoolArray = npt.NDArray[np.bool_]
+ByteArray = npt.NDArray[np.uint8]
+
+
+class Status(StrEnum):
+    """How a candidate ended."""
+
+    OK = "ok"
+    FALLBACK = "fallback"
+    FAILED = "failed"
+
+
+class Reason(StrEnum):
+    """Why a candidate is not `ok`, or why an object was rejected: the closed list of the records."""
+
+    TOO_FEW_POINTS = "too_few_points"
+    NO_PLANE = "no_plane"
+    NO_PARTITION = "no_partition"
+    INVALID_SOLID = "invalid_solid"
+    TOO_COMPLEX = "too_complex"
+    NO_FOOTPRINT = "no_footprint"
+    INTERNAL_ERROR = "internal_error"
+    TOO_SMALL = "too_small"
+    TOO_LOW = "too_low"
+    BELOW_Z_AVG = "below_z_avg"
+    NO_WALLS = "no_walls"
+    VEGETATION = "vegetation"
+    TOO_NARROW = "too_narrow"
+
+
+class RoofType(StrEnum):
+    """Roof types of the records."""
+
+    FLAT = "flat"
+    PENT = "pent"
+    GABLE = "gable"
+    HIP = "hip"
+    COMBINATION = "combination"
+    UNKNOWN = "unknown"
+    NONE = "none"
+
+
+class FaceKind(StrEnum):
+    """What a face of a solid is; the semantics of OBJ groups and CityJSON surfaces."""
+
+    ROOF = "roof"
+    WALL = "wall"
+    GROUND = "ground"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PointCloud:
+    """Points with the attributes that later stages use. All arrays have one length n."""
+
+    xyz: FloatArray
+    """(n, 3) float64, easting, northing, elevation in metres; finite."""
+    return_number: ByteArray
+    """(n,) uint8, 1 is the first return; 1 where the file has none."""
+    return_count: ByteArray
+    """(n,) uint8, returns of the pulse; 1 where the file has none."""
+    classification: ByteArray
+    """(n,) uint8, ASPRS class; 0 where the file has none."""
+    gps_time: FloatArray
+    """(n,) float64, seconds as in the file; 0 where the file has none."""
+    source_id: npt.NDArray[np.uint16]
+    """(n,) uint16, flight line; 0 where the file has none."""
+
+    def __post_init__(self) -> None:
+        """Hold the lengths together."""
+        n = len(self.xyz)
+        if self.xyz.shape != (n, 3):
+            raise ValueError(f"xyz has shape {self.xyz.shape}, not (n, 3)")
+        for field in dataclasses.fields(self):
+            if len(getattr(self, field.name)) != n:
+                raise ValueError(f"{field.name} has {len(getattr(self, field.name))} entries for {n} points")
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return len(self.xyz)
+
+    def take(self, index: npt.NDArray[Any] | slice) -> PointCloud:
+        """The points that an index array, mask or slice selects."""
+        return PointCloud(**{f.name: getattr(self, f.name)[index] for f in dataclasses.fields(self)})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tin:
+    """A triangulated irregular network over points that are kept elsewhere."""
+
+    facets: LabelArray
+    """(m, 3) int32, vertex indices, counter-clockwise seen from above."""
+    neighbours: LabelArray
+    """(m, 3) int32, the facet across the edge opposite to each vertex; -1 at the hull."""
+
+    def __len__(self) -> int:
+        """Number of facets."""
+        return len(self.facets)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plane:
+    """A roof plane z = a x + b y + c in the candidate's local metres."""
+
+    a: float
+    """Rise per metre of easting."""
+    b: float
+    """Rise per metre of northing."""
+    c: float
+    """Elevation over the local origin, metres."""
+    n_points: int
+    """Points that support the plane."""
+    rmse_m: float
+    """Root mean square of the vertical residuals of those points, metres."""
+
+    @property
+    def coefficients(self) -> tuple[float, float, float]:
+        """(a, b, c)."""
+        return self.a, self.b, self.c
+
+    @property
+    def normal(self) -> tuple[float, float, float]:
+        """Unit normal that points up."""
+        scale = 1.0 / math.sqrt(1.0 + self.a * self.a + self.b * self.b)
+        return -self.a * scale, -self.b * scale, scale
+
+    @property
+    def slope_deg(self) -> float:
+        """0 is horizontal, 90 vertical."""
+        return math.degrees(math.atan(math.hypot(self.a, self.b)))
+
+    @property
+    def aspect_deg(self) -> float:
+        """Direction of steepest descent, clockwise from north, in [0, 360); 0 for a horizontal plane."""
+        if self.a == 0.0 and self.b == 0.0:
+            return 0.0
+        aspect = math.degrees(math.atan2(-self.a, -self.b)) % 360.0
+        return 0.0 if aspect >= 360.0 else aspect
+
+    @property
+    def o_distance_m(self) -> float:
+        """Signed distance from the local origin to the plane, positive where the plane is above it."""
+        return self.c / math.sqrt(1.0 + self.a * self.a + self.b * self.b)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """The points of one possible building, and the terrain around it."""
+
+    building_id: str
+    """base32 of a sha256 over the CRS and the smallest point; the same for every method and tiling."""
+    origin: tuple[float, float, float]
+    """Absolute easting, northing, elevation in metres of the local origin: whole metres."""
+    points: FloatArray
+    """(n, 3) float64, local metres, exact multiples of 1 mm, in canonical order (X, Y, Z, return, GPS time, source)."""
+    ground: FloatArray
+    """(m, 3) float64, local metres: samples of the terrain around and beneath, on a 1 m lattice."""
+    ground_z_m: float
+    """Local elevation of the lowest terrain at the outline: where the walls end."""
+    footprint: Polygon | MultiPolygon | None = None
+    """Given footprint in local metres; None where none was given."""
+    source_id: str | None = None
+    """The given footprint's own id."""
+    touches_data_edge: bool = False
+    """True where the data end at the candidate: it may be cut."""
+
+    @property
+    def area_hint_m2(self) -> float:
+        """Rough plan area: the footprint's, else that of the points' bounding box."""
+        if self.footprint is not None:
+            return float(self.footprint.area)
+        if len(self.points) == 0:
+            return 0.0
+        width, depth = np.ptp(self.points[:, :2], axis=0)
+        return float(width * depth)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Segmentation:
+    """What a segmentation method returns: planes, and the plane of every point."""
+
+    planes: tuple[Plane, ...]
+    """The roof planes."""
+    labels: LabelArray
+    """(n,) int32, index into planes for every point of the candidate; -1 where no plane explains it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SolidFace:
+    """A planar face: an outer ring and holes, as vertex indices."""
+
+    rings: tuple[tuple[int, ...], ...]
+    """Outer ring first, counter-clockwise seen from outside the solid, holes clockwise; first vertex not repeated."""
+    kind: FaceKind
+    """Roof, wall or ground."""
+    plane: int = -1
+    """Index of the roof plane; -1 for walls and ground."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Solid:
+    """A closed, outward oriented polyhedron."""
+
+    vertices: FloatArray
+    """(v, 3) float64, local metres, exact multiples of 1 mm (rounded before validity is judged)."""
+    faces: tuple[SolidFace, ...]
+    """The boundary."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RoofFace:
+    """The polygon of a roof plane in one solid."""
+
+    plane: int
+    """Index into the building's planes."""
+    polygon: Polygon
+    """3D polygon in local metres."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BuildingResult:
+    """What became of a candidate. Every candidate gives one, also one that failed."""
+
+    building_id: str
+    """As the candidate's."""
+    origin: tuple[float, float, float]
+    """As the candidate's."""
+    source_id: str | None
+    """As the candidate's."""
+    status: Status
+    """ok, fallback or failed."""
+    reason: Reason | None
+    """None where ok."""
+    reason_detail: str
+    """The measured figure and the threshold; empty where ok."""
+    method: str
+    """Name of the method."""
+    roof_type: RoofType
+    """From the delivered planes; none where there is no model."""
+    lod: str
+    """2.2, 1.2 for a block, empty where there is no model."""
+    footprint: Polygon | MultiPolygon | None
+    """2D outline of the delivered solids in local metres (failed: of the points where that is possible)."""
+    planes: tuple[Plane, ...]
+    """The delivered roof planes."""
+    faces: tuple[RoofFace, ...]
+    """The delivered roof faces."""
+    solids: tuple[Solid, ...]
+    """The delivered closed solids; empty where failed."""
+    validity_codes: tuple[int, ...]
+    """Codes of the faults that kept the method's own solid from delivery; empty where there were none."""
+    ground_z_m: float
+    """Local elevation of the floor."""
+    n_points: int
+    """Points of the candidate."""
+    density_per_m2: float
+    """Points a square metre of footprint; nan without one."""
+    rmse_m: float
+    """Root mean square vertical distance of all covered points to the top surface; nan without a model."""
+    p95_m: float
+    """95th percentile of the absolute vertical distances; nan without a model."""
+    coverage: float
+    """Share of points that have a roof above or below them; 0 without a model."""
+    touches_data_edge: bool
+    """As the candidate's."""

@@ -1,0 +1,1 @@
+"""Roof planes to roof faces and closed solids."""

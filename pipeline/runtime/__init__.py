@@ -1,0 +1,1 @@
+"""A run: plan, ingest, split, join, reconstruct, publish; serial or on Dask."""

@@ -1,0 +1,1 @@
+"""Roof points to roof planes: one file a published segmentation."""

@@ -1,0 +1,1 @@
+"""Triangulated irregular networks of scattered points."""
