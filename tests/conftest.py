@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
 SHARED_DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+
+REQUIRED = "GABLEWORK_REQUIRE_SHARED_DATA"
+"""Environment variable of .ci/run: 1 makes a test that needs the real data fail where it would skip."""
 
 
 @pytest.fixture(scope="session")
@@ -15,3 +20,14 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(f"real data not found at ../shared/data ({SHARED_DATA})")
     return SHARED_DATA
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Turn the skip of a test that needs the real data into a failure, where the environment requires the data."""
+    report = yield
+    needs_data = "shared_data" in getattr(item, "fixturenames", ())
+    if report.skipped and needs_data and not hasattr(report, "wasxfail") and os.environ.get(REQUIRED) == "1":
+        report.outcome = "failed"
+        report.longrepr = f"{item.nodeid} needs ../shared/data and was skipped, but {REQUIRED}=1: {report.longrepr}"
+    return report

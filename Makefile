@@ -1,0 +1,92 @@
+# The commands of the house. A machine needs Python 3.11 to 3.14 (with venv) and make, nothing else.
+#
+#   make demo      simulate a small suburb, reconstruct it, show what was found
+#   make test      style, types, import directions, tests: everything but the slow tests
+#   make slow      the slow tests: minutes, real processes, real data
+#   make lock      resolve the dependencies anew (the locks name versions and hashes, no hosts)
+#   make docs      write docs/reference/ from the code
+#   make format    format the sources
+#   make clean     remove what these commands made, the environment included
+
+PYTHON ?= python3
+OUT ?= demo
+VENV := .venv
+BIN := $(VENV)/bin
+UV := $(BIN)/uv --no-progress
+COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml
+
+# numba keeps compiled kernels per source file and does not notice when a kernel in another file changed:
+# tests therefore use a cache named after the content of all kernels.
+KERNELS = $(shell grep -rl --include='*.py' njit pipeline | LC_ALL=C sort | xargs cat | cksum | tr ' ' '-')
+TEST_ENV = NUMBA_CACHE_DIR="$(CURDIR)/.cache/numba/$(KERNELS)" OPENBLAS_NUM_THREADS=1
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check unit slow lock docs format clean
+.DELETE_ON_ERROR:
+
+help:
+	@sed -n 's/^#   //p' Makefile
+
+# --- the environment -------------------------------------------------------------------------------------------------
+
+# pip installs uv and the build backend by hash; uv then installs the rest by hash, in parallel.
+$(VENV)/.build-stamp: requirements-build.lock
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if (3, 11) <= v < (3, 15) else \
+		f"gablework needs Python 3.11 to 3.14, this is {v.major}.{v.minor}: make PYTHON=python3.12 ...")'
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+		echo "Python's venv module is missing or incomplete: install it (Debian: python3-venv)." >&2; exit 1; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-build.lock
+	@touch $@
+
+# The project itself, editable, built by the backend of the lock (no isolated build: nothing unpinned is fetched).
+INSTALL_SELF = $(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable .
+
+# What `make demo` needs. The locks agree, so this adds to an environment that has the test tools and removes nothing.
+$(VENV)/.run-stamp: requirements.lock $(VENV)/.build-stamp pyproject.toml
+	$(UV) pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock
+	$(INSTALL_SELF)
+	@touch $@
+
+# What `make test` needs: exactly the locks.
+$(VENV)/.test-stamp: requirements-test.lock $(VENV)/.build-stamp pyproject.toml
+	$(UV) pip sync --quiet --python $(BIN)/python --require-hashes requirements-build.lock requirements-test.lock
+	$(INSTALL_SELF)
+	@touch $@ $(VENV)/.run-stamp
+
+lock: $(VENV)/.build-stamp
+	$(COMPILE) --group test -o requirements-test.lock
+	$(COMPILE) -c requirements-test.lock -o requirements.lock
+	$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		--no-emit-find-links --custom-compile-command "make lock" --group build \
+		-c requirements-test.lock -o requirements-build.lock
+
+# --- the two commands ------------------------------------------------------------------------------------------------
+
+demo: $(VENV)/.run-stamp
+	@$(BIN)/gablework demo --out $(OUT) --workers 2 --overwrite
+
+test: check unit
+
+check: $(VENV)/.test-stamp
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
+
+unit: $(VENV)/.test-stamp
+	$(TEST_ENV) $(BIN)/python -m pytest -m "not slow" --durations=15
+
+slow: $(VENV)/.test-stamp
+	$(TEST_ENV) $(BIN)/python -m pytest -m slow --durations=15
+
+docs: $(VENV)/.run-stamp
+	$(BIN)/python docs/generate.py
+
+format: $(VENV)/.test-stamp
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis demo runs
+	find pipeline service tests docs -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,122 @@
+"""The science commands. Each composes what stands below and imports it only when it runs: start-up counts."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipeline.console import Console, ExitCode
+
+if TYPE_CHECKING:
+    from pipeline.runtime.run import RunSummary
+    from pipeline.settings import RunSettings
+
+app = typer.Typer(
+    name="gablework",
+    help="Building models from raw airborne LiDAR: no classes and no footprints needed, both used when given.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document; events as JSON lines on stderr.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress; warnings and errors only.")]
+Crs = Annotated[
+    str | None, typer.Option(metavar="EPSG:n", help="The inputs' CRS, where their header has none or a wrong one.")
+]
+VerticalUnit = Annotated[
+    str | None, typer.Option(metavar="UNIT", help="Unit of elevations: metre, foot or us-foot; default as the header.")
+]
+Workers = Annotated[
+    int, typer.Option(min=0, help="Processes of the embedded cluster; 0 runs serially in this process.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already there.")]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from pipeline import __version__
+
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def gablework(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None:
+    """Building models from raw airborne LiDAR."""
+    del version
+
+
+@app.command()
+def reconstruct(
+    tiles: Annotated[list[str], typer.Argument(metavar="TILES...", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")],
+    out: Annotated[str, typer.Option(metavar="RUN", help="The run directory to write.")],
+    method: Annotated[str | None, typer.Option(metavar="METHOD", help="fuzzy-sart; default as the settings say.")] = None,
+    footprints: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, Shapefile) to model.")
+    ] = None,
+    crs: Crs = None,
+    vertical_unit: VerticalUnit = None,
+    bbox: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(metavar="XMIN YMIN XMAX YMAX", help="Only this rectangle, in the CRS's units."),
+    ] = None,
+    aoi: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Only what lies inside the polygons of this vector file.")
+    ] = None,
+    classes: Annotated[
+        str | None, typer.Option(metavar="trust|audit|ignore", help="What the file's own classes are worth.")
+    ] = None,
+    settings: Annotated[str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")] = None,
+    workers: Workers = 2,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
+    ] = None,
+    meshes: Annotated[
+        str, typer.Option(metavar="building|tile|none", help="One OBJ a building, one a tile, or none.")
+    ] = "building",
+    licence: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Reconstruct buildings from tiles into a run directory."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.runtime.run import RunRequest, run
+
+        request = RunRequest(
+            inputs=tuple(tiles),
+            out=out,
+            settings=_run_settings(settings, method=method, classes=classes),
+            footprints=footprints,
+            crs=crs,
+            vertical_unit=vertical_unit,
+            bbox=bbox,
+            aoi=aoi,
+            workers=workers,
+            scheduler=scheduler,
+            meshes=meshes,
+            licence=licence,
+        )
+        summary = run(request, console.on_event)
+        show_summary(console, summary)
+        if summary.failed_tiles:
+            raise typer.Exit(ExitCode.TILES_FAILED)
+
+
+def _run_settings(path: str | None, **overrides: str | None) -> RunSettings:
+    """The settings of a file, or the defaults, under the options of the command line."""
+    from pipeline.settings import RunSettings
+
+    given = {name: value for name, value in overrides.items() if value is not None}
+    return RunSettings.from_toml(path, given)

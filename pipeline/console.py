@@ -1,0 +1,251 @@
+"""How a command speaks: progress, tables, errors and exit codes, for people on a terminal, for logs and for machines.
+
+| mode | standard output | standard error |
+| --- | --- | --- |
+| terminal | tables | progress bars, warnings, errors |
+| elsewhere (a file, a pipe, CI) | tables | one log line an event, throttled |
+| `--json` | one JSON document | one JSON object an event, a line each |
+| `--quiet` | as above | warnings and errors only |
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from enum import IntEnum
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import typer
+
+from pipeline.errors import GableworkError, InputError, RunError, SettingsError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from pipeline.runtime.events import Event
+
+LOG_INTERVAL_S = 2.0
+"""A log line of progress follows the last one of its stage after this time at the earliest."""
+
+
+class ExitCode(IntEnum):
+    """What a command's exit code means."""
+
+    DONE = 0
+    TILES_FAILED = 1
+    USAGE = 2
+    INPUT = 3
+    RUN_DIRECTORY = 4
+    INTERNAL = 5
+    INTERRUPTED = 130
+
+
+EXIT_CODES: Mapping[ExitCode, str] = {
+    ExitCode.DONE: "Done. Single buildings may still have failed: each has a record with its reason.",
+    ExitCode.TILES_FAILED: "The run finished, but at least one tile failed; all other tiles are complete.",
+    ExitCode.USAGE: "The command line or a setting is wrong; nothing was done.",
+    ExitCode.INPUT: "An input cannot be used; the message names the file, the value and the fix.",
+    ExitCode.RUN_DIRECTORY: "The run directory cannot be written, read or resumed.",
+    ExitCode.INTERNAL: "A fault of gablework itself; the traceback is printed.",
+    ExitCode.INTERRUPTED: "Interrupted from the keyboard.",
+}
+"""The table of the reference docs."""
+
+
+def exit_code_of(error: BaseException) -> ExitCode:
+    """Which exit code an exception ends a command with.
+
+    >>> exit_code_of(SettingsError(["v is 7: use 0 to 1"])).name
+    'USAGE'
+    >>> exit_code_of(ZeroDivisionError()).name
+    'INTERNAL'
+    """
+    table: tuple[tuple[type[BaseException], ExitCode], ...] = (
+        (KeyboardInterrupt, ExitCode.INTERRUPTED),
+        (SettingsError, ExitCode.USAGE),
+        (InputError, ExitCode.INPUT),
+        (RunError, ExitCode.RUN_DIRECTORY),
+    )
+    return next((code for kind, code in table if isinstance(error, kind)), ExitCode.INTERNAL)
+
+
+class Console:
+    """What a command prints with; as a context manager it turns exceptions into messages and exit codes.
+
+    Parameters
+    ----------
+    as_json : bool
+        One JSON document on standard output, events as JSON lines on standard error.
+    quiet : bool
+        No progress.
+    clock : callable
+        Seconds, monotonic; replaced in tests.
+    """
+
+    def __init__(
+        self, *, as_json: bool = False, quiet: bool = False, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.as_json = as_json
+        self.quiet = quiet
+        self._clock = clock
+        self._bars: Progress | None = None
+        self._tasks: dict[str, TaskID] = {}
+        self._last_line_s: dict[str, float] = {}
+
+    def __enter__(self) -> Self:
+        """Start to speak."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the bars; print what went wrong and end with its exit code.
+
+        Raises
+        ------
+        typer.Exit
+            With the code of `EXIT_CODES`, in place of any error but those that typer itself handles.
+        """
+        self._close_bars()
+        if error is None or isinstance(error, SystemExit | typer.Exit | typer.Abort | typer.BadParameter):
+            return
+        if not isinstance(error, GableworkError | KeyboardInterrupt):
+            traceback.print_exception(error, file=sys.stderr)
+        code = exit_code_of(error)
+        self._tell_error(error, code)
+        raise typer.Exit(code) from error
+
+    # --- progress ----------------------------------------------------------------------------------------------------
+
+    def on_event(self, event: Event) -> None:
+        """Show an event of a run."""
+        if event.kind == "warning":
+            self.warn(event.message)
+        elif self.quiet:
+            return
+        elif self.as_json:
+            print(json.dumps(dataclasses.asdict(event)), file=sys.stderr, flush=True)
+        elif sys.stderr.isatty():
+            self._advance_bar(event)
+        else:
+            self._log(event)
+
+    def _advance_bar(self, event: Event) -> None:
+        if event.kind not in {"stage", "progress"}:
+            return
+        if self._bars is None:
+            from rich.console import Console as RichConsole
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+            columns = (
+                TextColumn("{task.description:<12}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TextColumn("{task.fields[message]}"),
+            )
+            self._bars = Progress(*columns, console=RichConsole(stderr=True))
+            self._bars.start()
+        if event.stage not in self._tasks:
+            self._tasks[event.stage] = self._bars.add_task(event.stage, total=None, message="")
+        total = event.total or None
+        self._bars.update(self._tasks[event.stage], completed=event.done, total=total, message=event.message)
+
+    def _log(self, event: Event) -> None:
+        now = self._clock()
+        ended = event.kind != "progress" or event.done >= event.total
+        if not ended and now - self._last_line_s.get(event.stage, -LOG_INTERVAL_S) < LOG_INTERVAL_S:
+            return
+        self._last_line_s[event.stage] = now
+        counted = f"{event.done}/{event.total}" if event.total else ""
+        words = [word for word in (event.stage, counted, event.message) if word]
+        if words:
+            print(" ".join(words), file=sys.stderr, flush=True)
+
+    def _close_bars(self) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+            self._bars = None
+            self._tasks = {}
+
+    # --- what is said once -------------------------------------------------------------------------------------------
+
+    def warn(self, message: str) -> None:
+        """Say on standard error what is usable but not as it should be."""
+        if self.as_json:
+            print(json.dumps({"kind": "warning", "message": message}), file=sys.stderr, flush=True)
+        elif self._bars is not None:
+            self._bars.console.print(f"warning: {message}", style="yellow", markup=False, highlight=False)
+        else:
+            print(f"warning: {message}", file=sys.stderr, flush=True)
+
+    def say(self, message: str) -> None:
+        """Print a line for people; silent with `--json`."""
+        if not self.as_json:
+            self._close_bars()
+            print(message, flush=True)
+
+    def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+        """Print a table for people; silent with `--json`. Columns of numbers only are set to the right."""
+        if self.as_json or not rows:
+            return
+        self._close_bars()
+        for line in table_lines(title, header, rows):
+            print(line)
+        print(flush=True)
+
+    def document(self, content: Mapping[str, Any]) -> None:
+        """Print the JSON document of `--json`; silent without."""
+        if self.as_json:
+            print(json.dumps(content, indent=2, default=str), flush=True)
+
+    def _tell_error(self, error: BaseException, code: ExitCode) -> None:
+        message = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+        if self.as_json:
+            detail: dict[str, Any] = {"type": type(error).__name__, "exit_code": int(code), "message": message}
+            if isinstance(error, InputError):
+                detail |= {"path": error.path, "problem": error.problem, "fix": error.fix}
+            if isinstance(error, SettingsError):
+                detail["faults"] = list(error.faults)
+            print(json.dumps({"error": detail}, indent=2), flush=True)
+            return
+        lines = list(error.faults) if isinstance(error, SettingsError) and len(error.faults) > 1 else [message]
+        for line in lines:
+            print(f"error: {line}", file=sys.stderr, flush=True)
+        if code is ExitCode.INTERNAL:
+            print("This is a fault of gablework, not of your input: please report it.", file=sys.stderr, flush=True)
+
+
+def table_lines(title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
+    """Lay out a table as plain lines, the same on a terminal and in a log.
+
+    >>> table_lines("Roofs", ["type", "count"], [["gable", 12], ["flat", 3]])
+    ['Roofs', '  type   count', '  gable     12', '  flat       3']
+    """
+    cells = [[str(cell) for cell in row] for row in rows]
+    widths = [max(len(row[i]) for row in [list(header), *cells]) for i in range(len(header))]
+    numeric = [
+        all(isinstance(row[i], int | float) or _is_figure(str(row[i])) for row in rows) for i in range(len(header))
+    ]
+    lines = [title] if title else []
+    for row in [list(header), *cells]:
+        padded = [
+            cell.rjust(w) if right else cell.ljust(w) for cell, w, right in zip(row, widths, numeric, strict=True)
+        ]
+        lines.append(("  " + "  ".join(padded)).rstrip())
+    return lines
+
+
+def _is_figure(text: str) -> bool:
+    """Whether a cell reads as a number, a unit allowed behind it."""
+    head = text.split(" ", maxsplit=1)[0].rstrip("%")
+    try:
+        float(head.replace(",", ""))
+    except ValueError:
+        return False
+    return True

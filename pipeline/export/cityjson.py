@@ -1,0 +1,148 @@
+"""CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature a building, a BuildingPart with semantics a solid."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.export.coordinates import SpatialReference, crs_coordinates, decimals, epsg_code
+from pipeline.export.obj import part_id
+from pipeline.model import BuildingResult, FaceKind, Plane, Solid
+
+VERSION = "2.0"
+"""Version of CityJSON."""
+
+_SURFACE = {FaceKind.ROOF: "RoofSurface", FaceKind.WALL: "WallSurface", FaceKind.GROUND: "GroundSurface"}
+_NOT_ATTRIBUTES = ("building_id", "geometry")
+
+
+def cityjson_lines(
+    rows: Sequence[tuple[BuildingResult, Mapping[str, Any]]], reference: SpatialReference, title: str
+) -> Iterable[str]:
+    """The lines of a CityJSONSeq file.
+
+    Vertices are integers: the transform's scale is 0.001 in metres (finer in other units, so that 1 mm is kept), its
+    translation whole units at the lower corner of all solids.
+
+    Parameters
+    ----------
+    rows : sequence of (BuildingResult, mapping)
+        Each building with its record (`building_row`), which becomes its attributes; buildings without a solid are
+        features without geometry.
+    reference : SpatialReference
+        Gives the units and, where an EPSG code is known, the referenceSystem.
+    title : str
+        Goes into the metadata.
+    """
+    digits = (
+        decimals(reference.horizontal_unit_m),
+        decimals(reference.horizontal_unit_m),
+        decimals(reference.vertical_unit_m),
+    )
+    placed = [
+        [crs_coordinates(solid.vertices, result.origin, reference) for solid in result.solids] for result, _ in rows
+    ]
+    corners = [xyz for solids in placed for xyz in solids]
+    low = np.min([xyz.min(axis=0) for xyz in corners], axis=0) if corners else np.zeros(3)
+    high = np.max([xyz.max(axis=0) for xyz in corners], axis=0) if corners else np.zeros(3)
+    translate = [math.floor(v) for v in low]
+    metadata: dict[str, Any] = {"title": title}
+    code = epsg_code(reference.projjson)
+    if code is not None:
+        metadata["referenceSystem"] = f"https://www.opengis.net/def/crs/EPSG/0/{code}"
+    if corners:
+        metadata["geographicalExtent"] = [float(v) for v in (*low, *high)]
+    yield _json(
+        {
+            "type": "CityJSON",
+            "version": VERSION,
+            "transform": {
+                "scale": [float(f"1e-{d}") for d in digits],
+                "translate": [float(v) for v in translate],
+            },
+            "metadata": metadata,
+            "CityObjects": {},
+            "vertices": [],
+        }
+    )
+    factor = np.array([10**d for d in digits], dtype=np.int64)
+    for (result, row), solids in zip(rows, placed, strict=True):
+        integers = [
+            np.round(xyz * factor).astype(np.int64) - np.array(translate, dtype=np.int64) * factor for xyz in solids
+        ]
+        yield _json(_feature(result, row, integers))
+
+
+def _json(value: Mapping[str, Any]) -> str:
+    """One line of JSON without idle spaces."""
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+
+def _feature(
+    result: BuildingResult, row: Mapping[str, Any], vertices: Sequence[np.ndarray[Any, np.dtype[np.int64]]]
+) -> dict[str, Any]:
+    """The CityJSONFeature of one building; each solid has its own vertices."""
+    parts = [part_id(result, part) for part in range(len(result.solids))]
+    building: dict[str, Any] = {"type": "Building", "attributes": _attributes(row)}
+    if parts:
+        building["children"] = parts
+    objects: dict[str, Any] = {result.building_id: building}
+    first = 0
+    for name, solid in zip(parts, result.solids, strict=True):
+        objects[name] = {
+            "type": "BuildingPart",
+            "parents": [result.building_id],
+            "geometry": [_solid(solid, result.planes, result.lod, first)],
+        }
+        first += len(solid.vertices)
+    return {
+        "type": "CityJSONFeature",
+        "id": result.building_id,
+        "CityObjects": objects,
+        "vertices": [xyz for array in vertices for xyz in array.tolist()],
+    }
+
+
+def _attributes(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The record as attributes: without geometry and id, without what is unknown, times as ISO 8601."""
+    attributes: dict[str, Any] = {}
+    for name, value in row.items():
+        if value is None or name in _NOT_ATTRIBUTES:
+            continue
+        attributes[name] = value.isoformat() if isinstance(value, dt.datetime) else value
+    return attributes
+
+
+def _solid(solid: Solid, planes: Sequence[Plane], lod: str, first: int) -> dict[str, Any]:
+    """The geometry of one part: one semantic surface a roof plane, one for the walls, one for the ground."""
+    surfaces: list[dict[str, Any]] = []
+    index: dict[tuple[FaceKind, int], int] = {}
+    values = []
+    for face in solid.faces:
+        key = (face.kind, face.plane if face.kind is FaceKind.ROOF else -1)
+        if key not in index:
+            index[key] = len(surfaces)
+            surfaces.append(_surface(key[0], key[1], planes))
+        values.append(index[key])
+    return {
+        "type": "Solid",
+        "lod": lod,
+        "boundaries": [[[[first + int(i) for i in ring] for ring in face.rings] for face in solid.faces]],
+        "semantics": {"surfaces": surfaces, "values": [values]},
+    }
+
+
+def _surface(kind: FaceKind, plane_id: int, planes: Sequence[Plane]) -> dict[str, Any]:
+    """A semantic surface; those of roof planes tell slope and aspect as the `planes` table does."""
+    surface: dict[str, Any] = {"type": _SURFACE[kind]}
+    if plane_id >= 0:
+        plane = planes[plane_id]
+        surface["plane_id"] = plane_id
+        surface["slope_deg"] = round(plane.slope_deg, 4)
+        surface["aspect_deg"] = round(plane.aspect_deg, 4) % 360.0
+    return surface

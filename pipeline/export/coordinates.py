@@ -1,0 +1,96 @@
+"""Coordinates of the outputs: from local metres to the units of the coordinate reference system."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from pipeline.model import FloatArray
+
+Geometry = TypeVar("Geometry", bound=BaseGeometry)
+
+
+class SpatialReference(Protocol):
+    """What the outputs need to know of a coordinate reference system (CRS)."""
+
+    @property
+    def horizontal_unit_m(self) -> float:
+        """Metres in one unit of easting and northing."""
+
+    @property
+    def vertical_unit_m(self) -> float:
+        """Metres in one unit of elevation."""
+
+    @property
+    def projjson(self) -> dict[str, Any] | None:
+        """The CRS as PROJJSON; None where it is unknown."""
+
+
+def decimals(unit_m: float) -> int:
+    """Decimals that keep 1 mm: 3 in metres; in other units one more than needed, so that 1 mm survives the way back.
+
+    Examples
+    --------
+    >>> decimals(1.0), decimals(0.3048)
+    (3, 4)
+    """
+    return 3 if unit_m == 1.0 else max(0, math.ceil(3.0 + math.log10(unit_m)) + 1)
+
+
+def crs_coordinates(local: FloatArray, origin: tuple[float, float, float], reference: SpatialReference) -> FloatArray:
+    """Coordinates in the CRS's own units, rounded to 1 mm or finer.
+
+    Parameters
+    ----------
+    local : array, shape (n, 2) or (n, 3)
+        Local metres.
+    origin : tuple of float
+        Absolute easting, northing, elevation of the local origin in metres.
+    reference : SpatialReference
+        Gives the units.
+
+    Returns
+    -------
+    array, shape as `local`
+        Easting, northing (and elevation) in CRS units.
+    """
+    out = np.empty(local.shape)
+    units = (reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m)
+    for axis in range(local.shape[1]):
+        absolute = (local[:, axis] + origin[axis]) / units[axis]
+        out[:, axis] = np.round(absolute, decimals(units[axis]))
+    return out + 0.0
+
+
+def crs_elevation(local_z_m: float, origin: tuple[float, float, float], reference: SpatialReference) -> float:
+    """An elevation in the CRS's own vertical unit, rounded to 1 mm or finer; nan stays nan."""
+    unit_m = reference.vertical_unit_m
+    return round((local_z_m + origin[2]) / unit_m, decimals(unit_m)) + 0.0
+
+
+def crs_geometry(geometry: Geometry, origin: tuple[float, float, float], reference: SpatialReference) -> Geometry:
+    """A polygon in CRS units in one canonical form, whatever the order in which it was built.
+
+    Exterior rings run counter-clockwise, holes clockwise, every ring starts at its smallest vertex, parts and holes
+    are in the order of GEOS's normal form.
+    """
+    moved = shapely.transform(
+        geometry, lambda local: crs_coordinates(local, origin, reference), include_z=bool(geometry.has_z)
+    )
+    canonical: Geometry = shapely.orient_polygons(shapely.normalize(moved))
+    return canonical
+
+
+def epsg_code(projjson: dict[str, Any] | None) -> int | None:
+    """The EPSG code of a CRS; of its horizontal part where a compound CRS has none; None where neither has one."""
+    while projjson is not None:
+        identifier = projjson.get("id") or {}
+        if identifier.get("authority") == "EPSG" and str(identifier.get("code", "")).isdigit():
+            return int(identifier["code"])
+        components = projjson.get("components") or []
+        projjson = components[0] if components else projjson.get("source_crs")
+    return None

@@ -1,0 +1,237 @@
+"""Dimensions of a delivered model in local metres: eave, ridge, percentiles of roof elevation, roof area, volume."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.model import FaceKind, FloatArray, Solid
+
+FLAT_BELOW_DEG = 7.0
+"""Roof planes below this slope count as flat (Hofmann, Maas and Streilein 2003): all their outer edges are eaves."""
+EAVE_WITHIN_DEG = 45.0
+"""An outer edge is an eave where it faces the plane's aspect within this angle; else it is a rake or a high edge."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Dimensions:
+    """Dimensions of one building's solids; elevations are local metres."""
+
+    eave_z_m: float
+    """Median elevation of the eave edges, each roof face weighing its area."""
+    ridge_z_m: float
+    """Highest roof point."""
+    roof_z_m: tuple[float, float, float, float]
+    """Lowest roof point, 50th and 70th percentile of roof elevation over plan area, highest roof point."""
+    roof_area_m2: float
+    """True (slanted) area of all roof faces."""
+    volume_m3: float
+    """Sum of the solids' volumes."""
+
+
+def area_vector(vertices: FloatArray, rings: Sequence[Sequence[int]]) -> FloatArray:
+    """Area vector of a planar face: along its normal, as long as its area (Newell), shape (3,), square metres."""
+    total = np.zeros(3)
+    anchor = vertices[rings[0][0]]
+    for ring in rings:
+        corner = vertices[list(ring)] - anchor
+        following = np.roll(corner, -1, axis=0)
+        total[0] += np.sum(corner[:, 1] * following[:, 2] - corner[:, 2] * following[:, 1])
+        total[1] += np.sum(corner[:, 2] * following[:, 0] - corner[:, 0] * following[:, 2])
+        total[2] += np.sum(corner[:, 0] * following[:, 1] - corner[:, 1] * following[:, 0])
+    return 0.5 * total
+
+
+def volume(solid: Solid) -> float:
+    """Volume of a closed, outward oriented solid, cubic metres (divergence theorem)."""
+    total = 0.0
+    for face in solid.faces:
+        normal = area_vector(solid.vertices, face.rings)
+        foot = solid.vertices[face.rings[0][0]]
+        total += float(foot[0] * normal[0] + foot[1] * normal[1] + foot[2] * normal[2])
+    return total / 3.0
+
+
+def weighted_median(values: Sequence[float], weights: Sequence[float]) -> float:
+    """The smallest value at which the running weight reaches half of the whole; nan of nothing.
+
+    Examples
+    --------
+    >>> weighted_median([3.0, 1.0, 2.0], [1.0, 1.0, 5.0])
+    2.0
+    """
+    if not values:
+        return math.nan
+    order = sorted(range(len(values)), key=lambda i: (values[i], i))
+    half, running = 0.5 * sum(weights[i] for i in order), 0.0
+    for i in order:
+        running += weights[i]
+        if running >= half:
+            return values[i]
+    return values[order[-1]]
+
+
+def _outer_edges(solid: Solid) -> set[tuple[int, int]]:
+    """Directed edges of the walls that stand on the ground."""
+    ground = {
+        edge for face in solid.faces if face.kind is FaceKind.GROUND for ring in face.rings for edge in _edges(ring)
+    }
+    outer = set()
+    for face in solid.faces:
+        if face.kind is not FaceKind.WALL:
+            continue
+        edges = [edge for ring in face.rings for edge in _edges(ring)]
+        if any((b, a) in ground for a, b in edges):
+            outer.update(edges)
+    return outer
+
+
+def _edges(ring: Sequence[int]) -> list[tuple[int, int]]:
+    """The directed edges of a ring."""
+    return [(ring[i], ring[(i + 1) % len(ring)]) for i in range(len(ring))]
+
+
+def _is_eave(step: FloatArray, normal: FloatArray) -> bool:
+    """Whether a roof face's outer edge is its low side; `step` runs counter-clockwise seen from above."""
+    flat = math.tan(math.radians(FLAT_BELOW_DEG))
+    tilt = math.hypot(normal[0], normal[1])
+    if tilt <= flat * abs(normal[2]):
+        return True
+    outward = (step[1], -step[0])
+    length = math.hypot(outward[0], outward[1])
+    along = outward[0] * normal[0] + outward[1] * normal[1]
+    return bool(along >= math.cos(math.radians(EAVE_WITHIN_DEG)) * length * tilt)
+
+
+def eave_elevation(solids: Sequence[Solid]) -> float:
+    """Median elevation of the eave edges: the low outer edges of the roof faces; nan where there are none.
+
+    An edge counts at its middle; a face's weight is its plan area, shared among its eaves by length.
+    """
+    values: list[float] = []
+    weights: list[float] = []
+    for solid in solids:
+        outer = _outer_edges(solid)
+        for face in solid.faces:
+            if face.kind is not FaceKind.ROOF:
+                continue
+            normal = area_vector(solid.vertices, face.rings)
+            middles, lengths = [], []
+            for ring in face.rings:
+                for a, b in _edges(ring):
+                    step = solid.vertices[b] - solid.vertices[a]
+                    if (b, a) in outer and _is_eave(step, normal):
+                        middles.append(0.5 * float(solid.vertices[a, 2] + solid.vertices[b, 2]))
+                        lengths.append(math.hypot(step[0], step[1]))
+            total = sum(lengths)
+            values.extend(middles)
+            weights.extend(abs(float(normal[2])) * length / total for length in lengths)
+    return weighted_median(values, weights)
+
+
+def _roof_triangles(solids: Sequence[Solid]) -> tuple[FloatArray, FloatArray]:
+    """Sorted elevations (t, 3) and signed plan areas (t,) of fans over the roof faces; signs cancel outside a face."""
+    corners, areas = [], []
+    for solid in solids:
+        for face in solid.faces:
+            if face.kind is not FaceKind.ROOF:
+                continue
+            for ring in face.rings:
+                ring_xyz = solid.vertices[list(ring)]
+                apex, first, second = ring_xyz[0], ring_xyz[1:-1], ring_xyz[2:]
+                one, two = first[:, :2] - apex[:2], second[:, :2] - apex[:2]
+                areas.append(0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
+                corners.append(np.stack([np.full(len(first), apex[2]), first[:, 2], second[:, 2]], axis=1))
+    if not corners:
+        return np.empty((0, 3)), np.empty(0)
+    return np.sort(np.concatenate(corners), axis=1), np.concatenate(areas)
+
+
+def _area_below(level: FloatArray, corner_z: FloatArray, area: FloatArray) -> FloatArray:
+    """Plan area of the roof at or below each level, shape (k,)."""
+    z = level[:, None]
+    low, middle, high = corner_z[:, 0], corner_z[:, 1], corner_z[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rising = (z - low) ** 2 / ((middle - low) * (high - low))
+        falling = 1.0 - (high - z) ** 2 / ((high - middle) * (high - low))
+    share = np.where(z >= high, 1.0, np.where(z < low, 0.0, np.where(z < middle, rising, falling)))
+    below: FloatArray = np.sum(share * area, axis=1)
+    return below
+
+
+def roof_percentiles(solids: Sequence[Solid], shares: Sequence[float]) -> tuple[float, ...]:
+    """Elevations below which the given shares of the roof's plan area lie; nan without a roof.
+
+    Between two neighbouring vertex elevations the area below a level is a quadratic of the level, so each percentile
+    is solved exactly, without a raster.
+    """
+    corner_z, area = _roof_triangles(solids)
+    if len(area) == 0:
+        return tuple(math.nan for _ in shares)
+    levels = np.unique(corner_z)
+    below = np.maximum.accumulate(_area_below(levels, corner_z, area))
+    total = below[-1]
+    found = []
+    for share in shares:
+        target = share * total
+        upper = int(np.searchsorted(below, target - 1e-9 * total))
+        if upper == 0 or total <= 0.0:
+            found.append(float(levels[min(upper, len(levels) - 1)]))
+            continue
+        found.append(_within(target, float(levels[upper - 1]), float(levels[upper]), corner_z, area))
+    return tuple(found)
+
+
+def _within(target: float, low: float, high: float, corner_z: FloatArray, area: FloatArray) -> float:
+    """The level between two neighbouring vertex elevations where the area below reaches the target.
+
+    The area may jump at `high`, where a level face begins; then `high` is the answer for targets within the jump.
+    """
+    samples = np.array([low, low + (high - low) / 3.0, low + 2.0 * (high - low) / 3.0])
+    first, second, third = (float(v) for v in _area_below(samples, corner_z, area))
+    # The parabola through t = 0, 1, 2 thirds of the way.
+    curve = 0.5 * (third - 2.0 * second + first)
+    slope = second - first - curve
+    missing = target - first
+    if 9.0 * curve + 3.0 * slope < missing:
+        return high
+    root = math.sqrt(max(0.0, slope * slope + 4.0 * curve * missing))
+    if slope + root <= 0.0:
+        return low
+    # The stable form of the root: no difference of near numbers.
+    thirds = 2.0 * missing / (slope + root)
+    return low + (high - low) * min(max(thirds / 3.0, 0.0), 1.0)
+
+
+def dimensions(solids: Sequence[Solid]) -> Dimensions:
+    """Measure the delivered solids of one building; all nan and zero areas without a roof.
+
+    Where no outer edge is an eave (a roof that only leans on others), the lowest roof point stands for the eave.
+    """
+    roof_z = [
+        float(solid.vertices[index, 2])
+        for solid in solids
+        for face in solid.faces
+        if face.kind is FaceKind.ROOF
+        for ring in face.rings
+        for index in ring
+    ]
+    lowest, highest = (min(roof_z), max(roof_z)) if roof_z else (math.nan, math.nan)
+    eave = eave_elevation(solids)
+    median, seventieth = roof_percentiles(solids, (0.5, 0.7))
+    roof_area = 0.0
+    for solid in solids:
+        for face in solid.faces:
+            if face.kind is FaceKind.ROOF:
+                normal = area_vector(solid.vertices, face.rings)
+                roof_area += math.sqrt(float(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2))
+    return Dimensions(
+        eave_z_m=lowest if math.isnan(eave) else eave,
+        ridge_z_m=highest,
+        roof_z_m=(lowest, median, seventieth, highest),
+        roof_area_m2=roof_area,
+        volume_m3=sum(volume(solid) for solid in solids),
+    )

@@ -1,0 +1,140 @@
+"""GeoParquet 1.1: the tables of a run directory, written and read.
+
+Geometries are ISO WKB with planar edges and counter-clockwise exterior rings; an unknown coordinate reference system is
+told as `crs: null`, since a missing key would mean WGS 84. A `bbox` column covers the geometries, so that a reader can
+skip row groups.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as pads
+import pyarrow.fs as pafs
+import pyarrow.parquet as pq
+import shapely
+
+from pipeline.errors import RunError
+from pipeline.export.records import KEYS, SCHEMAS
+
+VERSION = "1.1.0"
+"""Version of GeoParquet."""
+ROWS_A_GROUP = 20_000
+"""Rows in one row group."""
+
+_BBOX = pa.struct([pa.field(name, pa.float64(), nullable=False) for name in ("xmin", "ymin", "xmax", "ymax")])
+_DIMENSION_SUFFIX = {2: "", 3: " Z"}
+
+
+def stored_schema(table_name: str) -> pa.Schema:
+    """The schema of a table's files: the record's columns, then `bbox`."""
+    return SCHEMAS[table_name].append(pa.field("bbox", _BBOX))
+
+
+def geo_metadata(geometries: Any, projjson: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The `geo` entry of the file metadata.
+
+    Parameters
+    ----------
+    geometries : array of shapely geometries
+        Null ones are left out of types and bounds.
+    projjson : mapping or None
+        The coordinate reference system; None where it is unknown.
+    """
+    present = geometries[~shapely.is_missing(geometries)]
+    has_z = shapely.has_z(present)
+    names = {
+        shapely.GeometryType(int(kind)).name.title().replace("Multipolygon", "MultiPolygon")
+        + _DIMENSION_SUFFIX[3 if z else 2]
+        for kind, z in zip(shapely.get_type_id(present), has_z, strict=True)
+    }
+    column: dict[str, Any] = {
+        "encoding": "WKB",
+        "geometry_types": sorted(names),
+        "crs": None if projjson is None else dict(projjson),
+        "edges": "planar",
+        "orientation": "counterclockwise",
+        "covering": {"bbox": {name: ["bbox", name] for name in ("xmin", "ymin", "xmax", "ymax")}},
+    }
+    if len(present):
+        bounds = [float(v) for v in shapely.total_bounds(present)]
+        if has_z.all():
+            z = shapely.get_coordinates(present, include_z=True)[:, 2]
+            bounds = [*bounds[:2], float(z.min()), *bounds[2:], float(z.max())]
+        column["bbox"] = bounds
+    return {"version": VERSION, "primary_column": "geometry", "columns": {"geometry": column}}
+
+
+def geo_table(table_name: str, rows: Sequence[Mapping[str, Any]], projjson: Mapping[str, Any] | None) -> pa.Table:
+    """Rows as an Arrow table with GeoParquet metadata, sorted by the table's key.
+
+    Parameters
+    ----------
+    table_name : str
+        buildings, planes or rejected.
+    rows : sequence of mapping
+        As `pipeline.export.records` makes them; may be empty.
+    projjson : mapping or None
+        The coordinate reference system of the geometries; None where it is unknown.
+    """
+    schema, key = SCHEMAS[table_name], KEYS[table_name]
+    ordered = sorted(rows, key=lambda row: tuple(row[column] for column in key))
+    table = pa.Table.from_pylist([dict(row) for row in ordered], schema=schema)
+    geometries = shapely.from_wkb(np.array([row["geometry"] for row in ordered], dtype=object))
+    missing = shapely.is_missing(geometries)
+    bounds = shapely.bounds(geometries).reshape(-1, 4)
+    bbox = pa.StructArray.from_arrays(
+        [pa.array(np.where(missing, 0.0, bounds[:, i])) for i in range(4)],
+        fields=list(_BBOX),
+        mask=pa.array(missing, pa.bool_()),
+    )
+    table = table.append_column(pa.field("bbox", _BBOX), bbox)
+    geo = json.dumps(geo_metadata(geometries, projjson), sort_keys=True, separators=(",", ":"))
+    return table.replace_schema_metadata({"geo": geo})
+
+
+def parquet_bytes(table: pa.Table) -> bytes:
+    """A table as the bytes of a Parquet file: zstd, fixed row groups; the same table gives the same bytes."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd", row_group_size=ROWS_A_GROUP, write_statistics=True)
+    data: bytes = sink.getvalue().to_pybytes()
+    return data
+
+
+def table_dataset(run_dir: str, table_name: str, filesystem: pafs.FileSystem | None = None) -> pads.Dataset:
+    """All files of one table of a run, `tile` added as a text column from the folders' names.
+
+    Parameters
+    ----------
+    run_dir : str
+        The run directory: a local path, or a path of `filesystem`.
+    table_name : str
+        buildings, planes or rejected.
+    filesystem : pyarrow.fs.FileSystem, optional
+        Where the run lies; local by default.
+
+    Raises
+    ------
+    RunError
+        Where the folder does not exist or holds no such table.
+    """
+    filesystem = filesystem or pafs.LocalFileSystem()
+    folder = f"{str(run_dir).rstrip('/')}/{table_name}"
+    if filesystem.get_file_info(folder).type != pafs.FileType.Directory:
+        raise RunError(f"{folder} is no folder: give the directory that a run wrote")
+    partitioning = pads.partitioning(pa.schema([("tile", pa.string())]), flavor="hive")
+    schema = stored_schema(table_name).append(pa.field("tile", pa.string()))
+    try:
+        return pads.dataset(folder, schema=schema, filesystem=filesystem, format="parquet", partitioning=partitioning)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise RunError(f"{folder} cannot be read as Parquet: {error}") from error
+
+
+def read_table(run_dir: str, table_name: str, filesystem: pafs.FileSystem | None = None) -> pa.Table:
+    """One table of a run as a whole, sorted by its key; the arguments are those of `table_dataset`."""
+    table = table_dataset(run_dir, table_name, filesystem).to_table()
+    return table.sort_by([(column, "ascending") for column in KEYS[table_name]])

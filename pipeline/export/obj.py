@@ -1,0 +1,80 @@
+"""Wavefront OBJ: full coordinates, one `o` a closed solid, groups roof, wall and ground, one material a roof plane.
+
+There is no `mtllib`: a material's name says which roof plane a face belongs to (`roof_3` is plane_id 3), its colour is
+the viewer's business. Programs that know no such file make a default material of each name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from pipeline.export.coordinates import SpatialReference, crs_coordinates, decimals
+from pipeline.model import BuildingResult, FaceKind, FloatArray, Solid, SolidFace
+from pipeline.triangulation import triangulate_face
+
+_KINDS = (FaceKind.ROOF, FaceKind.WALL, FaceKind.GROUND)
+
+
+def obj_text(results: Iterable[BuildingResult], reference: SpatialReference) -> str:
+    """The solids of one or more buildings as one OBJ file.
+
+    Every solid has its own vertices, so that it is closed by itself. Faces without holes stay polygons, those with
+    holes become triangles on the same vertices.
+
+    Parameters
+    ----------
+    results : iterable of BuildingResult
+        Those without a solid are left out.
+    reference : SpatialReference
+        Gives the units of the coordinates.
+    """
+    unit = f"{reference.horizontal_unit_m:.12g} m horizontally, {reference.vertical_unit_m:.12g} m vertically"
+    lines = [f"# coordinates are easting, northing, elevation; one unit is {unit}"]
+    written = 0
+    for result in results:
+        for part, solid in enumerate(result.solids):
+            lines.append(f"o {part_id(result, part)}")
+            lines.extend(_vertex_lines(crs_coordinates(solid.vertices, result.origin, reference), reference))
+            lines.extend(_face_lines(solid, written + 1))
+            written += len(solid.vertices)
+    return "\n".join(lines) + "\n"
+
+
+def part_id(result: BuildingResult, part: int) -> str:
+    """The name of one of a building's solids, in OBJ and CityJSON alike."""
+    return f"{result.building_id}-{part}"
+
+
+def _vertex_lines(xyz: FloatArray, reference: SpatialReference) -> list[str]:
+    """The `v` lines."""
+    plan, up = decimals(reference.horizontal_unit_m), decimals(reference.vertical_unit_m)
+    return [f"v {x:.{plan}f} {y:.{plan}f} {z:.{up}f}" for x, y, z in xyz.tolist()]
+
+
+def _material(face: SolidFace) -> str:
+    """The material's name: a roof plane's own, else the kind's."""
+    return f"roof_{face.plane}" if face.kind is FaceKind.ROOF else face.kind.value
+
+
+def _face_lines(solid: Solid, first: int) -> list[str]:
+    """The `g`, `usemtl` and `f` lines of a solid whose first vertex has the number `first`."""
+    lines: list[str] = []
+    for kind in _KINDS:
+        faces = sorted((f for f in solid.faces if f.kind is kind), key=lambda f: f.plane)
+        if faces:
+            lines.append(f"g {kind.value}")
+        material = ""
+        for face in faces:
+            if _material(face) != material:
+                material = _material(face)
+                lines.append(f"usemtl {material}")
+            lines.extend("f " + " ".join(str(first + int(i)) for i in polygon) for polygon in _polygons(solid, face))
+    return lines
+
+
+def _polygons(solid: Solid, face: SolidFace) -> Sequence[Sequence[int]]:
+    """The face's outer ring, or its triangles where it has holes."""
+    if len(face.rings) == 1:
+        return face.rings
+    triangles: list[list[int]] = triangulate_face(solid.vertices, face.rings).tolist()
+    return triangles

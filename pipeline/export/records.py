@@ -1,0 +1,293 @@
+"""Records: one row a candidate, a roof plane, a rejected object, with the schemas that every reader relies on."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.export.coordinates import SpatialReference, crs_coordinates, crs_elevation, crs_geometry, decimals
+from pipeline.export.dimensions import Dimensions, dimensions
+from pipeline.model import BuildingResult, Plane, Reason
+
+_TIME = pa.timestamp("us", tz="UTC")
+
+BUILDINGS = pa.schema(
+    [
+        pa.field("building_id", pa.string(), nullable=False),
+        pa.field("source_id", pa.string()),
+        pa.field("status", pa.string(), nullable=False),
+        pa.field("reason", pa.string()),
+        pa.field("reason_detail", pa.string(), nullable=False),
+        pa.field("method", pa.string(), nullable=False),
+        pa.field("roof_type", pa.string(), nullable=False),
+        pa.field("geometry", pa.binary()),
+        pa.field("lod", pa.string()),
+        pa.field("ground_z", pa.float64()),
+        pa.field("eave_z", pa.float64()),
+        pa.field("ridge_z", pa.float64()),
+        pa.field("h_min", pa.float64()),
+        pa.field("h_50p", pa.float64()),
+        pa.field("h_70p", pa.float64()),
+        pa.field("h_max", pa.float64()),
+        pa.field("height_m", pa.float64()),
+        pa.field("footprint_area_m2", pa.float64()),
+        pa.field("roof_area_m2", pa.float64()),
+        pa.field("volume_m3", pa.float64()),
+        pa.field("n_points", pa.int64(), nullable=False),
+        pa.field("density_per_m2", pa.float64()),
+        pa.field("n_planes", pa.int32(), nullable=False),
+        pa.field("rmse_m", pa.float64()),
+        pa.field("p95_m", pa.float64()),
+        pa.field("coverage", pa.float64()),
+        pa.field("valid", pa.bool_(), nullable=False),
+        pa.field("validity_codes", pa.list_(pa.int32()), nullable=False),
+        pa.field("touches_data_edge", pa.bool_(), nullable=False),
+        pa.field("acquired_from", _TIME),
+        pa.field("acquired_to", _TIME),
+        pa.field("mesh_path", pa.string()),
+        pa.field("input_hash", pa.string()),
+        pa.field("settings_hash", pa.string(), nullable=False),
+        pa.field("engine_version", pa.string(), nullable=False),
+    ]
+)
+"""One row a candidate. `*_z` and `h_*` are elevations in the CRS's vertical unit; `_m`, `_m2`, `_m3` always metres."""
+
+PLANES = pa.schema(
+    [
+        pa.field("building_id", pa.string(), nullable=False),
+        pa.field("plane_id", pa.int32(), nullable=False),
+        pa.field("geometry", pa.binary()),
+        pa.field("slope_deg", pa.float64(), nullable=False),
+        pa.field("aspect_deg", pa.float64(), nullable=False),
+        pa.field("o_distance_m", pa.float64(), nullable=False),
+        pa.field("origin_x", pa.float64(), nullable=False),
+        pa.field("origin_y", pa.float64(), nullable=False),
+        pa.field("origin_z", pa.float64(), nullable=False),
+        pa.field("coefficients", pa.list_(pa.float64()), nullable=False),
+        pa.field("area_m2", pa.float64(), nullable=False),
+        pa.field("n_points", pa.int64(), nullable=False),
+        pa.field("rmse_m", pa.float64()),
+    ]
+)
+"""One row a roof plane.
+
+`coefficients` are a, b, c, d of a (X - origin_x) + b (Y - origin_y) + c (Z - origin_z) + d = 0 in CRS units, with
+(a, b, c) of unit length there and c > 0. `o_distance_m` is the plane's signed distance above that origin in metres;
+slope and aspect are true angles, also where the horizontal and the vertical unit differ.
+"""
+
+REJECTED = pa.schema(
+    [
+        pa.field("object_id", pa.string(), nullable=False),
+        pa.field("reason", pa.string(), nullable=False),
+        pa.field("reason_detail", pa.string(), nullable=False),
+        pa.field("geometry", pa.binary()),
+        pa.field("area_m2", pa.float64()),
+        pa.field("height_m", pa.float64()),
+        pa.field("n_points", pa.int64(), nullable=False),
+        pa.field("touches_data_edge", pa.bool_(), nullable=False),
+        pa.field("settings_hash", pa.string(), nullable=False),
+        pa.field("engine_version", pa.string(), nullable=False),
+    ]
+)
+"""One row an object that was judged to be no building: its id is made as a building's, `geometry` is its outline."""
+
+KEYS: Mapping[str, tuple[str, ...]] = {
+    "buildings": ("building_id",),
+    "planes": ("building_id", "plane_id"),
+    "rejected": ("object_id",),
+}
+"""The columns that order each table and name its rows."""
+SCHEMAS: Mapping[str, pa.Schema] = {"buildings": BUILDINGS, "planes": PLANES, "rejected": REJECTED}
+"""The schema of each table of a run directory."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CandidateFacts:
+    """Facts of one candidate that its result does not carry."""
+
+    input_hash: str | None = None
+    """Digest of the candidate's ordered points and ground."""
+    acquired_from: dt.datetime | None = None
+    """Time of the candidate's earliest point, with a time zone; None where the file tells no absolute time."""
+    acquired_to: dt.datetime | None = None
+    """Time of the candidate's latest point."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecordContext:
+    """Facts of the run that go into its records."""
+
+    reference: SpatialReference
+    """The outputs' coordinate reference system."""
+    settings_hash: str
+    """Digest of the settings that can change geometry."""
+    engine_version: str
+    """Version of this program."""
+    acquired_from: dt.datetime | None = None
+    """Earliest acquisition of the whole run's input, for candidates without facts of their own."""
+    acquired_to: dt.datetime | None = None
+    """Latest acquisition of the whole run's input."""
+    facts: Mapping[str, CandidateFacts] = dataclasses.field(default_factory=dict)
+    """Facts by building_id."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RejectedObject:
+    """An object that was judged to be no building."""
+
+    object_id: str
+    """Made as a building_id: from the CRS and the object's smallest point."""
+    origin: tuple[float, float, float]
+    """Absolute easting, northing, elevation in metres of the local origin."""
+    reason: Reason
+    """Why it is no building."""
+    reason_detail: str
+    """The measured figure and the threshold."""
+    outline: Polygon | MultiPolygon | None
+    """Outline or convex hull in local metres; None where its points span no area."""
+    area_m2: float
+    """Plan area in square metres; nan where it was not measured."""
+    height_m: float
+    """Height above ground in metres; nan where it was not measured."""
+    n_points: int
+    """Points of the object."""
+    touches_data_edge: bool = False
+    """True where the data end at the object: it may be cut."""
+
+
+def _or_none(value: float, digits: int = 3) -> float | None:
+    """A rounded figure; None where there is none, so that readers' means and sums are of the known ones."""
+    return round(float(value), digits) + 0.0 if math.isfinite(value) else None
+
+
+def _geometry(
+    polygon: Polygon | MultiPolygon | None, origin: tuple[float, float, float], reference: SpatialReference
+) -> bytes | None:
+    """A polygon as ISO WKB in CRS units; None of nothing and of the empty polygon."""
+    if polygon is None or polygon.is_empty:
+        return None
+    wkb: bytes = shapely.to_wkb(crs_geometry(polygon, origin, reference), flavor="iso")
+    return wkb
+
+
+def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: str | None = None) -> dict[str, Any]:
+    """The row of a candidate: the columns of `BUILDINGS`, in their order.
+
+    Figures that are unknown (nan) and those of a model that does not exist become None.
+    """
+    measured = dimensions(result.solids)
+    facts = context.facts.get(result.building_id) or CandidateFacts(
+        acquired_from=context.acquired_from, acquired_to=context.acquired_to
+    )
+    footprint = result.footprint if result.footprint is not None and not result.footprint.is_empty else None
+    modelled = bool(result.solids)
+    return {
+        "building_id": result.building_id,
+        "source_id": result.source_id,
+        "status": result.status.value,
+        "reason": None if result.reason is None else result.reason.value,
+        "reason_detail": result.reason_detail,
+        "method": result.method,
+        "roof_type": result.roof_type.value,
+        "geometry": _geometry(shapely.force_2d(footprint), result.origin, context.reference),
+        "lod": result.lod or None,
+        **_elevations(result, measured, context.reference),
+        "height_m": _or_none(measured.ridge_z_m - result.ground_z_m),
+        "footprint_area_m2": None if footprint is None else _or_none(footprint.area),
+        "roof_area_m2": _or_none(measured.roof_area_m2) if modelled else None,
+        "volume_m3": _or_none(measured.volume_m3) if modelled else None,
+        "n_points": result.n_points,
+        "density_per_m2": _or_none(result.density_per_m2),
+        "n_planes": len(result.planes),
+        "rmse_m": _or_none(result.rmse_m),
+        "p95_m": _or_none(result.p95_m),
+        "coverage": _or_none(result.coverage, 4),
+        "valid": modelled,
+        "validity_codes": list(result.validity_codes),
+        "touches_data_edge": result.touches_data_edge,
+        "acquired_from": facts.acquired_from,
+        "acquired_to": facts.acquired_to,
+        "mesh_path": mesh_path,
+        "input_hash": facts.input_hash,
+        "settings_hash": context.settings_hash,
+        "engine_version": context.engine_version,
+    }
+
+
+def _elevations(result: BuildingResult, measured: Dimensions, reference: SpatialReference) -> dict[str, float | None]:
+    """The elevation columns in the CRS's vertical unit."""
+    columns = ("ground_z", "eave_z", "ridge_z", "h_min", "h_50p", "h_70p", "h_max")
+    local = (result.ground_z_m, measured.eave_z_m, measured.ridge_z_m, *measured.roof_z_m)
+    return {
+        name: None if math.isnan(z) else crs_elevation(z, result.origin, reference)
+        for name, z in zip(columns, local, strict=True)
+    }
+
+
+def plane_rows(result: BuildingResult, context: RecordContext) -> list[dict[str, Any]]:
+    """The rows of a building's roof planes: the columns of `PLANES`; several faces make a MultiPolygon."""
+    reference = context.reference
+    origin = crs_coordinates(np.zeros((1, 3)), result.origin, reference)[0]
+    rows = []
+    for index, plane in enumerate(result.planes):
+        faces = [face.polygon for face in result.faces if face.plane == index]
+        geometry = faces[0] if len(faces) == 1 else MultiPolygon(faces)
+        plan_area = sum(face.area for face in faces)
+        rows.append(
+            {
+                "building_id": result.building_id,
+                "plane_id": index,
+                "geometry": _geometry(geometry, result.origin, reference),
+                "slope_deg": round(plane.slope_deg, 4),
+                "aspect_deg": round(plane.aspect_deg, 4) % 360.0,
+                "o_distance_m": round(plane.o_distance_m, 3) + 0.0,
+                "origin_x": float(origin[0]),
+                "origin_y": float(origin[1]),
+                "origin_z": float(origin[2]),
+                "coefficients": list(_coefficients(plane, reference)),
+                "area_m2": round(plan_area / math.cos(math.radians(plane.slope_deg)), 3),
+                "n_points": plane.n_points,
+                "rmse_m": _or_none(plane.rmse_m),
+            }
+        )
+    return rows
+
+
+def _coefficients(plane: Plane, reference: SpatialReference) -> tuple[float, float, float, float]:
+    """Unit normal (up) and offset of a plane about its origin, in CRS units."""
+    horizontal, vertical = reference.horizontal_unit_m, reference.vertical_unit_m
+    # z v = a (x h) + b (y h) + c, divided by v: a, b scale by h / v and c by 1 / v.
+    rise_x, rise_y, level = plane.a * horizontal / vertical, plane.b * horizontal / vertical, plane.c / vertical
+    scale = 1.0 / math.sqrt(1.0 + rise_x * rise_x + rise_y * rise_y)
+    return (
+        round(-rise_x * scale, 9) + 0.0,
+        round(-rise_y * scale, 9) + 0.0,
+        round(scale, 9),
+        round(-level * scale, decimals(vertical)) + 0.0,
+    )
+
+
+def rejected_row(rejected: RejectedObject, context: RecordContext) -> dict[str, Any]:
+    """The row of a rejected object: the columns of `REJECTED`, in their order."""
+    outline = None if rejected.outline is None else shapely.force_2d(rejected.outline)
+    return {
+        "object_id": rejected.object_id,
+        "reason": rejected.reason.value,
+        "reason_detail": rejected.reason_detail,
+        "geometry": _geometry(outline, rejected.origin, context.reference),
+        "area_m2": _or_none(rejected.area_m2),
+        "height_m": _or_none(rejected.height_m),
+        "n_points": rejected.n_points,
+        "touches_data_edge": rejected.touches_data_edge,
+        "settings_hash": context.settings_hash,
+        "engine_version": context.engine_version,
+    }

@@ -1,0 +1,158 @@
+"""Publishing one tile: its tables, meshes and city objects, each file whole or not at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import secrets
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from pipeline.errors import RunError
+from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.geoparquet import geo_table, parquet_bytes
+from pipeline.export.obj import obj_text
+from pipeline.export.records import RecordContext, RejectedObject, building_row, plane_rows, rejected_row
+from pipeline.model import BuildingResult
+
+MESHES = ("building", "tile", "none")
+"""What OBJ files a run writes: one a building, one a tile, none."""
+
+Put = Callable[[str, bytes], None]
+"""Stores bytes under a path relative to the run directory, atomically: readers see the old file or the new one."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TileFiles:
+    """What one tile published."""
+
+    digests: Mapping[str, str]
+    """sha256 of every file in hexadecimal, by its path relative to the run directory, in path order."""
+    n_buildings: int
+    """Rows of the buildings table."""
+    n_planes: int
+    """Rows of the planes table."""
+    n_rejected: int
+    """Rows of the rejected table."""
+
+
+def put_local(run_dir: str | Path) -> Put:
+    """An atomic put into a local run directory: a temporary name that readers skip, then a rename."""
+    root = Path(run_dir)
+
+    def put(path: str, data: bytes) -> None:
+        target = root / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}")
+        try:
+            temporary.write_bytes(data)
+            temporary.replace(target)
+        except OSError as error:
+            temporary.unlink(missing_ok=True)
+            raise RunError(f"{target} cannot be written: {error}. Free space, or give another --out") from error
+
+    return put
+
+
+def mesh_path(tile_key: str, building_id: str, meshes: str) -> str | None:
+    """Where a building's OBJ lies in the run directory; None where none is written."""
+    if meshes == "none":
+        return None
+    return f"meshes/{tile_key}/{building_id if meshes == 'building' else tile_key}.obj"
+
+
+def write_tile(
+    run_dir: str | Path,
+    tile_key: str,
+    results: Sequence[BuildingResult],
+    rejected: Sequence[RejectedObject],
+    context: RecordContext,
+    meshes: str = "building",
+    put: Put | None = None,
+) -> TileFiles:
+    """Publish one tile's buildings, planes, rejected objects, meshes and city objects.
+
+    Every file is put atomically and depends on the arguments only, so a task may run twice, also at the same time.
+    The tables are written also where they have no row.
+
+    Parameters
+    ----------
+    run_dir : str or Path
+        The local run directory; only told in messages where `put` is given.
+    tile_key : str
+        The hive key, such as x85_y447; never a bare integer, which readers would take for a number.
+    results : sequence of BuildingResult
+        The buildings that the tile owns, in any order.
+    rejected : sequence of RejectedObject
+        The rejected objects that the tile owns, in any order.
+    context : RecordContext
+        Facts of the run.
+    meshes : str
+        One of `MESHES`.
+    put : callable, optional
+        Stores a file elsewhere, such as in an object store; `put_local(run_dir)` by default.
+
+    Raises
+    ------
+    RunError
+        A file cannot be written, the key is a bare integer, `meshes` is unknown, or an id comes twice.
+    """
+    if meshes not in MESHES:
+        raise RunError(f"meshes is {meshes!r}: use one of {', '.join(MESHES)}")
+    if not tile_key or tile_key.lstrip("+-").isdigit() or set(tile_key) & set("/\\= "):
+        raise RunError(f"tile key {tile_key!r} cannot be a folder's hive key: use a form such as x85_y447")
+    results = sorted(results, key=lambda result: result.building_id)
+    _check_unique([result.building_id for result in results], tile_key)
+    _check_unique([entry.object_id for entry in rejected], tile_key)
+    store = put or put_local(run_dir)
+    digests = {}
+    for path, data in _tile_files(tile_key, results, rejected, context, meshes):
+        store(path, data)
+        digests[path] = hashlib.sha256(data).hexdigest()
+    return TileFiles(
+        digests=dict(sorted(digests.items())),
+        n_buildings=len(results),
+        n_planes=sum(len(result.planes) for result in results),
+        n_rejected=len(rejected),
+    )
+
+
+def _check_unique(ids: Sequence[str], tile_key: str) -> None:
+    """Refuse a tile that holds one object twice."""
+    twice = sorted({name for name in ids if ids.count(name) > 1}) if len(set(ids)) < len(ids) else []
+    if twice:
+        raise RunError(f"tile {tile_key} holds {twice[0]} more than once: an object has one owner and one record")
+
+
+def _tile_files(
+    tile_key: str,
+    results: Sequence[BuildingResult],
+    rejected: Sequence[RejectedObject],
+    context: RecordContext,
+    meshes: str,
+) -> Iterator[tuple[str, bytes]]:
+    """The tile's files as path and content: meshes first, so that no row names a mesh that is not there yet."""
+    modelled = [result for result in results if result.solids]
+    reference = context.reference
+    if meshes == "tile" and modelled:
+        yield f"meshes/{tile_key}/{tile_key}.obj", obj_text(modelled, reference).encode()
+    if meshes == "building":
+        for result in modelled:
+            yield f"meshes/{tile_key}/{result.building_id}.obj", obj_text([result], reference).encode()
+    rows = [
+        building_row(
+            result, context, mesh_path=mesh_path(tile_key, result.building_id, meshes) if result.solids else None
+        )
+        for result in results
+    ]
+    lines = cityjson_lines(list(zip(results, rows, strict=True)), reference, f"buildings of tile {tile_key}")
+    yield f"cityjson/tile={tile_key}/part-0.city.jsonl", "".join(f"{line}\n" for line in lines).encode()
+    tables = {
+        "planes": [row for result in results for row in plane_rows(result, context)],
+        "rejected": [rejected_row(entry, context) for entry in rejected],
+        "buildings": rows,
+    }
+    for name, table_rows in tables.items():
+        table = geo_table(name, table_rows, reference.projjson)
+        yield f"{name}/tile={tile_key}/part-0.parquet", parquet_bytes(table)

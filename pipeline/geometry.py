@@ -1,0 +1,557 @@
+"""Facets, planes, rings and neighbourhoods: the small geometry that all stages share.
+
+Planes are z = a x + b y + c. All sums run in the order of the points, one after the other, and not through BLAS: the
+result has the same bits on every machine. Equations are those of Shorter & Kasparis.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Plane
+
+_LOWER_QUARTILE_CHI2 = (math.nan, 0.10153, 0.57536, 1.21253, 1.92256, 2.67460, 3.45460)
+"""Lower quartile of the chi-squared distribution with 0 to 6 degrees of freedom."""
+
+# ---------------------------------------------------------------------------------------------------------- facets
+
+
+@njit(cache=True, nogil=True)
+def facet_normals(xyz: FloatArray, facets: LabelArray) -> FloatArray:
+    """Unit normals of facets, pointing up.
+
+    Parameters
+    ----------
+    xyz : (n, 3) float64
+        Vertices in metres.
+    facets : (m, 3) int32
+        Vertex indices.
+
+    Returns
+    -------
+    (m, 3) float64
+        z is never negative; (0, 0, 0) for a facet without area.
+    """
+    normals = np.zeros((len(facets), 3))
+    for t in range(len(facets)):
+        i, j, k = facets[t, 0], facets[t, 1], facets[t, 2]
+        ux, uy, uz = xyz[j, 0] - xyz[i, 0], xyz[j, 1] - xyz[i, 1], xyz[j, 2] - xyz[i, 2]
+        vx, vy, vz = xyz[k, 0] - xyz[i, 0], xyz[k, 1] - xyz[i, 1], xyz[k, 2] - xyz[i, 2]
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        length = math.sqrt(nx * nx + ny * ny + nz * nz)
+        if length > 0.0:
+            if nz < 0.0:
+                length = -length
+            normals[t, 0] = nx / length
+            normals[t, 1] = ny / length
+            normals[t, 2] = nz / length
+    return normals
+
+
+def slopes_deg(normals: FloatArray) -> FloatArray:
+    """Slope of each unit normal, (m,) float64: 0 horizontal, 90 vertical (and for the null normal of no area)."""
+    return np.degrees(np.arctan2(np.hypot(normals[:, 0], normals[:, 1]), normals[:, 2])) + np.where(
+        (normals == 0.0).all(axis=1), 90.0, 0.0
+    )
+
+
+def aspects_deg(normals: FloatArray) -> FloatArray:
+    """Direction of steepest descent of each upward normal, (m,) float64 clockwise from north in [0, 360); flat: 0."""
+    aspects = np.degrees(np.arctan2(normals[:, 0], normals[:, 1])) % 360.0
+    flat = (normals[:, 0] == 0.0) & (normals[:, 1] == 0.0)
+    return np.where(flat | (aspects >= 360.0), 0.0, aspects)
+
+
+def facet_slopes_deg(xyz: FloatArray, facets: LabelArray) -> FloatArray:
+    """Slope of every facet, (m,) float64, 0 horizontal, 90 vertical or without area."""
+    return slopes_deg(facet_normals(xyz, facets))
+
+
+@njit(cache=True, nogil=True)
+def facet_areas_m2(xyz: FloatArray, facets: LabelArray) -> FloatArray:
+    """Surface area of every facet, (m,) float64, square metres."""
+    areas = np.empty(len(facets))
+    for t in range(len(facets)):
+        i, j, k = facets[t, 0], facets[t, 1], facets[t, 2]
+        ux, uy, uz = xyz[j, 0] - xyz[i, 0], xyz[j, 1] - xyz[i, 1], xyz[j, 2] - xyz[i, 2]
+        vx, vy, vz = xyz[k, 0] - xyz[i, 0], xyz[k, 1] - xyz[i, 1], xyz[k, 2] - xyz[i, 2]
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        areas[t] = 0.5 * math.sqrt(nx * nx + ny * ny + nz * nz)
+    return areas
+
+
+@njit(cache=True, nogil=True)
+def facet_plan_areas_m2(xyz: FloatArray, facets: LabelArray) -> FloatArray:
+    """Signed area of every facet in plan, (m,) float64; positive where it turns left."""
+    areas = np.empty(len(facets))
+    for t in range(len(facets)):
+        i, j, k = facets[t, 0], facets[t, 1], facets[t, 2]
+        areas[t] = 0.5 * (
+            (xyz[j, 0] - xyz[i, 0]) * (xyz[k, 1] - xyz[i, 1]) - (xyz[j, 1] - xyz[i, 1]) * (xyz[k, 0] - xyz[i, 0])
+        )
+    return areas
+
+
+def facet_centroids(xyz: FloatArray, facets: LabelArray) -> FloatArray:
+    """Centroid of every facet, (m, 3) float64."""
+    return (xyz[facets[:, 0]] + xyz[facets[:, 1]] + xyz[facets[:, 2]]) / 3.0
+
+
+def o_distances_m(normals: FloatArray, points: FloatArray) -> FloatArray:
+    """Signed distance from the origin to the planes through points, (m,) float64.
+
+    Positive where the plane is above the origin (Hofmann et al. 2003). For facets pass their upward unit normals and
+    any one vertex each, (m, 3).
+    """
+    return normals[:, 0] * points[:, 0] + normals[:, 1] * points[:, 1] + normals[:, 2] * points[:, 2]
+
+
+# ---------------------------------------------------------------------------------------------------------- planes
+
+
+@njit(cache=True, nogil=True)
+def solve_plane_moments(sxx: float, sxy: float, syy: float, sxz: float, syz: float) -> tuple[float, float]:
+    """The slopes a, b that solve the centred normal equations (Eqs. 11 to 14).
+
+    Parameters
+    ----------
+    sxx, sxy, syy, sxz, syz : float
+        Sums of products of coordinates relative to their means.
+
+    Returns
+    -------
+    a, b : float
+        Where the points are collinear in plan, to 1e-6 of their spread, the plane is undetermined across the line: it
+        is taken level across, and sloping along the line. Where all are at one position it is horizontal.
+    """
+    determinant = sxx * syy - sxy * sxy
+    trace = sxx + syy
+    if trace <= 0.0:
+        return 0.0, 0.0
+    if determinant > 1e-12 * trace * trace:
+        return (sxz * syy - syz * sxy) / determinant, (syz * sxx - sxz * sxy) / determinant
+    # of rank one: the gradient lies along the line, whose direction is the larger row of the moments
+    if sxx >= syy:
+        along = sxz / (sxx * sxx + sxy * sxy)
+        return along * sxx, along * sxy
+    along = syz / (syy * syy + sxy * sxy)
+    return along * sxy, along * syy
+
+
+@njit(cache=True, nogil=True)
+def fit_plane_coefficients(points: FloatArray, index: LabelArray) -> tuple[float, float, float, float]:
+    """Least-squares plane z = a x + b y + c of some points (Eqs. 8 to 14), for use in compiled code.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Points in metres.
+    index : (k,) int32
+        Which of them; at least one.
+
+    Returns
+    -------
+    a, b, c, sse : float
+        Coefficients, and the sum of squared vertical residuals in m2 (Eq. 10). Collinear points: `solve_plane_moments`.
+    """
+    k = len(index)
+    mean_x = 0.0
+    mean_y = 0.0
+    mean_z = 0.0
+    for q in range(k):
+        i = index[q]
+        mean_x += points[i, 0]
+        mean_y += points[i, 1]
+        mean_z += points[i, 2]
+    mean_x /= k
+    mean_y /= k
+    mean_z /= k
+    sxx = 0.0
+    sxy = 0.0
+    syy = 0.0
+    sxz = 0.0
+    syz = 0.0
+    for q in range(k):
+        i = index[q]
+        x = points[i, 0] - mean_x
+        y = points[i, 1] - mean_y
+        z = points[i, 2] - mean_z
+        sxx += x * x
+        sxy += x * y
+        syy += y * y
+        sxz += x * z
+        syz += y * z
+    a, b = solve_plane_moments(sxx, sxy, syy, sxz, syz)
+    sse = 0.0
+    for q in range(k):
+        i = index[q]
+        residual = points[i, 2] - mean_z - a * (points[i, 0] - mean_x) - b * (points[i, 1] - mean_y)
+        sse += residual * residual
+    return a, b, mean_z - a * mean_x - b * mean_y, sse
+
+
+def fit_plane(points: FloatArray) -> Plane:
+    """Least-squares plane z = a x + b y + c of points (Shorter & Kasparis, Eqs. 8 to 14).
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Points in metres, at least one.
+
+    Returns
+    -------
+    Plane
+        Points collinear in plan give the plane that is level across their line; a single position a horizontal one.
+
+    Raises
+    ------
+    ValueError
+        Without points.
+
+    Examples
+    --------
+    >>> fit_plane(np.array([[0.0, 0, 1], [1, 0, 1.5], [0, 1, 1], [1, 1, 1.5]])).coefficients
+    (0.5, 0.0, 1.0)
+    """
+    if len(points) == 0:
+        raise ValueError("no points to fit a plane to")
+    a, b, c, sse = fit_plane_coefficients(np.ascontiguousarray(points), np.arange(len(points), dtype=np.int32))
+    return Plane(a=a, b=b, c=c, n_points=len(points), rmse_m=math.sqrt(sse / len(points)))
+
+
+def vertical_residuals_m(points: FloatArray, coefficients: tuple[float, float, float]) -> FloatArray:
+    """Height of points above the plane (a, b, c), (n,) float64 metres, signed."""
+    a, b, c = coefficients
+    return points[:, 2] - (a * points[:, 0] + b * points[:, 1] + c)
+
+
+def perpendicular_residuals_m(points: FloatArray, coefficients: tuple[float, float, float]) -> FloatArray:
+    """Distance of points from the plane (a, b, c), (n,) float64 metres, positive above (Eq. 1 with its sign)."""
+    a, b, _ = coefficients
+    return vertical_residuals_m(points, coefficients) / math.sqrt(1.0 + a * a + b * b)
+
+
+# ----------------------------------------------------------------------------------------------------------- rings
+
+
+@njit(cache=True, nogil=True)
+def ring_area_m2(ring: FloatArray) -> float:
+    """Signed area of a ring in plan, square metres: positive where it runs counter-clockwise.
+
+    Parameters
+    ----------
+    ring : (n, 2) or (n, 3) float64
+        Vertices; the first may be repeated at the end. Fewer than three have no area.
+    """
+    area = 0.0
+    for k in range(1, len(ring) - 1):
+        area += (ring[k, 0] - ring[0, 0]) * (ring[k + 1, 1] - ring[0, 1])
+        area -= (ring[k, 1] - ring[0, 1]) * (ring[k + 1, 0] - ring[0, 0])
+    return 0.5 * area
+
+
+def is_counter_clockwise(ring: FloatArray) -> bool:
+    """Whether a ring runs counter-clockwise in plan; False for one without area."""
+    return bool(ring_area_m2(ring) > 0.0)
+
+
+@njit(cache=True, nogil=True)
+def ring_normal_m2(ring: FloatArray) -> tuple[float, float, float]:
+    """Area vector of a ring in space (Newell): its direction is the normal, its length the area in square metres.
+
+    Parameters
+    ----------
+    ring : (n, 3) float64
+        Vertices, counter-clockwise seen from the tip of the normal; the first may be repeated at the end.
+    """
+    nx = 0.0
+    ny = 0.0
+    nz = 0.0
+    for k in range(1, len(ring) - 1):
+        ux, uy, uz = ring[k, 0] - ring[0, 0], ring[k, 1] - ring[0, 1], ring[k, 2] - ring[0, 2]
+        vx, vy, vz = ring[k + 1, 0] - ring[0, 0], ring[k + 1, 1] - ring[0, 1], ring[k + 1, 2] - ring[0, 2]
+        nx += uy * vz - uz * vy
+        ny += uz * vx - ux * vz
+        nz += ux * vy - uy * vx
+    return 0.5 * nx, 0.5 * ny, 0.5 * nz
+
+
+# -------------------------------------------------------------------------------------------------- neighbourhoods
+
+
+@njit(cache=True, nogil=True)
+def _grid_shape(points: FloatArray, cell_size_m: float) -> tuple[float, float, float, int, int]:
+    """Lower left corner, cell size and shape of a grid; cells grow until there are few more of them than points."""
+    x_min = points[0, 0]
+    y_min = points[0, 1]
+    x_max = x_min
+    y_max = y_min
+    for i in range(1, len(points)):
+        x_min = min(x_min, points[i, 0])
+        x_max = max(x_max, points[i, 0])
+        y_min = min(y_min, points[i, 1])
+        y_max = max(y_max, points[i, 1])
+    while (math.floor((x_max - x_min) / cell_size_m) + 1.0) * (
+        math.floor((y_max - y_min) / cell_size_m) + 1.0
+    ) > 4.0 * len(points) + 64.0:
+        cell_size_m *= 1.5
+    columns = int((x_max - x_min) / cell_size_m) + 1
+    rows = int((y_max - y_min) / cell_size_m) + 1
+    return x_min, y_min, cell_size_m, columns, rows
+
+
+@njit(cache=True, nogil=True)
+def _sort_into_grid(
+    points: FloatArray, x_min: float, y_min: float, cell_size_m: float, columns: int, rows: int
+) -> tuple[LabelArray, LabelArray]:
+    """Points by cell, ascending within one: where each cell starts (columns * rows + 1), and the indices."""
+    n = len(points)
+    start = np.zeros(columns * rows + 1, np.int32)
+    cell = np.empty(n, np.int32)
+    for i in range(n):
+        cell[i] = int((points[i, 1] - y_min) / cell_size_m) * columns + int((points[i, 0] - x_min) / cell_size_m)
+        start[cell[i] + 1] += 1
+    for c in range(columns * rows):
+        start[c + 1] += start[c]
+    end = start[:-1].copy()
+    members = np.empty(n, np.int32)
+    for i in range(n):
+        members[end[cell[i]]] = i
+        end[cell[i]] += 1
+    return start, members
+
+
+@njit(cache=True, nogil=True)
+def _nearest_neighbours(points: FloatArray, k: int, wanted_cell_size_m: float) -> tuple[LabelArray, FloatArray]:
+    """The kernel of `nearest_neighbours`; returns the squared distances too, infinite where there is no neighbour."""
+    n, dimensions = points.shape
+    neighbours = np.full((n, k), -1, np.int32)
+    squares = np.full((n, k), np.inf)
+    if n == 0 or k == 0:
+        return neighbours, squares
+    x_min, y_min, size, columns, rows = _grid_shape(points, wanted_cell_size_m)
+    start, members = _sort_into_grid(points, x_min, y_min, size, columns, rows)
+    sorted_points = points[members]
+    nearest = np.empty(k, np.int32)
+    distance = np.empty(k)
+    for s in range(n):
+        i = members[s]
+        px = sorted_points[s, 0]
+        py = sorted_points[s, 1]
+        pz = sorted_points[s, 2] if dimensions == 3 else 0.0
+        column = int((px - x_min) / size)
+        row = int((py - y_min) / size)
+        inset_x = min(px - x_min - column * size, x_min + (column + 1) * size - px)
+        inset_y = min(py - y_min - row * size, y_min + (row + 1) * size - py)
+        inset = min(inset_x, inset_y)
+        found = 0
+        ring = 0
+        while True:
+            for r in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
+                on_side = r in (row - ring, row + ring)
+                c = column - ring
+                while c <= column + ring:
+                    if 0 <= c < columns:
+                        for q in range(start[r * columns + c], start[r * columns + c + 1]):
+                            if q == s:
+                                continue
+                            dx = sorted_points[q, 0] - px
+                            dy = sorted_points[q, 1] - py
+                            square = dx * dx + dy * dy
+                            if dimensions == 3:
+                                dz = sorted_points[q, 2] - pz
+                                square += dz * dz
+                            if found == k and square > distance[k - 1]:
+                                continue
+                            j = members[q]
+                            if found < k:
+                                found += 1
+                            elif square == distance[k - 1] and j > nearest[k - 1]:
+                                continue
+                            m = found - 1
+                            while m > 0 and (
+                                distance[m - 1] > square or (distance[m - 1] == square and nearest[m - 1] > j)
+                            ):
+                                distance[m] = distance[m - 1]
+                                nearest[m] = nearest[m - 1]
+                                m -= 1
+                            distance[m] = square
+                            nearest[m] = j
+                    c += 1 if on_side or ring == 0 else 2 * ring
+            # whatever is not yet seen lies beyond the rings' outer border; a hair less allows for rounding
+            reach = (inset + ring * size) * (1.0 - 1e-9) - 1e-9
+            if found == k and reach > 0.0 and distance[k - 1] < reach * reach:
+                break
+            ring += 1
+            if ring > max(columns, rows):
+                break
+        neighbours[i, :found] = nearest[:found]
+        squares[i, :found] = distance[:found]
+    return neighbours, squares
+
+
+def nearest_neighbours(points: FloatArray, k: int, cell_size_m: float | None = None) -> LabelArray:
+    """The k nearest other points of every point, exactly.
+
+    Parameters
+    ----------
+    points : (n, 2) or (n, 3) float64
+        Positions in metres: distances are in plan or in space accordingly.
+    k : int
+        How many.
+    cell_size_m : float, optional
+        Cell of the search grid: only a matter of speed. Default: about two points a cell.
+
+    Returns
+    -------
+    (n, k) int32
+        Nearest first, of equal distances the lower index first; -1 where there are fewer other points. A point is not
+        its own neighbour, another one at the same position is.
+
+    Raises
+    ------
+    ValueError
+        If the shape is wrong, k is negative or the cell size is not positive.
+
+    Examples
+    --------
+    >>> nearest_neighbours(np.array([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0]]), 2)
+    array([[1, 2],
+           [0, 2],
+           [1, 0]], dtype=int32)
+    """
+    return _nearest_neighbours(*_checked_search(points, k, cell_size_m))[0]
+
+
+def _checked_search(points: FloatArray, k: int, cell_size_m: float | None) -> tuple[FloatArray, int, float]:
+    """The arguments of a neighbour search, validated and completed."""
+    if points.ndim != 2 or points.shape[1] not in {2, 3}:
+        raise ValueError(f"points has shape {points.shape}, not (n, 2) or (n, 3)")
+    if k < 0:
+        raise ValueError(f"k is {k}: use 0 or more")
+    if cell_size_m is None:
+        width, depth = (points[:, :2].max(axis=0) - points[:, :2].min(axis=0)).tolist() if len(points) else (0.0, 0.0)
+        longest = max(width, depth)
+        cell_size_m = max(math.sqrt(2.0 * width * depth / max(len(points), 1)), longest / max(len(points), 1), 1e-3)
+    if not cell_size_m > 0.0:
+        raise ValueError(f"cell_size_m is {cell_size_m}: use a positive size")
+    return np.ascontiguousarray(points, dtype=np.float64), k, cell_size_m
+
+
+def point_spacing_m(points: FloatArray) -> float:
+    """Typical spacing of points in plan: 1 / sqrt(density) where most of them lie.
+
+    The median over all points of the distance to the eighth neighbour, scaled by what it is among points strewn at
+    random: robust against borders, gaps, and the short steps along a scan line. On a square lattice it gives 0.9 of the
+    spacing.
+
+    Parameters
+    ----------
+    points : (n, 2) or (n, 3) float64
+        Points in metres; only x and y count.
+
+    Returns
+    -------
+    float
+        Metres; nan for fewer than two points.
+    """
+    k = min(8, len(points) - 1)
+    if k < 1:
+        return math.nan
+    _, squares = _nearest_neighbours(*_checked_search(points[:, :2], k, None))
+    # pi density r_k^2 is Gamma(k) distributed; its median is k - 1/3 within 2 % for k >= 1
+    return math.sqrt(float(np.median(squares[:, k - 1])) * math.pi / (k - 1.0 / 3.0))
+
+
+@njit(cache=True, nogil=True)
+def _local_plane_sse(points: FloatArray, neighbours: LabelArray) -> FloatArray:
+    """Sum of squared vertical residuals of each point and its neighbours to their own plane, (n,) m2."""
+    n, k = neighbours.shape
+    sse = np.empty(n)
+    index = np.empty(k + 1, np.int32)
+    for i in range(n):
+        index[0] = i
+        index[1:] = neighbours[i]
+        sse[i] = fit_plane_coefficients(points, index)[3]
+    return sse
+
+
+def noise_sigma_m(points: FloatArray) -> float:
+    """Robust standard deviation of the vertical noise, from the planes of nine neighbouring points each.
+
+    The lower quartile over all points of the local root mean square residual, scaled by what it is for normal noise:
+    neighbourhoods across edges and in trees are the upper part of the distribution and do not count.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Points in metres.
+
+    Returns
+    -------
+    float
+        Metres; nan for fewer than four points.
+    """
+    freedom = min(9, len(points)) - 3
+    if freedom < 1:
+        return math.nan
+    xyz, k, cell_size_m = _checked_search(points, freedom + 2, None)
+    neighbours, _ = _nearest_neighbours(np.ascontiguousarray(xyz[:, :2]), k, cell_size_m)
+    quartile = float(np.percentile(_local_plane_sse(xyz, neighbours), 25.0))
+    return math.sqrt(quartile / _LOWER_QUARTILE_CHI2[freedom])
+
+
+@njit(cache=True, nogil=True)
+def _covered(xyz_mm: IntArray, points: FloatArray, radius_mm: int, height_mm: int) -> BoolArray:
+    """Whether a point has another one more than `height_mm` above it within the radius in plan."""
+    n = len(points)
+    covered = np.zeros(n, np.bool_)
+    x_min, y_min, size, columns, rows = _grid_shape(points, radius_mm / 1000.0 + 0.001)
+    start, members = _sort_into_grid(points, x_min, y_min, size, columns, rows)
+    top = np.full(columns * rows, np.iinfo(np.int64).min)
+    for c in range(columns * rows):
+        for q in range(start[c], start[c + 1]):
+            top[c] = max(top[c], xyz_mm[members[q], 2])
+    for i in range(n):
+        column = int((points[i, 0] - x_min) / size)
+        row = int((points[i, 1] - y_min) / size)
+        limit = xyz_mm[i, 2] + height_mm
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            for c in range(max(column - 1, 0), min(column + 2, columns)):
+                if covered[i] or top[r * columns + c] <= limit:
+                    continue
+                for q in range(start[r * columns + c], start[r * columns + c + 1]):
+                    j = members[q]
+                    if xyz_mm[j, 2] > limit:
+                        dx = xyz_mm[j, 0] - xyz_mm[i, 0]
+                        dy = xyz_mm[j, 1] - xyz_mm[i, 1]
+                        if dx * dx + dy * dy <= radius_mm * radius_mm:
+                            covered[i] = True
+                            break
+    return covered
+
+
+def top_visible(points: FloatArray, radius_m: float = 0.5, height_m: float = 1.1) -> BoolArray:
+    """Which points see the sky: no other one is more than 1.1 m higher within 0.5 m in plan.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Points in metres; compared on whole millimetres, so that limits are met exactly.
+    radius_m, height_m : float
+        The limits, whole millimetres.
+
+    Returns
+    -------
+    (n,) bool
+        True where the point is visible from above.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.bool_)
+    xyz_mm = np.rint(points * 1000.0).astype(np.int64)
+    return ~_covered(
+        xyz_mm, np.ascontiguousarray(points, dtype=np.float64), round(radius_m * 1000), round(height_m * 1000)
+    )

@@ -1,0 +1,185 @@
+"""What can be known of a tile without reconstructing it: its facts, its classes and returns, rough estimates."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.io.source import ReadOptions, Source, SourceInfo, open_source
+from pipeline.model import FloatArray
+
+RAISED_M = 2.5
+"""Cells this far above the lowest surroundings count as raised."""
+SURROUNDINGS_M = 40.0
+"""Side of the square in which the lowest surroundings are sought: wider than most buildings."""
+LEAST_AREA_M2 = 10.0
+"""Smaller groups of raised cells are not counted."""
+MOST_CELLS = 4_000_000
+"""Bounds the raster's memory: a larger tile gets coarser cells."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Rates:
+    """What a run costs, measured on two cores of 2.x GHz (docs/how-to/plan_a_run.md tells with what)."""
+
+    seconds_start: float = 6.0
+    """Start of a run with two workers, kernels compiled."""
+    seconds_per_million_points: float = 6.0
+    """Ingest, split and join, both cores busy."""
+    seconds_per_object: float = 0.02
+    """Reconstruction of a candidate, both cores busy."""
+    gib_base: float = 0.45
+    """A worker with its libraries and kernels."""
+    gib_per_million_points: float = 0.25
+    """What a tile of the lattice adds to its worker for each million points in it, halo included."""
+    tile_million_points: float = 2.0
+    """Points of a tile of the lattice beyond which memory does not grow with the file."""
+
+
+RATES = Rates()
+"""The measured rates."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Inspection:
+    """What is known of a tile after one streamed read."""
+
+    info: SourceInfo
+    """What the header says."""
+    warnings: tuple[str, ...]
+    """What is odd but usable, of the header and of the points."""
+    used_points: int
+    """Points that a run would use."""
+    dropped: dict[str, int]
+    """Points that it would leave out, by cause."""
+    classes: dict[int, int]
+    """Used points by ASPRS class."""
+    returns: dict[int, int]
+    """Used points by the number of returns of their pulse."""
+    elevation_m: tuple[float, float]
+    """Lowest and highest used point."""
+    occupied_area_m2: float
+    """Area of the raster cells that hold a point."""
+    density_per_m2: float
+    """Used points a square metre of that area: unlike the header's figure not thinned by gaps."""
+    raised_objects: int
+    """Groups of raised cells: buildings, and also trees; touching houses count as one."""
+    cell_m: float
+    """Side of the raster's cells."""
+    estimated_seconds: float
+    """Wall time of `reconstruct` on two cores, kernels compiled."""
+    estimated_gib: float
+    """Peak memory of a worker process."""
+
+
+def inspect(path: str | Path, options: ReadOptions | None, on_progress: Callable[[int, int], None]) -> Inspection:
+    """Read a tile once, streamed, and tell what it holds.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    options : ReadOptions, optional
+        What the user says about it.
+    on_progress : callable
+        Called with points read and points promised.
+
+    Raises
+    ------
+    InputError
+        As `open_source` and the reading of its points.
+    """
+    source = open_source(path, options)
+    raster = _Raster(source.info)
+    classes = np.zeros(256, dtype=np.int64)
+    returns = np.zeros(256, dtype=np.int64)
+    used, lowest, highest = 0, math.inf, -math.inf
+    for cloud in source.chunks():
+        classes += np.bincount(cloud.classification, minlength=256)
+        returns += np.bincount(cloud.return_count, minlength=256)
+        raster.add(cloud.xyz)
+        used += len(cloud)
+        lowest = min(lowest, float(cloud.xyz[:, 2].min()))
+        highest = max(highest, float(cloud.xyz[:, 2].max()))
+        on_progress(used, source.info.point_count)
+    return _told(source, raster, classes, returns, used, (lowest, highest))
+
+
+def _told(
+    source: Source,
+    raster: _Raster,
+    classes: np.ndarray[tuple[int], np.dtype[np.int64]],
+    returns: np.ndarray[tuple[int], np.dtype[np.int64]],
+    used: int,
+    elevation_m: tuple[float, float],
+) -> Inspection:
+    objects = raster.raised_objects()
+    area = raster.occupied_area_m2()
+    millions = used / 1e6
+    return Inspection(
+        info=source.info,
+        warnings=source.warnings,
+        used_points=used,
+        dropped=source.dropped,
+        classes={int(k): int(classes[k]) for k in np.flatnonzero(classes)},
+        returns={int(k): int(returns[k]) for k in np.flatnonzero(returns)},
+        elevation_m=elevation_m,
+        occupied_area_m2=area,
+        density_per_m2=used / area if area > 0.0 else math.nan,
+        raised_objects=objects,
+        cell_m=raster.cell_m,
+        estimated_seconds=RATES.seconds_start
+        + RATES.seconds_per_million_points * millions
+        + RATES.seconds_per_object * objects,
+        estimated_gib=RATES.gib_base + RATES.gib_per_million_points * min(millions, RATES.tile_million_points),
+    )
+
+
+class _Raster:
+    """Lowest and highest point of every cell, over the header's bounds."""
+
+    def __init__(self, info: SourceInfo) -> None:
+        x0, y0, _, x1, y1, _ = info.bounds_m
+        area = max((x1 - x0) * (y1 - y0), 1.0)
+        self.cell_m = max(1.0, math.sqrt(area / MOST_CELLS))
+        self._x0, self._y0 = x0, y0
+        self._columns = int((x1 - x0) / self.cell_m) + 1
+        self._rows = int((y1 - y0) / self.cell_m) + 1
+        self._low = np.full(self._rows * self._columns, np.inf)
+        self._high = np.full(self._rows * self._columns, -np.inf)
+
+    def add(self, xyz: FloatArray) -> None:
+        """Count points in; those outside the header's bounds go to the nearest cell."""
+        column = np.clip(((xyz[:, 0] - self._x0) / self.cell_m).astype(np.int64), 0, self._columns - 1)
+        row = np.clip(((xyz[:, 1] - self._y0) / self.cell_m).astype(np.int64), 0, self._rows - 1)
+        cell = row * self._columns + column
+        np.minimum.at(self._low, cell, xyz[:, 2])
+        np.maximum.at(self._high, cell, xyz[:, 2])
+
+    def occupied_area_m2(self) -> float:
+        """Area of the cells that hold a point."""
+        return float(np.count_nonzero(np.isfinite(self._low))) * self.cell_m**2
+
+    def raised_objects(self) -> int:
+        """Groups of cells that stand above the lowest surroundings."""
+        from scipy import ndimage
+
+        low = self._low.reshape(self._rows, self._columns)
+        high = self._high.reshape(self._rows, self._columns)
+        # A single point far below the ground must not sink its surroundings.
+        typical = ndimage.percentile_filter(low, 20, size=5, mode="nearest")
+        floor = np.where(low < typical - 3.0, typical, low)
+        side = 2 * round(0.5 * SURROUNDINGS_M / self.cell_m) + 1
+        ground = ndimage.maximum_filter(
+            ndimage.minimum_filter(floor, size=side, mode="nearest"), size=side, mode="nearest"
+        )
+        raised = np.isfinite(high) & (high - ground > RAISED_M)
+        labels, n = ndimage.label(ndimage.binary_opening(raised, np.ones((2, 2))))
+        if n == 0:
+            return 0
+        areas = np.bincount(labels.ravel())[1:] * self.cell_m**2
+        return int(np.count_nonzero(areas >= LEAST_AREA_M2))

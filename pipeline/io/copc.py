@@ -1,0 +1,102 @@
+"""The octree of a COPC file: which compressed nodes meet a window. Source: COPC specification 1.0, copc.io.
+
+The walk is our own and not laspy's reader, because a query there decodes all of a window at once and a damaged
+hierarchy leads it into an endless loop.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+from laspy.copc import CopcInfoVlr
+
+from pipeline.errors import UnreadableInputError
+from pipeline.io.laz_chunks import CHUNK_SIZE_LIMIT
+
+if TYPE_CHECKING:
+    import laspy
+
+    from pipeline.io.records import Window
+
+ENTRY = np.dtype(
+    [("level", "<i4"), ("x", "<i4"), ("y", "<i4"), ("z", "<i4"), ("offset", "<u8"), ("size", "<i4"), ("count", "<i4")]
+)
+"""One entry of a hierarchy page; a count of -1 means that offset and size name another page."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OctreeInfo:
+    """Where the octree is."""
+
+    x_min: float
+    """West of the root cube, in the units of the CRS."""
+    y_min: float
+    """South of the root cube."""
+    width: float
+    """Edge of the root cube."""
+    root_offset: int
+    """Byte of the root page."""
+    root_size: int
+    """Bytes of the root page."""
+
+
+def octree_info(header: laspy.LasHeader) -> OctreeInfo | None:
+    """The octree that the first record of the header describes; None where the file is no COPC."""
+    if not header.vlrs or not isinstance(header.vlrs[0], CopcInfoVlr):
+        return None
+    info = header.vlrs[0]
+    return OctreeInfo(
+        x_min=float(info.center[0] - info.halfsize),
+        y_min=float(info.center[1] - info.halfsize),
+        width=2.0 * float(info.halfsize),
+        root_offset=int(info.hierarchy_root_offset),
+        root_size=int(info.hierarchy_root_size),
+    )
+
+
+def nodes_within(
+    path: Path, stream: BinaryIO, info: OctreeInfo, window: Window, file_size: int
+) -> npt.NDArray[np.void]:
+    """The nodes that hold points and meet the window, in file order.
+
+    Returns
+    -------
+    (n,) structured array of `ENTRY`
+
+    Raises
+    ------
+    UnreadableInputError
+        If a page or node lies outside the file.
+    """
+    fix = "Get the file again, or rewrite it as LAZ"
+    pages, seen = [(info.root_offset, info.root_size)], set()
+    found = []
+    while pages:
+        offset, size = pages.pop()
+        if offset in seen:
+            continue
+        seen.add(offset)
+        if size <= 0 or size % ENTRY.itemsize or offset + size > file_size:
+            raise UnreadableInputError(
+                str(path), f"the octree page at byte {offset} with {size} bytes is damaged or truncated", fix
+            )
+        stream.seek(offset)
+        entries = np.frombuffer(stream.read(size), dtype=ENTRY)
+        edge = info.width / np.exp2(entries["level"].astype(np.float64))
+        west, south = info.x_min + entries["x"] * edge, info.y_min + entries["y"] * edge
+        # One micrometre of slack: points sit on node borders by rounding.
+        slack = 1e-6
+        meets = (west - slack <= window.x_max) & (west + edge + slack >= window.x_min)
+        meets &= (south - slack <= window.y_max) & (south + edge + slack >= window.y_min)
+        pages.extend((int(page["offset"]), int(page["size"])) for page in entries[meets & (entries["count"] == -1)])
+        found.append(entries[meets & (entries["count"] > 0)])
+    nodes = np.concatenate(found)
+    ends = nodes["offset"].astype(np.float64) + nodes["size"]
+    if len(nodes) and (ends.max() > file_size or nodes["size"].min() <= 0 or nodes["count"].max() > CHUNK_SIZE_LIMIT):
+        raise UnreadableInputError(str(path), "an octree node is damaged or lies outside the file", fix)
+    ordered: npt.NDArray[np.void] = nodes[np.argsort(nodes["offset"], kind="stable")]
+    return ordered

@@ -1,0 +1,227 @@
+"""The coordinate reference system and the units of a file: horizontal and vertical are separate things."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import CrsError
+
+if TYPE_CHECKING:
+    import pyproj
+
+INTERNATIONAL_FOOT_M = 0.3048
+US_SURVEY_FOOT_M = 1200.0 / 3937.0
+
+UNITS_M = {
+    "m": 1.0,
+    "metre": 1.0,
+    "meter": 1.0,
+    "ft": INTERNATIONAL_FOOT_M,
+    "foot": INTERNATIONAL_FOOT_M,
+    "us-ft": US_SURVEY_FOOT_M,
+    "ftus": US_SURVEY_FOOT_M,
+    "us_survey_foot": US_SURVEY_FOOT_M,
+    "cm": 0.01,
+    "mm": 0.001,
+    "km": 1000.0,
+}
+"""Metres a unit, by the words that `--vertical-unit` understands."""
+
+EPSG_UNITS_M = {9001: 1.0, 9002: INTERNATIONAL_FOOT_M, 9003: US_SURVEY_FOOT_M}
+"""Metres a unit, by the EPSG codes that GeoTIFF keys use."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SpatialReference:
+    """Where coordinates live and in which units."""
+
+    wkt: str | None = None
+    """WKT2:2019 of the CRS, compound where it is; None where unknown."""
+    name: str = "unknown"
+    """The CRS's own name."""
+    epsg: int | None = None
+    """EPSG code of the whole CRS, compound where it is; None where it has none."""
+    horizontal_unit_m: float = 1.0
+    """Metres a unit of easting and northing."""
+    vertical_unit_m: float = 1.0
+    """Metres a unit of elevation."""
+
+    @property
+    def crs(self) -> pyproj.CRS | None:
+        """The CRS as a pyproj object; None where unknown."""
+        if self.wkt is None:
+            return None
+        import pyproj
+
+        return pyproj.CRS.from_wkt(self.wkt)
+
+    @property
+    def projjson(self) -> dict[str, Any] | None:
+        """PROJJSON of the whole CRS, compound where it is; None where unknown (GeoParquet's `crs: null`)."""
+        crs = self.crs
+        return None if crs is None else dict(crs.to_json_dict())
+
+    @property
+    def horizontal_crs(self) -> pyproj.CRS | None:
+        """The horizontal part as a pyproj object; None where unknown."""
+        crs = self.crs
+        return None if crs is None else horizontal_part(crs)
+
+
+UNKNOWN_REFERENCE = SpatialReference()
+"""No CRS: metres are assumed."""
+
+
+def unit_in_metres(word: str, *, path: str) -> float:
+    """Metres a unit, from a word such as m, ft or us-ft.
+
+    Raises
+    ------
+    CrsError
+        If the word is none of `UNITS_M`.
+    """
+    try:
+        return UNITS_M[word.strip().lower()]
+    except KeyError:
+        raise CrsError(path, f"unit {word!r} is not known", f"Use one of {', '.join(UNITS_M)}") from None
+
+
+def parse_crs(text: str, *, path: str) -> pyproj.CRS:
+    """The CRS that a user names: an EPSG code, WKT, PROJJSON or a PROJ string.
+
+    Raises
+    ------
+    CrsError
+        If PROJ does not understand the text.
+    """
+    import pyproj
+
+    try:
+        return pyproj.CRS.from_user_input(text)
+    except pyproj.exceptions.CRSError as fault:
+        raise CrsError(
+            path,
+            f"coordinate reference system {text[:80]!r} is not understood ({str(fault)[:120]})",
+            "Give an EPSG code such as EPSG:28992, or WKT",
+        ) from fault
+
+
+def horizontal_part(crs: pyproj.CRS) -> pyproj.CRS:
+    """The horizontal CRS of a compound, bound or 3D CRS; the CRS itself where it is none of these."""
+    if crs.is_bound and crs.source_crs is not None:
+        return horizontal_part(crs.source_crs)
+    if crs.is_compound:
+        return horizontal_part(crs.sub_crs_list[0])
+    return crs
+
+
+def vertical_unit_of(crs: pyproj.CRS) -> float | None:
+    """Metres a unit of the vertical axis; None where the CRS has no vertical axis."""
+    if crs.is_bound and crs.source_crs is not None:
+        return vertical_unit_of(crs.source_crs)
+    if crs.is_compound:
+        for part in crs.sub_crs_list[1:]:
+            if part.is_vertical:
+                return float(part.axis_info[0].unit_conversion_factor)
+        return None
+    if len(crs.axis_info) == 3:
+        return float(crs.axis_info[2].unit_conversion_factor)
+    return None
+
+
+def horizontal_unit_of(crs: pyproj.CRS, *, path: str) -> float:
+    """Metres a unit of the horizontal axes.
+
+    Raises
+    ------
+    CrsError
+        If the CRS is geographic, geocentric or vertical only, or its two axes differ in unit.
+    """
+    plane = horizontal_part(crs)
+    reproject = "Reproject the file to a projected CRS, or give --crs EPSG:n where the header is wrong"
+    if plane.is_geographic:
+        raise CrsError(path, f"CRS {crs.name!r} is geographic: its coordinates are degrees, not lengths", reproject)
+    if plane.is_geocentric:
+        raise CrsError(path, f"CRS {crs.name!r} is geocentric: it has no plan and elevation", reproject)
+    if plane.is_vertical or len(plane.axis_info) < 2:
+        raise CrsError(path, f"CRS {crs.name!r} has no horizontal axes", "Give --crs EPSG:n with a horizontal CRS")
+    units = {float(axis.unit_conversion_factor) for axis in plane.axis_info[:2]}
+    if len(units) != 1:
+        raise CrsError(path, f"CRS {crs.name!r} has axes in different units, {sorted(units)} m", reproject)
+    return units.pop()
+
+
+def resolve_reference(
+    *,
+    path: str,
+    header_crs: pyproj.CRS | None = None,
+    header_horizontal_unit_m: float | None = None,
+    header_vertical_unit_m: float | None = None,
+    crs: str | None = None,
+    vertical_unit: str | None = None,
+) -> tuple[SpatialReference, tuple[str, ...]]:
+    """The reference of a file from its header and the user's overrides, and what is worth telling.
+
+    Parameters
+    ----------
+    path : str
+        The file, for messages.
+    header_crs : pyproj.CRS, optional
+        As the header has it.
+    header_horizontal_unit_m, header_vertical_unit_m : float, optional
+        Metres a unit, where the header tells a unit beside the CRS (GeoTIFF keys).
+    crs : str, optional
+        The user's CRS; stands above the header's.
+    vertical_unit : str, optional
+        The user's vertical unit, a word of `UNITS_M`; stands above all else.
+
+    Returns
+    -------
+    reference : SpatialReference
+        The vertical unit is the user's, else the CRS's, else the header's, else the horizontal one.
+    warnings : tuple of str
+        One sentence each.
+
+    Raises
+    ------
+    CrsError
+        If the CRS is geographic or not understood, or the unit is not known.
+    """
+    told: list[str] = []
+    chosen = header_crs
+    if crs is not None:
+        chosen = parse_crs(crs, path=path)
+        if header_crs is not None and not horizontal_part(chosen).equals(
+            horizontal_part(header_crs), ignore_axis_order=True
+        ):
+            told.append(f"the given CRS {chosen.name!r} stands in place of the header's {header_crs.name!r}")
+    vertical_m = None if vertical_unit is None else unit_in_metres(vertical_unit, path=path)
+    if chosen is None:
+        horizontal_m = 1.0 if header_horizontal_unit_m is None else header_horizontal_unit_m
+        told.append(
+            f"no usable CRS in the file: unknown, horizontal unit taken as {horizontal_m:g} m; give --crs EPSG:n"
+        )
+        if vertical_m is None:
+            vertical_m = horizontal_m if header_vertical_unit_m is None else header_vertical_unit_m
+        return SpatialReference(horizontal_unit_m=horizontal_m, vertical_unit_m=vertical_m), tuple(told)
+
+    horizontal_m = horizontal_unit_of(chosen, path=path)
+    if vertical_m is None:
+        vertical_m = vertical_unit_of(chosen)
+    if vertical_m is None and crs is None:
+        vertical_m = header_vertical_unit_m
+    if vertical_m is None:
+        vertical_m = horizontal_m
+        told.append(
+            f"no vertical unit in CRS {chosen.name!r}: taken from the horizontal one ({horizontal_m:g} m); "
+            "give --vertical-unit where it is another"
+        )
+    reference = SpatialReference(
+        wkt=chosen.to_wkt("WKT2_2019"),
+        name=chosen.name,
+        epsg=chosen.to_epsg(),
+        horizontal_unit_m=horizontal_m,
+        vertical_unit_m=vertical_m,
+    )
+    return reference, tuple(told)

@@ -1,0 +1,167 @@
+"""Which format a file has, by what it begins with and by its name; and which files a list of paths means."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from pipeline.errors import EmptyInputError, UnreadableInputError
+
+MAGIC = {b"LASF": "las", b"ply\n": "ply", b"ply\r": "ply"}
+"""Formats by their first bytes."""
+FOREIGN_MAGIC = {
+    b"PK\x03\x04": "a zip archive: unpack it first",
+    b"\x1f\x8b": "a gzip file: unpack it first",
+    b"7z\xbc\xaf": "a 7z archive: unpack it first",
+    b"ASTM-E57": "an E57 file: convert it to LAZ first",
+    b"II*\0": "a TIFF raster, not points",
+    b"MM\0*": "a TIFF raster, not points",
+    b"\x89HDF": "an HDF5 file, not points",
+    b"SQLi": "a GeoPackage or SQLite file: give it as footprints",
+    b"%PDF": "a PDF file",
+}
+"""What is often mistaken for points, and what to do with it."""
+LAS_SUFFIXES = (".las", ".laz")
+ASCII_SUFFIXES = (".xyz", ".txt", ".csv", ".asc", ".pts")
+POINT_SUFFIXES = (*LAS_SUFFIXES, ".ply", *ASCII_SUFFIXES)
+VALID = "Valid are LAS and LAZ (.las, .laz, .copc.laz), PLY (.ply) and ASCII x y z (.xyz, .txt, .csv, .asc, .pts)"
+SNIFF_BYTES = 4096
+
+
+def first_bytes(path: Path) -> bytes:
+    """The first bytes of a file.
+
+    Raises
+    ------
+    UnreadableInputError
+        If the file is not there, is a folder, or may not be read.
+    EmptyInputError
+        If it has no bytes.
+    """
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(SNIFF_BYTES)
+    except FileNotFoundError:
+        raise UnreadableInputError(str(path), "no such file", "Check the path") from None
+    except IsADirectoryError:
+        raise UnreadableInputError(str(path), "a folder, not a file", "Give the files in it") from None
+    except OSError as fault:
+        raise UnreadableInputError(
+            str(path), f"cannot be read ({fault.strerror or fault})", "Check the file's permissions and the disk"
+        ) from fault
+    if not head:
+        raise EmptyInputError(str(path), "the file has 0 bytes", "Get the file again")
+    return head
+
+
+def recognise_format(path: Path) -> str:
+    """las, ply or ascii.
+
+    Raises
+    ------
+    UnreadableInputError
+        If the file is none of these, or not what its name says.
+    """
+    head, suffix = first_bytes(path), path.suffix.lower()
+    for magic, name in MAGIC.items():
+        if head.startswith(magic):
+            return name
+    for magic, what in FOREIGN_MAGIC.items():
+        if head.startswith(magic):
+            raise UnreadableInputError(str(path), f"this is {what}", VALID)
+    if suffix in LAS_SUFFIXES:
+        raise UnreadableInputError(
+            str(path), f"not a LAS file: it begins with {head[:4]!r}, not b'LASF'", f"Get the file again. {VALID}"
+        )
+    if suffix == ".ply":
+        raise UnreadableInputError(
+            str(path), f"not a PLY file: it begins with {head[:4]!r}, not b'ply'", f"Get the file again. {VALID}"
+        )
+    if b"\0" not in head and (suffix in ASCII_SUFFIXES or looks_like_points(head)):
+        return "ascii"
+    raise UnreadableInputError(str(path), f"format not known: it begins with {head[:8]!r}", VALID)
+
+
+def looks_like_points(head: bytes) -> bool:
+    """Whether text begins with rows of at least three numbers, after at most a few lines of header.
+
+    >>> looks_like_points(b"x,y,z\\n1.0,2.0,3.0\\n4,5,6\\n")
+    True
+    >>> looks_like_points(b"Read me first\\nThe data are ...\\n")
+    False
+    """
+    for line in head.split(b"\n")[:20]:
+        fields = line.replace(b",", b" ").replace(b";", b" ").split()
+        if len(fields) >= 3 and all(_is_number(field) for field in fields[:3]):
+            return True
+    return False
+
+
+def _is_number(field: bytes) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def find_inputs(paths: Iterable[str | Path]) -> list[Path]:
+    """The point files that paths, folders and glob patterns mean, each once, sorted by path.
+
+    Of a folder (not of the folders in it) its LAS, LAZ and PLY files are taken, and of its text files those that look
+    like points. A file that is named is taken whatever its name.
+
+    Raises
+    ------
+    UnreadableInputError
+        If a path is not there or may not be read, a folder holds no point files or a pattern meets none.
+    """
+    found: dict[str, Path] = {}
+    for entry in paths:
+        for path in _files_of(entry):
+            found.setdefault(os.path.realpath(path), path)
+    if not found:
+        raise UnreadableInputError(
+            "inputs", "no input files are given", "Name files, folders or patterns such as tiles/*.laz"
+        )
+    return sorted(found.values(), key=lambda path: path.as_posix())
+
+
+def _files_of(entry: str | Path) -> list[Path]:
+    """The files of one path, folder or pattern."""
+    path = Path(entry)
+    if path.is_dir():
+        return _files_in(path)
+    if not path.exists() and glob.has_magic(str(entry)):
+        met = [Path(name) for name in glob.glob(str(entry), recursive=True)]
+        files = [file for file in met if file.is_file()]
+        if not files:
+            raise UnreadableInputError(str(entry), "the pattern meets no files", "Check the pattern and the folder")
+        return files
+    first_bytes(path)
+    return [path]
+
+
+def _files_in(folder: Path) -> list[Path]:
+    """The point files of a folder."""
+    try:
+        entries = [path for path in folder.iterdir() if path.is_file()]
+    except OSError as fault:
+        raise UnreadableInputError(
+            str(folder), f"the folder cannot be read ({fault.strerror or fault})", "Check its permissions"
+        ) from fault
+    files = [path for path in entries if _is_point_file(path)]
+    if not files:
+        what = f"none of the {len(entries)} files in the folder is a point file" if entries else "the folder is empty"
+        raise UnreadableInputError(str(folder), what, VALID)
+    return files
+
+
+def _is_point_file(path: Path) -> bool:
+    """Whether a file found in a folder is meant, by its suffix, and text by its content."""
+    suffix = path.suffix.lower()
+    if path.name.startswith(".") or suffix not in POINT_SUFFIXES:
+        return False
+    return suffix not in ASCII_SUFFIXES or (path.stat().st_size > 0 and looks_like_points(first_bytes(path)))

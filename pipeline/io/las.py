@@ -1,0 +1,271 @@
+"""LAS 1.2 to 1.4 and LAZ, streamed. COPC is LAZ too; a window of it is read through its octree.
+
+laspy knows the header, the records and their bit fields; decompression goes to lazrs directly, because only then the
+fields that nobody uses can be left out, and because errors must be told by file and fix.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import laspy
+import lazrs
+import numpy as np
+from laspy.point.record import PackedPointRecord
+
+from pipeline.errors import InconsistentInputError, UnreadableInputError
+from pipeline.io import copc
+from pipeline.io.gps_time import GpsTimeKind, kind_of
+from pipeline.io.las_header import REWRITE, HeaderBlock, header_crs, read_header_block
+from pipeline.io.laz_chunks import CHUNK_SIZE_LIMIT, ChunkTable, check_last_chunk, read_chunk_table
+from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+SAMPLE_PLACES = 8
+SAMPLE_SIZE = 2_000
+"""Points looked at in each of some places of the file, to tell classes and GPS times without reading it all."""
+
+USED_FIELDS = (
+    lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL
+    | lazrs.SELECTIVE_DECOMPRESS_Z
+    | lazrs.SELECTIVE_DECOMPRESS_CLASSIFICATION
+    | lazrs.SELECTIVE_DECOMPRESS_FLAGS
+    | lazrs.SELECTIVE_DECOMPRESS_POINT_SOURCE_ID
+    | lazrs.SELECTIVE_DECOMPRESS_GPS_TIME
+)
+"""What is decompressed of point formats 6 and above; the older ones know no selection."""
+
+DECODING_ERRORS = (lazrs.LazrsError, laspy.LaspyException, OSError, ValueError, struct.error)
+
+
+class LasFile:
+    """A LAS, LAZ or COPC file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Raises
+    ------
+    InputError
+        If the header, the table of compressed chunks and the file's size do not fit one another.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._warnings: list[str] = []
+        self._block = read_header_block(path)
+        with path.open("rb") as stream:
+            self._header = self._laspy_header(stream)
+            self._laszip_record = b""
+            self._chunks: ChunkTable | None = None
+            self._copc = None
+            if self._block.compressed:
+                self._laszip_record = self._read_laszip_record()
+                self._chunks = read_chunk_table(path, stream, self._block, self._laszip_record)
+                check_last_chunk(path, stream, self._block, self._laszip_record, self._chunks)
+                self._copc = copc.octree_info(self._header)
+            else:
+                self._check_room()
+        self._facts = self._read_facts()
+
+    @property
+    def facts(self) -> FileFacts:
+        """What the header and a sample of the points say."""
+        return self._facts
+
+    def records(self, chunk_size: int, window: Window | None) -> Iterator[PointRecords]:
+        """The records in file order, in pieces of `chunk_size`; of COPC with a window only the nodes that meet it.
+
+        Raises
+        ------
+        UnreadableInputError
+            If the data end or break before the promised count.
+        """
+        if window is not None and self._copc is not None:
+            yield from self._octree_records(window)
+            return
+        with self._path.open("rb") as stream:
+            decoder = self._decoder(stream)
+            for begin in range(0, self._block.point_count, chunk_size):
+                count = min(chunk_size, self._block.point_count - begin)
+                yield self._to_records(self._decode(decoder, count, begin))
+
+    def _octree_records(self, window: Window) -> Iterator[PointRecords]:
+        """Records of the octree nodes that meet the window, one node a piece."""
+        assert self._copc is not None
+        with self._path.open("rb") as stream:
+            nodes = copc.nodes_within(self._path, stream, self._copc, window, self._block.file_size)
+            for node in nodes:
+                stream.seek(int(node["offset"]))
+                count, size = int(node["count"]), int(node["size"])
+                out = np.empty(count * self._block.point_size, dtype=np.uint8)
+                try:
+                    lazrs.decompress_points_with_chunk_table(
+                        stream.read(size), self._laszip_record, out, [(count, size)], self._selection()
+                    )
+                except DECODING_ERRORS as fault:
+                    raise self._broken(fault, "in an octree node") from fault
+                yield self._to_records(out)
+
+    def _laspy_header(self, stream: io.BufferedReader) -> laspy.LasHeader:
+        """The header by laspy; what it makes of damaged records is any of Python's errors."""
+        try:
+            return laspy.LasHeader.read_from(stream)
+        except (laspy.LaspyException, ValueError, LookupError, TypeError, AttributeError, struct.error) as fault:
+            raise UnreadableInputError(str(self._path), f"the LAS header is damaged ({fault})", REWRITE) from fault
+
+    def _read_laszip_record(self) -> bytes:
+        """The LAZ record, which tells how the points are compressed."""
+        try:
+            return bytes(self._header.vlrs[self._header.vlrs.index("LasZipVlr")].record_data)
+        except ValueError as fault:
+            raise UnreadableInputError(
+                str(self._path), "compressed, but without the LAZ record that tells how", REWRITE
+            ) from fault
+
+    def _check_room(self) -> None:
+        """Hold the promised count against the bytes of an uncompressed file."""
+        block = self._block
+        room = block.end_of_points - block.offset_to_points
+        held, rest = divmod(room, block.point_size)
+        problem = f"the header promises {block.point_count} points, the file has room for {held}"
+        if held < block.point_count:
+            if rest:
+                raise UnreadableInputError(str(self._path), f"truncated: {problem} and a piece", REWRITE)
+            raise InconsistentInputError(str(self._path), problem, REWRITE)
+        if held > block.point_count:
+            if not rest:
+                raise InconsistentInputError(str(self._path), problem, REWRITE)
+            self._warnings.append(
+                f"{room - block.point_count * block.point_size} bytes follow the points and are not read"
+            )
+
+    def _selection(self) -> Any:
+        """What lazrs shall decompress."""
+        return lazrs.DecompressionSelection(USED_FIELDS)
+
+    def _decoder(self, stream: io.BufferedReader, *, parallel: bool = True) -> Any:
+        """The thing that gives the next records: lazrs where compressed, else the stream itself."""
+        stream.seek(self._block.offset_to_points)
+        if self._chunks is None:
+            return stream
+        # The parallel one decodes whole chunks into memory, so chunks without measure go to the sequential one.
+        parallel = parallel and int(self._chunks.counts.max()) <= CHUNK_SIZE_LIMIT
+        make = lazrs.ParLasZipDecompressor if parallel else lazrs.LasZipDecompressor
+        try:
+            return make(stream, self._laszip_record, self._selection())
+        except DECODING_ERRORS as fault:
+            raise self._broken(fault, "at the start") from fault
+
+    def _decode(self, decoder: Any, count: int, begin: int) -> npt.NDArray[np.uint8]:
+        """The bytes of the next records."""
+        raw = np.empty(count * self._block.point_size, dtype=np.uint8)
+        try:
+            if self._chunks is not None:
+                decoder.decompress_many(raw)
+            elif decoder.readinto(memoryview(raw)) != len(raw):
+                raise EOFError("the file ends")
+        except (*DECODING_ERRORS, EOFError) as fault:
+            raise self._broken(fault, f"between points {begin} and {begin + count}") from fault
+        return raw
+
+    def _broken(self, fault: Exception, where: str) -> UnreadableInputError:
+        """The error for data that cannot be decoded."""
+        problem = f"the point data are damaged or truncated {where} of {self._block.point_count} ({fault})"
+        return UnreadableInputError(str(self._path), problem, REWRITE)
+
+    def _to_records(self, raw: npt.NDArray[np.uint8]) -> PointRecords:
+        """Arrays of the fields that are used."""
+        packed = PackedPointRecord.from_buffer(raw, self._header.point_format)
+        array = packed.array
+        xyz = np.empty((len(array), 3), dtype=np.float64)
+        for axis, name in enumerate(("X", "Y", "Z")):
+            np.multiply(array[name], self._header.scales[axis], out=xyz[:, axis])
+            xyz[:, axis] += self._header.offsets[axis]
+        return PointRecords(
+            xyz=xyz,
+            return_number=np.asarray(packed["return_number"], dtype=np.uint8),
+            return_count=np.asarray(packed["number_of_returns"], dtype=np.uint8),
+            classification=np.asarray(packed["classification"], dtype=np.uint8),
+            gps_time=np.array(array["gps_time"]) if "gps_time" in array.dtype.names else None,
+            source_id=np.array(array["point_source_id"]),
+            withheld=np.asarray(packed["withheld"], dtype=np.bool_),
+        )
+
+    def _sample(self) -> PointRecords:
+        """Points from some places spread over the file, in file order."""
+        count = self._block.point_count
+        starts: npt.NDArray[Any] = np.unique(
+            np.linspace(0, max(count - SAMPLE_SIZE, 0), SAMPLE_PLACES).astype(np.int64)
+        )
+        if self._chunks is not None:
+            begins = np.concatenate(([0], np.cumsum(self._chunks.counts)[:-1]))
+            starts = np.unique(begins[np.searchsorted(begins, starts, side="right") - 1])
+        pieces = []
+        with self._path.open("rb") as stream:
+            decoder = self._decoder(stream, parallel=False)
+            for start in starts.tolist():
+                if self._chunks is None:
+                    stream.seek(self._block.offset_to_points + start * self._block.point_size)
+                elif start:
+                    decoder.seek(start)
+                pieces.append(self._decode(decoder, min(SAMPLE_SIZE, count - start), start))
+        return self._to_records(np.concatenate(pieces))
+
+    def _read_facts(self) -> FileFacts:
+        """The facts from header and sample."""
+        header, block, sample = self._header, self._block, self._sample()
+        found = header_crs(self._path, header, block)
+        self._warnings.extend(found.warnings)
+        by_return = [int(n) for n in header.number_of_points_by_return]
+        assert sample.return_count is not None
+        assert sample.classification is not None
+        has_returns = any(by_return[1:]) or bool((sample.return_count > 1).any())
+        if block.minor >= 4 and block.legacy_count not in {0, block.point_count}:
+            self._warnings.append(
+                f"the old point count {block.legacy_count} differs from the 64-bit one {block.point_count}"
+            )
+        kind, time_range = GpsTimeKind.NONE, None
+        if sample.gps_time is not None and np.isfinite(sample.gps_time).all():
+            time_range = float(sample.gps_time.min()), float(sample.gps_time.max())
+            flagged = bool(block.flags & 1)
+            # LAS 1.5 may name an offset of its own.
+            kind = GpsTimeKind.UNKNOWN if block.minor > 4 else kind_of(*time_range, flagged_as_adjusted=flagged)
+            if kind is GpsTimeKind.ADJUSTED and not flagged:
+                self._warnings.append("GPS times are flagged as seconds of the week but are adjusted standard time")
+        return FileFacts(
+            format="copc" if self._copc is not None else "laz" if block.compressed else "las",
+            point_count=block.point_count,
+            bounds=self._bounds(),
+            crs=found.crs,
+            horizontal_unit_m=found.horizontal_unit_m,
+            vertical_unit_m=found.vertical_unit_m,
+            has_returns=has_returns,
+            has_classes=not bool(np.isin(sample.classification, UNSORTED_CLASSES).all()),
+            has_gps_time=kind is not GpsTimeKind.NONE,
+            gps_time_kind=kind,
+            gps_time_range=None if kind is GpsTimeKind.NONE else time_range,
+            created=header.creation_date,
+            warnings=tuple(self._warnings),
+        )
+
+    def _bounds(self) -> tuple[float, float, float, float, float, float]:
+        """The header's bounds; where they cannot be, those of a pass over the points."""
+        lows, highs = np.array(self._header.mins), np.array(self._header.maxs)
+        if not (np.isfinite(lows).all() and np.isfinite(highs).all() and (lows <= highs).all()):
+            self._warnings.append(
+                f"the header's bounds {lows.tolist()} to {highs.tolist()} cannot be: taken from the points"
+            )
+            lows, highs = np.full(3, np.inf), np.full(3, -np.inf)
+            for piece in self.records(1_000_000, None):
+                lows, highs = np.minimum(lows, piece.xyz.min(axis=0)), np.maximum(highs, piece.xyz.max(axis=0))
+        x_min, y_min, z_min, x_max, y_max, z_max = (float(value) for value in (*lows, *highs))
+        return x_min, y_min, z_min, x_max, y_max, z_max

@@ -1,0 +1,171 @@
+"""The chunk table of LAZ: how many compressed pieces a file has, where they are and how many points they hold.
+
+The table is what a header's claim can be held against before anything is decoded. Source: M. Isenburg, LASzip:
+lossless compression of LiDAR data, 2013, and the LASzip VLR (record 22204).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+import lazrs
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import InconsistentInputError, UnreadableInputError
+
+if TYPE_CHECKING:
+    from pipeline.io.las_header import HeaderBlock
+
+CHUNK_SIZE_LIMIT = 4_000_000
+"""Points a chunk beyond which chunks are not decoded at once: writers use 50,000, COPC some 100,000."""
+FIX = "Get the file again, or rewrite it with a LAZ tool"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ChunkTable:
+    """The compressed chunks of a LAZ file, in file order."""
+
+    counts: npt.NDArray[np.int64]
+    """(c,) points a chunk; in files of a fixed chunk size the last is what the header's count leaves for it."""
+    sizes: npt.NDArray[np.int64]
+    """(c,) bytes a chunk."""
+    offsets: npt.NDArray[np.int64]
+    """(c,) byte at which a chunk begins."""
+    item_size: int
+    """Bytes a record, uncompressed."""
+    variable: bool
+    """True where each chunk has a count of its own (COPC)."""
+
+
+def read_chunk_table(path: Path, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes) -> ChunkTable:
+    """The chunk table, checked against the header and the file's size without decoding a point.
+
+    Raises
+    ------
+    UnreadableInputError
+        If the table is missing or damaged, as in a truncated file.
+    InconsistentInputError
+        If the header promises more or fewer points than the chunks hold.
+    """
+    name, start = str(path), block.offset_to_points
+    try:
+        vlr = lazrs.LazVlr(laszip_record)
+        item_size, chunk_size = int(vlr.item_size()), int(vlr.chunk_size())
+        variable = bool(vlr.uses_variable_size_chunks())
+    except (lazrs.LazrsError, ValueError) as fault:
+        raise UnreadableInputError(name, f"the LAZ record in the header is damaged ({fault})", FIX) from fault
+    if item_size != block.point_size:
+        raise InconsistentInputError(
+            name, f"the header has {block.point_size} bytes a point, its LAZ record {item_size}", FIX
+        )
+    table_at = _table_offset(stream, block)
+    if not start + 8 < table_at <= block.file_size - 8:
+        raise UnreadableInputError(
+            name,
+            f"truncated: {block.point_count} points are promised, but the table of compressed chunks"
+            f" should be at byte {table_at} of {block.file_size}",
+            FIX,
+        )
+    stream.seek(table_at)
+    _, chunk_count = struct.unpack("<II", stream.read(8))
+    body = table_at - start - 8
+    # Each chunk begins with one record uncompressed.
+    if chunk_count == 0 or chunk_count * item_size > body:
+        raise UnreadableInputError(
+            name, f"the table of compressed chunks is damaged: {chunk_count} chunks in {body} bytes", FIX
+        )
+    if not variable and (chunk_size == 0 or chunk_count != -(-block.point_count // chunk_size)):
+        raise InconsistentInputError(
+            name,
+            f"the header promises {block.point_count} points, but the file holds {chunk_count} compressed"
+            f" chunks of at most {chunk_size}, so at most {chunk_count * chunk_size}",
+            FIX,
+        )
+    stream.seek(start)
+    try:
+        rows = np.array(lazrs.read_chunk_table(stream, vlr), dtype=np.int64).reshape(-1, 2)
+    except (lazrs.LazrsError, OSError, ValueError) as fault:
+        raise UnreadableInputError(name, f"the table of compressed chunks is damaged ({fault})", FIX) from fault
+    counts, sizes = rows[:, 0].copy(), rows[:, 1]
+    if len(rows) != chunk_count or sizes.min() < item_size or sizes.sum() != body:
+        raise UnreadableInputError(
+            name, f"the table of compressed chunks is damaged: {sizes.sum()} bytes of chunks in {body}", FIX
+        )
+    if not variable:
+        counts[-1] = block.point_count - counts[:-1].sum()
+    elif counts.sum() != block.point_count:
+        raise InconsistentInputError(
+            name, f"the header promises {block.point_count} points, its compressed chunks hold {counts.sum()}", FIX
+        )
+    offsets = start + 8 + np.concatenate(([0], np.cumsum(sizes)[:-1]))
+    return ChunkTable(counts=counts, sizes=sizes, offsets=offsets, item_size=item_size, variable=variable)
+
+
+def _table_offset(stream: BinaryIO, block: HeaderBlock) -> int:
+    """Byte of the chunk table; writers that could not seek leave -1 and put it into the file's last 8 bytes."""
+    stream.seek(block.offset_to_points)
+    raw = stream.read(8)
+    if len(raw) < 8:
+        return -1
+    at = int(struct.unpack("<q", raw)[0])
+    if at == -1 and block.file_size >= 8:
+        stream.seek(block.file_size - 8)
+        at = int(struct.unpack("<q", stream.read(8))[0])
+    return at
+
+
+def check_last_chunk(path: Path, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes, table: ChunkTable) -> None:
+    """Hold the header's count against the last chunk of a file of a fixed chunk size, to the point.
+
+    Point formats 6 and above store the count of a chunk after its first record. The older ones do not, but their
+    arithmetic coder uses up its bytes exactly: the right count fails with one byte less, and with one point more.
+
+    Raises
+    ------
+    InconsistentInputError
+        If the last chunk holds another number of points.
+    UnreadableInputError
+        If it cannot be decoded.
+    """
+    count, size = int(table.counts[-1]), int(table.sizes[-1])
+    if table.variable or count > CHUNK_SIZE_LIMIT:
+        return
+    stream.seek(int(table.offsets[-1]))
+    chunk = stream.read(size)
+    before = block.point_count - count
+    if block.point_format >= 6:
+        held = struct.unpack_from("<I", chunk, table.item_size)[0] if size >= table.item_size + 4 else 0
+        if held != count:
+            raise InconsistentInputError(
+                str(path), f"the header promises {block.point_count} points, its chunks hold {before + held}", FIX
+            )
+        return
+    if size > table.item_size and _decodes(chunk[:-1], count, laszip_record, table.item_size):
+        if _decodes(chunk, count + 1, laszip_record, table.item_size):
+            raise InconsistentInputError(
+                str(path), f"the header promises {block.point_count} points, its last chunk holds more", FIX
+            )
+    elif not _decodes(chunk, count, laszip_record, table.item_size):
+        raise InconsistentInputError(
+            str(path), f"the header promises {block.point_count} points, its last chunk ends before them", FIX
+        )
+
+
+def _decodes(chunk: bytes, count: int, laszip_record: bytes, item_size: int) -> bool:
+    """Whether so many points can be decoded from the bytes of a chunk."""
+    out = np.empty(count * item_size, dtype=np.uint8)
+    try:
+        lazrs.decompress_points_with_chunk_table(
+            chunk,
+            laszip_record,
+            out,
+            [(count, len(chunk))],
+            lazrs.DecompressionSelection(lazrs.SELECTIVE_DECOMPRESS_ALL),
+        )
+    except lazrs.LazrsError:
+        return False
+    return True

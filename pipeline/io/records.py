@@ -1,0 +1,107 @@
+"""What every format's reader hands to `pipeline.io.source`: facts of a file, and its records in pieces."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.io.gps_time import GpsTimeKind
+from pipeline.model import BoolArray, ByteArray, FloatArray
+
+if TYPE_CHECKING:
+    import pyproj
+
+UNSORTED_CLASSES = (0, 1)
+"""ASPRS classes of points that nobody classified: never classified, unassigned."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Window:
+    """A rectangle in plan, closed on all sides, in the units of the CRS."""
+
+    x_min: float
+    """West."""
+    y_min: float
+    """South."""
+    x_max: float
+    """East."""
+    y_max: float
+    """North."""
+
+    def contains(self, xyz: FloatArray) -> BoolArray:
+        """(n,) bool, True for points inside or on the edge."""
+        x, y = xyz[:, 0], xyz[:, 1]
+        inside: BoolArray = (x >= self.x_min) & (x <= self.x_max) & (y >= self.y_min) & (y <= self.y_max)
+        return inside
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PointRecords:
+    """Points as the file has them. All arrays have one length n; None where the file has no such field."""
+
+    xyz: FloatArray
+    """(n, 3) float64, in the units of the CRS, easting, northing, elevation."""
+    return_number: ByteArray | None = None
+    """(n,) uint8, 1 is the first return."""
+    return_count: ByteArray | None = None
+    """(n,) uint8, returns of the pulse."""
+    classification: ByteArray | None = None
+    """(n,) uint8, ASPRS class."""
+    gps_time: FloatArray | None = None
+    """(n,) float64, seconds as in the file."""
+    source_id: npt.NDArray[np.uint16] | None = None
+    """(n,) uint16, flight line."""
+    withheld: BoolArray | None = None
+    """(n,) bool, True where the producer says not to use the point."""
+
+    def __len__(self) -> int:
+        """Number of records."""
+        return len(self.xyz)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FileFacts:
+    """What a file says about itself before its points are read, in the units of its CRS."""
+
+    format: str
+    """las, laz, copc, ply or ascii."""
+    point_count: int
+    """Points in the file."""
+    bounds: tuple[float, float, float, float, float, float]
+    """x_min, y_min, z_min, x_max, y_max, z_max."""
+    crs: pyproj.CRS | None = None
+    """As in the header; None where there is none or it cannot be understood (then a warning tells)."""
+    horizontal_unit_m: float | None = None
+    """Metres a horizontal unit, where the header tells it beside the CRS."""
+    vertical_unit_m: float | None = None
+    """Metres a vertical unit, where the header tells it beside the CRS."""
+    has_returns: bool = False
+    """Whether any pulse has more than one return."""
+    has_classes: bool = False
+    """Whether sampled points carry a class other than 0 (never classified) and 1 (unassigned)."""
+    has_gps_time: bool = False
+    """Whether sampled points carry differing GPS times."""
+    gps_time_kind: GpsTimeKind = GpsTimeKind.NONE
+    """How to read the GPS times."""
+    gps_time_range: tuple[float, float] | None = None
+    """Smallest and largest sampled GPS time, seconds as in the file."""
+    created: datetime.date | None = None
+    """Day on which the file was made, which is not the day of the flight."""
+    warnings: tuple[str, ...] = ()
+    """What is odd but usable, one sentence each."""
+
+
+class PointFile(Protocol):
+    """An opened file of one format: its facts, and its records in pieces. Opened again for every pass."""
+
+    @property
+    def facts(self) -> FileFacts:
+        """What the file says about itself."""
+
+    def records(self, chunk_size: int, window: Window | None) -> Iterator[PointRecords]:
+        """The records in pieces of at most `chunk_size`; those outside the window may be left out, but need not."""

@@ -1,0 +1,346 @@
+"""A point file of any format as a stream of `PointCloud` in metres, and what can be known of it beforehand."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+
+from pipeline.errors import InconsistentInputError, SettingsError
+from pipeline.io.crs import SpatialReference, resolve_reference
+from pipeline.io.formats import recognise_format
+from pipeline.io.gps_time import GpsTimeKind, utc_of
+from pipeline.io.records import PointFile, PointRecords, Window
+from pipeline.model import BoolArray, ByteArray, PointCloud
+
+if TYPE_CHECKING:
+    from shapely import MultiPolygon, Polygon
+
+NOISE_CLASSES = (7, 18)
+"""ASPRS low point (noise) and high noise."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """What the user says about the inputs and wants of them."""
+
+    crs: str | None = None
+    """EPSG code, WKT or PROJ string that stands above the header's CRS."""
+    vertical_unit: str | None = None
+    """Unit of elevation that stands above the header's: m, ft, us-ft or another word of `crs.UNITS_M`."""
+    bbox: tuple[float, float, float, float] | None = None
+    """x_min, y_min, x_max, y_max in the units of the CRS; closed."""
+    aoi: Polygon | MultiPolygon | None = None
+    """Area of interest in the units of the CRS; closed."""
+    keep_withheld: bool = False
+    """Use points that the producer withheld."""
+    drop_classes: tuple[int, ...] = NOISE_CLASSES
+    """ASPRS classes that are left out."""
+    ascii_columns: str | None = None
+    """Names of the columns of ASCII files, see `pipeline.io.ascii`; None to find out."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises
+        ------
+        SettingsError
+            Listing all faults at once.
+        """
+        faults = []
+        if self.bbox is not None:
+            x_min, y_min, x_max, y_max = self.bbox
+            if not (np.isfinite(self.bbox).all() and x_min < x_max and y_min < y_max):
+                faults.append(f"bbox is {self.bbox}: use x_min y_min x_max y_max with x_min < x_max and y_min < y_max")
+        if self.aoi is not None and (self.aoi.is_empty or not self.aoi.is_valid):
+            faults.append(
+                f"aoi is {'empty' if self.aoi.is_empty else shapely.is_valid_reason(self.aoi)}: use a valid polygon"
+            )
+        wrong = [c for c in self.drop_classes if not 0 <= c <= 255]
+        if wrong:
+            faults.append(f"drop_classes has {wrong}: use ASPRS classes 0 to 255")
+        if faults:
+            raise SettingsError(faults)
+
+    @property
+    def window(self) -> Window | None:
+        """The rectangle outside which no point is wanted; None where there is no limit."""
+        boxes = [box for box in (self.bbox, None if self.aoi is None else self.aoi.bounds) if box is not None]
+        if not boxes:
+            return None
+        return Window(
+            x_min=max(box[0] for box in boxes),
+            y_min=max(box[1] for box in boxes),
+            x_max=min(box[2] for box in boxes),
+            y_max=min(box[3] for box in boxes),
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SourceInfo:
+    """What is known of a file before its points are read."""
+
+    path: str
+    """The file."""
+    format: str
+    """las, laz, copc, ply or ascii."""
+    point_count: int
+    """Points in the file, before anything is dropped."""
+    bounds_m: tuple[float, float, float, float, float, float]
+    """x_min, y_min, z_min, x_max, y_max, z_max in metres of the CRS: from the header, or measured where it has none."""
+    reference: SpatialReference
+    """CRS and units."""
+    density_per_m2: float
+    """Points a square metre of the bounds: too low where the data do not fill them; nan where they have no area."""
+    has_returns: bool
+    """Whether any pulse has more than one return."""
+    has_classes: bool
+    """Whether sampled points carry a class other than 0 (never classified) and 1 (unassigned)."""
+    has_gps_time: bool
+    """Whether sampled points carry differing GPS times."""
+    gps_time_kind: GpsTimeKind
+    """How to read the GPS times."""
+    acquired_from: datetime.datetime | None
+    """Earliest sampled time, UTC; None unless the file has adjusted standard GPS times."""
+    acquired_to: datetime.datetime | None
+    """Latest sampled time, UTC."""
+    created: datetime.date | None
+    """Day on which the file was made, which says nothing about the flight."""
+    warnings: tuple[str, ...]
+    """What is odd but usable, one sentence each."""
+    file_size: int
+    """Bytes."""
+
+
+def _open_las(path: Path, _options: ReadOptions) -> PointFile:
+    from pipeline.io.las import LasFile
+
+    return LasFile(path)
+
+
+READERS: dict[str, Callable[[Path, ReadOptions], PointFile]] = {
+    "las": _open_las,
+}
+"""The reader of each format; imports wait until a file of the format is opened."""
+
+
+class Source:
+    """A point file, opened: its facts, and its points as often as wanted.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    options : ReadOptions
+        What the user says and wants.
+    """
+
+    def __init__(self, path: Path, options: ReadOptions) -> None:
+        self._path = path
+        self._options = options
+        self._file = READERS[recognise_format(path)](path, options)
+        self._info = _info_of(path, self._file, options)
+        self._dropped = dict.fromkeys(("withheld", "noise_class", "outside"), 0)
+        self._warnings: list[str] = []
+
+    @property
+    def info(self) -> SourceInfo:
+        """What is known before the points are read."""
+        return self._info
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Points left out by the last pass of `chunks`, by cause: outside, then withheld, then noise_class."""
+        return dict(self._dropped)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Those of `info`, and what the last pass of `chunks` found."""
+        return self._info.warnings + tuple(self._warnings)
+
+    def chunks(self, chunk_size: int = 1_000_000) -> Iterator[PointCloud]:
+        """The wanted points in metres, in the file's order (COPC with a window: in the octree's), in pieces.
+
+        Parameters
+        ----------
+        chunk_size : int
+            Most points a piece; bounds the memory.
+
+        Yields
+        ------
+        PointCloud
+            Never empty.
+
+        Raises
+        ------
+        UnreadableInputError
+            If the data end or break before the promised count.
+        InconsistentInputError
+            If a coordinate is NaN or infinite.
+        """
+        if chunk_size < 1:
+            raise SettingsError([f"chunk_size is {chunk_size}: use 1 or more"])
+        self._dropped = dict.fromkeys(self._dropped, 0)
+        self._warnings = []
+        window, n_beyond = self._options.window, 0
+        if self._options.aoi is not None:
+            shapely.prepare(self._options.aoi)
+        if window is not None and (window.x_min > window.x_max or window.y_min > window.y_max):
+            self._dropped["outside"] = self._info.point_count
+            return
+        reference = self._info.reference
+        factors = np.array([reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m])
+        n_read = 0
+        for records in self._file.records(chunk_size, window):
+            self._check_finite(records, n_read)
+            n_read += len(records)
+            n_beyond += self._count_beyond_bounds(records)
+            kept = _select(records, self._wanted(records, window))
+            if len(kept):
+                yield _to_cloud(kept, factors)
+        # A window of COPC leaves whole nodes unread.
+        self._dropped["outside"] += self._info.point_count - n_read
+        if n_beyond:
+            self._warnings.append(f"{n_beyond} points lie outside the bounds in the header")
+
+    def _wanted(self, records: PointRecords, window: Window | None) -> BoolArray:
+        """(n,) bool, True for the points to keep; counts the others."""
+        options = self._options
+        keep: BoolArray = np.ones(len(records), dtype=np.bool_)
+        if window is not None:
+            keep &= window.contains(records.xyz)
+            if options.aoi is not None:
+                inside = np.flatnonzero(keep)
+                keep[inside] = shapely.intersects_xy(options.aoi, records.xyz[inside, 0], records.xyz[inside, 1])
+            self._dropped["outside"] += int(len(keep) - keep.sum())
+        if records.withheld is not None and not options.keep_withheld:
+            self._dropped["withheld"] += int((keep & records.withheld).sum())
+            keep &= ~records.withheld
+        if records.classification is not None and options.drop_classes:
+            table = np.zeros(256, dtype=np.bool_)
+            table[list(options.drop_classes)] = True
+            noise = table[records.classification]
+            self._dropped["noise_class"] += int((keep & noise).sum())
+            keep &= ~noise
+        return keep
+
+    def _check_finite(self, records: PointRecords, n_before: int) -> None:
+        """Refuse NaN and infinite coordinates."""
+        finite = np.isfinite(records.xyz)
+        if not finite.all():
+            row = int(np.argmin(finite.all(axis=1)))
+            raise InconsistentInputError(
+                str(self._path),
+                f"point {n_before + row + 1} has the coordinates {records.xyz[row].tolist()}",
+                "Remove points whose coordinates are NaN or infinite",
+            )
+
+    def _count_beyond_bounds(self, records: PointRecords) -> int:
+        """Points outside the bounds that the file claims, by more than rounding."""
+        bounds = self._file.facts.bounds
+        low, high = np.array(bounds[:3]) - 0.02, np.array(bounds[3:]) + 0.02
+        if (records.xyz.min(axis=0) >= low).all() and (records.xyz.max(axis=0) <= high).all():
+            return 0
+        return int((~((records.xyz >= low) & (records.xyz <= high)).all(axis=1)).sum())
+
+
+def open_source(path: str | Path, options: ReadOptions | None = None) -> Source:
+    """Open a LAS, LAZ, COPC, PLY or ASCII file, and check all that can be checked without reading it through.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    options : ReadOptions, optional
+        Overrides and limits.
+
+    Raises
+    ------
+    UnreadableInputError
+        Not there, no permission, not one of the formats, truncated.
+    InconsistentInputError
+        Header and data disagree.
+    EmptyInputError
+        No points.
+    CrsError
+        The CRS is geographic or not understood.
+    """
+    return Source(Path(path), options or ReadOptions())
+
+
+def _info_of(path: Path, file: PointFile, options: ReadOptions) -> SourceInfo:
+    """The facts of a file in metres, with the user's overrides."""
+    facts = file.facts
+    reference, told = resolve_reference(
+        path=str(path),
+        header_crs=facts.crs,
+        header_horizontal_unit_m=facts.horizontal_unit_m,
+        header_vertical_unit_m=facts.vertical_unit_m,
+        crs=options.crs,
+        vertical_unit=options.vertical_unit,
+    )
+    plan, up = reference.horizontal_unit_m, reference.vertical_unit_m
+    x_min, y_min, z_min, x_max, y_max, z_max = facts.bounds
+    bounds_m = (x_min * plan, y_min * plan, z_min * up, x_max * plan, y_max * plan, z_max * up)
+    area_m2 = (bounds_m[3] - bounds_m[0]) * (bounds_m[4] - bounds_m[1])
+    acquired = None
+    if facts.gps_time_kind is GpsTimeKind.ADJUSTED and facts.gps_time_range is not None:
+        acquired = utc_of(facts.gps_time_range[0]), utc_of(facts.gps_time_range[1])
+    return SourceInfo(
+        path=str(path),
+        format=facts.format,
+        point_count=facts.point_count,
+        bounds_m=bounds_m,
+        reference=reference,
+        density_per_m2=facts.point_count / area_m2 if area_m2 > 0.0 else float("nan"),
+        has_returns=facts.has_returns,
+        has_classes=facts.has_classes,
+        has_gps_time=facts.has_gps_time,
+        gps_time_kind=facts.gps_time_kind,
+        acquired_from=acquired[0] if acquired else None,
+        acquired_to=acquired[1] if acquired else None,
+        created=facts.created,
+        warnings=facts.warnings + told,
+        file_size=path.stat().st_size,
+    )
+
+
+def _select(records: PointRecords, keep: BoolArray) -> PointRecords:
+    """The records of a mask; the very same where it keeps all."""
+    if keep.all():
+        return records
+    arrays = {field.name: getattr(records, field.name) for field in dataclasses.fields(records)}
+    return PointRecords(**{name: None if array is None else array[keep] for name, array in arrays.items()})
+
+
+def _to_cloud(records: PointRecords, factors: np.ndarray[tuple[int], np.dtype[np.float64]]) -> PointCloud:
+    """Metres, and the defaults for fields that the file does not have."""
+    n = len(records)
+    xyz = records.xyz if (factors == 1.0).all() else records.xyz * factors
+    number, count = _honest_returns(records)
+    return PointCloud(
+        xyz=xyz,
+        return_number=number,
+        return_count=count,
+        classification=_or(records.classification, n),
+        gps_time=np.zeros(n) if records.gps_time is None else records.gps_time,
+        source_id=np.zeros(n, dtype=np.uint16) if records.source_id is None else records.source_id,
+    )
+
+
+def _or(values: ByteArray | None, n: int) -> ByteArray:
+    """The values, or zeros."""
+    return np.zeros(n, dtype=np.uint8) if values is None else values
+
+
+def _honest_returns(records: PointRecords) -> tuple[ByteArray, ByteArray]:
+    """Return number and count, at least 1 and the count not below the number: writers leave zeros."""
+    ones: ByteArray = np.ones(len(records), dtype=np.uint8)
+    number = ones if records.return_number is None else np.maximum(records.return_number, ones)
+    count = number if records.return_count is None else np.maximum(records.return_count, number)
+    return number, count

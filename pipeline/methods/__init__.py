@@ -1,0 +1,93 @@
+"""The methods by name: each a recipe from a candidate to its roof planes."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+from pipeline.errors import SettingsError
+from pipeline.methods import fuzzy_sart
+from pipeline.model import Candidate, Segmentation
+from pipeline.parameters import Parameters
+from pipeline.roof.roof_type import RoofTypeSettings
+from pipeline.roof.settings import RoofSettings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Method:
+    """A segmentation method."""
+
+    name: str
+    """As on the command line and in the records."""
+    settings_type: type[Parameters]
+    """Its settings class."""
+    segment: Callable[[Candidate, Any], Segmentation]
+    """From a candidate and an instance of `settings_type` to planes and labels."""
+
+
+METHODS: Mapping[str, Method] = MappingProxyType(
+    {
+        method.name: method
+        for method in (
+            Method(name="fuzzy-sart", settings_type=fuzzy_sart.FuzzySartSettings, segment=fuzzy_sart.segment),
+        )
+    }
+)
+"""All methods by name."""
+
+
+def method_named(name: str) -> Method:
+    """The method of a name.
+
+    Parameters
+    ----------
+    name : str
+        One of `METHODS`.
+
+    Returns
+    -------
+    Method
+        Its entry.
+
+    Raises
+    ------
+    SettingsError
+        Naming all methods.
+
+    Examples
+    --------
+    >>> method_named("fuzzy-sart").settings_type.__name__
+    'FuzzySartSettings'
+    """
+    if name not in METHODS:
+        raise SettingsError([f"method is {name!r}: use one of {', '.join(sorted(METHODS))}"])
+    return METHODS[name]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReconstructSettings:
+    """What modelling one building needs: settings of the method, of the roof and of the roof type."""
+
+    method: Parameters | None = None
+    """An instance of the method's settings class; None for its defaults."""
+    roof: RoofSettings = dataclasses.field(default_factory=RoofSettings)
+    """From planes to solids."""
+    roof_type: RoofTypeSettings = dataclasses.field(default_factory=RoofTypeSettings)
+    """Thresholds of the roof types."""
+
+    def segmentation(self, method: Method) -> Callable[[Candidate], Segmentation]:
+        """The method with its settings bound.
+
+        Raises
+        ------
+        SettingsError
+            Where the settings belong to another method.
+        """
+        settings = method.settings_type() if self.method is None else self.method
+        if not isinstance(settings, method.settings_type):
+            wanted, got = method.settings_type.__name__, type(settings).__name__
+            raise SettingsError([f"the settings of {method.name} are {got}: use {wanted}"])
+        return functools.partial(method.segment, settings=settings)

@@ -1,0 +1,228 @@
+"""Fuzzy SART (Shorter and Kasparis): from the points of one building to its roof planes.
+
+The order of the steps is the paper's: TIN by greedy insertion with absorption of noise (3.1), clustering of the facets
+(3.2), best-fit planes, merging, absorption of outliers and straight ridges (3.3). The defaults are the form that
+measured better (unit normals, thresholds that follow the noise, clusters split where they do not hang together);
+`FuzzySartSettings.literal` is the paper to the letter, as far as it is printed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily
+
+from pipeline.errors import BuildingError
+from pipeline.geometry import (
+    facet_areas_m2,
+    facet_centroids,
+    facet_normals,
+    nearest_neighbours,
+    noise_sigma_m,
+    point_spacing_m,
+    top_visible,
+)
+from pipeline.model import BoolArray, Candidate, FloatArray, Reason, Segmentation
+from pipeline.parameters import parameter
+from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
+from pipeline.segmentation.fuzzy_sart import (
+    FuzzySartClusteringSettings,
+    centre_of_building,
+    cluster,
+    facet_vectors,
+)
+from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes, refine_planes
+from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
+from pipeline.segmentation.surrounding_ground import far_from
+from pipeline.terrain.height_rule import facets_above_z_avg
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FuzzySartSettings(FuzzySartClusteringSettings, PlaneRefinementSettings):
+    """Settings of the recipe; those of the clustering and of the refinement are among them."""
+
+    absorption: str = parameter(
+        "bucket",
+        "Absorbed points are kept in their facet, or inserted at its elevation (the paper's way, slower).",
+        choices=("bucket", "insert"),
+    )
+    absorption_min_m: float = parameter(
+        0.10, "Least distance up to which a facet absorbs points (Eq. 1).", unit="m", minimum=0.0, maximum=10.0
+    )
+    absorption_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
+    absorption_max_slope_deg: float = parameter(
+        60.0, "Facets that are steeper absorb nothing (Eq. 2) and are no roof.", unit="deg", minimum=1.0, maximum=89.0
+    )
+    plane_distance_min_m: float = parameter(
+        0.15, "Least distance up to which a point is merged with a plane.", unit="m", minimum=0.0, maximum=10.0
+    )
+    plane_distance_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
+    noise_factor: float = parameter(
+        3.0,
+        "Both distances are this many standard deviations of the noise, within their bounds.",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    height_rule: str = parameter(
+        "separated",
+        "Which facets can be roof: those that touch no terrain, or those above the Z_avg of the scene.",
+        choices=("separated", "scene"),
+    )
+    wall_height_m: float = parameter(
+        2.0, "Elevation difference from which a facet is a wall, for Z_avg.", unit="m", minimum=0.0, maximum=100.0
+    )
+    split_by_connectivity: bool = parameter(
+        True, "Whether a cluster is cut into the parts that hang together in the TIN."
+    )
+    neighbours: int = parameter(
+        9, "Nearest points whose planes a point chooses among.", unit="points", minimum=3, maximum=64
+    )
+    ridge_reach_spacings: float = parameter(
+        1.5, "Distance in plan up to which points are near a ridge, in mean point spacings.", minimum=0.0, maximum=10.0
+    )
+
+    @classmethod
+    def literal(cls) -> FuzzySartSettings:
+        """The paper's words: scaled spherical vectors, V = 0.7, 0.2 m and 60 degrees, Z_avg, fixed thresholds."""
+        return cls(
+            vectors="spherical_scaled",
+            vigilance=0.7,
+            absorption="insert",
+            absorption_min_m=0.2,
+            absorption_max_m=0.2,
+            plane_distance_min_m=0.2,
+            plane_distance_max_m=0.2,
+            height_rule="scene",
+            split_by_connectivity=False,
+            assignment="all_planes",
+            rounds=1,
+        )
+
+    def cross_faults(self) -> list[str]:
+        """Bounds must be ranges."""
+        faults = super().cross_faults()
+        for name in ("absorption", "plane_distance"):
+            low, high = getattr(self, f"{name}_min_m"), getattr(self, f"{name}_max_m")
+            if low > high:
+                faults.append(f"{name}_min_m is {low:g}: use at most {name}_max_m, {high:g}")
+        return faults
+
+    def absorption_distance_m(self, sigma_m: float) -> float:
+        """Distance of Eq. 1 for a noise."""
+        return min(max(self.noise_factor * sigma_m, self.absorption_min_m), self.absorption_max_m)
+
+    def plane_distance_m(self, sigma_m: float) -> float:
+        """Distance of a point from its plane for a noise."""
+        return min(max(self.noise_factor * sigma_m, self.plane_distance_min_m), self.plane_distance_max_m)
+
+    def insertion(self, sigma_m: float) -> GreedyInsertionSettings:
+        """Settings of the TIN for a noise."""
+        return GreedyInsertionSettings(
+            absorption=self.absorption,
+            absorption_distance_m=self.absorption_distance_m(sigma_m),
+            absorption_slope_deg=self.absorption_max_slope_deg,
+        )
+
+
+def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
+    """Find the roof planes of one building.
+
+    Points that a higher point of the building hides (facades, returns from below the roof) take no part and keep the
+    label -1, as do points that no plane explains.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Its points, and the terrain around it.
+    settings : FuzzySartSettings
+        `FuzzySartSettings()` or `FuzzySartSettings.literal()`.
+
+    Returns
+    -------
+    Segmentation
+        Without planes where no cluster has one.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_few_points`` below the fewest points of a plane; ``too_complex`` beyond a limit of work.
+    """
+    if len(candidate.points) < settings.least_points:
+        raise BuildingError(
+            Reason.TOO_FEW_POINTS, f"{len(candidate.points)} points, least_points is {settings.least_points}"
+        )
+    points, shift = _local_metres(candidate.points)
+    visible = np.flatnonzero(top_visible(points))
+    roof = points[visible]
+    spacing_m = point_spacing_m(roof)
+    sigma_m = noise_sigma_m(roof)
+    neighbours = nearest_neighbours(roof, settings.neighbours)
+    distance_m = settings.plane_distance_m(sigma_m)
+
+    # 3.1: the TIN of the building with its ground; points near a facet are absorbed by it.
+    ground = _ground_around(candidate, shift, roof, spacing_m)
+    greedy = insert_greedily(
+        np.concatenate([roof, ground]), settings.insertion(sigma_m), candidate.ground_z_m - float(shift[2])
+    )
+    facets = greedy.tin.facets
+    normals = facet_normals(greedy.vertices, facets)
+    areas_m2 = facet_areas_m2(greedy.vertices, facets)
+    can_be_roof = _roof_facets(greedy, normals, len(roof), settings)
+
+    # 3.2: facets with alike vectors are one cluster.
+    centre = centre_of_building(greedy.vertices[greedy.vertex_point >= 0])
+    vectors = facet_vectors(
+        settings.vectors,
+        normals[can_be_roof],
+        facet_centroids(greedy.vertices, facets[can_be_roof]),
+        centre,
+        scaled_minimum=settings.scaled_minimum,
+    )
+    clusters = np.full(len(facets), -1, np.int32)
+    clusters[can_be_roof] = cluster(vectors, areas_m2[can_be_roof], settings).labels
+    if settings.split_by_connectivity:
+        clusters = connected_parts(clusters, greedy.tin.neighbours)
+    rough = labels_of_points(facets, clusters, areas_m2, greedy.vertex_point, greedy.facet_of_point)[: len(roof)]
+
+    # 3.3: best-fit planes on the original elevations, merging, absorption of outliers, straight ridges.
+    planes, labels = refine_planes(
+        roof,
+        neighbours,
+        rough,
+        distance_m=distance_m,
+        fewest_points=settings.fewest_points(1.0 / spacing_m**2),
+        settings=settings,
+    )
+    reach_m = settings.ridge_reach_spacings * spacing_m
+    ridges = find_ridges(roof, planes, labels, neighbours, distance_m=distance_m, reach_m=reach_m)
+    labels = label_by_ridges(roof, planes, labels, ridges, distance_m=distance_m, reach_m=reach_m)
+
+    all_labels = np.full(len(points), -1, np.int32)
+    all_labels[visible] = labels
+    planes[:, 2] += shift[2] - planes[:, 0] * shift[0] - planes[:, 1] * shift[1]
+    return Segmentation(planes=describe_planes(candidate.points, planes, all_labels), labels=all_labels)
+
+
+def _local_metres(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points about an origin of their own, in whole metres: the outcome is the same wherever the building stands."""
+    millimetres = np.rint(points * 1000.0).astype(np.int64)
+    shift_m = millimetres.min(axis=0) // 1000
+    return (millimetres - shift_m * 1000) / 1000.0, shift_m.astype(np.float64)
+
+
+def _ground_around(candidate: Candidate, shift: FloatArray, roof: FloatArray, spacing_m: float) -> FloatArray:
+    """Samples of the terrain beside the building, and in its courtyards, about the same origin."""
+    ground = (np.rint(candidate.ground * 1000.0) - shift * 1000.0) / 1000.0
+    return np.asarray(ground[far_from(ground, roof, max(1.3 * spacing_m, 1.0))])
+
+
+def _roof_facets(greedy: GreedyTin, normals: FloatArray, n_roof: int, settings: FuzzySartSettings) -> BoolArray:
+    """Facets that may be roof: not too steep, and by the height rule."""
+    facets = greedy.tin.facets
+    gentle = normals[:, 2] > np.cos(np.radians(settings.absorption_max_slope_deg))
+    if settings.height_rule == "scene":
+        z_m = greedy.vertices[:, 2]
+        return np.asarray(gentle & facets_above_z_avg(z_m, facets, wall_height_m=settings.wall_height_m))
+    is_roof_vertex = (greedy.vertex_point >= 0) & (greedy.vertex_point < n_roof)
+    return np.asarray(gentle & is_roof_vertex[facets].all(axis=1))

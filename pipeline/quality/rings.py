@@ -1,0 +1,248 @@
+"""Rings and polygons of a face, projected to integer millimetres: every test is exact (ISO 19107, codes 104 to 208)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray, IntArray
+from pipeline.triangulation import turn_of
+
+RING_SELF_INTERSECTION = 104
+INTERSECTION_RINGS = 201
+DUPLICATED_RINGS = 202
+POLYGON_INTERIOR_DISCONNECTED = 205
+INNER_RING_OUTSIDE = 206
+INNER_RINGS_NESTED = 207
+ORIENTATION_RINGS_SAME = 208
+
+_OUTSIDE, _INSIDE, _BOTH = 0, 1, 2
+
+
+@njit(cache=True, nogil=True)
+def _within_box(flat: IntArray, a: int, b: int, p: int) -> bool:
+    """Whether p, which is on the line through a and b, is between them or at an end."""
+    return bool(
+        min(flat[a, 0], flat[b, 0]) <= flat[p, 0] <= max(flat[a, 0], flat[b, 0])
+        and min(flat[a, 1], flat[b, 1]) <= flat[p, 1] <= max(flat[a, 1], flat[b, 1])
+    )
+
+
+@njit(cache=True, nogil=True)
+def segments_meet(flat: IntArray, a: int, b: int, c: int, d: int) -> bool:
+    """Whether the closed segments a, b and c, d have a point in common."""
+    if (
+        max(flat[a, 0], flat[b, 0]) < min(flat[c, 0], flat[d, 0])
+        or max(flat[c, 0], flat[d, 0]) < min(flat[a, 0], flat[b, 0])
+        or max(flat[a, 1], flat[b, 1]) < min(flat[c, 1], flat[d, 1])
+        or max(flat[c, 1], flat[d, 1]) < min(flat[a, 1], flat[b, 1])
+    ):
+        return False
+    side_c, side_d = turn_of(flat, a, b, c), turn_of(flat, a, b, d)
+    if (side_c > 0 and side_d > 0) or (side_c < 0 and side_d < 0):
+        return False
+    side_a, side_b = turn_of(flat, c, d, a), turn_of(flat, c, d, b)
+    if (side_a > 0 and side_b > 0) or (side_a < 0 and side_b < 0):
+        return False
+    if side_c == 0 and side_d == 0:
+        return (
+            _within_box(flat, a, b, c)
+            or _within_box(flat, a, b, d)
+            or _within_box(flat, c, d, a)
+            or _within_box(flat, c, d, b)
+        )
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _runs_back(flat: IntArray, before: int, corner: int, after: int) -> bool:
+    """Whether the edges before and after a corner lie on each other."""
+    if turn_of(flat, before, corner, after) != 0:
+        return False
+    return bool(
+        (flat[before, 0] - flat[corner, 0]) * (flat[after, 0] - flat[corner, 0])
+        + (flat[before, 1] - flat[corner, 1]) * (flat[after, 1] - flat[corner, 1])
+        > 0
+    )
+
+
+@njit(cache=True, nogil=True)
+def twice_ring_area(flat: IntArray, start: int, stop: int) -> int:
+    """Twice the signed area of the ring start:stop in mm2, positive counter-clockwise."""
+    area = 0
+    for i in range(start + 1, stop - 1):
+        area += turn_of(flat, start, i, i + 1)
+    return area
+
+
+@njit(cache=True, nogil=True)
+def ring_is_simple(flat: IntArray, start: int, stop: int) -> bool:
+    """Whether the ring start:stop encloses an area and neither crosses nor touches itself."""
+    count = stop - start
+    if twice_ring_area(flat, start, stop) == 0:
+        return False
+    for i in range(count):
+        a, b = start + i, start + (i + 1) % count
+        if _runs_back(flat, a, b, start + (i + 2) % count):
+            return False
+        last = count - 1 if i == 0 else count
+        for j in range(i + 2, last):
+            if segments_meet(flat, a, b, start + j, start + (j + 1) % count):
+                return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _same_ring(ids: IntArray, a: int, a_stop: int, b: int, b_stop: int) -> bool:
+    """Whether two rings have the same vertices in the same or the opposite order."""
+    count = a_stop - a
+    if b_stop - b != count:
+        return False
+    for shift in range(count):
+        if ids[b + shift] == ids[a]:
+            ahead = back = True
+            for i in range(count):
+                ahead = ahead and ids[b + (shift + i) % count] == ids[a + i]
+                back = back and ids[b + (shift - i) % count] == ids[a + i]
+            return ahead or back
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _rings_cross(flat: IntArray, ids: IntArray, a: int, a_stop: int, b: int, b_stop: int) -> bool:
+    """Whether edges of two rings have more in common than a vertex of both."""
+    for i in range(a, a_stop):
+        p, q = i, i + 1 if i + 1 < a_stop else a
+        for j in range(b, b_stop):
+            r, s = j, j + 1 if j + 1 < b_stop else b
+            if not segments_meet(flat, p, q, r, s):
+                continue
+            if ids[p] == ids[r] or ids[q] == ids[s] or ids[p] == ids[s] or ids[q] == ids[r]:
+                common, far, other_far = p, q, s
+                if ids[q] == ids[s]:
+                    common, far, other_far = q, p, r
+                elif ids[p] == ids[s]:
+                    common, far, other_far = p, q, r
+                elif ids[q] == ids[r]:
+                    common, far, other_far = q, p, s
+                if not _runs_back(flat, far, common, other_far):
+                    continue
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _side_of_ring(flat: IntArray, a: int, a_stop: int, b: int, b_stop: int) -> int:
+    """Where the edges of ring a lie to ring b, which they do not cross: outside, inside or both, by their middles."""
+    inside = outside = 0
+    for i in range(a, a_stop):
+        ahead = i + 1 if i + 1 < a_stop else a
+        x, y = flat[i, 0] + flat[ahead, 0], flat[i, 1] + flat[ahead, 1]
+        crossings = 0
+        for j in range(b, b_stop):
+            k = j + 1 if j + 1 < b_stop else b
+            x0, y0, x1, y1 = 2 * flat[j, 0], 2 * flat[j, 1], 2 * flat[k, 0], 2 * flat[k, 1]
+            if (y0 > y) != (y1 > y):
+                turn = (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)
+                if (turn > 0) == (y1 > y0):
+                    crossings += 1
+        if crossings % 2 == 1:
+            inside += 1
+        else:
+            outside += 1
+    if inside and outside:
+        return _BOTH
+    return _INSIDE if inside else _OUTSIDE
+
+
+@njit(cache=True, nogil=True)
+def _root(parent: IntArray, node: int) -> int:
+    """The representative of a set in a union-find forest."""
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node
+
+
+@njit(cache=True, nogil=True)
+def _touches_enclose_a_part(ids: IntArray, ring_offsets: IntArray) -> bool:
+    """Whether rings that touch at vertices cut the interior: their graph (rings and common vertices) has a cycle."""
+    rings = len(ring_offsets) - 1
+    corners = len(ids)
+    parent = np.arange(rings + corners)
+    ring_of = np.empty(corners, np.int64)
+    for r in range(rings):
+        ring_of[ring_offsets[r] : ring_offsets[r + 1]] = r
+    for i in range(corners):
+        for j in range(i):
+            if ids[j] == ids[i]:
+                first, second = _root(parent, rings + j), _root(parent, ring_of[i])
+                if _root(parent, ring_of[j]) != first:
+                    parent[first] = _root(parent, ring_of[j])
+                    first = _root(parent, first)
+                if first == second:
+                    return True
+                parent[first] = second
+                break
+    return False
+
+
+@njit(cache=True, nogil=True)
+def polygon_code(flat: IntArray, ids: IntArray, ring_offsets: IntArray) -> int:
+    """The first fault of a polygon whose plane is known, 0 where there is none.
+
+    Parameters
+    ----------
+    flat : (n, 2) int64
+        Corners of all rings in mm, projected so that the outer ring is counter-clockwise.
+    ids : (n,) int64
+        Vertices of the corners.
+    ring_offsets : (r + 1,) int64
+        Where each ring starts, and n; the outer ring comes first.
+
+    Returns
+    -------
+    int
+        0 or a code of 104 and 201 to 208 without 203, 204. A ring that touches another off its vertices counts as
+        crossing, since no neighbour could share such an edge.
+    """
+    rings = len(ring_offsets) - 1
+    for r in range(rings):
+        if not ring_is_simple(flat, ring_offsets[r], ring_offsets[r + 1]):
+            return RING_SELF_INTERSECTION
+    if rings == 1:
+        return 0
+    for r in range(1, rings):
+        if twice_ring_area(flat, ring_offsets[r], ring_offsets[r + 1]) > 0:
+            return ORIENTATION_RINGS_SAME
+    for r in range(rings):
+        for s in range(r):
+            if _same_ring(ids, ring_offsets[s], ring_offsets[s + 1], ring_offsets[r], ring_offsets[r + 1]):
+                return DUPLICATED_RINGS
+            if _rings_cross(flat, ids, ring_offsets[s], ring_offsets[s + 1], ring_offsets[r], ring_offsets[r + 1]):
+                return INTERSECTION_RINGS
+    for r in range(1, rings):
+        side = _side_of_ring(flat, ring_offsets[r], ring_offsets[r + 1], 0, ring_offsets[1])
+        if side != _INSIDE:
+            return INTERSECTION_RINGS if side == _BOTH else INNER_RING_OUTSIDE
+    for r in range(1, rings):
+        for s in range(1, rings):
+            if r != s:
+                side = _side_of_ring(flat, ring_offsets[r], ring_offsets[r + 1], ring_offsets[s], ring_offsets[s + 1])
+                if side != _OUTSIDE:
+                    return INTERSECTION_RINGS if side == _BOTH else INNER_RINGS_NESTED
+    return POLYGON_INTERIOR_DISCONNECTED if _touches_enclose_a_part(ids, ring_offsets) else 0
+
+
+@njit(cache=True, nogil=True)
+def has_repeated_neighbours(ids: IntArray, start: int, stop: int) -> bool:
+    """Whether two consecutive corners of the ring start:stop are the same vertex (code 102)."""
+    for i in range(start, stop):
+        if ids[i] == ids[i + 1 if i + 1 < stop else start]:
+            return True
+    return False
+
+
+def codes_of(found: BoolArray) -> tuple[int, ...]:
+    """The numbers of the True entries, ascending."""
+    return tuple(int(code) for code in np.flatnonzero(found))

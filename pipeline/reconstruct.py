@@ -1,0 +1,272 @@
+"""One building end to end, without I/O: from a candidate's points to closed solids and their record."""
+
+from __future__ import annotations
+
+import math
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import PurePath
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.errors import BuildingError
+from pipeline.methods import ReconstructSettings, method_named
+from pipeline.model import BuildingResult, Candidate, Plane, Reason, RoofFace, RoofType, Segmentation, Solid, Status
+from pipeline.quality.residuals import summarise, vertical_residuals
+from pipeline.quality.validity import check_solid
+from pipeline.roof.block import block_parts, block_plane
+from pipeline.roof.footprint import hull_of_points, outline
+from pipeline.roof.partition import RoofPartition
+from pipeline.roof.plan import RoofPoints, level_dipping_faces, partition_roof, roof_points
+from pipeline.roof.roof_type import roof_type
+from pipeline.roof.settings import RoofSettings
+from pipeline.roof.simplification import simplify_partition
+from pipeline.roof.solid import SolidPart, solid_parts
+
+__all__ = ["ReconstructSettings", "reconstruct_building"]
+
+
+def reconstruct_building(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
+    """Model one building.
+
+    The method finds planes; the plan is cut into roof faces and extruded. Solids that fail the validity check are
+    tried again with all their border vertices; what still fails becomes a block.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Points and terrain of one possible building.
+    method : str
+        One of `pipeline.methods.METHODS`.
+    settings : ReconstructSettings
+        For the method and for the roof.
+
+    Returns
+    -------
+    BuildingResult
+        Always one for a known method: a building's own faults are its status and reason, also unexpected ones
+        (`internal_error`). Only a lack of memory is passed on: it says nothing about the building, and a record of it
+        would differ between machines.
+
+    Raises
+    ------
+    SettingsError
+        For an unknown method, or settings of another method.
+    MemoryError
+        As it came.
+    """
+    segment = settings.segmentation(method_named(method))
+    try:
+        return _reconstruct(candidate, method, segment, settings)
+    except BuildingError as error:
+        return _failed(candidate, method, error.reason, error.detail)
+    except MemoryError:
+        raise
+    except Exception as error:  # noqa: BLE001 - told in the record, with its place
+        return _failed(candidate, method, Reason.INTERNAL_ERROR, _describe(error))
+
+
+def _describe(error: Exception) -> str:
+    """Type, message and the innermost place of an unexpected exception."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f"{'/'.join(PurePath(frames[-1].filename).parts[-3:])}:{frames[-1].lineno}" if frames else "unknown place"
+    return f"{type(error).__name__}: {error} ({place})"
+
+
+def _reconstruct(
+    candidate: Candidate,
+    method: str,
+    segment: Callable[[Candidate], Segmentation],
+    settings: ReconstructSettings,
+) -> BuildingResult:
+    """The chain of a method's own solids, then the block."""
+    bare = roof_points(candidate, None, settings.roof)
+    partition: RoofPartition | None = None
+    codes: tuple[int, ...] = ()
+    try:
+        segmentation = segment(candidate)
+        if len(segmentation.planes) == 0:
+            raise BuildingError(Reason.NO_PLANE, f"no plane in {len(candidate.points)} points")
+        roof = roof_points(candidate, segmentation.labels, settings.roof)
+        if not (roof.labels >= 0).any():
+            raise BuildingError(Reason.NO_PLANE, f"none of {len(roof.points)} roof points lies on a plane")
+        partition = partition_roof(roof, segmentation.planes, settings.roof)
+        parts, planes, codes = _own_solids(candidate, roof, partition, segmentation.planes, settings.roof)
+        if parts:
+            return _result(candidate, method, settings, parts, planes, status=Status.OK, lod="2.2")
+        reason = Reason.INVALID_SOLID
+        detail = f"validity codes {', '.join(map(str, codes)) or 'none'}: no form of the solid passes"
+    except BuildingError as error:
+        reason, detail = error.reason, error.detail
+    parts, planes = _block(candidate, bare, partition, settings.roof)
+    return _result(
+        candidate, method, settings, parts, planes, status=Status.FALLBACK, lod="1.2", reason=reason, detail=detail,
+        codes=codes,
+    )  # fmt: skip
+
+
+def _own_solids(
+    candidate: Candidate,
+    roof: RoofPoints,
+    partition: RoofPartition,
+    planes: Sequence[Plane],
+    settings: RoofSettings,
+) -> tuple[list[SolidPart], list[Plane], tuple[int, ...]]:
+    """The first form of the method's solids that is valid throughout; no parts and all codes met where none is."""
+    tolerance = settings.simplification_spacings * roof.spacing_m
+    codes: set[int] = set()
+    for factor in (1.0, 0.5, 0.1, 0.0):
+        try:
+            form = partition
+            if factor * tolerance > 0.0:
+                form = simplify_partition(partition, factor * tolerance, outline_too=roof.footprint_mm is None)
+            form, own_planes = level_dipping_faces(form, roof, planes, candidate.ground_z_m, settings)
+            parts = large_parts(solid_parts(form, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
+        except BuildingError:
+            continue
+        faults = {code for part in parts for code in check_solid(part.solid)}
+        if parts and not faults:
+            return parts, own_planes, ()
+        codes |= faults
+    return [], [], tuple(sorted(codes))
+
+
+def large_parts(parts: list[SolidPart], minimum_area_m2: float) -> list[SolidPart]:
+    """The parts that are large enough, or the largest one."""
+    large = [part for part in parts if part.footprint.area >= minimum_area_m2]
+    return large or sorted(parts, key=lambda part: -part.footprint.area)[:1]
+
+
+def _block(
+    candidate: Candidate, roof: RoofPoints, partition: RoofPartition | None, settings: RoofSettings
+) -> tuple[list[SolidPart], list[Plane]]:
+    """A valid block on the footprint, else on the partition's outline, else on the points' outline."""
+    plane = block_plane(roof.points, candidate.ground_z_m, settings.block_height_percentile)
+    outlines: list[MultiPolygon] = []
+    if roof.footprint_mm is not None:
+        outlines.append(roof.footprint_mm)
+    elif partition is not None:
+        outlines.append(outline(partition))
+    else:
+        unlabelled = RoofPoints(
+            points=roof.points,
+            xy_mm=roof.xy_mm,
+            labels=np.zeros(len(roof.points), np.int32),
+            spacing_m=roof.spacing_m,
+            footprint_mm=None,
+        )
+        outlines.append(outline(partition_roof(unlabelled, [plane], settings)))
+    tolerance = settings.simplification_spacings * roof.spacing_m
+    hull = hull_of_points(roof.points)
+    if hull is not None:
+        outlines.append(MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))]))
+    for footprint in outlines:
+        for factor in (1.0, 0.0) if roof.footprint_mm is None else (0.0, 0.2):
+            try:
+                parts = block_parts(
+                    footprint, plane, candidate.ground_z_m, factor * tolerance, settings.minimum_part_area_m2
+                )
+            except BuildingError:
+                continue
+            if not any(check_solid(part.solid) for part in parts):
+                return parts, [plane]
+    raise BuildingError(Reason.NO_FOOTPRINT, f"no valid block over {len(roof.points)} roof points")
+
+
+def _result(
+    candidate: Candidate,
+    method: str,
+    settings: ReconstructSettings,
+    parts: Sequence[SolidPart],
+    planes: Sequence[Plane],
+    *,
+    status: Status,
+    lod: str,
+    reason: Reason | None = None,
+    detail: str = "",
+    codes: tuple[int, ...] = (),
+) -> BuildingResult:
+    """The record of a building with a model; planes that no face uses are left out."""
+    used = sorted({face.plane for part in parts for face in part.faces})
+    number = {plane: k for k, plane in enumerate(used)}
+    delivered = tuple(planes[plane] for plane in used)
+    faces = tuple(
+        RoofFace(plane=number[face.plane], polygon=face.polygon) for part in parts for face in part.faces
+    )
+    solids = tuple(_renumbered(part.solid, number) for part in parts)
+    footprint = _united([part.footprint for part in parts])
+    summary = summarise(vertical_residuals(candidate.points, faces, delivered))
+    return BuildingResult(
+        building_id=candidate.building_id,
+        origin=candidate.origin,
+        source_id=candidate.source_id,
+        status=status,
+        reason=reason,
+        reason_detail=detail,
+        method=method,
+        roof_type=roof_type(delivered, faces, solids, settings.roof_type),
+        lod=lod,
+        footprint=footprint,
+        planes=delivered,
+        faces=faces,
+        solids=solids,
+        validity_codes=codes,
+        ground_z_m=candidate.ground_z_m,
+        n_points=len(candidate.points),
+        density_per_m2=len(candidate.points) / footprint.area,
+        rmse_m=summary.rmse_m,
+        p95_m=summary.p95_m,
+        coverage=summary.coverage,
+        touches_data_edge=candidate.touches_data_edge,
+    )
+
+
+def _renumbered(solid: Solid, number: dict[int, int]) -> Solid:
+    """The solid with other plane numbers."""
+    import dataclasses
+
+    faces = tuple(dataclasses.replace(f, plane=number[f.plane]) if f.plane >= 0 else f for f in solid.faces)
+    return Solid(vertices=solid.vertices, faces=faces)
+
+
+def _united(footprints: Sequence[Polygon]) -> Polygon | MultiPolygon:
+    """One geometry of footprints that do not overlap."""
+    if len(footprints) == 1:
+        return footprints[0]
+    together = MultiPolygon(list(footprints))
+    if together.is_valid:
+        return together
+    united = shapely.union_all(list(footprints), grid_size=1e-3)
+    return united if isinstance(united, Polygon | MultiPolygon) else MultiPolygon(list(footprints))
+
+
+def _failed(candidate: Candidate, method: str, reason: Reason, detail: str) -> BuildingResult:
+    """The record of a building without a model."""
+    finite = candidate.points[np.isfinite(candidate.points).all(axis=1)]
+    footprint = candidate.footprint if candidate.footprint is not None else hull_of_points(finite)
+    area = footprint.area if footprint is not None else 0.0
+    return BuildingResult(
+        building_id=candidate.building_id,
+        origin=candidate.origin,
+        source_id=candidate.source_id,
+        status=Status.FAILED,
+        reason=reason,
+        reason_detail=detail,
+        method=method,
+        roof_type=RoofType.NONE,
+        lod="",
+        footprint=footprint,
+        planes=(),
+        faces=(),
+        solids=(),
+        validity_codes=(),
+        ground_z_m=candidate.ground_z_m,
+        n_points=len(candidate.points),
+        density_per_m2=len(candidate.points) / area if area > 0.0 else math.nan,
+        rmse_m=math.nan,
+        p95_m=math.nan,
+        coverage=0.0,
+        touches_data_edge=candidate.touches_data_edge,
+    )

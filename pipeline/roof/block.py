@@ -1,0 +1,87 @@
+"""The fallback: an LoD1.2 block, a footprint extruded to one height."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon
+
+from pipeline.errors import BuildingError
+from pipeline.model import FloatArray, Plane, Reason
+from pipeline.roof.footprint import polygons_of
+from pipeline.roof.partition import RoofPartition
+from pipeline.roof.solid import SolidPart, solid_parts
+
+_MINIMUM_HEIGHT_M = 0.1
+
+
+def block_plane(points: FloatArray, ground_z_m: float, percentile: float) -> Plane:
+    """The horizontal plane at a percentile of the points' elevations.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Roof points, at least one.
+    ground_z_m : float
+        The floor; the plane lies at least 0.1 m above it.
+    percentile : float
+        0 to 100.
+
+    Returns
+    -------
+    Plane
+        Rounded to 1 mm.
+    """
+    z = np.sort(points[:, 2])
+    height = float(z[min(len(z) - 1, math.floor(percentile / 100.0 * len(z)))])
+    height = round(max(height, ground_z_m + _MINIMUM_HEIGHT_M), 3)
+    squares = math.fsum(((z - height) ** 2).tolist())
+    return Plane(a=0.0, b=0.0, c=height, n_points=len(z), rmse_m=math.sqrt(squares / len(z)))
+
+
+def block_parts(
+    footprint_mm: MultiPolygon, plane: Plane, ground_z_m: float, tolerance_m: float, minimum_area_m2: float
+) -> list[SolidPart]:
+    """One block for every part of a footprint.
+
+    Parts are opened by a few centimetres where they pinch, and simplified.
+
+    Parameters
+    ----------
+    footprint_mm : MultiPolygon
+        Integer millimetres, valid.
+    plane : Plane
+        The horizontal roof.
+    ground_z_m : float
+        Elevation of the floor.
+    tolerance_m : float
+        Simplification of the outline (0 for none).
+    minimum_area_m2 : float
+        Smaller parts are left out unless there is no larger one.
+
+    Returns
+    -------
+    list of SolidPart
+        At least one.
+
+    Raises
+    ------
+    BuildingError
+        `no_footprint` where no part has an area.
+    """
+    opened = shapely.buffer(shapely.buffer(footprint_mm, -25.0, join_style="mitre"), 25.0, join_style="mitre")
+    # the opening can leave two parts touching where it cut a neck: draw each back by 2 mm
+    drawn = shapely.buffer(opened, -2.0, join_style="mitre")
+    if tolerance_m > 0.0:
+        drawn = shapely.simplify(drawn, tolerance_m * 1e3, preserve_topology=True)
+    snapped = shapely.remove_repeated_points(shapely.set_precision(drawn, 1.0), 5.0)
+    polygons = polygons_of(snapped if snapped.is_valid else shapely.make_valid(snapped))
+    large = [p for p in polygons if p.area >= minimum_area_m2 * 1e6]
+    if not large and polygons:
+        large = [max(polygons, key=lambda p: p.area)]
+    if not large:
+        raise BuildingError(Reason.NO_FOOTPRINT, f"the outline has an area of {footprint_mm.area * 1e-6:g} m2")
+    partition = RoofPartition(polygons=tuple(large), labels=np.zeros(len(large), np.int32))
+    return solid_parts(partition, [plane], ground_z_m)

@@ -1,0 +1,133 @@
+"""Footprints: what is given is cleaned, what is missing is drawn around the roof."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.errors import BuildingError
+from pipeline.model import FloatArray, IntArray, Reason
+from pipeline.roof.partition import RoofPartition
+
+_REPEATED_MM = 10.0
+
+
+def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
+    """A given footprint on the millimetre grid: valid, without repeated vertices.
+
+    Parameters
+    ----------
+    footprint : Polygon or MultiPolygon
+        Local metres; a third dimension is ignored.
+
+    Returns
+    -------
+    MultiPolygon
+        Integer millimetres.
+
+    Raises
+    ------
+    BuildingError
+        `no_footprint` where nothing with an area is left.
+    """
+    scaled = shapely.transform(shapely.force_2d(footprint), lambda xy: xy * 1e3)
+    if not scaled.is_valid:
+        scaled = shapely.make_valid(scaled, method="structure", keep_collapsed=False)
+    snapped = shapely.set_precision(scaled, 1.0)
+    thinned = shapely.remove_repeated_points(snapped, _REPEATED_MM)
+    cleaned = polygons_of(thinned if thinned.is_valid else snapped)
+    if not cleaned:
+        raise BuildingError(Reason.NO_FOOTPRINT, f"the given footprint has an area of {footprint.area:g} m2")
+    return MultiPolygon(cleaned)
+
+
+def polygons_of(geometry: shapely.Geometry) -> list[Polygon]:
+    """The polygons with an area in any geometry."""
+    parts = shapely.get_parts(shapely.get_parts(geometry))
+    return [p for p in parts.tolist() if isinstance(p, Polygon) and p.area > 0.0]
+
+
+def clip_partition(partition: RoofPartition, footprint_mm: MultiPolygon, minimum_area_m2: float) -> RoofPartition:
+    """The part of a partition inside a footprint.
+
+    Parameters
+    ----------
+    partition : RoofPartition
+        A coverage that reaches beyond the footprint wherever there is roof.
+    footprint_mm : MultiPolygon
+        Integer millimetres.
+    minimum_area_m2 : float
+        Smaller pieces join the neighbour with the longest border, or go where they have none.
+
+    Returns
+    -------
+    RoofPartition
+        Every polygon connected.
+
+    Raises
+    ------
+    BuildingError
+        `no_partition` where nothing is left.
+    """
+    shapely.prepare(footprint_mm)
+    polygons = np.array(partition.polygons, dtype=object)
+    inside = shapely.contains_properly(footprint_mm, polygons)
+    pieces: list[Polygon] = []
+    labels: list[int] = []
+    for polygon, label, whole in zip(polygons, partition.labels.tolist(), inside, strict=True):
+        for piece in [polygon] if whole else polygons_of(shapely.intersection(polygon, footprint_mm, grid_size=1.0)):
+            pieces.append(piece)
+            labels.append(label)
+    pieces, labels = _absorb_small(pieces, labels, minimum_area_m2 * 1e6)
+    if not pieces:
+        raise BuildingError(Reason.NO_PARTITION, "no roof face lies inside the footprint")
+    return RoofPartition(polygons=tuple(pieces), labels=np.array(labels, np.int32))
+
+
+def _absorb_small(
+    pieces: list[Polygon], labels: list[int], minimum_area_mm2: float
+) -> tuple[list[Polygon], list[int]]:
+    """Unite pieces that are too small with a neighbour, smallest first."""
+    alive = [True] * len(pieces)
+    small = [k for k in range(len(pieces)) if pieces[k].area < minimum_area_mm2]
+    if not small:
+        return pieces, labels
+    tree = shapely.STRtree(pieces)
+    for k in sorted(small, key=lambda k: (pieces[k].area, k)):
+        if pieces[k].area >= minimum_area_mm2:
+            continue
+        longest, into = 0.0, -1
+        for j in sorted(tree.query(pieces[k]).tolist()):
+            if j == k or not alive[j]:
+                continue
+            border = shapely.intersection(pieces[k], pieces[j], grid_size=1.0).length
+            if border > longest:
+                longest, into = border, j
+        alive[k] = False
+        if into >= 0:
+            united = shapely.union(pieces[k], pieces[into], grid_size=1.0)
+            if isinstance(united, Polygon):
+                pieces[into] = united
+    kept = [k for k in range(len(pieces)) if alive[k]]
+    return [pieces[k] for k in kept], [labels[k] for k in kept]
+
+
+def outline(partition: RoofPartition) -> MultiPolygon:
+    """The area of a partition in integer millimetres."""
+    return MultiPolygon(polygons_of(shapely.coverage_union_all(np.array(partition.polygons, dtype=object))))
+
+
+def hull_of_points(points: FloatArray) -> Polygon | None:
+    """Convex hull of points in plan; None where it has no area."""
+    if len(points) < 3:
+        return None
+    hull = shapely.convex_hull(shapely.multipoints(points[:, :2]))
+    return hull if isinstance(hull, Polygon) and hull.area > 0.0 else None
+
+
+def in_footprint(footprint_mm: MultiPolygon, xy_mm: IntArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Mask of the points inside or on the border."""
+    shapely.prepare(footprint_mm)
+    inside: np.ndarray[tuple[int], np.dtype[np.bool_]] = shapely.intersects_xy(footprint_mm, xy_mm[:, 0], xy_mm[:, 1])
+    return inside

@@ -1,0 +1,152 @@
+"""Which plane each place of the plan belongs to: labels of all points, and samples where there are none."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
+
+_MAX_CELLS = 4_000_000
+
+
+@njit(cache=True, nogil=True)
+def _bucket(x: IntArray, y: IntArray, cell: int) -> tuple[LabelArray, LabelArray, int, int, int, int]:
+    """Points by square cells in row-major order: starts, order, columns, rows, low x, low y."""
+    low_x = x.min()
+    low_y = y.min()
+    columns = (x.max() - low_x) // cell + 1
+    rows = (y.max() - low_y) // cell + 1
+    starts = np.zeros(columns * rows + 1, np.int32)
+    for i in range(len(x)):
+        starts[(y[i] - low_y) // cell * columns + (x[i] - low_x) // cell + 1] += 1
+    for k in range(columns * rows):
+        starts[k + 1] += starts[k]
+    filled = starts[:-1].copy()
+    order = np.empty(len(x), np.int32)
+    for i in range(len(x)):
+        k = (y[i] - low_y) // cell * columns + (x[i] - low_x) // cell
+        order[filled[k]] = i
+        filled[k] += 1
+    return starts, order, columns, rows, low_x, low_y
+
+
+@njit(cache=True, nogil=True)
+def _nearest(x: IntArray, y: IntArray, query_x: IntArray, query_y: IntArray, cell: int) -> tuple[LabelArray, IntArray]:
+    """The nearest point of every query and its squared distance; ties by index."""
+    starts, order, columns, rows, low_x, low_y = _bucket(x, y, cell)
+    n = len(query_x)
+    found = np.full(n, -1, np.int32)
+    squared = np.full(n, np.iinfo(np.int64).max, np.int64)
+    for q in range(n):
+        column = (query_x[q] - low_x) // cell
+        row = (query_y[q] - low_y) // cell
+        best = squared[q]
+        index = -1
+        # rings of cells around the query's own; those before the grid begins are skipped
+        first = max(0, max(max(-column, column - columns + 1), max(-row, row - rows + 1)))
+        last = max(max(column, columns - 1 - column), max(row, rows - 1 - row))
+        for ring in range(first, last + 1):
+            if ring > 0 and best <= ((ring - 1) * cell) ** 2:
+                break
+            for r in range(max(0, row - ring), min(rows - 1, row + ring) + 1):
+                step = 1 if ring == 0 or r in (row - ring, row + ring) else 2 * ring
+                for c in range(column - ring, column + ring + 1, step):
+                    if c < 0 or c >= columns:
+                        continue
+                    for s in range(starts[r * columns + c], starts[r * columns + c + 1]):
+                        i = order[s]
+                        d = (x[i] - query_x[q]) ** 2 + (y[i] - query_y[q]) ** 2
+                        if d < best or (d == best and i < index):
+                            best = d
+                            index = i
+        found[q] = index
+        squared[q] = best
+    return found, squared
+
+
+def _cell_size(xy_mm: IntArray) -> int:
+    """Cell in mm that holds about two points, and not more than the allowed cells in all."""
+    width, depth = (int(v) + 1 for v in xy_mm.max(axis=0) - xy_mm.min(axis=0))
+    cell = max(50, int((2.0 * width * depth / len(xy_mm)) ** 0.5))
+    while (width // cell + 1) * (depth // cell + 1) > _MAX_CELLS:
+        cell *= 2
+    return cell
+
+
+def nearest_points(xy_mm: IntArray, query_mm: IntArray) -> tuple[LabelArray, FloatArray]:
+    """The nearest point in plan of every query.
+
+    Parameters
+    ----------
+    xy_mm : (n, 2) int64
+        At least one point, millimetres.
+    query_mm : (q, 2) int64
+        Where to look, millimetres.
+
+    Returns
+    -------
+    index : (q,) int32
+        Row of `xy_mm`; of equally near points the lowest.
+    distance_m : (q,) float64
+        Distance in plan.
+    """
+    index, squared = _nearest(
+        np.ascontiguousarray(xy_mm[:, 0]),
+        np.ascontiguousarray(xy_mm[:, 1]),
+        np.ascontiguousarray(query_mm[:, 0]),
+        np.ascontiguousarray(query_mm[:, 1]),
+        _cell_size(xy_mm),
+    )
+    return index, np.sqrt(squared.astype(np.float64)) * 1e-3
+
+
+def fill_labels(xy_mm: IntArray, labels: LabelArray) -> LabelArray:
+    """Labels in which every unlabelled point (-1) has taken the nearest labelled point's."""
+    known = labels >= 0
+    if known.all() or not known.any():
+        return labels
+    filled = labels.copy()
+    index, _ = nearest_points(xy_mm[known], xy_mm[~known])
+    filled[~known] = labels[known][index]
+    return filled
+
+
+def empty_samples(xy_mm: IntArray, low: IntArray, high: IntArray, pitch_mm: int, gap_m: float) -> tuple[IntArray, LabelArray, FloatArray]:
+    """Lattice samples around and between the points, where no point is near.
+
+    The lattice hangs on its lower left corner: tied to the points, it moves with them.
+
+    Parameters
+    ----------
+    xy_mm : (n, 2) int64
+        The points, millimetres.
+    pitch_mm : int
+        Distance of the samples; widened where it would give more than a million of them.
+    low, high : (2,) int64
+        Opposite corners of the lattice.
+    gap_m : float
+        A sample nearer to a point than this is dropped.
+
+    Returns
+    -------
+    samples_mm : (s, 2) int64
+        The samples.
+    nearest : (s,) int32
+        The nearest point of each.
+    distance_m : (s,) float64
+        Its distance.
+    """
+    while float((high - low).prod()) / pitch_mm**2 > _MAX_CELLS / 4:
+        pitch_mm *= 2
+    columns = np.arange(low[0], high[0] + pitch_mm, pitch_mm)
+    rows = np.arange(low[1], high[1] + pitch_mm, pitch_mm)
+    lattice = np.empty((len(rows), len(columns), 2), np.int64)
+    lattice[:, :, 0] = columns
+    lattice[:, :, 1] = rows[:, None]
+    # every other row is shifted by half a pitch: an equilateral lattice has no ties for the Delaunay triangulation
+    lattice[1::2, :, 0] += pitch_mm // 2
+    samples = lattice.reshape(-1, 2)
+    index, distance = nearest_points(xy_mm, samples)
+    empty: BoolArray = distance > gap_m
+    return samples[empty], index[empty], distance[empty]

@@ -1,0 +1,221 @@
+"""From labelled points to a partition of the plan: labels everywhere, a TIN, marching triangles, the footprint."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from shapely import MultiPolygon
+
+from pipeline.errors import BuildingError
+from pipeline.geometry import point_spacing_m, top_visible
+from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Reason, Segmentation
+from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint
+from pipeline.roof.labelling import empty_samples, fill_labels
+from pipeline.roof.partition import OUTSIDE, RoofPartition, absorb_small_regions, march
+from pipeline.roof.settings import RoofSettings
+from pipeline.tin.delaunay import triangulate, unique_xy
+
+_PITCH_SPACINGS = 1.2
+_MARGIN_SPACINGS = 4.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RoofPoints:
+    """The points of a candidate that see the sky and lie above the floor."""
+
+    points: FloatArray
+    """(n, 3) float64, local metres."""
+    xy_mm: IntArray
+    """(n, 2) int64, millimetres; every position once, the highest point of each."""
+    labels: LabelArray
+    """(n,) int32, plane of every point; -1 where the segmentation gave none."""
+    spacing_m: float
+    """Typical distance of neighbours in plan."""
+    footprint_mm: MultiPolygon | None
+    """The given footprint in integer millimetres."""
+
+
+def roof_points(candidate: Candidate, labels: LabelArray | None, settings: RoofSettings) -> RoofPoints:
+    """Select the roof points of a candidate.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Its points.
+    labels : (n,) int32 or None
+        Labels of its points; None for none.
+    settings : RoofSettings
+        `minimum_roof_height_m`, `minimum_points`.
+
+    Returns
+    -------
+    RoofPoints
+        In the candidate's order.
+
+    Raises
+    ------
+    BuildingError
+        `too_few_points`, `too_complex` or `no_footprint`.
+    """
+    points = candidate.points
+    if len(points) > settings.maximum_points:
+        raise BuildingError(
+            Reason.TOO_COMPLEX, f"{len(points)} points, more than maximum_points = {settings.maximum_points}"
+        )
+    chosen = top_visible(points) & (points[:, 2] >= candidate.ground_z_m + settings.minimum_roof_height_m)
+    index = np.flatnonzero(chosen)
+    grid = np.rint(points[index] * 1e3).astype(np.int64)
+    kept, _ = unique_xy(grid[:, :2], grid[:, 2])
+    index = index[kept]
+    if len(index) < settings.minimum_points:
+        raise BuildingError(
+            Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than minimum_points = {settings.minimum_points}"
+        )
+    footprint = None if candidate.footprint is None else footprint_in_mm(candidate.footprint)
+    return RoofPoints(
+        points=points[index],
+        xy_mm=grid[kept, :2],
+        labels=np.full(len(index), -1, np.int32) if labels is None else labels[index],
+        spacing_m=min(max(point_spacing_m(points[index]), 0.1), 3.0),
+        footprint_mm=footprint,
+    )
+
+
+def _coefficients(planes: Sequence[Plane]) -> FloatArray:
+    return np.array([plane.coefficients for plane in planes], np.float64).reshape(len(planes), 3)
+
+
+def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettings) -> RoofPartition:
+    """Cut the plan into roof faces.
+
+    Without a footprint the eave lies between roof points and the empty places around them. With one, the faces are
+    continued beyond it and clipped, so that the walls stand exactly on it.
+
+    Parameters
+    ----------
+    roof : RoofPoints
+        At least one of them with a label.
+    planes : sequence of Plane
+        The labels' planes.
+    settings : RoofSettings
+        Distances and areas.
+
+    Returns
+    -------
+    RoofPartition
+        A coverage in integer millimetres, not yet simplified.
+
+    Raises
+    ------
+    BuildingError
+        `no_partition` where nothing is left.
+    """
+    spacing = roof.spacing_m
+    margin = round(_MARGIN_SPACINGS * spacing * 1e3)
+    low, high = roof.xy_mm.min(axis=0) - margin, roof.xy_mm.max(axis=0) + margin
+    if roof.footprint_mm is not None:
+        bounds = np.rint(roof.footprint_mm.bounds).astype(np.int64)
+        low, high = np.minimum(low, bounds[:2] - margin), np.maximum(high, bounds[2:] + margin)
+    pitch = max(50, round(_PITCH_SPACINGS * spacing * 1e3))
+    samples, nearest, distance_m = empty_samples(roof.xy_mm, low, high, pitch, settings.gap_spacings * spacing)
+    labels = fill_labels(roof.xy_mm, roof.labels)
+    sample_labels = np.full(len(samples), OUTSIDE, np.int32)
+    counted: BoolArray = np.ones(len(roof.xy_mm), np.bool_)
+    sample_counted: BoolArray = np.ones(len(samples), np.bool_)
+    if roof.footprint_mm is not None:
+        sample_counted = in_footprint(roof.footprint_mm, samples)
+        counted = in_footprint(roof.footprint_mm, roof.xy_mm)
+        # beyond the footprint the faces go on, within it they close gaps that are not too wide
+        covered = ~sample_counted | (distance_m <= settings.void_distance_m)
+        sample_labels[covered] = labels[nearest[covered]]
+    frame = _frame(low, high, margin)
+    xy_mm = np.concatenate((roof.xy_mm, samples, frame))
+    all_labels = np.concatenate((labels, sample_labels, np.full(len(frame), OUTSIDE, np.int32)))
+    all_counted = np.concatenate((counted, sample_counted, np.zeros(len(frame), np.bool_)))
+    coefficients = _coefficients(planes)
+    z = np.zeros(len(xy_mm))
+    z[: len(roof.points)] = roof.points[:, 2]
+    tin = triangulate(xy_mm)
+    area = minimum_face_area(roof, settings)
+    all_labels = absorb_small_regions(
+        np.ascontiguousarray(xy_mm[:, 0]),
+        np.ascontiguousarray(xy_mm[:, 1]),
+        z,
+        tin.facets,
+        all_labels,
+        all_counted.astype(np.int32),
+        coefficients,
+        area,
+        settings.minimum_void_m2,
+    )
+    partition = march(xy_mm, tin, all_labels, coefficients, settings.outside_fraction)
+    if roof.footprint_mm is not None:
+        partition = clip_partition(partition, roof.footprint_mm, area)
+    return partition
+
+
+def minimum_face_area(roof: RoofPoints, settings: RoofSettings) -> float:
+    """Area in m2 under which a roof face joins a neighbour."""
+    return max(settings.minimum_face_area_m2, settings.minimum_face_spacings2 * roof.spacing_m**2)
+
+
+def _frame(low: IntArray, high: IntArray, margin: int) -> IntArray:
+    """Eight points far around: the hull of the triangulation."""
+    x = [int(low[0]) - margin, int(low[0] + high[0]) // 2, int(high[0]) + margin * 2]
+    y = [int(low[1]) - margin, int(low[1] + high[1]) // 2, int(high[1]) + margin * 2]
+    bulge = margin // 2
+    return np.array(
+        [
+            (x[0], y[0]), (x[1], y[0] - bulge), (x[2], y[0]), (x[2] + bulge, y[1]),
+            (x[2], y[2]), (x[1], y[2] + bulge), (x[0], y[2]), (x[0] - bulge, y[1]),
+        ],
+        np.int64,
+    )
+
+
+def level_dipping_faces(
+    partition: RoofPartition, roof: RoofPoints, planes: Sequence[Plane], ground_z_m: float, settings: RoofSettings
+) -> tuple[RoofPartition, list[Plane]]:
+    """Replace the plane of every face that dips (nearly) under the floor by a horizontal one.
+
+    Parameters
+    ----------
+    partition : RoofPartition
+        The faces.
+    roof : RoofPoints
+        The horizontal plane lies at the median of the face's own points.
+    planes : sequence of Plane
+        The planes.
+    ground_z_m : float
+        The floor.
+    settings : RoofSettings
+        `minimum_clearance_m`.
+
+    Returns
+    -------
+    partition : RoofPartition
+        With the labels of the new planes.
+    planes : list of Plane
+        The old ones and the new ones behind them.
+    """
+    import shapely
+
+    labels = partition.labels.copy()
+    extended = list(planes)
+    lowest = ground_z_m + settings.minimum_clearance_m
+    for k, polygon in enumerate(partition.polygons):
+        plane = planes[labels[k]]
+        xy = shapely.get_coordinates(polygon) * 1e-3
+        if float((plane.a * xy[:, 0] + plane.b * xy[:, 1] + plane.c).min()) >= lowest:
+            continue
+        shapely.prepare(polygon)
+        inside = shapely.intersects_xy(polygon, roof.xy_mm[:, 0], roof.xy_mm[:, 1])
+        own = inside & (roof.labels == labels[k])
+        z = np.sort(roof.points[own if own.any() else inside, 2])
+        height = round(max(float(z[len(z) // 2]) if len(z) else plane.c, lowest), 3)
+        rmse = float(np.sqrt(np.mean((z - height) ** 2))) if len(z) else 0.0
+        labels[k] = len(extended)
+        extended.append(Plane(a=0.0, b=0.0, c=height, n_points=len(z), rmse_m=rmse))
+    return RoofPartition(polygons=partition.polygons, labels=labels), extended

@@ -1,0 +1,71 @@
+"""Settings of the way from labelled points to solids."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from pipeline.parameters import Parameters, parameter
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RoofSettings(Parameters):
+    """How roof planes become roof faces and closed solids."""
+
+    minimum_points: int = parameter(
+        10, "A candidate with fewer roof points is not modelled.", minimum=3, maximum=1000
+    )
+    maximum_points: int = parameter(
+        4_000_000, "A candidate with more points is refused as too complex.", minimum=1000
+    )
+    minimum_roof_height_m: float = parameter(
+        1.5, "Points lower than this above the floor are no roof points.", unit="m", minimum=0.2, maximum=10.0
+    )
+    gap_spacings: float = parameter(
+        1.3, "A place farther than this from every roof point is not roof.", unit="point spacings", minimum=0.7, maximum=5.0
+    )
+    outside_fraction: float = parameter(
+        0.3,
+        "Where on the way from a roof point to the nearest empty place the eave lies, without a footprint.",
+        minimum=0.05,
+        maximum=0.95,
+    )
+    void_distance_m: float = parameter(
+        4.0,
+        "Inside a given footprint a place farther than this from every roof point is no roof.",
+        unit="m",
+        minimum=0.5,
+        maximum=100.0,
+    )
+    minimum_face_area_m2: float = parameter(
+        0.6, "A smaller roof face joins a neighbour.", unit="m2", minimum=0.05, maximum=100.0
+    )
+    minimum_face_spacings2: float = parameter(
+        2.0,
+        "A roof face smaller than this many squared point spacings joins a neighbour.",
+        unit="squared point spacings",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    minimum_void_m2: float = parameter(
+        6.0, "A smaller gap in a roof is closed.", unit="m2", minimum=0.0, maximum=1000.0
+    )
+    minimum_part_area_m2: float = parameter(
+        4.0, "A smaller separate part of a building is left out.", unit="m2", minimum=0.0, maximum=100.0
+    )
+    simplification_spacings: float = parameter(
+        0.4,
+        "Border vertices are dropped while the area cut off stays under the square of this.",
+        unit="point spacings",
+        minimum=0.0,
+        maximum=3.0,
+    )
+    minimum_clearance_m: float = parameter(
+        0.4,
+        "A roof face that comes nearer to the floor than this becomes horizontal.",
+        unit="m",
+        minimum=0.05,
+        maximum=5.0,
+    )
+    block_height_percentile: float = parameter(
+        70.0, "Height of a fallback block: this percentile of the roof points.", unit="%", minimum=1.0, maximum=100.0
+    )

@@ -1,0 +1,33 @@
+"""What a run tells while it runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal
+
+EventKind = Literal["run", "stage", "progress", "warning", "finished"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Event:
+    """One thing that happened; carries no object of the engine, so that it can be logged, stored or sent."""
+
+    kind: EventKind
+    """What happened."""
+    stage: str = ""
+    """plan, ingest, split, join, reconstruct or publish; empty for the run as a whole."""
+    done: int = 0
+    """Units done of this stage (files, tiles or candidates)."""
+    total: int = 0
+    """Units of this stage; 0 where unknown."""
+    message: str = ""
+    """One sentence for people; empty for mere progress."""
+
+
+Listener = Callable[[Event], None]
+
+
+def ignore(event: Event) -> None:
+    """Listen to nothing."""
+    del event

@@ -1,0 +1,241 @@
+"""One tile's points to surface fragments, end to end, without I/O.
+
+Ground, heights, a TIN of thinned points, wall facets, fragments: the front half of the science
+(`reconstruct` is the other). Every step declares how far it looks; `SceneSettings.support_m` is
+their sum, and a halo at least that wide makes the outcome independent of the tiles.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray, LabelArray
+from pipeline.terrain.candidates import CandidateSettings
+from pipeline.terrain.ground import CELL_MM, NO_DATA, GroundSettings, Terrain, ground_of, height_above
+from pipeline.terrain.outliers import OutlierSettings, dense_enough
+from pipeline.terrain.surfaces import (
+    Fragments,
+    ScenePoints,
+    SceneVertices,
+    SurfaceSettings,
+    VertexKind,
+    fragments_of,
+)
+from pipeline.terrain.thinning import highest_per_cell
+from pipeline.terrain.vegetation import VegetationSettings, planarity
+from pipeline.tiling import Window
+from pipeline.tin.delaunay import triangulate
+
+GROUND_CLASS = 2
+BUILDING_CLASS = 6
+NEUTRAL_CLASSES = (0, 1, 12, 19)
+"""Classes that say nothing about buildings: never classified, unclassified, overlap, overhead structure."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneSettings:
+    """The settings of the stages between a tile's points and its candidates."""
+
+    outliers: OutlierSettings = dataclasses.field(default_factory=OutlierSettings)
+    ground: GroundSettings = dataclasses.field(default_factory=GroundSettings)
+    vegetation: VegetationSettings = dataclasses.field(default_factory=VegetationSettings)
+    surfaces: SurfaceSettings = dataclasses.field(default_factory=SurfaceSettings)
+    candidates: CandidateSettings = dataclasses.field(default_factory=CandidateSettings)
+
+    @property
+    def support_m(self) -> float:
+        """How far the fragments of a tile look beyond its core."""
+        return (
+            self.outliers.support_m
+            + self.ground.support_m
+            + max(self.surfaces.support_m, self.vegetation.support_m)
+            + self.vegetation.support_m
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ClassesInUse:
+    """Which of the file's classes are believed, decided once for a run."""
+
+    ground: bool = False
+    """Class 2 is the ground; no filter runs."""
+    building: bool = False
+    """Class 6 is building, classes that exclude buildings are believed, the rest is judged by its own evidence."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WindowPoints:
+    """All points of a tile's window, without exact duplicates; arrays of one length n."""
+
+    x_mm: IntArray
+    y_mm: IntArray
+    z_mm: IntArray
+    return_number: ByteArray
+    return_count: ByteArray
+    classification: ByteArray
+    gps_time: FloatArray
+    source_id: npt.NDArray[np.uint16]
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return len(self.x_mm)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SplitTile:
+    """What the split of one tile finds."""
+
+    fragments: Fragments
+    """Descriptors for the join."""
+    core_index: npt.NDArray[np.int64]
+    """(n,) int64, indices into the window's points of those that the core owns."""
+    point_fragment: LabelArray
+    """(n,) int32, their fragments; -1 where none."""
+    terrain: Terrain
+    """The ground of the whole window."""
+    occupied: BoolArray
+    """(rows, columns) on the terrain's lattice: some point lies in the cell."""
+    outliers: int
+    """Gross outliers in the core."""
+
+
+def lattice_of(window: Window) -> tuple[int, int, int, int]:
+    """column0, row0, columns, rows of the terrain lattice that covers a window."""
+    column0, row0 = window.x0_mm // CELL_MM, window.y0_mm // CELL_MM
+    columns = -((-window.x1_mm) // CELL_MM) - column0
+    rows = -((-window.y1_mm) // CELL_MM) - row0
+    return column0, row0, columns, rows
+
+
+def _occupied(points: WindowPoints, kept: BoolArray, lattice: tuple[int, int, int, int]) -> BoolArray:
+    column0, row0, columns, rows = lattice
+    filled = np.zeros((rows, columns), np.bool_)
+    filled[points.y_mm[kept] // CELL_MM - row0, points.x_mm[kept] // CELL_MM - column0] = True
+    return filled
+
+
+def terrain_of(
+    points: WindowPoints, window: Window, settings: SceneSettings, classes: ClassesInUse
+) -> tuple[Terrain, BoolArray, BoolArray]:
+    """Terrain of a window, the mask of points that are no outliers, and the occupied cells.
+
+    Parameters
+    ----------
+    points : WindowPoints
+        Points of the window.
+    window : Window
+        Its extent.
+    settings : SceneSettings
+        Outliers and ground.
+    classes : ClassesInUse
+        Whether class 2 is believed.
+    """
+    lattice = lattice_of(window)
+    kept = dense_enough(points.x_mm, points.y_mm, points.z_mm, settings.outliers)
+    if classes.ground:
+        usable = kept & (points.classification == GROUND_CLASS)
+    else:
+        usable = kept & (points.return_number >= points.return_count)
+    terrain = ground_of(
+        points.x_mm, points.y_mm, points.z_mm, usable, lattice, settings.ground, trusted=classes.ground
+    )
+    return terrain, kept, _occupied(points, kept, lattice)
+
+
+def split_tile(
+    points: WindowPoints, core: Window, window: Window, settings: SceneSettings, classes: ClassesInUse
+) -> SplitTile:
+    """Split one tile into surface fragments.
+
+    Parameters
+    ----------
+    points : WindowPoints
+        All points of the window: the core and a halo of at least `settings.support_m`.
+    core : Window
+        What the tile owns.
+    window : Window
+        What it sees.
+    settings : SceneSettings
+        All stages.
+    classes : ClassesInUse
+        Which classes of the file are believed.
+
+    Returns
+    -------
+    SplitTile
+        Fragments and the assignment of the core's points.
+    """
+    terrain, kept, occupied = terrain_of(points, window, settings, classes)
+    near = core.grown(round(1000 * (settings.surfaces.support_m + settings.vegetation.support_m)))
+    in_near = near.contains(points.x_mm, points.y_mm) & kept
+    height = np.full(len(points), NO_DATA, np.int64)
+    index = np.flatnonzero(in_near)
+    height[index] = height_above(
+        points.x_mm[index],
+        points.y_mm[index],
+        points.z_mm[index],
+        terrain.elevation_mm,
+        terrain.column0,
+        terrain.row0,
+    )
+    known = height != NO_DATA
+    last = points.return_number >= points.return_count
+    building = (points.classification == BUILDING_CLASS) & classes.building
+    used = in_near & known & (last | building)
+    chosen = highest_per_cell(
+        points.x_mm, points.y_mm, points.z_mm, building, used, settings.surfaces.thinning_m
+    )
+    x, y, z = points.x_mm[chosen], points.y_mm[chosen], points.z_mm[chosen]
+    kind = np.full(len(chosen), VertexKind.OBJECT, np.int8)
+    chosen_class = points.classification[chosen]
+    excluded = np.zeros(len(points), np.bool_)
+    if classes.building:
+        excluded = ~np.isin(points.classification, (*NEUTRAL_CLASSES, GROUND_CLASS, BUILDING_CLASS))
+        kind[excluded[chosen]] = VertexKind.EXCLUDED
+    kind[height[chosen] < round(settings.ground.tolerance_m * 1000)] = VertexKind.GROUND
+    if classes.ground:
+        kind[chosen_class == GROUND_CLASS] = VertexKind.GROUND
+    kind[building[chosen]] = VertexKind.BUILDING
+    tin = triangulate(np.column_stack((x, y)))
+    vertices = SceneVertices(
+        x_mm=x,
+        y_mm=y,
+        z_mm=z,
+        height_mm=height[chosen],
+        kind=kind,
+        planar=planarity(x, y, z, settings.vegetation),
+    )
+    in_core = core.contains(points.x_mm, points.y_mm)
+    core_index = np.flatnonzero(in_core & known)
+    allowed = np.ones(len(core_index), np.int8)
+    allowed[excluded[core_index]] = 0
+    allowed[building[core_index]] = 2
+    if classes.ground:
+        allowed[points.classification[core_index] == GROUND_CLASS] = 0
+    fragments, point_fragment = fragments_of(
+        tin,
+        vertices,
+        ScenePoints(
+            x_mm=points.x_mm[core_index],
+            y_mm=points.y_mm[core_index],
+            z_mm=points.z_mm[core_index],
+            height_mm=height[core_index],
+            last=last[core_index],
+            allowed=allowed,
+        ),
+        (core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm),
+        settings.surfaces,
+        canopy_m=settings.vegetation.canopy_m,
+        ground_m=settings.ground.tolerance_m,
+    )
+    return SplitTile(
+        fragments=fragments,
+        core_index=core_index,
+        point_fragment=point_fragment,
+        terrain=terrain,
+        occupied=occupied,
+        outliers=int((in_core & ~kept).sum()),
+    )

@@ -1,0 +1,386 @@
+"""Fuzzy SART clustering of facet vectors (Shorter and Kasparis, section 3.2; Baraldi and Parmiggiani 1997).
+
+The paper prints the vector degree of match (Eqs. 3 to 6), the centring (Eq. 7), the two user parameters
+(vigilance and tau) and that all dimensions are scaled to one range. It prints no rule of learning, and none of
+the public texts on Fuzzy SART does. What is below is therefore a deterministic *reconstruction* from what those
+texts say in words: soft-to-hard competitive learning, neurons made example by example, removed a mini-batch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.errors import BuildingError
+from pipeline.model import FloatArray, LabelArray, Reason
+from pipeline.parameters import Parameters, parameter
+
+VECTOR_KINDS = ("unit_normal", "footpoint", "spherical_scaled")
+
+_FLAT_RANGE = 1e-6
+"""Ranges below this (metres or radians) count as none: scaling them would only blow up rounding."""
+_ZERO_MODULE = 1e-9
+"""A vector shorter than this has no direction: an outlier."""
+_NEGLIGIBLE_RANK = 12.0
+"""exp(-12) is 6e-6: a neuron that far down the ranking is not moved."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FuzzySartClusteringSettings(Parameters):
+    """Settings of the clustering; the paper publishes the vigilance alone."""
+
+    vectors: str = parameter(
+        "unit_normal",
+        "What of a facet is clustered: its unit normal, the foot of the perpendicular from the building's centre, "
+        "or that foot in spherical coordinates scaled to one range.",
+        choices=VECTOR_KINDS,
+    )
+    vigilance: float = parameter(
+        0.95, "Vector degree of match below which an input starts a cluster of its own.", minimum=0.0, maximum=1.0
+    )
+    tau_epochs: int = parameter(5, "Epochs in which a neuron learns.", unit="epochs", minimum=1, maximum=100)
+    epochs_per_tau: int = parameter(
+        4, "The clustering ends after this many times tau epochs at the latest.", minimum=1, maximum=100
+    )
+    learning_rate_start: float = parameter(0.5, "Learning rate of a new neuron.", minimum=1e-6, maximum=1.0)
+    learning_rate_end: float = parameter(0.005, "Learning rate of a neuron of age tau.", minimum=1e-6, maximum=1.0)
+    neighbourhood_start: float = parameter(
+        1.0,
+        "Ranks over which the learning fades when a new winner wins.",
+        minimum=1e-6,
+        maximum=100.0,
+    )
+    neighbourhood_end: float = parameter(
+        0.01, "The same for a winner of age tau: practically none but the winner learns.", minimum=1e-6, maximum=100.0
+    )
+    scaled_minimum: float = parameter(
+        0.0, "Lower end of the one range, up to 1, of spherical_scaled vectors.", minimum=0.0, maximum=1.0
+    )
+    work_limit: int = parameter(
+        1_500_000_000,
+        "Comparisons of a vector with a neuron after which a building is given up as too complex.",
+        minimum=1,
+        maximum=10**15,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Clustering:
+    """The outcome of the clustering."""
+
+    labels: LabelArray
+    """(n,) int32, neuron of every vector; -1 for outliers: zero vectors and those that match no neuron."""
+    templates: FloatArray
+    """(k, 3) float64, the neurons: one vector a cluster."""
+    epochs: int
+    """Epochs until nothing changed any more, or the limit."""
+
+
+def vector_degree_of_match(template: npt.ArrayLike, vector: npt.ArrayLike) -> float:
+    """VDM of Eq. 3: product of the module and the angle degree of match.
+
+    Parameters
+    ----------
+    template, vector : array_like, shape (3,)
+        T and X. Where one of them is the zero vector nothing matches: 0.
+
+    Returns
+    -------
+    float
+        In [0, 1], 1 for equal vectors; symmetric.
+    """
+    t, x = np.asarray(template, np.float64), np.asarray(vector, np.float64)
+    t_module, x_module = math.sqrt(_dot(t, t)), math.sqrt(_dot(x, x))
+    if t_module == 0.0 or x_module == 0.0:
+        return 0.0
+    cosine = _dot(t, x) / (t_module * x_module)
+    return float(_module_degree(t_module, x_module) * _angle_degree(cosine))
+
+
+def _dot(t: FloatArray, x: FloatArray) -> float:
+    return float(t[0] * x[0] + t[1] * x[1] + t[2] * x[2])
+
+
+@njit(cache=True, nogil=True)
+def _module_degree(t_module: float, x_module: float) -> float:
+    """MDM of Eq. 4."""
+    return min(t_module / x_module, x_module / t_module)
+
+
+@njit(cache=True, nogil=True)
+def _angle_degree(cosine: float) -> float:
+    """ADM of Eq. 5, with alpha of Eq. 6; the cosine may leave [-1, 1] by rounding."""
+    return 1.0 - math.acos(min(1.0, max(-1.0, cosine))) / math.pi
+
+
+def centre_of_building(points: FloatArray) -> FloatArray:
+    """The point that Eq. 7 moves to the origin: the middle of the bounding box.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        The building *with its ground*: without it the plane of a flat or pent roof passes near the centre and
+        its footpoints degenerate.
+
+    Returns
+    -------
+    (3,) float64
+    """
+    lowest = points.min(axis=0)
+    return np.asarray(lowest + (points.max(axis=0) - lowest) / 2.0, dtype=np.float64)
+
+
+def facet_vectors(
+    kind: str, normals: FloatArray, centroids: FloatArray, centre: FloatArray, *, scaled_minimum: float = 0.0
+) -> FloatArray:
+    """What is clustered: one vector a facet.
+
+    Parameters
+    ----------
+    kind : {"unit_normal", "footpoint", "spherical_scaled"}
+        ``unit_normal`` is the normal; ``footpoint`` the foot of the perpendicular from the centre to the facet's
+        plane (the reading under which Figs. 6 and 7 of the paper make sense); ``spherical_scaled`` that foot as
+        (r, theta, phi), each scaled to [scaled_minimum, 1] (the paper's literal words).
+    normals : (m, 3) float64
+        Unit normals.
+    centroids : (m, 3) float64
+        Centres of the facets, metres.
+    centre : (3,) float64
+        As `centre_of_building` gives it.
+    scaled_minimum : float
+        Lower end of the range of ``spherical_scaled``.
+
+    Returns
+    -------
+    (m, 3) float64
+        Dimensionless, or metres for ``footpoint``.
+    """
+    if kind == "unit_normal":
+        return normals.copy()
+    offset_m = _row_dot(centroids - centre, normals)
+    footpoints = normals * offset_m[:, None]
+    if kind == "footpoint":
+        return footpoints
+    return _scaled_spherical(footpoints, scaled_minimum)
+
+
+def _row_dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Dot products of the rows, summed in one fixed order."""
+    return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2], dtype=np.float64)
+
+
+def _scaled_spherical(footpoints: FloatArray, scaled_minimum: float) -> FloatArray:
+    """(r, theta, phi) of every vector, each dimension scaled to [scaled_minimum, 1]."""
+    if len(footpoints) == 0:
+        return footpoints.copy()
+    r = np.sqrt(_row_dot(footpoints, footpoints))
+    theta = np.arccos(np.clip(footpoints[:, 2] / np.maximum(r, _ZERO_MODULE), -1.0, 1.0))
+    phi = np.arctan2(footpoints[:, 1], footpoints[:, 0]) % (2.0 * math.pi)
+    # The branch cut of phi goes where it parts the fewest: behind the widest gap between azimuths.
+    ordered = np.sort(phi)
+    gaps = np.diff(np.append(ordered, ordered[0] + 2.0 * math.pi))
+    phi = (phi - ordered[(int(gaps.argmax()) + 1) % len(ordered)]) % (2.0 * math.pi)
+    return np.column_stack([_to_one_range(values, scaled_minimum) for values in (r, theta, phi)])
+
+
+def _to_one_range(values: FloatArray, scaled_minimum: float) -> FloatArray:
+    """Values scaled to [scaled_minimum, 1]; all 1 where they have no range."""
+    low, high = float(values.min()), float(values.max())
+    if high - low < _FLAT_RANGE:
+        return np.ones_like(values)
+    return np.asarray(scaled_minimum + (1.0 - scaled_minimum) * (values - low) / (high - low), dtype=np.float64)
+
+
+def cluster(vectors: FloatArray, areas_m2: FloatArray, settings: FuzzySartClusteringSettings) -> Clustering:
+    """Cluster facet vectors by Fuzzy SART.
+
+    Inputs are presented in descending area, ties by index, epoch after epoch, until no neuron was made or removed,
+    all have lived tau epochs and none moved. Outliers are told by -1, and no vectors give no clusters.
+
+    Parameters
+    ----------
+    vectors : (n, 3) float64
+        As `facet_vectors` gives them.
+    areas_m2 : (n,) float64
+        Areas of the facets.
+    settings : FuzzySartClusteringSettings
+        Vigilance, tau and the constants of the reconstruction.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_complex`` where more than ``work_limit`` comparisons would be needed.
+    """
+    order = np.argsort(-areas_m2, kind="stable")
+    labels, templates, epochs, work = _learn(
+        np.ascontiguousarray(vectors, dtype=np.float64),
+        order,
+        settings.vigilance,
+        settings.tau_epochs,
+        settings.epochs_per_tau * settings.tau_epochs,
+        settings.learning_rate_start,
+        settings.learning_rate_end,
+        settings.neighbourhood_start,
+        settings.neighbourhood_end,
+        settings.work_limit,
+    )
+    if work > settings.work_limit:
+        raise BuildingError(
+            Reason.TOO_COMPLEX,
+            f"Fuzzy SART stood at {work} comparisons of {len(vectors)} facets with {len(templates)} clusters, "
+            f"work_limit is {settings.work_limit}",
+        )
+    return Clustering(labels=labels, templates=templates, epochs=int(epochs))
+
+
+@njit(cache=True, nogil=True)
+def _learn(
+    vectors: FloatArray,
+    order: npt.NDArray[np.int64],
+    vigilance: float,
+    tau: int,
+    max_epochs: int,
+    rate_start: float,
+    rate_end: float,
+    reach_start: float,
+    reach_end: float,
+    work_limit: int,
+) -> tuple[LabelArray, FloatArray, int, int]:
+    """Labels, templates, epochs and comparisons; stops early once the comparisons pass the limit."""
+    n = vectors.shape[0]
+    module = np.empty(n)
+    largest = 0.0
+    for i in range(n):
+        module[i] = math.sqrt(
+            vectors[i, 0] * vectors[i, 0] + vectors[i, 1] * vectors[i, 1] + vectors[i, 2] * vectors[i, 2]
+        )
+        largest = max(largest, module[i])
+    capacity = 16
+    template = np.zeros((capacity, 3))
+    template_module = np.zeros(capacity)
+    before = np.zeros((capacity, 3))
+    age = np.zeros(capacity, np.int64)
+    hits = np.zeros(capacity, np.int64)
+    ranked = np.zeros(capacity, np.int64)
+    degree = np.zeros(capacity)
+    # An angle beyond pi (1 - V) cannot reach the vigilance: its arc cosine need not be taken.
+    least_cosine = math.cos(math.pi * (1.0 - vigilance)) - 1e-12
+    count = 0
+    work = 0
+    epochs = 0
+    for _ in range(max_epochs):
+        hits[:count] = 0
+        before[:count] = template[:count]
+        count_before = count
+        made = False
+        for i in order:
+            if module[i] < _ZERO_MODULE:
+                continue
+            work += count + 1
+            matches = 0
+            for k in range(count):
+                match = _degree(template, template_module, k, vectors, module, i, least_cosine, vigilance)
+                if match >= vigilance:
+                    at = matches
+                    while at > 0 and degree[at - 1] < match:
+                        degree[at] = degree[at - 1]
+                        ranked[at] = ranked[at - 1]
+                        at -= 1
+                    degree[at] = match
+                    ranked[at] = k
+                    matches += 1
+            if matches == 0:
+                if count == capacity:
+                    template = np.concatenate((template, np.zeros((capacity, 3))))
+                    template_module = np.concatenate((template_module, np.zeros(capacity)))
+                    before = np.concatenate((before, np.zeros((capacity, 3))))
+                    age = np.concatenate((age, np.zeros(capacity, np.int64)))
+                    hits = np.concatenate((hits, np.zeros(capacity, np.int64)))
+                    ranked = np.concatenate((ranked, np.zeros(capacity, np.int64)))
+                    degree = np.concatenate((degree, np.zeros(capacity)))
+                    capacity *= 2
+                template[count] = vectors[i]
+                template_module[count] = module[i]
+                age[count] = 0
+                hits[count] = 1
+                count += 1
+                made = True
+                continue
+            winner = ranked[0]
+            hits[winner] += 1
+            reach = reach_start * (reach_end / reach_start) ** min(1.0, age[winner] / tau)
+            for rank in range(matches):
+                fading = rank / reach
+                if fading > _NEGLIGIBLE_RANK:
+                    break
+                k = ranked[rank]
+                rate = rate_start * (rate_end / rate_start) ** min(1.0, age[k] / tau) * math.exp(-fading)
+                square = 0.0
+                for d in range(3):
+                    template[k, d] += rate * (vectors[i, d] - template[k, d])
+                    square += template[k, d] * template[k, d]
+                template_module[k] = math.sqrt(square)
+        epochs += 1
+        if work > work_limit:
+            break
+        moved = 0.0
+        removed = False
+        grown = True
+        kept = 0
+        for k in range(count):
+            if k < count_before:
+                for d in range(3):
+                    moved = max(moved, abs(template[k, d] - before[k, d]))
+            if hits[k] == 0:
+                removed = True
+                continue
+            template[kept] = template[k]
+            template_module[kept] = template_module[k]
+            age[kept] = age[k] + 1
+            grown = grown and age[kept] > tau
+            kept += 1
+        count = kept
+        if not made and not removed and grown and moved < 1e-3 * largest:
+            break
+    labels = np.full(n, -1, np.int32)
+    if work > work_limit:
+        return labels, template[:count].copy(), epochs, work
+    for i in range(n):
+        if module[i] < _ZERO_MODULE:
+            continue
+        best = vigilance
+        for k in range(count):
+            match = _degree(template, template_module, k, vectors, module, i, least_cosine, vigilance)
+            if match > best or (match == best and labels[i] < 0):
+                best = match
+                labels[i] = k
+    return labels, template[:count].copy(), epochs, work
+
+
+@njit(cache=True, nogil=True)
+def _degree(
+    template: FloatArray,
+    template_module: FloatArray,
+    k: int,
+    vectors: FloatArray,
+    module: FloatArray,
+    i: int,
+    least_cosine: float,
+    vigilance: float,
+) -> float:
+    """VDM of neuron k and vector i (Eq. 3), or -1 where it is certain to stay below the vigilance."""
+    if template_module[k] < _ZERO_MODULE:
+        return -1.0
+    modules = _module_degree(template_module[k], module[i])
+    if modules < vigilance:
+        return -1.0
+    cosine = (template[k, 0] * vectors[i, 0] + template[k, 1] * vectors[i, 1] + template[k, 2] * vectors[i, 2]) / (
+        template_module[k] * module[i]
+    )
+    if cosine < least_cosine:
+        return -1.0
+    return modules * _angle_degree(cosine)

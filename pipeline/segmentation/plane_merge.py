@@ -1,0 +1,341 @@
+"""Merging of clusters that represent one plane, best pair first (Shorter and Kasparis, section 3.3).
+
+The paper says that clusters of one plane are merged, not by which test. Here two clusters are one plane where the plane
+of their union adds little *systematic* residual to either, and their planes make a small angle. Only clusters that
+touch, or lie within a reach, are compared, in a queue, so that a city block costs about as much a fragment as a house.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
+from pipeline.segmentation.plane_regression import best_fit_plane, cosine_of_slope, mean_square_residual
+
+_NO_MERGE = 1e30
+
+
+@njit(cache=True, nogil=True)
+def touching_pairs(neighbours: LabelArray, labels: LabelArray, usable: BoolArray) -> IntArray:
+    """Codes low * n + high of all pairs of usable clusters that occur together among one point and its neighbours.
+
+    Parameters
+    ----------
+    neighbours : (p, k) int32
+        Nearest neighbours of every point, -1 where there are fewer.
+    labels : (p,) int32
+        Cluster of every point, -1 for none: so a gap of unlabelled points one wide is bridged.
+    usable : (n,) bool
+        Clusters that have a plane.
+
+    Returns
+    -------
+    (m,) int64
+        Ascending, each pair once.
+    """
+    n = usable.size
+    width = neighbours.shape[1]
+    codes = np.empty(64, np.int64)
+    count = 0
+    seen = np.empty(width + 1, np.int64)
+    for i in range(labels.size):
+        first = labels[i]
+        mixed = first < 0
+        if not mixed:
+            for q in range(width):
+                j = neighbours[i, q]
+                if j >= 0 and labels[j] != first:
+                    mixed = True
+                    break
+        if not mixed:
+            continue
+        kinds = 0
+        for q in range(-1, width):
+            j = i if q < 0 else neighbours[i, q]
+            if j < 0 or labels[j] < 0 or not usable[labels[j]]:
+                continue
+            known = False
+            for s in range(kinds):
+                known = known or seen[s] == labels[j]
+            if not known:
+                seen[kinds] = labels[j]
+                kinds += 1
+        for s in range(kinds):
+            for t in range(s):
+                if count == codes.size:
+                    codes = np.concatenate((codes, np.empty(count, np.int64)))
+                codes[count] = min(seen[s], seen[t]) * n + max(seen[s], seen[t])
+                count += 1
+    return _ascending_once(codes[:count])
+
+
+@njit(cache=True, nogil=True)
+def _ascending_once(codes: IntArray) -> IntArray:
+    """Sorted codes without repetition."""
+    ordered = np.sort(codes)
+    kept = 0
+    for i in range(ordered.size):
+        if i == 0 or ordered[i] != ordered[i - 1]:
+            ordered[kept] = ordered[i]
+            kept += 1
+    return ordered[:kept].copy()
+
+
+@njit(cache=True, nogil=True)
+def parallel_pairs_in_reach(
+    points: FloatArray,
+    labels: LabelArray,
+    planes: FloatArray,
+    usable: BoolArray,
+    reach_m: float,
+    min_cosine: float,
+    work_limit: int,
+) -> tuple[IntArray, int]:
+    """Codes of pairs of usable clusters whose boxes in plan lie within a reach and whose planes are about parallel.
+
+    A plane that a dormer or a wing cuts in two has parts that do not touch. Returns the codes as `touching_pairs`
+    does, and the work; a work beyond the limit means that the list is not complete.
+    """
+    n = usable.size
+    box = np.empty((n, 4))
+    box[:, 0] = np.inf
+    box[:, 1] = np.inf
+    box[:, 2] = -np.inf
+    box[:, 3] = -np.inf
+    for i in range(labels.size):
+        k = labels[i]
+        if k >= 0:
+            box[k, 0] = min(box[k, 0], points[i, 0])
+            box[k, 1] = min(box[k, 1], points[i, 1])
+            box[k, 2] = max(box[k, 2], points[i, 0])
+            box[k, 3] = max(box[k, 3], points[i, 1])
+    nodes = np.flatnonzero(usable)
+    nodes = nodes[np.argsort(box[nodes, 0], kind="mergesort")]
+    codes = np.empty(64, np.int64)
+    count = 0
+    work = 0
+    for s in range(nodes.size):
+        i = nodes[s]
+        for t in range(s + 1, nodes.size):
+            j = nodes[t]
+            if box[j, 0] > box[i, 2] + reach_m:
+                break
+            work += 1
+            if work > work_limit:
+                return codes[:count].copy(), work
+            if box[j, 1] > box[i, 3] + reach_m or box[i, 1] > box[j, 3] + reach_m:
+                continue
+            if _cosine_between(planes, i, j) < min_cosine:
+                continue
+            if count == codes.size:
+                codes = np.concatenate((codes, np.empty(count, np.int64)))
+            codes[count] = min(i, j) * n + max(i, j)
+            count += 1
+    return _ascending_once(codes[:count]), work
+
+
+@njit(cache=True, nogil=True)
+def _cosine_between(planes: FloatArray, i: int, j: int) -> float:
+    """Cosine of the angle between two planes (a, b, c)."""
+    dot = planes[i, 0] * planes[j, 0] + planes[i, 1] * planes[j, 1] + 1.0
+    return float(dot * cosine_of_slope(planes[i, 0], planes[i, 1]) * cosine_of_slope(planes[j, 0], planes[j, 1]))
+
+
+@njit(cache=True, nogil=True)
+def _merged_residual(
+    sums: FloatArray, planes: FloatArray, i: int, j: int, min_cosine: float, min_cosine_small: float, small: float
+) -> float:
+    """Systematic residual in metres that the common plane adds to the worse of two clusters; huge where it must not be.
+
+    The mean square of a cluster about the common plane is that about its own plane (noise) plus a systematic part.
+    """
+    if _cosine_between(planes, i, j) < (min_cosine if min(sums[i, 0], sums[j, 0]) >= small else min_cosine_small):
+        return _NO_MERGE
+    a, b, c, fitted = best_fit_plane(sums[i] + sums[j])
+    if not fitted:
+        return _NO_MERGE
+    in_i = mean_square_residual(sums[i], a, b, c) - mean_square_residual(
+        sums[i], planes[i, 0], planes[i, 1], planes[i, 2]
+    )
+    in_j = mean_square_residual(sums[j], a, b, c) - mean_square_residual(
+        sums[j], planes[j, 0], planes[j, 1], planes[j, 2]
+    )
+    return math.sqrt(max(0.0, in_i, in_j)) * cosine_of_slope(a, b)
+
+
+@njit(cache=True, nogil=True)
+def merge_planes(
+    sums: FloatArray,
+    planes: FloatArray,
+    pairs: IntArray,
+    max_residual_m: float,
+    max_angle_deg: float,
+    small_cluster_points: int,
+    work_limit: int,
+) -> tuple[LabelArray, int]:
+    """Merge pairs of clusters of one plane, the least systematic residual first, until none is left.
+
+    Parameters
+    ----------
+    sums : (n, 10) float64
+        As `plane_regression.cluster_sums` gives them; those of a merged cluster are added to its partner in place.
+    planes : (n, 3) float64
+        (a, b, c) of every cluster; refitted in place.
+    pairs : (m,) int64
+        Codes low * n + high of the clusters that may merge, ascending. Pairs of a merged cluster pass to its partner.
+    max_residual_m : float
+        Largest systematic residual of either cluster about the common plane, perpendicular.
+    max_angle_deg : float
+        Largest angle between two planes; twice as much where one has fewer than `small_cluster_points` points.
+    work_limit : int
+        Most comparisons of two planes.
+
+    Returns
+    -------
+    root : (n,) int32
+        The cluster that every cluster became part of; the smaller index of two stays.
+    work : int
+        Comparisons made; beyond the limit the merging is not complete.
+    """
+    n = sums.shape[0]
+    min_cosine = math.cos(math.radians(max_angle_deg))
+    min_cosine_small = math.cos(math.radians(2.0 * max_angle_deg))
+    small = float(small_cluster_points)
+    root = np.arange(n).astype(np.int32)
+    version = np.zeros(n, np.int32)
+    # Chains of partners, two entries a pair.
+    first = np.full(n, -1, np.int64)
+    last = np.full(n, -1, np.int64)
+    following = np.full(2 * pairs.size, -1, np.int64)
+    partner = np.empty(2 * pairs.size, np.int64)
+    keys = np.empty(pairs.size + 16)
+    items = np.empty((pairs.size + 16, 4), np.int32)
+    held = 0
+    work = 0
+    for p in range(pairs.size):
+        i = pairs[p] // n
+        j = pairs[p] % n
+        for entry, owner, other in ((2 * p, i, j), (2 * p + 1, j, i)):
+            partner[entry] = other
+            if first[owner] < 0:
+                first[owner] = entry
+            else:
+                following[last[owner]] = entry
+            last[owner] = entry
+        work += 1
+        residual = _merged_residual(sums, planes, i, j, min_cosine, min_cosine_small, small)
+        if residual < max_residual_m:
+            held = _push(keys, items, held, residual, i, j, 0, 0)
+    mark = np.full(n, -1, np.int64)
+    merges = 0
+    while held > 0:
+        i = items[0, 0]
+        j = items[0, 1]
+        stale = version[i] != items[0, 2] or version[j] != items[0, 3]
+        held = _pop(keys, items, held)
+        if stale:
+            continue
+        merges += 1
+        root[j] = i
+        version[i] += 1
+        version[j] = -1
+        sums[i] += sums[j]
+        a, b, c, _ = best_fit_plane(sums[i])
+        planes[i, 0] = a
+        planes[i, 1] = b
+        planes[i, 2] = c
+        following[last[i]] = first[j]
+        last[i] = last[j]
+        # The merged cluster is compared with all partners of both, each once; spent entries leave the chain.
+        before = np.int64(-1)
+        entry = first[i]
+        while entry >= 0:
+            other = partner[entry]
+            while root[other] != other:
+                other = root[other]
+            if other == i or mark[other] == merges:
+                if before < 0:
+                    first[i] = following[entry]
+                else:
+                    following[before] = following[entry]
+                    if last[i] == entry:
+                        last[i] = before
+                entry = following[entry]
+                continue
+            mark[other] = merges
+            partner[entry] = other
+            work += 1
+            low = min(i, other)
+            high = max(i, other)
+            residual = _merged_residual(sums, planes, low, high, min_cosine, min_cosine_small, small)
+            if residual < max_residual_m:
+                if held == keys.size:
+                    keys = np.concatenate((keys, np.empty(held)))
+                    items = np.concatenate((items, np.empty((held, 4), np.int32)))
+                held = _push(keys, items, held, residual, low, high, version[low], version[high])
+            before = entry
+            entry = following[entry]
+        if work > work_limit:
+            break
+    for k in range(n):
+        r = k
+        while root[r] != r:
+            r = root[r]
+        root[k] = r
+    return root, work
+
+
+@njit(cache=True, nogil=True)
+def _before(keys: FloatArray, items: npt.NDArray[np.int32], p: int, q: int) -> bool:
+    """Order of the queue: smaller residual, then smaller indices."""
+    if keys[p] != keys[q]:
+        return bool(keys[p] < keys[q])
+    if items[p, 0] != items[q, 0]:
+        return bool(items[p, 0] < items[q, 0])
+    return bool(items[p, 1] < items[q, 1])
+
+
+@njit(cache=True, nogil=True)
+def _swap(keys: FloatArray, items: npt.NDArray[np.int32], p: int, q: int) -> None:
+    keys[p], keys[q] = keys[q], keys[p]
+    for d in range(4):
+        items[p, d], items[q, d] = items[q, d], items[p, d]
+
+
+@njit(cache=True, nogil=True)
+def _push(
+    keys: FloatArray, items: npt.NDArray[np.int32], held: int, key: float, i: int, j: int, age_i: int, age_j: int
+) -> int:
+    """Put a pair into the binary heap; returns how many it then holds."""
+    keys[held] = key
+    items[held, 0] = i
+    items[held, 1] = j
+    items[held, 2] = age_i
+    items[held, 3] = age_j
+    at = held
+    while at > 0 and _before(keys, items, at, (at - 1) // 2):
+        _swap(keys, items, at, (at - 1) // 2)
+        at = (at - 1) // 2
+    return held + 1
+
+
+@njit(cache=True, nogil=True)
+def _pop(keys: FloatArray, items: npt.NDArray[np.int32], held: int) -> int:
+    """Drop the first pair of the heap; returns how many it then holds."""
+    held -= 1
+    _swap(keys, items, 0, held)
+    at = 0
+    while True:
+        child = 2 * at + 1
+        if child >= held:
+            return held
+        if child + 1 < held and _before(keys, items, child + 1, child):
+            child += 1
+        if not _before(keys, items, child, at):
+            return held
+        _swap(keys, items, at, child)
+        at = child

@@ -1,0 +1,381 @@
+"""From the rough clusters of a TIN to roof planes of its points (Shorter and Kasparis, section 3.3).
+
+Rounds of: best-fit planes of the clusters on the *original* elevations, clusters of one plane merged, points assigned
+anew to the planes around them, outliers absorbed. The paper tells these steps; its thresholds are unpublished and are
+settings here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.errors import BuildingError
+from pipeline.model import BoolArray, FloatArray, LabelArray, Plane, Reason
+from pipeline.parameters import Parameters, parameter
+from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_reach, touching_pairs
+from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
+
+_LEAST_SEED_POINTS = 4
+"""In the first round a cluster may still be small: its points have not been assigned by planes yet."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlaneRefinementSettings(Parameters):
+    """Settings of the refinement; the paper publishes none of them."""
+
+    rounds: int = parameter(5, "Rounds of regression, merging and assignment.", unit="rounds", minimum=1, maximum=50)
+    voting_passes: int = parameter(4, "Passes of assignment a round.", unit="passes", minimum=1, maximum=50)
+    vote_weight: float = parameter(
+        0.04, "Share of the largest squared distance that one vote of a neighbour outweighs.", minimum=0.0, maximum=1.0
+    )
+    assignment: str = parameter(
+        "neighbours",
+        "Which planes a point chooses among: those of its neighbours, or all planes of the building (the nearest).",
+        choices=("neighbours", "all_planes"),
+    )
+    points_per_density: float = parameter(
+        1.5, "Fewest points of a plane are those of this area.", unit="m2", minimum=0.0, maximum=1000.0
+    )
+    least_points: int = parameter(6, "Fewest points of a plane, however sparse the cloud.", minimum=3, maximum=10_000)
+    most_least_points: int = parameter(
+        25, "Points that make a plane, however dense the cloud.", minimum=3, maximum=100_000
+    )
+    max_slope_deg: float = parameter(
+        70.0, "Planes steeper than this are no roof.", unit="deg", minimum=1.0, maximum=89.0
+    )
+    outlier_factor: float = parameter(
+        2.0,
+        "Points beyond this many times the threshold leave their cluster before it is fitted again.",
+        minimum=1.0,
+        maximum=100.0,
+    )
+    merge_residual_m: float = parameter(
+        0.10,
+        "Two clusters are one plane where it adds less systematic residual than this to both.",
+        unit="m",
+        minimum=0.0,
+        maximum=10.0,
+    )
+    merge_angle_deg: float = parameter(
+        12.0,
+        "Largest angle between two planes that merge; twice as much for small clusters.",
+        unit="deg",
+        minimum=0.0,
+        maximum=45.0,
+    )
+    small_cluster_points: int = parameter(
+        15, "Clusters with fewer points have a poorly known plane.", minimum=3, maximum=10_000
+    )
+    merge_reach_m: float = parameter(
+        10.0,
+        "Parts of one plane that do not touch merge up to this distance of their boxes in plan.",
+        unit="m",
+        minimum=0.0,
+        maximum=1e6,
+    )
+    work_limit: int = parameter(
+        200_000_000,
+        "Comparisons of planes with planes, and of points with all planes, after which a building is too complex.",
+        minimum=1,
+        maximum=10**15,
+    )
+
+    def fewest_points(self, density_per_m2: float) -> int:
+        """Fewest points of a plane at a density."""
+        return int(min(max(self.points_per_density * density_per_m2, self.least_points), self.most_least_points))
+
+    def cross_faults(self) -> list[str]:
+        """The fewest points must be a range."""
+        if self.least_points > self.most_least_points:
+            return [f"least_points is {self.least_points}: use at most most_least_points, {self.most_least_points}"]
+        return []
+
+
+def refine_planes(
+    points: FloatArray,
+    neighbours: LabelArray,
+    labels: LabelArray,
+    *,
+    distance_m: float,
+    fewest_points: int,
+    settings: PlaneRefinementSettings,
+) -> tuple[FloatArray, LabelArray]:
+    """Turn rough clusters into planes, and give every point the plane that explains it.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Roof points with their original elevation, metres.
+    neighbours : (n, k) int32
+        Nearest neighbours of every point, -1 where there are fewer.
+    labels : (n,) int32
+        Rough cluster of every point, -1 for none.
+    distance_m : float
+        Largest perpendicular distance of a point to its plane.
+    fewest_points : int
+        Planes of fewer points are dropped.
+    settings : PlaneRefinementSettings
+        All else.
+
+    Returns
+    -------
+    planes : (k, 3) float64
+        (a, b, c) of z = a x + b y + c, ordered by their first point; empty where no cluster has a plane.
+    labels : (n,) int32
+        Plane of every point, -1 where no plane near it explains it.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_complex`` beyond ``work_limit``.
+    """
+    n_clusters = int(labels.max()) + 1 if len(labels) else 0
+    if n_clusters == 0:
+        return np.zeros((0, 3)), np.full(len(labels), -1, np.int32)
+    planes, refined, work = _refine(
+        np.ascontiguousarray(points),
+        np.ascontiguousarray(neighbours, dtype=np.int32),
+        labels.astype(np.int32),
+        n_clusters,
+        distance_m,
+        fewest_points,
+        settings.rounds,
+        settings.voting_passes,
+        settings.vote_weight,
+        settings.assignment == "all_planes",
+        math.cos(math.radians(settings.max_slope_deg)),
+        settings.outlier_factor,
+        settings.merge_residual_m,
+        settings.merge_angle_deg,
+        settings.small_cluster_points,
+        settings.merge_reach_m,
+        settings.work_limit,
+    )
+    if work > settings.work_limit:
+        raise BuildingError(
+            Reason.TOO_COMPLEX,
+            f"the refinement stood at {work} comparisons for {n_clusters} clusters of {len(points)} points, "
+            f"work_limit is {settings.work_limit}",
+        )
+    return planes, refined
+
+
+def describe_planes(points: FloatArray, planes: FloatArray, labels: LabelArray) -> tuple[Plane, ...]:
+    """Planes with their support: count and root mean square vertical residual of the points that carry their label.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Metres, original elevations.
+    planes : (k, 3) float64
+        (a, b, c).
+    labels : (n,) int32
+        Plane of every point, -1 for none.
+    """
+    sums = cluster_sums(points, labels, len(planes))
+    described = []
+    for (a, b, c), plane_sums in zip(planes.tolist(), sums, strict=True):
+        count = int(plane_sums[0])
+        rmse_m = math.sqrt(mean_square_residual(plane_sums, a, b, c)) if count else 0.0
+        described.append(Plane(a=a, b=b, c=c, n_points=count, rmse_m=rmse_m))
+    return tuple(described)
+
+
+@njit(cache=True, nogil=True)
+def _refine(
+    points: FloatArray,
+    neighbours: LabelArray,
+    labels: LabelArray,
+    n_clusters: int,
+    distance_m: float,
+    fewest_points: int,
+    rounds: int,
+    voting_passes: int,
+    vote_weight: float,
+    all_planes: bool,
+    min_cosine: float,
+    outlier_factor: float,
+    merge_residual_m: float,
+    merge_angle_deg: float,
+    small_cluster_points: int,
+    merge_reach_m: float,
+    work_limit: int,
+) -> tuple[FloatArray, LabelArray, int]:
+    """Planes, labels and work; incomplete once the work passes the limit."""
+    planes = np.zeros((n_clusters, 3))
+    usable = np.zeros(n_clusters, np.bool_)
+    parallel_cosine = math.cos(math.radians(merge_angle_deg))
+    work = 0
+    for round_ in range(rounds):
+        fewest = fewest_points if round_ > 0 else min(fewest_points, _LEAST_SEED_POINTS)
+        sums = cluster_sums(points, labels, n_clusters)
+        _fit_all(sums, planes, usable, fewest, min_cosine)
+        _drop_outliers(points, labels, planes, usable, outlier_factor * distance_m)
+        sums = cluster_sums(points, labels, n_clusters)
+        _fit_all(sums, planes, usable, min(fewest, _LEAST_SEED_POINTS), min_cosine)
+        pairs = touching_pairs(neighbours, labels, usable)
+        if merge_reach_m > 0.0:
+            settled = usable & (sums[:, 0] >= fewest_points)
+            distant, looks = parallel_pairs_in_reach(
+                points, labels, planes, settled, merge_reach_m, parallel_cosine, work_limit
+            )
+            work += looks
+            pairs = np.unique(np.concatenate((pairs, distant)))
+        root, comparisons = merge_planes(
+            sums, planes, pairs, merge_residual_m, merge_angle_deg, small_cluster_points, work_limit
+        )
+        work += comparisons
+        for i in range(labels.size):
+            if labels[i] >= 0:
+                labels[i] = root[labels[i]]
+        for k in range(n_clusters):
+            usable[k] = usable[k] and root[k] == k
+        if all_planes:
+            work += labels.size * int(usable.sum())
+        if work > work_limit:
+            return planes, labels, work
+        if all_planes:
+            labels = _nearest_plane(points, planes, usable, distance_m)
+        else:
+            labels = _vote(points, neighbours, labels, planes, usable, distance_m, vote_weight, voting_passes)
+    sums = cluster_sums(points, labels, n_clusters)
+    _fit_all(sums, planes, usable, fewest_points, min_cosine)
+    if not all_planes:
+        labels = _vote(points, neighbours, labels, planes, usable, distance_m, vote_weight, voting_passes)
+    planes, labels = _renumber(points, labels, planes, usable)
+    return planes, labels, work
+
+
+@njit(cache=True, nogil=True)
+def _fit_all(sums: FloatArray, planes: FloatArray, usable: BoolArray, fewest: int, min_cosine: float) -> None:
+    """Best-fit plane of every cluster, in place; usable where there are points enough and it is not too steep."""
+    for k in range(sums.shape[0]):
+        a, b, c, fitted = best_fit_plane(sums[k])
+        planes[k, 0] = a
+        planes[k, 1] = b
+        planes[k, 2] = c
+        usable[k] = fitted and sums[k, 0] >= fewest and cosine_of_slope(a, b) >= min_cosine
+
+
+@njit(cache=True, nogil=True)
+def _distance(points: FloatArray, i: int, planes: FloatArray, k: int) -> float:
+    """Perpendicular distance of a point to a plane (Eq. 1)."""
+    vertical = points[i, 2] - planes[k, 0] * points[i, 0] - planes[k, 1] * points[i, 1] - planes[k, 2]
+    return float(abs(vertical) * cosine_of_slope(planes[k, 0], planes[k, 1]))
+
+
+@njit(cache=True, nogil=True)
+def _drop_outliers(
+    points: FloatArray, labels: LabelArray, planes: FloatArray, usable: BoolArray, limit_m: float
+) -> None:
+    """Take the label from points that are far from their plane or have none, in place."""
+    for i in range(labels.size):
+        k = labels[i]
+        if k >= 0 and (not usable[k] or _distance(points, i, planes, k) > limit_m):
+            labels[i] = -1
+
+
+@njit(cache=True, nogil=True)
+def _vote(
+    points: FloatArray,
+    neighbours: LabelArray,
+    labels: LabelArray,
+    planes: FloatArray,
+    usable: BoolArray,
+    distance_m: float,
+    vote_weight: float,
+    passes: int,
+) -> LabelArray:
+    """Every point takes the plane of its neighbourhood with the least (distance / limit)^2 minus weight times votes.
+
+    All points choose at once from the labels before, so the outcome does not depend on their order. A plane beyond
+    the distance is no choice; a point without any choice is an outlier.
+    """
+    width = neighbours.shape[1]
+    old = labels.copy()
+    kind = np.empty(width + 1, np.int32)
+    votes = np.empty(width + 1, np.int32)
+    for _ in range(passes):
+        new = np.full(old.size, -1, np.int32)
+        changes = 0
+        for i in range(old.size):
+            kinds = 0
+            for q in range(-1, width):
+                j = i if q < 0 else neighbours[i, q]
+                if j < 0 or (q >= 0 and j == i):
+                    continue
+                k = old[j]
+                if k < 0 or not usable[k]:
+                    continue
+                at = 0
+                while at < kinds and kind[at] != k:
+                    at += 1
+                if at == kinds:
+                    kind[at] = k
+                    votes[at] = 0
+                    kinds += 1
+                if q >= 0:
+                    votes[at] += 1
+            least = 1.0
+            for s in range(kinds):
+                ratio = _distance(points, i, planes, kind[s]) / distance_m
+                if ratio > 1.0:
+                    continue
+                cost = ratio * ratio - vote_weight * votes[s]
+                if cost < least or (cost == least and kind[s] < new[i]):
+                    least = cost
+                    new[i] = kind[s]
+            changes += new[i] != old[i]
+        old = new
+        if changes == 0:
+            break
+    return old
+
+
+@njit(cache=True, nogil=True)
+def _nearest_plane(points: FloatArray, planes: FloatArray, usable: BoolArray, distance_m: float) -> LabelArray:
+    """The nearest of all planes within the distance (the paper's merging of points with planes), -1 for none."""
+    labels = np.full(points.shape[0], -1, np.int32)
+    for i in range(points.shape[0]):
+        least = distance_m
+        for k in range(usable.size):
+            if not usable[k]:
+                continue
+            distance = _distance(points, i, planes, k)
+            if distance < least or (distance == least and labels[i] < 0):
+                least = distance
+                labels[i] = k
+    return labels
+
+
+@njit(cache=True, nogil=True)
+def _renumber(
+    points: FloatArray, labels: LabelArray, planes: FloatArray, usable: BoolArray
+) -> tuple[FloatArray, LabelArray]:
+    """Usable planes fitted to their final points, numbered by their first point."""
+    number = np.full(usable.size, -1, np.int32)
+    count = 0
+    for i in range(labels.size):
+        k = labels[i]
+        if k >= 0 and not usable[k]:
+            labels[i] = -1
+        elif k >= 0:
+            if number[k] < 0:
+                number[k] = count
+                count += 1
+            labels[i] = number[k]
+    sums = cluster_sums(points, labels, count)
+    fitted = np.zeros((count, 3))
+    for k in range(usable.size):
+        m = number[k]
+        if m < 0:
+            continue
+        a, b, c, good = best_fit_plane(sums[m])
+        fitted[m, 0] = a if good else planes[k, 0]
+        fitted[m, 1] = b if good else planes[k, 1]
+        fitted[m, 2] = c if good else planes[k, 2]
+    return fitted, labels

@@ -1,0 +1,93 @@
+"""Best-fit planes z = b0 + b1 x + b2 y by least squares (Shorter and Kasparis, Eqs. 8 to 14), from sums a cluster.
+
+All that the regression needs of a cluster are ten sums over its points. The sums of two clusters add up to those of
+their union, so merging needs no second look at the points, and they are taken in the order of the points, so the
+planes do not depend on a linear algebra library.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.geometry import solve_plane_moments
+from pipeline.model import FloatArray, LabelArray
+
+N_SUMS = 10
+"""n, x, y, z, xx, xy, yy, xz, yz, zz."""
+_LEAST_WIDTH_RATIO = 1e-3
+"""A cluster narrower than this share of its length is a line: it holds no plane."""
+_LEAST_VARIANCE_M2 = 1e-9
+"""Below this the points coincide in plan."""
+
+
+@njit(cache=True, nogil=True)
+def cluster_sums(points: FloatArray, labels: LabelArray, n_clusters: int) -> FloatArray:
+    """The sums of Eq. 14 for every cluster: (n_clusters, 10) float64; labels below 0 are skipped."""
+    sums = np.zeros((n_clusters, N_SUMS))
+    for i in range(labels.size):
+        k = labels[i]
+        if k < 0:
+            continue
+        x = points[i, 0]
+        y = points[i, 1]
+        z = points[i, 2]
+        sums[k, 0] += 1.0
+        sums[k, 1] += x
+        sums[k, 2] += y
+        sums[k, 3] += z
+        sums[k, 4] += x * x
+        sums[k, 5] += x * y
+        sums[k, 6] += y * y
+        sums[k, 7] += x * z
+        sums[k, 8] += y * z
+        sums[k, 9] += z * z
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def best_fit_plane(sums: FloatArray) -> tuple[float, float, float, bool]:
+    """The solution (b1, b2, b0) of Eq. 14 and whether there is one.
+
+    Fewer than three points, points on one line in plan or in one place have none: they come back as the horizontal
+    plane of their mean elevation and False.
+    """
+    n = sums[0]
+    if n < 1.0:
+        return 0.0, 0.0, 0.0, False
+    x = sums[1] / n
+    y = sums[2] / n
+    z = sums[3] / n
+    xx = sums[4] / n - x * x
+    xy = sums[5] / n - x * y
+    yy = sums[6] / n - y * y
+    determinant = xx * yy - xy * xy
+    spread = xx + yy
+    if n < 3.0 or spread < _LEAST_VARIANCE_M2 or determinant < (_LEAST_WIDTH_RATIO * spread) ** 2:
+        return 0.0, 0.0, z, False
+    xz = sums[7] / n - x * z
+    yz = sums[8] / n - y * z
+    a, b = solve_plane_moments(xx, xy, yy, xz, yz)
+    return a, b, z - a * x - b * y, True
+
+
+@njit(cache=True, nogil=True)
+def mean_square_residual(sums: FloatArray, a: float, b: float, c: float) -> float:
+    """SSE of Eq. 10 over n, for any plane, from the sums; vertical, square metres, never negative."""
+    sse = (
+        sums[9]
+        + a * a * sums[4]
+        + b * b * sums[6]
+        + c * c * sums[0]
+        + 2.0 * (a * b * sums[5] + a * c * sums[1] + b * c * sums[2])
+        - 2.0 * (a * sums[7] + b * sums[8] + c * sums[3])
+    )
+    return float(max(0.0, sse / sums[0]))
+
+
+@njit(cache=True, nogil=True)
+def cosine_of_slope(a: float, b: float) -> float:
+    """Turns a vertical distance to the plane into a perpendicular one (Eq. 1)."""
+    return 1.0 / math.sqrt(1.0 + a * a + b * b)

@@ -1,0 +1,58 @@
+"""Terrain samples that lie beside a building, not beneath it: a TIN of both would shatter the roof."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray, FloatArray
+
+
+@njit(cache=True, nogil=True)
+def far_from(samples: FloatArray, points: FloatArray, distance_m: float) -> BoolArray:
+    """Which samples have no point within a distance in plan.
+
+    Parameters
+    ----------
+    samples : (m, 3) float64
+        Metres.
+    points : (n, 3) float64
+        Metres, at least one.
+    distance_m : float
+        More than 0.
+
+    Returns
+    -------
+    (m,) bool
+    """
+    x_min = points[:, 0].min()
+    y_min = points[:, 1].min()
+    columns = int((points[:, 0].max() - x_min) / distance_m) + 1
+    rows = int((points[:, 1].max() - y_min) / distance_m) + 1
+    cell = ((points[:, 1] - y_min) / distance_m).astype(np.int64) * columns
+    cell += ((points[:, 0] - x_min) / distance_m).astype(np.int64)
+    order = np.argsort(cell, kind="mergesort")
+    cell = cell[order]
+    far = np.ones(samples.shape[0], np.bool_)
+    for s in range(samples.shape[0]):
+        x = samples[s, 0]
+        y = samples[s, 1]
+        column = int(np.floor((x - x_min) / distance_m))
+        row = int(np.floor((y - y_min) / distance_m))
+        left = max(column - 1, 0)
+        right = min(column + 1, columns - 1)
+        if left > right:
+            continue
+        for r in range(max(row - 1, 0), min(row + 1, rows - 1) + 1):
+            begin = np.searchsorted(cell, r * columns + left)
+            for q in range(begin, cell.size):
+                if cell[q] > r * columns + right:
+                    break
+                dx = points[order[q], 0] - x
+                dy = points[order[q], 1] - y
+                if dx * dx + dy * dy <= distance_m * distance_m:
+                    far[s] = False
+                    break
+            if not far[s]:
+                break
+    return far

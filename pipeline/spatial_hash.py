@@ -1,0 +1,89 @@
+"""Hashing of lattice cells and points: what duplicates and neighbours in space are found by."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
+
+# 2^64 / golden ratio, as a signed 64-bit number: Fibonacci hashing (Knuth, TAOCP 3, 6.4).
+_GOLDEN = -7046029254386353131
+
+
+@njit(cache=True, nogil=True)
+def slot_of_key(key: int, mask: int) -> int:
+    """First slot of a key in an open-addressing table of mask + 1 (a power of two) slots."""
+    return ((key * _GOLDEN) >> 20) & mask
+
+
+@njit(cache=True, nogil=True)
+def _first_of_each(x_mm, y_mm, z_mm, return_number, gps_bits, source_id, classification):  # type: ignore[no-untyped-def]
+    """Kernel: open addressing; of equal points the one of the lowest source, then class, stays."""
+    n = x_mm.size
+    keep = np.zeros(n, np.bool_)
+    size = 2
+    while size < 2 * n:
+        size *= 2
+    mask = size - 1
+    holder = np.full(size, -1, np.int64)
+    for i in range(n):
+        mixed = (x_mm[i] * 73856093) ^ (y_mm[i] * 19349663) ^ (z_mm[i] * 83492791)
+        mixed ^= gps_bits[i] * 2654435761 + return_number[i]
+        s = slot_of_key(mixed, mask)
+        while True:
+            j = holder[s]
+            if j < 0:
+                holder[s] = i
+                keep[i] = True
+                break
+            same = (
+                x_mm[i] == x_mm[j]
+                and y_mm[i] == y_mm[j]
+                and z_mm[i] == z_mm[j]
+                and return_number[i] == return_number[j]
+                and gps_bits[i] == gps_bits[j]
+            )
+            if same:
+                if source_id[i] < source_id[j] or (
+                    source_id[i] == source_id[j] and classification[i] < classification[j]
+                ):
+                    holder[s] = i
+                    keep[i] = True
+                    keep[j] = False
+                break
+            s = (s + 1) & mask
+    return keep
+
+
+def first_of_each(
+    x_mm: IntArray,
+    y_mm: IntArray,
+    z_mm: IntArray,
+    return_number: ByteArray,
+    gps_time: FloatArray,
+    source_id: npt.NDArray[np.uint16],
+    classification: ByteArray,
+) -> BoolArray:
+    """Mask that keeps one of each set of equal points.
+
+    Points are equal where coordinates, return number and GPS time are: what overlapping inputs and
+    careless merges repeat. Which one stays depends on the values alone, not on their order.
+
+    Parameters
+    ----------
+    x_mm, y_mm, z_mm : (n,) int64
+        Coordinates in millimetres.
+    return_number, gps_time, source_id, classification : (n,) arrays
+        As in `PointCloud`.
+
+    Returns
+    -------
+    (n,) bool
+        True for the points that stay.
+    """
+    kept: BoolArray = _first_of_each(
+        x_mm, y_mm, z_mm, return_number, np.ascontiguousarray(gps_time).view(np.int64), source_id, classification
+    )
+    return kept

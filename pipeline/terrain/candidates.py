@@ -1,0 +1,239 @@
+"""Whole surfaces are judged: which are candidates for buildings, and why the others are not.
+
+The Z_avg rule (Shorter and Kasparis, section 3.1) asks whether a facet lies above the mean height of
+the walls. For a scene it is asked of each surface and the walls that touch it: a roof lies at the
+top of its walls, a street at their foot. Each metre of outline votes, so one tower beside a low roof
+cannot outvote the roof's own eaves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.model import IntArray, Reason
+from pipeline.parameters import Parameters, parameter
+from pipeline.terrain.surfaces import FacetKind, Sum
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CandidateSettings(Parameters):
+    """What a surface must be to become a candidate."""
+
+    min_object_area_m2: float = parameter(
+        4.0,
+        "Smaller surfaces are no objects: crowns fall apart into thousands of them; they are counted, not listed.",
+        unit="m2",
+        minimum=0.5,
+        maximum=100.0,
+    )
+    min_area_m2: float = parameter(
+        10.0, "Least plan area of a building's surface.", unit="m2", minimum=1.0, maximum=1000.0
+    )
+    min_height_m: float = parameter(
+        2.0, "Least mean height above the terrain.", unit="m", minimum=0.5, maximum=20.0
+    )
+    min_width_m: float = parameter(
+        1.5, "Least mean width, twice the area over the outline.", unit="m", minimum=0.0, maximum=20.0
+    )
+    min_planar_share: float = parameter(
+        0.5, "Least share of vertices with planar surroundings.", minimum=0.0, maximum=1.0
+    )
+    max_canopy_share: float = parameter(
+        0.35, "Largest share of earlier returns above the surface.", minimum=0.0, maximum=1.0
+    )
+    min_wall_share: float = parameter(
+        0.15, "Least share of the outline that touches walls.", minimum=0.0, maximum=1.0
+    )
+    min_top_share: float = parameter(
+        0.3,
+        "Least share of the touching walls at whose top the surface lies (the Z_avg rule by surface).",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    large_roof_m2: float = parameter(
+        400.0,
+        "A surface on the filter's ground of at least this area is a roof where walls fall off all around it.",
+        unit="m2",
+        minimum=50.0,
+        maximum=100000.0,
+    )
+    large_roof_top_share: float = parameter(
+        0.6, "Share of the whole outline of such a roof that lies at the top of walls.", minimum=0.3, maximum=1.0
+    )
+    unite_share: float = parameter(
+        0.5,
+        "A surface with at least this share of its outline along steps joins the largest roof beside them.",
+        minimum=0.1,
+        maximum=1.0,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Surfaces:
+    """Whole surfaces, merged over tiles."""
+
+    kind: npt.NDArray[np.int8]
+    """(k,) FacetKind."""
+    sums: IntArray
+    """(k, N_SUMS) columns as in Sum."""
+    boxes_mm: IntArray
+    """(k, 4) xmin, ymin, xmax, ymax."""
+    lowest_point_mm: IntArray
+    """(k, 3) smallest assigned point; 2^62 where there is none."""
+    along_steps: IntArray
+    """(s, 3) surface, step, shared length in mm; one row a pair."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What is said of a surface that is no candidate."""
+
+    reason: Reason
+    """From the closed list."""
+    detail: str
+    """The measured figure and the threshold."""
+
+
+def _figures(sums: IntArray) -> dict[str, float]:
+    """The measures of one surface in metres and shares."""
+    area_m2 = float(sums[Sum.AREA2]) / 2e6
+    outline_mm = max(1, int(sums[Sum.BOUNDARY]))
+    judged = max(1, int(sums[Sum.PLANAR] + sums[Sum.ROUGH]))
+    return {
+        "area_m2": area_m2,
+        "height_m": float(sums[Sum.HEIGHT]) / max(1, int(sums[Sum.VERTICES])) / 1000.0,
+        "width_m": 2000.0 * area_m2 / (outline_mm / 1000.0) / 1000.0,
+        "planar_share": float(sums[Sum.PLANAR]) / judged,
+        "judged": float(sums[Sum.PLANAR] + sums[Sum.ROUGH]),
+        "canopy_share": float(sums[Sum.CANOPY]) / max(1, int(sums[Sum.CANOPY] + sums[Sum.POINTS])),
+        "wall_share": float(sums[Sum.WALL]) / outline_mm,
+        "top_share": float(sums[Sum.WALL_TOP]) / max(1, int(sums[Sum.WALL])),
+        "top_of_outline": float(sums[Sum.WALL_TOP]) / outline_mm,
+        "step_share": float(sums[Sum.STEP]) / outline_mm,
+    }
+
+
+def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Verdict | None:
+    """Why one whole surface is no candidate; None where it is one.
+
+    Parameters
+    ----------
+    kind : int
+        FacetKind of the surface: GROUND, OBJECT or BUILDING.
+    sums : (N_SUMS,) int64
+        Its sums.
+    settings : CandidateSettings
+        The thresholds.
+    """
+    f = _figures(sums)
+    if kind == FacetKind.GROUND:
+        if f["area_m2"] < settings.large_roof_m2 or f["top_of_outline"] < settings.large_roof_top_share:
+            return Verdict(reason=Reason.TOO_LOW, detail="ground")
+        return None
+    if f["area_m2"] < settings.min_area_m2:
+        return Verdict(
+            reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {settings.min_area_m2:g}"
+        )
+    if kind == FacetKind.BUILDING:
+        return None
+    if f["height_m"] < settings.min_height_m:
+        return Verdict(
+            reason=Reason.TOO_LOW, detail=f"mean height {f['height_m']:.2f} m, at least {settings.min_height_m:g}"
+        )
+    if f["judged"] > 0 and f["planar_share"] < settings.min_planar_share:
+        return Verdict(
+            reason=Reason.VEGETATION,
+            detail=f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}",
+        )
+    if f["canopy_share"] > settings.max_canopy_share:
+        return Verdict(
+            reason=Reason.VEGETATION,
+            detail=f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}",
+        )
+    if f["width_m"] < settings.min_width_m:
+        return Verdict(
+            reason=Reason.TOO_NARROW, detail=f"mean width {f['width_m']:.2f} m, at least {settings.min_width_m:g}"
+        )
+    if f["wall_share"] < settings.min_wall_share:
+        return Verdict(
+            reason=Reason.NO_WALLS,
+            detail=f"walls along {f['wall_share']:.2f} of the outline, at least {settings.min_wall_share:g}",
+        )
+    if f["top_share"] < settings.min_top_share:
+        z_avg = float(sums[Sum.WALLS_Z_MX]) / max(1, int(sums[Sum.WALLS])) / 1000.0
+        own = float(sums[Sum.WALLS_OWN_Z]) / max(1, int(sums[Sum.WALLS])) / 1000.0
+        return Verdict(
+            reason=Reason.BELOW_Z_AVG,
+            detail=f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g} "
+            f"(own {own:.2f} m, Z_avg {z_avg:.2f} m)",
+        )
+    return None
+
+
+def is_object(kind: int, sums: IntArray, settings: CandidateSettings) -> bool:
+    """Whether a surface is large enough to be listed at all, as candidate or rejected."""
+    if kind == FacetKind.GROUND:
+        return judge_surface(kind, sums, settings) is None
+    large_enough = bool(sums[Sum.AREA2] >= 2e6 * settings.min_object_area_m2)
+    return kind in {FacetKind.OBJECT, FacetKind.BUILDING} and large_enough
+
+
+def _joins(kind: int, sums: IntArray, verdict: Verdict | None, settings: CandidateSettings) -> bool:
+    """Whether a surface is roof-like and mostly bounded by steps, as a dormer, a lift house or an upper storey."""
+    f = _figures(sums)
+    small_roof = verdict is None or (
+        verdict.reason in {Reason.TOO_SMALL, Reason.TOO_NARROW, Reason.BELOW_Z_AVG}
+        and f["height_m"] >= settings.min_height_m
+        and f["planar_share"] >= settings.min_planar_share
+        and f["canopy_share"] <= settings.max_canopy_share
+    )
+    return kind != FacetKind.GROUND and small_roof and f["step_share"] >= settings.unite_share
+
+
+def unite_levels(
+    surfaces: Surfaces, verdicts: list[Verdict | None], settings: CandidateSettings
+) -> npt.NDArray[np.int64]:
+    """The candidate that each surface belongs to: its own index, or that of a larger roof across a step.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+        Whole surfaces.
+    verdicts : list of Verdict or None
+        One a surface.
+    settings : CandidateSettings
+        `unite_share`.
+
+    Returns
+    -------
+    (k,) int64
+        Index of the surface that leads the candidate; -1 for surfaces that belong to none.
+    """
+    count = len(surfaces.kind)
+    leader = np.array([k if verdicts[k] is None else -1 for k in range(count)], np.int64)
+    by_step: dict[int, list[int]] = {}
+    steps_of: dict[int, list[int]] = {}
+    for surface, step, _length in surfaces.along_steps.tolist():
+        by_step.setdefault(step, []).append(surface)
+        steps_of.setdefault(surface, []).append(step)
+
+    def rank(k: int) -> tuple[int, tuple[int, ...]]:
+        # the largest first; equal areas by the smallest point, so that numbering does not matter
+        return -int(surfaces.sums[k, Sum.AREA2]), tuple(surfaces.lowest_point_mm[k].tolist())
+
+    for k in sorted(steps_of):
+        if not _joins(int(surfaces.kind[k]), surfaces.sums[k], verdicts[k], settings):
+            continue
+        beside = {s for step in steps_of[k] for s in by_step[step] if verdicts[s] is None and rank(s) < rank(k)}
+        if beside:
+            leader[k] = min(beside, key=rank)
+    # a leader may itself have joined a larger one: follow to the end; ranks strictly fall, so there is no cycle
+    for k in range(count):
+        top = int(leader[k])
+        while top >= 0 and int(leader[top]) != top:
+            top = int(leader[top])
+        leader[k] = top
+    return leader

@@ -1,0 +1,103 @@
+"""Gross outliers: points that are nearly alone in a wide neighbourhood of space.
+
+Birds, clouds and multipath echoes stand metres to hundreds of metres from everything else. A point
+is an outlier where the 27 cubes around it hold too few points; the decision looks 2 cubes far and no
+further, so that tiles agree on it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray, IntArray
+from pipeline.parameters import Parameters, parameter
+from pipeline.spatial_hash import slot_of_key
+
+# 21 bits a coordinate pack a cube into one key: 2^21 cubes of 4 m are 8000 km, more than any CRS spans.
+_BITS = 21
+_EMPTY = -1
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OutlierSettings(Parameters):
+    """When a point counts as a gross outlier."""
+
+    cube_m: float = parameter(
+        5.0, "Side of the cubes in which neighbours are counted.", unit="m", minimum=1.0, maximum=50.0
+    )
+    min_neighbours: int = parameter(
+        4, "Fewest other points in the 27 cubes around a point that is kept.", minimum=0, maximum=100
+    )
+
+    @property
+    def support_m(self) -> float:
+        """How far the decision looks."""
+        return 2.0 * self.cube_m
+
+
+@njit(cache=True, nogil=True)
+def _dense_enough(x_mm, y_mm, z_mm, cube_mm, min_neighbours):  # type: ignore[no-untyped-def]
+    """Kernel: count points a cube, then sum the 27 cubes around each occupied cube once."""
+    n = x_mm.size
+    keep = np.zeros(n, np.bool_)
+    if n == 0:
+        return keep
+    size = 1
+    while size < 2 * n:
+        size *= 2
+    mask = size - 1
+    keys = np.full(size, _EMPTY, np.int64)
+    counts = np.zeros(size, np.int64)
+    enough = np.zeros(size, np.int8)  # 0 unknown, 1 yes, 2 no
+    slot_of = np.empty(n, np.int64)
+    low_x, low_y, low_z = x_mm.min() // cube_mm - 1, y_mm.min() // cube_mm - 1, z_mm.min() // cube_mm - 1
+    for i in range(n):
+        a, b, c = x_mm[i] // cube_mm - low_x, y_mm[i] // cube_mm - low_y, z_mm[i] // cube_mm - low_z
+        key = (a << (2 * _BITS)) | (b << _BITS) | c
+        s = slot_of_key(key, mask)
+        while keys[s] != _EMPTY and keys[s] != key:
+            s = (s + 1) & mask
+        keys[s] = key
+        counts[s] += 1
+        slot_of[i] = s
+    for i in range(n):
+        s = slot_of[i]
+        if enough[s] == 0:
+            total = counts[s]
+            key = keys[s]
+            for da in range(-1, 2):
+                for db in range(-1, 2):
+                    for dc in range(-1, 2):
+                        if total > min_neighbours or (da == 0 and db == 0 and dc == 0):
+                            continue
+                        other = key + (da << (2 * _BITS)) + (db << _BITS) + dc
+                        t = slot_of_key(other, mask)
+                        while keys[t] != _EMPTY and keys[t] != other:
+                            t = (t + 1) & mask
+                        if keys[t] == other:
+                            total += counts[t]
+            enough[s] = 1 if total > min_neighbours else 2
+        keep[i] = enough[s] == 1
+    return keep
+
+
+def dense_enough(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: OutlierSettings) -> BoolArray:
+    """Mask of the points that are no gross outliers.
+
+    Parameters
+    ----------
+    x_mm, y_mm, z_mm : (n,) int64
+        Absolute coordinates in millimetres: the cubes are anchored at the CRS's origin.
+    settings : OutlierSettings
+        Side of the cubes and the fewest neighbours.
+
+    Returns
+    -------
+    (n,) bool
+        False for outliers; empty for no points.
+    """
+    kept: BoolArray = _dense_enough(x_mm, y_mm, z_mm, round(settings.cube_m * 1000), settings.min_neighbours)
+    return kept

@@ -1,0 +1,89 @@
+"""Thinning a cloud to the density of the papers: one point a cell of a fine lattice.
+
+A TIN of all points of a dense multi-return cloud shatters, because each wall becomes many small
+facets. The highest last return of each cell keeps roofs up to their edge, drops most of the façade,
+and lets trees fall apart. Sparse clouds pass unchanged: thinning adapts by itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.model import BoolArray, IntArray
+from pipeline.spatial_hash import slot_of_key
+
+_BITS = 31
+
+
+@njit(cache=True, nogil=True)
+def _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, cell_mm):  # type: ignore[no-untyped-def]
+    """Kernel: of each cell the point that is preferred, highest, then southernmost, then westernmost."""
+    n = x_mm.size
+    size = 2
+    while size < 2 * n:
+        size *= 2
+    mask = size - 1
+    keys = np.full(size, -1, np.int64)
+    holder = np.full(size, -1, np.int64)
+    filled = np.empty(n, np.int64)
+    count = 0
+    column0, row0 = 0, 0
+    if n > 0:
+        column0, row0 = x_mm.min() // cell_mm, y_mm.min() // cell_mm
+    for i in range(n):
+        if not used[i]:
+            continue
+        key = ((x_mm[i] // cell_mm - column0) << _BITS) | (y_mm[i] // cell_mm - row0)
+        s = slot_of_key(key, mask)
+        while keys[s] != -1 and keys[s] != key:
+            s = (s + 1) & mask
+        j = holder[s]
+        if j < 0:
+            keys[s] = key
+            holder[s] = i
+            filled[count] = s
+            count += 1
+            continue
+        if preferred[i] != preferred[j]:
+            better = preferred[i]
+        elif z_mm[i] != z_mm[j]:
+            better = z_mm[i] > z_mm[j]
+        elif y_mm[i] != y_mm[j]:
+            better = y_mm[i] < y_mm[j]
+        else:
+            better = x_mm[i] < x_mm[j]
+        if better:
+            holder[s] = i
+    chosen = np.empty(count, np.int64)
+    for k in range(count):
+        chosen[k] = holder[filled[k]]
+    return chosen
+
+
+def highest_per_cell(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, preferred: BoolArray, used: BoolArray, cell_m: float
+) -> npt.NDArray[np.int64]:
+    """Indices of one point a cell, ordered by (x, y).
+
+    Parameters
+    ----------
+    x_mm, y_mm, z_mm : (n,) int64
+        Absolute coordinates in millimetres; the lattice is anchored at the CRS's origin.
+    preferred : (n,) bool
+        Points that win their cell whatever their height (the file's building class where it is trusted).
+    used : (n,) bool
+        Points that may be chosen at all.
+    cell_m : float
+        Side of a cell in metres.
+
+    Returns
+    -------
+    (m,) int64
+        At most one index a cell, so all (x, y) differ; the order does not depend on that of the points.
+    """
+    chosen = _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, round(cell_m * 1000))
+    order = np.lexsort((y_mm[chosen], x_mm[chosen]))
+    result: npt.NDArray[np.int64] = chosen[order]
+    return result

@@ -1,0 +1,225 @@
+"""Delaunay triangulation of points on whole millimetres: exact, canonical, incremental.
+
+Points are inserted along a Hilbert curve, every 8^k-th point first, with a walk from the facet of the point before and
+Lawson's flips. With the exact predicates and their symbolic perturbation the result is unique: it does not depend on
+the order of the points, and facets whose circumcircles lie in a shared part of two data sets are the same in both.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.model import FloatArray, IntArray, LabelArray, Tin
+from pipeline.tin.half_edges import canonical_facets, locate, restore_delaunay, split_facet, start_sphere
+from pipeline.tin.predicates import orientation
+
+MAX_WINDOW_MM = 2_000_000
+"""The largest width or depth of one triangulation."""
+
+_HILBERT_BITS = 16
+_ROUND_FACTOR = 8
+
+
+@njit(cache=True, nogil=True)
+def _hilbert_keys(xy_mm: IntArray, x_min: int, y_min: int, shift: int) -> npt.NDArray[np.uint64]:
+    """Position on the Hilbert curve in the upper, index in the lower 32 bits."""
+    n = len(xy_mm)
+    keys = np.empty(n, np.uint64)
+    for i in range(n):
+        a = (xy_mm[i, 0] - x_min) >> shift
+        b = (xy_mm[i, 1] - y_min) >> shift
+        key = 0
+        side = 1 << (_HILBERT_BITS - 1)
+        while side > 0:
+            right = 1 if a & side else 0
+            upper = 1 if b & side else 0
+            key = (key << 2) | ((3 * right) ^ upper)
+            if upper == 0:
+                if right == 1:
+                    a = ~a
+                    b = ~b
+                a, b = b, a
+            side >>= 1
+        keys[i] = (np.uint64(key) << np.uint64(32)) | np.uint64(i)
+    return keys
+
+
+@njit(cache=True, nogil=True)
+def _insert_all(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArray) -> tuple[int, int]:
+    """Triangulate vertices that follow a Hilbert curve; return the number of facets and a duplicate vertex or -1."""
+    n = len(x) - 1
+    third = 2
+    while third < n and orientation(x[0], y[0], x[1], y[1], x[third], y[third]) == 0.0:
+        third += 1
+    if n < 3 or third == n:
+        return 0, -1
+    start_sphere(x, y, origin, twin, 0, 1, third)
+    n_facets = 4
+    facet = 0
+    stride = 1
+    while stride * _ROUND_FACTOR < n:
+        stride *= _ROUND_FACTOR
+    coarser = n
+    while stride > 0:
+        for p in range(0, n, stride):
+            if p % coarser == 0 or p in (0, 1, third):
+                continue
+            facet = locate(x, y, origin, twin, facet, p)
+            for k in range(3):
+                v = origin[4 * facet + k]
+                if x[v] == x[p] and y[v] == y[p]:
+                    return 0, p
+            split_facet(origin, twin, facet, n_facets, p)
+            n_facets += 2
+            restore_delaunay(x, y, origin, twin, facet)
+        coarser = stride
+        stride //= _ROUND_FACTOR
+    return n_facets, -1
+
+
+def hilbert_order(xy_mm: IntArray) -> LabelArray:
+    """Indices of points, (n,) int32, in the order in which a Hilbert curve passes them; at least one point.
+
+    The cells of the curve are the 2^16th part of the extent; points of one cell are ordered by index.
+    """
+    low = xy_mm.min(axis=0)
+    extent = int((xy_mm.max(axis=0) - low).max())
+    keys = _hilbert_keys(xy_mm, int(low[0]), int(low[1]), max(0, extent.bit_length() - _HILBERT_BITS))
+    keys.sort()
+    return (keys & np.uint64(0xFFFFFFFF)).astype(np.int32)
+
+
+def triangulate(xy_mm: IntArray) -> Tin:
+    """The Delaunay triangulation of different points on whole millimetres.
+
+    The hull is the exact convex hull, and points on its edges are vertices of it; there are no auxiliary vertices. At
+    the hull, facets may be long and narrow. Facets start with their smallest vertex index and are sorted, so the same
+    points in the same order give the same arrays, and in another order the same triangles.
+
+    Parameters
+    ----------
+    xy_mm : (n, 2) int64
+        Easting, northing in millimetres. No two points may be equal; see `unique_xy`.
+
+    Returns
+    -------
+    Tin
+        Vertex indices are those of `xy_mm`. No facets where fewer than three points are given or all are collinear.
+
+    Raises
+    ------
+    ValueError
+        If the points extend over more than 2 km, or two are equal.
+
+    Notes
+    -----
+    Of points on a common circle, the perturbation described in `pipeline.tin.predicates` decides.
+
+    Examples
+    --------
+    >>> triangulate(np.array([[0, 0], [1000, 0], [1000, 1000], [0, 1000]])).facets
+    array([[0, 1, 3],
+           [1, 2, 3]], dtype=int32)
+    """
+    xy_mm = np.ascontiguousarray(xy_mm, dtype=np.int64)
+    if xy_mm.ndim != 2 or xy_mm.shape[1] != 2:
+        raise ValueError(f"xy_mm has shape {xy_mm.shape}, not (n, 2)")
+    n = len(xy_mm)
+    no_facets = np.empty((0, 3), np.int32)
+    if n == 0:
+        return Tin(facets=no_facets, neighbours=no_facets)
+    low = xy_mm.min(axis=0)
+    extent = int((xy_mm.max(axis=0) - low).max())
+    if extent > MAX_WINDOW_MM:
+        raise ValueError(f"points extend over {extent / 1000:.3f} m: triangulate windows of at most 2000 m")
+    order = hilbert_order(xy_mm)
+    x = np.empty(n + 1)
+    y = np.empty(n + 1)
+    x[:n] = (xy_mm[:, 0] - low[0])[order]
+    y[:n] = (xy_mm[:, 1] - low[1])[order]
+    x[n] = y[n] = np.nan
+    # the sphere over n vertices and infinity has 2 n - 2 facets
+    origin = np.empty(8 * n, np.int32)
+    twin = np.empty(8 * n, np.int32)
+    n_facets, duplicate = _insert_all(x, y, origin, twin)
+    if n_facets == 0:
+        _refuse_duplicates(xy_mm, order, duplicate)
+        return Tin(facets=no_facets, neighbours=no_facets)
+    facets, neighbours, _ = canonical_facets(origin, twin, n_facets, order)
+    return Tin(facets=facets, neighbours=neighbours)
+
+
+def _refuse_duplicates(xy_mm: IntArray, order: LabelArray, duplicate: int) -> None:
+    """Raise where the insertion met a duplicate, or collinear points hold one."""
+    if duplicate < 0:
+        _, index, counts = np.unique(xy_mm, axis=0, return_index=True, return_counts=True)
+        if not (counts > 1).any():
+            return
+        point = int(index[counts > 1][0])
+    else:
+        point = int(order[duplicate])
+    raise ValueError(f"point {point} at {tuple(xy_mm[point].tolist())} mm is given twice: use unique_xy first")
+
+
+def unique_xy(xy_mm: IntArray, z_mm: IntArray) -> tuple[IntArray, LabelArray]:
+    """Keep the highest point of every position.
+
+    Parameters
+    ----------
+    xy_mm : (n, 2) int64
+        Easting, northing in millimetres.
+    z_mm : (n,) int64
+        Elevation in millimetres; of equal heights the lowest index is kept.
+
+    Returns
+    -------
+    kept : (u,) int64
+        Indices of the kept points, ascending.
+    kept_of_point : (n,) int32
+        For every point the position in `kept` of the one that stands for it.
+
+    Examples
+    --------
+    >>> unique_xy(np.array([[0, 0], [5, 5], [0, 0]]), np.array([1, 2, 3]))
+    (array([1, 2]), array([1, 0, 1], dtype=int32))
+    """
+    if len(xy_mm) == 0:
+        return np.empty(0, np.int64), np.empty(0, np.int32)
+    low = xy_mm.min(axis=0)
+    extent = xy_mm.max(axis=0) - low
+    if extent.max() >= 1 << 31:
+        raise ValueError(f"points extend over {extent.max() / 1000:.3f} m: use coordinates of at most 2^31 mm extent")
+    position = ((xy_mm[:, 0] - low[0]) << 31) + (xy_mm[:, 1] - low[1])
+    # stable: points that come in canonical order are sorted already, and found so in one pass
+    return _keep_highest(position, np.asarray(z_mm, dtype=np.int64), np.argsort(position, kind="stable"))
+
+
+@njit(cache=True, nogil=True)
+def _keep_highest(position: IntArray, z_mm: IntArray, order: IntArray) -> tuple[IntArray, LabelArray]:
+    """The kernel of `unique_xy`: `order` sorts the positions, ascending by index where they are equal."""
+    n = len(position)
+    stands_for = np.empty(n, np.int32)
+    is_kept = np.zeros(n, np.bool_)
+    first = 0
+    while first < n:
+        end = first
+        highest = order[first]
+        while end < n and position[order[end]] == position[order[first]]:
+            if z_mm[order[end]] > z_mm[highest]:
+                highest = order[end]
+            end += 1
+        is_kept[highest] = True
+        for q in range(first, end):
+            stands_for[order[q]] = highest
+        first = end
+    number = np.empty(n, np.int32)
+    kept = np.empty(is_kept.sum(), np.int64)
+    n_kept = 0
+    for i in range(n):
+        if is_kept[i]:
+            number[i] = n_kept
+            kept[n_kept] = i
+            n_kept += 1
+    return kept, number[stands_for]

@@ -1,0 +1,41 @@
+"""What is imported, and when: start-up counts in every worker process."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+HEAVY = ("dask", "distributed", "pandas", "geopandas", "pyarrow", "matplotlib", "fastapi", "laspy", "pyogrio")
+
+
+def modules_after(statement: str) -> set[str]:
+    """Top-level modules that a fresh interpreter has loaded after a statement."""
+    code = f"{statement}\nimport json, sys\nprint(json.dumps(sorted(set(m.split('.')[0] for m in sys.modules))))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(json.loads(result.stdout.splitlines()[-1]))
+
+
+def test_the_science_imports_no_engine_and_no_data_frames() -> None:
+    assert modules_after("import pipeline.reconstruct") & set(HEAVY) == set()
+
+
+def test_the_console_script_imports_nothing_heavy() -> None:
+    assert modules_after("import service.cli") & {*HEAVY, "numpy", "numba", "scipy", "shapely"} == set()
+
+
+def test_the_check_sees_a_heavy_import() -> None:
+    assert "pandas" in modules_after("import pandas")
+
+
+@pytest.mark.slow
+def test_help_comes_at_once() -> None:
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "service.cli", "--help"], capture_output=True, check=True)
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 0.5
