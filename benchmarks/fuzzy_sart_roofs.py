@@ -23,7 +23,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pipeline.methods.fuzzy_sart import FuzzySartSettings, segment
-from pipeline.model import Candidate, FloatArray, IntArray, Segmentation
+from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, Segmentation
 
 KINDS = ("gable", "hip", "flat", "L")
 DENSITIES_PER_M2 = (0.77, 8.0)
@@ -84,7 +84,7 @@ def simulate_roof(
 
 def _roof(
     kind: str, width: float, length: float, eave: float, rise: float, uv: FloatArray
-) -> tuple[FloatArray, FloatArray, IntArray]:
+) -> tuple[FloatArray, BoolArray, IntArray]:
     """Planes over (u, v) along and across the ridge, which positions have roof, and the plane of every one."""
     u, v = uv[:, 0], uv[:, 1]
     sides = [(0.0, -rise, eave + rise * width / 2), (0.0, rise, eave + rise * width / 2)]
@@ -149,7 +149,12 @@ def variants() -> dict[str, FuzzySartSettings]:
 
 
 def shares(
-    settings: FuzzySartSettings, density: float, noise_m: float, seeds: range, kinds: tuple[str, ...], pitch: float | None
+    settings: FuzzySartSettings,
+    density: float,
+    noise_m: float,
+    seeds: range,
+    kinds: tuple[str, ...],
+    pitch: float | None,
 ) -> tuple[float, float, float]:
     """Share of roofs all right, share exactly right, and milliseconds a roof."""
     right = exact = 0

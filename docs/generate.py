@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,10 @@ from typing import Any
 import typer
 
 from pipeline.console import EXIT_CODES
-from pipeline.settings import RunSettings
+from pipeline.methods import METHODS
+from pipeline.parameters import Parameters
+from pipeline.quality import validity as checker
+from pipeline.settings import SECTIONS, GeneralSettings
 from service.cli import app
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
@@ -42,7 +47,7 @@ def option_names(parameter: Any) -> str:
     if parameter.param_type_name == "argument":
         return f"`{parameter.metavar or parameter.name.upper()}`"
     names = ", ".join(f"`{name}`" for name in [*parameter.opts, *parameter.secondary_opts])
-    return names if parameter.is_flag or not parameter.metavar else f"{names} {cell(parameter.metavar)}"
+    return names if parameter.is_flag or not parameter.metavar else f"{names} {parameter.metavar}"
 
 
 def default_of(parameter: Any) -> str:
@@ -69,33 +74,102 @@ def command_line() -> str:
     return "\n".join(lines)
 
 
-def settings() -> str:
-    """The page of settings."""
-    lines = [NOTE, "# Settings", ""]
-    lines += [
-        "A settings file is TOML, one table a stage; every value has a default, an unknown or wrong one is refused, all faults at once.",
-        "Values that cannot change results (marked *no* under *geometry*) are not part of the `settings_hash`.",
-        "",
-    ]
-    for section, rows in sections().items():
-        lines += [f"## {section}", "", *table(["setting", "default", "unit", "allowed", "geometry", "meaning"], rows), ""]
-    return "\n".join(lines)
+def allowed(field: dataclasses.Field[Any]) -> str:
+    """What values a setting takes."""
+    choices, low, high = (field.metadata[key] for key in ("choices", "minimum", "maximum"))
+    if choices is not None:
+        return ", ".join(f"`{choice}`" for choice in choices)
+    if isinstance(field.default, bool):
+        return "`true`, `false`"
+    if low is None and high is None:
+        return "any"
+    if high is None:
+        return f"{low:g} or more"
+    return f"up to {high:g}" if low is None else f"{low:g} to {high:g}"
+
+
+def toml(value: object) -> str:
+    """A default as TOML writes it."""
+    return f"`{str(value).lower()}`" if isinstance(value, bool) else f"`{value!r}`".replace("'", '"')
 
 
 def sections() -> dict[str, list[list[object]]]:
-    """Rows of the settings page by section."""
-    found: dict[str, list[list[object]]] = {}
-    for row in RunSettings.describe():
-        found.setdefault(row.section, []).append(
-            [f"`{row.name}`", f"`{row.default}`", row.unit, row.allowed, "yes" if row.changes_geometry else "no", row.doc]
-        )
-    return found
+    """Rows of the settings page by table of the settings file."""
+    kinds: dict[str, type[Parameters]] = {"settings": GeneralSettings}
+    kinds |= {f"settings.{name}": kind for name, kind in SECTIONS.items()}
+    kinds |= {f"settings.{name}": entry.settings_type for name, entry in METHODS.items()}
+    return {
+        name: [
+            [
+                f"`{field.name}`",
+                toml(field.default),
+                field.metadata["unit"],
+                allowed(field),
+                "yes" if field.metadata["changes_geometry"] else "no",
+                field.metadata["doc"],
+            ]
+            for field in dataclasses.fields(kind)
+        ]
+        for name, kind in kinds.items()
+    }
+
+
+def settings() -> str:
+    """The page of settings."""
+    lines = [
+        NOTE,
+        "# Settings",
+        "",
+        "A settings file is TOML with a table `[settings]` and one table a stage below it; it holds only what differs.",
+        "An unknown name or a value out of range is refused before anything runs, all faults at once:",
+        "",
+        "```toml",
+        "[settings]",
+        'method = "fuzzy-sart"',
+        "",
+        "[settings.candidates]",
+        "min_area_m2 = 15.0",
+        "```",
+        "",
+        "Values that cannot change results (*no* under *geometry*) are not part of the `settings_hash`.",
+        "",
+    ]
+    header = ["setting", "default", "unit", "allowed", "geometry", "meaning"]
+    for name, rows in sections().items():
+        lines += [f"## [{name}]", "", *table(header, rows), ""]
+    return "\n".join(lines)
+
+
+def validity() -> str:
+    """The page of validity codes: those of the checker's own docstring."""
+    codes = re.findall(r"^(\d{3})  +(.+)$", checker.__doc__ or "", re.MULTILINE)
+    tolerances: list[list[object]] = [
+        [f"`{field.name}`", toml(field.default), field.metadata["unit"], field.metadata["doc"]]
+        for field in dataclasses.fields(checker.ValidityTolerances)
+    ]
+    lines = [
+        NOTE,
+        "# Validity",
+        "",
+        "Every solid is judged after its coordinates were rounded to 1 mm, by the rules of ISO 19107 as Ledoux (2013)",
+        "and val3dity number them. A solid that breaks one is not delivered: simpler and finer forms of it are tried,",
+        "then a labelled LoD1.2 block takes its place, or the candidate is `failed`. What was wrong stays in the",
+        "record (`validity_codes`).",
+        "",
+        *table(["code", "fault"], [[code, fault] for code, fault in codes]),
+        "",
+        "The tolerances are val3dity's:",
+        "",
+        *table(["tolerance", "value", "unit", "meaning"], tolerances),
+    ]
+    return "\n".join(lines) + "\n"
 
 
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
     "command_line.md": command_line,
     "exit_codes.md": exit_codes,
+    "validity.md": validity,
 }
 """The generated pages by file name."""
 

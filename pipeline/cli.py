@@ -21,6 +21,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # rich would triple the time until help shows
 )
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document; events as JSON lines on stderr.")]
@@ -29,7 +30,7 @@ Crs = Annotated[
     str | None, typer.Option(metavar="EPSG:n", help="The inputs' CRS, where their header has none or a wrong one.")
 ]
 VerticalUnit = Annotated[
-    str | None, typer.Option(metavar="UNIT", help="Unit of elevations: metre, foot or us-foot; default as the header.")
+    str | None, typer.Option(metavar="UNIT", help="Unit of elevations: m, ft or us-ft; default as the header says.")
 ]
 Workers = Annotated[
     int, typer.Option(min=0, help="Processes of the embedded cluster; 0 runs serially in this process.")
@@ -57,9 +58,13 @@ def gablework(
 
 @app.command()
 def reconstruct(
-    tiles: Annotated[list[str], typer.Argument(metavar="TILES...", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")],
+    tiles: Annotated[
+        list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
+    ],
     out: Annotated[str, typer.Option(metavar="RUN", help="The run directory to write.")],
-    method: Annotated[str | None, typer.Option(metavar="METHOD", help="fuzzy-sart; default as the settings say.")] = None,
+    method: Annotated[
+        str | None, typer.Option(metavar="METHOD", help="fuzzy-sart; default as the settings say.")
+    ] = None,
     footprints: Annotated[
         str | None, typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, Shapefile) to model.")
     ] = None,
@@ -75,7 +80,9 @@ def reconstruct(
     classes: Annotated[
         str | None, typer.Option(metavar="trust|audit|ignore", help="What the file's own classes are worth.")
     ] = None,
-    settings: Annotated[str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")] = None,
+    settings: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")
+    ] = None,
     workers: Workers = 2,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
@@ -120,3 +127,43 @@ def _run_settings(path: str | None, **overrides: str | None) -> RunSettings:
 
     given = {name: value for name, value in overrides.items() if value is not None}
     return RunSettings.from_toml(path, given)
+
+
+@app.command()
+def inspect(
+    tile: Annotated[str, typer.Argument(metavar="TILE", help="A LAS, LAZ, COPC, PLY or ASCII file.")],
+    crs: Crs = None,
+    vertical_unit: VerticalUnit = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Tell what a tile holds and roughly what it takes; reads it once, streamed."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.inspection import inspect as inspect_tile
+        from pipeline.io.source import ReadOptions
+        from pipeline.runtime.events import Event
+
+        def on_progress(done: int, total: int) -> None:
+            console.on_event(Event(kind="progress", stage="read", done=done, total=total))
+
+        found = inspect_tile(tile, ReadOptions(crs=crs, vertical_unit=vertical_unit), on_progress)
+        for warning in found.warnings:
+            console.warn(warning)
+        console.table(tile, ["fact", "value"], found.rows())
+        shares = [[n, count, f"{100.0 * count / found.used_points:.1f} %"] for n, count in found.classes.items()]
+        console.table("Classes", ["class", "points", "share"], shares)
+        console.document(dataclasses.asdict(found))
+
+
+@app.command()
+def digest(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="A run directory.")],
+    as_json: AsJson = False,
+) -> None:
+    """Print the sha256 of a run's content, the same for all workers and tilings."""
+    with Console(as_json=as_json) as console:
+        from pipeline.runtime.digest import run_digest
+
+        content = run_digest(run)
+        console.say(content)
+        console.document({"run": run, "content_sha256": content})

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import sys
 import time
 import traceback
@@ -202,7 +203,7 @@ class Console:
     def document(self, content: Mapping[str, Any]) -> None:
         """Print the JSON document of `--json`; silent without."""
         if self.as_json:
-            print(json.dumps(content, indent=2, default=str), flush=True)
+            print(json.dumps(_json_value(content), indent=2, allow_nan=False), flush=True)
 
     def _tell_error(self, error: BaseException, code: ExitCode) -> None:
         message = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
@@ -239,6 +240,21 @@ def table_lines(title: str, header: Sequence[str], rows: Sequence[Sequence[objec
         ]
         lines.append(("  " + "  ".join(padded)).rstrip())
     return lines
+
+
+def _json_value(value: Any) -> Any:
+    """A value as JSON knows it: what is not finite becomes null, what is unknown its text.
+
+    >>> _json_value({"rmse_m": float("nan"), 3: (1, Ellipsis)})
+    {'rmse_m': None, '3': [1, 'Ellipsis']}
+    """
+    if isinstance(value, Mapping):
+        return {str(name): _json_value(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_value(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
 def _is_figure(text: str) -> bool:

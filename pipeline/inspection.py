@@ -11,6 +11,8 @@ import numpy as np
 
 from pipeline.io.source import ReadOptions, Source, SourceInfo, open_source
 from pipeline.model import FloatArray
+from pipeline.runtime.plan import make_plan
+from pipeline.settings import RunSettings
 
 RAISED_M = 2.5
 """Cells this far above the lowest surroundings count as raised."""
@@ -33,11 +35,7 @@ class Rates:
     seconds_per_object: float = 0.02
     """Reconstruction of a candidate, both cores busy."""
     gib_base: float = 0.45
-    """A worker with its libraries and kernels."""
-    gib_per_million_points: float = 0.25
-    """What a tile of the lattice adds to its worker for each million points in it, halo included."""
-    tile_million_points: float = 2.0
-    """Points of a tile of the lattice beyond which memory does not grow with the file."""
+    """A worker with its libraries and kernels; the largest task of the plan comes on top."""
 
 
 RATES = Rates()
@@ -75,6 +73,36 @@ class Inspection:
     estimated_gib: float
     """Peak memory of a worker process."""
 
+    def rows(self) -> list[tuple[str, str]]:
+        """The facts as pairs of name and value, for people."""
+        info, reference = self.info, self.info.reference
+        x0, y0, _, x1, y1, _ = info.bounds_m
+        kept_out = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in self.dropped.items() if n)
+        pulses = ", ".join(f"{n}: {100.0 * k / self.used_points:.0f} %" for n, k in self.returns.items())
+        acquired = "unknown"
+        if info.acquired_from is not None and info.acquired_to is not None:
+            acquired = f"{info.acquired_from:%Y-%m-%d} to {info.acquired_to:%Y-%m-%d}"
+        return [
+            ("format", f"{info.format}, {info.file_size / 1e6:.1f} MB"),
+            (
+                "points",
+                f"{self.used_points} used of {info.point_count}" + (f" (left out: {kept_out})" if kept_out else ""),
+            ),
+            ("CRS", reference.name if reference.epsg is None else f"{reference.name} (EPSG:{reference.epsg})"),
+            ("units", f"horizontal {reference.horizontal_unit_m:g} m, vertical {reference.vertical_unit_m:g} m"),
+            ("extent", f"{x1 - x0:.1f} x {y1 - y0:.1f} m"),
+            ("elevation", f"{self.elevation_m[0]:.2f} to {self.elevation_m[1]:.2f} m"),
+            ("density", f"{self.density_per_m2:.2f} points/m2 where there are points"),
+            ("returns a pulse", pulses),
+            ("acquired", acquired),
+            (
+                "raised objects",
+                f"{self.raised_objects} higher than {RAISED_M:g} m (trees too; touching houses are one)",
+            ),
+            ("estimated time", f"{self.estimated_seconds:.0f} s on two cores"),
+            ("estimated memory", f"{self.estimated_gib:.1f} GiB a worker"),
+        ]
+
 
 def inspect(path: str | Path, options: ReadOptions | None, on_progress: Callable[[int, int], None]) -> Inspection:
     """Read a tile once, streamed, and tell what it holds.
@@ -106,7 +134,8 @@ def inspect(path: str | Path, options: ReadOptions | None, on_progress: Callable
         lowest = min(lowest, float(cloud.xyz[:, 2].min()))
         highest = max(highest, float(cloud.xyz[:, 2].max()))
         on_progress(used, source.info.point_count)
-    return _told(source, raster, classes, returns, used, (lowest, highest))
+    plan = make_plan([str(path)], options or ReadOptions(), RunSettings())
+    return _told(source, raster, classes, returns, used, (lowest, highest), plan.window_bytes)
 
 
 def _told(
@@ -116,6 +145,7 @@ def _told(
     returns: np.ndarray[tuple[int], np.dtype[np.int64]],
     used: int,
     elevation_m: tuple[float, float],
+    window_bytes: int,
 ) -> Inspection:
     objects = raster.raised_objects()
     area = raster.occupied_area_m2()
@@ -135,7 +165,7 @@ def _told(
         estimated_seconds=RATES.seconds_start
         + RATES.seconds_per_million_points * millions
         + RATES.seconds_per_object * objects,
-        estimated_gib=RATES.gib_base + RATES.gib_per_million_points * min(millions, RATES.tile_million_points),
+        estimated_gib=RATES.gib_base + window_bytes / 2**30,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import traceback
 from collections.abc import Callable, Sequence
@@ -19,10 +20,9 @@ from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_parts, block_plane
 from pipeline.roof.footprint import hull_of_points, outline
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.plan import RoofPoints, level_dipping_faces, partition_roof, roof_points
+from pipeline.roof.plan import FORMS, RoofPoints, draw_plan, level_dipping_faces, partition_roof, roof_points
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.settings import RoofSettings
-from pipeline.roof.simplification import simplify_partition
 from pipeline.roof.solid import SolidPart, solid_parts
 
 __all__ = ["ReconstructSettings", "reconstruct_building"]
@@ -87,11 +87,8 @@ def _reconstruct(
     codes: tuple[int, ...] = ()
     try:
         segmentation = segment(candidate)
-        if len(segmentation.planes) == 0:
-            raise BuildingError(Reason.NO_PLANE, f"no plane in {len(candidate.points)} points")
         roof = roof_points(candidate, segmentation.labels, settings.roof)
-        if not (roof.labels >= 0).any():
-            raise BuildingError(Reason.NO_PLANE, f"none of {len(roof.points)} roof points lies on a plane")
+        _require_planes(segmentation, roof)
         partition = partition_roof(roof, segmentation.planes, settings.roof)
         parts, planes, codes = _own_solids(candidate, roof, partition, segmentation.planes, settings.roof)
         if parts:
@@ -107,6 +104,14 @@ def _reconstruct(
     )  # fmt: skip
 
 
+def _require_planes(segmentation: Segmentation, roof: RoofPoints) -> None:
+    """Raise where no roof point lies on a plane."""
+    if len(segmentation.planes) == 0 or not (roof.labels >= 0).any():
+        raise BuildingError(
+            Reason.NO_PLANE, f"{len(segmentation.planes)} planes; none explains any of {len(roof.points)} roof points"
+        )
+
+
 def _own_solids(
     candidate: Candidate,
     roof: RoofPoints,
@@ -115,15 +120,12 @@ def _own_solids(
     settings: RoofSettings,
 ) -> tuple[list[SolidPart], list[Plane], tuple[int, ...]]:
     """The first form of the method's solids that is valid throughout; no parts and all codes met where none is."""
-    tolerance = settings.simplification_spacings * roof.spacing_m
     codes: set[int] = set()
-    for factor in (1.0, 0.5, 0.1, 0.0):
+    for form in FORMS:
         try:
-            form = partition
-            if factor * tolerance > 0.0:
-                form = simplify_partition(partition, factor * tolerance, outline_too=roof.footprint_mm is None)
-            form, own_planes = level_dipping_faces(form, roof, planes, candidate.ground_z_m, settings)
-            parts = large_parts(solid_parts(form, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
+            plan = draw_plan(partition, roof, settings, form)
+            plan, own_planes = level_dipping_faces(plan, roof, planes, candidate.ground_z_m, settings)
+            parts = large_parts(solid_parts(plan, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
         except BuildingError:
             continue
         faults = {code for part in parts for code in check_solid(part.solid)}
@@ -192,9 +194,7 @@ def _result(
     used = sorted({face.plane for part in parts for face in part.faces})
     number = {plane: k for k, plane in enumerate(used)}
     delivered = tuple(planes[plane] for plane in used)
-    faces = tuple(
-        RoofFace(plane=number[face.plane], polygon=face.polygon) for part in parts for face in part.faces
-    )
+    faces = tuple(RoofFace(plane=number[face.plane], polygon=face.polygon) for part in parts for face in part.faces)
     solids = tuple(_renumbered(part.solid, number) for part in parts)
     footprint = _united([part.footprint for part in parts])
     summary = summarise(vertical_residuals(candidate.points, faces, delivered))
@@ -225,8 +225,6 @@ def _result(
 
 def _renumbered(solid: Solid, number: dict[int, int]) -> Solid:
     """The solid with other plane numbers."""
-    import dataclasses
-
     faces = tuple(dataclasses.replace(f, plane=number[f.plane]) if f.plane >= 0 else f for f in solid.faces)
     return Solid(vertices=solid.vertices, faces=faces)
 

@@ -52,7 +52,7 @@ def cityjson_lines(
     high = np.max([xyz.max(axis=0) for xyz in corners], axis=0) if corners else np.zeros(3)
     translate = [math.floor(v) for v in low]
     metadata: dict[str, Any] = {"title": title}
-    code = epsg_code(reference.projjson)
+    code = epsg_code(reference)
     if code is not None:
         metadata["referenceSystem"] = f"https://www.opengis.net/def/crs/EPSG/0/{code}"
     if corners:

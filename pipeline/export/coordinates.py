@@ -26,6 +26,10 @@ class SpatialReference(Protocol):
         """Metres in one unit of elevation."""
 
     @property
+    def epsg(self) -> int | None:
+        """EPSG code of the whole CRS, compound where it is; None where it has none."""
+
+    @property
     def projjson(self) -> dict[str, Any] | None:
         """The CRS as PROJJSON; None where it is unknown."""
 
@@ -85,12 +89,15 @@ def crs_geometry(geometry: Geometry, origin: tuple[float, float, float], referen
     return canonical
 
 
-def epsg_code(projjson: dict[str, Any] | None) -> int | None:
+def epsg_code(reference: SpatialReference) -> int | None:
     """The EPSG code of a CRS; of its horizontal part where a compound CRS has none; None where neither has one."""
-    while projjson is not None:
-        identifier = projjson.get("id") or {}
+    if reference.epsg is not None:
+        return reference.epsg
+    part = reference.projjson
+    while part is not None:
+        identifier = part.get("id") or {}
         if identifier.get("authority") == "EPSG" and str(identifier.get("code", "")).isdigit():
             return int(identifier["code"])
-        components = projjson.get("components") or []
-        projjson = components[0] if components else projjson.get("source_crs")
+        components = part.get("components") or []
+        part = components[0] if components else part.get("source_crs")
     return None

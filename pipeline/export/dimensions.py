@@ -176,7 +176,7 @@ def roof_percentiles(solids: Sequence[Solid], shares: Sequence[float]) -> tuple[
     total = below[-1]
     found = []
     for share in shares:
-        target = share * total
+        target = share * float(total)
         upper = int(np.searchsorted(below, target - 1e-9 * total))
         if upper == 0 or total <= 0.0:
             found.append(float(levels[min(upper, len(levels) - 1)]))

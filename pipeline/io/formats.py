@@ -85,11 +85,11 @@ def recognise_format(path: Path) -> str:
 
 
 def looks_like_points(head: bytes) -> bool:
-    """Whether text begins with rows of at least three numbers, after at most a few lines of header.
+    r"""Whether text begins with rows of at least three numbers, after at most a few lines of header.
 
-    >>> looks_like_points(b"x,y,z\\n1.0,2.0,3.0\\n4,5,6\\n")
+    >>> looks_like_points(b"x,y,z\n1.0,2.0,3.0\n4,5,6\n")
     True
-    >>> looks_like_points(b"Read me first\\nThe data are ...\\n")
+    >>> looks_like_points(b"Read me first\nThe data are ...\n")
     False
     """
     for line in head.split(b"\n")[:20]:
@@ -135,7 +135,7 @@ def _files_of(entry: str | Path) -> list[Path]:
     if path.is_dir():
         return _files_in(path)
     if not path.exists() and glob.has_magic(str(entry)):
-        met = [Path(name) for name in glob.glob(str(entry), recursive=True)]
+        met = [Path(name) for name in glob.glob(str(entry), recursive=True)]  # noqa: PTH207 - pathlib knows no absolute patterns
         files = [file for file in met if file.is_file()]
         if not files:
             raise UnreadableInputError(str(entry), "the pattern meets no files", "Check the pattern and the folder")

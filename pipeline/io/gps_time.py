@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import datetime
+import datetime as dt
 from enum import StrEnum
 
 SECONDS_PER_WEEK = 604_800.0
 ADJUSTMENT_S = 1e9
 """What LAS subtracts from the seconds since 1980-01-06 to keep digits (LAS 1.4 R15, global encoding bit 0)."""
-GPS_EPOCH = datetime.datetime(1980, 1, 6, tzinfo=datetime.UTC)
+GPS_EPOCH = dt.datetime(1980, 1, 6, tzinfo=dt.UTC)
 
 LEAP_SECONDS = (
-    (datetime.datetime(2017, 1, 1, tzinfo=datetime.UTC), 18),
-    (datetime.datetime(2015, 7, 1, tzinfo=datetime.UTC), 17),
-    (datetime.datetime(2012, 7, 1, tzinfo=datetime.UTC), 16),
-    (datetime.datetime(2009, 1, 1, tzinfo=datetime.UTC), 15),
-    (datetime.datetime(2006, 1, 1, tzinfo=datetime.UTC), 14),
-    (datetime.datetime(1999, 1, 1, tzinfo=datetime.UTC), 13),
+    (dt.datetime(2017, 1, 1, tzinfo=dt.UTC), 18),
+    (dt.datetime(2015, 7, 1, tzinfo=dt.UTC), 17),
+    (dt.datetime(2012, 7, 1, tzinfo=dt.UTC), 16),
+    (dt.datetime(2009, 1, 1, tzinfo=dt.UTC), 15),
+    (dt.datetime(2006, 1, 1, tzinfo=dt.UTC), 14),
+    (dt.datetime(1999, 1, 1, tzinfo=dt.UTC), 13),
 )
-"""Seconds that GPS time is ahead of UTC since a date, newest first (IERS Bulletin C); 12 before, good to a second or so."""
+"""Seconds that GPS time is ahead of UTC since a date, newest first (IERS Bulletin C); 12 before."""
 
 
 class GpsTimeKind(StrEnum):
@@ -53,20 +53,20 @@ def kind_of(smallest_s: float, largest_s: float, *, flagged_as_adjusted: bool) -
     if within_a_week:
         return GpsTimeKind.UNKNOWN if flagged_as_adjusted else GpsTimeKind.WEEK
     # Airborne laser scanning begins in the 1990s, and 1e9 adjusted seconds is the year 2043.
-    if -7e8 <= smallest_s and largest_s < ADJUSTMENT_S:
+    if smallest_s >= -7e8 and largest_s < ADJUSTMENT_S:
         return GpsTimeKind.ADJUSTED
     return GpsTimeKind.UNKNOWN
 
 
-def utc_of(adjusted_s: float) -> datetime.datetime:
+def utc_of(adjusted_s: float) -> dt.datetime:
     """UTC of an adjusted standard GPS time.
 
     >>> utc_of(297417271.0).isoformat()
-    '2021-02-16T07:47:33+00:00'
+    '2021-02-15T09:40:53+00:00'
     """
-    gps = GPS_EPOCH + datetime.timedelta(seconds=adjusted_s + ADJUSTMENT_S)
+    gps = GPS_EPOCH + dt.timedelta(seconds=adjusted_s + ADJUSTMENT_S)
     for since, seconds in LEAP_SECONDS:
-        utc = gps - datetime.timedelta(seconds=seconds)
+        utc = gps - dt.timedelta(seconds=seconds)
         if utc >= since:
             return utc
-    return gps - datetime.timedelta(seconds=12)
+    return gps - dt.timedelta(seconds=12)

@@ -20,7 +20,7 @@ from laspy.point.record import PackedPointRecord
 from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.io import copc
 from pipeline.io.gps_time import GpsTimeKind, kind_of
-from pipeline.io.las_header import REWRITE, HeaderBlock, header_crs, read_header_block
+from pipeline.io.las_header import REWRITE, header_crs, read_header_block
 from pipeline.io.laz_chunks import CHUNK_SIZE_LIMIT, ChunkTable, check_last_chunk, read_chunk_table
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
 
@@ -171,8 +171,8 @@ class LasFile:
         try:
             if self._chunks is not None:
                 decoder.decompress_many(raw)
-            elif decoder.readinto(memoryview(raw)) != len(raw):
-                raise EOFError("the file ends")
+            else:
+                read_exactly(decoder, raw)
         except (*DECODING_ERRORS, EOFError) as fault:
             raise self._broken(fault, f"between points {begin} and {begin + count}") from fault
         return raw
@@ -269,3 +269,15 @@ class LasFile:
                 lows, highs = np.minimum(lows, piece.xyz.min(axis=0)), np.maximum(highs, piece.xyz.max(axis=0))
         x_min, y_min, z_min, x_max, y_max, z_max = (float(value) for value in (*lows, *highs))
         return x_min, y_min, z_min, x_max, y_max, z_max
+
+
+def read_exactly(stream: io.BufferedReader, into: npt.NDArray[np.uint8]) -> None:
+    """Fill an array from a stream.
+
+    Raises
+    ------
+    EOFError
+        If the stream ends before.
+    """
+    if stream.readinto(into.data) != len(into):
+        raise EOFError("the file ends")

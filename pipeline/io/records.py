@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
+import datetime as dt
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Protocol
 
@@ -90,7 +90,7 @@ class FileFacts:
     """How to read the GPS times."""
     gps_time_range: tuple[float, float] | None = None
     """Smallest and largest sampled GPS time, seconds as in the file."""
-    created: datetime.date | None = None
+    created: dt.date | None = None
     """Day on which the file was made, which is not the day of the flight."""
     warnings: tuple[str, ...] = ()
     """What is odd but usable, one sentence each."""

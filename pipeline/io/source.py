@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
+import datetime as dt
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
@@ -105,11 +105,11 @@ class SourceInfo:
     """Whether sampled points carry differing GPS times."""
     gps_time_kind: GpsTimeKind
     """How to read the GPS times."""
-    acquired_from: datetime.datetime | None
+    acquired_from: dt.datetime | None
     """Earliest sampled time, UTC; None unless the file has adjusted standard GPS times."""
-    acquired_to: datetime.datetime | None
+    acquired_to: dt.datetime | None
     """Latest sampled time, UTC."""
-    created: datetime.date | None
+    created: dt.date | None
     """Day on which the file was made, which says nothing about the flight."""
     warnings: tuple[str, ...]
     """What is odd but usable, one sentence each."""
@@ -123,8 +123,22 @@ def _open_las(path: Path, _options: ReadOptions) -> PointFile:
     return LasFile(path)
 
 
+def _open_ply(path: Path, _options: ReadOptions) -> PointFile:
+    from pipeline.io.ply import PlyFile
+
+    return PlyFile(path)
+
+
+def _open_ascii(path: Path, options: ReadOptions) -> PointFile:
+    from pipeline.io.ascii import AsciiFile
+
+    return AsciiFile(path, options.ascii_columns)
+
+
 READERS: dict[str, Callable[[Path, ReadOptions], PointFile]] = {
     "las": _open_las,
+    "ply": _open_ply,
+    "ascii": _open_ascii,
 }
 """The reader of each format; imports wait until a file of the format is opened."""
 
@@ -314,8 +328,11 @@ def _select(records: PointRecords, keep: BoolArray) -> PointRecords:
     """The records of a mask; the very same where it keeps all."""
     if keep.all():
         return records
-    arrays = {field.name: getattr(records, field.name) for field in dataclasses.fields(records)}
-    return PointRecords(**{name: None if array is None else array[keep] for name, array in arrays.items()})
+    arrays: dict[str, Any] = {}
+    for field in dataclasses.fields(records):
+        array = getattr(records, field.name)
+        arrays[field.name] = None if array is None else array[keep]
+    return PointRecords(**arrays)
 
 
 def _to_cloud(records: PointRecords, factors: np.ndarray[tuple[int], np.dtype[np.float64]]) -> PointCloud:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -90,4 +89,4 @@ class ReconstructSettings:
         if not isinstance(settings, method.settings_type):
             wanted, got = method.settings_type.__name__, type(settings).__name__
             raise SettingsError([f"the settings of {method.name} are {got}: use {wanted}"])
-        return functools.partial(method.segment, settings=settings)
+        return lambda candidate: method.segment(candidate, settings)

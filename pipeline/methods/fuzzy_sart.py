@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily
 
 from pipeline.errors import BuildingError
 from pipeline.geometry import (
@@ -36,6 +35,11 @@ from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, desc
 from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
 from pipeline.segmentation.surrounding_ground import far_from
 from pipeline.terrain.height_rule import facets_above_z_avg
+from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily
+from pipeline.tin.predicates import MAX_EXTENT_MM
+
+_MAX_EXTENT_M = MAX_EXTENT_MM / 1000.0 - 10.0
+"""The TIN's limit, less its margins."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -148,13 +152,14 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     BuildingError
         Reason ``too_few_points`` below the fewest points of a plane; ``too_complex`` beyond a limit of work.
     """
-    if len(candidate.points) < settings.least_points:
-        raise BuildingError(
-            Reason.TOO_FEW_POINTS, f"{len(candidate.points)} points, least_points is {settings.least_points}"
-        )
     points, shift = _local_metres(candidate.points)
     visible = np.flatnonzero(top_visible(points))
     roof = points[visible]
+    if len(roof) < settings.least_points:
+        raise BuildingError(
+            Reason.TOO_FEW_POINTS,
+            f"{len(roof)} of {len(points)} points are visible from above, least_points is {settings.least_points}",
+        )
     spacing_m = point_spacing_m(roof)
     sigma_m = noise_sigma_m(roof)
     neighbours = nearest_neighbours(roof, settings.neighbours)
@@ -162,9 +167,9 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
 
     # 3.1: the TIN of the building with its ground; points near a facet are absorbed by it.
     ground = _ground_around(candidate, shift, roof, spacing_m)
-    greedy = insert_greedily(
-        np.concatenate([roof, ground]), settings.insertion(sigma_m), candidate.ground_z_m - float(shift[2])
-    )
+    building_with_ground = np.concatenate([roof, ground])
+    _check_extent(building_with_ground)
+    greedy = insert_greedily(building_with_ground, settings.insertion(sigma_m), candidate.ground_z_m - float(shift[2]))
     facets = greedy.tin.facets
     normals = facet_normals(greedy.vertices, facets)
     areas_m2 = facet_areas_m2(greedy.vertices, facets)
@@ -191,7 +196,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
         neighbours,
         rough,
         distance_m=distance_m,
-        fewest_points=settings.fewest_points(1.0 / spacing_m**2),
+        fewest_points=settings.fewest_points(spacing_m),
         settings=settings,
     )
     reach_m = settings.ridge_reach_spacings * spacing_m
@@ -209,6 +214,15 @@ def _local_metres(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     millimetres = np.rint(points * 1000.0).astype(np.int64)
     shift_m = millimetres.min(axis=0) // 1000
     return (millimetres - shift_m * 1000) / 1000.0, shift_m.astype(np.float64)
+
+
+def _check_extent(points: FloatArray) -> None:
+    """Refuse what no single TIN can hold."""
+    extent_m = float(np.ptp(points[:, :2], axis=0).max())
+    if extent_m > _MAX_EXTENT_M:
+        raise BuildingError(
+            Reason.TOO_COMPLEX, f"the candidate extends over {extent_m:.0f} m, a TIN over at most {_MAX_EXTENT_M:.0f} m"
+        )
 
 
 def _ground_around(candidate: Candidate, shift: FloatArray, roof: FloatArray, spacing_m: float) -> FloatArray:

@@ -54,8 +54,8 @@ def _top_surface(
     for i in range(n):
         x = px[i]
         y = py[i]
-        column = int(math.floor((x - low_x) / cell))
-        row = int(math.floor((y - low_y) / cell))
+        column = math.floor((x - low_x) / cell)
+        row = math.floor((y - low_y) / cell)
         if column < 0 or row < 0 or column >= columns or row >= rows:
             continue
         k = row * columns + column
@@ -96,10 +96,10 @@ def _faces_of_cells(
             faces = np.empty(starts[-1], np.int64)
             filled = starts[:-1].copy()
         for f in range(len(boxes)):
-            c0 = int(math.floor((boxes[f, 0] - low_x) / cell))
-            r0 = int(math.floor((boxes[f, 1] - low_y) / cell))
-            c1 = min(columns - 1, int(math.floor((boxes[f, 2] - low_x) / cell)))
-            r1 = min(rows - 1, int(math.floor((boxes[f, 3] - low_y) / cell)))
+            c0 = math.floor((boxes[f, 0] - low_x) / cell)
+            r0 = math.floor((boxes[f, 1] - low_y) / cell)
+            c1 = min(columns - 1, math.floor((boxes[f, 2] - low_x) / cell))
+            r1 = min(rows - 1, math.floor((boxes[f, 3] - low_y) / cell))
             for r in range(r0, r1 + 1):
                 for c in range(c0, c1 + 1):
                     if turn == 0:
@@ -224,4 +224,3 @@ def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummar
         coverage=covered / n,
         n_points=n,
     )
-

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pipeline.model import BoolArray, IntArray
+from pipeline.model import IntArray
 from pipeline.triangulation import turn_of
 
 RING_SELF_INTERSECTION = 104
@@ -237,12 +237,7 @@ def polygon_code(flat: IntArray, ids: IntArray, ring_offsets: IntArray) -> int:
 @njit(cache=True, nogil=True)
 def has_repeated_neighbours(ids: IntArray, start: int, stop: int) -> bool:
     """Whether two consecutive corners of the ring start:stop are the same vertex (code 102)."""
+    repeated = False
     for i in range(start, stop):
-        if ids[i] == ids[i + 1 if i + 1 < stop else start]:
-            return True
-    return False
-
-
-def codes_of(found: BoolArray) -> tuple[int, ...]:
-    """The numbers of the True entries, ascending."""
-    return tuple(int(code) for code in np.flatnonzero(found))
+        repeated = repeated or ids[i] == ids[i + 1 if i + 1 < stop else start]
+    return repeated

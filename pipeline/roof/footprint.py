@@ -85,9 +85,7 @@ def clip_partition(partition: RoofPartition, footprint_mm: MultiPolygon, minimum
     return RoofPartition(polygons=tuple(pieces), labels=np.array(labels, np.int32))
 
 
-def _absorb_small(
-    pieces: list[Polygon], labels: list[int], minimum_area_mm2: float
-) -> tuple[list[Polygon], list[int]]:
+def _absorb_small(pieces: list[Polygon], labels: list[int], minimum_area_mm2: float) -> tuple[list[Polygon], list[int]]:
     """Unite pieces that are too small with a neighbour, smallest first."""
     alive = [True] * len(pieces)
     small = [k for k in range(len(pieces)) if pieces[k].area < minimum_area_mm2]

@@ -44,8 +44,8 @@ def _nearest(x: IntArray, y: IntArray, query_x: IntArray, query_y: IntArray, cel
         best = squared[q]
         index = -1
         # rings of cells around the query's own; those before the grid begins are skipped
-        first = max(0, max(max(-column, column - columns + 1), max(-row, row - rows + 1)))
-        last = max(max(column, columns - 1 - column), max(row, rows - 1 - row))
+        first = max(0, -column, column - columns + 1, -row, row - rows + 1)
+        last = max(column, columns - 1 - column, row, rows - 1 - row)
         for ring in range(first, last + 1):
             if ring > 0 and best <= ((ring - 1) * cell) ** 2:
                 break
@@ -112,7 +112,9 @@ def fill_labels(xy_mm: IntArray, labels: LabelArray) -> LabelArray:
     return filled
 
 
-def empty_samples(xy_mm: IntArray, low: IntArray, high: IntArray, pitch_mm: int, gap_m: float) -> tuple[IntArray, LabelArray, FloatArray]:
+def empty_samples(
+    xy_mm: IntArray, low: IntArray, high: IntArray, pitch_mm: int, gap_m: float
+) -> tuple[IntArray, LabelArray, FloatArray]:
     """Lattice samples around and between the points, where no point is near.
 
     The lattice hangs on its lower left corner: tied to the points, it moves with them.

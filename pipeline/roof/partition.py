@@ -9,6 +9,8 @@ border can pinch (Lorensen and Cline 1987 in the plane, with many labels).
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 
 import numpy as np
 import shapely
@@ -206,8 +208,8 @@ def _cut_fraction(
     if (d0 < 0.0 < d1) or (d1 < 0.0 < d0):
         return min(max(d0 / (d0 - d1), 0.03), 0.97)
     # the planes cross shortly beyond one end: the border hugs that end; a step lies in the middle
-    length = np.sqrt(float((x1 - x0) ** 2 + (y1 - y0) ** 2)) * 1e-3
-    if min(abs(d0), abs(d1)) < 0.3 * np.sqrt(da * da + db * db) * length:
+    length = math.sqrt(float((x1 - x0) ** 2 + (y1 - y0) ** 2)) * 1e-3
+    if min(abs(d0), abs(d1)) < 0.3 * math.sqrt(da * da + db * db) * length:
         return 0.03 if abs(d0) < abs(d1) else 0.97
     return 0.5
 
@@ -220,7 +222,7 @@ def _meeting_point(
 
     `vx`, `vy` are the corners, `mx`, `my` the cuts after each corner.
     """
-    if min(lab[0], min(lab[1], lab[2])) >= 0:
+    if min(lab[0], lab[1], lab[2]) >= 0:
         a1 = planes[lab[0], 0] - planes[lab[1], 0]
         b1 = planes[lab[0], 1] - planes[lab[1], 1]
         c1 = planes[lab[0], 2] - planes[lab[1], 2]
@@ -327,9 +329,7 @@ def _march(
     return nodes[:count].copy(), np.array(ring_starts, np.int32), np.array(ring_regions, np.int32)
 
 
-def march(
-    xy_mm: IntArray, tin: Tin, labels: LabelArray, planes: FloatArray, outside_fraction: float
-) -> RoofPartition:
+def march(xy_mm: IntArray, tin: Tin, labels: LabelArray, planes: FloatArray, outside_fraction: float) -> RoofPartition:
     """Cut the plan into one polygon a connected region of equal labels.
 
     Parameters
@@ -398,5 +398,5 @@ def _polygons(
     rings = [shapely.linearrings(nodes[ring_starts[r] : ring_starts[r + 1]]) for r in order]
     owners = ring_regions[order]
     bounds = [0, *(np.flatnonzero(np.diff(owners)) + 1).tolist(), len(rings)]
-    polygons = [shapely.Polygon(rings[i], rings[i + 1 : j]) for i, j in zip(bounds[:-1], bounds[1:], strict=True)]
+    polygons = [shapely.Polygon(rings[i], rings[i + 1 : j]) for i, j in itertools.pairwise(bounds)]
     return RoofPartition(polygons=tuple(polygons), labels=label_of_region[owners[bounds[:-1]]])

@@ -6,15 +6,17 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
 from pipeline.geometry import point_spacing_m, top_visible
-from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Reason, Segmentation
-from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint
+from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
+from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, polygons_of
 from pipeline.roof.labelling import empty_samples, fill_labels
 from pipeline.roof.partition import OUTSIDE, RoofPartition, absorb_small_regions, march
 from pipeline.roof.settings import RoofSettings
+from pipeline.roof.simplification import simplify_partition, unite_close_vertices
 from pipeline.tin.delaunay import triangulate, unique_xy
 
 _PITCH_SPACINGS = 1.2
@@ -91,7 +93,7 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     """Cut the plan into roof faces.
 
     Without a footprint the eave lies between roof points and the empty places around them. With one, the faces are
-    continued beyond it and clipped, so that the walls stand exactly on it.
+    continued beyond it, to be clipped: so the walls will stand exactly on it.
 
     Parameters
     ----------
@@ -105,7 +107,7 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     Returns
     -------
     RoofPartition
-        A coverage in integer millimetres, not yet simplified.
+        A coverage in integer millimetres, neither clipped nor simplified: see `draw_plan`.
 
     Raises
     ------
@@ -150,9 +152,66 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
         area,
         settings.minimum_void_m2,
     )
-    partition = march(xy_mm, tin, all_labels, coefficients, settings.outside_fraction)
+    return march(xy_mm, tin, all_labels, coefficients, settings.outside_fraction)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanForm:
+    """One way to draw the final plan: the forms are tried one after another until the solid is valid."""
+
+    simplification: float
+    """Times the simplification of the settings."""
+    shrink_mm: float
+    """By how much the footprint is drawn back, so that it passes by vertices that it touched."""
+    unite_mm: float
+    """Clipped vertices closer than this are one."""
+
+
+FORMS = (
+    PlanForm(simplification=1.0, shrink_mm=0.0, unite_mm=10.0),
+    PlanForm(simplification=1.0, shrink_mm=0.0, unite_mm=2.5),
+    PlanForm(simplification=1.0, shrink_mm=7.0, unite_mm=2.5),
+    PlanForm(simplification=0.4, shrink_mm=16.0, unite_mm=2.5),
+    PlanForm(simplification=0.1, shrink_mm=29.0, unite_mm=2.5),
+    PlanForm(simplification=0.0, shrink_mm=0.0, unite_mm=0.0),
+)
+"""From the one that is wanted to the one that is most likely to succeed."""
+
+
+def draw_plan(partition: RoofPartition, roof: RoofPoints, settings: RoofSettings, form: PlanForm) -> RoofPartition:
+    """Clip a partition by the footprint, if there is one, and simplify its borders.
+
+    Parameters
+    ----------
+    partition : RoofPartition
+        From `partition_roof`.
+    roof : RoofPoints
+        The footprint and the spacing.
+    settings : RoofSettings
+        Areas and the simplification.
+    form : PlanForm
+        How.
+
+    Returns
+    -------
+    RoofPartition
+        In integer millimetres.
+
+    Raises
+    ------
+    BuildingError
+        `no_partition` where this form cannot be drawn.
+    """
     if roof.footprint_mm is not None:
-        partition = clip_partition(partition, roof.footprint_mm, area)
+        footprint = roof.footprint_mm
+        if form.shrink_mm > 0.0:
+            drawn_back = shapely.set_precision(shapely.buffer(footprint, -form.shrink_mm, join_style="mitre"), 1.0)
+            footprint = MultiPolygon(polygons_of(drawn_back))
+        partition = clip_partition(partition, footprint, minimum_face_area(roof, settings))
+        partition = unite_close_vertices(partition, form.unite_mm)
+    tolerance = form.simplification * settings.simplification_spacings * roof.spacing_m
+    if tolerance > 0.0:
+        partition = simplify_partition(partition, tolerance, outline_too=roof.footprint_mm is None)
     return partition
 
 
@@ -168,8 +227,14 @@ def _frame(low: IntArray, high: IntArray, margin: int) -> IntArray:
     bulge = margin // 2
     return np.array(
         [
-            (x[0], y[0]), (x[1], y[0] - bulge), (x[2], y[0]), (x[2] + bulge, y[1]),
-            (x[2], y[2]), (x[1], y[2] + bulge), (x[0], y[2]), (x[0] - bulge, y[1]),
+            (x[0], y[0]),
+            (x[1], y[0] - bulge),
+            (x[2], y[0]),
+            (x[2] + bulge, y[1]),
+            (x[2], y[2]),
+            (x[1], y[2] + bulge),
+            (x[0], y[2]),
+            (x[0] - bulge, y[1]),
         ],
         np.int64,
     )
@@ -200,8 +265,6 @@ def level_dipping_faces(
     planes : list of Plane
         The old ones and the new ones behind them.
     """
-    import shapely
-
     labels = partition.labels.copy()
     extended = list(planes)
     lowest = ground_z_m + settings.minimum_clearance_m

@@ -22,7 +22,11 @@ class RoofTypeSettings(Parameters):
         7.0, "A roof plane with less slope is flat.", unit="deg", minimum=0.5, maximum=20.0
     )
     aspect_tolerance_deg: float = parameter(
-        20.0, "Sides are opposite where their aspects are 180 degrees apart within this.", unit="deg", minimum=1.0, maximum=45.0
+        20.0,
+        "Sides are opposite where their aspects are 180 degrees apart within this.",
+        unit="deg",
+        minimum=1.0,
+        maximum=45.0,
     )
     slope_tolerance_deg: float = parameter(
         10.0, "Slopes within this are similar.", unit="deg", minimum=1.0, maximum=45.0

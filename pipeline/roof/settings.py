@@ -11,17 +11,17 @@ from pipeline.parameters import Parameters, parameter
 class RoofSettings(Parameters):
     """How roof planes become roof faces and closed solids."""
 
-    minimum_points: int = parameter(
-        10, "A candidate with fewer roof points is not modelled.", minimum=3, maximum=1000
-    )
-    maximum_points: int = parameter(
-        4_000_000, "A candidate with more points is refused as too complex.", minimum=1000
-    )
+    minimum_points: int = parameter(10, "A candidate with fewer roof points is not modelled.", minimum=3, maximum=1000)
+    maximum_points: int = parameter(4_000_000, "A candidate with more points is refused as too complex.", minimum=1000)
     minimum_roof_height_m: float = parameter(
         1.5, "Points lower than this above the floor are no roof points.", unit="m", minimum=0.2, maximum=10.0
     )
     gap_spacings: float = parameter(
-        1.3, "A place farther than this from every roof point is not roof.", unit="point spacings", minimum=0.7, maximum=5.0
+        1.3,
+        "A place farther than this from every roof point is not roof.",
+        unit="point spacings",
+        minimum=0.7,
+        maximum=5.0,
     )
     outside_fraction: float = parameter(
         0.3,

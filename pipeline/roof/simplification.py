@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import shapely
 
 from pipeline.errors import BuildingError
-from pipeline.model import Reason
+from pipeline.model import FloatArray, Reason
 from pipeline.roof.partition import RoofPartition
 
 
@@ -42,3 +44,50 @@ def simplify_partition(partition: RoofPartition, tolerance_m: float, *, outline_
     if shapely.is_empty(polygons).any() or (shapely.get_type_id(polygons) != shapely.GeometryType.POLYGON).any():
         raise BuildingError(Reason.NO_PARTITION, f"a roof face vanished when simplified by {tolerance_m:g} m")
     return RoofPartition(polygons=tuple(polygons), labels=partition.labels)
+
+
+def unite_close_vertices(partition: RoofPartition, distance_mm: float) -> RoofPartition:
+    """Make one of border vertices that lie closer than a distance, the same in every polygon.
+
+    Where a clipped border passes close by a corner of the footprint, two vertices can lie a millimetre apart: distinct
+    here, the same for whoever reads the model with a tolerance.
+
+    Parameters
+    ----------
+    partition : RoofPartition
+        A coverage in integer millimetres.
+    distance_mm : float
+        Vertices at most this far apart are one; the leftmost of a group stands for it.
+
+    Returns
+    -------
+    RoofPartition
+        Without polygons that vanished. The same object where no vertices are close.
+
+    Raises
+    ------
+    BuildingError
+        `no_partition` where a polygon breaks.
+    """
+    polygons = np.array(partition.polygons, dtype=object)
+    vertices = np.unique(shapely.get_coordinates(polygons), axis=0)
+    representative: dict[tuple[float, float], tuple[float, float]] = {}
+    points: list[tuple[float, float]] = [(x, y) for x, y in vertices.tolist()]
+    for i, first in enumerate(points):
+        for j in range(i + 1, len(points)):
+            second = points[j]
+            if second[0] - first[0] > distance_mm:
+                break
+            if math.hypot(second[0] - first[0], second[1] - first[1]) <= distance_mm and second not in representative:
+                representative[second] = representative.get(first, first)
+    if not representative:
+        return partition
+
+    def moved(xy: FloatArray) -> FloatArray:
+        return np.array([representative.get((x, y), (x, y)) for x, y in xy.tolist()]).reshape(-1, 2)
+
+    united = shapely.remove_repeated_points(shapely.transform(polygons, moved))
+    kept = ~shapely.is_empty(united)
+    if not shapely.is_valid(united[kept]).all() or not kept.any():
+        raise BuildingError(Reason.NO_PARTITION, f"a roof face breaks when vertices within {distance_mm:g} mm are one")
+    return RoofPartition(polygons=tuple(united[kept]), labels=partition.labels[kept])

@@ -210,9 +210,7 @@ class _Levels:
                 middle = 0.5 * (touching[end][left] + touching[end][right])
                 touching[end][left] = touching[end][right] = middle
 
-    def _stack(
-        self, xy: tuple[int, int], v: int, heights: dict[int, float], floor: int | None, lowest: int
-    ) -> None:
+    def _stack(self, xy: tuple[int, int], v: int, heights: dict[int, float], floor: int | None, lowest: int) -> None:
         """Make the solid vertices over plan vertex `v`."""
         line: list[int] = []
         if floor is not None:
@@ -267,9 +265,7 @@ def _trace(following: dict[int, int], xy: Sequence[tuple[int, int]]) -> list[Rin
         rings.append(ring)
 
     def twice_area(ring: Ring) -> int:
-        return sum(
-            xy[a][0] * xy[b][1] - xy[b][0] * xy[a][1] for a, b in zip(ring, ring[1:] + ring[:1], strict=True)
-        )
+        return sum(xy[a][0] * xy[b][1] - xy[b][0] * xy[a][1] for a, b in zip(ring, ring[1:] + ring[:1], strict=True))
 
     rings.sort(key=twice_area)
     if sum(twice_area(ring) < 0 for ring in rings) != 1:

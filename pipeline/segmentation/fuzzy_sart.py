@@ -60,7 +60,7 @@ class FuzzySartClusteringSettings(Parameters):
     scaled_minimum: float = parameter(
         0.0, "Lower end of the one range, up to 1, of spherical_scaled vectors.", minimum=0.0, maximum=1.0
     )
-    work_limit: int = parameter(
+    clustering_work_limit: int = parameter(
         1_500_000_000,
         "Comparisons of a vector with a neuron after which a building is given up as too complex.",
         minimum=1,
@@ -213,7 +213,7 @@ def cluster(vectors: FloatArray, areas_m2: FloatArray, settings: FuzzySartCluste
     Raises
     ------
     BuildingError
-        Reason ``too_complex`` where more than ``work_limit`` comparisons would be needed.
+        Reason ``too_complex`` where more than ``clustering_work_limit`` comparisons would be needed.
     """
     order = np.argsort(-areas_m2, kind="stable")
     labels, templates, epochs, work = _learn(
@@ -226,13 +226,13 @@ def cluster(vectors: FloatArray, areas_m2: FloatArray, settings: FuzzySartCluste
         settings.learning_rate_end,
         settings.neighbourhood_start,
         settings.neighbourhood_end,
-        settings.work_limit,
+        settings.clustering_work_limit,
     )
-    if work > settings.work_limit:
+    if work > settings.clustering_work_limit:
         raise BuildingError(
             Reason.TOO_COMPLEX,
             f"Fuzzy SART stood at {work} comparisons of {len(vectors)} facets with {len(templates)} clusters, "
-            f"work_limit is {settings.work_limit}",
+            f"clustering_work_limit is {settings.clustering_work_limit}",
         )
     return Clustering(labels=labels, templates=templates, epochs=int(epochs))
 
@@ -373,14 +373,13 @@ def _degree(
     vigilance: float,
 ) -> float:
     """VDM of neuron k and vector i (Eq. 3), or -1 where it is certain to stay below the vigilance."""
-    if template_module[k] < _ZERO_MODULE:
+    # Both bounds are tested by multiplication first: nearly all comparisons end here.
+    t_module = template_module[k]
+    x_module = module[i]
+    if t_module < _ZERO_MODULE or min(t_module, x_module) < vigilance * max(t_module, x_module):
         return -1.0
-    modules = _module_degree(template_module[k], module[i])
-    if modules < vigilance:
+    dot = template[k, 0] * vectors[i, 0] + template[k, 1] * vectors[i, 1] + template[k, 2] * vectors[i, 2]
+    modules = t_module * x_module
+    if dot < least_cosine * modules:
         return -1.0
-    cosine = (template[k, 0] * vectors[i, 0] + template[k, 1] * vectors[i, 1] + template[k, 2] * vectors[i, 2]) / (
-        template_module[k] * module[i]
-    )
-    if cosine < least_cosine:
-        return -1.0
-    return modules * _angle_degree(cosine)
+    return float(_module_degree(t_module, x_module) * _angle_degree(dot / modules))

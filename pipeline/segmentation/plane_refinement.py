@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from pipeline.errors import BuildingError
-from pipeline.model import BoolArray, FloatArray, LabelArray, Plane, Reason
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.parameters import Parameters, parameter
 from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_reach, touching_pairs
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
@@ -37,8 +37,12 @@ class PlaneRefinementSettings(Parameters):
         "Which planes a point chooses among: those of its neighbours, or all planes of the building (the nearest).",
         choices=("neighbours", "all_planes"),
     )
-    points_per_density: float = parameter(
-        1.5, "Fewest points of a plane are those of this area.", unit="m2", minimum=0.0, maximum=1000.0
+    least_area_m2: float = parameter(
+        1.5,
+        "A plane has at least as many points as this area holds in plan, within the two bounds below.",
+        unit="m2",
+        minimum=0.0,
+        maximum=1000.0,
     )
     least_points: int = parameter(6, "Fewest points of a plane, however sparse the cloud.", minimum=3, maximum=10_000)
     most_least_points: int = parameter(
@@ -77,22 +81,36 @@ class PlaneRefinementSettings(Parameters):
         minimum=0.0,
         maximum=1e6,
     )
-    work_limit: int = parameter(
+    plane_cost: float = parameter(
+        6.0,
+        "A plane stays if without it this many points more would be unexplained; a point that another plane explains "
+        "badly counts in part.",
+        unit="points",
+        minimum=0.0,
+        maximum=1e6,
+    )
+    refinement_work_limit: int = parameter(
         200_000_000,
         "Comparisons of planes with planes, and of points with all planes, after which a building is too complex.",
         minimum=1,
         maximum=10**15,
     )
 
-    def fewest_points(self, density_per_m2: float) -> int:
-        """Fewest points of a plane at a density."""
-        return int(min(max(self.points_per_density * density_per_m2, self.least_points), self.most_least_points))
+    def fewest_points(self, spacing_m: float) -> int:
+        """Fewest points of a plane at a mean spacing in plan."""
+        if spacing_m * spacing_m * self.most_least_points <= self.least_area_m2:
+            return self.most_least_points
+        points = self.least_area_m2 / (spacing_m * spacing_m)
+        return int(min(max(points, self.least_points), self.most_least_points))
 
     def cross_faults(self) -> list[str]:
         """The fewest points must be a range."""
+        faults = super().cross_faults()
         if self.least_points > self.most_least_points:
-            return [f"least_points is {self.least_points}: use at most most_least_points, {self.most_least_points}"]
-        return []
+            faults.append(
+                f"least_points is {self.least_points}: use at most most_least_points, {self.most_least_points}"
+            )
+        return faults
 
 
 def refine_planes(
@@ -131,7 +149,7 @@ def refine_planes(
     Raises
     ------
     BuildingError
-        Reason ``too_complex`` beyond ``work_limit``.
+        Reason ``too_complex`` beyond ``refinement_work_limit``.
     """
     n_clusters = int(labels.max()) + 1 if len(labels) else 0
     if n_clusters == 0:
@@ -153,13 +171,14 @@ def refine_planes(
         settings.merge_angle_deg,
         settings.small_cluster_points,
         settings.merge_reach_m,
-        settings.work_limit,
+        settings.plane_cost,
+        settings.refinement_work_limit,
     )
-    if work > settings.work_limit:
+    if work > settings.refinement_work_limit:
         raise BuildingError(
             Reason.TOO_COMPLEX,
             f"the refinement stood at {work} comparisons for {n_clusters} clusters of {len(points)} points, "
-            f"work_limit is {settings.work_limit}",
+            f"refinement_work_limit is {settings.refinement_work_limit}",
         )
     return planes, refined
 
@@ -203,6 +222,7 @@ def _refine(
     merge_angle_deg: float,
     small_cluster_points: int,
     merge_reach_m: float,
+    plane_cost: float,
     work_limit: int,
 ) -> tuple[FloatArray, LabelArray, int]:
     """Planes, labels and work; incomplete once the work passes the limit."""
@@ -241,10 +261,13 @@ def _refine(
         if all_planes:
             labels = _nearest_plane(points, planes, usable, distance_m)
         else:
+            if round_ > 0:
+                _dissolve(points, neighbours, labels, planes, usable, distance_m, plane_cost)
             labels = _vote(points, neighbours, labels, planes, usable, distance_m, vote_weight, voting_passes)
     sums = cluster_sums(points, labels, n_clusters)
     _fit_all(sums, planes, usable, fewest_points, min_cosine)
     if not all_planes:
+        _dissolve(points, neighbours, labels, planes, usable, distance_m, plane_cost)
         labels = _vote(points, neighbours, labels, planes, usable, distance_m, vote_weight, voting_passes)
     planes, labels = _renumber(points, labels, planes, usable)
     return planes, labels, work
@@ -277,6 +300,93 @@ def _drop_outliers(
         k = labels[i]
         if k >= 0 and (not usable[k] or _distance(points, i, planes, k) > limit_m):
             labels[i] = -1
+
+
+@njit(cache=True, nogil=True)
+def _dissolve(
+    points: FloatArray,
+    neighbours: LabelArray,
+    labels: LabelArray,
+    planes: FloatArray,
+    usable: BoolArray,
+    distance_m: float,
+    plane_cost: float,
+) -> None:
+    """Give up planes whose points the planes around explain nearly as well, the smallest first, in place.
+
+    The noise of a large plane leaves clusters of its outliers, and the edge between two planes a plane across it. The
+    worth of a plane is the sum over its points of (distance / limit)^2 to the nearest touching plane, at most 1, less
+    the same to itself. Points of a plane that is given up take the nearest touching plane, or none.
+    """
+    n = usable.size
+    pairs = touching_pairs(neighbours, labels, usable)
+    if plane_cost <= 0.0 or pairs.size == 0:
+        return
+    first, partner = _partners(pairs, n)
+    size = np.zeros(n, np.int64)
+    for k in labels:
+        if k >= 0:
+            size[k] += 1
+    # Points by label, in their order.
+    begin = np.zeros(n + 1, np.int64)
+    for k in range(n):
+        begin[k + 1] = begin[k] + size[k]
+    fill = begin[:-1].copy()
+    member = np.empty(begin[n], np.int64)
+    for i in range(labels.size):
+        k = labels[i]
+        if k >= 0:
+            member[fill[k]] = i
+            fill[k] += 1
+    for k in np.argsort(size, kind="mergesort"):
+        if not usable[k] or first[k] == first[k + 1]:
+            continue
+        worth = 0.0
+        for m in range(begin[k], begin[k + 1]):
+            i = member[m]
+            least = distance_m
+            for p in range(first[k], first[k + 1]):
+                if usable[partner[p]]:
+                    least = min(least, _distance(points, i, planes, partner[p]))
+            own = min(distance_m, _distance(points, i, planes, k))
+            worth += (least * least - own * own) / (distance_m * distance_m)
+            if worth > 4.0 * plane_cost:
+                break
+        if worth >= plane_cost:
+            continue
+        usable[k] = False
+        for m in range(begin[k], begin[k + 1]):
+            i = member[m]
+            least = distance_m
+            labels[i] = -1
+            for p in range(first[k], first[k + 1]):
+                if not usable[partner[p]]:
+                    continue
+                distance = _distance(points, i, planes, partner[p])
+                if distance < least:
+                    least = distance
+                    labels[i] = partner[p]
+
+
+@njit(cache=True, nogil=True)
+def _partners(pairs: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """Pairs as lists: where the partners of every cluster begin, (n + 1,), and the partners, ascending."""
+    first = np.zeros(n + 1, np.int64)
+    for code in pairs:
+        first[code // n + 1] += 1
+        first[code % n + 1] += 1
+    for k in range(n):
+        first[k + 1] += first[k]
+    fill = first[:-1].copy()
+    partner = np.empty(2 * pairs.size, np.int64)
+    for side in range(2):
+        for code in pairs:
+            low = code // n
+            high = code % n
+            owner = high if side == 0 else low
+            partner[fill[owner]] = low if side == 0 else high
+            fill[owner] += 1
+    return first, partner
 
 
 @njit(cache=True, nogil=True)

@@ -85,8 +85,10 @@ def moved_plane(plane: Plane, origin: tuple[float, float, float]) -> Plane:
     return Plane(a=plane.a, b=plane.b, c=c, n_points=plane.n_points, rmse_m=plane.rmse_m)
 
 
-def truth_record(building: Building, scene_origin: tuple[float, float, float]) -> BuildingResult:
-    """The building as the record that a perfect method would deliver.
+def truth_record(
+    building: Building, scene_origin: tuple[float, float, float], *, touches_data_edge: bool = False
+) -> BuildingResult:
+    """The building as the record that a perfect method would deliver; its block is the source_id.
 
     Its local origin is the scene coordinate of the building's middle in whole metres. Figures that need points
     (density, residuals) are nan, the number of points is 0.
@@ -117,7 +119,7 @@ def truth_record(building: Building, scene_origin: tuple[float, float, float]) -
         rmse_m=math.nan,
         p95_m=math.nan,
         coverage=1.0,
-        touches_data_edge=False,
+        touches_data_edge=touches_data_edge,
     )
 
 

@@ -185,41 +185,49 @@ def unique_xy(xy_mm: IntArray, z_mm: IntArray) -> tuple[IntArray, LabelArray]:
     >>> unique_xy(np.array([[0, 0], [5, 5], [0, 0]]), np.array([1, 2, 3]))
     (array([1, 2]), array([1, 0, 1], dtype=int32))
     """
+    kept, kept_of_point, _ = unique_xy_ranked(xy_mm, z_mm)
+    return kept, kept_of_point
+
+
+def unique_xy_ranked(xy_mm: IntArray, z_mm: IntArray) -> tuple[IntArray, LabelArray, LabelArray]:
+    """As `unique_xy`, and the rank of every kept point, (u,) int32, in the lexicographic order of (x, y)."""
     if len(xy_mm) == 0:
-        return np.empty(0, np.int64), np.empty(0, np.int32)
+        return np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0, np.int32)
     low = xy_mm.min(axis=0)
     extent = xy_mm.max(axis=0) - low
     if extent.max() >= 1 << 31:
         raise ValueError(f"points extend over {extent.max() / 1000:.3f} m: use coordinates of at most 2^31 mm extent")
     position = ((xy_mm[:, 0] - low[0]) << 31) + (xy_mm[:, 1] - low[1])
-    # stable: points that come in canonical order are sorted already, and found so in one pass
-    return _keep_highest(position, np.asarray(z_mm, dtype=np.int64), np.argsort(position, kind="stable"))
+    return _keep_highest(position, np.ascontiguousarray(z_mm, dtype=np.int64), np.argsort(position))
 
 
 @njit(cache=True, nogil=True)
-def _keep_highest(position: IntArray, z_mm: IntArray, order: IntArray) -> tuple[IntArray, LabelArray]:
-    """The kernel of `unique_xy`: `order` sorts the positions, ascending by index where they are equal."""
+def _keep_highest(position: IntArray, z_mm: IntArray, order: IntArray) -> tuple[IntArray, LabelArray, LabelArray]:
+    """The kernel of `unique_xy_ranked`; `order` sorts the positions, in whatever way where they are equal."""
     n = len(position)
     stands_for = np.empty(n, np.int32)
-    is_kept = np.zeros(n, np.bool_)
+    rank = np.full(n, -1, np.int32)
+    n_kept = 0
     first = 0
     while first < n:
         end = first
         highest = order[first]
         while end < n and position[order[end]] == position[order[first]]:
-            if z_mm[order[end]] > z_mm[highest]:
-                highest = order[end]
+            q = order[end]
+            if z_mm[q] > z_mm[highest] or (z_mm[q] == z_mm[highest] and q < highest):
+                highest = q
             end += 1
-        is_kept[highest] = True
-        for q in range(first, end):
-            stands_for[order[q]] = highest
+        rank[highest] = n_kept
+        n_kept += 1
+        for i in range(first, end):
+            stands_for[order[i]] = highest
         first = end
     number = np.empty(n, np.int32)
-    kept = np.empty(is_kept.sum(), np.int64)
+    kept = np.empty(n_kept, np.int64)
     n_kept = 0
     for i in range(n):
-        if is_kept[i]:
+        if rank[i] >= 0:
             number[i] = n_kept
             kept[n_kept] = i
             n_kept += 1
-    return kept, number[stands_for]
+    return kept, number[stands_for], rank[kept]

@@ -44,6 +44,11 @@ def test_the_sources_keep_all_contracts(copied_house: Path) -> None:
         ("pipeline/tin/delaunay.py", "import pipeline.io", "The science knows no files"),
         ("pipeline/segmentation/fuzzy_sart.py", "import dask", "The science knows no files"),
         ("pipeline/reconstruct.py", "import pandas", "The science knows no files"),
+        (
+            "pipeline/segmentation/fuzzy_sart.py",
+            "import pipeline.segmentation.plane_refinement",
+            "Steps of a segmentation do not import one another",
+        ),
         ("pipeline/runtime/plan.py", "from dask.distributed import Client", "Only runtime.executors imports Dask"),
         ("pipeline/newcomer.py", "", "Layers of the pipeline"),
         ("service/newcomer.py", "", "Layers of the service"),

@@ -1,0 +1,117 @@
+"""The shell as a mesh: closed, 2-manifold, connected, consistently oriented (ISO 19107, codes 302 to 307).
+
+Faces enter as their triangles, so that an inner ring which touches the outer one is judged by the interior between
+them. An edge is manifold where exactly two triangles run along it in opposite directions; a vertex, where its
+triangles form one umbrella.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray, IntArray
+
+SHELL_NOT_CLOSED = 302
+NON_MANIFOLD_CASE = 303
+MULTIPLE_CONNECTED_COMPONENTS = 305
+POLYGON_WRONG_ORIENTATION = 307
+
+
+@njit(cache=True, nogil=True)
+def _root(parent: IntArray, node: int) -> int:
+    """The representative of a set in a union-find forest."""
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node
+
+
+@njit(cache=True, nogil=True)
+def _join(parent: IntArray, first: int, second: int) -> None:
+    """Unite two sets."""
+    a, b = _root(parent, first), _root(parent, second)
+    if a != b:
+        parent[max(a, b)] = min(a, b)
+
+
+@njit(cache=True, nogil=True)
+def _edges_in_order(triangles: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]:
+    """Keys of the undirected edges of all triangles, ascending, and where each is: 3 * triangle + corner."""
+    keys = np.empty(3 * len(triangles), np.int64)
+    for t in range(len(triangles)):
+        for k in range(3):
+            u, v = triangles[t, k], triangles[t, (k + 1) % 3]
+            keys[3 * t + k] = min(u, v) * vertex_count + max(u, v)
+    order = np.argsort(keys)
+    return keys[order], order
+
+
+@njit(cache=True, nogil=True)
+def find_shell_faults(triangles: IntArray, vertex_count: int, found: BoolArray) -> None:
+    """Set found[code] for every fault of the mesh.
+
+    Parameters
+    ----------
+    triangles : (t, 3) int64
+        Vertex indices of all triangles of all faces; no triangle uses a vertex twice.
+    vertex_count : int
+        One more than the largest index.
+    found : (n,) bool
+        Gets True at the codes 302, 303, 305, 307 that hold.
+    """
+    keys, order = _edges_in_order(triangles, vertex_count)
+    component = np.arange(len(triangles))
+    umbrella = np.arange(3 * len(triangles))
+    manifold = True
+    start = 0
+    while start < len(keys):
+        stop = start + 1
+        while stop < len(keys) and keys[stop] == keys[start]:
+            stop += 1
+        first = order[start]
+        for i in range(start + 1, stop):
+            _join(component, first // 3, order[i] // 3)
+        if stop - start == 1:
+            found[SHELL_NOT_CLOSED] = True
+            manifold = False
+        elif stop - start > 2:
+            found[NON_MANIFOLD_CASE] = True
+            manifold = False
+        else:
+            t, k, s, m = first // 3, first % 3, order[start + 1] // 3, order[start + 1] % 3
+            if triangles[t, k] == triangles[s, m]:
+                found[POLYGON_WRONG_ORIENTATION] = True
+                manifold = False
+            else:
+                _join(umbrella, 3 * t + k, 3 * s + (m + 1) % 3)
+                _join(umbrella, 3 * t + (k + 1) % 3, 3 * s + m)
+        start = stop
+    for t in range(len(triangles)):
+        if _root(component, t) != _root(component, 0):
+            found[MULTIPLE_CONNECTED_COMPONENTS] = True
+    if not manifold:
+        return
+    umbrella_of = np.full(vertex_count, -1)
+    for t in range(len(triangles)):
+        for k in range(3):
+            root = _root(umbrella, 3 * t + k)
+            vertex = triangles[t, k]
+            if umbrella_of[vertex] < 0:
+                umbrella_of[vertex] = root
+            elif umbrella_of[vertex] != root:
+                found[NON_MANIFOLD_CASE] = True
+
+
+@njit(cache=True, nogil=True)
+def six_volumes(vertices: IntArray, triangles: IntArray) -> float:
+    """Six times the volume that the triangles enclose in mm3, positive where they face outward."""
+    total = 0.0
+    x0, y0, z0 = vertices[triangles[0, 0], 0], vertices[triangles[0, 0], 1], vertices[triangles[0, 0], 2]
+    for t in range(len(triangles)):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        ax, ay, az = float(vertices[a, 0] - x0), float(vertices[a, 1] - y0), float(vertices[a, 2] - z0)
+        bx, by, bz = float(vertices[b, 0] - x0), float(vertices[b, 1] - y0), float(vertices[b, 2] - z0)
+        cx, cy, cz = float(vertices[c, 0] - x0), float(vertices[c, 1] - y0), float(vertices[c, 2] - z0)
+        total += ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
+    return total

@@ -1,0 +1,283 @@
+"""Validity of solids by the rules of ISO 19107, with the codes and default tolerances of val3dity.
+
+=====  ================================================================================================
+Code   Fault
+=====  ================================================================================================
+101    ring of fewer than three vertices
+102    consecutive vertices of a ring coincide (within the snapping tolerance)
+104    ring crosses or touches itself, or encloses no area
+201    rings of a face cross, overlap or touch off their vertices
+202    two rings of a face are the same
+203    a vertex is farther from the face's least-squares plane than the tolerance
+204    two triangles of a face have normals that differ by more than the tolerance
+205    rings that touch cut the interior of a face in two
+206    a hole lies outside the outer ring
+207    a hole lies in a hole
+208    a hole runs the same way round as the outer ring
+300    a face without any of the faults above cannot be triangulated
+301    fewer than four faces
+302    an edge has one face: the shell is not watertight
+303    an edge has more than two faces, or the faces at a vertex form more than one umbrella
+305    the faces form more than one component
+306    faces meet anywhere but in their common vertices and edges
+307    two neighbours run along their edge in the same direction: one of them faces inward
+405    the shell as a whole faces inward
+=====  ================================================================================================
+
+The codes of the format (103), of inner shells (401 to 404) and of groups of solids (5xx, 6xx) cannot arise: rings
+close by themselves, and a `Solid` has one shell. The faults are judged in stages: rings and polygons of every face;
+the shell if all faces are sound; self-intersection if the shell is; orientation if there is none. A face shows its
+first fault. References: Ledoux (2013), On the validation of solids represented with the international standards for
+geographic information; Ledoux (2018), val3dity: validation of 3D GIS primitives according to the international
+standards.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable
+from itertools import chain
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray, IntArray, Solid
+from pipeline.parameters import Parameters, parameter
+from pipeline.quality.planarity import distance_to_plane, least_cosine_of_normals
+from pipeline.quality.rings import RING_SELF_INTERSECTION, has_repeated_neighbours, polygon_code
+from pipeline.quality.self_intersection import shell_intersects_itself
+from pipeline.quality.shell import find_shell_faults, six_volumes
+from pipeline.triangulation import (
+    DONE,
+    MILLIMETRES_PER_METRE,
+    area_vector,
+    project_along_dominant_axis,
+    triangulate_rings,
+)
+
+TOO_FEW_POINTS = 101
+CONSECUTIVE_POINTS_SAME = 102
+NON_PLANAR_DISTANCE = 203
+NON_PLANAR_NORMALS = 204
+NOT_VALID_2_MANIFOLD = 300
+TOO_FEW_POLYGONS = 301
+SHELL_SELF_INTERSECTION = 306
+WRONG_ORIENTATION_SHELL = 405
+
+_CODE_LIMIT = 406
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ValidityTolerances(Parameters):
+    """How exactly a solid has to keep the rules; the defaults are val3dity's."""
+
+    snap_m: float = parameter(
+        0.001, "Vertices up to this distance apart count as one.", unit="m", minimum=0.0, maximum=0.1
+    )
+    planarity_m: float = parameter(
+        0.01, "Largest distance of a vertex to the plane of its face.", unit="m", minimum=0.0, maximum=1.0
+    )
+    normals_deg: float = parameter(
+        20.0, "Largest angle between the normals of two triangles of a face.", unit="deg", minimum=0.0, maximum=90.0
+    )
+
+
+DEFAULT_TOLERANCES = ValidityTolerances()
+
+
+def check_solid(solid: Solid, tolerances: ValidityTolerances = DEFAULT_TOLERANCES) -> tuple[int, ...]:
+    """The codes of a solid's faults.
+
+    Parameters
+    ----------
+    solid : Solid
+        Vertices are taken to the nearest millimetre; unused ones do not matter.
+    tolerances : ValidityTolerances
+        Snapping and planarity.
+
+    Returns
+    -------
+    tuple of int
+        Ascending, each code once; empty for a valid solid. A pair of vertices exactly as far apart as the snapping
+        tolerance is judged both as one vertex and as two, and the codes of both verdicts are given.
+    """
+    vertices = np.rint(solid.vertices * MILLIMETRES_PER_METRE).astype(np.int64)
+    rings = [ring for face in solid.faces for ring in face.rings]
+    ring_vertices = np.fromiter(chain.from_iterable(rings), np.int64)
+    ring_offsets = _offsets([len(ring) for ring in rings])
+    face_offsets = _offsets([len(face.rings) for face in solid.faces])
+    found = _find_faults(
+        np.ascontiguousarray(vertices),
+        ring_vertices,
+        ring_offsets,
+        face_offsets,
+        tolerances.snap_m * MILLIMETRES_PER_METRE,
+        tolerances.planarity_m * MILLIMETRES_PER_METRE,
+        math.cos(math.radians(tolerances.normals_deg)),
+    )
+    return tuple(int(code) for code in np.flatnonzero(found))
+
+
+def check_solids(
+    solids: Iterable[Solid], tolerances: ValidityTolerances = DEFAULT_TOLERANCES
+) -> tuple[tuple[int, ...], ...]:
+    """The codes of several solids, each judged alone, in their order."""
+    return tuple(check_solid(solid, tolerances) for solid in solids)
+
+
+def _offsets(lengths: list[int]) -> IntArray:
+    """Where each of consecutive runs starts, and where the last ends."""
+    offsets = np.zeros(len(lengths) + 1, dtype=np.int64)
+    np.cumsum(lengths, out=offsets[1:])
+    return offsets
+
+
+@njit(cache=True, nogil=True)
+def _snap(vertices: IntArray, used: IntArray, snap_mm: float, inclusive: bool) -> tuple[IntArray, bool]:
+    """The representative of each vertex, and whether a pair is exactly as far apart as the tolerance.
+
+    Vertices within the tolerance are one, and so are chains of them. The first by x, y, z represents them.
+    """
+    count = len(vertices)
+    representative = np.arange(count)
+    on_the_limit = False
+    order = used[np.argsort(vertices[used, 0])]
+    limit = snap_mm * snap_mm
+    for i in range(len(order)):
+        p = order[i]
+        for j in range(i + 1, len(order)):
+            q = order[j]
+            dx = vertices[q, 0] - vertices[p, 0]
+            if dx > snap_mm:
+                break
+            dy, dz = vertices[q, 1] - vertices[p, 1], vertices[q, 2] - vertices[p, 2]
+            distance = float(dx * dx + dy * dy + dz * dz)
+            exactly = distance > 0.0 and distance == limit
+            on_the_limit = on_the_limit or exactly
+            if distance == 0.0 or distance < limit or (exactly and inclusive):
+                a, b = p, q
+                while representative[a] != a:
+                    a = representative[a]
+                while representative[b] != b:
+                    b = representative[b]
+                if a == b:
+                    continue
+                for k in range(3):
+                    if vertices[a, k] != vertices[b, k]:
+                        if vertices[b, k] < vertices[a, k]:
+                            a, b = b, a
+                        break
+                representative[b] = a
+    for p in range(count):
+        a = p
+        while representative[a] != a:
+            a = representative[a]
+        representative[p] = a
+    return representative, on_the_limit
+
+
+@njit(cache=True, nogil=True)
+def _face_code(corners: IntArray, ids: IntArray, rings: IntArray, planarity_mm: float) -> int:
+    """The first fault of a face's rings, 0 where there is none: corners in mm, their vertices, ring offsets."""
+    for r in range(len(rings) - 1):
+        if rings[r + 1] - rings[r] < 3:
+            return TOO_FEW_POINTS
+    for r in range(len(rings) - 1):
+        if has_repeated_neighbours(ids, rings[r], rings[r + 1]):
+            return CONSECUTIVE_POINTS_SAME
+    if len(corners) == 3:
+        x, y, z = area_vector(corners, 0, 3)
+        return RING_SELF_INTERSECTION if x == 0 and y == 0 and z == 0 else 0
+    if distance_to_plane(corners) > planarity_mm:
+        return NON_PLANAR_DISTANCE
+    flat, has_area = project_along_dominant_axis(corners, rings[1])
+    return int(polygon_code(flat, ids, rings)) if has_area else RING_SELF_INTERSECTION
+
+
+@njit(cache=True, nogil=True)
+def _find_snapped_faults(
+    vertices: IntArray,
+    ids: IntArray,
+    ring_offsets: IntArray,
+    face_offsets: IntArray,
+    planarity_mm: float,
+    least_cosine: float,
+    found: BoolArray,
+) -> None:
+    """Set found[code] for the faults of a solid whose corners `ids` are snapped vertices."""
+    corners = vertices[ids]
+    faces = len(face_offsets) - 1
+    sound = True
+    for f in range(faces):
+        rings = ring_offsets[face_offsets[f] : face_offsets[f + 1] + 1]
+        if len(rings) < 2:
+            found[TOO_FEW_POINTS] = True
+            sound = False
+            continue
+        start, stop = rings[0], rings[-1]
+        code = _face_code(corners[start:stop], ids[start:stop], rings - start, planarity_mm)
+        if code:
+            found[code] = True
+            sound = False
+    if not sound:
+        return
+    triangles = np.empty((len(ids) + 2 * len(ring_offsets), 3), np.int64)
+    face_of = np.empty(len(triangles), np.int64)
+    count = 0
+    for f in range(faces):
+        rings = ring_offsets[face_offsets[f] : face_offsets[f + 1] + 1]
+        start, stop = rings[0], rings[-1]
+        cut, status = triangulate_rings(corners[start:stop], rings - start)
+        if status != DONE:
+            found[NOT_VALID_2_MANIFOLD] = True
+            sound = False
+            continue
+        if len(cut) > 1 and least_cosine_of_normals(corners[start:stop], cut, least_cosine) < least_cosine:
+            found[NON_PLANAR_NORMALS] = True
+            sound = False
+        for t in range(len(cut)):
+            for k in range(3):
+                triangles[count, k] = ids[start + cut[t, k]]
+            face_of[count] = f
+            count += 1
+    if not sound:
+        return
+    if faces < 4:
+        found[TOO_FEW_POLYGONS] = True
+        return
+    triangles = triangles[:count]
+    find_shell_faults(triangles, len(vertices), found)
+    if found.any():
+        return
+    if shell_intersects_itself(vertices, triangles, face_of):
+        found[SHELL_SELF_INTERSECTION] = True
+    elif six_volumes(vertices, triangles) <= 0.0:
+        found[WRONG_ORIENTATION_SHELL] = True
+
+
+@njit(cache=True, nogil=True)
+def _find_faults(
+    vertices: IntArray,
+    ring_vertices: IntArray,
+    ring_offsets: IntArray,
+    face_offsets: IntArray,
+    snap_mm: float,
+    planarity_mm: float,
+    least_cosine: float,
+) -> BoolArray:
+    """The one compiled entry: flat arrays of a solid to a (406,) bool, True at the codes of its faults."""
+    found = np.zeros(_CODE_LIMIT, np.bool_)
+    is_used = np.zeros(len(vertices), np.bool_)
+    is_used[ring_vertices] = True
+    used = np.flatnonzero(is_used)
+    representative, on_the_limit = _snap(vertices, used, snap_mm, True)
+    ids = representative[ring_vertices]
+    _find_snapped_faults(vertices, ids, ring_offsets, face_offsets, planarity_mm, least_cosine, found)
+    if on_the_limit:
+        again = np.zeros(_CODE_LIMIT, np.bool_)
+        apart, _ = _snap(vertices, used, snap_mm, False)
+        ids = apart[ring_vertices]
+        _find_snapped_faults(vertices, ids, ring_offsets, face_offsets, planarity_mm, least_cosine, again)
+        found |= again
+    return found

@@ -1,0 +1,184 @@
+"""The digest of a run: one sha256 over its content, whatever the workers, the tiles, the files or the Parquet writer.
+
+Content is all columns of buildings, planes and rejected but `tile`, `mesh_path` and `input_hash`, in the order of the
+rows' keys. Every row is hashed by itself in a canonical form (columns by name; integers, floats and times as eight
+bytes, texts as UTF-8, null told apart from all values), then the row hashes are hashed in the order of the keys. So
+only keys and 32 bytes a row are held, not the rows.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.fs as pafs
+
+from pipeline.errors import RunError
+from pipeline.export.geoparquet import table_dataset
+from pipeline.export.records import KEYS
+
+NOT_CONTENT = frozenset({"tile", "mesh_path", "input_hash"})
+"""Columns that may differ between tilings of one result."""
+ROWS_A_BATCH = 8192
+"""Rows that are held at once."""
+
+_NULL, _PRESENT = b"\x00", b"\x01"
+_HASH_BYTES = hashlib.sha256().digest_size
+
+Fixed = npt.NDArray[np.uint8]
+
+
+def run_digest(run_dir: str, filesystem: pafs.FileSystem | None = None) -> str:
+    """The sha256 of a run's content in hexadecimal.
+
+    Parameters
+    ----------
+    run_dir : str
+        The run directory: a local path, or a path of `filesystem`.
+    filesystem : pyarrow.fs.FileSystem, optional
+        Where the run lies; local by default.
+
+    Raises
+    ------
+    RunError
+        The directory lacks one of the tables, a table lacks its key, or an object comes twice.
+    """
+    whole = hashlib.sha256(b"gablework content 1\n")
+    for name, key in KEYS.items():
+        keys, hashes = _row_hashes(run_dir, name, key, filesystem)
+        order = np.lexsort(tuple(reversed(keys)))
+        _check_unique(name, key, keys, order)
+        whole.update(f"{name} {len(order)}\n".encode())
+        for start in range(0, len(order), ROWS_A_BATCH):
+            whole.update(hashes[order[start : start + ROWS_A_BATCH]].tobytes())
+    return whole.hexdigest()
+
+
+def _row_hashes(
+    run_dir: str, name: str, key: tuple[str, ...], filesystem: pafs.FileSystem | None
+) -> tuple[list[npt.NDArray[Any]], Fixed]:
+    """The key columns of a table, and the hash of every row, shape (n, 32)."""
+    dataset = table_dataset(run_dir, name, filesystem)
+    columns = [column for column in dataset.schema.names if column not in NOT_CONTENT]
+    key_parts: list[list[npt.NDArray[Any]]] = [[] for _ in key]
+    hash_parts = [np.empty((0, _HASH_BYTES), np.uint8)]
+    for batch in dataset.to_batches(columns=columns, batch_size=ROWS_A_BATCH):
+        if batch.num_rows == 0:
+            continue
+        digests = b"".join(hashlib.sha256(row).digest() for row in canonical_rows(batch))
+        hash_parts.append(np.frombuffer(digests, np.uint8).reshape(-1, _HASH_BYTES))
+        for part, column in zip(key_parts, key, strict=True):
+            part.append(_key_values(batch.column(column), f"{run_dir}/{name}", column))
+    keys = [np.concatenate(part) if part else np.empty(0, "S1") for part in key_parts]
+    return keys, np.concatenate(hash_parts)
+
+
+def _key_values(column: pa.Array, folder: str, name: str) -> npt.NDArray[Any]:
+    """A key column as an array that sorts: bytes or integers."""
+    if column.null_count:
+        raise RunError(f"{folder} has {column.null_count} rows without {name}: it was not written by this program")
+    if _is_text(column.type):
+        return np.array([text.encode() for text in column.to_pylist()])
+    return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.int64)
+
+
+def _check_unique(name: str, key: tuple[str, ...], keys: list[npt.NDArray[Any]], order: npt.NDArray[Any]) -> None:
+    """Refuse a table with two rows of one key: the order, and so the digest, would be open."""
+    if len(order) < 2:
+        return
+    same = np.ones(len(order) - 1, dtype=bool)
+    for values in keys:
+        ordered = values[order]
+        same &= ordered[1:] == ordered[:-1]
+    if same.any():
+        row = order[int(np.argmax(same))]
+        found = ", ".join(f"{column} {values[row]!r}" for column, values in zip(key, keys, strict=True))
+        raise RunError(f"{name} has more than one row of {found}: files of two runs lie in one directory")
+
+
+def canonical_rows(batch: pa.RecordBatch) -> Iterator[bytes]:
+    """Every row of a batch as bytes that depend on names and values only, not on how Arrow holds them."""
+    names = sorted(batch.schema.names)
+    cells = [_cells(batch.column(name), name) for name in names]
+    heading = "\x1f".join(names).encode()
+    for row in zip(*cells, strict=True):
+        yield heading + b"".join(row)
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    """Whether a type is a string type, also dictionary encoded."""
+    if pa.types.is_dictionary(kind):
+        return _is_text(kind.value_type)
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind))
+
+
+def _is_binary(kind: pa.DataType) -> bool:
+    """Whether a type is a bytes type."""
+    return bool(pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or pa.types.is_binary_view(kind))
+
+
+def _cells(column: pa.Array, name: str) -> list[bytes]:
+    """The cells of a column: a zero byte for null, else a one byte and the value."""
+    kind = column.type
+    if _is_text(kind):
+        return [_NULL if text is None else _sized(text.encode()) for text in column.to_pylist()]
+    if _is_binary(kind):
+        return [_NULL if data is None else _sized(data) for data in column.to_pylist()]
+    if pa.types.is_struct(kind):
+        return _struct_cells(column, name)
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        items = _cells(column.flatten(), name)
+        return _list_cells(column, items)
+    return _fixed_cells(column, name)
+
+
+def _sized(data: bytes) -> bytes:
+    """Bytes with their length before them, so that neighbours cannot run together."""
+    return _PRESENT + struct.pack("<Q", len(data)) + data
+
+
+def _fixed_cells(column: pa.Array, name: str) -> list[bytes]:
+    """Numbers, truth values and times as eight little-endian bytes."""
+    kind = column.type
+    if pa.types.is_timestamp(kind):
+        column = pc.cast(column, pa.timestamp("us", tz=kind.tz)).cast(pa.int64())
+    elif pa.types.is_boolean(kind) or pa.types.is_integer(kind):
+        column = column.cast(pa.int64())
+    elif pa.types.is_floating(kind):
+        column = column.cast(pa.float64())
+    else:
+        raise RunError(f"column {name} has type {kind}, which the digest does not know")
+    present = column.is_valid().to_numpy(zero_copy_only=False)
+    dtype = np.dtype("<f8") if pa.types.is_floating(column.type) else np.dtype("<i8")
+    values = column.fill_null(0).to_numpy(zero_copy_only=False).astype(dtype)
+    if dtype.kind == "f":
+        # One zero and one nan, whatever their bits.
+        values = np.where(np.isnan(values), np.nan, values + 0.0)
+    data = values.tobytes()
+    return [_PRESENT + data[8 * i : 8 * i + 8] if there else _NULL for i, there in enumerate(present.tolist())]
+
+
+def _struct_cells(column: pa.StructArray, name: str) -> list[bytes]:
+    """The fields of each struct in the order of their names."""
+    fields = sorted(field.name for field in column.type)
+    parts = [_cells(column.field(field), f"{name}.{field}") for field in fields]
+    present = column.is_valid().to_pylist()
+    return [_PRESENT + b"".join(cells) if there else _NULL for there, *cells in zip(present, *parts, strict=True)]
+
+
+def _list_cells(column: pa.Array, items: list[bytes]) -> list[bytes]:
+    """Every list as its length and its items."""
+    cells, start = [], 0
+    for length in pc.list_value_length(column).to_pylist():
+        if length is None:
+            cells.append(_NULL)
+            continue
+        cells.append(_PRESENT + struct.pack("<Q", length) + b"".join(items[start : start + length]))
+        start += length
+    return cells

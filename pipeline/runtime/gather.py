@@ -1,0 +1,185 @@
+"""Gather: the points and the terrain of one candidate, from all tiles that hold some of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import hashlib
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+from shapely import MultiPolygon, Polygon
+from shapely.affinity import translate
+
+from pipeline.export.records import CandidateFacts
+from pipeline.io.gps_time import GpsTimeKind, utc_of
+from pipeline.model import BoolArray, Candidate
+from pipeline.runtime.join import CandidateSite
+from pipeline.runtime.scratch import POINT, Scratch
+from pipeline.terrain.ground import CELL_MM, NO_DATA
+from pipeline.tiling import MM, TileGrid, Window
+
+_GROUND_MARGIN_M = 4
+_VIEW_MARGIN_M = 10
+_OUTLINE_CELLS = 2
+_EMPTY_CELLS = 4
+_EDGE_CELLS = 5
+_HEIGHT_WITHOUT_TERRAIN_MM = 2500
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Surroundings:
+    """Terrain around a candidate, on the 1 m lattice."""
+
+    column0: int
+    row0: int
+    elevation_mm: npt.NDArray[np.int32]
+    """(rows, columns), NO_DATA where unknown."""
+    occupied: BoolArray
+    """(rows, columns), some point lies in the cell."""
+
+
+def surroundings_of(scratch: Scratch, grid: TileGrid, view: Window) -> Surroundings:
+    """Mosaic of the tiles' terrain over a view."""
+    column0, row0 = view.x0_mm // CELL_MM, view.y0_mm // CELL_MM
+    columns, rows = -(-view.x1_mm // CELL_MM) - column0, -(-view.y1_mm // CELL_MM) - row0
+    elevation = np.full((rows, columns), NO_DATA, np.int32)
+    occupied = np.zeros((rows, columns), np.bool_)
+    # a cell belongs to the tile of its centre, so the neighbours of the view's own tiles may hold its border cells
+    for tile in grid.tiles_over(view.grown(CELL_MM)):
+        name = f"tiles/{tile.key}"
+        if not scratch.has(name):
+            continue
+        corner = scratch.array(name, "corner")
+        part = scratch.array(name, "terrain", mapped=True)
+        c0, r0 = int(corner[0]) - column0, int(corner[1]) - row0
+        left, right = max(c0, 0), min(c0 + part.shape[1], columns)
+        low, high = max(r0, 0), min(r0 + part.shape[0], rows)
+        if left < right and low < high:
+            theirs = (slice(low - r0, high - r0), slice(left - c0, right - c0))
+            ours = (slice(low, high), slice(left, right))
+            elevation[ours] = part[theirs]
+            occupied[ours] = scratch.array(name, "occupied", mapped=True)[theirs]
+    return Surroundings(column0=column0, row0=row0, elevation_mm=elevation, occupied=occupied)
+
+
+def _grown(mask: BoolArray, cells: int) -> BoolArray:
+    """Dilation by a square of 2 cells + 1."""
+    out = mask.copy()
+    for axis in (0, 1):
+        source = out.copy()
+        for shift in range(1, cells + 1):
+            for direction in (1, -1):
+                moved = np.roll(source, direction * shift, axis=axis)
+                edge: list[slice] = [slice(None), slice(None)]
+                edge[axis] = slice(0, shift) if direction > 0 else slice(-shift, None)
+                moved[tuple(edge)] = False
+                out |= moved
+    return out
+
+
+def _touches_data_edge(roof: BoolArray, occupied: BoolArray) -> bool:
+    """Whether a square of 9 m without any point begins within 5 m of the roof."""
+    empty_around = ~_grown(occupied, _EMPTY_CELLS)
+    return bool((empty_around & _grown(roof, _EDGE_CELLS + _EMPTY_CELLS)).any())
+
+
+def points_of(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
+    """A candidate's points in canonical order: X, Y, Z, return, GPS time, source."""
+    pieces = []
+    for part in site.ranges:
+        stored = scratch.array(f"tiles/{part.tile.key}", "points", mapped=True).view(POINT)
+        pieces.append(np.array(stored[part.start : part.stop]))
+    points = np.concatenate(pieces) if pieces else np.empty(0, POINT)
+    order = np.lexsort(
+        (points["source"], points["gps_time"], points["return_number"], points["z"], points["y"], points["x"])
+    )
+    sorted_points: npt.NDArray[np.void] = points[order]
+    return sorted_points
+
+
+def gather(
+    scratch: Scratch,
+    grid: TileGrid,
+    site: CandidateSite,
+    footprints: tuple[Polygon | MultiPolygon, ...] | None,
+    source_ids: tuple[str, ...] | None,
+    gps_kind: GpsTimeKind,
+) -> tuple[Candidate, CandidateFacts]:
+    """One candidate with the terrain around it.
+
+    Parameters
+    ----------
+    scratch, grid : Scratch, TileGrid
+        Where the tiles' points and terrain are.
+    site : CandidateSite
+        Which points.
+    footprints, source_ids : tuples or None
+        The given footprints in metres and their ids.
+    gps_kind : GpsTimeKind
+        Whether GPS times tell dates.
+    """
+    points = points_of(scratch, site)
+    footprint = None if site.footprint is None or footprints is None else footprints[site.footprint]
+    source_id = None if site.footprint is None or source_ids is None else source_ids[site.footprint]
+    xyz = np.column_stack((points["x"], points["y"], points["z"].astype(np.int64)))
+    if len(xyz):
+        low, high = xyz.min(axis=0), xyz.max(axis=0)
+    else:
+        x0, y0, x1, y1 = footprint.bounds if footprint is not None else (0.0, 0.0, 0.0, 0.0)
+        low = np.array([round(x0 * MM), round(y0 * MM), 0], np.int64)
+        high = np.array([round(x1 * MM), round(y1 * MM), 0], np.int64)
+    origin_mm = low // MM * MM
+    margin = _VIEW_MARGIN_M * MM
+    view = Window(
+        x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1
+    ).grown(margin)
+    around = surroundings_of(scratch, grid, view)
+    roof = np.zeros(around.occupied.shape, np.bool_)
+    roof[xyz[:, 1] // CELL_MM - around.row0, xyz[:, 0] // CELL_MM - around.column0] = True
+    # terrain far from all points may lie in a tile that nobody made
+    known = (around.elevation_mm != NO_DATA) & _grown(around.occupied, _EMPTY_CELLS)
+    outline = _grown(roof, _OUTLINE_CELLS) & ~roof & known
+    sampled = known & _grown(roof, _GROUND_MARGIN_M)
+    if not roof.any():
+        sampled = known
+    rows, columns = np.nonzero(sampled)
+    ground_mm = np.column_stack(
+        (
+            (columns + around.column0) * CELL_MM + CELL_MM // 2,
+            (rows + around.row0) * CELL_MM + CELL_MM // 2,
+            around.elevation_mm[rows, columns].astype(np.int64),
+        )
+    )
+    if outline.any():
+        ground_z = int(around.elevation_mm[outline].min())
+    elif len(ground_mm):
+        ground_z = int(ground_mm[:, 2].min())
+    else:
+        ground_z = int(low[2]) - _HEIGHT_WITHOUT_TERRAIN_MM
+    digest = hashlib.sha256(points.tobytes())
+    digest.update(np.ascontiguousarray(ground_mm).tobytes())
+    candidate = Candidate(
+        building_id=site.building_id,
+        origin=tuple(float(v // MM) for v in origin_mm),
+        points=(xyz - origin_mm) / MM,
+        ground=(ground_mm - origin_mm) / MM,
+        ground_z_m=(ground_z - int(origin_mm[2])) / MM,
+        footprint=None
+        if footprint is None
+        else translate(footprint, -float(origin_mm[0] // MM), -float(origin_mm[1] // MM)),
+        source_id=source_id,
+        touches_data_edge=_touches_data_edge(roof, around.occupied),
+    )
+    return candidate, CandidateFacts(input_hash=digest.hexdigest(), **_acquired(points, gps_kind))
+
+
+def _acquired(points: npt.NDArray[np.void], kind: GpsTimeKind) -> Mapping[str, datetime.datetime | None]:
+    """First and last time of the points where GPS times tell dates."""
+    if kind is not GpsTimeKind.ADJUSTED or len(points) == 0:
+        return {"acquired_from": None, "acquired_to": None}
+    return {
+        "acquired_from": utc_of(float(points["gps_time"].min())),
+        "acquired_to": utc_of(float(points["gps_time"].max())),
+    }

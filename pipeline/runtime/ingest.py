@@ -1,0 +1,193 @@
+"""Ingest: one streamed read of an input file, its points bucketed on the lattice of tiles.
+
+LAZ has no spatial index: reading windows of it would decode the file again for every tile.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import InconsistentInputError
+from pipeline.io import ReadOptions, open_source
+from pipeline.io.storage import sha256_of
+from pipeline.model import PointCloud
+from pipeline.runtime.scratch import POINT, Scratch
+from pipeline.tiling import MM, Tile, TileGrid
+
+_CHUNK_POINTS = 1_000_000
+_MAX_MM = 2**31 - 2
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class IngestTask:
+    """One input file."""
+
+    index: int
+    """Position in the sorted list of inputs; names the file's parts in scratch."""
+    path: str
+    """The file."""
+    options: ReadOptions
+    """CRS, units, area of interest, dropped classes."""
+    grid: TileGrid
+    """The lattice."""
+    scratch: Scratch
+    """Where the buckets go."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ingested:
+    """What one input file held."""
+
+    index: int
+    """As the task's."""
+    points_by_tile: dict[Tile, int]
+    """Points in each tile's bucket."""
+    classes: dict[int, int]
+    """Points by ASPRS class, of those kept."""
+    dropped: dict[str, int]
+    """Points left out, by cause."""
+    warnings: tuple[str, ...]
+    """What is odd but usable."""
+    bounds_mm: tuple[int, int, int, int, int, int] | None
+    """x, y, z minimum, then maximum, of the kept points; None where there are none."""
+    moments: tuple[float, ...]
+    """n, Sx, Sy, Sxx, Sxy, Syy in metres about the first kept point: tells whether all lie on one line."""
+    first_mm: tuple[int, int]
+    """That first point."""
+    multiple_returns: bool
+    """Whether any kept pulse has more than one return."""
+    sha256: str
+    """Digest of the file."""
+
+
+def to_records(cloud: PointCloud, path: str) -> npt.NDArray[np.void]:
+    """Points in whole millimetres.
+
+    Raises
+    ------
+    InconsistentInputError
+        An elevation is beyond what whole millimetres of 32 bits hold (2,147 km).
+    """
+    if np.abs(cloud.xyz[:, 2]).max(initial=0.0) * MM > _MAX_MM:
+        worst = float(cloud.xyz[np.abs(cloud.xyz[:, 2]).argmax(), 2])
+        raise InconsistentInputError(path, f"a point has elevation {worst:g} m", "Check the vertical unit and scale")
+    records = np.empty(len(cloud), POINT)
+    rounded = np.rint(cloud.xyz * MM)
+    records["x"] = rounded[:, 0]
+    records["y"] = rounded[:, 1]
+    records["z"] = rounded[:, 2]
+    records["source"] = cloud.source_id
+    records["return_number"] = cloud.return_number
+    records["return_count"] = cloud.return_count
+    records["gps_time"] = cloud.gps_time
+    records["classification"] = cloud.classification
+    return records
+
+
+def ingest(task: IngestTask) -> Ingested:
+    """Read one file and bucket its points by tile.
+
+    Returns
+    -------
+    Ingested
+        Counts and facts; the points are in scratch under `points/<tile>/<index>.bin`.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used.
+    """
+    source = open_source(task.path, task.options)
+    suffix = f".{uuid4().hex}.part"
+    counts: Counter[Tile] = Counter()
+    classes: Counter[int] = Counter()
+    low = np.full(3, 2**62)
+    high = np.full(3, -(2**62))
+    moments = np.zeros(6)
+    first: tuple[int, int] | None = None
+    multiple = False
+    for cloud in source.chunks(_CHUNK_POINTS):
+        records = to_records(cloud, task.path)
+        x, y = records["x"], records["y"]
+        for axis, name in enumerate("xyz"):
+            low[axis] = min(low[axis], int(records[name].min()))
+            high[axis] = max(high[axis], int(records[name].max()))
+        if first is None:
+            first = int(x[0]), int(y[0])
+        dx, dy = (x - first[0]) / MM, (y - first[1]) / MM
+        moments += (len(records), dx.sum(), dy.sum(), (dx * dx).sum(), (dx * dy).sum(), (dy * dy).sum())
+        histogram = np.bincount(records["classification"])
+        classes.update({int(c): int(histogram[c]) for c in np.flatnonzero(histogram)})
+        multiple = multiple or bool((records["return_count"] > 1).any())
+        counts.update(_append_by_tile(records, task, suffix))
+    for tile in counts:
+        part = task.scratch.path("points", tile.key, f"{task.index}{suffix}")
+        part.replace(task.scratch.path("points", tile.key, f"{task.index}.bin"))
+    return Ingested(
+        index=task.index,
+        points_by_tile=dict(counts),
+        classes=dict(classes),
+        dropped=source.dropped,
+        warnings=source.warnings,
+        bounds_mm=None if first is None else (*(int(v) for v in low), *(int(v) for v in high)),  # type: ignore[arg-type]
+        moments=tuple(float(v) for v in moments),
+        first_mm=first or (0, 0),
+        multiple_returns=multiple,
+        sha256=sha256_of(Path(task.path)),
+    )
+
+
+def _append_by_tile(records: npt.NDArray[np.void], task: IngestTask, suffix: str) -> Counter[Tile]:
+    """Append a chunk to the parts of its tiles; points of each tile."""
+    columns, rows = task.grid.columns_rows(records["x"], records["y"])
+    order = np.lexsort((rows, columns))
+    columns, rows, ordered = columns[order], rows[order], records[order]
+    starts = np.flatnonzero(np.diff(columns, prepend=columns[0] - 1) | np.diff(rows, prepend=rows[0] - 1))
+    counts: Counter[Tile] = Counter()
+    for start, stop in zip(starts, [*starts[1:], len(ordered)], strict=True):
+        tile = Tile(int(columns[start]), int(rows[start]))
+        with task.scratch.path("points", tile.key, f"{task.index}{suffix}").open("ab") as part:
+            ordered[start:stop].tofile(part)
+        counts[tile] += int(stop - start)
+    return counts
+
+
+def spread_m(results: list[Ingested]) -> float:
+    """Standard deviation across the line that fits all points best: 0 where they lie on one line.
+
+    Parameters
+    ----------
+    results : list of Ingested
+        All inputs.
+    """
+    total = np.zeros(6)
+    anchor: tuple[int, int] | None = None
+    for result in results:
+        n, sx, sy, sxx, sxy, syy = result.moments
+        if n == 0:
+            continue
+        if anchor is None:
+            anchor = result.first_mm
+        # move the moments to the first file's first point
+        dx, dy = (result.first_mm[0] - anchor[0]) / MM, (result.first_mm[1] - anchor[1]) / MM
+        total += (
+            n,
+            sx + n * dx,
+            sy + n * dy,
+            sxx + 2 * dx * sx + n * dx * dx,
+            sxy + dx * sy + dy * sx + n * dx * dy,
+            syy + 2 * dy * sy + n * dy * dy,
+        )
+    n, sx, sy, sxx, sxy, syy = total
+    if n == 0:
+        return 0.0
+    xx, xy, yy = sxx / n - (sx / n) ** 2, sxy / n - sx * sy / n**2, syy / n - (sy / n) ** 2
+    smallest = (xx + yy) / 2 - math.hypot((xx - yy) / 2, xy)
+    return math.sqrt(max(0.0, smallest))

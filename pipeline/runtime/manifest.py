@@ -1,0 +1,214 @@
+"""The manifest of a run, `run.json`: what was asked, from which inputs, what came out, how long and how large.
+
+The driver writes it at the start with status `running` and again at the end; a reader that finds `running` sees a run
+that is under way or was cut off. Times of day and durations are here and nowhere in the tables, so that the content of
+a run does not depend on them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import hashlib
+import json
+from collections.abc import Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import pyarrow.fs as pafs
+
+from pipeline.errors import RunError, UnreadableInputError
+from pipeline.export.tile import Put, put_local
+
+NAME = "run.json"
+"""File name of the manifest in the run directory."""
+FORMAT = 1
+"""Version of the run directory's layout; a reader refuses others."""
+_BYTES_A_READ = 1 << 20
+
+
+class RunStatus(StrEnum):
+    """How far a run is."""
+
+    RUNNING = "running"
+    """Under way, or cut off."""
+    FINISHED = "finished"
+    """All tiles are published."""
+    INCOMPLETE = "incomplete"
+    """Ended, but some tiles failed."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class InputFile:
+    """One input file of a run."""
+
+    path: str
+    """As the user gave it, or as it was found in a folder."""
+    sha256: str
+    """Of the whole file, hexadecimal."""
+    size_bytes: int
+    """Its size."""
+    n_points: int | None = None
+    """Points that were read from it; None until then, and for files that are no point clouds."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunManifest:
+    """What `run.json` holds."""
+
+    status: RunStatus
+    """How far the run is."""
+    engine_version: str
+    """Version of this program."""
+    method: str
+    """Name of the method."""
+    settings: Mapping[str, Any]
+    """The resolved settings, as plain JSON values."""
+    settings_hash: str
+    """Digest of those that can change geometry."""
+    started_at: dt.datetime
+    """With a time zone."""
+    finished_at: dt.datetime | None = None
+    """With a time zone; None while running."""
+    crs: Mapping[str, Any] | None = None
+    """epsg, name, wkt, horizontal_unit_m, vertical_unit_m of the outputs; None where unknown and in metres."""
+    inputs: tuple[InputFile, ...] = ()
+    """Point clouds and footprints."""
+    source_licence: str | None = None
+    """Licence of the source data in the user's words; None where none was given."""
+    tiles: tuple[str, ...] = ()
+    """Keys of the tiles on the lattice, sorted."""
+    failed_tiles: tuple[str, ...] = ()
+    """Keys of the tiles that could not be published."""
+    counts: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """candidates, ok, fallback, failed, rejected, planes, points and the like."""
+    timings_s: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Wall-clock seconds by stage."""
+    peak_memory_bytes: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """Largest resident memory by process."""
+    warnings: tuple[str, ...] = ()
+    """What was told while running."""
+    content_sha256: str | None = None
+    """`gablework digest` of the finished run; None where it was not computed."""
+
+    def __post_init__(self) -> None:
+        """Refuse times without a time zone."""
+        for name in ("started_at", "finished_at"):
+            value = getattr(self, name)
+            if value is not None and value.tzinfo is None:
+                raise RunError(f"{name} is {value.isoformat()}: give a time zone")
+
+    def to_json(self) -> str:
+        """The manifest as JSON text for people and programs."""
+        return json.dumps({"format": FORMAT, **_plain(self)}, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str, source: str = NAME) -> RunManifest:
+        """The manifest from JSON text.
+
+        Parameters
+        ----------
+        text : str
+            As `to_json` writes it; entries that are not known are left out.
+        source : str
+            Name of the file, for messages.
+
+        Raises
+        ------
+        RunError
+            The text is no manifest, or one of another format.
+        """
+        try:
+            found = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise RunError(f"{source} is no JSON ({error}): the run directory is damaged") from error
+        if not isinstance(found, dict) or found.get("format") != FORMAT:
+            told = found.get("format") if isinstance(found, dict) else type(found).__name__
+            raise RunError(f"{source} has format {told!r}, this version reads {FORMAT}: use the version that wrote it")
+        names = {field.name for field in dataclasses.fields(cls)}
+        values = {name: value for name, value in found.items() if name in names}
+        try:
+            values["status"] = RunStatus(values["status"])
+            for name in ("started_at", "finished_at"):
+                if values.get(name) is not None:
+                    values[name] = dt.datetime.fromisoformat(values[name])
+            values["inputs"] = tuple(InputFile(**entry) for entry in values.get("inputs", ()))
+            for name in ("tiles", "failed_tiles", "warnings"):
+                values[name] = tuple(values.get(name, ()))
+            return cls(**values)
+        except (KeyError, TypeError, ValueError) as error:
+            raise RunError(f"{source} is no manifest of a run ({error}): the run directory is damaged") from error
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON knows it: dataclasses become objects, times ISO 8601."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(entry) for name, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, dt.datetime):
+        return value.isoformat()
+    return value
+
+
+def input_file(path: str | Path, n_points: int | None = None) -> InputFile:
+    """Describe a local input file; it is read once, in pieces.
+
+    Raises
+    ------
+    UnreadableInputError
+        The file cannot be read.
+    """
+    digest, size = hashlib.sha256(), 0
+    try:
+        with Path(path).open("rb") as stream:
+            while piece := stream.read(_BYTES_A_READ):
+                digest.update(piece)
+                size += len(piece)
+    except OSError as error:
+        raise UnreadableInputError(str(path), f"cannot be read ({error.strerror})", "Check path and rights") from error
+    return InputFile(path=str(path), sha256=digest.hexdigest(), size_bytes=size, n_points=n_points)
+
+
+def write_manifest(run_dir: str | Path, manifest: RunManifest, put: Put | None = None) -> None:
+    """Write `run.json` atomically.
+
+    Parameters
+    ----------
+    run_dir : str or Path
+        The local run directory; unused where `put` is given.
+    manifest : RunManifest
+        What to write.
+    put : callable, optional
+        Stores a file elsewhere; `put_local(run_dir)` by default.
+    """
+    (put or put_local(run_dir))(NAME, manifest.to_json().encode())
+
+
+def read_manifest(run_dir: str | Path, filesystem: pafs.FileSystem | None = None) -> RunManifest:
+    """Read `run.json`.
+
+    Parameters
+    ----------
+    run_dir : str or Path
+        The run directory: a local path, or a path of `filesystem`.
+    filesystem : pyarrow.fs.FileSystem, optional
+        Where the run lies; local by default.
+
+    Raises
+    ------
+    RunError
+        There is none, or it cannot be read.
+    """
+    path = f"{str(run_dir).rstrip('/')}/{NAME}"
+    try:
+        with (filesystem or pafs.LocalFileSystem()).open_input_stream(path) as stream:
+            text = stream.read().decode()
+    except FileNotFoundError:
+        raise RunError(f"{path} does not exist: give the directory that a run wrote") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise RunError(f"{path} cannot be read: {error}") from error
+    return RunManifest.from_json(text, path)

@@ -1,0 +1,126 @@
+"""The plan of a run: what will be read, on which lattice, and whether it can fit. Pure data, made before any work."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+from pipeline.errors import CrsError, InputError
+from pipeline.io import ReadOptions, SourceInfo, open_source
+from pipeline.settings import RunSettings
+from pipeline.tiling import MM, TileGrid
+
+_TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
+_POINTS_PER_WINDOW = 3_000_000
+_BYTES_PER_POINT = 220
+"""Measured peak of a split, bytes a point of the window."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a run is going to do."""
+
+    sources: tuple[SourceInfo, ...]
+    """The inputs, in the order of their names."""
+    grid: TileGrid
+    """The lattice."""
+    options: ReadOptions
+    """How the inputs are read."""
+    points: int
+    """Points that the headers promise."""
+    density_per_m2: float
+    """Points a square metre, the densest input's."""
+    window_bytes: int
+    """Estimated peak of the largest task above the process's own size."""
+    warnings: tuple[str, ...]
+    """What is odd but usable."""
+
+
+def tile_size_m(density_per_m2: float, halo_m: float) -> float:
+    """The largest usual tile whose window, halo and all, holds about three million points.
+
+    >>> tile_size_m(1.0, 100.0), tile_size_m(14.0, 100.0)
+    (1000.0, 250.0)
+    """
+    for size in _TILE_SIZES_M:
+        if density_per_m2 * (size + 2.0 * halo_m) ** 2 <= _POINTS_PER_WINDOW:
+            return size
+    return _TILE_SIZES_M[-1]
+
+
+def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings) -> Plan:
+    """Look at every input's header and lay out the lattice.
+
+    Parameters
+    ----------
+    paths : sequence of str
+        Point files.
+    options : ReadOptions
+        CRS, units, area of interest.
+    settings : RunSettings
+        Tile size and the stages' support.
+
+    Raises
+    ------
+    InputError
+        An input cannot be used, or two inputs disagree about their CRS.
+    """
+    sources = tuple(open_source(path, options).info for path in sorted(paths))
+    first = sources[0].reference
+    warnings = [f"{info.path}: {text}" for info in sources for text in info.warnings]
+    for info in sources[1:]:
+        other = info.reference
+        same_units = (
+            other.horizontal_unit_m == first.horizontal_unit_m and other.vertical_unit_m == first.vertical_unit_m
+        )
+        if not same_units or (other.crs is None) != (first.crs is None) or other.crs != first.crs:
+            raise CrsError(
+                info.path,
+                f"its CRS is {other.name}, that of {sources[0].path} is {first.name}",
+                "Run inputs of different CRS apart, or give --crs if one header is wrong",
+            )
+    densities = [info.density_per_m2 for info in sources if math.isfinite(info.density_per_m2)]
+    density = max(densities, default=1.0)
+    halo_m = settings.halo_m
+    size = settings.general.tile_size_m or tile_size_m(density, halo_m)
+    grid = TileGrid(
+        size_mm=round(size * MM),
+        halo_mm=math.ceil(halo_m * MM),
+        origin_x_mm=round(settings.general.lattice_x_m * MM),
+        origin_y_mm=round(settings.general.lattice_y_m * MM),
+    )
+    return Plan(
+        sources=sources,
+        grid=grid,
+        options=options,
+        points=sum(info.point_count for info in sources),
+        density_per_m2=density,
+        window_bytes=int(density * (size + 2.0 * halo_m) ** 2 * _BYTES_PER_POINT),
+        warnings=tuple(warnings),
+    )
+
+
+def check_memory(plan: Plan, limit_bytes: int | None) -> None:
+    """Refuse a plan whose largest task cannot fit into a worker, before the first task.
+
+    Parameters
+    ----------
+    plan : Plan
+        The plan.
+    limit_bytes : int or None
+        A worker's memory limit; None where there is none.
+
+    Raises
+    ------
+    InputError
+        Naming the tile size that would fit.
+    """
+    if limit_bytes is None or plan.window_bytes <= limit_bytes:
+        return
+    raise InputError(
+        plan.sources[0].path,
+        f"a tile of {plan.grid.size_mm / MM:g} m needs about {plan.window_bytes / 1e9:.1f} GB a worker, "
+        f"its limit is {limit_bytes / 1e9:.1f} GB",
+        "Set a smaller tile_size_m, or give the workers more memory",
+    )

@@ -1,0 +1,78 @@
+"""Publish: one tile's results into the run directory, its state last."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import shapely
+
+from pipeline.export.records import RecordContext, RejectedObject
+from pipeline.export.tile import TileFiles, put_local, write_tile
+from pipeline.runtime.join import RejectedSite
+from pipeline.runtime.modelling import StoredResult
+from pipeline.runtime.scratch import Scratch
+from pipeline.tiling import MM, Tile
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PublishTask:
+    """One tile."""
+
+    tile: Tile
+    run_dir: str
+    scratch: Scratch
+    batches: tuple[int, ...]
+    """Batches that modelled buildings of this tile."""
+    rejected: tuple[RejectedSite, ...]
+    """Objects of this tile that are no buildings."""
+    context: RecordContext
+    meshes: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Published:
+    """One tile's files."""
+
+    tile: Tile
+    files: TileFiles
+
+
+def _rejected_object(site: RejectedSite) -> RejectedObject:
+    """The record of a rejected object; its outline is the box around its facets."""
+    x0, y0, x1, y1 = site.box_mm
+    origin = (x0 // MM, y0 // MM)
+    outline = shapely.box(
+        (x0 - origin[0] * MM) / MM, (y0 - origin[1] * MM) / MM, (x1 - origin[0] * MM) / MM, (y1 - origin[1] * MM) / MM
+    )
+    return RejectedObject(
+        object_id=site.object_id,
+        origin=(float(origin[0]), float(origin[1]), 0.0),
+        reason=site.verdict.reason,
+        reason_detail=site.verdict.detail,
+        outline=outline,
+        area_m2=site.area_m2,
+        height_m=site.height_m,
+        n_points=site.points,
+    )
+
+
+def publish(task: PublishTask) -> Published:
+    """Write one tile's tables, meshes and city objects, then its state; may run twice."""
+    stored: list[StoredResult] = []
+    for number in task.batches:
+        stored.extend(task.scratch.get_object(f"results/{task.tile.key}/{number}.pickle"))
+    context = dataclasses.replace(
+        task.context, facts={entry.result.building_id: entry.facts for entry in stored}
+    )
+    files = write_tile(
+        task.run_dir,
+        task.tile.key,
+        [entry.result for entry in stored],
+        [_rejected_object(site) for site in task.rejected],
+        context,
+        meshes=task.meshes,
+    )
+    state = {"tile": task.tile.key, "state": "done", "files": dict(files.digests)}
+    put_local(task.run_dir)(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
+    return Published(tile=task.tile, files=files)

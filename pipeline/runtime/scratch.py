@@ -1,0 +1,79 @@
+"""Where a run keeps what is neither input nor result: points by tile, fragments, terrain, models to be published.
+
+Plain files of fixed records under one folder that all workers see. Every file is written under a
+temporary name and renamed, so a task may run twice or die half way.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+import numpy.typing as npt
+
+POINT = np.dtype(
+    [
+        ("x", "<i8"),
+        ("y", "<i8"),
+        ("z", "<i4"),
+        ("source", "<u2"),
+        ("return_number", "u1"),
+        ("return_count", "u1"),
+        ("gps_time", "<f8"),
+        ("classification", "u1"),
+    ]
+)
+"""A point in scratch: absolute millimetres and the attributes of `PointCloud`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scratch:
+    """A folder for the duration of a run."""
+
+    root: str
+    """Path of the folder; a string, so that tasks stay small and picklable."""
+
+    def path(self, *parts: str) -> Path:
+        """A path inside; its folder exists afterwards."""
+        path = Path(self.root, *parts)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def put_arrays(self, name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Store arrays, one file each under the folder `name`, so that they can be mapped."""
+        for key, array in arrays.items():
+            target = self.path(name, f"{key}.npy")
+            temporary = target.with_name(f".{key}.{uuid4().hex}.npy")
+            np.save(temporary, array, allow_pickle=False)
+            temporary.replace(target)
+
+    def array(self, name: str, key: str, *, mapped: bool = False) -> npt.NDArray[Any]:
+        """One stored array, read whole or mapped."""
+        path = Path(self.root, name, f"{key}.npy")
+        loaded: npt.NDArray[Any] = np.load(path, mmap_mode="r" if mapped else None, allow_pickle=False)
+        return loaded
+
+    def has(self, name: str) -> bool:
+        """Whether anything is stored under a name."""
+        return Path(self.root, name).exists()
+
+    def put_object(self, name: str, value: object) -> None:
+        """Store one of our own frozen records."""
+        target = self.path(name)
+        temporary = target.with_name(f".{target.name}.{uuid4().hex}")
+        temporary.write_bytes(pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL))
+        temporary.replace(target)
+
+    def get_object(self, name: str) -> Any:
+        """A record stored by this run. Never called on files that others wrote."""
+        return pickle.loads(Path(self.root, name).read_bytes())  # noqa: S301
+
+    def clear(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.root, ignore_errors=True)

@@ -1,0 +1,225 @@
+"""Split: one tile's window of points to surface fragments, or to the points of given footprints."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from pipeline.model import BoolArray
+from pipeline.runtime.scratch import POINT, Scratch
+from pipeline.scene import (
+    BUILDING_CLASS,
+    GROUND_CLASS,
+    ClassesInUse,
+    SceneSettings,
+    WindowPoints,
+    lattice_of,
+    split_tile,
+    terrain_of,
+)
+from pipeline.spatial_hash import first_of_each
+from pipeline.terrain.ground import CELL_MM, NO_DATA, Terrain, height_above
+from pipeline.terrain.surfaces import Fragments
+from pipeline.tiling import MM, Tile, TileGrid, Window
+
+APRON_MM = 6 * MM
+"""Width of the terrain that a tile stores beyond its core; less than the halo's own margin."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SplitTask:
+    """One tile."""
+
+    tile: Tile
+    """The tile."""
+    grid: TileGrid
+    """The lattice."""
+    settings: SceneSettings
+    """Ground to candidates."""
+    classes: ClassesInUse
+    """Which of the file's classes are believed."""
+    scratch: Scratch
+    """Points in, fragments out."""
+    footprints: str | None
+    """Name of the stored footprints in scratch; None where none were given."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Split:
+    """The small descriptors of one tile that travel to the driver."""
+
+    tile: Tile
+    """The tile."""
+    fragments: Fragments | None
+    """Surface fragments; None where footprints were given or the tile has no points."""
+    starts: npt.NDArray[np.int64]
+    """(k + 1,) int64, where each fragment's (or footprint's) points start in the tile's sorted points."""
+    keys: npt.NDArray[np.int64]
+    """(k,) int64, the fragment's or footprint's number."""
+    lowest_points_mm: npt.NDArray[np.int64]
+    """(k, 3) int64, lexicographically smallest point of each."""
+    points: int
+    """Points of the core, without duplicates."""
+    duplicates: int
+    """Exact duplicates in the core that were dropped."""
+    outliers: int
+    """Gross outliers in the core."""
+    audit: tuple[int, int, int]
+    """Points of the core: assigned and class 6, assigned and not, class 6 and not assigned."""
+
+
+def load_window(scratch: Scratch, grid: TileGrid, tile: Tile) -> tuple[WindowPoints, int]:
+    """The points of a tile's window without exact duplicates, and how many duplicates its core had."""
+    window, core = grid.window(tile), grid.core(tile)
+    pieces = []
+    for other in grid.tiles_over(window):
+        folder = Path(scratch.root, "points", other.key)
+        if not folder.is_dir():
+            continue
+        for part in sorted(folder.glob("*.bin")):
+            records = np.fromfile(part, POINT)
+            pieces.append(records if other == tile else records[window.contains(records["x"], records["y"])])
+    records = np.concatenate(pieces) if pieces else np.empty(0, POINT)
+    del pieces
+    columns = {name: np.ascontiguousarray(records[name]) for name in POINT.names or ()}
+    del records
+    columns["z"] = columns["z"].astype(np.int64)
+    kept = first_of_each(
+        columns["x"],
+        columns["y"],
+        columns["z"],
+        columns["return_number"],
+        columns["gps_time"],
+        columns["source"],
+        columns["classification"],
+    )
+    duplicates = int((~kept & core.contains(columns["x"], columns["y"])).sum())
+    if not kept.all():
+        columns = {name: values[kept] for name, values in columns.items()}
+    points = WindowPoints(
+        x_mm=columns["x"],
+        y_mm=columns["y"],
+        z_mm=columns["z"],
+        return_number=columns["return_number"],
+        return_count=columns["return_count"],
+        classification=columns["classification"],
+        gps_time=columns["gps_time"],
+        source_id=columns["source"],
+    )
+    return points, duplicates
+
+
+def split(task: SplitTask) -> Split:
+    """Split one tile and store its points, sorted by fragment, and its terrain.
+
+    Returns
+    -------
+    Split
+        Descriptors; arrays are in scratch under `tiles/<tile>/`.
+    """
+    points, duplicates = load_window(task.scratch, task.grid, task.tile)
+    core, window = task.grid.core(task.tile), task.grid.window(task.tile)
+    fragments: Fragments | None = None
+    if task.footprints is None:
+        result = split_tile(points, core, window, task.settings, task.classes)
+        index, owner = result.core_index, result.point_fragment.astype(np.int64)
+        fragments, terrain, occupied, outliers = result.fragments, result.terrain, result.occupied, result.outliers
+    else:
+        terrain, kept, occupied = terrain_of(points, window, task.settings, task.classes)
+        in_core = core.contains(points.x_mm, points.y_mm)
+        outliers = int((in_core & ~kept).sum())
+        index, owner = _inside_footprints(points, in_core & kept, terrain, task)
+    is_building = points.classification[index] == BUILDING_CLASS
+    assigned = owner >= 0
+    audit = (
+        int((assigned & is_building).sum()),
+        int((assigned & ~is_building).sum()),
+        int((~assigned & is_building).sum()),
+    )
+    keys, starts, lowest = _store(task, points, index[assigned], owner[assigned])
+    _store_terrain(task, terrain, occupied, core)
+    return Split(
+        tile=task.tile,
+        fragments=fragments,
+        starts=starts,
+        keys=keys,
+        lowest_points_mm=lowest,
+        points=int(core.contains(points.x_mm, points.y_mm).sum()),
+        duplicates=duplicates,
+        outliers=outliers,
+        audit=audit,
+    )
+
+
+def _store(
+    task: SplitTask, points: WindowPoints, index: npt.NDArray[np.int64], owner: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Store points sorted by owner; the owners, where each one's points start, and their smallest points."""
+    order = np.lexsort((points.z_mm[index], points.y_mm[index], points.x_mm[index], owner))
+    index, owner = index[order], owner[order]
+    records = np.empty(len(index), POINT)
+    records["x"], records["y"], records["z"] = points.x_mm[index], points.y_mm[index], points.z_mm[index]
+    records["source"] = points.source_id[index]
+    records["return_number"] = points.return_number[index]
+    records["return_count"] = points.return_count[index]
+    records["gps_time"] = points.gps_time[index]
+    records["classification"] = points.classification[index]
+    task.scratch.put_arrays(f"tiles/{task.tile.key}", {"points": records.view(np.uint8)})
+    keys, starts = np.unique(owner, return_index=True)
+    lowest = np.column_stack([records[name][starts] for name in "xyz"]).astype(np.int64)
+    return keys, np.append(starts, len(owner)).astype(np.int64), lowest
+
+
+def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core: Window) -> None:
+    """Store the terrain of the core and an apron around it.
+
+    The apron lets a candidate at the data's edge see terrain whose own tile holds no point and so is never made.
+    Where aprons overlap they agree.
+    """
+    apron = core.grown(APRON_MM)
+    column0, row0, n_columns, n_rows = lattice_of(apron)
+    rows = slice(row0 - terrain.row0, row0 - terrain.row0 + n_rows)
+    columns = slice(column0 - terrain.column0, column0 - terrain.column0 + n_columns)
+    task.scratch.put_arrays(
+        f"tiles/{task.tile.key}",
+        {
+            "terrain": np.ascontiguousarray(terrain.elevation_mm[rows, columns]),
+            "occupied": np.ascontiguousarray(occupied[rows, columns]),
+            "corner": np.array([column0, row0], np.int64),
+        },
+    )
+
+
+def _inside_footprints(
+    points: WindowPoints, usable: BoolArray, terrain: Terrain, task: SplitTask
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Indices of the core's points and the footprint that holds each, -1 where none.
+
+    Inside a footprint all points above the ground count, or those of class 6 where it is believed.
+    """
+    polygons = task.scratch.get_object(task.footprints or "").polygons
+    index = np.flatnonzero(usable)
+    owner = np.full(len(index), -1, np.int64)
+    x, y = points.x_mm[index], points.y_mm[index]
+    height = height_above(x, y, points.z_mm[index], terrain.elevation_mm, terrain.column0, terrain.row0)
+    above = (height == NO_DATA) | (height >= round(task.settings.ground.tolerance_m * MM))
+    if task.classes.building:
+        above = points.classification[index] == BUILDING_CLASS
+    elif task.classes.ground:
+        above &= points.classification[index] != GROUND_CLASS
+    core = task.grid.core(task.tile)
+    tree = shapely.STRtree(polygons)
+    box = shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM)
+    # the smaller number wins where footprints overlap, whatever the tile
+    for number in sorted((int(k) for k in tree.query(box)), reverse=True):
+        polygon = polygons[number]
+        x0, y0, x1, y1 = (round(v * MM) for v in polygon.bounds)
+        near = np.flatnonzero(above & (x >= x0 - 1) & (x <= x1 + 1) & (y >= y0 - 1) & (y <= y1 + 1))
+        if len(near):
+            shapely.prepare(polygon)
+            owner[near[shapely.contains_xy(polygon, x[near] / MM, y[near] / MM)]] = number
+    return index, owner

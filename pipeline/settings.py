@@ -1,0 +1,217 @@
+"""All settings of a run: the small settings classes that live beside each stage, composed and hashed."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import SettingsError
+from pipeline.methods import METHODS, ReconstructSettings, method_named
+from pipeline.parameters import Parameters, parameter
+from pipeline.roof.roof_type import RoofTypeSettings
+from pipeline.roof.settings import RoofSettings
+from pipeline.scene import SceneSettings
+from pipeline.terrain.candidates import CandidateSettings
+from pipeline.terrain.ground import GroundSettings
+from pipeline.terrain.outliers import OutlierSettings
+from pipeline.terrain.surfaces import SurfaceSettings
+from pipeline.terrain.vegetation import VegetationSettings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GeneralSettings(Parameters):
+    """Settings of the run as a whole."""
+
+    method: str = parameter("fuzzy-sart", "The method that models the buildings.", choices=tuple(METHODS))
+    classes: str = parameter(
+        "trust",
+        "What the file's own classes are worth: believed, only compared with what is found, or not looked at.",
+        choices=("trust", "audit", "ignore"),
+    )
+    tile_size_m: float = parameter(
+        0.0,
+        "Side of the tiles; 0 chooses it from the density. Results do not depend on it.",
+        unit="m",
+        minimum=0.0,
+        maximum=2000.0,
+        changes_geometry=False,
+    )
+    halo_m: float = parameter(
+        0.0,
+        "Width of the ring that a tile sees around itself; 0 is the least that the settings need.",
+        unit="m",
+        minimum=0.0,
+        maximum=1000.0,
+        changes_geometry=False,
+    )
+    lattice_x_m: float = parameter(
+        0.0, "Easting of the lattice's origin, to test that tiles do not matter.", unit="m", changes_geometry=False
+    )
+    lattice_y_m: float = parameter(0.0, "Northing of the lattice's origin.", unit="m", changes_geometry=False)
+
+
+SECTIONS: Mapping[str, type[Parameters]] = {
+    "outliers": OutlierSettings,
+    "ground": GroundSettings,
+    "vegetation": VegetationSettings,
+    "surfaces": SurfaceSettings,
+    "candidates": CandidateSettings,
+    "roof": RoofSettings,
+    "roof-type": RoofTypeSettings,
+}
+"""Tables of the settings file that every method shares; each method adds one of its own name."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunSettings:
+    """Everything that can be set, for one method."""
+
+    general: GeneralSettings = dataclasses.field(default_factory=GeneralSettings)
+    """The run as a whole."""
+    scene: SceneSettings = dataclasses.field(default_factory=SceneSettings)
+    """From a tile's points to candidates."""
+    building: ReconstructSettings = dataclasses.field(default_factory=ReconstructSettings)
+    """From a candidate to its model; `building.method` is never None here."""
+
+    def __post_init__(self) -> None:
+        """Fill in the method's defaults and refuse a halo that is too narrow."""
+        entry = method_named(self.general.method)
+        if self.building.method is None:
+            building = dataclasses.replace(self.building, method=entry.settings_type())
+            object.__setattr__(self, "building", building)
+        support = self.scene.support_m
+        if 0.0 < self.general.halo_m < support:
+            raise SettingsError([f"halo_m is {self.general.halo_m:g}: use at least {support:g} m, or 0 for just that"])
+
+    @property
+    def halo_m(self) -> float:
+        """The halo in metres: as set, or the support of all stages."""
+        return self.general.halo_m or self.scene.support_m
+
+    def sections(self) -> dict[str, Parameters]:
+        """Every settings object by the name of its table; `general` is the top level of the file."""
+        method = self.building.method
+        if method is None:
+            raise AssertionError("filled in at construction")
+        return {
+            "general": self.general,
+            "outliers": self.scene.outliers,
+            "ground": self.scene.ground,
+            "vegetation": self.scene.vegetation,
+            "surfaces": self.scene.surfaces,
+            "candidates": self.scene.candidates,
+            "roof": self.building.roof,
+            "roof-type": self.building.roof_type,
+            self.general.method: method,
+        }
+
+    def as_dict(self) -> dict[str, dict[str, Any]]:
+        """All values by section and name."""
+        return {name: dataclasses.asdict(section) for name, section in self.sections().items()}
+
+    @property
+    def settings_hash(self) -> str:
+        """sha256 of the canonical JSON of all values that can change geometry, for the chosen method."""
+        content = {
+            name: {
+                field.name: getattr(section, field.name)
+                for field in dataclasses.fields(section)
+                if field.metadata.get("changes_geometry", True)
+            }
+            for name, section in self.sections().items()
+        }
+        text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @classmethod
+    def from_mapping(cls, table: Mapping[str, Any]) -> RunSettings:
+        """Settings from the `[settings]` table of a file.
+
+        Parameters
+        ----------
+        table : mapping
+            General settings at the top level, one table a section: those of `SECTIONS` and one named
+            after a method.
+
+        Raises
+        ------
+        SettingsError
+            Listing all faults at once: unknown names, wrong types, values out of range.
+        """
+        faults: list[str] = []
+        general_values = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
+        general = _build(GeneralSettings, "", general_values, faults)
+        method_name = general_values.get("method", GeneralSettings().method)
+        known = {**SECTIONS, **{name: entry.settings_type for name, entry in METHODS.items()}}
+        built: dict[str, Any] = {}
+        for name, values in table.items():
+            if not isinstance(values, Mapping):
+                continue
+            if name not in known:
+                faults.append(f"[{name}] is no table of settings: use one of {', '.join(known)}")
+            else:
+                built[name] = _build(known[name], name, values, faults)
+        if faults:
+            raise SettingsError(faults)
+        scene_names = {field.name for field in dataclasses.fields(SceneSettings)}
+        scene = SceneSettings(**{name: built[name] for name in scene_names if name in built})
+        building = ReconstructSettings(
+            method=built.get(method_name),
+            roof=built.get("roof", RoofSettings()),
+            roof_type=built.get("roof-type", RoofTypeSettings()),
+        )
+        return cls(general=general or GeneralSettings(), scene=scene, building=building)
+
+    @classmethod
+    def from_toml(cls, path: str | None, overrides: Mapping[str, Any]) -> RunSettings:
+        """Settings of a TOML file under overrides of its top level.
+
+        Parameters
+        ----------
+        path : str or None
+            A file with a `[settings]` table; None for the defaults.
+        overrides : mapping
+            General settings that win over the file, such as `{"method": "fuzzy-sart"}`.
+
+        Raises
+        ------
+        SettingsError
+            The file cannot be read or parsed, or holds faults.
+        """
+        table: dict[str, Any] = {}
+        if path is not None:
+            try:
+                document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+            except OSError as error:
+                raise SettingsError([f"settings file {path} cannot be read: {error.strerror or error}"]) from error
+            except tomllib.TOMLDecodeError as error:
+                raise SettingsError([f"settings file {path} is no TOML: {error}"]) from error
+            table = dict(document.get("settings", {}))
+            if not table and document:
+                raise SettingsError([f"settings file {path} has no [settings] table; it has {', '.join(document)}"])
+        table.update(overrides)
+        return cls.from_mapping(table)
+
+
+def _build(kind: type[Parameters], section: str, values: Mapping[str, Any], faults: list[str]) -> Any:
+    """One settings object, or None with its faults appended, each under the name of its table."""
+    names = {field.name: field for field in dataclasses.fields(kind)}
+    prefix = f"[{section}] " if section else ""
+    unknown = [name for name in values if name not in names]
+    faults.extend(f"{prefix}{name} is no setting: use one of {', '.join(names)}" for name in unknown)
+    given = {}
+    for name, value in values.items():
+        if name in names:
+            # TOML writes 2 where a float is meant
+            wants_float = isinstance(names[name].default, float) and isinstance(value, int)
+            given[name] = float(value) if wants_float and not isinstance(value, bool) else value
+    try:
+        return kind(**given)
+    except SettingsError as error:
+        faults.extend(f"{prefix}{fault}" for fault in error.faults)
+        return None

@@ -1,0 +1,184 @@
+"""The named suites: what `simulate` can make."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from pipeline.errors import SettingsError
+from pipeline.synthetic.als import ScannerSettings
+from pipeline.synthetic.roofs import RoofDimensions, RoofShape
+from pipeline.synthetic.scene import Scene, Terrain, place_building, undulating_terrain
+from pipeline.synthetic.suburb import suburb, tree_at
+from pipeline.synthetic.town import town
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Suite:
+    """A kind of scene and the survey that goes with it."""
+
+    name: str
+    """As given on the command line."""
+    summary: str
+    """One sentence."""
+    make: Callable[[int, tuple[float, float]], Scene]
+    """Scene from a seed and a size in metres."""
+    scanner: ScannerSettings
+    """Default survey."""
+    size_m: tuple[float, float]
+    """Default extent east and north."""
+    seed: int
+    """Default seed."""
+
+
+def _suburb(seed: int, size_m: tuple[float, float]) -> Scene:
+    return suburb(seed, size_m=size_m)
+
+
+def _town(seed: int, size_m: tuple[float, float]) -> Scene:
+    return town(seed, size_m=size_m)
+
+
+def _cube(seed: int, size_m: tuple[float, float]) -> Scene:
+    """The test of Shorter and Kasparis: elevations of 0 and 10 m. The cube has 10 m edges; the seed has no say."""
+    del seed
+    terrain = Terrain(base_z_m=0.0)
+    middle_x, middle_y = size_m[0] / 2, size_m[1] / 2
+    size = RoofDimensions(length_m=10.0, width_m=10.0)
+    cube = place_building(
+        "cube", RoofShape.FLAT, size, x=middle_x, y=middle_y, azimuth_deg=0.0, eave_height_m=10.0, terrain=terrain
+    )
+    return Scene(
+        name="cube", origin=(0.0, 0.0, 0.0), crs=None, extent=(0.0, 0.0, *size_m), terrain=terrain, buildings=(cube,)
+    )
+
+
+_SINGLE_SIZES = {
+    RoofShape.FLAT: RoofDimensions(length_m=12.0, width_m=9.0),
+    RoofShape.PENT: RoofDimensions(length_m=12.0, width_m=8.0, pitch_deg=15.0),
+    RoofShape.GABLE: RoofDimensions(length_m=13.0, width_m=9.0, pitch_deg=35.0),
+    RoofShape.HIP: RoofDimensions(length_m=14.0, width_m=9.0, pitch_deg=35.0),
+    RoofShape.L_SHAPE: RoofDimensions(length_m=15.0, width_m=9.0, pitch_deg=35.0, wing_length_m=6.0, wing_width_m=7.0),
+}
+
+
+def single_building(
+    shape: RoofShape,
+    seed: int,
+    size_m: tuple[float, float] = (40.0, 40.0),
+    dimensions: RoofDimensions | None = None,
+    *,
+    slope_deg: float = 0.0,
+    trees: int = 0,
+) -> Scene:
+    """One building in the middle of a field; the seed turns it and places the trees.
+
+    Parameters
+    ----------
+    shape : RoofShape
+        What stands there.
+    seed : int
+        Not negative.
+    size_m : tuple of float
+        Extent east and north.
+    dimensions : RoofDimensions, optional
+        Its size; without one a house of about 110 m2 with 35 deg of pitch (pent: 15).
+    slope_deg : float
+        Slope of the terrain.
+    trees : int
+        Number of trees around it.
+    """
+    random = np.random.default_rng([seed, 0x1B])
+    terrain = undulating_terrain(100.0, slope_deg, random.uniform(0, 360), 0.0, 100.0, random)
+    building = place_building(
+        str(shape),
+        shape,
+        dimensions or _SINGLE_SIZES[shape],
+        x=size_m[0] / 2,
+        y=size_m[1] / 2,
+        azimuth_deg=float(random.uniform(0, 360)),
+        eave_height_m=4.0,
+        terrain=terrain,
+    )
+    around = random.uniform(0, 2 * np.pi, trees)
+    standing = tuple(
+        tree_at(building.x + 13.0 * float(np.cos(a)), building.y + 13.0 * float(np.sin(a)), 2.5, 8.0, terrain)
+        for a in around
+    )
+    return Scene(
+        name=str(shape),
+        origin=(565_000.0, 5_934_000.0, 0.0),
+        crs="EPSG:25832+7837",
+        extent=(0.0, 0.0, *size_m),
+        terrain=terrain,
+        buildings=(building,),
+        trees=standing,
+    )
+
+
+def _single_suite(shape: RoofShape) -> Suite:
+    def make(seed: int, size_m: tuple[float, float]) -> Scene:
+        return single_building(shape, seed, size_m)
+
+    return Suite(
+        name=str(shape),
+        summary=f"one {str(shape).replace('_', '-')} building on level ground, 4 points a m2, 3 cm of noise",
+        make=make,
+        scanner=ScannerSettings(pulse_density_per_m2=4.0),
+        size_m=(40.0, 40.0),
+        seed=1,
+    )
+
+
+_CUBE_SCANNER = ScannerSettings(
+    pulse_density_per_m2=4.0, range_noise_m=0.1, altitude_m=100_000.0, beam_radius_m=0.0, drop_out=0.0, jitter=1.0
+)
+
+SUITES: dict[str, Suite] = {
+    suite.name: suite
+    for suite in (
+        Suite(
+            name="suburb",
+            summary="detached houses of all five roof shapes on gentle terrain, with trees and cars",
+            make=_suburb,
+            scanner=ScannerSettings(pulse_density_per_m2=7.0, flight_azimuth_deg=90.0),
+            size_m=(200.0, 200.0),
+            seed=7,
+        ),
+        Suite(
+            name="town",
+            summary="streets with rows of touching houses of several levels, courtyards and parks, of any size",
+            make=_town,
+            scanner=ScannerSettings(
+                pulse_density_per_m2=7.0, altitude_m=900.0, strip_spacing_m=300.0, flight_azimuth_deg=90.0
+            ),
+            size_m=(400.0, 400.0),
+            seed=11,
+        ),
+        Suite(
+            name="cube",
+            summary="the cube of Shorter and Kasparis: elevations of 0 and 10 m, 0.1 m of vertical noise",
+            make=_cube,
+            scanner=_CUBE_SCANNER,
+            size_m=(30.0, 30.0),
+            seed=1,
+        ),
+        *(_single_suite(shape) for shape in RoofShape),
+    )
+}
+"""All suites by name."""
+
+
+def suite_named(name: str) -> Suite:
+    """The suite of that name.
+
+    Raises
+    ------
+    SettingsError
+        Naming the valid suites.
+    """
+    if name not in SUITES:
+        raise SettingsError([f"suite is {name!r}: use one of {', '.join(SUITES)}"])
+    return SUITES[name]

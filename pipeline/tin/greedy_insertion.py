@@ -1,0 +1,400 @@
+"""Greedy insertion TIN with noise absorption (Garland & Heckbert 1995; Shorter & Kasparis, section 3.1).
+
+Always the unused point with the largest vertical error is inserted and the Delaunay property restored, so the points
+that define the surface most come first: corners, ridges, break lines. What lies on a facet up to a distance (Eq. 1),
+where the facet is no wall (Eq. 2), is absorbed by it.
+
+Nothing here depends on the order of the points. Facets are half-open, so that each unused point is in one facet only;
+the plane of a facet is computed from its smallest vertex on; equal errors follow the lexicographic order of (x, y).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray, FloatArray, LabelArray, Tin
+from pipeline.parameters import Parameters, parameter
+from pipeline.tin.delaunay import hilbert_order, unique_xy_ranked
+from pipeline.tin.half_edges import canonical_facets, locate, restore_delaunay, split_facet, start_sphere
+from pipeline.tin.predicates import MAX_EXTENT_MM, orientation
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GreedyInsertionSettings(Parameters):
+    """Settings of the greedy insertion."""
+
+    absorption: str = parameter(
+        "bucket",
+        "What becomes of absorbed points: they stay in the bucket of their facet and insertion ends when all that is "
+        "left would be absorbed, or they are inserted at the facet's elevation (the paper's way, slower).",
+        choices=("bucket", "insert"),
+    )
+    absorption_distance_m: float = parameter(
+        0.2, "Perpendicular distance up to which a facet absorbs a point (Eq. 1).", unit="m", minimum=0.0, maximum=10.0
+    )
+    absorption_slope_deg: float = parameter(
+        60.0, "Slope up to which a facet absorbs points (Eq. 2).", unit="deg", minimum=0.0, maximum=89.0
+    )
+    margin_m: float = parameter(
+        2.0,
+        "Distance of the four corners of the TIN beyond the bounding box of the points.",
+        unit="m",
+        minimum=0.001,
+        maximum=40.0,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GreedyTin:
+    """A TIN by greedy insertion, and where every point went."""
+
+    tin: Tin
+    """Delaunay facets over `vertices`."""
+    vertices: FloatArray
+    """(v, 3) float64 metres: four corners, counter-clockwise from the lower left, then the inserted points in the order
+    of the input. The elevation of a point that was absorbed and inserted is that of its facet."""
+    vertex_point: LabelArray
+    """(v,) int32, the input point of every vertex; -1 for the corners."""
+    facet_of_point: LabelArray
+    """(n,) int32, the facet that contains a point; -1 for inserted points. A point beneath another one at the same
+    position follows that one's facet, or the first facet at its vertex."""
+    absorbed: BoolArray
+    """(n,) bool, True for a point that was absorbed by a facet; False for one beneath another at the same position."""
+
+
+@njit(cache=True, nogil=True)
+def _is_left(x: FloatArray, y: FloatArray, rank: LabelArray, a: int, b: int, p: int) -> bool:
+    """Whether p belongs to the left of the directed edge a, b; points on it are left of its ascending direction."""
+    turn = orientation(x[a], y[a], x[b], y[b], x[p], y[p])
+    return bool(turn > 0.0 or (turn == 0.0 and rank[a] < rank[b]))
+
+
+@njit(cache=True, nogil=True)
+def _facet_plane(
+    x: FloatArray, y: FloatArray, z: FloatArray, rank: LabelArray, origin: LabelArray, facet: int
+) -> tuple[int, float, float]:
+    """The smallest vertex of a facet and its gradient from there: independent of the slots that the vertices are in."""
+    e = 4 * facet
+    a, b, c = origin[e], origin[e + 1], origin[e + 2]
+    if rank[b] < rank[a] and rank[b] < rank[c]:
+        a, b, c = b, c, a
+    elif rank[c] < rank[a] and rank[c] < rank[b]:
+        a, b, c = c, a, b
+    ux, uy, uz = x[b] - x[a], y[b] - y[a], z[b] - z[a]
+    vx, vy, vz = x[c] - x[a], y[c] - y[a], z[c] - z[a]
+    twice_area = ux * vy - uy * vx
+    return a, (uz * vy - vz * uy) / twice_area, (ux * vz - vx * uz) / twice_area
+
+
+@njit(cache=True, nogil=True)
+def _push(
+    errors: FloatArray,
+    points: LabelArray,
+    facets: LabelArray,
+    rank: LabelArray,
+    size: int,
+    error: float,
+    point: int,
+    facet: int,
+) -> None:
+    """Add an entry to a heap of `size` entries; at its top is the largest error, of equal ones the smallest point."""
+    i = size
+    while i > 0:
+        parent = (i - 1) >> 1
+        if errors[parent] > error or (errors[parent] == error and rank[points[parent]] <= rank[point]):
+            break
+        errors[i] = errors[parent]
+        points[i] = points[parent]
+        facets[i] = facets[parent]
+        i = parent
+    errors[i] = error
+    points[i] = point
+    facets[i] = facet
+
+
+@njit(cache=True, nogil=True)
+def _pop(errors: FloatArray, points: LabelArray, facets: LabelArray, rank: LabelArray, size: int) -> None:
+    """Remove the top of a heap of `size` entries."""
+    last = size - 1
+    error = errors[last]
+    point = points[last]
+    facet = facets[last]
+    i = 0
+    while True:
+        child = 2 * i + 1
+        if child >= last:
+            break
+        if child + 1 < last and (
+            errors[child + 1] > errors[child]
+            or (errors[child + 1] == errors[child] and rank[points[child + 1]] < rank[points[child]])
+        ):
+            child += 1
+        if errors[child] < error or (errors[child] == error and rank[points[child]] >= rank[point]):
+            break
+        errors[i] = errors[child]
+        points[i] = points[child]
+        facets[i] = facets[child]
+        i = child
+    errors[i] = error
+    points[i] = point
+    facets[i] = facet
+
+
+@njit(cache=True, nogil=True)
+def _insert_greedily(
+    x: FloatArray,
+    y: FloatArray,
+    z: FloatArray,
+    rank: LabelArray,
+    is_absorbed_inserted: bool,
+    distance_mm: float,
+    steepest: float,
+) -> tuple[LabelArray, LabelArray, int, LabelArray, BoolArray]:
+    """The insertion over n points, the four corners counter-clockwise, and the vertex at infinity; z changes in place.
+
+    Returns origins and twins of the half-edges, the number of facets, the facet of every point or -1 where it was
+    inserted, and which points are absorbed.
+    """
+    infinity = len(x) - 1
+    n = infinity - 4
+    origin = np.empty(8 * (n + 4), np.int32)
+    twin = np.empty(8 * (n + 4), np.int32)
+    start_sphere(x, y, origin, twin, n, n + 1, n + 2)
+    facet = locate(x, y, origin, twin, 0, n + 3)
+    split_facet(origin, twin, facet, 4, n + 3)
+    n_facets = 6
+    restore_delaunay(x, y, origin, twin, facet)
+
+    is_absorbed = np.zeros(n, np.bool_)
+    bucket = np.full(2 * (n + 4), -1, np.int32)  # the first unused point of every facet
+    next_in_bucket = np.empty(n, np.int32)
+    worst = np.full(2 * (n + 4), -1, np.int32)  # the candidate of every facet
+    worst_error = np.empty(2 * (n + 4))
+    heap_errors = np.empty(1024)
+    heap_points = np.empty(1024, np.int32)
+    heap_facets = np.empty(1024, np.int32)
+    heap_size = 0
+    star = np.empty(64, np.int32)
+    unplaced = np.arange(n).astype(np.int32)
+    n_unplaced = n
+    newest = (
+        n + 3
+    )  # opposite to the lower left corner, which the diagonal of the square avoids: both facets are its own
+    while True:
+        # only the facets around the newest vertex have changed, and all of them
+        first = 4 * facet
+        e = first
+        n_star = 0
+        while True:
+            if origin[e + 1] != infinity and origin[e + 2] != infinity:
+                if n_star == len(star):
+                    star = np.concatenate((star, star))
+                star[n_star] = e >> 2
+                n_star += 1
+                q = bucket[e >> 2]
+                while q >= 0:
+                    if q != newest:
+                        unplaced[n_unplaced] = q
+                        n_unplaced += 1
+                    q = next_in_bucket[q]
+            e = twin[e + 2]
+            if e == first:
+                break
+        for s in range(n_star):
+            bucket[star[s]] = -1
+        # points go from one facet to the next around the vertex: neighbours in a bucket are neighbours in the plane
+        s = 0
+        e = 4 * star[0]
+        for i in range(n_unplaced):
+            q = unplaced[i]
+            if _is_left(x, y, rank, newest, origin[e + 1], q):
+                while _is_left(x, y, rank, newest, origin[e + 2], q):
+                    s = s + 1 if s + 1 < n_star else 0
+                    e = 4 * star[s]
+            else:
+                s = s - 1 if s > 0 else n_star - 1
+                e = 4 * star[s]
+                while not _is_left(x, y, rank, newest, origin[e + 1], q):
+                    s = s - 1 if s > 0 else n_star - 1
+                    e = 4 * star[s]
+            next_in_bucket[q] = bucket[e >> 2]
+            bucket[e >> 2] = q
+        n_unplaced = 0
+        for s in range(n_star):
+            t = star[s]
+            worst[t] = -1
+            q = bucket[t]
+            if q < 0:
+                continue
+            base, gradient_x, gradient_y = _facet_plane(x, y, z, rank, origin, t)
+            steepness = gradient_x * gradient_x + gradient_y * gradient_y
+            # Eq. 1 by Eq. 2: perpendicular is vertical distance times the cosine of the slope
+            absorbing_mm = -1.0
+            if steepness <= steepest and not is_absorbed_inserted:
+                absorbing_mm = distance_mm * math.sqrt(1.0 + steepness)
+            largest = -1.0
+            chosen = -1
+            while q >= 0:
+                error = abs(z[q] - (z[base] + gradient_x * (x[q] - x[base]) + gradient_y * (y[q] - y[base])))
+                if error > absorbing_mm and (error > largest or (error == largest and rank[q] < rank[chosen])):
+                    largest = error
+                    chosen = q
+                q = next_in_bucket[q]
+            if chosen < 0:
+                continue
+            worst[t] = chosen
+            worst_error[t] = largest
+            if heap_size == len(heap_errors):
+                heap_errors = np.concatenate((heap_errors, heap_errors))
+                heap_points = np.concatenate((heap_points, heap_points))
+                heap_facets = np.concatenate((heap_facets, heap_facets))
+            _push(heap_errors, heap_points, heap_facets, rank, heap_size, largest, chosen, t)
+            heap_size += 1
+        newest = -1
+        while heap_size > 0 and newest < 0:
+            # an entry is stale where its facet has changed since
+            if worst[heap_facets[0]] == heap_points[0] and worst_error[heap_facets[0]] == heap_errors[0]:
+                newest = heap_points[0]
+                facet = heap_facets[0]
+            _pop(heap_errors, heap_points, heap_facets, rank, heap_size)
+            heap_size -= 1
+        if newest < 0:
+            break
+        if is_absorbed_inserted:
+            base, gradient_x, gradient_y = _facet_plane(x, y, z, rank, origin, facet)
+            steepness = gradient_x * gradient_x + gradient_y * gradient_y
+            if steepness <= steepest and worst_error[facet] <= distance_mm * math.sqrt(1.0 + steepness):
+                is_absorbed[newest] = True
+                z[newest] = z[base] + gradient_x * (x[newest] - x[base]) + gradient_y * (y[newest] - y[base])
+        split_facet(origin, twin, facet, n_facets, newest)
+        n_facets += 2
+        restore_delaunay(x, y, origin, twin, facet)
+    facet_of_point = np.full(n, -1, np.int32)
+    for t in range(n_facets):
+        q = bucket[t]
+        while q >= 0:
+            facet_of_point[q] = t
+            is_absorbed[q] = True
+            q = next_in_bucket[q]
+    return origin, twin, n_facets, facet_of_point, is_absorbed
+
+
+def insert_greedily(points_m: FloatArray, settings: GreedyInsertionSettings, corner_z_m: float) -> GreedyTin:
+    """Triangulate points by greedy insertion with noise absorption.
+
+    The TIN begins with four corners around the points. Of points at one position the highest takes part.
+
+    Parameters
+    ----------
+    points_m : (n, 3) float64
+        Points in metres, whole millimetres.
+    settings : GreedyInsertionSettings
+        Absorption and margin.
+    corner_z_m : float
+        Elevation of the four corners: that of the ground.
+
+    Returns
+    -------
+    GreedyTin
+        Without points, no vertices and no facets.
+
+    Raises
+    ------
+    ValueError
+        If the points with their margins extend over more than 2^21 mm, 2.097 km.
+
+    Notes
+    -----
+    The point inserted next is that of the largest *vertical* error, as Garland & Heckbert have it: perpendicular
+    distances differ wildly on walls. Eq. 2 of Shorter & Kasparis is the slope of the facet and is computed as such, as
+    it is 0/0 for a point on the facet.
+
+    Examples
+    --------
+    >>> flat = np.array([[0.0, 0.0, 5.0], [4.0, 0.0, 5.0], [4.0, 4.0, 5.0], [0.0, 4.0, 5.0], [1.0, 2.0, 4.9]])
+    >>> greedy = insert_greedily(flat, GreedyInsertionSettings(), corner_z_m=0.0)
+    >>> greedy.absorbed
+    array([False, False, False, False,  True])
+    """
+    n_points = len(points_m)
+    if n_points == 0:
+        nothing = np.empty((0, 3), np.int32)
+        return GreedyTin(
+            tin=Tin(facets=nothing, neighbours=nothing),
+            vertices=np.empty((0, 3)),
+            vertex_point=np.empty(0, np.int32),
+            facet_of_point=np.empty(0, np.int32),
+            absorbed=np.empty(0, np.bool_),
+        )
+    xyz_mm = np.rint(points_m * 1000.0).astype(np.int64)
+    margin_mm = round(settings.margin_m * 1000.0)
+    low = xyz_mm[:, :2].min(axis=0) - margin_mm
+    wide = xyz_mm[:, :2].max(axis=0) + margin_mm - low
+    if wide.max() > MAX_EXTENT_MM:
+        raise ValueError(
+            f"points with their margin extend over {wide.max() / 1000:.3f} m: triangulate windows of at most "
+            f"{MAX_EXTENT_MM / 1000:.3f} m"
+        )
+    kept, kept_of_point, kept_rank = unique_xy_ranked(xyz_mm[:, :2], xyz_mm[:, 2])
+    kept_mm = xyz_mm[kept]
+    along_curve = hilbert_order(kept_mm[:, :2])
+    point = kept[along_curve]
+    n = len(point)
+
+    corners_xy = np.array([[0, 0], [wide[0], 0], [wide[0], wide[1]], [0, wide[1]]])
+    x = np.concatenate((xyz_mm[point, 0] - low[0], corners_xy[:, 0], [0])).astype(np.float64)
+    y = np.concatenate((xyz_mm[point, 1] - low[1], corners_xy[:, 1], [0])).astype(np.float64)
+    z = np.concatenate((xyz_mm[point, 2], np.full(5, round(corner_z_m * 1000.0)))).astype(np.float64)
+    rank = np.empty(n + 4, np.int32)
+    rank[:n] = kept_rank[along_curve] + 2
+    rank[n:] = [0, n + 2, n + 3, 1]
+    surveyed_z = z.copy()
+    origin, twin, n_facets, facet_of_vertex, is_absorbed = _insert_greedily(
+        x,
+        y,
+        z,
+        rank,
+        settings.absorption == "insert",
+        settings.absorption_distance_m * 1000.0,
+        math.tan(math.radians(settings.absorption_slope_deg)) ** 2,
+    )
+
+    inserted = np.sort(point[facet_of_vertex < 0])
+    number_of_vertex = np.full(n + 4, -1, np.int32)
+    number_of_vertex[n:] = np.arange(4)
+    number_of_vertex[:n][facet_of_vertex < 0] = 4 + np.searchsorted(inserted, point[facet_of_vertex < 0])
+    facets, neighbours, row_of_facet = canonical_facets(origin, twin, n_facets, number_of_vertex)
+
+    vertices = np.empty((4 + len(inserted), 3))
+    vertices[:4, :2] = (corners_xy + low) / 1000.0
+    vertices[:4, 2] = corner_z_m
+    vertices[4:] = points_m[inserted]
+    moved = z[:n] != surveyed_z[:n]
+    vertices[number_of_vertex[:n][moved], 2] = z[:n][moved] / 1000.0
+    vertex_point = np.concatenate((np.full(4, -1), inserted)).astype(np.int32)
+
+    facet_of_point = np.full(n_points, -1, np.int32)
+    facet_of_point[point] = np.where(facet_of_vertex < 0, -1, row_of_facet[facet_of_vertex])
+    beneath = np.ones(n_points, np.bool_)
+    beneath[kept] = False
+    if beneath.any():
+        first_facet = np.full(len(vertices), len(facets), np.int32)
+        np.minimum.at(first_facet, facets.ravel(), np.repeat(np.arange(len(facets), dtype=np.int32), 3))
+        above = kept[kept_of_point[beneath]]
+        followed = facet_of_point[above]
+        at_vertex = followed < 0
+        followed[at_vertex] = first_facet[4 + np.searchsorted(inserted, above[at_vertex])]
+        facet_of_point[beneath] = followed
+    absorbed = np.zeros(n_points, np.bool_)
+    absorbed[point] = is_absorbed
+    return GreedyTin(
+        tin=Tin(facets=facets, neighbours=neighbours),
+        vertices=vertices,
+        vertex_point=vertex_point,
+        facet_of_point=facet_of_point,
+        absorbed=absorbed,
+    )

@@ -1,0 +1,167 @@
+"""The docs say what the code says: settings, options, columns, reasons, commands and links."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import re
+import shlex
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import typer
+
+from pipeline.export.records import SCHEMAS
+from pipeline.methods.fuzzy_sart import FuzzySartSettings
+from pipeline.model import Reason, RoofType, Status
+from service.cli import app
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")])
+
+
+@pytest.fixture(scope="module")
+def generator() -> ModuleType:
+    """docs/generate.py as a module."""
+    spec = importlib.util.spec_from_file_location("generate_docs", DOCS / "generate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def commands() -> dict[str, Any]:
+    """The commands of the console script."""
+    return dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
+
+
+GENERATED = ("settings.md", "command_line.md", "exit_codes.md", "validity.md")
+
+
+@pytest.mark.parametrize("page", GENERATED)
+def test_a_generated_page_is_what_the_code_says(generator: ModuleType, page: str) -> None:
+    assert tuple(generator.PAGES) == GENERATED
+    assert (DOCS / "reference" / page).read_text() == generator.PAGES[page](), "run make docs"
+
+
+def test_every_option_is_in_the_reference() -> None:
+    text = (DOCS / "reference" / "command_line.md").read_text()
+    sections = dict(re.findall(r"^## gablework (\S+)\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL))
+    assert set(sections) == set(commands())
+    for name, command in commands().items():
+        for parameter in command.params:
+            if parameter.param_type_name == "option" and parameter.name != "help":
+                assert f"`{parameter.opts[0]}`" in sections[name], f"{name} {parameter.opts[0]}"
+
+
+def test_every_option_explains_itself() -> None:
+    silent = [
+        f"{name} {parameter.name}"
+        for name, command in commands().items()
+        for parameter in command.params
+        if not getattr(parameter, "help", "")
+    ]
+    assert silent == []
+
+
+def test_every_setting_of_every_stage_is_in_the_reference(generator: ModuleType) -> None:
+    text = (DOCS / "reference" / "settings.md").read_text()
+    missing = [
+        row[0] for rows in generator.sections().values() for row in rows if str(row[0]) not in text or not str(row[-1])
+    ]
+    assert missing == []
+
+
+def test_the_method_page_tells_every_setting_of_its_recipe() -> None:
+    text = (DOCS / "methods" / "fuzzy_sart.md").read_text()
+    missing = [f.name for f in dataclasses.fields(FuzzySartSettings) if f"`{f.name}" not in text]
+    assert missing == []
+
+
+def test_every_setting_that_a_page_names_exists(generator: ModuleType) -> None:
+    known = {str(row[0]).strip("`").rsplit(".", 1)[-1] for rows in generator.sections().values() for row in rows}
+    text = (DOCS / "methods" / "fuzzy_sart.md").read_text()
+    named = set(re.findall(r"`([a-z]+(?:_[a-z0-9]+)+)(?:: [a-z_]+)?`", text))
+    values = {"unit_normal", "spherical_scaled", "too_complex", "all_planes"}
+    assert named - known - values == set()
+
+
+@pytest.mark.parametrize("table", list(SCHEMAS))
+def test_every_column_is_told_with_its_type_in_order(table: str) -> None:
+    text = (DOCS / "reference" / "records.md").read_text()
+    section = re.search(rf"^## {table}\n(.*?)(?=^## )", text, re.MULTILINE | re.DOTALL)
+    assert section is not None
+    told = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", section[1], re.MULTILINE)
+    assert [name for name, _ in told] == SCHEMAS[table].names
+    for name, kind in told:
+        real = str(SCHEMAS[table].field(name).type)
+        assert re.sub(r"list<\w+: ", "list<", real).split("[")[0] == kind, name
+
+
+def test_every_reason_status_and_roof_type_is_told() -> None:
+    text = (DOCS / "reference" / "records.md").read_text()
+    reasons = text.split("## Reasons")[1]
+    assert re.findall(r"^\| `(\w+)` \|", reasons, re.MULTILINE) == [reason.value for reason in Reason]
+    status = text.split("## Status")[1].split("## Reasons")[0]
+    assert re.findall(r"^\| `(\w+)` \|", status, re.MULTILINE) == [entry.value for entry in Status]
+    row = re.search(r"^\| `roof_type`.*$", text, re.MULTILINE)
+    assert row is not None
+    assert all(f"`{kind.value}`" in row[0] for kind in RoofType)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", page.read_text()):
+        if "://" in target:
+            continue
+        name, _, anchor = target.partition("#")
+        path = (page.parent / name).resolve() if name else page
+        assert path.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", path.read_text(), re.MULTILINE)
+            assert anchor in {re.sub(r"[^a-z0-9 -]", "", h.lower()).replace(" ", "-") for h in headings}, target
+
+
+def test_every_page_can_be_reached_from_the_readme() -> None:
+    reached, open_pages = set(), [ROOT / "README.md"]
+    while open_pages:
+        page = open_pages.pop()
+        reached.add(page)
+        for target in re.findall(r"\]\(([^)#]+\.md)(?:#[^)]*)?\)", page.read_text()):
+            path = (page.parent / target).resolve()
+            if "://" not in target and path not in reached:
+                open_pages.append(path)
+    assert set(PAGES) - reached == set()
+
+
+def shell_lines() -> list[tuple[str, str]]:
+    """Every line of every sh block, with its page."""
+    return [
+        (page.relative_to(ROOT).as_posix(), line.split(" #")[0].strip())
+        for page in PAGES
+        for block in re.findall(r"^ *```sh\n(.*?)^ *```", page.read_text(), re.MULTILINE | re.DOTALL)
+        for line in block.splitlines()
+        if line.strip()
+    ]
+
+
+@pytest.mark.parametrize(("page", "line"), shell_lines())
+def test_a_command_of_the_docs_is_one_that_exists(page: str, line: str) -> None:
+    words = shlex.split(line)
+    if words[0] == "make":
+        targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        assert [word for word in words[1:] if "=" not in word and word not in targets] == []
+        return
+    assert words[0] == ".venv/bin/gablework", f"{page}: {line}"
+    command = commands()[words[1]]
+    context = command.make_context(words[1], words[2:], resilient_parsing=False)
+    assert context.params
+
+
+def test_the_readme_tells_the_two_commands_first() -> None:
+    lines = [line for page, line in shell_lines() if page == "README.md"]
+    assert lines[:2] == ["make demo", "make test"]

@@ -1,0 +1,169 @@
+"""CityJSONSeq: its rules, the official schema, cjio, and the geometry that comes back."""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import os
+import sys
+from collections import Counter
+from pathlib import Path
+
+import cityjson_rules
+import jsonschema
+import numpy as np
+import pytest
+import referencing
+import small_buildings as small
+from cjio import cityjson as cjio_cityjson
+
+from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.records import building_row
+
+CRSES = ["compound", "feet and metres", "US feet", "unknown"]
+BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent)
+SCHEMAS = "GABLEWORK_CITYJSON_SCHEMAS"
+"""Names a folder with the schema files of CityJSON 2.0 as its maintainers publish them."""
+
+
+def sequence(context, builders=BUILT) -> list[dict]:
+    """The objects of a file with these buildings."""
+    rows = [(build(), building_row(build(), context, mesh_path="meshes/t/a.obj")) for build in builders]
+    return [json.loads(line) for line in cityjson_lines(rows, context.reference, "test")]
+
+
+def merged_by_cjio(lines: list[dict], monkeypatch: pytest.MonkeyPatch) -> cjio_cityjson.CityJSON:
+    """One CityJSON of a sequence, as `cat file | cjio stdin` makes it."""
+    monkeypatch.setattr(sys, "stdin", io.StringIO("".join(json.dumps(line) + "\n" for line in lines)))
+    return cjio_cityjson.read_stdin()
+
+
+@pytest.mark.parametrize("crs", CRSES)
+def test_a_sequence_follows_the_rules(contexts, crs: str) -> None:
+    assert cityjson_rules.faults(sequence(contexts[crs])) == []
+    assert cityjson_rules.faults(sequence(contexts[crs], ())) == []
+
+
+def test_the_rules_catch_what_is_broken(contexts) -> None:
+    sound = sequence(contexts["compound"], [small.gable])
+
+    def broken(path: list, value: object) -> list[str]:
+        lines = copy.deepcopy(sound)
+        *way, last = path
+        inner = lines
+        for step in way:
+            inner = inner[step]
+        inner[last] = value
+        return cityjson_rules.faults(lines)
+
+    part = [1, "CityObjects", "gable-0"]
+    solid = [*part, "geometry", 0]
+    assert broken([0, "version"], "1.1")
+    assert broken([1, "id"], "another")
+    assert broken([1, "vertices", 0], [0.5, 0, 0])
+    assert broken([*part, "parents"], ["another"])
+    assert broken([*part, "type"], "Buildingpart")
+    assert broken([*solid, "lod"], 2.2)
+    assert broken([*solid, "boundaries", 0, 0, 0, 0], 999)
+    assert broken([*solid, "semantics", "values", 0], [0, 1])
+    assert broken([*solid, "semantics", "surfaces", 0, "type"], "Roof")
+
+
+@pytest.mark.skipif(SCHEMAS not in os.environ, reason=f"{SCHEMAS} names no folder with the official schema files")
+@pytest.mark.parametrize("crs", CRSES)
+def test_every_line_fits_the_official_schema(contexts, crs: str) -> None:
+    files = {path.name: json.loads(path.read_text()) for path in Path(os.environ[SCHEMAS]).glob("*.schema.json")}
+    registry = referencing.Registry().with_resources(
+        (schema["$id"], referencing.Resource.from_contents(schema)) for schema in files.values()
+    )
+    for number, line in enumerate(sequence(contexts[crs])):
+        name = "cityjsonfeature.schema.json" if number else "cityjson.schema.json"
+        validator = jsonschema.Draft7Validator(files[name], registry=registry)
+        assert [error.message[:300] for error in validator.iter_errors(line)] == []
+
+
+@pytest.mark.parametrize("crs", CRSES)
+def test_integer_vertices_give_back_the_coordinates(contexts, crs: str) -> None:
+    reference = contexts[crs].reference
+    first, *features = sequence(contexts[crs])
+    units = np.array([reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m])
+    built = {build().building_id: build() for build in BUILT}
+    for feature in features:
+        solids = built[feature["id"]].solids
+        xyz = np.array(feature["vertices"]).reshape(-1, 3) * first["transform"]["scale"] + first["transform"]["translate"]
+        wanted = np.vstack([solid.vertices for solid in solids]) if solids else np.empty((0, 3))
+        assert np.array_equal(np.round(xyz * units - small.ORIGIN, 3), wanted)
+
+
+def test_the_scale_is_a_millimetre_in_metres(contexts) -> None:
+    assert sequence(contexts["compound"])[0]["transform"]["scale"] == [0.001, 0.001, 0.001]
+
+
+def test_solids_are_closed_and_one_part_each(contexts) -> None:
+    for feature in sequence(contexts["compound"])[1:]:
+        parts = [entry for entry in feature["CityObjects"].values() if entry["type"] == "BuildingPart"]
+        assert len(parts) == {"two_parts": 2, "failed": 0}.get(feature["id"], 1)
+        for part in parts:
+            (shell,) = part["geometry"][0]["boundaries"]
+            rings = [ring for surface in shell for ring in surface]
+            edges = Counter((ring[i - 1], ring[i]) for ring in rings for i in range(len(ring)))
+            assert set(edges.values()) == {1}
+            assert all((b, a) in edges for a, b in edges)
+
+
+def test_semantic_surfaces_tell_slope_and_aspect_of_each_roof_plane(contexts) -> None:
+    feature = sequence(contexts["compound"], [small.two_parts])[1]
+    (solid,) = feature["CityObjects"]["two_parts-1"]["geometry"]
+    semantics = solid["semantics"]
+    kinds = Counter(semantics["surfaces"][value]["type"] for value in semantics["values"][0])
+    assert kinds == {"RoofSurface": 2, "WallSurface": 6, "GroundSurface": 1}
+    roofs = [surface for surface in semantics["surfaces"] if surface["type"] == "RoofSurface"]
+    assert [(roof["plane_id"], roof["aspect_deg"]) for roof in roofs] == [(2, 180.0), (3, 0.0)]
+    assert [roof["slope_deg"] for roof in roofs] == pytest.approx([36.8699, 36.8699])
+
+
+def test_attributes_are_the_record_without_what_is_unknown(contexts) -> None:
+    first = contexts["compound"]
+    by_id = {feature["id"]: feature["CityObjects"][feature["id"]]["attributes"] for feature in sequence(first)[1:]}
+    row = building_row(small.courtyard(), first, mesh_path="meshes/t/a.obj")
+    wanted = {n: v for n, v in row.items() if v is not None and n not in {"geometry", "building_id"}}
+    told = {name: value for name, value in wanted.items() if not name.startswith("acquired")}
+    assert {n: v for n, v in by_id["courtyard"].items() if not n.startswith("acquired")} == told
+    assert by_id["courtyard"]["acquired_from"] == "2014-03-01T10:00:00.000125+00:00"
+    assert by_id["failed"]["reason"] == "too_few_points"
+    assert "ridge_z" not in by_id["failed"]
+
+
+def test_the_reference_system_is_told_where_it_is_known(contexts) -> None:
+    codes = {"compound": "7415", "feet and metres": "2992", "US feet": "2225"}
+    for crs, code in codes.items():
+        system = sequence(contexts[crs])[0]["metadata"]["referenceSystem"]
+        assert system == f"https://www.opengis.net/def/crs/EPSG/0/{code}"
+    assert "referenceSystem" not in sequence(contexts["unknown"])[0]["metadata"]
+
+
+@pytest.mark.parametrize("crs", CRSES)
+def test_cjio_reads_the_sequence_as_one_model(contexts, crs: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = merged_by_cjio(sequence(contexts[crs]), monkeypatch)
+    names = {build().building_id for build in BUILT}
+    parts = {"gable-0", "courtyard-0", "two_parts-0", "two_parts-1", "pent-0"}
+    assert set(model.j["CityObjects"]) == names | parts
+    if contexts[crs].reference.epsg:
+        assert model.get_epsg() == contexts[crs].reference.epsg
+    reference = contexts[crs].reference
+    low = np.array(small.ORIGIN) / [reference.horizontal_unit_m] * 1.0
+    assert model.get_bbox()[:2] == pytest.approx(low[:2], abs=0.001)
+
+
+def test_cjio_merges_two_tiles(contexts, monkeypatch: pytest.MonkeyPatch) -> None:
+    context = contexts["compound"]
+    one = merged_by_cjio(sequence(context, [small.gable, small.failed]), monkeypatch)
+    two = merged_by_cjio(sequence(context, [small.courtyard]), monkeypatch)
+    one.merge([two])
+    assert set(one.j["CityObjects"]) == {"gable", "gable-0", "failed", "courtyard", "courtyard-0"}
+    court = one.j["CityObjects"]["courtyard-0"]["geometry"][0]["boundaries"][0]
+    scale, translate = (np.array(one.j["transform"][name]) for name in ("scale", "translate"))
+    xyz = np.array(one.j["vertices"])[[i for surface in court for ring in surface for i in ring]] * scale + translate
+    assert xyz.min(axis=0) == pytest.approx([85_020.0, 447_000.0, 2.0])
+    assert xyz.max(axis=0) == pytest.approx([85_040.0, 447_020.0, 11.0])

@@ -1,0 +1,117 @@
+"""The commands as a user meets them: help, usage errors, input errors, machine output."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from pipeline import __version__
+from pipeline.cli import app
+
+COMMANDS = ("reconstruct", "inspect", "simulate", "digest", "warm-up", "demo")
+
+
+def invoke(*words: str) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a command line."""
+    result = CliRunner().invoke(app, list(words))
+    return result.exit_code, result.stdout, result.stderr
+
+
+def ascii_tile(folder: Path) -> Path:
+    """A small sloping terrain with a box on it, as an ASCII file."""
+    rows = [
+        f"{1000 + 0.5 * i:.2f} {2000 + 0.5 * j:.2f} {40 + 0.01 * i + (5 if 20 < i < 40 and 20 < j < 36 else 0):.2f}"
+        for i in range(60)
+        for j in range(60)
+    ]
+    path = folder / "tile.xyz"
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_the_commands_are_the_documented_ones() -> None:
+    assert set(typer.main.get_command(app).commands) == set(COMMANDS)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help(command: str) -> None:
+    code, said, _ = invoke(command, "--help")
+    assert code == 0
+    assert command in said
+
+
+def test_the_version_is_told() -> None:
+    assert invoke("--version") == (0, f"{__version__}\n", "")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("inspect",),
+        ("reconstruct", "a.laz"),
+        ("reconstruct", "a.laz", "--out", "run", "--bbox", "1", "2", "3"),
+        ("reconstruct", "a.laz", "--out", "run", "--workers", "-1"),
+        ("digest", "run", "--no-such-option"),
+        ("no-such-command",),
+    ],
+)
+def test_a_wrong_command_line_is_exit_code_2(words: tuple[str, ...]) -> None:
+    assert invoke(*words)[0] == 2
+
+
+@pytest.mark.parametrize("option", [("--method", "magic"), ("--classes", "maybe"), ("--settings", "no-such.toml")])
+def test_a_wrong_setting_is_exit_code_2_and_names_it(tmp_path: Path, option: tuple[str, str]) -> None:
+    code, _, said = invoke("reconstruct", str(ascii_tile(tmp_path)), "--out", str(tmp_path / "run"), *option)
+    assert code == 2
+    assert option[1] in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_input_is_exit_code_3_and_names_it(tmp_path: Path) -> None:
+    for words in (("inspect", "no-such.laz"), ("reconstruct", "no-such.laz", "--out", str(tmp_path / "run"))):
+        code, _, said = invoke(*words)
+        assert code == 3
+        assert "no-such.laz" in said
+        assert "Traceback" not in said
+
+
+def test_a_folder_that_is_no_run_is_exit_code_4(tmp_path: Path) -> None:
+    code, _, said = invoke("digest", str(tmp_path))
+    assert code == 4
+    assert str(tmp_path) in said
+
+
+def test_errors_for_machines_are_json(tmp_path: Path) -> None:
+    code, said, _ = invoke("digest", str(tmp_path), "--json")
+    assert json.loads(said)["error"]["exit_code"] == code == 4
+
+
+def test_inspect_tells_what_a_tile_holds(tmp_path: Path) -> None:
+    code, said, _ = invoke("inspect", str(ascii_tile(tmp_path)), "--crs", "EPSG:28992")
+    assert code == 0
+    assert "3600 used of 3600" in said
+    assert "EPSG:28992" in said
+
+
+def test_inspect_counts_the_raised_box_for_machines(tmp_path: Path) -> None:
+    code, said, events = invoke("inspect", str(ascii_tile(tmp_path)), "--json")
+    found = json.loads(said)
+    assert code == 0
+    assert found["used_points"] == 3600
+    assert found["raised_objects"] == 1
+    assert found["density_per_m2"] == pytest.approx(4.0, rel=0.1)
+    assert found["elevation_m"] == [40.0, 45.39]
+    assert all("kind" in json.loads(line) for line in events.splitlines())
+
+
+def test_the_console_script_runs_as_a_program() -> None:
+    command = [sys.executable, "-m", "service.cli", "inspect", "no-such.laz"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 3
+    assert result.stderr.startswith("error: no-such.laz: no such file")
