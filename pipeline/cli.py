@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -78,7 +77,8 @@ def reconstruct(
         str | None, typer.Option(metavar="FILE", help="Only what lies inside the polygons of this vector file.")
     ] = None,
     classes: Annotated[
-        str | None, typer.Option(metavar="trust|audit|ignore", help="What the file's own classes are worth.")
+        Literal["trust", "audit", "ignore"] | None,
+        typer.Option(help="What the file's own classes are worth; default as the settings say."),
     ] = None,
     settings: Annotated[
         str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")
@@ -88,7 +88,7 @@ def reconstruct(
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
     ] = None,
     meshes: Annotated[
-        str, typer.Option(metavar="building|tile|none", help="One OBJ a building, one a tile, or none.")
+        Literal["building", "tile", "none"], typer.Option(help="One OBJ a building, one a tile, or none.")
     ] = "building",
     licence: Annotated[
         str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
@@ -114,6 +114,7 @@ def reconstruct(
             scheduler=scheduler,
             meshes=meshes,
             licence=licence,
+            overwrite=overwrite,
         )
         summary = run(request, console.on_event)
         show_summary(console, summary)
@@ -127,6 +128,24 @@ def _run_settings(path: str | None, **overrides: str | None) -> RunSettings:
 
     given = {name: value for name, value in overrides.items() if value is not None}
     return RunSettings.from_toml(path, given)
+
+
+def show_summary(console: Console, summary: RunSummary) -> None:
+    """What a run found, as tables or as the JSON document."""
+    counts = summary.counts
+    told = {**summary.reasons, **{f"rejected: {reason}": n for reason, n in summary.rejected.items()}}
+    console.table("Candidates", ["status", "count"], sorted(summary.statuses.items()))
+    console.table("Reasons", ["reason", "count"], sorted(told.items()))
+    console.table("Roof types", ["type", "count"], sorted(summary.roof_types.items()))
+    seconds = [(stage, f"{taken:.1f} s") for stage, taken in summary.timings_s.items()]
+    console.table("Time", ["stage", "wall clock"], seconds)
+    largest = max(summary.peak_memory_bytes.values(), default=0) / 2**30
+    console.say(f"{counts['points']} points in {counts['tiles']} tiles; peak memory of a process {largest:.2f} GiB")
+    for tile in summary.failed_tiles:
+        console.warn(f"tile {tile} failed")
+    console.say(f"content sha256 {summary.digest}")
+    console.say(f"results are in {summary.run_dir}")
+    console.document(dataclasses.asdict(summary))
 
 
 @app.command()
@@ -167,3 +186,58 @@ def digest(
         content = run_digest(run)
         console.say(content)
         console.document({"run": run, "content_sha256": content})
+
+
+@app.command()
+def simulate(
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="suburb, town, cube or one of the roof shapes.")],
+    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: a LAZ tile and the truth beside it.")],
+    seed: Annotated[
+        int | None, typer.Option(metavar="N", help="Of layout and scanner; default the suite's own.")
+    ] = None,
+    size: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="EAST NORTH", help="Extent in metres; default the suite's own."),
+    ] = None,
+    density: Annotated[float | None, typer.Option(metavar="D", help="Pulses a square metre.")] = None,
+    noise: Annotated[float | None, typer.Option(metavar="M", help="Range noise in metres.")] = None,
+    with_classes: Annotated[bool, typer.Option("--with-classes", help="Write the true classes into the tile.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a scene as a LAZ tile, with the exact truth beside it."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.runtime.events import Event
+        from pipeline.synthetic.dataset import simulate as simulate_scene
+
+        paths = simulate_scene(
+            suite,
+            out,
+            seed,
+            size_m=size,
+            density_per_m2=density,
+            noise_m=noise,
+            with_classes=with_classes,
+            on_points=lambda n: console.on_event(Event(kind="progress", stage="scan", done=n)),
+        )
+        console.say(f"{paths.points} points of {paths.buildings} buildings in {paths.laz}, the truth in {paths.truth}")
+        console.document(dataclasses.asdict(paths))
+
+
+@app.command(name="warm-up")
+def warm_up(as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """Compile the numba kernels, by a small simulated run in this process."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from tempfile import TemporaryDirectory
+
+        from pipeline.runtime.run import RunRequest, run
+        from pipeline.synthetic.dataset import simulate as simulate_scene
+
+        with TemporaryDirectory(prefix="gablework-") as folder:
+            started = time.perf_counter()
+            scene = simulate_scene("gable", f"{folder}/scene")
+            request = RunRequest(inputs=(str(scene.laz),), out=f"{folder}/run", workers=0)
+            summary = run(request, console.on_event)
+            seconds = time.perf_counter() - started
+        console.say(f"kernels compiled and one building modelled in {seconds:.1f} s")
+        console.document({"seconds": seconds, "statuses": summary.statuses})

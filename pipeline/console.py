@@ -159,11 +159,11 @@ class Console:
 
     def _log(self, event: Event) -> None:
         now = self._clock()
-        ended = event.kind != "progress" or event.done >= event.total
+        ended = event.kind != "progress" or event.done == event.total
         if not ended and now - self._last_line_s.get(event.stage, -LOG_INTERVAL_S) < LOG_INTERVAL_S:
             return
         self._last_line_s[event.stage] = now
-        counted = f"{event.done}/{event.total}" if event.total else ""
+        counted = f"{event.done}/{event.total}" if event.total else str(event.done or "")
         words = [word for word in (event.stage, counted, event.message) if word]
         if words:
             print(" ".join(words), file=sys.stderr, flush=True)

@@ -19,8 +19,7 @@ from pipeline.quality.residuals import summarise, vertical_residuals
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_parts, block_plane
 from pipeline.roof.footprint import hull_of_points, outline
-from pipeline.roof.partition import RoofPartition
-from pipeline.roof.plan import FORMS, RoofPoints, draw_plan, level_dipping_faces, partition_roof, roof_points
+from pipeline.roof.plan import RoofPlan, RoofPoints, level_dipping_faces, partition_roof, plan_forms, roof_points
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.solid import SolidPart, solid_parts
@@ -82,22 +81,22 @@ def _reconstruct(
     settings: ReconstructSettings,
 ) -> BuildingResult:
     """The chain of a method's own solids, then the block."""
-    bare = roof_points(candidate, None, settings.roof)
-    partition: RoofPartition | None = None
+    bare = roof_points(candidate, settings.roof)
+    plan: RoofPlan | None = None
     codes: tuple[int, ...] = ()
     try:
         segmentation = segment(candidate)
-        roof = roof_points(candidate, segmentation.labels, settings.roof)
+        roof = dataclasses.replace(bare, labels=segmentation.labels[bare.index])
         _require_planes(segmentation, roof)
-        partition = partition_roof(roof, segmentation.planes, settings.roof)
-        parts, planes, codes = _own_solids(candidate, roof, partition, segmentation.planes, settings.roof)
+        plan = partition_roof(roof, segmentation.planes, settings.roof)
+        parts, planes, codes = _own_solids(candidate, roof, plan, segmentation.planes, settings.roof)
         if parts:
             return _result(candidate, method, settings, parts, planes, status=Status.OK, lod="2.2")
         reason = Reason.INVALID_SOLID
         detail = f"validity codes {', '.join(map(str, codes)) or 'none'}: no form of the solid passes"
     except BuildingError as error:
         reason, detail = error.reason, error.detail
-    parts, planes = _block(candidate, bare, partition, settings.roof)
+    parts, planes = _block(candidate, bare, plan, settings.roof)
     return _result(
         candidate, method, settings, parts, planes, status=Status.FALLBACK, lod="1.2", reason=reason, detail=detail,
         codes=codes,
@@ -115,17 +114,16 @@ def _require_planes(segmentation: Segmentation, roof: RoofPoints) -> None:
 def _own_solids(
     candidate: Candidate,
     roof: RoofPoints,
-    partition: RoofPartition,
+    plan: RoofPlan,
     planes: Sequence[Plane],
     settings: RoofSettings,
 ) -> tuple[list[SolidPart], list[Plane], tuple[int, ...]]:
     """The first form of the method's solids that is valid throughout; no parts and all codes met where none is."""
     codes: set[int] = set()
-    for form in FORMS:
+    for form in plan_forms(plan, roof, settings):
         try:
-            plan = draw_plan(partition, roof, settings, form)
-            plan, own_planes = level_dipping_faces(plan, roof, planes, candidate.ground_z_m, settings)
-            parts = large_parts(solid_parts(plan, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
+            drawn, own_planes = level_dipping_faces(form(), roof, planes, candidate.ground_z_m, settings)
+            parts = large_parts(solid_parts(drawn, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
         except BuildingError:
             continue
         faults = {code for part in parts for code in check_solid(part.solid)}
@@ -142,30 +140,22 @@ def large_parts(parts: list[SolidPart], minimum_area_m2: float) -> list[SolidPar
 
 
 def _block(
-    candidate: Candidate, roof: RoofPoints, partition: RoofPartition | None, settings: RoofSettings
+    candidate: Candidate, roof: RoofPoints, plan: RoofPlan | None, settings: RoofSettings
 ) -> tuple[list[SolidPart], list[Plane]]:
     """A valid block on the footprint, else on the partition's outline, else on the points' outline."""
     plane = block_plane(roof.points, candidate.ground_z_m, settings.block_height_percentile)
-    outlines: list[MultiPolygon] = []
-    if roof.footprint_mm is not None:
-        outlines.append(roof.footprint_mm)
-    elif partition is not None:
-        outlines.append(outline(partition))
-    else:
-        unlabelled = RoofPoints(
-            points=roof.points,
-            xy_mm=roof.xy_mm,
-            labels=np.zeros(len(roof.points), np.int32),
-            spacing_m=roof.spacing_m,
-            footprint_mm=None,
-        )
-        outlines.append(outline(partition_roof(unlabelled, [plane], settings)))
+    if plan is None:
+        unlabelled = dataclasses.replace(roof, labels=np.zeros(len(roof.points), np.int32))
+        plan = partition_roof(unlabelled, [plane], settings)
+    outlines = [plan.outline_mm]
+    if plan.raw is not None:
+        outlines.append(outline(plan.raw))
     tolerance = settings.simplification_spacings * roof.spacing_m
     hull = hull_of_points(roof.points)
     if hull is not None:
         outlines.append(MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))]))
     for footprint in outlines:
-        for factor in (1.0, 0.0) if roof.footprint_mm is None else (0.0, 0.2):
+        for factor in (0.0, 0.5, 1.0):
             try:
                 parts = block_parts(
                     footprint, plane, candidate.ground_z_m, factor * tolerance, settings.minimum_part_area_m2

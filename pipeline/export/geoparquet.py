@@ -120,7 +120,7 @@ def table_dataset(run_dir: str, table_name: str, filesystem: pafs.FileSystem | N
     Raises
     ------
     RunError
-        Where the folder does not exist or holds no such table.
+        Where the folder does not exist.
     """
     filesystem = filesystem or pafs.LocalFileSystem()
     folder = f"{str(run_dir).rstrip('/')}/{table_name}"
@@ -128,13 +128,20 @@ def table_dataset(run_dir: str, table_name: str, filesystem: pafs.FileSystem | N
         raise RunError(f"{folder} is no folder: give the directory that a run wrote")
     partitioning = pads.partitioning(pa.schema([("tile", pa.string())]), flavor="hive")
     schema = stored_schema(table_name).append(pa.field("tile", pa.string()))
-    try:
-        return pads.dataset(folder, schema=schema, filesystem=filesystem, format="parquet", partitioning=partitioning)
-    except (pa.ArrowInvalid, OSError) as error:
-        raise RunError(f"{folder} cannot be read as Parquet: {error}") from error
+    return pads.dataset(folder, schema=schema, filesystem=filesystem, format="parquet", partitioning=partitioning)
 
 
 def read_table(run_dir: str, table_name: str, filesystem: pafs.FileSystem | None = None) -> pa.Table:
-    """One table of a run as a whole, sorted by its key; the arguments are those of `table_dataset`."""
-    table = table_dataset(run_dir, table_name, filesystem).to_table()
+    """One table of a run as a whole, sorted by its key; the arguments are those of `table_dataset`.
+
+    Raises
+    ------
+    RunError
+        Where the folder does not exist or a file in it is damaged.
+    """
+    dataset = table_dataset(run_dir, table_name, filesystem)
+    try:
+        table = dataset.to_table()
+    except (pa.ArrowInvalid, OSError) as error:
+        raise RunError(f"{table_name} of {run_dir} cannot be read as Parquet: {error}") from error
     return table.sort_by([(column, "ascending") for column in KEYS[table_name]])

@@ -90,7 +90,7 @@ class LasFile:
             If the data end or break before the promised count.
         """
         if window is not None and self._copc is not None:
-            yield from self._octree_records(window)
+            yield from self._octree_records(chunk_size, window)
             return
         with self._path.open("rb") as stream:
             decoder = self._decoder(stream)
@@ -98,29 +98,50 @@ class LasFile:
                 count = min(chunk_size, self._block.point_count - begin)
                 yield self._to_records(self._decode(decoder, count, begin))
 
-    def _octree_records(self, window: Window) -> Iterator[PointRecords]:
-        """Records of the octree nodes that meet the window, one node a piece."""
+    def _octree_records(self, chunk_size: int, window: Window) -> Iterator[PointRecords]:
+        """Records of the octree nodes that meet the window, small nodes together and large ones in pieces."""
         assert self._copc is not None
         with self._path.open("rb") as stream:
             nodes = copc.nodes_within(self._path, stream, self._copc, window, self._block.file_size)
+            batch: list[npt.NDArray[np.uint8]] = []
             for node in nodes:
-                stream.seek(int(node["offset"]))
-                count, size = int(node["count"]), int(node["size"])
-                out = np.empty(count * self._block.point_size, dtype=np.uint8)
-                try:
-                    lazrs.decompress_points_with_chunk_table(
-                        stream.read(size), self._laszip_record, out, [(count, size)], self._selection()
-                    )
-                except DECODING_ERRORS as fault:
-                    raise self._broken(fault, "in an octree node") from fault
-                yield self._to_records(out)
+                offset, size, count = int(node["offset"]), int(node["size"]), int(node["count"])
+                held = sum(map(len, batch)) // self._block.point_size
+                if batch and held + count > chunk_size:
+                    yield from self._pieces(batch, chunk_size)
+                    batch = []
+                batch.append(self._decode_chunk(stream, offset, size, count))
+            if batch:
+                yield from self._pieces(batch, chunk_size)
+
+    def _pieces(self, batch: list[npt.NDArray[np.uint8]], chunk_size: int) -> Iterator[PointRecords]:
+        """Records of some decoded nodes, at most so many a piece."""
+        raw, step = np.concatenate(batch), chunk_size * self._block.point_size
+        for begin in range(0, len(raw), step):
+            yield self._to_records(raw[begin : begin + step])
 
     def _laspy_header(self, stream: io.BufferedReader) -> laspy.LasHeader:
         """The header by laspy; what it makes of damaged records is any of Python's errors."""
         try:
-            return laspy.LasHeader.read_from(stream)
-        except (laspy.LaspyException, ValueError, LookupError, TypeError, AttributeError, struct.error) as fault:
+            header = laspy.LasHeader.read_from(stream)
+            item_size = header.point_format.dtype().itemsize
+        except (
+            laspy.LaspyException,
+            ArithmeticError,
+            AttributeError,
+            LookupError,
+            TypeError,
+            ValueError,
+            struct.error,
+        ) as fault:
             raise UnreadableInputError(str(self._path), f"the LAS header is damaged ({fault})", REWRITE) from fault
+        if item_size != self._block.point_size:
+            raise InconsistentInputError(
+                str(self._path),
+                f"the header has {self._block.point_size} bytes a point, its point format and extra fields {item_size}",
+                REWRITE,
+            )
+        return header
 
     def _read_laszip_record(self) -> bytes:
         """The LAZ record, which tells how the points are compressed."""
@@ -152,13 +173,13 @@ class LasFile:
         """What lazrs shall decompress."""
         return lazrs.DecompressionSelection(USED_FIELDS)
 
-    def _decoder(self, stream: io.BufferedReader, *, parallel: bool = True) -> Any:
+    def _decoder(self, stream: io.BufferedReader) -> Any:
         """The thing that gives the next records: lazrs where compressed, else the stream itself."""
         stream.seek(self._block.offset_to_points)
         if self._chunks is None:
             return stream
         # The parallel one decodes whole chunks into memory, so chunks without measure go to the sequential one.
-        parallel = parallel and int(self._chunks.counts.max()) <= CHUNK_SIZE_LIMIT
+        parallel = int(self._chunks.counts.max()) <= CHUNK_SIZE_LIMIT
         make = lazrs.ParLasZipDecompressor if parallel else lazrs.LasZipDecompressor
         try:
             return make(stream, self._laszip_record, self._selection())
@@ -175,6 +196,18 @@ class LasFile:
                 read_exactly(decoder, raw)
         except (*DECODING_ERRORS, EOFError) as fault:
             raise self._broken(fault, f"between points {begin} and {begin + count}") from fault
+        return raw
+
+    def _decode_chunk(self, stream: io.BufferedReader, offset: int, size: int, count: int) -> npt.NDArray[np.uint8]:
+        """The bytes of the first records of a compressed chunk."""
+        stream.seek(offset)
+        raw = np.empty(count * self._block.point_size, dtype=np.uint8)
+        try:
+            lazrs.decompress_points_with_chunk_table(
+                stream.read(size), self._laszip_record, raw, [(count, size)], self._selection()
+            )
+        except DECODING_ERRORS as fault:
+            raise self._broken(fault, f"in the chunk at byte {offset}") from fault
         return raw
 
     def _broken(self, fault: Exception, where: str) -> UnreadableInputError:
@@ -202,22 +235,22 @@ class LasFile:
 
     def _sample(self) -> PointRecords:
         """Points from some places spread over the file, in file order."""
-        count = self._block.point_count
-        starts: npt.NDArray[Any] = np.unique(
-            np.linspace(0, max(count - SAMPLE_SIZE, 0), SAMPLE_PLACES).astype(np.int64)
-        )
-        if self._chunks is not None:
-            begins = np.concatenate(([0], np.cumsum(self._chunks.counts)[:-1]))
-            starts = np.unique(begins[np.searchsorted(begins, starts, side="right") - 1])
         pieces = []
         with self._path.open("rb") as stream:
-            decoder = self._decoder(stream, parallel=False)
-            for start in starts.tolist():
-                if self._chunks is None:
+            if self._chunks is None:
+                last = max(self._block.point_count - SAMPLE_SIZE, 0)
+                for start in np.unique(np.linspace(0, last, SAMPLE_PLACES).astype(np.int64)).tolist():
                     stream.seek(self._block.offset_to_points + start * self._block.point_size)
-                elif start:
-                    decoder.seek(start)
-                pieces.append(self._decode(decoder, min(SAMPLE_SIZE, count - start), start))
+                    count = min(SAMPLE_SIZE, self._block.point_count - start)
+                    pieces.append(self._decode(stream, count, start))
+            else:
+                filled = np.flatnonzero(self._chunks.counts)
+                for chunk in filled[
+                    np.unique(np.linspace(0, len(filled) - 1, SAMPLE_PLACES).astype(np.int64))
+                ].tolist():
+                    count = min(SAMPLE_SIZE, int(self._chunks.counts[chunk]))
+                    offset, size = int(self._chunks.offsets[chunk]), int(self._chunks.sizes[chunk])
+                    pieces.append(self._decode_chunk(stream, offset, size, count))
         return self._to_records(np.concatenate(pieces))
 
     def _read_facts(self) -> FileFacts:

@@ -74,7 +74,7 @@ def read_chunk_table(path: Path, stream: BinaryIO, block: HeaderBlock, laszip_re
     _, chunk_count = struct.unpack("<II", stream.read(8))
     body = table_at - start - 8
     # Each chunk begins with one record uncompressed.
-    if chunk_count == 0 or chunk_count * item_size > body:
+    if chunk_count == 0 or (chunk_count - 1) * item_size > body:
         raise UnreadableInputError(
             name, f"the table of compressed chunks is damaged: {chunk_count} chunks in {body} bytes", FIX
         )
@@ -91,7 +91,9 @@ def read_chunk_table(path: Path, stream: BinaryIO, block: HeaderBlock, laszip_re
     except (lazrs.LazrsError, OSError, ValueError) as fault:
         raise UnreadableInputError(name, f"the table of compressed chunks is damaged ({fault})", FIX) from fault
     counts, sizes = rows[:, 0].copy(), rows[:, 1]
-    if len(rows) != chunk_count or sizes.min() < item_size or sizes.sum() != body:
+    # Some writers of COPC end with an empty chunk.
+    too_small = (sizes < item_size) & ~((sizes == 0) & (counts == 0))
+    if len(rows) != chunk_count or too_small.any() or sizes.sum() != body:
         raise UnreadableInputError(
             name, f"the table of compressed chunks is damaged: {sizes.sum()} bytes of chunks in {body}", FIX
         )

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from pipeline.model import IntArray
+from pipeline.triangulation import ascending_order
 
 _SURELY_EXACT = 4.0e18
 """A determinant whose float estimate is below this fits an int64, whatever the estimate's error."""
@@ -140,6 +141,17 @@ def triangles_intersect(vertices: IntArray, first: IntArray, second: IntArray) -
 
 
 @njit(cache=True, nogil=True)
+def _longest_plan_axis(low: IntArray) -> int:
+    """0 where the lower corners of boxes (n, 3) spread farther in x than in y, else 1."""
+    least_x = most_x = low[0, 0]
+    least_y = most_y = low[0, 1]
+    for i in range(1, len(low)):
+        least_x, most_x = min(least_x, low[i, 0]), max(most_x, low[i, 0])
+        least_y, most_y = min(least_y, low[i, 1]), max(most_y, low[i, 1])
+    return 0 if most_x - least_x >= most_y - least_y else 1
+
+
+@njit(cache=True, nogil=True)
 def shell_intersects_itself(vertices: IntArray, triangles: IntArray, face_of: IntArray) -> bool:
     """Whether triangles of different faces intersect.
 
@@ -163,9 +175,9 @@ def shell_intersects_itself(vertices: IntArray, triangles: IntArray, face_of: In
         for k in range(3):
             a, b, c = vertices[triangles[t, 0], k], vertices[triangles[t, 1], k], vertices[triangles[t, 2], k]
             low[t, k], high[t, k] = min(a, b, c), max(a, b, c)
-    along = 0 if low[:, 0].max() - low[:, 0].min() >= low[:, 1].max() - low[:, 1].min() else 1
+    along = _longest_plan_axis(low)
     across = 1 - along
-    order = np.argsort(low[:, along])
+    order = ascending_order(low[:, along].copy())
     for i in range(count):
         t = order[i]
         for j in range(i + 1, count):

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from pipeline.model import BoolArray, IntArray
+from pipeline.triangulation import ascending_order
 
 SHELL_NOT_CLOSED = 302
 NON_MANIFOLD_CASE = 303
@@ -31,25 +32,23 @@ def _root(parent: IntArray, node: int) -> int:
 def _join(parent: IntArray, first: int, second: int) -> None:
     """Unite two sets."""
     a, b = _root(parent, first), _root(parent, second)
-    if a != b:
-        parent[max(a, b)] = min(a, b)
+    parent[a] = b
 
 
 @njit(cache=True, nogil=True)
-def _edges_in_order(triangles: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]:
-    """Keys of the undirected edges of all triangles, ascending, and where each is: 3 * triangle + corner."""
+def _edge_keys(triangles: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]:
+    """Keys of the undirected edges of all triangles, by 3 * triangle + corner, and the order that sorts them."""
     keys = np.empty(3 * len(triangles), np.int64)
     for t in range(len(triangles)):
         for k in range(3):
-            u, v = triangles[t, k], triangles[t, (k + 1) % 3]
-            keys[3 * t + k] = min(u, v) * vertex_count + max(u, v)
-    order = np.argsort(keys)
-    return keys[order], order
+            a, b = triangles[t, k], triangles[t, (k + 1) % 3]
+            keys[3 * t + k] = a * vertex_count + b if a < b else b * vertex_count + a
+    return keys, ascending_order(keys)
 
 
 @njit(cache=True, nogil=True)
-def find_shell_faults(triangles: IntArray, vertex_count: int, found: BoolArray) -> None:
-    """Set found[code] for every fault of the mesh.
+def is_sound_shell(triangles: IntArray, vertex_count: int, found: BoolArray) -> bool:
+    """Whether the mesh is a 2-manifold without border; sets found[code] for every fault.
 
     Parameters
     ----------
@@ -59,15 +58,20 @@ def find_shell_faults(triangles: IntArray, vertex_count: int, found: BoolArray) 
         One more than the largest index.
     found : (n,) bool
         Gets True at the codes 302, 303, 305, 307 that hold.
+
+    Returns
+    -------
+    bool
+        True where none holds.
     """
-    keys, order = _edges_in_order(triangles, vertex_count)
+    keys, order = _edge_keys(triangles, vertex_count)
     component = np.arange(len(triangles))
     umbrella = np.arange(3 * len(triangles))
     manifold = True
     start = 0
     while start < len(keys):
         stop = start + 1
-        while stop < len(keys) and keys[stop] == keys[start]:
+        while stop < len(keys) and keys[order[stop]] == keys[order[start]]:
             stop += 1
         first = order[start]
         for i in range(start + 1, stop):
@@ -87,11 +91,13 @@ def find_shell_faults(triangles: IntArray, vertex_count: int, found: BoolArray) 
                 _join(umbrella, 3 * t + k, 3 * s + (m + 1) % 3)
                 _join(umbrella, 3 * t + (k + 1) % 3, 3 * s + m)
         start = stop
+    sound = manifold
     for t in range(len(triangles)):
         if _root(component, t) != _root(component, 0):
             found[MULTIPLE_CONNECTED_COMPONENTS] = True
+            sound = False
     if not manifold:
-        return
+        return False
     umbrella_of = np.full(vertex_count, -1)
     for t in range(len(triangles)):
         for k in range(3):
@@ -101,6 +107,8 @@ def find_shell_faults(triangles: IntArray, vertex_count: int, found: BoolArray) 
                 umbrella_of[vertex] = root
             elif umbrella_of[vertex] != root:
                 found[NON_MANIFOLD_CASE] = True
+                sound = False
+    return sound
 
 
 @njit(cache=True, nogil=True)

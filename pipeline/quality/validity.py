@@ -47,11 +47,12 @@ from pipeline.parameters import Parameters, parameter
 from pipeline.quality.planarity import distance_to_plane, least_cosine_of_normals
 from pipeline.quality.rings import RING_SELF_INTERSECTION, has_repeated_neighbours, polygon_code
 from pipeline.quality.self_intersection import shell_intersects_itself
-from pipeline.quality.shell import find_shell_faults, six_volumes
+from pipeline.quality.shell import is_sound_shell, six_volumes
 from pipeline.triangulation import (
     DONE,
     MILLIMETRES_PER_METRE,
     area_vector,
+    ascending_order,
     project_along_dominant_axis,
     triangulate_rings,
 )
@@ -102,20 +103,17 @@ def check_solid(solid: Solid, tolerances: ValidityTolerances = DEFAULT_TOLERANCE
         Ascending, each code once; empty for a valid solid. A pair of vertices exactly as far apart as the snapping
         tolerance is judged both as one vertex and as two, and the codes of both verdicts are given.
     """
-    vertices = np.rint(solid.vertices * MILLIMETRES_PER_METRE).astype(np.int64)
+    vertices = np.ascontiguousarray(np.rint(solid.vertices * MILLIMETRES_PER_METRE), dtype=np.int64)
     rings = [ring for face in solid.faces for ring in face.rings]
     ring_vertices = np.fromiter(chain.from_iterable(rings), np.int64)
     ring_offsets = _offsets([len(ring) for ring in rings])
     face_offsets = _offsets([len(face.rings) for face in solid.faces])
-    found = _find_faults(
-        np.ascontiguousarray(vertices),
-        ring_vertices,
-        ring_offsets,
-        face_offsets,
-        tolerances.snap_m * MILLIMETRES_PER_METRE,
-        tolerances.planarity_m * MILLIMETRES_PER_METRE,
-        math.cos(math.radians(tolerances.normals_deg)),
-    )
+    planarity_mm = tolerances.planarity_m * MILLIMETRES_PER_METRE
+    least_cosine = math.cos(math.radians(tolerances.normals_deg))
+    joined, apart, differ = _snap(vertices, ring_vertices, tolerances.snap_m * MILLIMETRES_PER_METRE)
+    found = _find_faults(vertices, joined, ring_offsets, face_offsets, planarity_mm, least_cosine)
+    if differ:
+        found |= _find_faults(vertices, apart, ring_offsets, face_offsets, planarity_mm, least_cosine)
     return tuple(int(code) for code in np.flatnonzero(found))
 
 
@@ -134,47 +132,63 @@ def _offsets(lengths: list[int]) -> IntArray:
 
 
 @njit(cache=True, nogil=True)
-def _snap(vertices: IntArray, used: IntArray, snap_mm: float, inclusive: bool) -> tuple[IntArray, bool]:
-    """The representative of each vertex, and whether a pair is exactly as far apart as the tolerance.
+def _root(parent: IntArray, node: int) -> int:
+    """The representative of a set in a union-find forest."""
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node
 
-    Vertices within the tolerance are one, and so are chains of them. The first by x, y, z represents them.
+
+@njit(cache=True, nogil=True)
+def _join(parent: IntArray, vertices: IntArray, p: int, q: int) -> None:
+    """Unite the sets of two vertices; the first by x, y, z represents them."""
+    a, b = _root(parent, p), _root(parent, q)
+    for k in range(3):
+        if vertices[a, k] != vertices[b, k]:
+            if vertices[b, k] < vertices[a, k]:
+                a, b = b, a
+            break
+    parent[b] = a
+
+
+@njit(cache=True, nogil=True)
+def _snap(vertices: IntArray, ring_vertices: IntArray, snap_mm: float) -> tuple[IntArray, IntArray, bool]:
+    """Snapped vertices of all corners: pairs at the tolerance joined; pairs at the tolerance apart; whether it matters.
+
+    Vertices within the tolerance are one, and so are chains of them.
     """
     count = len(vertices)
-    representative = np.arange(count)
-    on_the_limit = False
-    order = used[np.argsort(vertices[used, 0])]
+    is_used = np.zeros(count, np.bool_)
+    for vertex in ring_vertices:
+        is_used[vertex] = True
+    order = ascending_order(vertices[:, 0].copy())
+    inclusive, exclusive = np.arange(count), np.arange(count)
     limit = snap_mm * snap_mm
-    for i in range(len(order)):
+    differ = False
+    for i in range(count):
         p = order[i]
-        for j in range(i + 1, len(order)):
+        if not is_used[p]:
+            continue
+        for j in range(i + 1, count):
             q = order[j]
             dx = vertices[q, 0] - vertices[p, 0]
             if dx > snap_mm:
                 break
             dy, dz = vertices[q, 1] - vertices[p, 1], vertices[q, 2] - vertices[p, 2]
             distance = float(dx * dx + dy * dy + dz * dz)
-            exactly = distance > 0.0 and distance == limit
-            on_the_limit = on_the_limit or exactly
-            if distance == 0.0 or distance < limit or (exactly and inclusive):
-                a, b = p, q
-                while representative[a] != a:
-                    a = representative[a]
-                while representative[b] != b:
-                    b = representative[b]
-                if a == b:
-                    continue
-                for k in range(3):
-                    if vertices[a, k] != vertices[b, k]:
-                        if vertices[b, k] < vertices[a, k]:
-                            a, b = b, a
-                        break
-                representative[b] = a
-    for p in range(count):
-        a = p
-        while representative[a] != a:
-            a = representative[a]
-        representative[p] = a
-    return representative, on_the_limit
+            if distance > limit or not is_used[q]:
+                continue
+            _join(inclusive, vertices, p, q)
+            if distance < limit or distance == 0.0:
+                _join(exclusive, vertices, p, q)
+            else:
+                differ = True
+    joined, apart = np.empty_like(ring_vertices), np.empty_like(ring_vertices)
+    for corner in range(len(ring_vertices)):
+        joined[corner] = _root(inclusive, ring_vertices[corner])
+        apart[corner] = _root(exclusive, ring_vertices[corner])
+    return joined, apart, differ
 
 
 @njit(cache=True, nogil=True)
@@ -196,17 +210,20 @@ def _face_code(corners: IntArray, ids: IntArray, rings: IntArray, planarity_mm: 
 
 
 @njit(cache=True, nogil=True)
-def _find_snapped_faults(
+def _find_faults(
     vertices: IntArray,
     ids: IntArray,
     ring_offsets: IntArray,
     face_offsets: IntArray,
     planarity_mm: float,
     least_cosine: float,
-    found: BoolArray,
-) -> None:
-    """Set found[code] for the faults of a solid whose corners `ids` are snapped vertices."""
-    corners = vertices[ids]
+) -> BoolArray:
+    """(406,) bool, True at the codes of the faults of a solid whose corners `ids` are snapped vertices."""
+    found = np.zeros(_CODE_LIMIT, np.bool_)
+    corners = np.empty((len(ids), 3), np.int64)
+    for i in range(len(ids)):
+        for k in range(3):
+            corners[i, k] = vertices[ids[i], k]
     faces = len(face_offsets) - 1
     sound = True
     for f in range(faces):
@@ -221,7 +238,7 @@ def _find_snapped_faults(
             found[code] = True
             sound = False
     if not sound:
-        return
+        return found
     triangles = np.empty((len(ids) + 2 * len(ring_offsets), 3), np.int64)
     face_of = np.empty(len(triangles), np.int64)
     count = 0
@@ -242,42 +259,15 @@ def _find_snapped_faults(
             face_of[count] = f
             count += 1
     if not sound:
-        return
+        return found
     if faces < 4:
         found[TOO_FEW_POLYGONS] = True
-        return
+        return found
     triangles = triangles[:count]
-    find_shell_faults(triangles, len(vertices), found)
-    if found.any():
-        return
+    if not is_sound_shell(triangles, len(vertices), found):
+        return found
     if shell_intersects_itself(vertices, triangles, face_of):
         found[SHELL_SELF_INTERSECTION] = True
     elif six_volumes(vertices, triangles) <= 0.0:
         found[WRONG_ORIENTATION_SHELL] = True
-
-
-@njit(cache=True, nogil=True)
-def _find_faults(
-    vertices: IntArray,
-    ring_vertices: IntArray,
-    ring_offsets: IntArray,
-    face_offsets: IntArray,
-    snap_mm: float,
-    planarity_mm: float,
-    least_cosine: float,
-) -> BoolArray:
-    """The one compiled entry: flat arrays of a solid to a (406,) bool, True at the codes of its faults."""
-    found = np.zeros(_CODE_LIMIT, np.bool_)
-    is_used = np.zeros(len(vertices), np.bool_)
-    is_used[ring_vertices] = True
-    used = np.flatnonzero(is_used)
-    representative, on_the_limit = _snap(vertices, used, snap_mm, True)
-    ids = representative[ring_vertices]
-    _find_snapped_faults(vertices, ids, ring_offsets, face_offsets, planarity_mm, least_cosine, found)
-    if on_the_limit:
-        again = np.zeros(_CODE_LIMIT, np.bool_)
-        apart, _ = _snap(vertices, used, snap_mm, False)
-        ids = apart[ring_vertices]
-        _find_snapped_faults(vertices, ids, ring_offsets, face_offsets, planarity_mm, least_cosine, again)
-        found |= again
     return found

@@ -206,7 +206,8 @@ def _cut_fraction(
     d0 = (da * x0 + db * y0) * 1e-3 + dc
     d1 = (da * x1 + db * y1) * 1e-3 + dc
     if (d0 < 0.0 < d1) or (d1 < 0.0 < d0):
-        return min(max(d0 / (d0 - d1), 0.03), 0.97)
+        fraction: float = d0 / (d0 - d1)
+        return min(max(fraction, 0.03), 0.97)
     # the planes cross shortly beyond one end: the border hugs that end; a step lies in the middle
     length = math.sqrt(float((x1 - x0) ** 2 + (y1 - y0) ** 2)) * 1e-3
     if min(abs(d0), abs(d1)) < 0.3 * math.sqrt(da * da + db * db) * length:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 import shapely
@@ -11,8 +12,9 @@ from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
 from pipeline.geometry import point_spacing_m, top_visible
-from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
-from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, polygons_of
+from pipeline.model import Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
+from pipeline.roof.eaves import straighten
+from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
 from pipeline.roof.labelling import empty_samples, fill_labels
 from pipeline.roof.partition import OUTSIDE, RoofPartition, absorb_small_regions, march
 from pipeline.roof.settings import RoofSettings
@@ -31,6 +33,8 @@ class RoofPoints:
     """(n, 3) float64, local metres."""
     xy_mm: IntArray
     """(n, 2) int64, millimetres; every position once, the highest point of each."""
+    index: IntArray
+    """(n,) int64, which of the candidate's points they are."""
     labels: LabelArray
     """(n,) int32, plane of every point; -1 where the segmentation gave none."""
     spacing_m: float
@@ -39,22 +43,20 @@ class RoofPoints:
     """The given footprint in integer millimetres."""
 
 
-def roof_points(candidate: Candidate, labels: LabelArray | None, settings: RoofSettings) -> RoofPoints:
+def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
     """Select the roof points of a candidate.
 
     Parameters
     ----------
     candidate : Candidate
         Its points.
-    labels : (n,) int32 or None
-        Labels of its points; None for none.
     settings : RoofSettings
         `minimum_roof_height_m`, `minimum_points`.
 
     Returns
     -------
     RoofPoints
-        In the candidate's order.
+        In the candidate's order, without labels.
 
     Raises
     ------
@@ -79,21 +81,30 @@ def roof_points(candidate: Candidate, labels: LabelArray | None, settings: RoofS
     return RoofPoints(
         points=points[index],
         xy_mm=grid[kept, :2],
-        labels=np.full(len(index), -1, np.int32) if labels is None else labels[index],
+        index=index,
+        labels=np.full(len(index), -1, np.int32),
         spacing_m=min(max(point_spacing_m(points[index]), 0.1), 3.0),
         footprint_mm=footprint,
     )
 
 
-def _coefficients(planes: Sequence[Plane]) -> FloatArray:
-    return np.array([plane.coefficients for plane in planes], np.float64).reshape(len(planes), 3)
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RoofPlan:
+    """The roof faces in plan before they get their final outline."""
+
+    faces: RoofPartition
+    """Continued beyond the outline, to be clipped by it."""
+    outline_mm: MultiPolygon
+    """The given footprint, or the outline around the roof points; integer millimetres."""
+    raw: RoofPartition | None
+    """Without a given footprint: the faces up to the raw outline."""
 
 
-def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettings) -> RoofPartition:
+def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettings) -> RoofPlan:
     """Cut the plan into roof faces.
 
-    Without a footprint the eave lies between roof points and the empty places around them. With one, the faces are
-    continued beyond it, to be clipped: so the walls will stand exactly on it.
+    With a footprint the faces are continued beyond it, to be clipped: so the walls will stand exactly on it. Without
+    one the eave lies between roof points and the empty places around them; straightened, it serves as a footprint.
 
     Parameters
     ----------
@@ -106,53 +117,54 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
 
     Returns
     -------
-    RoofPartition
-        A coverage in integer millimetres, neither clipped nor simplified: see `draw_plan`.
+    RoofPlan
+        Neither clipped nor simplified: see `draw_plan`.
 
     Raises
     ------
     BuildingError
         `no_partition` where nothing is left.
     """
-    spacing = roof.spacing_m
-    margin = round(_MARGIN_SPACINGS * spacing * 1e3)
+    given = roof.footprint_mm
+    margin = round(_MARGIN_SPACINGS * roof.spacing_m * 1e3)
     low, high = roof.xy_mm.min(axis=0) - margin, roof.xy_mm.max(axis=0) + margin
-    if roof.footprint_mm is not None:
-        bounds = np.rint(roof.footprint_mm.bounds).astype(np.int64)
+    if given is not None:
+        bounds = np.rint(given.bounds).astype(np.int64)
         low, high = np.minimum(low, bounds[:2] - margin), np.maximum(high, bounds[2:] + margin)
-    pitch = max(50, round(_PITCH_SPACINGS * spacing * 1e3))
-    samples, nearest, distance_m = empty_samples(roof.xy_mm, low, high, pitch, settings.gap_spacings * spacing)
-    labels = fill_labels(roof.xy_mm, roof.labels)
-    sample_labels = np.full(len(samples), OUTSIDE, np.int32)
-    counted: BoolArray = np.ones(len(roof.xy_mm), np.bool_)
-    sample_counted: BoolArray = np.ones(len(samples), np.bool_)
-    if roof.footprint_mm is not None:
-        sample_counted = in_footprint(roof.footprint_mm, samples)
-        counted = in_footprint(roof.footprint_mm, roof.xy_mm)
-        # beyond the footprint the faces go on, within it they close gaps that are not too wide
-        covered = ~sample_counted | (distance_m <= settings.void_distance_m)
-        sample_labels[covered] = labels[nearest[covered]]
+    pitch = max(50, round(_PITCH_SPACINGS * roof.spacing_m * 1e3))
+    gap_m = settings.gap_spacings * roof.spacing_m
+    samples, nearest, distance_m = empty_samples(roof.xy_mm, low, high, pitch, gap_m)
     frame = _frame(low, high, margin)
     xy_mm = np.concatenate((roof.xy_mm, samples, frame))
-    all_labels = np.concatenate((labels, sample_labels, np.full(len(frame), OUTSIDE, np.int32)))
-    all_counted = np.concatenate((counted, sample_counted, np.zeros(len(frame), np.bool_)))
-    coefficients = _coefficients(planes)
-    z = np.zeros(len(xy_mm))
-    z[: len(roof.points)] = roof.points[:, 2]
     tin = triangulate(xy_mm)
+    coefficients = np.array([plane.coefficients for plane in planes], np.float64).reshape(len(planes), 3)
+    n, m = len(roof.xy_mm), len(samples)
+    labels = np.full(len(xy_mm), OUTSIDE, np.int32)
+    labels[:n] = fill_labels(roof.xy_mm, roof.labels)
+    counted = np.zeros(len(xy_mm), np.int32)
+    if given is None:
+        counted[: n + m] = 1
+    else:
+        counted[: n + m] = in_footprint(given, xy_mm[: n + m])
+        # beyond the footprint the faces go on, within it they close gaps that are not too wide
+        continued = (counted[n : n + m] == 0) | (distance_m <= settings.void_distance_m)
+        labels[n : n + m][continued] = labels[nearest[continued]]
+    z = np.zeros(len(xy_mm))
+    z[:n] = roof.points[:, 2]
+    x, y = np.ascontiguousarray(xy_mm[:, 0]), np.ascontiguousarray(xy_mm[:, 1])
     area = minimum_face_area(roof, settings)
-    all_labels = absorb_small_regions(
-        np.ascontiguousarray(xy_mm[:, 0]),
-        np.ascontiguousarray(xy_mm[:, 1]),
-        z,
-        tin.facets,
-        all_labels,
-        all_counted.astype(np.int32),
-        coefficients,
-        area,
-        settings.minimum_void_m2,
-    )
-    return march(xy_mm, tin, all_labels, coefficients, settings.outside_fraction)
+    labels = absorb_small_regions(x, y, z, tin.facets, labels, counted, coefficients, area, settings.minimum_void_m2)
+    partition = march(xy_mm, tin, labels, coefficients, settings.outside_fraction)
+    if given is not None:
+        return RoofPlan(faces=partition, outline_mm=given, raw=None)
+    around = outline(partition)
+    if not settings.straight_eaves:
+        return RoofPlan(faces=partition, outline_mm=around, raw=partition)
+    labels[:n] = fill_labels(roof.xy_mm, labels[:n])
+    outside = np.flatnonzero(labels[n : n + m] < 0)
+    labels[n + outside] = labels[nearest[outside]]
+    continued_faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction)
+    return RoofPlan(faces=continued_faces, outline_mm=straighten(around, roof.spacing_m, settings), raw=partition)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -177,16 +189,35 @@ FORMS = (
 )
 """From the one that is wanted to the one that is most likely to succeed."""
 
+RAW_FORMS = (
+    PlanForm(simplification=0.5, shrink_mm=0.0, unite_mm=0.0),
+    PlanForm(simplification=0.1, shrink_mm=0.0, unite_mm=0.0),
+    PlanForm(simplification=0.0, shrink_mm=0.0, unite_mm=0.0),
+)
+"""The same for faces up to the raw outline."""
 
-def draw_plan(partition: RoofPartition, roof: RoofPoints, settings: RoofSettings, form: PlanForm) -> RoofPartition:
-    """Clip a partition by the footprint, if there is one, and simplify its borders.
+
+def plan_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> Iterator[Callable[[], RoofPartition]]:
+    """Ways to draw the final plan, the best first; each raises `no_partition` where it cannot be drawn."""
+    clipped = plan.raw is None or settings.straight_eaves
+    if clipped:
+        for form in FORMS:
+            yield partial(draw_clipped, plan, roof, settings, form)
+    if plan.raw is not None:
+        for form in RAW_FORMS if clipped else (FORMS[0], *RAW_FORMS):
+            tolerance = form.simplification * settings.simplification_spacings * roof.spacing_m
+            yield partial(simplify_partition, plan.raw, tolerance)
+
+
+def draw_clipped(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings, form: PlanForm) -> RoofPartition:
+    """Clip the faces by the outline and simplify the borders between them.
 
     Parameters
     ----------
-    partition : RoofPartition
+    plan : RoofPlan
         From `partition_roof`.
     roof : RoofPoints
-        The footprint and the spacing.
+        For the spacing.
     settings : RoofSettings
         Areas and the simplification.
     form : PlanForm
@@ -202,17 +233,13 @@ def draw_plan(partition: RoofPartition, roof: RoofPoints, settings: RoofSettings
     BuildingError
         `no_partition` where this form cannot be drawn.
     """
-    if roof.footprint_mm is not None:
-        footprint = roof.footprint_mm
-        if form.shrink_mm > 0.0:
-            drawn_back = shapely.set_precision(shapely.buffer(footprint, -form.shrink_mm, join_style="mitre"), 1.0)
-            footprint = MultiPolygon(polygons_of(drawn_back))
-        partition = clip_partition(partition, footprint, minimum_face_area(roof, settings))
-        partition = unite_close_vertices(partition, form.unite_mm)
+    outline_mm = plan.outline_mm
+    if form.shrink_mm > 0.0:
+        drawn_back = shapely.set_precision(shapely.buffer(outline_mm, -form.shrink_mm, join_style="mitre"), 1.0)
+        outline_mm = MultiPolygon(polygons_of(drawn_back))
+    partition = clip_partition(plan.faces, outline_mm, minimum_face_area(roof, settings))
     tolerance = form.simplification * settings.simplification_spacings * roof.spacing_m
-    if tolerance > 0.0:
-        partition = simplify_partition(partition, tolerance, outline_too=roof.footprint_mm is None)
-    return partition
+    return unite_close_vertices(simplify_partition(partition, tolerance, outline_too=False), form.unite_mm)
 
 
 def minimum_face_area(roof: RoofPoints, settings: RoofSettings) -> float:

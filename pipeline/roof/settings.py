@@ -29,6 +29,23 @@ class RoofSettings(Parameters):
         minimum=0.05,
         maximum=0.95,
     )
+    straight_eaves: bool = parameter(
+        True, "Whether the outline is drawn with straight lines where no footprint is given."
+    )
+    eave_tolerance_spacings: float = parameter(
+        1.0,
+        "How far the raw outline may lie from its straight lines.",
+        unit="point spacings",
+        minimum=0.2,
+        maximum=5.0,
+    )
+    square_within_deg: float = parameter(
+        12.0,
+        "An outline's line takes the dominant direction, or the one square to it, when it is this close.",
+        unit="deg",
+        minimum=0.0,
+        maximum=30.0,
+    )
     void_distance_m: float = parameter(
         4.0,
         "Inside a given footprint a place farther than this from every roof point is no roof.",
@@ -53,7 +70,7 @@ class RoofSettings(Parameters):
         4.0, "A smaller separate part of a building is left out.", unit="m2", minimum=0.0, maximum=100.0
     )
     simplification_spacings: float = parameter(
-        0.4,
+        0.8,
         "Border vertices are dropped while the area cut off stays under the square of this.",
         unit="point spacings",
         minimum=0.0,

@@ -24,7 +24,7 @@ def simplify_partition(partition: RoofPartition, tolerance_m: float, *, outline_
     partition : RoofPartition
         A valid coverage.
     tolerance_m : float
-        Square root of the area that may be cut off or added, metres.
+        Square root of the area that may be cut off or added, metres; 0 changes nothing.
     outline_too : bool
         Whether the outer border is simplified as well.
 
@@ -38,6 +38,8 @@ def simplify_partition(partition: RoofPartition, tolerance_m: float, *, outline_
     BuildingError
         `no_partition` where a polygon vanished or fell apart.
     """
+    if tolerance_m <= 0.0:
+        return partition
     polygons = shapely.coverage_simplify(
         np.array(partition.polygons, dtype=object), tolerance_m * 1e3, simplify_boundary=outline_too
     )

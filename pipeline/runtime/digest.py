@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.dataset as pads
 import pyarrow.fs as pafs
 
 from pipeline.errors import RunError
@@ -68,7 +69,7 @@ def _row_hashes(
     columns = [column for column in dataset.schema.names if column not in NOT_CONTENT]
     key_parts: list[list[npt.NDArray[Any]]] = [[] for _ in key]
     hash_parts = [np.empty((0, _HASH_BYTES), np.uint8)]
-    for batch in dataset.to_batches(columns=columns, batch_size=ROWS_A_BATCH):
+    for batch in _batches(dataset, columns, f"{run_dir}/{name}"):
         if batch.num_rows == 0:
             continue
         digests = b"".join(hashlib.sha256(row).digest() for row in canonical_rows(batch))
@@ -77,6 +78,14 @@ def _row_hashes(
             part.append(_key_values(batch.column(column), f"{run_dir}/{name}", column))
     keys = [np.concatenate(part) if part else np.empty(0, "S1") for part in key_parts]
     return keys, np.concatenate(hash_parts)
+
+
+def _batches(dataset: pads.Dataset, columns: list[str], folder: str) -> Iterator[pa.RecordBatch]:
+    """The rows of a table, some thousand at a time."""
+    try:
+        yield from dataset.to_batches(columns=columns, batch_size=ROWS_A_BATCH, fragment_readahead=1)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise RunError(f"{folder} cannot be read as Parquet: {error}") from error
 
 
 def _key_values(column: pa.Array, folder: str, name: str) -> npt.NDArray[Any]:
@@ -98,7 +107,9 @@ def _check_unique(name: str, key: tuple[str, ...], keys: list[npt.NDArray[Any]],
         same &= ordered[1:] == ordered[:-1]
     if same.any():
         row = order[int(np.argmax(same))]
-        found = ", ".join(f"{column} {values[row]!r}" for column, values in zip(key, keys, strict=True))
+        told = [column[row].item() for column in keys]
+        texts = [value.decode() if isinstance(value, bytes) else value for value in told]
+        found = ", ".join(f"{column} {text!r}" for column, text in zip(key, texts, strict=True))
         raise RunError(f"{name} has more than one row of {found}: files of two runs lie in one directory")
 
 

@@ -93,7 +93,8 @@ def label_by_ridges(
     """Labels whose borders along the ridges are straight.
 
     A point within reach of a ridge that carries one of its two labels, and that both planes explain, takes the label
-    of the side of the line on which it lies. All others keep theirs. Parameters as for `find_ridges`.
+    of the side of the line on which it lies; of several ridges the nearest one decides. All others keep theirs.
+    Parameters as for `find_ridges`.
 
     Returns
     -------
@@ -101,14 +102,15 @@ def label_by_ridges(
         New labels.
     """
     snapped = labels.copy()
+    nearest_m = np.full(len(points), np.inf)
     for ridge in ridges:
-        near = _near(points, planes, snapped, ridge, distance_m, reach_m)
-        difference_m = _difference(planes, ridge, points[near])
-        low_side = difference_m > 0.0 if ridge.is_valley else difference_m < 0.0
+        near, distance = _near(points, planes, labels, ridge, distance_m, reach_m)
+        closer = np.abs(distance) < nearest_m[near]
+        near, distance = near[closer], distance[closer]
+        nearest_m[near] = np.abs(distance)
+        low_side = distance > 0.0 if ridge.is_valley else distance < 0.0
         # On the line itself both are right: the label stays.
-        snapped[near] = np.where(
-            difference_m == 0.0, snapped[near], np.where(low_side, ridge.plane_low, ridge.plane_high)
-        )
+        snapped[near] = np.where(distance == 0.0, labels[near], np.where(low_side, ridge.plane_low, ridge.plane_high))
     return snapped
 
 
@@ -138,16 +140,14 @@ def snap_to_ridges(
     moved[on_plane, 2] = _elevation(coefficients, points[on_plane])
     nearest_m = np.full(len(points), np.inf)
     for ridge in ridges:
-        near = _near(points, planes, labels, ridge, distance_m, reach_m)
+        near, distance = _near(points, planes, labels, ridge, distance_m, reach_m)
+        closer = np.abs(distance) < nearest_m[near]
+        near, distance = near[closer], distance[closer]
+        nearest_m[near] = np.abs(distance)
         gradient = planes[ridge.plane_low] - planes[ridge.plane_high]
-        square = float(gradient[0] ** 2 + gradient[1] ** 2)
-        shift = _difference(planes, ridge, points[near]) / square
-        distance = np.abs(shift) * math.sqrt(square)
-        closer = distance < nearest_m[near]
-        near, shift = near[closer], shift[closer]
-        nearest_m[near] = distance[closer]
-        moved[near, 0] = points[near, 0] - shift * gradient[0]
-        moved[near, 1] = points[near, 1] - shift * gradient[1]
+        steepness = math.hypot(gradient[0], gradient[1])
+        moved[near, 0] = points[near, 0] - distance * gradient[0] / steepness
+        moved[near, 1] = points[near, 1] - distance * gradient[1] / steepness
         moved[near, 2] = _elevation(planes[ridge.plane_low][None, :], moved[near])
     return moved
 
@@ -155,12 +155,6 @@ def snap_to_ridges(
 def _elevation(coefficients: FloatArray, points: FloatArray) -> FloatArray:
     """Elevation of planes at points, row by row."""
     return np.asarray(coefficients[:, 0] * points[:, 0] + coefficients[:, 1] * points[:, 1] + coefficients[:, 2])
-
-
-def _difference(planes: FloatArray, ridge: Ridge, points: FloatArray) -> FloatArray:
-    """Elevation of the low-numbered plane above the other; its zero is the line of intersection."""
-    gradient = planes[ridge.plane_low] - planes[ridge.plane_high]
-    return _elevation(gradient[None, :], points)
 
 
 def _links(labels: LabelArray, neighbours: LabelArray) -> IntArray:
@@ -237,19 +231,24 @@ def _explained(points: FloatArray, plane: FloatArray, distance_m: float) -> Bool
 
 def _near(
     points: FloatArray, planes: FloatArray, labels: LabelArray, ridge: Ridge, distance_m: float, reach_m: float
-) -> IntArray:
-    """Indices of the points of the two planes that lie near the ridge and that both explain."""
+) -> tuple[IntArray, FloatArray]:
+    """Points of the two planes that lie near the ridge and that both explain, and their distance in plan from its line.
+
+    The distance is positive where the low-numbered plane is the upper one.
+    """
     gradient = planes[ridge.plane_low] - planes[ridge.plane_high]
-    steepness = math.hypot(gradient[0], gradient[1])
     index = np.flatnonzero((labels == ridge.plane_low) | (labels == ridge.plane_high))
-    index = index[np.abs(_difference(planes, ridge, points[index])) <= reach_m * steepness]
+    distance = _elevation(gradient[None, :], points[index]) / math.hypot(gradient[0], gradient[1])
+    near = np.abs(distance) <= reach_m
+    index, distance = index[near], distance[near]
     start, end = np.array(ridge.start), np.array(ridge.end)
     length = math.hypot(*(end - start))
     if length > 0.0:
         along = (end - start) / length
         offset = points[index, :2] - start
         position = offset[:, 0] * along[0] + offset[:, 1] * along[1]
-        index = index[(position >= 0.0) & (position <= length)]
-    for plane in (planes[ridge.plane_low], planes[ridge.plane_high]):
-        index = index[_explained(points[index], plane, distance_m)]
-    return index
+        inside = (position >= 0.0) & (position <= length)
+        index, distance = index[inside], distance[inside]
+    explained = _explained(points[index], planes[ridge.plane_low], distance_m)
+    explained &= _explained(points[index], planes[ridge.plane_high], distance_m)
+    return index[explained], distance[explained]

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from pipeline.model import BoolArray, ByteArray, FloatArray, LabelArray, PointCloud
 from pipeline.parameters import Parameters, parameter
 from pipeline.synthetic.beam import COLUMNS, MAX_RETURNS, FlightLine, scan_lines
-from pipeline.synthetic.first_hit import SceneArrays, scene_arrays
 from pipeline.synthetic.scene import Scene
+from pipeline.synthetic.scene_arrays import SceneArrays, scene_arrays
 
 _FIRST_GPS_TIME_S = 427_536_018.0
 """Start of the first strip: 1 April 2025, 10:00 UTC, as adjusted standard GPS time."""
@@ -46,11 +46,14 @@ class ScannerSettings(Parameters):
         0.0, "Direction of the strips, clockwise from north.", unit="deg", minimum=0.0, maximum=360.0
     )
     jitter: float = parameter(
-        0.5, "Random shift of each pulse along and across the line, as a share of the spacing.", minimum=0.0, maximum=1.0
+        0.5,
+        "Random shift of each pulse along and across the line, as a share of the spacing.",
+        minimum=0.0,
+        maximum=1.0,
     )
     beam_radius_m: float = parameter(0.12, "Radius of the beam's footprint.", unit="m", minimum=0.0, maximum=2.0)
     range_resolution_m: float = parameter(
-        0.7, "Echoes of one beam that are closer than this melt into one return.", unit="m", minimum=0.0, maximum=10.0
+        1.2, "Echoes of one beam that are closer than this melt into one return.", unit="m", minimum=0.0, maximum=10.0
     )
     drop_out: float = parameter(0.005, "Share of pulses that never come back.", minimum=0.0, maximum=1.0)
     strip_shift_m: float = parameter(
@@ -118,7 +121,9 @@ def strip_count(scene: Scene, settings: ScannerSettings) -> int:
     return len(_flight_lines(scene, settings, 0))
 
 
-def scan(scene: Scene, settings: ScannerSettings, seed: int, *, chunk_points: int = 1_000_000, threads: int = 2) -> Iterator[ScanBlock]:
+def scan(
+    scene: Scene, settings: ScannerSettings, seed: int, *, chunk_points: int = 1_000_000, threads: int = 2
+) -> Iterator[ScanBlock]:
     """Scan a scene, chunk by chunk, in the order of time.
 
     Parameters

@@ -8,18 +8,18 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from pipeline.model import FloatArray, LabelArray
+from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.synthetic.first_hit import (
     BOX,
     GROUND,
     TREE,
-    SceneArrays,
     cell_of,
     first_hit,
     mixed_bits,
     terrain_hit,
     uniform_of,
 )
+from pipeline.synthetic.scene_arrays import SceneArrays
 
 LINES_A_BEAM = 7
 """One in the middle, six around it."""
@@ -199,7 +199,7 @@ def scan_lines(
 
 
 @njit(cache=True, nogil=True)
-def _sort_downwards(z: FloatArray, kind: LabelArray, thing: LabelArray, face: LabelArray, n: int) -> None:
+def _sort_downwards(z: FloatArray, kind: IntArray, thing: IntArray, face: IntArray, n: int) -> None:
     """Insertion sort of the hits, highest (nearest to the aircraft) first, equal ones in the order of their lines."""
     for k in range(1, n):
         this_z, this_kind, this_thing, this_face = z[k], kind[k], thing[k], face[k]
@@ -211,7 +211,7 @@ def _sort_downwards(z: FloatArray, kind: LabelArray, thing: LabelArray, face: La
 
 
 @njit(cache=True, nogil=True)
-def _most_frequent(kind: LabelArray, thing: LabelArray, face: LabelArray, first: int, stop: int) -> tuple[int, int]:
+def _most_frequent(kind: IntArray, thing: IntArray, face: IntArray, first: int, stop: int) -> tuple[int, int]:
     """The hit whose surface has most of the beam (the higher one on ties), and 1 where there are several surfaces."""
     best, most = first, 0
     for k in range(first, stop):

@@ -10,6 +10,7 @@ truth/buildings, planes, meshes, cityjson      the exact models, laid out and na
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import datetime as dt
 import json
@@ -29,6 +30,7 @@ from pipeline.errors import InputError, SettingsError
 from pipeline.export.records import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.io.crs import UNKNOWN_REFERENCE, SpatialReference
+from pipeline.model import BoolArray, ByteArray, LabelArray
 from pipeline.synthetic.als import ScanBlock, ScannerSettings, scan, strip_count
 from pipeline.synthetic.scene import Scene
 from pipeline.synthetic.solids import truth_record
@@ -131,6 +133,73 @@ def simulate(
     return ScenePaths(laz=laz, truth=truth, labels=labels, points=count, buildings=len(scene.buildings))
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneTruth:
+    """The truth of a simulated tile, without its models: those are read as any run directory's."""
+
+    folder: Path
+    """The folder of the truth; `pipeline.report.roof_models.read_roof_models` reads its models."""
+    suite: str
+    """Name of the suite."""
+    seed: int
+    """Seed of layout and scanner."""
+    crs: str | None
+    """As in `Scene.crs`."""
+    extent: tuple[float, float, float, float]
+    """CRS coordinates: smallest x, smallest y, largest x, largest y."""
+    building_ids: tuple[str, ...]
+    """All true buildings, sorted."""
+    classification: ByteArray
+    """(n,) uint8, true ASPRS class of every point in the order of the LAZ; 1 for small things."""
+    building: LabelArray
+    """(n,) int32, index into building_ids; -1 for none."""
+    face: LabelArray
+    """(n,) int32, roof plane of the building; -1 for walls and for what is no building."""
+    mixed: BoolArray
+    """(n,) bool, True where echoes of different surfaces melted into the return."""
+
+    @property
+    def wall(self) -> BoolArray:
+        """(n,) bool, True where a wall was hit."""
+        return (self.building >= 0) & (self.face < 0)
+
+
+def read_truth(truth_dir: str | Path) -> SceneTruth:
+    """Read the truth that `simulate` wrote, all labels in memory: 10 bytes a point.
+
+    Raises
+    ------
+    InputError
+        If scene.json or the labels are missing or not readable.
+    """
+    folder = Path(truth_dir)
+    try:
+        manifest = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+        labels = pq.read_table(folder / "labels.parquet")
+    except (OSError, ValueError) as error:
+        raise InputError(
+            str(folder), f"no readable truth ({error})", "Give the folder `truth` that `gablework simulate` wrote"
+        ) from error
+    names = labels["building_id"].combine_chunks()
+    ids = sorted(str(name) for name in names.dictionary.to_pylist())
+    place = np.array([bisect.bisect_left(ids, name) for name in names.dictionary.to_pylist()], np.int32)
+    building = np.full(len(labels), -1, np.int32)
+    known = names.indices.is_valid().to_numpy(zero_copy_only=False)
+    building[known] = place[names.indices.drop_null().to_numpy()]
+    return SceneTruth(
+        folder=folder,
+        suite=manifest["suite"],
+        seed=manifest["seed"],
+        crs=manifest["crs"],
+        extent=tuple(manifest["extent"]),
+        building_ids=tuple(ids),
+        classification=labels["class"].to_numpy(),
+        building=building,
+        face=labels["face"].to_numpy().astype(np.int32),
+        mixed=labels["mixed"].to_numpy(),
+    )
+
+
 def spatial_reference(scene: Scene) -> SpatialReference:
     """The scene's coordinate reference system, in metres."""
     if scene.crs is None:
@@ -209,7 +278,7 @@ def _las_points(block: ScanBlock, header: laspy.LasHeader, with_classes: bool) -
     record["intensity"] = block.intensity
     record["return_number"] = cloud.return_number
     record["number_of_returns"] = cloud.return_count
-    record["classification"] = cloud.classification if with_classes else np.uint8(1)
+    record["classification"] = cloud.classification if with_classes else np.ones(len(block), np.uint8)
     record["scan_angle"] = np.round(block.scan_angle_deg / 0.006).astype(np.int16)
     record["point_source_id"] = cloud.source_id
     record["gps_time"] = cloud.gps_time

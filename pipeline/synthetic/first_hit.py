@@ -8,137 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from pipeline.model import BoolArray, FloatArray, LabelArray
 from pipeline.synthetic.scene import Scene
+from pipeline.synthetic.scene_arrays import CELL_M, SceneArrays, scene_arrays
 
 GROUND, ROOF, WALL, TREE, BOX = 0, 1, 2, 3, 4
 """Kinds of hits."""
 
-_CELL_M = 5.0
 _ON_ROOF_M = 1e-6
-
-
-class SceneArrays(NamedTuple):
-    """A scene for the kernels. Prisms are buildings, then boxes; entries of the grid >= 0 are prisms, < 0 trees (~i)."""
-
-    terrain: FloatArray
-    """(3,) float64: base elevation, slope east, slope north."""
-    waves: FloatArray
-    """(k, 4) float64, as `Terrain.waves`."""
-    n_buildings: int
-    """Prisms below this number are buildings."""
-    face_start: LabelArray
-    """(prisms + 1,) int32, first face of each prism."""
-    ring_start: LabelArray
-    """(faces + 1,) int32, first vertex of each face."""
-    ring_x: FloatArray
-    """(vertices,) float64."""
-    ring_y: FloatArray
-    """(vertices,) float64."""
-    planes: FloatArray
-    """(faces, 3) float64: a, b, c."""
-    trees: FloatArray
-    """(trees, 6) float64: x, y, z, radius, half height, free path."""
-    grid: FloatArray
-    """(2,) float64, lower left corner of the grid."""
-    cells_across: int
-    """Columns of the grid."""
-    cells_up: int
-    """Rows of the grid."""
-    cell_start: LabelArray
-    """(cells + 1,) int32, first entry of each cell."""
-    cell_entries: LabelArray
-    """(entries,) int32."""
-
-
-def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5) -> SceneArrays:
-    """Flatten a scene.
-
-    Parameters
-    ----------
-    scene : Scene
-        What can be hit.
-    max_lean : float
-        Largest lean of the lines to come: objects are entered into all cells from whose terrain they can be hit.
-    margin_m : float
-        Added to the reach, for beams with a footprint.
-    """
-    face_start, ring_start = [0], [0]
-    rings: list[FloatArray] = []
-    planes: list[tuple[float, float, float]] = []
-    bounds: list[tuple[float, float, float, float]] = []
-    for building in scene.buildings:
-        low, high = building.vertices.min(axis=0), building.vertices.max(axis=0)
-        for face, plane in zip(building.faces, building.planes, strict=True):
-            rings.append(building.vertices[list(face), :2])
-            planes.append(plane.coefficients)
-            ring_start.append(ring_start[-1] + len(face))
-        face_start.append(len(planes))
-        bounds.append(_reach(low, high, (high[2] - building.floor_z_m) * max_lean + margin_m))
-    for box in scene.boxes:
-        rings.append(box.corners)
-        planes.append((0.0, 0.0, box.top_z_m))
-        ring_start.append(ring_start[-1] + len(box.corners))
-        face_start.append(len(planes))
-        bounds.append(_reach(box.corners.min(axis=0), box.corners.max(axis=0), 5.0 * max_lean + margin_m))
-    trees = np.array([dataclasses.astuple(tree) for tree in scene.trees]).reshape(-1, 6)
-    ground = scene.terrain.elevation(trees[:, 0], trees[:, 1])
-    for row, z in zip(trees, ground, strict=True):
-        reach = row[3] + max(0.0, row[2] + row[4] - z) * max_lean * 1.5 + margin_m
-        bounds.append((row[0] - reach, row[1] - reach, row[0] + reach, row[1] + reach))
-    numbers = [*range(len(scene.buildings) + len(scene.boxes)), *(~k for k in range(len(trees)))]
-    vertices = np.concatenate(rings) if rings else np.zeros((0, 2))
-    grid, across, up, cell_start, cell_entries = _cells(scene.extent, np.array(bounds).reshape(-1, 4), numbers)
-    terrain = scene.terrain
-    return SceneArrays(
-        terrain=np.array([terrain.base_z_m, terrain.slope_x, terrain.slope_y]),
-        waves=np.ascontiguousarray(terrain.waves, dtype=np.float64),
-        n_buildings=len(scene.buildings),
-        face_start=np.array(face_start, dtype=np.int32),
-        ring_start=np.array(ring_start, dtype=np.int32),
-        ring_x=np.ascontiguousarray(vertices[:, 0]),
-        ring_y=np.ascontiguousarray(vertices[:, 1]),
-        planes=np.array(planes, dtype=np.float64).reshape(-1, 3),
-        trees=trees,
-        grid=grid,
-        cells_across=across,
-        cells_up=up,
-        cell_start=cell_start,
-        cell_entries=cell_entries,
-    )
-
-
-def _reach(low: FloatArray, high: FloatArray, reach_m: float) -> tuple[float, float, float, float]:
-    return (low[0] - reach_m, low[1] - reach_m, high[0] + reach_m, high[1] + reach_m)
-
-
-def _cells(
-    extent: tuple[float, float, float, float], bounds: FloatArray, numbers: list[int]
-) -> tuple[FloatArray, int, int, LabelArray, LabelArray]:
-    """The grid: each object's number in every cell that its bounds touch, in the order of the objects."""
-    pad = 50.0  # pulses may start outside the extent; beyond the grid nothing stands
-    low = np.array(extent[:2]) - pad
-    across = math.ceil((extent[2] - extent[0] + 2 * pad) / _CELL_M)
-    up = math.ceil((extent[3] - extent[1] + 2 * pad) / _CELL_M)
-    cells: list[npt.NDArray[np.int64]] = [np.zeros(0, np.int64)]
-    entries: list[npt.NDArray[np.int64]] = [np.zeros(0, np.int64)]
-    for bound, number in zip(bounds, numbers, strict=True):
-        first = np.clip(np.floor((bound[:2] - low) / _CELL_M).astype(int), 0, [across - 1, up - 1])
-        last = np.clip(np.floor((bound[2:] - low) / _CELL_M).astype(int), 0, [across - 1, up - 1])
-        rows, columns = np.mgrid[first[1] : last[1] + 1, first[0] : last[0] + 1]
-        cells.append((rows * across + columns).ravel())
-        entries.append(np.full(rows.size, number))
-    flat, values = np.concatenate(cells), np.concatenate(entries)
-    order = np.argsort(flat, kind="stable")
-    start = np.zeros(across * up + 1, np.int32)
-    start[1:] = np.cumsum(np.bincount(flat, minlength=across * up))
-    return low, across, up, start, values[order].astype(np.int32)
 
 
 @njit(cache=True, nogil=True)
@@ -159,7 +41,7 @@ def uniform_of(state: np.uint64, draw: int) -> float:
 @njit(cache=True, nogil=True)
 def terrain_z(scene: SceneArrays, x: float, y: float) -> float:
     """Elevation of the terrain."""
-    z = scene.terrain[0] + scene.terrain[1] * x + scene.terrain[2] * y
+    z: float = scene.terrain[0] + scene.terrain[1] * x + scene.terrain[2] * y
     for k in range(len(scene.waves)):
         z += scene.waves[k, 0] * math.sin(scene.waves[k, 1] * x + scene.waves[k, 2] * y + scene.waves[k, 3])
     return z
@@ -197,7 +79,7 @@ def _inside(scene: SceneArrays, face: int, x: float, y: float) -> bool:
 
 @njit(cache=True, nogil=True)
 def _prism_hit(scene: SceneArrays, prism: int, x: float, y: float, z: float, lean_x: float, lean_y: float) -> Any:
-    """Highest hit of a line with the prisms under a building's faces: elevation (-inf for none), face or -1 for a wall."""
+    """Highest hit of a line with the prisms under the faces: elevation (-inf for none), face or -1 for a wall."""
     best, hit = -np.inf, -1
     first = scene.face_start[prism]
     for face in range(first, scene.face_start[prism + 1]):
@@ -251,17 +133,18 @@ def _tree_hit(
     up = (-linear + math.sqrt(root)) / square - depth / length
     if up <= (-linear - math.sqrt(root)) / square or up <= 0.0:
         return -np.inf
-    return z + up
+    return float(z + up)
 
 
 @njit(cache=True, nogil=True)
 def cell_of(scene: SceneArrays, x: float, y: float) -> int:
     """Number of the grid's cell, -1 outside."""
-    column = int(math.floor((x - scene.grid[0]) / _CELL_M))
-    row = int(math.floor((y - scene.grid[1]) / _CELL_M))
+    column = math.floor((x - scene.grid[0]) / CELL_M)
+    row = math.floor((y - scene.grid[1]) / CELL_M)
     if column < 0 or row < 0 or column >= scene.cells_across or row >= scene.cells_up:
         return -1
-    return row * scene.cells_across + column
+    cell: int = row * scene.cells_across + column
+    return cell
 
 
 @njit(cache=True, nogil=True)
@@ -301,7 +184,15 @@ def first_hit(
 
 
 @njit(cache=True, nogil=True)
-def _surface(scene: SceneArrays, x: FloatArray, y: FloatArray, z: FloatArray, kind: LabelArray, thing: LabelArray, face: LabelArray) -> None:
+def _surface(
+    scene: SceneArrays,
+    x: FloatArray,
+    y: FloatArray,
+    z: FloatArray,
+    kind: LabelArray,
+    thing: LabelArray,
+    face: LabelArray,
+) -> None:
     for k in range(len(x)):
         ground = terrain_z(scene, x[k], y[k])
         cell = cell_of(scene, x[k], y[k])

@@ -55,9 +55,7 @@ def undulating_terrain(
         direction, phase = random.uniform(0, 2 * math.pi, 2)
         number = 2 * math.pi / (wavelength_m * length)
         waves[k] = amplitude_m * share, number * math.cos(direction), number * math.sin(direction), phase
-    return Terrain(
-        base_z_m=base_z_m, slope_x=-fall * math.sin(aspect), slope_y=-fall * math.cos(aspect), waves=waves
-    )
+    return Terrain(base_z_m=base_z_m, slope_x=-fall * math.sin(aspect), slope_y=-fall * math.cos(aspect), waves=waves)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,7 +102,9 @@ class Building:
         """2D outline in the scene frame."""
         outline = shapely.union_all([shapely.Polygon(self.vertices[list(face), :2]) for face in self.faces])
         if not isinstance(outline, shapely.Polygon):
-            raise TypeError(f"{self.building_id}: the roof faces do not join to one outline but to a {outline.geom_type}")
+            raise TypeError(
+                f"{self.building_id}: the roof faces do not join to one outline but to a {outline.geom_type}"
+            )
         return outline
 
     def roof_polygons(self) -> tuple[shapely.Polygon, ...]:
@@ -155,7 +155,7 @@ class Scene:
     terrain: Terrain
     """The ground."""
     buildings: tuple[Building, ...]
-    """In the order of their ids."""
+    """Numbered in this order by hits and labels."""
     trees: tuple[Tree, ...] = ()
     """Trees and shrubs."""
     boxes: tuple[Box, ...] = ()

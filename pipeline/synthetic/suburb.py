@@ -50,11 +50,15 @@ def house_size(shape: RoofShape, random: np.random.Generator) -> RoofDimensions:
             wing_length_m=random.uniform(3.5, 6.0),
         )
     if shape is RoofShape.HIP:
-        return RoofDimensions(length_m=width * random.uniform(1.2, 1.6), width_m=width, pitch_deg=random.uniform(25.0, 38.0))
+        return RoofDimensions(
+            length_m=width * random.uniform(1.2, 1.6), width_m=width, pitch_deg=random.uniform(25.0, 38.0)
+        )
     return RoofDimensions(length_m=length, width_m=width, pitch_deg=pitch)
 
 
-def tree_at(x: float, y: float, radius_m: float, height_m: float, terrain: Terrain, free_path_share: float = 0.3) -> Tree:
+def tree_at(
+    x: float, y: float, radius_m: float, height_m: float, terrain: Terrain, free_path_share: float = 0.2
+) -> Tree:
     """A tree of a total height, with a bare trunk over the lowest fifth (under 2 m: a shrub down to the ground)."""
     ground = float(terrain.elevation(np.array([x]), np.array([y]))[0])
     base = 0.2 * height_m if height_m > 2.0 else 0.0
@@ -170,9 +174,7 @@ def _house(
     )
 
 
-def _garden(
-    house: Building, footprint: shapely.Polygon, terrain: Terrain, random: np.random.Generator
-) -> list[Tree]:
+def _garden(house: Building, footprint: shapely.Polygon, terrain: Terrain, random: np.random.Generator) -> list[Tree]:
     """Trees and shrubs around a house; a third of the houses has one whose crown reaches over the eave."""
     trees = []
     half = math.hypot(house.dimensions.length_m, house.dimensions.width_m) / 2

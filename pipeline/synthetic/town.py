@@ -50,7 +50,7 @@ def town(seed: int, *, size_m: tuple[float, float] = (400.0, 400.0), name: str =
             middle = turned((np.array([(column, row)]) + 0.5) * step, 0.0, 0.0, TOWN_AZIMUTH_DEG)[0]
             if not (-60.0 < middle[0] < size_m[0] + 60.0 and -60.0 < middle[1] < size_m[1] + 60.0):
                 continue
-            block = _Block(f"{name}-{column:+d}{row:+d}", middle, terrain, seed, column, row)
+            block = _Block(f"{name}-{column}_{row}", middle, terrain, seed, column, row)
             buildings += [one for one in block.buildings if _is_inside(one.vertices, size_m)]
             trees += [one for one in block.trees if 0 <= one.x < size_m[0] and 0 <= one.y < size_m[1]]
             boxes += [one for one in block.boxes if _is_inside(one.corners, size_m)]
@@ -106,7 +106,14 @@ class _Block:
         return float(x), float(y)
 
     def _build(
-        self, shape: RoofShape, size: RoofDimensions, u: float, v: float, turn_deg: float, eave_m: float, block: str | None
+        self,
+        shape: RoofShape,
+        size: RoofDimensions,
+        u: float,
+        v: float,
+        turn_deg: float,
+        eave_m: float,
+        block: str | None,
     ) -> None:
         x, y = self._place(u, v)
         self.buildings.append(
@@ -151,7 +158,9 @@ class _Block:
                 turn = (0.0 if side > 0 else 180.0) + float(self.random.uniform(-2.0, 2.0))
                 eave = 2.9 * int(self.random.integers(1, 3)) + float(self.random.uniform(0.2, 0.8))
                 # The wing of an L stands out to the left of the ridge: turned so that this is the court.
-                self._build(shape, house_size(shape, self.random), (k - 1.5) * 20.5, side * 15.5, turn + 180.0, eave, None)
+                self._build(
+                    shape, house_size(shape, self.random), (k - 1.5) * 20.5, side * 15.5, turn + 180.0, eave, None
+                )
         self._planted(4, BLOCK_M[0] / 2 - 6.0, 2.0)
 
     def _hall(self) -> None:
@@ -197,4 +206,6 @@ def _stands_in(building: Building, x: float, y: float, margin_m: float) -> bool:
     v = (y - building.y) * east - (x - building.x) * north
     size = building.dimensions
     out = size.wing_length_m
-    return abs(u) < size.length_m / 2 + margin_m and -size.width_m / 2 - margin_m < v < size.width_m / 2 + out + margin_m
+    return (
+        abs(u) < size.length_m / 2 + margin_m and -size.width_m / 2 - margin_m < v < size.width_m / 2 + out + margin_m
+    )

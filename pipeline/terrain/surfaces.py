@@ -163,22 +163,38 @@ def classify_facets(x, y, z, height, kind, facets, max_radius_mm, wall_mm, steep
 
 
 @njit(cache=True, nogil=True)
-def facets_near(x, y, facets, x0, y0, x1, y1):  # type: ignore[no-untyped-def]
-    """Mask of the facets that share a vertex with a facet whose bounding box meets the core."""
-    m = facets.shape[0]
-    near_vertex = np.zeros(x.size, np.bool_)
-    for f in range(m):
+def _marks(x, y, facets, kinds, core, far_mm):  # type: ignore[no-untyped-def]
+    """Masks of the vertices that the core's points may refer to, and of those that another tile's may refer to too.
+
+    Points refer to the vertices of the facet around them and to vertices within far_mm. Facets across gaps do not
+    count, since they differ from tile to tile.
+    """
+    x0, y0, x1, y1 = core
+    n = x.size
+    near = np.empty(n, np.bool_)
+    shared = np.empty(n, np.bool_)
+    for v in range(n):
+        near[v] = x0 - far_mm <= x[v] < x1 + far_mm and y0 - far_mm <= y[v] < y1 + far_mm
+        shared[v] = not (x0 + far_mm <= x[v] < x1 - far_mm and y0 + far_mm <= y[v] < y1 - far_mm)
+    for f in range(facets.shape[0]):
+        if kinds[f] == 0:
+            continue
         a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
-        if (
-            max(x[a], x[b], x[c]) >= x0
-            and min(x[a], x[b], x[c]) < x1
-            and max(y[a], y[b], y[c]) >= y0
-            and min(y[a], y[b], y[c]) < y1
-        ):
-            near_vertex[a] = near_vertex[b] = near_vertex[c] = True
-    out = np.empty(m, np.bool_)
-    for f in range(m):
-        out[f] = near_vertex[facets[f, 0]] or near_vertex[facets[f, 1]] or near_vertex[facets[f, 2]]
+        west, east = min(x[a], x[b], x[c]), max(x[a], x[b], x[c])
+        south, north = min(y[a], y[b], y[c]), max(y[a], y[b], y[c])
+        if east >= x0 and west < x1 and north >= y0 and south < y1:
+            near[a] = near[b] = near[c] = True
+        if not (west >= x0 and east < x1 and south >= y0 and north < y1):
+            shared[a] = shared[b] = shared[c] = True
+    return near, shared
+
+
+@njit(cache=True, nogil=True)
+def _with_vertex(facets, marked):  # type: ignore[no-untyped-def]
+    """Mask of the facets with at least one marked vertex."""
+    out = np.empty(facets.shape[0], np.bool_)
+    for f in range(facets.shape[0]):
+        out[f] = marked[facets[f, 0]] or marked[facets[f, 1]] or marked[facets[f, 2]]
     return out
 
 
@@ -347,6 +363,28 @@ def _facet_containing(px, py, start, x, y, facets, neighbours):  # type: ignore[
 
 
 @njit(cache=True, nogil=True)
+def _nearest_vertex(px, py, pz, x, y, z, far_mm):  # type: ignore[no-untyped-def]
+    """Nearest vertex in plan within far_mm, equal distances by elevation, then by coordinates; -1 where none.
+
+    The vertices come sorted by (x, y).
+    """
+    best = -1
+    best_distance, best_dz = far_mm * far_mm + 1, np.int64(0)
+    for v in range(np.searchsorted(x, px - far_mm), x.size):
+        if x[v] > px + far_mm:
+            break
+        distance = (px - x[v]) ** 2 + (py - y[v]) ** 2
+        if distance > best_distance:
+            continue
+        dz = abs(pz - z[v])
+        if distance < best_distance or dz < best_dz:
+            best = v
+            best_distance = distance
+            best_dz = dz
+    return best
+
+
+@njit(cache=True, nogil=True)
 def assign_points(  # type: ignore[no-untyped-def]
     px, py, pz, above_ground, last, allowed, x, y, z, facets, neighbours, kinds, label, vertex_label, fragment_kind,
     reach_mm, canopy_mm, ground_mm, far_mm, sums, lowest_point
@@ -371,37 +409,42 @@ def assign_points(  # type: ignore[no-untyped-def]
         hint[(y[v] // cell - row0) * columns + x[v] // cell - column0] = f
     previous = 0
     for i in range(n):
+        if allowed[i] == 0 or above_ground[i] < ground_mm:
+            continue
         c, r = px[i] // cell - column0, py[i] // cell - row0
         start = previous
         if 0 <= c < columns and 0 <= r < rows and hint[r * columns + c] >= 0:
             start = hint[r * columns + c]
         f, on_edge = _facet_containing(px[i], py[i], start, x, y, facets, neighbours)
-        if f < 0:
-            continue
-        previous = f
-        if allowed[i] == 0 or above_ground[i] < ground_mm:
-            continue
+        if f >= 0:
+            previous = f
         at_vertex = -1
         for q in range(3):
-            v = facets[f, q]
-            if x[v] == px[i] and y[v] == py[i]:
-                at_vertex = v
+            if f >= 0:
+                v = facets[f, q]
+                if x[v] == px[i] and y[v] == py[i]:
+                    at_vertex = v
+        if at_vertex < 0 and f >= 0 and on_edge >= 0:
+            # on an edge: the facet that is no gap, else the one with the smaller opposite vertex, whichever way we came
+            g = neighbours[f, on_edge]
+            if g >= 0 and kinds[g] != 0:
+                v = facets[f, on_edge]
+                k = 0
+                while neighbours[g, k] != f:
+                    k += 1
+                w = facets[g, k]
+                if kinds[f] == 0 or x[w] < x[v] or (x[w] == x[v] and y[w] < y[v]):
+                    f = g
         fragment = -1
-        if at_vertex >= 0:
+        if f < 0 or (kinds[f] == 0 and at_vertex < 0):
+            # facets across gaps differ from tile to tile: only the nearest vertex is sure
+            v = _nearest_vertex(px[i], py[i], pz[i], x, y, z, far_mm)
+            if v >= 0 and abs(pz[i] - z[v]) <= reach_mm:
+                fragment = vertex_label[v]
+        elif at_vertex >= 0:
             if abs(pz[i] - z[at_vertex]) <= reach_mm:
                 fragment = vertex_label[at_vertex]
         else:
-            if on_edge >= 0:
-                # on an edge: of the two facets the one with the smaller opposite vertex, whichever way we came
-                g = neighbours[f, on_edge]
-                if g >= 0:
-                    v = facets[f, on_edge]
-                    k = 0
-                    while neighbours[g, k] != f:
-                        k += 1
-                    w = facets[g, k]
-                    if x[w] < x[v] or (x[w] == x[v] and y[w] < y[v]):
-                        f = g
             if kinds[f] == 3 or kinds[f] == 4:
                 k = 0
                 for q in range(1, 3):
@@ -427,8 +470,6 @@ def assign_points(  # type: ignore[no-untyped-def]
                         continue
                     dz = abs(pz[i] - z[v])
                     distance = (px[i] - x[v]) ** 2 + (py[i] - y[v]) ** 2
-                    if distance > far_mm * far_mm:
-                        continue
                     if dz < best or (dz == best and distance < best_distance):
                         best = dz
                         best_distance = distance
@@ -448,43 +489,25 @@ def assign_points(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def crossing_facets(x, y, facets, label, core):  # type: ignore[no-untyped-def]
-    """Labelled facets that reach outside the core: sorted vertex coordinates (k, 6) and fragments (k,).
+def facet_keys(x, y, facets, chosen):  # type: ignore[no-untyped-def]
+    """Coordinates (k, 6) of the vertices of the chosen facets, from the smallest on, counter-clockwise.
 
     The same facet gives the same coordinates in every tile that sees it: that is how fragments of one
     surface find each other.
     """
-    x0, y0, x1, y1 = core
-    count = 0
-    for pass_number in range(2):
-        if pass_number == 1:
-            keys = np.empty((count, 6), np.int64)
-            fragments = np.empty(count, np.int32)
-            count = 0
-        for f in range(facets.shape[0]):
-            if label[f] < 0:
-                continue
-            a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
-            if (
-                min(x[a], x[b], x[c]) >= x0
-                and max(x[a], x[b], x[c]) < x1
-                and min(y[a], y[b], y[c]) >= y0
-                and max(y[a], y[b], y[c]) < y1
-            ):
-                continue
-            if pass_number == 1:
-                k = 0
-                for q in range(1, 3):
-                    v, w = facets[f, q], facets[f, k]
-                    if x[v] < x[w] or (x[v] == x[w] and y[v] < y[w]):
-                        k = q
-                for q in range(3):
-                    v = facets[f, (k + q) % 3]
-                    keys[count, 2 * q] = x[v]
-                    keys[count, 2 * q + 1] = y[v]
-                fragments[count] = label[f]
-            count += 1
-    return keys, fragments
+    keys = np.empty((chosen.size, 6), np.int64)
+    for i in range(chosen.size):
+        f = chosen[i]
+        k = 0
+        for q in range(1, 3):
+            v, w = facets[f, q], facets[f, k]
+            if x[v] < x[w] or (x[v] == x[w] and y[v] < y[w]):
+                k = q
+        for q in range(3):
+            v = facets[f, (k + q) % 3]
+            keys[i, 2 * q] = x[v]
+            keys[i, 2 * q + 1] = y[v]
+    return keys
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -500,7 +523,7 @@ class Fragments:
     lowest_point_mm: IntArray
     """(k, 3) int64, lexicographically smallest assigned point; 2^62 where there is none."""
     crossing_keys: IntArray
-    """(j, 6) int64, facets that reach outside the core, by their vertices from the smallest on."""
+    """(j, 6) int64, facets that another tile may see too, by their vertices from the smallest on."""
     crossing_fragment: LabelArray
     """(j,) int32, the fragment of each crossing facet."""
     along_steps: IntArray
@@ -580,7 +603,9 @@ def fragments_of(
         round(settings.steep_m * 1000),
         round(settings.step_height_m * 1000),
     )  # fmt: skip
-    considered = facets_near(x, y, tin.facets, *core)
+    far_mm = round(2 * settings.thinning_m * 1000)
+    near, shared = _marks(x, y, tin.facets, kinds, core, far_mm)
+    considered = _with_vertex(tin.facets, near)
     label, fragment_kind = label_fragments(kinds, tin.neighbours, considered)
     vertex_label = label_vertices(x, y, tin.facets, kinds, label)
     sums, boxes, along = sum_fragments(
@@ -592,17 +617,17 @@ def fragments_of(
         points.x_mm, points.y_mm, points.z_mm, points.height_mm, points.last, points.allowed,
         x, y, z, tin.facets, tin.neighbours, kinds, label, vertex_label, fragment_kind,
         round(settings.reach_m * 1000), round(canopy_m * 1000), round(ground_m * 1000),
-        round(2 * settings.max_circumradius_m * 1000), sums, lowest,
+        far_mm, sums, lowest,
     )  # fmt: skip
-    keys, crossing = crossing_facets(x, y, tin.facets, label, core)
+    crossing = np.flatnonzero((label >= 0) & _with_vertex(tin.facets, shared))
     return (
         Fragments(
             kind=fragment_kind,
             sums=sums,
             boxes_mm=boxes,
             lowest_point_mm=lowest,
-            crossing_keys=keys,
-            crossing_fragment=crossing,
+            crossing_keys=facet_keys(x, y, tin.facets, crossing),
+            crossing_fragment=label[crossing],
             along_steps=along,
         ),
         point_fragment,

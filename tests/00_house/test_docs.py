@@ -6,6 +6,7 @@ import dataclasses
 import importlib.util
 import re
 import shlex
+import tomllib
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,6 +17,7 @@ import typer
 from pipeline.export.records import SCHEMAS
 from pipeline.methods.fuzzy_sart import FuzzySartSettings
 from pipeline.model import Reason, RoofType, Status
+from pipeline.settings import RunSettings
 from service.cli import app
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -88,6 +90,22 @@ def test_every_setting_that_a_page_names_exists(generator: ModuleType) -> None:
     named = set(re.findall(r"`([a-z]+(?:_[a-z0-9]+)+)(?:: [a-z_]+)?`", text))
     values = {"unit_normal", "spherical_scaled", "too_complex", "all_planes"}
     assert named - known - values == set()
+
+
+def toml_blocks() -> list[tuple[str, str]]:
+    """Every toml block, with its page."""
+    return [
+        (page.relative_to(ROOT).as_posix(), block)
+        for page in PAGES
+        for block in re.findall(r"^```toml\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    ]
+
+
+@pytest.mark.parametrize(("page", "block"), toml_blocks())
+def test_a_settings_file_of_the_docs_is_valid(page: str, block: str) -> None:
+    settings = RunSettings.from_mapping(tomllib.loads(block)["settings"])
+    if page == "docs/methods/fuzzy_sart.md":
+        assert settings.building.method == FuzzySartSettings.literal()
 
 
 @pytest.mark.parametrize("table", list(SCHEMAS))

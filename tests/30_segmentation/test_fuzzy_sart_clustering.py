@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from pipeline.errors import BuildingError, SettingsError
-from pipeline.model import Reason
+from pipeline.model import FloatArray, Reason
 from pipeline.segmentation.fuzzy_sart import (
     FuzzySartClusteringSettings,
     centre_of_building,
@@ -22,7 +25,7 @@ coordinate = st.floats(-100, 100, allow_nan=False).filter(lambda value: abs(valu
 vector = st.tuples(coordinate, coordinate, coordinate)
 
 
-def scalar_vdm(template, vector_):
+def scalar_vdm(template: Sequence[float], vector_: Sequence[float]) -> float:
     """Eqs. 3 to 6, one number after the other."""
     t = math.sqrt(sum(value * value for value in template))
     x = math.sqrt(sum(value * value for value in vector_))
@@ -30,11 +33,13 @@ def scalar_vdm(template, vector_):
     return min(t / x, x / t) * (math.pi - alpha) / math.pi
 
 
-def plain_clustering(vectors, areas, chosen):
+def plain_clustering(
+    vectors: list[list[float]], areas: list[float], chosen: FuzzySartClusteringSettings
+) -> tuple[list[int], list[list[float]]]:
     """The reconstruction of the learning rule, neuron by neuron in lists."""
     order = sorted(range(len(vectors)), key=lambda i: (-areas[i], i))
     modules = [math.sqrt(sum(value * value for value in v)) for v in vectors]
-    neurons: list[dict] = []
+    neurons: list[dict[str, Any]] = []
     for _ in range(chosen.epochs_per_tau * chosen.tau_epochs):
         made = False
         for neuron in neurons:
@@ -80,7 +85,7 @@ def plain_clustering(vectors, areas, chosen):
     return labels, [n["t"] for n in neurons]
 
 
-def noisy_normals(seed, count=60, spread=0.1):
+def noisy_normals(seed: int, count: int = 60, spread: float = 0.1) -> tuple[FloatArray, FloatArray]:
     random = np.random.default_rng(seed)
     means = np.array([[0.5, 0, 1], [-0.5, 0, 1], [0, 0.4, 1], [0, 0, 1.0]])
     normals = means[random.integers(0, 4, count)] + random.normal(0, spread, (count, 3))
@@ -89,13 +94,15 @@ def noisy_normals(seed, count=60, spread=0.1):
 
 @settings(deadline=None)
 @given(vector, vector)
-def test_the_degree_of_match_is_its_scalar_twin(template, other):
+def test_the_degree_of_match_is_its_scalar_twin(template: Sequence[float], other: Sequence[float]) -> None:
     assert vector_degree_of_match(template, other) == pytest.approx(scalar_vdm(template, other), abs=1e-12)
 
 
 @settings(deadline=None)
 @given(vector, vector)
-def test_the_degree_of_match_is_symmetric_and_between_0_and_1(template, other):
+def test_the_degree_of_match_is_symmetric_and_between_0_and_1(
+    template: Sequence[float], other: Sequence[float]
+) -> None:
     degree = vector_degree_of_match(template, other)
     assert degree == pytest.approx(vector_degree_of_match(other, template), abs=1e-12)
     assert 0.0 <= degree <= 1.0
@@ -103,27 +110,27 @@ def test_the_degree_of_match_is_symmetric_and_between_0_and_1(template, other):
 
 @settings(deadline=None)
 @given(vector)
-def test_a_vector_matches_itself_entirely_and_its_opposite_not_at_all(template):
+def test_a_vector_matches_itself_entirely_and_its_opposite_not_at_all(template: Sequence[float]) -> None:
     assert vector_degree_of_match(template, template) == pytest.approx(1.0, abs=1e-7)
     assert vector_degree_of_match(template, [-value for value in template]) == pytest.approx(0.0, abs=1e-7)
 
 
-def test_equal_directions_match_by_the_ratio_of_their_modules():
+def test_equal_directions_match_by_the_ratio_of_their_modules() -> None:
     assert vector_degree_of_match([1, 2, 2], [2, 4, 4]) == pytest.approx(0.5, abs=1e-7)
 
 
-def test_equal_modules_at_a_right_angle_match_by_half():
+def test_equal_modules_at_a_right_angle_match_by_half() -> None:
     assert vector_degree_of_match([1, 0, 0], [0, 0, 1]) == pytest.approx(0.5, abs=1e-12)
 
 
-def test_the_zero_vector_matches_nothing():
+def test_the_zero_vector_matches_nothing() -> None:
     assert vector_degree_of_match([0, 0, 0], [1, 0, 0]) == 0.0
     assert vector_degree_of_match([0, 0, 0], [0, 0, 0]) == 0.0
 
 
 @pytest.mark.parametrize("vigilance", [0.7, 0.9, 0.95])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_clustering_equals_its_plain_twin(seed, vigilance):
+def test_the_clustering_equals_its_plain_twin(seed: int, vigilance: float) -> None:
     normals, areas = noisy_normals(seed)
     chosen = FuzzySartClusteringSettings(vigilance=vigilance)
     found = cluster(normals, areas, chosen)
@@ -133,7 +140,7 @@ def test_the_clustering_equals_its_plain_twin(seed, vigilance):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_clustering_of_footpoints_equals_its_plain_twin(seed):
+def test_the_clustering_of_footpoints_equals_its_plain_twin(seed: int) -> None:
     normals, areas = noisy_normals(seed)
     offsets = np.random.default_rng(seed + 100).uniform(2, 9, len(normals))
     chosen = FuzzySartClusteringSettings(vigilance=0.7, tau_epochs=2)
@@ -145,7 +152,7 @@ def test_the_clustering_of_footpoints_equals_its_plain_twin(seed):
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10_000))
-def test_every_clustered_vector_matches_its_own_neuron_best(seed):
+def test_every_clustered_vector_matches_its_own_neuron_best(seed: int) -> None:
     normals, areas = noisy_normals(seed, count=25)
     found = cluster(normals, areas, FuzzySartClusteringSettings(vigilance=0.9))
     for normal, label in zip(normals, found.labels, strict=True):
@@ -153,7 +160,7 @@ def test_every_clustered_vector_matches_its_own_neuron_best(seed):
         assert max(degrees) < 0.9 if label < 0 else degrees[label] >= max(max(degrees) - 1e-12, 0.9 - 1e-12)
 
 
-def test_two_roof_sides_give_two_clusters_at_high_vigilance_and_one_at_low():
+def test_two_roof_sides_give_two_clusters_at_high_vigilance_and_one_at_low() -> None:
     sides = np.array([[0.4, 0, 1], [-0.4, 0, 1]])
     normals = np.repeat(sides / np.linalg.norm(sides, axis=1)[:, None], 10, axis=0)
     areas = np.ones(20)
@@ -163,7 +170,7 @@ def test_two_roof_sides_give_two_clusters_at_high_vigilance_and_one_at_low():
     assert len(together.templates) == 1
 
 
-def test_a_higher_vigilance_never_gives_fewer_clusters_on_noisy_roofs():
+def test_a_higher_vigilance_never_gives_fewer_clusters_on_noisy_roofs() -> None:
     for seed in range(5):
         normals, areas = noisy_normals(seed)
         counts = [
@@ -172,7 +179,7 @@ def test_a_higher_vigilance_never_gives_fewer_clusters_on_noisy_roofs():
         assert counts == sorted(counts)
 
 
-def test_a_zero_vector_is_an_outlier_and_no_vectors_give_no_clusters():
+def test_a_zero_vector_is_an_outlier_and_no_vectors_give_no_clusters() -> None:
     found = cluster(np.array([[0.0, 0, 0], [0, 0, 1]]), np.ones(2), FuzzySartClusteringSettings())
     assert found.labels.tolist() == [-1, 0]
     nothing = cluster(np.zeros((0, 3)), np.zeros(0), FuzzySartClusteringSettings())
@@ -180,19 +187,19 @@ def test_a_zero_vector_is_an_outlier_and_no_vectors_give_no_clusters():
     assert nothing.templates.shape == (0, 3)
 
 
-def test_more_work_than_allowed_is_told_as_too_complex():
+def test_more_work_than_allowed_is_told_as_too_complex() -> None:
     normals, areas = noisy_normals(1, count=500)
     with pytest.raises(BuildingError, match="clustering_work_limit is 1000") as caught:
         cluster(normals, areas, FuzzySartClusteringSettings(clustering_work_limit=1000))
     assert caught.value.reason is Reason.TOO_COMPLEX
 
 
-def test_the_centre_is_the_middle_of_the_box_in_every_dimension():
+def test_the_centre_is_the_middle_of_the_box_in_every_dimension() -> None:
     points = np.array([[1.0, 2, 3], [5, 2, 9], [2, 8, 4]])
     assert centre_of_building(points).tolist() == [3.0, 5.0, 6.0]
 
 
-def test_a_footpoint_lies_on_its_facet_plane_along_its_normal():
+def test_a_footpoint_lies_on_its_facet_plane_along_its_normal() -> None:
     random = np.random.default_rng(3)
     normals, _ = noisy_normals(3, count=20)
     centroids, centre = random.uniform(-5, 5, (20, 3)), np.array([1.0, 2, 3])
@@ -201,33 +208,33 @@ def test_a_footpoint_lies_on_its_facet_plane_along_its_normal():
     np.testing.assert_allclose(np.cross(feet, normals), 0, atol=1e-12)
 
 
-def test_footpoints_of_opposite_roof_sides_are_mirrored_about_the_centre():
+def test_footpoints_of_opposite_roof_sides_are_mirrored_about_the_centre() -> None:
     normals = np.array([[0.6, 0, 0.8], [-0.6, 0, 0.8]])
     feet = facet_vectors("footpoint", normals, np.array([[3.0, 0, 4], [-3.0, 0, 4]]), np.zeros(3))
     np.testing.assert_allclose(feet[0] * [-1, 1, 1], feet[1])
 
 
 @pytest.mark.parametrize("low", [0.0, 1.0])
-def test_scaled_spherical_vectors_fill_their_range(low):
+def test_scaled_spherical_vectors_fill_their_range(low: float) -> None:
     normals, _ = noisy_normals(5, count=30)
     vectors = facet_vectors("spherical_scaled", normals, normals * 7, np.array([1.0, 0, 0]), scaled_minimum=low)
     np.testing.assert_allclose(vectors.min(axis=0), low, atol=1e-12)
     np.testing.assert_allclose(vectors.max(axis=0), 1.0, atol=1e-12)
 
 
-def test_the_branch_cut_of_the_azimuth_lies_in_its_widest_gap():
+def test_the_branch_cut_of_the_azimuth_lies_in_its_widest_gap() -> None:
     azimuth = np.radians([-2.0, 0.0, 2.0, 40.0])
     normals = np.column_stack([0.6 * np.cos(azimuth), 0.6 * np.sin(azimuth), np.full(4, 0.8)])
     phi = facet_vectors("spherical_scaled", normals, normals, np.zeros(3))[:, 2]
     np.testing.assert_allclose(phi, np.array([0.0, 2, 4, 42]) / 42, atol=1e-9)
 
 
-def test_a_dimension_without_range_is_one_constant():
+def test_a_dimension_without_range_is_one_constant() -> None:
     normals = np.array([[0.0, 0, 1], [0.0, 0, 1]])
     assert facet_vectors("spherical_scaled", normals, normals * 3, np.zeros(3)).tolist() == [[1.0] * 3] * 2
 
 
-def test_settings_out_of_range_are_all_named_at_once():
-    with pytest.raises(SettingsError, match="vigilance is 1.5") as caught:
+def test_settings_out_of_range_are_all_named_at_once() -> None:
+    with pytest.raises(SettingsError, match=r"vigilance is 1\.5") as caught:
         FuzzySartClusteringSettings(vigilance=1.5, vectors="normals")
     assert len(caught.value.faults) == 2

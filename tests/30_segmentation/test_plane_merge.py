@@ -6,30 +6,34 @@ import math
 
 import numpy as np
 import pytest
+
 from pipeline.geometry import nearest_neighbours
+from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_reach, touching_pairs
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
 
 ALWAYS = 10**9
 
 
-def fit(sums):
+def fit(sums: FloatArray) -> FloatArray:
     return np.array([best_fit_plane(row)[:3] for row in sums])
 
 
-def brute_force(points, labels, allowed, limit_m, angle_deg, small):
+def brute_force(
+    points: FloatArray, labels: LabelArray, allowed: list[tuple[int, int]], limit_m: float, angle_deg: float, small: int
+) -> dict[int, list[int]]:
     """Merge the best of all allowed pairs until none is left, from the points and not from sums."""
     groups = {k: [k] for k in range(labels.max() + 1)}
     allowed = {tuple(sorted(pair)) for pair in allowed}
 
-    def plane_of(index):
+    def plane_of(index: IntArray) -> FloatArray:
         design = np.column_stack([points[index, :2], np.ones(len(index))])
         return np.linalg.lstsq(design, points[index, 2], rcond=None)[0]
 
-    def members(k):
+    def members(k: int) -> IntArray:
         return np.flatnonzero(np.isin(labels, groups[k]))
 
-    def mean_square(index, plane):
+    def mean_square(index: IntArray, plane: FloatArray) -> float:
         return float(((points[index, 2] - points[index, :2] @ plane[:2] - plane[2]) ** 2).mean())
 
     while True:
@@ -56,7 +60,7 @@ def brute_force(points, labels, allowed, limit_m, angle_deg, small):
         allowed = {tuple(sorted((i if a == j else a, i if b == j else b))) for a, b in allowed if {a, b} != {i, j}}
 
 
-def strips(seed, pieces=8, noise=0.03):
+def strips(seed: int, pieces: int = 8, noise: float = 0.03) -> tuple[FloatArray, LabelArray]:
     """A gable cut into pieces along the ridge: points and labels; even labels on one side."""
     random = np.random.default_rng(seed)
     points = np.column_stack([random.uniform(0, 16, 600), random.uniform(-4, 4, 600), np.zeros(600)])
@@ -66,7 +70,7 @@ def strips(seed, pieces=8, noise=0.03):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_merging_in_a_queue_equals_merging_by_brute_force(seed):
+def test_merging_in_a_queue_equals_merging_by_brute_force(seed: int) -> None:
     points, labels = strips(seed, noise=0.08)
     sums = cluster_sums(points, labels, 16)
     pairs = touching_pairs(nearest_neighbours(points, 9), labels, np.ones(16, np.bool_))
@@ -76,7 +80,7 @@ def test_merging_in_a_queue_equals_merging_by_brute_force(seed):
     assert found == expected
 
 
-def test_the_pieces_of_a_gable_become_its_two_sides():
+def test_the_pieces_of_a_gable_become_its_two_sides() -> None:
     points, labels = strips(1)
     sums = cluster_sums(points, labels, 16)
     planes = fit(sums)
@@ -88,7 +92,7 @@ def test_the_pieces_of_a_gable_become_its_two_sides():
     assert sums[:2, 0].sum() == 600
 
 
-def test_clusters_without_a_common_pair_stay_apart():
+def test_clusters_without_a_common_pair_stay_apart() -> None:
     points, labels = strips(1)
     sums = cluster_sums(points, labels, 16)
     root, work = merge_planes(sums, fit(sums), np.empty(0, np.int64), 0.1, 12.0, 15, ALWAYS)
@@ -96,7 +100,7 @@ def test_clusters_without_a_common_pair_stay_apart():
     assert work == 0
 
 
-def test_merging_stops_where_its_work_is_limited_and_says_so():
+def test_merging_stops_where_its_work_is_limited_and_says_so() -> None:
     points, labels = strips(1)
     sums = cluster_sums(points, labels, 16)
     pairs = touching_pairs(nearest_neighbours(points, 9), labels, np.ones(16, np.bool_))
@@ -104,7 +108,7 @@ def test_merging_stops_where_its_work_is_limited_and_says_so():
     assert work > 5
 
 
-def test_a_step_of_parallel_planes_does_not_merge():
+def test_a_step_of_parallel_planes_does_not_merge() -> None:
     points, labels = strips(1, pieces=2, noise=0.0)
     points[:, 2] = np.where(labels >= 2, 5.0, 5.5)
     sums = cluster_sums(points, labels, 4)
@@ -114,7 +118,7 @@ def test_a_step_of_parallel_planes_does_not_merge():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_touching_pairs_are_those_among_neighbours(seed):
+def test_touching_pairs_are_those_among_neighbours(seed: int) -> None:
     random = np.random.default_rng(seed)
     points = random.uniform(0, 10, (150, 3))
     labels = random.integers(-1, 12, 150).astype(np.int32)
@@ -128,7 +132,7 @@ def test_touching_pairs_are_those_among_neighbours(seed):
 
 
 @pytest.mark.parametrize("reach_m", [0.5, 3.0, 100.0])
-def test_pairs_in_reach_are_those_of_near_boxes_and_parallel_planes(reach_m):
+def test_pairs_in_reach_are_those_of_near_boxes_and_parallel_planes(reach_m: float) -> None:
     random = np.random.default_rng(4)
     centre = random.uniform(0, 60, (30, 2))
     labels = np.repeat(np.arange(30), 20).astype(np.int32)
@@ -148,7 +152,7 @@ def test_pairs_in_reach_are_those_of_near_boxes_and_parallel_planes(reach_m):
     assert work >= len(expected)
 
 
-def test_looking_for_pairs_in_reach_stops_at_its_limit():
+def test_looking_for_pairs_in_reach_stops_at_its_limit() -> None:
     labels = np.repeat(np.arange(30), 3).astype(np.int32)
     points = np.zeros((90, 3))
     _, work = parallel_pairs_in_reach(points, labels, np.zeros((30, 3)), np.ones(30, np.bool_), 1.0, 0.9, 50)

@@ -123,6 +123,31 @@ def handle(gap: float = 1.0) -> Solid:
     return solid_of(tower + arm)
 
 
+def terraces(cells: int) -> Solid:
+    """A block of cells by cells rooms whose flat roofs rise in steps; every room has its own roof, floor and walls."""
+    heights = {(i, j): 1 + (i + j) // 7 % 3 for i in range(cells) for j in range(cells)}
+
+    def levels(corner: tuple[int, int], low: int, high: int) -> list[int]:
+        around = {heights.get((corner[0] - a, corner[1] - b), 0) for a in (0, 1) for b in (0, 1)}
+        return sorted(level for level in around if low <= level <= high)
+
+    def place(corner: tuple[int, int], level: int) -> Place:
+        return 3.0 * corner[0], 3.0 * corner[1], 2.5 * level
+
+    faces: list[Rings] = []
+    for (i, j), high in heights.items():
+        plan = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)]
+        faces.append([[place(corner, high) for corner in plan]])
+        faces.append([[place(corner, 0) for corner in reversed(plan)]])
+        beside = [(i, j - 1), (i + 1, j), (i, j + 1), (i - 1, j)]
+        for a, b, other in zip(plan, plan[1:] + plan[:1], beside, strict=True):
+            low = heights.get(other, 0)
+            if low < high:
+                down, up = levels(a, low, high)[::-1], levels(b, low, high)
+                faces.append([[*(place(a, level) for level in down), *(place(b, level) for level in up)]])
+    return solid_of(faces)
+
+
 VALID: dict[str, Callable[[], Solid]] = {
     "cube": cube,
     "gable": gable,
@@ -130,6 +155,7 @@ VALID: dict[str, Callable[[], Solid]] = {
     "courtyard": courtyard,
     "stepped": stepped,
     "handle": handle,
+    "terraces": lambda: terraces(5),
 }
 
 
@@ -290,6 +316,12 @@ def broken_solid(request: pytest.FixtureRequest) -> tuple[tuple[int, ...], Solid
     """Each broken solid with the codes of its faults."""
     codes, make = BROKEN[request.param]
     return codes, make()
+
+
+@pytest.fixture(scope="session")
+def block() -> Solid:
+    """A city block of more than five thousand faces."""
+    return terraces(47)
 
 
 @pytest.fixture(scope="session")

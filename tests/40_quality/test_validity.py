@@ -82,7 +82,7 @@ moves = st.tuples(millimetres, millimetres, millimetres, st.integers(0, 3), st.i
 
 
 @given(move=moves, chance=st.randoms(use_true_random=False), which=st.integers(0, 10_000))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_moves_and_relabelling_keep_the_verdict(
     move: tuple[int, int, int, int, int, bool],
     chance: random.Random,

@@ -106,7 +106,9 @@ def faults(lines: Sequence[dict[str, Any]]) -> list[str]:
     found = []
     for number, line in enumerate(lines):
         schema = FIRST_LINE if number == 0 else FEATURE
-        found += [f"line {number}: {error.message[:200]}" for error in jsonschema.Draft7Validator(schema).iter_errors(line)]
+        found += [
+            f"line {number}: {error.message[:200]}" for error in jsonschema.Draft7Validator(schema).iter_errors(line)
+        ]
         if number and not found:
             found += [f"line {number}: {fault}" for fault in _feature_faults(line)]
     return found

@@ -11,10 +11,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import small_buildings as small  # noqa: E402
+import small_buildings as small
 
-from pipeline.export.records import RecordContext, RejectedObject  # noqa: E402
-from pipeline.model import Reason  # noqa: E402
+from pipeline.export.records import RecordContext, RejectedObject
+from pipeline.model import Reason
 
 FOOT_M = 0.3048
 US_FOOT_M = 1200.0 / 3937.0
@@ -43,8 +43,8 @@ def contexts(references: dict[str, small.Reference]) -> dict[str, RecordContext]
     facts: dict[str, Any] = {
         "settings_hash": "0f" * 32,
         "engine_version": "0.1.0",
-        "acquired_from": dt.datetime(2014, 3, 1, 10, 0, 0, 125, tzinfo=dt.timezone.utc),
-        "acquired_to": dt.datetime(2014, 3, 1, 11, tzinfo=dt.timezone.utc),
+        "acquired_from": dt.datetime(2014, 3, 1, 10, 0, 0, 125, tzinfo=dt.UTC),
+        "acquired_to": dt.datetime(2014, 3, 1, 11, tzinfo=dt.UTC),
     }
     return {name: RecordContext(reference=reference, **facts) for name, reference in references.items()}
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from shapely import Polygon, unary_union
 
+from pipeline.export.records import RecordContext, RejectedObject
 from pipeline.model import (
     BuildingResult,
     FaceKind,
@@ -24,6 +25,9 @@ from pipeline.model import (
 ORIGIN = (85_000.0, 447_000.0, 2.0)
 
 Corner = tuple[float, float, float]
+Builder = Callable[[], BuildingResult]
+Contexts = dict[str, RecordContext]
+RejectedObjects = list[RejectedObject]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,9 +65,7 @@ def roofed_solid(
     boundary = {(a, b) for a, b in edges if (b, a) not in edges}
     below = {index: len(vertices) + n for n, index in enumerate(sorted({a for a, _ in boundary}))}
     vertices = np.vstack([vertices, [(*vertices[index, :2], floor_z) for index in below]])
-    faces += [
-        SolidFace(rings=((b, a, below[a], below[b]),), kind=FaceKind.WALL) for a, b in sorted(boundary)
-    ]
+    faces += [SolidFace(rings=((b, a, below[a], below[b]),), kind=FaceKind.WALL) for a, b in sorted(boundary)]
     loops = sorted(_loops(boundary), key=lambda loop: -float(np.ptp(vertices[loop, 0])))
     floor = tuple(tuple(below[index] for index in reversed(loop)) for loop in loops)
     return Solid(vertices=vertices, faces=(*faces, SolidFace(rings=floor, kind=FaceKind.GROUND)))
@@ -81,9 +83,7 @@ def building(
     building_id: str, *solids: Solid, origin: Corner = ORIGIN, floor_z: float = 0.0, **changes: Any
 ) -> BuildingResult:
     """The result of a building with these solids, whose roof planes are numbered through."""
-    roof = {
-        face.plane: (solid, face) for solid in solids for face in solid.faces if face.kind is FaceKind.ROOF
-    }
+    roof = {face.plane: (solid, face) for solid in solids for face in solid.faces if face.kind is FaceKind.ROOF}
     faces = [
         RoofFace(
             plane=face.plane,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import copy
-import io
 import json
 import os
+import subprocess
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import cityjson_rules
@@ -16,10 +17,10 @@ import numpy as np
 import pytest
 import referencing
 import small_buildings as small
-from cjio import cityjson as cjio_cityjson
+from small_buildings import Builder, Contexts
 
 from pipeline.export.cityjson import cityjson_lines
-from pipeline.export.records import building_row
+from pipeline.export.records import RecordContext, building_row
 
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
 BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent)
@@ -27,25 +28,28 @@ SCHEMAS = "GABLEWORK_CITYJSON_SCHEMAS"
 """Names a folder with the schema files of CityJSON 2.0 as its maintainers publish them."""
 
 
-def sequence(context, builders=BUILT) -> list[dict]:
+def sequence(context: RecordContext, builders: Sequence[Builder] = BUILT) -> list[dict]:
     """The objects of a file with these buildings."""
     rows = [(build(), building_row(build(), context, mesh_path="meshes/t/a.obj")) for build in builders]
     return [json.loads(line) for line in cityjson_lines(rows, context.reference, "test")]
 
 
-def merged_by_cjio(lines: list[dict], monkeypatch: pytest.MonkeyPatch) -> cjio_cityjson.CityJSON:
-    """One CityJSON of a sequence, as `cat file | cjio stdin` makes it."""
-    monkeypatch.setattr(sys, "stdin", io.StringIO("".join(json.dumps(line) + "\n" for line in lines)))
-    return cjio_cityjson.read_stdin()
+def cjio(*words: str, lines: Sequence[dict] = ()) -> str:
+    """Run the command line of cjio in a process of its own, since it changes Python's json on import."""
+    command = [sys.executable, "-c", "from cjio.cjio import cli; cli()", *words]
+    fed = "".join(json.dumps(line) + "\n" for line in lines)
+    result = subprocess.run(command, input=fed, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
 
 
 @pytest.mark.parametrize("crs", CRSES)
-def test_a_sequence_follows_the_rules(contexts, crs: str) -> None:
+def test_a_sequence_follows_the_rules(contexts: Contexts, crs: str) -> None:
     assert cityjson_rules.faults(sequence(contexts[crs])) == []
     assert cityjson_rules.faults(sequence(contexts[crs], ())) == []
 
 
-def test_the_rules_catch_what_is_broken(contexts) -> None:
+def test_the_rules_catch_what_is_broken(contexts: Contexts) -> None:
     sound = sequence(contexts["compound"], [small.gable])
 
     def broken(path: list, value: object) -> list[str]:
@@ -72,7 +76,7 @@ def test_the_rules_catch_what_is_broken(contexts) -> None:
 
 @pytest.mark.skipif(SCHEMAS not in os.environ, reason=f"{SCHEMAS} names no folder with the official schema files")
 @pytest.mark.parametrize("crs", CRSES)
-def test_every_line_fits_the_official_schema(contexts, crs: str) -> None:
+def test_every_line_fits_the_official_schema(contexts: Contexts, crs: str) -> None:
     files = {path.name: json.loads(path.read_text()) for path in Path(os.environ[SCHEMAS]).glob("*.schema.json")}
     registry = referencing.Registry().with_resources(
         (schema["$id"], referencing.Resource.from_contents(schema)) for schema in files.values()
@@ -84,23 +88,25 @@ def test_every_line_fits_the_official_schema(contexts, crs: str) -> None:
 
 
 @pytest.mark.parametrize("crs", CRSES)
-def test_integer_vertices_give_back_the_coordinates(contexts, crs: str) -> None:
+def test_integer_vertices_give_back_the_coordinates(contexts: Contexts, crs: str) -> None:
     reference = contexts[crs].reference
     first, *features = sequence(contexts[crs])
     units = np.array([reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m])
     built = {build().building_id: build() for build in BUILT}
     for feature in features:
         solids = built[feature["id"]].solids
-        xyz = np.array(feature["vertices"]).reshape(-1, 3) * first["transform"]["scale"] + first["transform"]["translate"]
+        xyz = (
+            np.array(feature["vertices"]).reshape(-1, 3) * first["transform"]["scale"] + first["transform"]["translate"]
+        )
         wanted = np.vstack([solid.vertices for solid in solids]) if solids else np.empty((0, 3))
         assert np.array_equal(np.round(xyz * units - small.ORIGIN, 3), wanted)
 
 
-def test_the_scale_is_a_millimetre_in_metres(contexts) -> None:
+def test_the_scale_is_a_millimetre_in_metres(contexts: Contexts) -> None:
     assert sequence(contexts["compound"])[0]["transform"]["scale"] == [0.001, 0.001, 0.001]
 
 
-def test_solids_are_closed_and_one_part_each(contexts) -> None:
+def test_solids_are_closed_and_one_part_each(contexts: Contexts) -> None:
     for feature in sequence(contexts["compound"])[1:]:
         parts = [entry for entry in feature["CityObjects"].values() if entry["type"] == "BuildingPart"]
         assert len(parts) == {"two_parts": 2, "failed": 0}.get(feature["id"], 1)
@@ -112,7 +118,7 @@ def test_solids_are_closed_and_one_part_each(contexts) -> None:
             assert all((b, a) in edges for a, b in edges)
 
 
-def test_semantic_surfaces_tell_slope_and_aspect_of_each_roof_plane(contexts) -> None:
+def test_semantic_surfaces_tell_slope_and_aspect_of_each_roof_plane(contexts: Contexts) -> None:
     feature = sequence(contexts["compound"], [small.two_parts])[1]
     (solid,) = feature["CityObjects"]["two_parts-1"]["geometry"]
     semantics = solid["semantics"]
@@ -123,7 +129,7 @@ def test_semantic_surfaces_tell_slope_and_aspect_of_each_roof_plane(contexts) ->
     assert [roof["slope_deg"] for roof in roofs] == pytest.approx([36.8699, 36.8699])
 
 
-def test_attributes_are_the_record_without_what_is_unknown(contexts) -> None:
+def test_attributes_are_the_record_without_what_is_unknown(contexts: Contexts) -> None:
     first = contexts["compound"]
     by_id = {feature["id"]: feature["CityObjects"][feature["id"]]["attributes"] for feature in sequence(first)[1:]}
     row = building_row(small.courtyard(), first, mesh_path="meshes/t/a.obj")
@@ -135,7 +141,7 @@ def test_attributes_are_the_record_without_what_is_unknown(contexts) -> None:
     assert "ridge_z" not in by_id["failed"]
 
 
-def test_the_reference_system_is_told_where_it_is_known(contexts) -> None:
+def test_the_reference_system_is_told_where_it_is_known(contexts: Contexts) -> None:
     codes = {"compound": "7415", "feet and metres": "2992", "US feet": "2225"}
     for crs, code in codes.items():
         system = sequence(contexts[crs])[0]["metadata"]["referenceSystem"]
@@ -144,26 +150,27 @@ def test_the_reference_system_is_told_where_it_is_known(contexts) -> None:
 
 
 @pytest.mark.parametrize("crs", CRSES)
-def test_cjio_reads_the_sequence_as_one_model(contexts, crs: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = merged_by_cjio(sequence(contexts[crs]), monkeypatch)
+def test_cjio_reads_the_sequence_as_one_model(contexts: Contexts, crs: str, tmp_path: Path) -> None:
+    cjio("stdin", "save", str(tmp_path / "one.city.json"), lines=sequence(contexts[crs]))
+    model = json.loads((tmp_path / "one.city.json").read_text())
     names = {build().building_id for build in BUILT}
     parts = {"gable-0", "courtyard-0", "two_parts-0", "two_parts-1", "pent-0"}
-    assert set(model.j["CityObjects"]) == names | parts
-    if contexts[crs].reference.epsg:
-        assert model.get_epsg() == contexts[crs].reference.epsg
-    reference = contexts[crs].reference
-    low = np.array(small.ORIGIN) / [reference.horizontal_unit_m] * 1.0
-    assert model.get_bbox()[:2] == pytest.approx(low[:2], abs=0.001)
+    assert set(model["CityObjects"]) == names | parts
+    first = sequence(contexts[crs])[0]
+    assert model["metadata"].get("referenceSystem") == first["metadata"].get("referenceSystem")
+    assert model["metadata"]["geographicalExtent"] == pytest.approx(first["metadata"]["geographicalExtent"], abs=1e-3)
 
 
-def test_cjio_merges_two_tiles(contexts, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cjio_merges_two_tiles(contexts: Contexts, tmp_path: Path) -> None:
     context = contexts["compound"]
-    one = merged_by_cjio(sequence(context, [small.gable, small.failed]), monkeypatch)
-    two = merged_by_cjio(sequence(context, [small.courtyard]), monkeypatch)
-    one.merge([two])
-    assert set(one.j["CityObjects"]) == {"gable", "gable-0", "failed", "courtyard", "courtyard-0"}
-    court = one.j["CityObjects"]["courtyard-0"]["geometry"][0]["boundaries"][0]
-    scale, translate = (np.array(one.j["transform"][name]) for name in ("scale", "translate"))
-    xyz = np.array(one.j["vertices"])[[i for surface in court for ring in surface for i in ring]] * scale + translate
+    one, two, both = (str(tmp_path / f"{name}.city.json") for name in ("one", "two", "both"))
+    cjio("stdin", "save", one, lines=sequence(context, [small.gable, small.failed]))
+    cjio("stdin", "save", two, lines=sequence(context, [small.courtyard]))
+    cjio(one, "merge", two, "save", both)
+    model = json.loads(Path(both).read_text())
+    assert set(model["CityObjects"]) == {"gable", "gable-0", "failed", "courtyard", "courtyard-0"}
+    court = model["CityObjects"]["courtyard-0"]["geometry"][0]["boundaries"][0]
+    scale, translate = (np.array(model["transform"][name]) for name in ("scale", "translate"))
+    xyz = np.array(model["vertices"])[[i for surface in court for ring in surface for i in ring]] * scale + translate
     assert xyz.min(axis=0) == pytest.approx([85_020.0, 447_000.0, 2.0])
     assert xyz.max(axis=0) == pytest.approx([85_040.0, 447_020.0, 11.0])

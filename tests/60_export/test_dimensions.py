@@ -9,9 +9,15 @@ import pytest
 import shapely
 import small_buildings as small
 from scipy.spatial import ConvexHull
+from small_buildings import Builder
 
 from pipeline.export.dimensions import dimensions, eave_elevation, roof_percentiles, volume
 from pipeline.model import FaceKind, Solid, SolidFace
+
+
+def moved(solid: Solid, *by: float) -> Solid:
+    """The solid, shifted."""
+    return dataclasses.replace(solid, vertices=solid.vertices + np.array(by))
 
 
 def tower_on_a_slab() -> Solid:
@@ -24,9 +30,7 @@ def tower_on_a_slab() -> Solid:
     hole = tuple(range(first, first + 4))
     low = dataclasses.replace(around.faces[0], rings=(*around.faces[0].rings, hole))
     walls = [
-        SolidFace(
-            rings=((first + (i + 1) % 4, first + i, first + 4 + i, first + 4 + (i + 1) % 4),), kind=FaceKind.WALL
-        )
+        SolidFace(rings=((first + (i + 1) % 4, first + i, first + 4 + i, first + 4 + (i + 1) % 4),), kind=FaceKind.WALL)
         for i in range(4)
     ]
     top = SolidFace(rings=(tuple(range(first + 7, first + 3, -1)),), kind=FaceKind.ROOF, plane=1)
@@ -68,7 +72,7 @@ def test_a_jump_between_level_roofs_is_answered_by_one_of_them() -> None:
 
 def test_the_eave_is_that_of_the_larger_roof_face() -> None:
     low = small.gable_solid(30.0)
-    high = dataclasses.replace(small.pent().solids[0], vertices=small.pent().solids[0].vertices + [0.0, 0.0, 7.0])
+    high = moved(small.pent().solids[0], 0.0, 0.0, 7.0)
     assert eave_elevation([low, high]) == 3.0
 
 
@@ -79,7 +83,7 @@ def test_no_solid_has_no_dimensions() -> None:
 
 
 @pytest.mark.parametrize("build", [small.gable, small.pent, small.two_parts])
-def test_volume_is_that_of_the_convex_hull_where_the_solid_is_convex(build) -> None:
+def test_volume_is_that_of_the_convex_hull_where_the_solid_is_convex(build: Builder) -> None:
     for solid in build().solids:
         assert volume(solid) == pytest.approx(ConvexHull(solid.vertices).volume)
 
@@ -108,10 +112,10 @@ def test_percentiles_are_those_of_a_finely_sampled_roof(seed: int) -> None:
 def test_moving_a_building_moves_its_elevations_only() -> None:
     still = dimensions(small.gable().solids)
     solid = small.gable_solid()
-    moved = dimensions([dataclasses.replace(solid, vertices=solid.vertices + [1000.0, -500.0, 12.0])])
-    assert moved.eave_z_m == still.eave_z_m + 12.0
-    assert moved.roof_z_m == pytest.approx([z + 12.0 for z in still.roof_z_m])
-    assert moved.volume_m3 == pytest.approx(still.volume_m3)
+    elsewhere = dimensions([moved(solid, 1000.0, -500.0, 12.0)])
+    assert elsewhere.eave_z_m == still.eave_z_m + 12.0
+    assert elsewhere.roof_z_m == pytest.approx([z + 12.0 for z in still.roof_z_m])
+    assert elsewhere.volume_m3 == pytest.approx(still.volume_m3)
 
 
 def test_a_building_without_eaves_takes_its_lowest_roof_point() -> None:

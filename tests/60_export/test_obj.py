@@ -8,6 +8,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import small_buildings as small
+from small_buildings import Builder, Contexts
 
 from pipeline.export.dimensions import volume
 from pipeline.export.obj import obj_text
@@ -47,7 +48,9 @@ def read_obj(text: str) -> tuple[np.ndarray, list[ReadObject]]:
 
 @pytest.mark.parametrize("crs", CRSES)
 @pytest.mark.parametrize("build", BUILT)
-def test_every_object_is_closed_every_edge_twice_in_opposite_directions(contexts, build, crs: str) -> None:
+def test_every_object_is_closed_every_edge_twice_in_opposite_directions(
+    contexts: Contexts, build: Builder, crs: str
+) -> None:
     _, objects = read_obj(obj_text([build()], contexts[crs].reference))
     assert len(objects) == len(build().solids)
     for read in objects:
@@ -56,7 +59,7 @@ def test_every_object_is_closed_every_edge_twice_in_opposite_directions(contexts
         assert all((b, a) in edges for a, b in edges)
 
 
-def test_objects_share_no_vertices(contexts) -> None:
+def test_objects_share_no_vertices(contexts: Contexts) -> None:
     _, objects = read_obj(obj_text([small.two_parts(), small.gable()], contexts["compound"].reference))
     used = [{i for _, _, face in read.faces for i in face} for read in objects]
     assert [read.name for read in objects] == ["two_parts-0", "two_parts-1", "gable-0"]
@@ -65,7 +68,7 @@ def test_objects_share_no_vertices(contexts) -> None:
 
 @pytest.mark.parametrize("crs", CRSES)
 @pytest.mark.parametrize("build", BUILT)
-def test_vertices_are_the_full_coordinates_of_the_crs(contexts, build, crs: str) -> None:
+def test_vertices_are_the_full_coordinates_of_the_crs(contexts: Contexts, build: Builder, crs: str) -> None:
     reference = contexts[crs].reference
     vertices, _ = read_obj(obj_text([build()], reference))
     metres = vertices * [reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m]
@@ -73,15 +76,15 @@ def test_vertices_are_the_full_coordinates_of_the_crs(contexts, build, crs: str)
     assert np.array_equal(np.round(metres - small.ORIGIN, 3), wanted)
 
 
-def test_millimetres_are_written_to_the_last_digit(contexts) -> None:
+def test_millimetres_are_written_to_the_last_digit(contexts: Contexts) -> None:
     solid = small.gable_solid()
-    shifted = dataclasses.replace(solid, vertices=solid.vertices + [0.001, 0.0, 0.127])
+    shifted = dataclasses.replace(solid, vertices=solid.vertices + np.array([0.001, 0.0, 0.127]))
     text = obj_text([small.building("a", shifted)], contexts["compound"].reference)
     assert "\nv 85000.001 447000.000 5.127\n" in text
     assert "e+" not in text
 
 
-def test_groups_and_materials_tell_roof_planes_walls_and_ground(contexts) -> None:
+def test_groups_and_materials_tell_roof_planes_walls_and_ground(contexts: Contexts) -> None:
     _, objects = read_obj(obj_text([small.two_parts()], contexts["compound"].reference))
     named = [Counter((group, material) for group, material, _ in read.faces) for read in objects]
     shared = {("wall", "wall"): 6, ("ground", "ground"): 1}
@@ -89,7 +92,7 @@ def test_groups_and_materials_tell_roof_planes_walls_and_ground(contexts) -> Non
     assert named[1] == {("roof", "roof_2"): 1, ("roof", "roof_3"): 1, **shared}
 
 
-def test_faces_with_holes_become_triangles_that_keep_volume_and_orientation(contexts) -> None:
+def test_faces_with_holes_become_triangles_that_keep_volume_and_orientation(contexts: Contexts) -> None:
     result = small.courtyard()
     vertices, (read,) = read_obj(obj_text([result], contexts["compound"].reference))
     assert {len(face) for group, _, face in read.faces if group != "wall"} == {3}
@@ -100,6 +103,6 @@ def test_faces_with_holes_become_triangles_that_keep_volume_and_orientation(cont
     assert volume(again) == pytest.approx(volume(result.solids[0]))
 
 
-def test_buildings_without_a_solid_leave_no_object(contexts) -> None:
+def test_buildings_without_a_solid_leave_no_object(contexts: Contexts) -> None:
     vertices, objects = read_obj(obj_text([small.failed()], contexts["compound"].reference))
     assert (len(vertices), objects) == (0, [])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import shapely
 import small_buildings as small
+from small_buildings import Builder, Contexts, RejectedObjects
 
 from pipeline.export.coordinates import crs_coordinates, decimals, epsg_code
 from pipeline.export.records import (
@@ -35,14 +36,16 @@ def test_buildings_have_the_designed_columns_in_order() -> None:
 
 
 @pytest.mark.parametrize("crs", CRSES)
-def test_rows_have_the_columns_of_their_schemas(contexts, rejected_objects, crs: str) -> None:
+def test_rows_have_the_columns_of_their_schemas(
+    contexts: Contexts, rejected_objects: RejectedObjects, crs: str
+) -> None:
     for build in (small.gable, small.courtyard, small.failed):
         assert list(building_row(build(), contexts[crs])) == BUILDINGS.names
         assert all(list(row) == PLANES.names for row in plane_rows(build(), contexts[crs]))
     assert all(list(rejected_row(entry, contexts[crs])) == REJECTED.names for entry in rejected_objects)
 
 
-def test_a_gable_in_metres_reads_as_built(contexts) -> None:
+def test_a_gable_in_metres_reads_as_built(contexts: Contexts) -> None:
     row = building_row(small.gable(), contexts["compound"], mesh_path="meshes/t/gable.obj")
     elevations = [row[name] for name in ("ground_z", "eave_z", "ridge_z", "h_min", "h_50p", "h_70p", "h_max")]
     assert elevations == [2.0, 5.0, 8.0, 5.0, 6.5, 7.1, 8.0]
@@ -51,7 +54,7 @@ def test_a_gable_in_metres_reads_as_built(contexts) -> None:
     assert shapely.from_wkb(row["geometry"]).equals(shapely.box(85_000, 447_000, 85_010, 447_008))
 
 
-def test_columns_in_metres_stay_in_metres_where_the_crs_is_in_feet(contexts) -> None:
+def test_columns_in_metres_stay_in_metres_where_the_crs_is_in_feet(contexts: Contexts) -> None:
     metres = building_row(small.gable(), contexts["unknown"])
     feet = building_row(small.gable(), contexts["US feet"])
     for name in BUILDINGS.names:
@@ -61,14 +64,14 @@ def test_columns_in_metres_stay_in_metres_where_the_crs_is_in_feet(contexts) -> 
         assert feet[name] == pytest.approx(metres[name] * 3937.0 / 1200.0, abs=1e-4), name
 
 
-def test_elevations_follow_the_vertical_unit_and_plans_the_horizontal_one(contexts) -> None:
+def test_elevations_follow_the_vertical_unit_and_plans_the_horizontal_one(contexts: Contexts) -> None:
     row = building_row(small.gable(), contexts["feet and metres"])
     assert row["ridge_z"] == 8.0
     west, south, _, _ = shapely.from_wkb(row["geometry"]).bounds
     assert (west, south) == pytest.approx((85_000 / 0.3048, 447_000 / 0.3048), abs=1e-4)
 
 
-def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts) -> None:
+def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) -> None:
     row = building_row(small.failed(), contexts["compound"])
     empty = {name for name, value in row.items() if value is None}
     assert empty == {
@@ -79,8 +82,8 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts) -> None:
     assert (row["valid"], row["n_planes"], row["coverage"], row["ground_z"]) == (False, 0, 0.0, 2.0)
 
 
-def test_facts_of_a_candidate_stand_above_those_of_the_run(contexts) -> None:
-    moment = dt.datetime(2020, 5, 5, tzinfo=dt.timezone.utc)
+def test_facts_of_a_candidate_stand_above_those_of_the_run(contexts: Contexts) -> None:
+    moment = dt.datetime(2020, 5, 5, tzinfo=dt.UTC)
     facts = {"gable": CandidateFacts(input_hash="ab", acquired_from=moment, acquired_to=moment)}
     context = dataclasses.replace(contexts["compound"], facts=facts)
     own, other = building_row(small.gable(), context), building_row(small.pent(), context)
@@ -90,7 +93,7 @@ def test_facts_of_a_candidate_stand_above_those_of_the_run(contexts) -> None:
 
 @pytest.mark.parametrize("crs", CRSES)
 @pytest.mark.parametrize("build", [small.gable, small.pent, small.courtyard, small.two_parts])
-def test_faces_satisfy_the_equation_of_their_plane_in_crs_units(contexts, crs: str, build) -> None:
+def test_faces_satisfy_the_equation_of_their_plane_in_crs_units(contexts: Contexts, crs: str, build: Builder) -> None:
     for row in plane_rows(build(), contexts[crs]):
         *normal, offset = row["coefficients"]
         xyz = shapely.get_coordinates(shapely.from_wkb(row["geometry"]), include_z=True)
@@ -100,7 +103,7 @@ def test_faces_satisfy_the_equation_of_their_plane_in_crs_units(contexts, crs: s
         assert normal[2] > 0.0
 
 
-def test_slope_and_o_distance_are_metric_where_the_units_differ(contexts) -> None:
+def test_slope_and_o_distance_are_metric_where_the_units_differ(contexts: Contexts) -> None:
     for crs in CRSES:
         row = plane_rows(small.gable(), contexts[crs])[0]
         assert row["slope_deg"] == pytest.approx(np.degrees(np.arctan(0.75)), abs=1e-4)
@@ -109,14 +112,14 @@ def test_slope_and_o_distance_are_metric_where_the_units_differ(contexts) -> Non
         assert row["area_m2"] == pytest.approx(50.0)
 
 
-def test_an_aspect_just_west_of_north_is_not_a_full_turn(contexts) -> None:
+def test_an_aspect_just_west_of_north_is_not_a_full_turn(contexts: Contexts) -> None:
     plane = Plane(a=1e-9, b=-0.5, c=3.0, n_points=9, rmse_m=0.0)
     assert plane.aspect_deg > 359.9999
     result = dataclasses.replace(small.pent(), planes=(plane,))
     assert plane_rows(result, contexts["compound"])[0]["aspect_deg"] == 0.0
 
 
-def test_one_plane_of_several_faces_is_a_multipolygon(contexts) -> None:
+def test_one_plane_of_several_faces_is_a_multipolygon(contexts: Contexts) -> None:
     result = small.two_parts()
     faces = tuple(dataclasses.replace(face, plane=face.plane % 2) for face in result.faces)
     shared = dataclasses.replace(result, faces=faces, planes=result.planes[:2])
@@ -143,7 +146,7 @@ def test_the_epsg_code_of_a_compound_without_one_is_its_horizontal_part() -> Non
     assert epsg_code(small.Reference()) is None
 
 
-def test_the_geometry_does_not_depend_on_where_a_ring_starts_or_which_way_it_runs(contexts) -> None:
+def test_the_geometry_does_not_depend_on_where_a_ring_starts_or_which_way_it_runs(contexts: Contexts) -> None:
     result = small.courtyard()
     shell, hole = (list(ring.coords)[:-1] for ring in (result.footprint.exterior, result.footprint.interiors[0]))
     turned = small.Polygon([*shell[2:], *shell[:2]][::-1], [[*hole[1:], hole[0]][::-1]])

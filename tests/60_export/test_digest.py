@@ -1,0 +1,188 @@
+"""The digest of a run: blind to files, order and storage, awake to every millimetre."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import shapely
+import small_buildings as small
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_buildings import Contexts, RejectedObjects
+
+from pipeline.errors import RunError
+from pipeline.export.geoparquet import read_table
+from pipeline.export.records import BUILDINGS, SCHEMAS, CandidateFacts
+from pipeline.export.tile import write_tile
+from pipeline.runtime import digest
+from pipeline.runtime.digest import NOT_CONTENT, canonical_rows, run_digest
+
+BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent)
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory, contexts: Contexts, rejected_objects: RejectedObjects) -> Path:
+    """A run of one tile."""
+    folder = tmp_path_factory.mktemp("run")
+    write_tile(folder, "t1", [build() for build in BUILT], rejected_objects, contexts["compound"])
+    return folder
+
+
+def rewritten(run_dir: Path, target: Path, table: str, change: Callable[[pa.Table], pa.Table]) -> Path:
+    """A copy of a run, one table of which went through a function."""
+    shutil.copytree(run_dir, target, dirs_exist_ok=True)
+    path = target / table / "tile=t1" / "part-0.parquet"
+    pq.write_table(change(pq.ParquetFile(path).read()), path)
+    return target
+
+
+def with_value(table: pa.Table, column: str, row: int, value: object) -> pa.Table:
+    """A table with one value changed."""
+    values = table[column].to_pylist()
+    values[row] = value
+    index = table.schema.get_field_index(column)
+    field = table.schema.field(column).with_nullable(True)
+    return table.set_column(index, field, pa.array(values, field.type))
+
+
+@settings(max_examples=15, deadline=None)
+@given(data=st.data())
+def test_rows_may_lie_in_any_files_row_groups_and_order(
+    data: st.DataObject, run_dir: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    target = tmp_path_factory.mktemp("split")
+    for name in SCHEMAS:
+        table = read_table(str(run_dir), name).drop_columns("tile")
+        order = data.draw(st.permutations(range(table.num_rows)))
+        tiles = data.draw(st.lists(st.sampled_from("abc"), min_size=len(order), max_size=len(order)))
+        group, compression = data.draw(st.integers(1, 5)), data.draw(st.sampled_from(["none", "zstd", "snappy"]))
+        (target / name).mkdir()
+        for tile in sorted(set(tiles)):
+            (target / name / f"tile={tile}").mkdir()
+            rows = [row for row, place in zip(order, tiles, strict=True) if place == tile]
+            path = target / name / f"tile={tile}" / "part-0.parquet"
+            pq.write_table(table.take(rows), path, row_group_size=group, compression=compression)
+    assert run_digest(str(target)) == run_digest(str(run_dir))
+
+
+def test_tile_mesh_path_and_input_hash_are_no_content(
+    run_dir: Path, tmp_path: Path, contexts: Contexts, rejected_objects: RejectedObjects
+) -> None:
+    same = contexts["compound"]
+    hashed = CandidateFacts(input_hash="another", acquired_from=same.acquired_from, acquired_to=same.acquired_to)
+    other = dataclasses.replace(same, facts={build().building_id: hashed for build in BUILT})
+    write_tile(tmp_path, "t1", [build() for build in BUILT[:2]], [], other, "none")
+    write_tile(tmp_path, "t2", [build() for build in BUILT[2:]], rejected_objects, other, "tile")
+    assert run_digest(str(tmp_path)) == run_digest(str(run_dir))
+
+
+@pytest.mark.parametrize("column", ["ground_z", "volume_m3", "n_points", "valid", "validity_codes", "reason_detail"])
+def test_one_changed_value_changes_the_digest(run_dir: Path, tmp_path: Path, column: str) -> None:
+    changes = {"ground_z": 2.001, "volume_m3": 0.001, "n_points": 319, "valid": False, "validity_codes": [203]}
+
+    def change(table: pa.Table) -> pa.Table:
+        return with_value(table, column, 0, changes.get(column, "another"))
+
+    assert run_digest(str(rewritten(run_dir, tmp_path, "buildings", change))) != run_digest(str(run_dir))
+
+
+@pytest.mark.parametrize("name", sorted(set(BUILDINGS.names) - NOT_CONTENT))
+def test_every_column_of_content_counts(run_dir: Path, tmp_path: Path, name: str) -> None:
+    def change(table: pa.Table) -> pa.Table:
+        row = next((i for i, value in enumerate(table[name].to_pylist()) if value is not None), 0)
+        value = table[name][row].as_py()
+        kinds = {bool: lambda: not value, int: lambda: value + 1, float: lambda: value + 0.001, list: lambda: [1, 2, 3]}
+        other = kinds.get(type(value), lambda: f"{value}x")
+        if isinstance(value, dt.datetime):
+            return with_value(table, name, row, value + dt.timedelta(microseconds=1))
+        return with_value(table, name, row, value + b"x" if isinstance(value, bytes) else other())
+
+    assert run_digest(str(rewritten(run_dir, tmp_path, "buildings", change))) != run_digest(str(run_dir))
+
+
+@pytest.mark.parametrize("table", list(SCHEMAS))
+def test_a_vertex_that_moves_by_a_millimetre_changes_the_digest(run_dir: Path, tmp_path: Path, table: str) -> None:
+    def change(found: pa.Table) -> pa.Table:
+        row = next(i for i, wkb in enumerate(found["geometry"].to_pylist()) if wkb is not None)
+        polygon = shapely.from_wkb(found["geometry"][row].as_py())
+        corners = shapely.get_coordinates(polygon, include_z=polygon.has_z)
+        corners[1, 0] += 0.001
+        moved = shapely.to_wkb(shapely.set_coordinates(polygon, corners), flavor="iso")
+        return with_value(found, "geometry", row, moved)
+
+    assert run_digest(str(rewritten(run_dir, tmp_path, table, change))) != run_digest(str(run_dir))
+
+
+def test_a_lost_row_changes_the_digest(run_dir: Path, tmp_path: Path) -> None:
+    before = run_digest(str(run_dir))
+    for table in SCHEMAS:
+        assert run_digest(str(rewritten(run_dir, tmp_path / table, table, lambda found: found.slice(1)))) != before
+
+
+def test_how_arrow_holds_the_values_does_not_count(run_dir: Path) -> None:
+    (batch,) = read_table(str(run_dir), "buildings").combine_chunks().to_batches()
+    told = list(canonical_rows(batch))
+    casts = {"method": pa.large_string(), "n_planes": pa.int64()}
+    casts |= {"acquired_from": pa.timestamp("ns", tz="UTC"), "validity_codes": pa.large_list(pa.int64())}
+    columns = {
+        name: batch[name].dictionary_encode()
+        if name == "status"
+        else batch[name].cast(casts.get(name, batch[name].type))
+        for name in reversed(batch.schema.names)
+    }
+    other = pa.RecordBatch.from_pydict(columns)
+    assert list(canonical_rows(other)) == told
+    assert [row for i in range(len(told)) for row in canonical_rows(batch.slice(i, 1))] == told
+
+
+def test_null_zero_and_nothing_are_three_things() -> None:
+    def row(**columns: pa.Array) -> bytes:
+        return next(canonical_rows(pa.RecordBatch.from_pydict(columns)))
+
+    whole = {row(a=pa.array([value], pa.float64())) for value in (None, 0.0, 1e-9)}
+    assert len(whole) == 3
+    assert row(a=pa.array([0.0])) == row(a=pa.array([-0.0]))
+    texts = [("a", "bc"), ("ab", "c"), (None, "abc"), ("", "abc"), ("abc", "")]
+    assert len({row(a=pa.array([one], pa.string()), b=pa.array([two], pa.string())) for one, two in texts}) == 5
+    lists = [([1], [2, 3]), ([1, 2], [3]), (None, [1, 2, 3]), ([], [1, 2, 3])]
+    assert len({row(a=pa.array([one], pa.list_(pa.int32())), b=pa.array([two])) for one, two in lists}) == 4
+
+
+def test_the_batch_size_does_not_count(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = run_digest(str(run_dir))
+    monkeypatch.setattr(digest, "ROWS_A_BATCH", 2)
+    assert run_digest(str(run_dir)) == before
+
+
+def test_one_object_in_two_files_is_an_error(run_dir: Path, tmp_path: Path, contexts: Contexts) -> None:
+    shutil.copytree(run_dir, tmp_path, dirs_exist_ok=True)
+    write_tile(tmp_path, "t2", [small.pent()], [], contexts["compound"])
+    with pytest.raises(RunError, match="more than one row of building_id 'pent'"):
+        run_digest(str(tmp_path))
+
+
+def test_a_directory_without_a_run_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="buildings is no folder"):
+        run_digest(str(tmp_path))
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_rows_take_seconds(tmp_path: Path, run_dir: Path) -> None:
+    for name in SCHEMAS:
+        rows = read_table(str(run_dir), name).drop_columns("tile")
+        many = rows.take(np.zeros(100_000, np.int64))
+        ids = pa.array([f"{i:026d}" for i in range(100_000)])
+        (tmp_path / name / "tile=t").mkdir(parents=True)
+        pq.write_table(many.set_column(0, many.schema.field(0), ids), tmp_path / name / "tile=t" / "part-0.parquet")
+    start = time.perf_counter()
+    run_digest(str(tmp_path))
+    assert time.perf_counter() - start < 30.0

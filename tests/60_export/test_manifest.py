@@ -1,0 +1,118 @@
+"""run.json: written whole, read back as it was, honest about damage."""
+
+from __future__ import annotations
+
+import datetime as dt
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import RunError, UnreadableInputError
+from pipeline.runtime.manifest import (
+    InputFile,
+    RunManifest,
+    RunStatus,
+    input_file,
+    read_manifest,
+    write_manifest,
+)
+
+
+@pytest.fixture
+def manifest() -> RunManifest:
+    """A finished run with a value in every field."""
+    return RunManifest(
+        status=RunStatus.INCOMPLETE,
+        engine_version="0.1.0",
+        method="fuzzy-sart",
+        settings={"method": "fuzzy-sart", "vigilance": 0.9, "footprints": None, "ground": {"cell_size_m": 1.0}},
+        settings_hash="ab" * 32,
+        started_at=dt.datetime(2026, 1, 2, 3, 4, 5, tzinfo=dt.UTC),
+        finished_at=dt.datetime(2026, 1, 2, 3, 5, 5, 250, tzinfo=dt.UTC),
+        crs={"epsg": 7415, "name": "RD + NAP", "horizontal_unit_m": 1.0, "vertical_unit_m": 1.0},
+        inputs=(InputFile(path="é.laz", sha256="cd" * 32, size_bytes=12, n_points=3),),
+        source_licence="CC0, Kadaster",
+        tiles=("x85_y447", "x86_y447"),
+        failed_tiles=("x86_y447",),
+        counts={"candidates": 3, "ok": 2},
+        timings_s={"ingest": 0.25},
+        peak_memory_bytes={"driver": 1 << 30},
+        warnings=("no vertical unit",),
+        content_sha256="ef" * 32,
+    )
+
+
+def test_a_manifest_comes_back_as_it_was(tmp_path: Path, manifest: RunManifest) -> None:
+    write_manifest(tmp_path, manifest)
+    assert read_manifest(tmp_path) == manifest
+
+
+def test_the_end_replaces_the_start(tmp_path: Path, manifest: RunManifest) -> None:
+    start = RunManifest(
+        status=RunStatus.RUNNING,
+        engine_version="0.1.0",
+        method="fuzzy-sart",
+        settings={},
+        settings_hash="ab",
+        started_at=manifest.started_at,
+    )
+    write_manifest(tmp_path, start)
+    assert read_manifest(tmp_path).status is RunStatus.RUNNING
+    write_manifest(tmp_path, manifest)
+    assert read_manifest(tmp_path).status is RunStatus.INCOMPLETE
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+def test_an_input_is_described_by_its_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "tile.laz"
+    path.write_bytes(b"x" * 3_000_000)
+    told = input_file(path, n_points=7)
+    assert told == InputFile(
+        path=str(path), sha256=hashlib.sha256(b"x" * 3_000_000).hexdigest(), size_bytes=3_000_000, n_points=7
+    )
+
+
+def test_a_missing_input_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(UnreadableInputError, match=r"no\.laz: cannot be read"):
+        input_file(tmp_path / "no.laz")
+
+
+def test_a_directory_without_manifest_is_no_run(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"run\.json does not exist: give the directory that a run wrote"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("{", "is no JSON"),
+        ("[]", "has format 'list'"),
+        ('{"format": 99}', "has format 99"),
+        ('{"format": 1}', "is no manifest of a run"),
+        ('{"format": 1, "status": "dreaming"}', "dreaming"),
+    ],
+)
+def test_a_damaged_manifest_is_told_with_what_is_wrong(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(RunError, match=told):
+        read_manifest(tmp_path)
+
+
+def test_entries_of_a_later_version_are_left_out(tmp_path: Path, manifest: RunManifest) -> None:
+    found = json.loads(manifest.to_json())
+    (tmp_path / "run.json").write_text(json.dumps({**found, "colour": "red"}))
+    assert read_manifest(tmp_path) == manifest
+
+
+def test_a_time_without_zone_is_refused(manifest: RunManifest) -> None:
+    with pytest.raises(RunError, match="give a time zone"):
+        RunManifest(
+            status=manifest.status,
+            engine_version="0",
+            method="m",
+            settings={},
+            settings_hash="s",
+            started_at=manifest.started_at.replace(tzinfo=None),
+        )

@@ -1,0 +1,122 @@
+"""Publishing a tile: the designed paths, whole files only, the same twice."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from pathlib import Path
+
+import pytest
+import small_buildings as small
+from small_buildings import Contexts, RejectedObjects
+
+from pipeline.errors import RunError
+from pipeline.export.geoparquet import read_table
+from pipeline.export.tile import put_local, write_tile
+
+BUILT = (small.gable, small.two_parts, small.failed)
+
+
+def files_of(folder: Path) -> dict[str, str]:
+    """sha256 of every file under a folder, by relative path."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_a_tile_writes_the_designed_files_and_tells_their_digests(
+    tmp_path: Path, contexts: Contexts, rejected_objects: RejectedObjects
+) -> None:
+    told = write_tile(tmp_path, "x85_y447", [build() for build in BUILT], rejected_objects, contexts["compound"])
+    assert sorted(told.digests) == [
+        "buildings/tile=x85_y447/part-0.parquet",
+        "cityjson/tile=x85_y447/part-0.city.jsonl",
+        "meshes/x85_y447/gable.obj",
+        "meshes/x85_y447/two_parts.obj",
+        "planes/tile=x85_y447/part-0.parquet",
+        "rejected/tile=x85_y447/part-0.parquet",
+    ]
+    assert told.digests == files_of(tmp_path)
+    assert (told.n_buildings, told.n_planes, told.n_rejected) == (3, 6, 2)
+
+
+def test_mesh_paths_of_the_table_are_those_of_the_files(tmp_path: Path, contexts: Contexts) -> None:
+    for meshes, wanted in (
+        ("building", {"meshes/t1/gable.obj", "meshes/t1/two_parts.obj"}),
+        ("tile", {"meshes/t1/t1.obj"}),
+    ):
+        folder = tmp_path / meshes
+        write_tile(folder, "t1", [build() for build in BUILT], [], contexts["compound"], meshes)
+        told = read_table(str(folder), "buildings")["mesh_path"].to_pylist()
+        assert {path for path in told if path} == wanted
+        assert {path.relative_to(folder).as_posix() for path in folder.rglob("*.obj")} == wanted
+    text = (tmp_path / "tile" / "meshes" / "t1" / "t1.obj").read_text()
+    assert [line for line in text.splitlines() if line.startswith("o ")] == [
+        "o gable-0",
+        "o two_parts-0",
+        "o two_parts-1",
+    ]
+
+
+def test_without_meshes_there_are_no_obj_files_and_no_paths(tmp_path: Path, contexts: Contexts) -> None:
+    write_tile(tmp_path, "t1", [small.gable()], [], contexts["compound"], "none")
+    assert not (tmp_path / "meshes").exists()
+    assert read_table(str(tmp_path), "buildings")["mesh_path"].to_pylist() == [None]
+
+
+def test_publishing_twice_in_another_order_changes_nothing(
+    tmp_path: Path, contexts: Contexts, rejected_objects: RejectedObjects
+) -> None:
+    results = [build() for build in BUILT]
+    once = write_tile(tmp_path, "t1", results, rejected_objects, contexts["compound"])
+    twice = write_tile(tmp_path, "t1", results[::-1], rejected_objects[::-1], contexts["compound"])
+    assert once == twice
+    assert once.digests == files_of(tmp_path)
+
+
+def test_a_cut_off_put_leaves_the_old_file_and_no_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    put = put_local(tmp_path)
+    put("a/b.parquet", b"old")
+
+    def no_space(path: Path, data: bytes) -> int:
+        with path.open("wb") as stream:
+            stream.write(data[:1])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", no_space)
+    with pytest.raises(RunError, match="No space left"):
+        put("a/b.parquet", b"new")
+    assert (tmp_path / "a" / "b.parquet").read_bytes() == b"old"
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["b.parquet"]
+
+
+def test_a_temporary_file_is_seen_by_no_reader(tmp_path: Path, contexts: Contexts) -> None:
+    write_tile(tmp_path, "t1", [small.gable()], [], contexts["compound"])
+    (tmp_path / "buildings" / "tile=t1" / ".part-0.parquet.17-abcd").write_bytes(b"half a file")
+    assert read_table(str(tmp_path), "buildings").num_rows == 1
+
+
+def test_another_store_gets_the_same_files(tmp_path: Path, contexts: Contexts) -> None:
+    stored: dict[str, bytes] = {}
+    told = write_tile("bucket/run", "t1", [small.gable()], [], contexts["compound"], put=stored.__setitem__)
+    assert {path: hashlib.sha256(data).hexdigest() for path, data in stored.items()} == told.digests
+    assert write_tile(tmp_path, "t1", [small.gable()], [], contexts["compound"]) == told
+
+
+@pytest.mark.parametrize("key", ["", "85", "-3", "a/b", "tile=x", "x 1"])
+def test_a_key_that_readers_would_misread_is_refused(tmp_path: Path, contexts: Contexts, key: str) -> None:
+    with pytest.raises(RunError, match="hive key"):
+        write_tile(tmp_path, key, [], [], contexts["compound"])
+
+
+def test_one_building_twice_is_refused(tmp_path: Path, contexts: Contexts) -> None:
+    again = dataclasses.replace(small.pent(), building_id="gable")
+    with pytest.raises(RunError, match="gable more than once"):
+        write_tile(tmp_path, "t1", [small.gable(), again], [], contexts["compound"])
+
+
+def test_an_unknown_kind_of_meshes_lists_the_known_ones(tmp_path: Path, contexts: Contexts) -> None:
+    with pytest.raises(RunError, match="'all': use one of building, tile, none"):
+        write_tile(tmp_path, "t1", [], [], contexts["compound"], "all")
