@@ -11,6 +11,7 @@ import typer
 from pipeline.console import Console, ExitCode
 
 if TYPE_CHECKING:
+    from pipeline.report.truth_score import TruthScore
     from pipeline.runtime.run import RunSummary
     from pipeline.settings import RunSettings
 
@@ -241,3 +242,81 @@ def warm_up(as_json: AsJson = False, quiet: Quiet = False) -> None:
             seconds = time.perf_counter() - started
         console.say(f"kernels compiled and one building modelled in {seconds:.1f} s")
         console.document({"seconds": seconds, "statuses": summary.statuses})
+
+
+@app.command()
+def report(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="A run directory.")],
+    truth: Annotated[
+        str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: score the models against it.")
+    ] = None,
+    picture: Annotated[str | None, typer.Option(metavar="FILE", help="Draw the run to this PNG file.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what a finished run found, as tables and as a picture."""
+    with Console(as_json=as_json) as console:
+        from pipeline.report.table import run_statistics
+
+        found = run_statistics(run)
+        document: dict[str, Any] = {"run": run, "statistics": found}
+        console.table(run, ["status", "count"], list(found["statuses"].items()))
+        quantiles = [
+            (name, *(figures[q] for q in ("n", "p10", "p50", "p90", "max")))
+            for name, figures in found["quantiles"].items()
+        ]
+        console.table("Over the buildings", ["figure", "n", "p10", "p50", "p90", "max"], quantiles)
+        if truth is not None:
+            from pipeline.report.roof_models import read_roof_models
+            from pipeline.report.truth_score import score_against_truth
+
+            score = score_against_truth(read_roof_models(run), read_roof_models(truth))
+            show_score(console, score)
+            document["score"] = dict(score.table())
+        if picture is not None:
+            from pipeline.report.render import render_run
+
+            render_run(run, picture, truth=truth)
+            console.say(f"the picture is {picture}")
+            document["picture"] = picture
+        console.document(document)
+
+
+def show_score(console: Console, score: TruthScore) -> None:
+    """Models against the truth, as tables."""
+    console.table("Against the truth", ["figure", "value"], score.table())
+    confused = [(str(true), str(model), n) for (true, model), n in score.confusion().items()]
+    console.table("Roof types", ["truth", "model", "buildings"], confused)
+
+
+@app.command()
+def demo(
+    out: Annotated[str, typer.Option(metavar="DIR", help="The folder of everything the demo makes.")] = "demo",
+    size: Annotated[
+        tuple[float, float] | None, typer.Option(metavar="EAST NORTH", help="Extent of the suburb in metres.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Of the suburb; default its own.")] = None,
+    workers: Workers = 2,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a small suburb, reconstruct it, score it against the truth, draw it."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.demo import demonstrate
+
+        made = demonstrate(out, console.on_event, workers=workers, overwrite=overwrite, size_m=size, seed=seed)
+        show_summary(console, made.summary)
+        show_score(console, made.score)
+        console.say("Where to look:")
+        places = [
+            ("picture", made.picture),
+            ("run directory", made.summary.run_dir),
+            ("meshes (OBJ)", f"{made.summary.run_dir}/meshes"),
+            ("tables (GeoParquet)", f"{made.summary.run_dir}/buildings"),
+            ("the tile", made.scene.laz),
+            ("the truth", made.scene.truth),
+        ]
+        console.table("", ["what", "where"], places)
+        console.document(
+            dataclasses.asdict(made.summary) | {"score": dict(made.score.table()), "picture": str(made.picture)}
+        )

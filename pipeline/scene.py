@@ -206,7 +206,7 @@ def split_tile(
         z_mm=z,
         height_mm=height[chosen],
         kind=kind,
-        planar=planarity(x, y, z, settings.vegetation),
+        planar=planarity(x, y, z, kind == VertexKind.OBJECT, settings.vegetation),
     )
     in_core = core.contains(points.x_mm, points.y_mm)
     core_index = np.flatnonzero(in_core & known)

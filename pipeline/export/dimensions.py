@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -172,12 +173,16 @@ def roof_percentiles(solids: Sequence[Solid], shares: Sequence[float]) -> tuple[
     if len(area) == 0:
         return tuple(math.nan for _ in shares)
     levels = np.unique(corner_z)
-    below = np.maximum.accumulate(_area_below(levels, corner_z, area))
-    total = below[-1]
+
+    def below(index: int) -> float:
+        return float(_area_below(levels[index : index + 1], corner_z, area)[0])
+
+    total = below(len(levels) - 1)
     found = []
     for share in shares:
-        target = share * float(total)
-        upper = int(np.searchsorted(below, target - 1e-9 * total))
+        target = share * total
+        # bisection: a block has thousands of levels and of triangles, and their product is not needed
+        upper = bisect.bisect_left(range(len(levels)), target - 1e-9 * total, key=below)
         if upper == 0 or total <= 0.0:
             found.append(float(levels[min(upper, len(levels) - 1)]))
             continue

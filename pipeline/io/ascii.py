@@ -224,7 +224,7 @@ class AsciiFile:
     def _measure(self, sample: FloatArray) -> FileFacts:
         """Count and bounds by a pass over the file; classes and times from the sample."""
         low, high, count, has_returns = np.full(3, np.inf), np.full(3, -np.inf), 0, False
-        for piece in self.records(500_000, None):
+        for piece in self.records(100_000, None):
             count += len(piece)
             low, high = np.minimum(low, piece.xyz.min(axis=0)), np.maximum(high, piece.xyz.max(axis=0))
             has_returns = has_returns or (piece.return_count is not None and bool((piece.return_count > 1).any()))

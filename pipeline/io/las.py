@@ -162,12 +162,11 @@ class LasFile:
             if rest:
                 raise UnreadableInputError(str(self._path), f"truncated: {problem} and a piece", REWRITE)
             raise InconsistentInputError(str(self._path), problem, REWRITE)
-        if held > block.point_count:
-            if not rest:
-                raise InconsistentInputError(str(self._path), problem, REWRITE)
-            self._warnings.append(
-                f"{room - block.point_count * block.point_size} bytes follow the points and are not read"
-            )
+        if held > block.point_count and not rest:
+            raise InconsistentInputError(str(self._path), problem, REWRITE)
+        spare = room - block.point_count * block.point_size
+        if spare:
+            self._warnings.append(f"{spare} bytes follow the points and are not read")
 
     def _selection(self) -> Any:
         """What lazrs shall decompress."""

@@ -277,7 +277,7 @@ class PlyFile:
         """Bounds, returns, classes and times by a pass over the vertices."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         earliest, latest, classified, has_returns = np.inf, -np.inf, False, False
-        for piece in self.records(500_000, None):
+        for piece in self.records(100_000, None):
             low, high = np.minimum(low, piece.xyz.min(axis=0)), np.maximum(high, piece.xyz.max(axis=0))
             if piece.gps_time is not None:
                 earliest, latest = min(earliest, piece.gps_time.min()), max(latest, piece.gps_time.max())

@@ -31,6 +31,7 @@ from pipeline.segmentation.fuzzy_sart import (
     cluster,
     facet_vectors,
 )
+from pipeline.segmentation.leftover_planes import cluster_leftovers
 from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes, refine_planes
 from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
 from pipeline.segmentation.surrounding_ground import far_from
@@ -82,6 +83,13 @@ class FuzzySartSettings(FuzzySartClusteringSettings, PlaneRefinementSettings):
     neighbours: int = parameter(
         9, "Nearest points whose planes a point chooses among.", unit="points", minimum=3, maximum=64
     )
+    leftover_rounds: int = parameter(
+        2,
+        "Rounds of refinement with clusters that grow among the points no plane explains; 0 for none (as the paper).",
+        unit="rounds",
+        minimum=0,
+        maximum=50,
+    )
     ridge_reach_spacings: float = parameter(
         1.5, "Distance in plan up to which points are near a ridge, in mean point spacings.", minimum=0.0, maximum=10.0
     )
@@ -101,6 +109,7 @@ class FuzzySartSettings(FuzzySartClusteringSettings, PlaneRefinementSettings):
             split_by_connectivity=False,
             assignment="all_planes",
             rounds=1,
+            leftover_rounds=0,
         )
 
     def cross_faults(self) -> list[str]:
@@ -191,14 +200,14 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     rough = labels_of_points(facets, clusters, areas_m2, greedy.vertex_point, greedy.facet_of_point)[: len(roof)]
 
     # 3.3: best-fit planes on the original elevations, merging, absorption of outliers, straight ridges.
-    planes, labels = refine_planes(
-        roof,
-        neighbours,
-        rough,
-        distance_m=distance_m,
-        fewest_points=settings.fewest_points(spacing_m),
-        settings=settings,
-    )
+    fewest_points = settings.fewest_points(spacing_m)
+    refined = {"distance_m": distance_m, "fewest_points": fewest_points}
+    planes, labels = refine_planes(roof, neighbours, rough, **refined, settings=settings)
+    if settings.leftover_rounds > 0:
+        with_leftovers = cluster_leftovers(roof, neighbours, labels, distance_m, fewest_points)
+        if (with_leftovers != labels).any():
+            again = dataclasses.replace(settings, rounds=settings.leftover_rounds)
+            planes, labels = refine_planes(roof, neighbours, with_leftovers, **refined, settings=again)
     reach_m = settings.ridge_reach_spacings * spacing_m
     ridges = find_ridges(roof, planes, labels, neighbours, distance_m=distance_m, reach_m=reach_m)
     labels = label_by_ridges(roof, planes, labels, ridges, distance_m=distance_m, reach_m=reach_m)

@@ -6,7 +6,8 @@ import numpy as np
 from numba import njit
 
 from pipeline.model import IntArray
-from pipeline.triangulation import turn_of
+from pipeline.quality.union_find import root_of, unite
+from pipeline.triangulation.projection import turn_of
 
 RING_SELF_INTERSECTION = 104
 INTERSECTION_RINGS = 201
@@ -156,15 +157,6 @@ def _side_of_ring(flat: IntArray, a: int, a_stop: int, b: int, b_stop: int) -> i
 
 
 @njit(cache=True, nogil=True)
-def _root(parent: IntArray, node: int) -> int:
-    """The representative of a set in a union-find forest."""
-    while parent[node] != node:
-        parent[node] = parent[parent[node]]
-        node = parent[node]
-    return node
-
-
-@njit(cache=True, nogil=True)
 def _touches_enclose_a_part(ids: IntArray, ring_offsets: IntArray) -> bool:
     """Whether rings that touch at vertices cut the interior: their graph (rings and common vertices) has a cycle."""
     rings = len(ring_offsets) - 1
@@ -176,13 +168,10 @@ def _touches_enclose_a_part(ids: IntArray, ring_offsets: IntArray) -> bool:
     for i in range(corners):
         for j in range(i):
             if ids[j] == ids[i]:
-                first, second = _root(parent, rings + j), _root(parent, ring_of[i])
-                if _root(parent, ring_of[j]) != first:
-                    parent[first] = _root(parent, ring_of[j])
-                    first = _root(parent, first)
-                if first == second:
+                if root_of(parent, rings + j) == rings + j:
+                    unite(parent, rings + j, ring_of[j])
+                if not unite(parent, rings + j, ring_of[i]):
                     return True
-                parent[first] = second
                 break
     return False
 

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from pipeline.model import IntArray
-from pipeline.triangulation import ascending_order
+from pipeline.triangulation.edge_flips import ascending_order
 
 _SURELY_EXACT = 4.0e18
 """A determinant whose float estimate is below this fits an int64, whatever the estimate's error."""

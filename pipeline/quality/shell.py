@@ -11,28 +11,13 @@ import numpy as np
 from numba import njit
 
 from pipeline.model import BoolArray, IntArray
-from pipeline.triangulation import ascending_order
+from pipeline.quality.union_find import root_of, unite
+from pipeline.triangulation.edge_flips import ascending_order
 
 SHELL_NOT_CLOSED = 302
 NON_MANIFOLD_CASE = 303
 MULTIPLE_CONNECTED_COMPONENTS = 305
 POLYGON_WRONG_ORIENTATION = 307
-
-
-@njit(cache=True, nogil=True)
-def _root(parent: IntArray, node: int) -> int:
-    """The representative of a set in a union-find forest."""
-    while parent[node] != node:
-        parent[node] = parent[parent[node]]
-        node = parent[node]
-    return node
-
-
-@njit(cache=True, nogil=True)
-def _join(parent: IntArray, first: int, second: int) -> None:
-    """Unite two sets."""
-    a, b = _root(parent, first), _root(parent, second)
-    parent[a] = b
 
 
 @njit(cache=True, nogil=True)
@@ -75,7 +60,7 @@ def is_sound_shell(triangles: IntArray, vertex_count: int, found: BoolArray) -> 
             stop += 1
         first = order[start]
         for i in range(start + 1, stop):
-            _join(component, first // 3, order[i] // 3)
+            unite(component, first // 3, order[i] // 3)
         if stop - start == 1:
             found[SHELL_NOT_CLOSED] = True
             manifold = False
@@ -88,12 +73,12 @@ def is_sound_shell(triangles: IntArray, vertex_count: int, found: BoolArray) -> 
                 found[POLYGON_WRONG_ORIENTATION] = True
                 manifold = False
             else:
-                _join(umbrella, 3 * t + k, 3 * s + (m + 1) % 3)
-                _join(umbrella, 3 * t + (k + 1) % 3, 3 * s + m)
+                unite(umbrella, 3 * t + k, 3 * s + (m + 1) % 3)
+                unite(umbrella, 3 * t + (k + 1) % 3, 3 * s + m)
         start = stop
     sound = manifold
     for t in range(len(triangles)):
-        if _root(component, t) != _root(component, 0):
+        if root_of(component, t) != root_of(component, 0):
             found[MULTIPLE_CONNECTED_COMPONENTS] = True
             sound = False
     if not manifold:
@@ -101,7 +86,7 @@ def is_sound_shell(triangles: IntArray, vertex_count: int, found: BoolArray) -> 
     umbrella_of = np.full(vertex_count, -1)
     for t in range(len(triangles)):
         for k in range(3):
-            root = _root(umbrella, 3 * t + k)
+            root = root_of(umbrella, 3 * t + k)
             vertex = triangles[t, k]
             if umbrella_of[vertex] < 0:
                 umbrella_of[vertex] = root

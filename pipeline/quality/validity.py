@@ -48,14 +48,10 @@ from pipeline.quality.planarity import distance_to_plane, least_cosine_of_normal
 from pipeline.quality.rings import RING_SELF_INTERSECTION, has_repeated_neighbours, polygon_code
 from pipeline.quality.self_intersection import shell_intersects_itself
 from pipeline.quality.shell import is_sound_shell, six_volumes
-from pipeline.triangulation import (
-    DONE,
-    MILLIMETRES_PER_METRE,
-    area_vector,
-    ascending_order,
-    project_along_dominant_axis,
-    triangulate_rings,
-)
+from pipeline.quality.union_find import root_of
+from pipeline.triangulation.edge_flips import ascending_order
+from pipeline.triangulation.faces import DONE, MILLIMETRES_PER_METRE, triangulate_rings
+from pipeline.triangulation.projection import area_vector, project_along_dominant_axis
 
 TOO_FEW_POINTS = 101
 CONSECUTIVE_POINTS_SAME = 102
@@ -132,18 +128,9 @@ def _offsets(lengths: list[int]) -> IntArray:
 
 
 @njit(cache=True, nogil=True)
-def _root(parent: IntArray, node: int) -> int:
-    """The representative of a set in a union-find forest."""
-    while parent[node] != node:
-        parent[node] = parent[parent[node]]
-        node = parent[node]
-    return node
-
-
-@njit(cache=True, nogil=True)
 def _join(parent: IntArray, vertices: IntArray, p: int, q: int) -> None:
     """Unite the sets of two vertices; the first by x, y, z represents them."""
-    a, b = _root(parent, p), _root(parent, q)
+    a, b = root_of(parent, p), root_of(parent, q)
     for k in range(3):
         if vertices[a, k] != vertices[b, k]:
             if vertices[b, k] < vertices[a, k]:
@@ -186,8 +173,8 @@ def _snap(vertices: IntArray, ring_vertices: IntArray, snap_mm: float) -> tuple[
                 differ = True
     joined, apart = np.empty_like(ring_vertices), np.empty_like(ring_vertices)
     for corner in range(len(ring_vertices)):
-        joined[corner] = _root(inclusive, ring_vertices[corner])
-        apart[corner] = _root(exclusive, ring_vertices[corner])
+        joined[corner] = root_of(inclusive, ring_vertices[corner])
+        apart[corner] = root_of(exclusive, ring_vertices[corner])
     return joined, apart, differ
 
 

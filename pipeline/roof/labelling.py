@@ -152,3 +152,117 @@ def empty_samples(
     index, distance = nearest_points(xy_mm, samples)
     empty: BoolArray = distance > gap_m
     return samples[empty], index[empty], distance[empty]
+
+
+@njit(cache=True, nogil=True)
+def _pairs_that_cross(
+    x: IntArray, y: IntArray, facets: LabelArray, labels: LabelArray, n_points: int, planes: FloatArray
+) -> tuple[IntArray, LabelArray]:
+    """Pairs of planes whose border between points is where they cross: keys low * k + high, -1 ridge, +1 valley."""
+    k = len(planes)
+    keys = np.empty(3 * len(facets), np.int64)
+    votes = np.empty(3 * len(facets), np.int8)
+    count = 0
+    for t in range(len(facets)):
+        for e in range(3):
+            p = facets[t, e]
+            q = facets[t, (e + 1) % 3]
+            if p >= n_points or q >= n_points or labels[p] < 0 or labels[q] < 0 or labels[p] == labels[q]:
+                continue
+            if labels[p] > labels[q]:
+                p, q = q, p
+            low = labels[p]
+            high = labels[q]
+            da = (planes[low, 0] - planes[high, 0]) * 1e-3
+            db = (planes[low, 1] - planes[high, 1]) * 1e-3
+            dc = planes[low, 2] - planes[high, 2]
+            at_p = da * x[p] + db * y[p] + dc
+            at_q = da * x[q] + db * y[q] + dc
+            keys[count] = np.int64(low) * k + high
+            votes[count] = 0
+            if at_p < 0.0 < at_q:
+                votes[count] = -1
+            elif at_q < 0.0 < at_p:
+                votes[count] = 1
+            count += 1
+    order = np.argsort(keys[:count], kind="mergesort")
+    pair_keys = np.empty(count, np.int64)
+    kinds = np.empty(count, np.int32)
+    n_pairs = 0
+    i = 0
+    while i < count:
+        j = i
+        ridge = 0
+        valley = 0
+        while j < count and keys[order[j]] == keys[order[i]]:
+            if votes[order[j]] < 0:
+                ridge += 1
+            elif votes[order[j]] > 0:
+                valley += 1
+            j += 1
+        pair_keys[n_pairs] = keys[order[i]]
+        kinds[n_pairs] = 0
+        if 5 * ridge >= 3 * (j - i):
+            kinds[n_pairs] = -1
+        elif 5 * valley >= 3 * (j - i):
+            kinds[n_pairs] = 1
+        n_pairs += 1
+        i = j
+    return pair_keys[:n_pairs], kinds[:n_pairs]
+
+
+@njit(cache=True, nogil=True)
+def continue_crossings(
+    x: IntArray, y: IntArray, facets: LabelArray, labels: LabelArray, n_points: int, planes: FloatArray
+) -> LabelArray:
+    """Labels in which borders of two planes that cross go on straight where there are no points.
+
+    A place without points takes the label of the nearest point; there a ridge would leave its line. Whether two planes
+    meet in a ridge (the lower one is the roof) or a valley (the upper one) is told by the edges between their points;
+    a sample whose label contradicts it takes the label of the neighbour that does not.
+
+    Parameters
+    ----------
+    x, y : (n,) int64
+        Vertices of the TIN, points first, millimetres.
+    facets : (m, 3) int32
+        The TIN.
+    labels : (n,) int32
+        Planes; -1 outside.
+    n_points : int
+        How many of the vertices are points; only the others change.
+    planes : (k, 3) float64
+        Coefficients in metres.
+
+    Returns
+    -------
+    (n,) int32
+        The new labels.
+    """
+    labels = labels.copy()
+    pair_keys, kinds = _pairs_that_cross(x, y, facets, labels, n_points, planes)
+    if len(pair_keys) == 0:
+        return labels
+    k = len(planes)
+    for _ in range(12):
+        changed = False
+        for t in range(len(facets)):
+            for e in range(6):
+                v = facets[t, e % 3]
+                w = facets[t, (e + 1 + e // 3) % 3]
+                a = labels[v]
+                b = labels[w]
+                if v < n_points or a < 0 or b < 0 or a == b:
+                    continue
+                key = np.int64(min(a, b)) * k + max(a, b)
+                i = np.searchsorted(pair_keys, key)
+                if i == len(pair_keys) or pair_keys[i] != key or kinds[i] == 0:
+                    continue
+                above = (planes[a, 0] - planes[b, 0]) * x[v] + (planes[a, 1] - planes[b, 1]) * y[v]
+                above = above * 1e-3 + planes[a, 2] - planes[b, 2]
+                if above * kinds[i] < 0.0:
+                    labels[v] = b
+                    changed = True
+        if not changed:
+            break
+    return labels

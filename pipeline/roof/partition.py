@@ -23,6 +23,11 @@ OUTSIDE = -1
 """The label of what is no roof."""
 
 
+SHADING_RADIUS_M = 0.5
+SHADING_HEIGHT_M = 1.1
+"""Points with a point this much higher within this distance are not among those that are partitioned (`top_visible`)."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RoofPartition:
     """Polygons that share their borders exactly, each with a roof plane."""
@@ -193,7 +198,15 @@ def absorb_small_regions(
 
 @njit(cache=True, nogil=True)
 def _cut_fraction(
-    x0: int, y0: int, x1: int, y1: int, label0: int, label1: int, planes: FloatArray, outside_fraction: float
+    x0: int,
+    y0: int,
+    x1: int,
+    y1: int,
+    label0: int,
+    label1: int,
+    planes: FloatArray,
+    outside_fraction: float,
+    step_offset_m: float,
 ) -> float:
     """Where on the edge from 0 to 1 the label changes."""
     if label0 < 0:
@@ -212,6 +225,10 @@ def _cut_fraction(
     length = math.sqrt(float((x1 - x0) ** 2 + (y1 - y0) ** 2)) * 1e-3
     if min(abs(d0), abs(d1)) < 0.3 * math.sqrt(da * da + db * db) * length:
         return 0.03 if abs(d0) < abs(d1) else 0.97
+    if min(abs(d0), abs(d1)) > SHADING_HEIGHT_M:
+        # lower points within the shading radius of the upper face were left out: the step stands near to the latter
+        near = min(max(step_offset_m / max(length, 1e-3), 0.05), 0.5)
+        return near if d0 > 0.0 else 1.0 - near
     return 0.5
 
 
@@ -256,6 +273,7 @@ def _march(
     regions: LabelArray,
     planes: FloatArray,
     outside_fraction: float,
+    step_offset_m: float,
 ) -> tuple[FloatArray, LabelArray, LabelArray]:
     """Rings around all roof regions: node coordinates in mm ring after ring, ring starts, region of each ring.
 
@@ -294,7 +312,7 @@ def _march(
                     nodes = grown
                     capacity *= 2
                 p, q = (a, b) if a < b else (b, a)
-                f = _cut_fraction(x[p], y[p], x[q], y[q], labels[p], labels[q], planes, outside_fraction)
+                f = _cut_fraction(x[p], y[p], x[q], y[q], labels[p], labels[q], planes, outside_fraction, step_offset_m)
                 nodes[count, 0] = np.rint(x[p] + f * (x[q] - x[p]))
                 nodes[count, 1] = np.rint(y[p] + f * (y[q] - y[p]))
                 count += 1
@@ -311,7 +329,9 @@ def _march(
                             lab[j] = labels[p]
                             if p > q:
                                 p, q = q, p
-                            f = _cut_fraction(x[p], y[p], x[q], y[q], labels[p], labels[q], planes, outside_fraction)
+                            f = _cut_fraction(
+                                x[p], y[p], x[q], y[q], labels[p], labels[q], planes, outside_fraction, step_offset_m
+                            )
                             mx[j] = x[p] + f * (x[q] - x[p])
                             my[j] = y[p] + f * (y[q] - y[p])
                         px, py = _meeting_point(vx, vy, mx, my, lab, planes)
@@ -330,7 +350,9 @@ def _march(
     return nodes[:count].copy(), np.array(ring_starts, np.int32), np.array(ring_regions, np.int32)
 
 
-def march(xy_mm: IntArray, tin: Tin, labels: LabelArray, planes: FloatArray, outside_fraction: float) -> RoofPartition:
+def march(
+    xy_mm: IntArray, tin: Tin, labels: LabelArray, planes: FloatArray, outside_fraction: float, step_offset_m: float
+) -> RoofPartition:
     """Cut the plan into one polygon a connected region of equal labels.
 
     Parameters
@@ -345,6 +367,8 @@ def march(xy_mm: IntArray, tin: Tin, labels: LabelArray, planes: FloatArray, out
         Coefficients a, b, c of z = a x + b y + c, metres.
     outside_fraction : float
         Where on the way from a roof vertex to an outside one the border lies.
+    step_offset_m : float
+        Distance of a high step edge from the points of its upper face.
 
     Returns
     -------
@@ -362,7 +386,7 @@ def march(xy_mm: IntArray, tin: Tin, labels: LabelArray, planes: FloatArray, out
     >>> from pipeline.tin.delaunay import triangulate
     >>> xy = np.array([[0, 0], [900, 0], [900, 900], [0, 900], [400, 450]])
     >>> labels = np.array([-1, -1, -1, -1, 0], np.int32)
-    >>> march(xy, triangulate(xy), labels, np.zeros((1, 3)), 0.5).polygons[0].area
+    >>> march(xy, triangulate(xy), labels, np.zeros((1, 3)), 0.5, 0.1).polygons[0].area
     202500.0
     """
     regions, _ = connected_regions(tin.facets, labels)
@@ -375,6 +399,7 @@ def march(xy_mm: IntArray, tin: Tin, labels: LabelArray, planes: FloatArray, out
         regions,
         planes,
         outside_fraction,
+        step_offset_m,
     )
     if len(ring_regions) == 0:
         raise BuildingError(Reason.NO_PARTITION, "no point with a plane lies inside the triangulation")

@@ -15,8 +15,15 @@ from pipeline.geometry import point_spacing_m, top_visible
 from pipeline.model import Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.eaves import straighten
 from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
-from pipeline.roof.labelling import empty_samples, fill_labels
-from pipeline.roof.partition import OUTSIDE, RoofPartition, absorb_small_regions, march
+from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
+from pipeline.roof.partition import (
+    OUTSIDE,
+    SHADING_HEIGHT_M,
+    SHADING_RADIUS_M,
+    RoofPartition,
+    absorb_small_regions,
+    march,
+)
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.simplification import simplify_partition, unite_close_vertices
 from pipeline.tin.delaunay import triangulate, unique_xy
@@ -68,7 +75,9 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
         raise BuildingError(
             Reason.TOO_COMPLEX, f"{len(points)} points, more than maximum_points = {settings.maximum_points}"
         )
-    chosen = top_visible(points) & (points[:, 2] >= candidate.ground_z_m + settings.minimum_roof_height_m)
+    chosen = top_visible(points, SHADING_RADIUS_M, SHADING_HEIGHT_M) & (
+        points[:, 2] >= candidate.ground_z_m + settings.minimum_roof_height_m
+    )
     index = np.flatnonzero(chosen)
     grid = np.rint(points[index] * 1e3).astype(np.int64)
     kept, _ = unique_xy(grid[:, :2], grid[:, 2])
@@ -153,8 +162,10 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     z[:n] = roof.points[:, 2]
     x, y = np.ascontiguousarray(xy_mm[:, 0]), np.ascontiguousarray(xy_mm[:, 1])
     area = minimum_face_area(roof, settings)
+    step_offset_m = settings.step_offset_spacings * roof.spacing_m
+    labels = continue_crossings(x, y, tin.facets, labels, n, coefficients)
     labels = absorb_small_regions(x, y, z, tin.facets, labels, counted, coefficients, area, settings.minimum_void_m2)
-    partition = march(xy_mm, tin, labels, coefficients, settings.outside_fraction)
+    partition = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     if given is not None:
         return RoofPlan(faces=partition, outline_mm=given, raw=None)
     around = outline(partition)
@@ -163,7 +174,8 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     labels[:n] = fill_labels(roof.xy_mm, labels[:n])
     outside = np.flatnonzero(labels[n : n + m] < 0)
     labels[n + outside] = labels[nearest[outside]]
-    continued_faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction)
+    labels = continue_crossings(x, y, tin.facets, labels, n, coefficients)
+    continued_faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     return RoofPlan(faces=continued_faces, outline_mm=straighten(around, roof.spacing_m, settings), raw=partition)
 
 

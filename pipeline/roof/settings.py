@@ -29,6 +29,13 @@ class RoofSettings(Parameters):
         minimum=0.05,
         maximum=0.95,
     )
+    step_offset_spacings: float = parameter(
+        0.35,
+        "Distance of a high step edge from the outermost points of its upper face.",
+        unit="point spacings",
+        minimum=0.0,
+        maximum=2.0,
+    )
     straight_eaves: bool = parameter(
         True, "Whether the outline is drawn with straight lines where no footprint is given."
     )

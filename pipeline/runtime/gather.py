@@ -65,18 +65,15 @@ def surroundings_of(scratch: Scratch, grid: TileGrid, view: Window) -> Surroundi
 
 
 def _grown(mask: BoolArray, cells: int) -> BoolArray:
-    """Dilation by a square of 2 cells + 1."""
-    out = mask.copy()
-    for axis in (0, 1):
-        source = out.copy()
-        for shift in range(1, cells + 1):
-            for direction in (1, -1):
-                moved = np.roll(source, direction * shift, axis=axis)
-                edge: list[slice] = [slice(None), slice(None)]
-                edge[axis] = slice(0, shift) if direction > 0 else slice(-shift, None)
-                moved[tuple(edge)] = False
-                out |= moved
-    return out
+    """Dilation by a square of 2 cells + 1: where the box around a cell holds any True (integral image)."""
+    rows, columns = mask.shape
+    sums = np.zeros((rows + 2 * cells + 1, columns + 2 * cells + 1), np.int32)
+    padded = np.pad(mask, cells)
+    sums[1:, 1:] = padded.cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
+    side = 2 * cells + 1
+    inside = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
+    grown: BoolArray = inside > 0
+    return grown
 
 
 def _touches_data_edge(roof: BoolArray, occupied: BoolArray) -> bool:
@@ -162,7 +159,7 @@ def gather(
     digest.update(np.ascontiguousarray(ground_mm).tobytes())
     candidate = Candidate(
         building_id=site.building_id,
-        origin=tuple(float(v // MM) for v in origin_mm),
+        origin=(float(origin_mm[0] // MM), float(origin_mm[1] // MM), float(origin_mm[2] // MM)),
         points=(xyz - origin_mm) / MM,
         ground=(ground_mm - origin_mm) / MM,
         ground_z_m=(ground_z - int(origin_mm[2])) / MM,

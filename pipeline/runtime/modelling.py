@@ -18,7 +18,7 @@ from pipeline.runtime.join import CandidateSite
 from pipeline.runtime.scratch import Scratch
 from pipeline.tiling import Tile, TileGrid
 
-_POINTS_PER_BATCH = 60_000
+_POINTS_PER_BATCH = 20_000
 _MAX_PER_BATCH = 64
 
 
@@ -79,7 +79,7 @@ def batches(sites: Sequence[CandidateSite]) -> list[tuple[CandidateSite, ...]]:
 
     >>> from pipeline.runtime.join import CandidateSite
     >>> site = lambda n: CandidateSite(building_id=str(n), owner=Tile(0, 0), ranges=(), points=n)
-    >>> [len(b) for b in batches([site(90_000), site(40_000), site(15_000), site(10_000), site(10)])]
+    >>> [len(b) for b in batches([site(30_000), site(14_000), site(5_000), site(4_000), site(10)])]
     [1, 2, 2]
     """
     groups: list[tuple[CandidateSite, ...]] = []

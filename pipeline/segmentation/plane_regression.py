@@ -24,6 +24,24 @@ _LEAST_VARIANCE_M2 = 1e-9
 
 
 @njit(cache=True, nogil=True)
+def add_point(sums: FloatArray, points: FloatArray, i: int) -> None:
+    """Add point i to the ten sums of a cluster, in place."""
+    x = points[i, 0]
+    y = points[i, 1]
+    z = points[i, 2]
+    sums[0] += 1.0
+    sums[1] += x
+    sums[2] += y
+    sums[3] += z
+    sums[4] += x * x
+    sums[5] += x * y
+    sums[6] += y * y
+    sums[7] += x * z
+    sums[8] += y * z
+    sums[9] += z * z
+
+
+@njit(cache=True, nogil=True)
 def cluster_sums(points: FloatArray, labels: LabelArray, n_clusters: int) -> FloatArray:
     """The sums of Eq. 14 for every cluster: (n_clusters, 10) float64; labels below 0 are skipped."""
     sums = np.zeros((n_clusters, N_SUMS))
@@ -31,19 +49,7 @@ def cluster_sums(points: FloatArray, labels: LabelArray, n_clusters: int) -> Flo
         k = labels[i]
         if k < 0:
             continue
-        x = points[i, 0]
-        y = points[i, 1]
-        z = points[i, 2]
-        sums[k, 0] += 1.0
-        sums[k, 1] += x
-        sums[k, 2] += y
-        sums[k, 3] += z
-        sums[k, 4] += x * x
-        sums[k, 5] += x * y
-        sums[k, 6] += y * y
-        sums[k, 7] += x * z
-        sums[k, 8] += y * z
-        sums[k, 9] += z * z
+        add_point(sums[k], points, i)
     return sums
 
 

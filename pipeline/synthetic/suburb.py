@@ -57,7 +57,7 @@ def house_size(shape: RoofShape, random: np.random.Generator) -> RoofDimensions:
 
 
 def tree_at(
-    x: float, y: float, radius_m: float, height_m: float, terrain: Terrain, free_path_share: float = 0.2
+    x: float, y: float, radius_m: float, height_m: float, terrain: Terrain, free_path_share: float = 0.28
 ) -> Tree:
     """A tree of a total height, with a bare trunk over the lowest fifth (under 2 m: a shrub down to the ground)."""
     ground = float(terrain.elevation(np.array([x]), np.array([y]))[0])

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from pipeline.model import IntArray
+from pipeline.model import BoolArray, IntArray
 from pipeline.parameters import Parameters, parameter
 
 _SCALES = 3
@@ -65,8 +65,8 @@ def smallest_eigenvalue(xx: float, xy: float, xz: float, yy: float, yz: float, z
 
 
 @njit(cache=True, nogil=True)
-def _planar(x_mm, y_mm, z_mm, radius_mm, min_points, roughness_mm, out):  # type: ignore[no-untyped-def]
-    """Kernel for one scale: fills the entries of out that are still -1 with 1 (planar) or 0 (rough)."""
+def _planar(x_mm, y_mm, z_mm, wanted, radius_mm, min_points, roughness_mm, out):  # type: ignore[no-untyped-def]
+    """Kernel for one scale: fills the wanted entries of out that are still -1 with 1 (planar) or 0 (rough)."""
     n = x_mm.size
     if n == 0:
         return
@@ -91,7 +91,7 @@ def _planar(x_mm, y_mm, z_mm, radius_mm, min_points, roughness_mm, out):  # type
         position[k] += 1
     sums = np.empty((9, 10), np.int64)
     for i in range(n):
-        if out[i] >= 0:
+        if out[i] >= 0 or not wanted[i]:
             continue
         c, r = x_mm[i] // cell - column0, y_mm[i] // cell - row0
         sums[:] = 0
@@ -137,7 +137,7 @@ def _planar(x_mm, y_mm, z_mm, radius_mm, min_points, roughness_mm, out):  # type
 
 
 def planarity(
-    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: VegetationSettings
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, wanted: BoolArray, settings: VegetationSettings
 ) -> npt.NDArray[np.int8]:
     """Whether the surroundings of each vertex are planar.
 
@@ -149,13 +149,15 @@ def planarity(
     ----------
     x_mm, y_mm, z_mm : (n,) int64
         Thinned points in millimetres.
+    wanted : (n,) bool
+        The vertices to be judged; all are neighbours.
     settings : VegetationSettings
         Radius and the largest roughness.
 
     Returns
     -------
     (n,) int8
-        1 planar, 0 rough, -1 where there are too few neighbours to tell.
+        1 planar, 0 rough, -1 where it was not wanted or there are too few neighbours to tell.
     """
     verdict = np.full(len(x_mm), -1, np.int8)
     for scale in range(_SCALES):
@@ -163,6 +165,7 @@ def planarity(
             x_mm,
             y_mm,
             z_mm,
+            wanted,
             round(settings.radius_m * 1000) * 2**scale,
             settings.min_neighbours,
             settings.roughness_m * 1000.0 * 1.5**scale,

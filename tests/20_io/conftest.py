@@ -20,7 +20,7 @@ WriteLas = Callable[..., Path]
 
 
 def _points(n: int) -> FloatArray:
-    """n points on a lattice of centimetres around Delft."""
+    """So many points on a lattice of centimetres around Delft."""
     rng = np.random.default_rng(7)
     return np.round(
         np.column_stack((rng.uniform(84_000, 84_100, n), rng.uniform(447_000, 447_100, n), rng.uniform(0, 20, n))), 2

@@ -1,0 +1,81 @@
+"""The demo: a simulated suburb with exact truth, reconstructed, scored against the truth, drawn."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from pipeline.report.render import render_run
+from pipeline.report.roof_models import read_roof_models
+from pipeline.report.truth_score import TruthScore, score_against_truth
+from pipeline.runtime.events import Event, Listener
+from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.synthetic.dataset import ScenePaths, simulate
+
+SUITE = "suburb"
+"""What is simulated."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Demo:
+    """What the demo made."""
+
+    scene: ScenePaths
+    """The simulated tile and its truth."""
+    summary: RunSummary
+    """The run on it."""
+    score: TruthScore
+    """The run's models against the truth."""
+    picture: Path
+    """The run, drawn."""
+
+
+def demonstrate(
+    out: str | Path,
+    on_event: Listener,
+    *,
+    workers: int,
+    overwrite: bool,
+    size_m: tuple[float, float] | None,
+    seed: int | None,
+) -> Demo:
+    """Simulate, reconstruct, score, draw.
+
+    Parameters
+    ----------
+    out : str or Path
+        Folder of everything: `scene/`, `run/` and `demo.png`.
+    on_event : callable
+        Gets the events of all steps.
+    workers : int
+        Processes of the embedded cluster; 0 runs serially.
+    overwrite : bool
+        Replace an earlier demo.
+    size_m : tuple of float or None
+        Extent of the suburb east and north; its own by default.
+    seed : int or None
+        Of the suburb; its own by default.
+
+    Raises
+    ------
+    RunError
+        There is a run already, and `overwrite` is not asked for.
+    """
+    folder = Path(out)
+    scene = simulate(
+        SUITE,
+        folder / "scene",
+        seed,
+        size_m=size_m,
+        on_points=lambda n: on_event(Event(kind="progress", stage="scan", done=n)),
+    )
+    request = RunRequest(inputs=(str(scene.laz),), out=str(folder / "run"), workers=workers, overwrite=overwrite)
+    summary = run(request, on_event)
+    on_event(Event(kind="stage", stage="score", total=1))
+    score = score_against_truth(read_roof_models(summary.run_dir), read_roof_models(scene.truth))
+    on_event(Event(kind="progress", stage="score", done=1, total=1))
+    on_event(Event(kind="stage", stage="draw", total=1))
+    picture = folder / "demo.png"
+    render_run(summary.run_dir, picture, truth=scene.truth)
+    on_event(Event(kind="progress", stage="draw", done=1, total=1))
+    return Demo(scene=scene, summary=summary, score=score, picture=picture)

@@ -1,0 +1,286 @@
+"""A picture of a run: the map of its roof faces, and a bird's-eye view of its models where they stand densest."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.fs as pafs
+import shapely
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+
+from pipeline.errors import RunError
+from pipeline.export.geoparquet import read_table
+from pipeline.model import RoofType, Status
+from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, drawn_path, lambert, shaded
+from pipeline.report.table import run_statistics
+from pipeline.runtime.manifest import NAME, read_manifest
+
+ROOF_COLOURS = {
+    RoofType.FLAT: "#9fb4c7",
+    RoofType.PENT: "#6dbb9d",
+    RoofType.GABLE: "#e2725b",
+    RoofType.HIP: "#edb24a",
+    RoofType.COMBINATION: "#a583c0",
+    RoofType.UNKNOWN: "#c8c2b4",
+    RoofType.NONE: "#dddddd",
+}
+"""The colour of each roof type in full light."""
+WALL_COLOUR = "#f1ece1"
+FAILED_COLOUR = "#c22032"
+VIEW_SIDE_M = 180.0
+"""The bird's-eye view shows a square of this side, the one with the most roof faces."""
+WHOLE_BELOW_M = 260.0
+"""It shows the whole run where that is no wider and no longer than this."""
+_SURFACE_KINDS = {"RoofSurface", "WallSurface"}
+
+
+def render_run(
+    run_dir: str | Path,
+    png_path: str | Path,
+    truth: str | Path | None = None,
+    filesystem: pafs.FileSystem | None = None,
+) -> None:
+    """Draw a finished run to a PNG file.
+
+    Roof faces have the colour of their roof type, lit from the north-west; fallbacks are hatched, failed candidates
+    hatched in red, rejected objects thin grey outlines.
+
+    Parameters
+    ----------
+    run_dir : str or Path
+        The run directory: a local path, or a path of `filesystem`.
+    png_path : str or Path
+        The local file to write.
+    truth : str or Path, optional
+        A local run directory of true models, whose footprints are drawn as dashed lines.
+    filesystem : pyarrow.fs.FileSystem, optional
+        Where the run lies; local by default.
+
+    Raises
+    ------
+    RunError
+        The directory holds no run, or the picture cannot be written.
+    """
+    run = str(run_dir)
+    buildings = read_table(run, "buildings", filesystem)
+    planes = read_table(run, "planes", filesystem)
+    rejected = read_table(run, "rejected", filesystem)
+    outlines = None if truth is None else _geometries(read_table(str(truth), "buildings"))
+    units = _units(run, filesystem)
+    figure = Figure(figsize=(20.0, 10.5), dpi=120, facecolor="white")
+    FigureCanvasAgg(figure)
+    plan, view = figure.subplots(1, 2, gridspec_kw={"width_ratios": [0.85, 1.0], "wspace": 0.02})
+    figure.subplots_adjust(left=0.01, right=0.99, top=0.94, bottom=0.06)
+    window = _densest_window(planes, units[0])
+    _draw_map(plan, buildings, planes, rejected, outlines)
+    _draw_scale_bar(plan, units[0])
+    if window is not None:
+        _draw_window(plan, window)
+        models = _solids(run, buildings, window, units, filesystem)
+        if models:
+            draw_view(view, models, View())
+    view.set_axis_off()
+    statistics = run_statistics(run, filesystem)
+    figure.suptitle(_title(statistics, buildings), fontsize=15, x=0.01, ha="left")
+    figure.legend(handles=_legend(statistics, outlines is not None), loc="lower center", ncols=12, frameon=False)
+    try:
+        figure.savefig(png_path, format="png")
+    except OSError as error:
+        raise RunError(f"{png_path} cannot be written: {error.strerror or error}") from error
+
+
+def _geometries(table: pa.Table) -> Any:
+    """The geometries of a table as an array, None where there are none."""
+    return shapely.from_wkb(np.array(table["geometry"].to_pylist(), dtype=object))
+
+
+def _units(run_dir: str, filesystem: pafs.FileSystem | None) -> tuple[float, float]:
+    """Metres in a horizontal and in a vertical unit; 1 where the run has no manifest, as truth has none."""
+    held = (filesystem or pafs.LocalFileSystem()).get_file_info(f"{run_dir.rstrip('/')}/{NAME}")
+    crs = {} if held.type == pafs.FileType.NotFound else read_manifest(run_dir, filesystem).crs or {}
+    return float(crs.get("horizontal_unit_m", 1.0)), float(crs.get("vertical_unit_m", 1.0))
+
+
+def _densest_window(planes: pa.Table, unit_m: float) -> tuple[float, float, float, float] | None:
+    """The square of the given side with the most roof faces, in CRS units; None without faces.
+
+    Faces are counted on a lattice of half the side; the first of equals is taken. A run that is small is taken whole.
+    """
+    found = _geometries(planes)
+    present = found[~shapely.is_missing(found)]
+    if len(present) == 0:
+        return None
+    west, south, east, north = (float(v) for v in shapely.total_bounds(present))
+    if max(east - west, north - south) <= WHOLE_BELOW_M / unit_m:
+        return west, south, east, north
+    side = VIEW_SIDE_M / unit_m
+    cell = np.floor((shapely.get_coordinates(shapely.centroid(present)) - [west, south]) / (side / 2.0)).astype(int)
+    counts = np.zeros(cell.max(axis=0) + 2, dtype=np.int64)
+    np.add.at(counts, (cell[:, 0], cell[:, 1]), 1)
+    pooled = counts[:-1, :-1] + counts[1:, :-1] + counts[:-1, 1:] + counts[1:, 1:]
+    column, row = np.unravel_index(int(np.argmax(pooled)), pooled.shape)
+    left = max(west, min(west + float(column) * side / 2.0, east - side))
+    bottom = max(south, min(south + float(row) * side / 2.0, north - side))
+    return left, bottom, left + side, bottom + side
+
+
+def _rings(polygon: shapely.Polygon) -> list[Any]:
+    """The rings of a polygon in plan, first vertex not repeated."""
+    return [shapely.get_coordinates(ring)[:-1] for ring in (polygon.exterior, *polygon.interiors)]
+
+
+def _draw_map(axes: Axes, buildings: pa.Table, planes: pa.Table, rejected: pa.Table, truth: Any) -> None:
+    """Roof faces, outlines, what failed and what was rejected."""
+    kinds = dict(zip(buildings["building_id"].to_pylist(), buildings["roof_type"].to_pylist(), strict=True))
+    paths, fills = [], []
+    rows = zip(
+        _geometries(planes),
+        planes["building_id"].to_pylist(),
+        planes["slope_deg"].to_pylist(),
+        planes["aspect_deg"].to_pylist(),
+        strict=True,
+    )
+    for geometry, building_id, slope, aspect in rows:
+        if geometry is None:
+            continue
+        tilt, turn = math.radians(slope), math.radians(aspect)
+        light = lambert((math.sin(tilt) * math.sin(turn), math.sin(tilt) * math.cos(turn), math.cos(tilt)), MAP_SUN)
+        for polygon in shapely.get_parts(geometry):
+            paths.append(drawn_path(_rings(polygon)))
+            fills.append(shaded(ROOF_COLOURS[RoofType(kinds[building_id])], light))
+    axes.add_collection(PathCollection(paths, facecolors=fills, edgecolors="#55504a", linewidths=0.25))
+    _draw_outlines(axes, _geometries(rejected), color="#9a9a9a", linewidths=0.5)
+    footprints = _geometries(buildings)
+    _draw_outlines(axes, footprints, color="#2b2b2b", linewidths=0.6)
+    statuses = np.array(buildings["status"].to_pylist(), dtype=object)
+    for status, colour in ((Status.FALLBACK, "#333333"), (Status.FAILED, FAILED_COLOUR)):
+        chosen = [g for g, s in zip(footprints, statuses, strict=True) if s == status and g is not None]
+        hatched = [drawn_path(_rings(part)) for g in chosen for part in shapely.get_parts(g)]
+        if hatched:
+            marked = PathCollection(hatched, facecolors="none", edgecolors=colour, linewidths=0.9)
+            marked.set_hatch("////" if status is Status.FALLBACK else "xxxx")
+            axes.add_collection(marked)
+    if truth is not None:
+        _draw_outlines(axes, truth, color="#0050a0", linewidths=0.9, linestyles=(0, (4, 2)))
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for side in axes.spines.values():
+        side.set_color("#cccccc")
+
+
+def _draw_outlines(axes: Axes, geometries: Any, **style: Any) -> None:
+    """The rings of polygons as lines."""
+    lines = [
+        np.vstack([ring, ring[:1]])
+        for geometry in geometries
+        if geometry is not None
+        for part in shapely.get_parts(geometry)
+        for ring in _rings(part)
+    ]
+    axes.add_collection(LineCollection(lines, **style))
+
+
+def _draw_scale_bar(axes: Axes, unit_m: float) -> None:
+    """A bar of a round number of metres, about a fifth of the map's width, in its lower left corner."""
+    west, east = axes.get_xlim()
+    south, north = axes.get_ylim()
+    wanted_m = (east - west) * unit_m / 5.0
+    step = 10.0 ** math.floor(math.log10(wanted_m))
+    length_m = max(step * factor for factor in (1.0, 2.0, 5.0) if step * factor <= wanted_m)
+    x, y = west + 0.02 * (east - west), south + 0.02 * (north - south)
+    height = 0.006 * (north - south)
+    axes.add_patch(Rectangle((x, y), length_m / unit_m, height, color="#222222", zorder=5))
+    axes.text(x, y + 2.0 * height, f"{length_m:g} m", fontsize=11, color="#222222", zorder=5)
+
+
+def _draw_window(axes: Axes, window: tuple[float, float, float, float]) -> None:
+    """The square that the bird's-eye view shows."""
+    west, south, east, north = window
+    axes.add_patch(
+        Rectangle((west, south), east - west, north - south, fill=False, edgecolor="#111111", linewidth=1.2, zorder=4)
+    )
+
+
+def _solids(
+    run_dir: str,
+    buildings: pa.Table,
+    window: tuple[float, float, float, float],
+    units: tuple[float, float],
+    filesystem: pafs.FileSystem | None,
+) -> list[list[ViewedFace]]:
+    """The faces of the buildings in a window, in metres about its corner, from the run's CityJSON files."""
+    footprints = _geometries(buildings)
+    inside = shapely.intersects(shapely.centroid(footprints), shapely.box(*window))
+    rows = buildings.filter(pa.array(inside))
+    kinds = dict(zip(rows["building_id"].to_pylist(), rows["roof_type"].to_pylist(), strict=True))
+    filesystem = filesystem or pafs.LocalFileSystem()
+    models = []
+    for tile in sorted(set(rows["tile"].to_pylist())):
+        path = f"{run_dir.rstrip('/')}/cityjson/tile={tile}/part-0.city.jsonl"
+        with filesystem.open_input_stream(path) as stream:
+            lines = stream.read().decode().splitlines()
+        transform = json.loads(lines[0])["transform"]
+        scale, shift = (np.array(transform[name]) for name in ("scale", "translate"))
+        metres = np.array([units[0], units[0], units[1]])
+        for line in lines[1:]:
+            feature = json.loads(line)
+            kind = kinds.get(feature["id"])
+            if kind is not None and feature["vertices"]:
+                local = (np.array(feature["vertices"]) * scale + shift - [window[0], window[1], 0.0]) * metres
+                models.append(_viewed_faces(feature, local, ROOF_COLOURS[RoofType(kind)]))
+    return models
+
+
+def _viewed_faces(feature: dict[str, Any], xyz: Any, roof_colour: str) -> list[ViewedFace]:
+    """Roofs and walls of a CityJSONFeature."""
+    faces = []
+    for entry in feature["CityObjects"].values():
+        for solid in entry.get("geometry", ()):
+            surfaces = [surface["type"] for surface in solid["semantics"]["surfaces"]]
+            for shell, values in zip(solid["boundaries"], solid["semantics"]["values"], strict=True):
+                for rings, value in zip(shell, values, strict=True):
+                    if surfaces[value] in _SURFACE_KINDS:
+                        colour = roof_colour if surfaces[value] == "RoofSurface" else WALL_COLOUR
+                        faces.append(ViewedFace(rings=tuple(xyz[ring] for ring in rings), colour=colour))
+    return faces
+
+
+def _title(statistics: dict[str, Any], buildings: pa.Table) -> str:
+    """Counts and residuals in two lines."""
+    statuses, rmse = statistics["statuses"], statistics["quantiles"]["rmse_m"]
+    methods = ", ".join(sorted(set(buildings["method"].to_pylist()))) or "no method"
+    told = f"{statistics['candidates']} candidates by {methods}: " + ", ".join(f"{n} {s}" for s, n in statuses.items())
+    if rmse["p50"] is None:
+        return told
+    coverage = statistics["quantiles"]["coverage"]["p50"]
+    return f"{told}; rmse {rmse['p50']:.2f} m (median), {rmse['p90']:.2f} m (p90), coverage {coverage:.1%}"
+
+
+def _legend(statistics: dict[str, Any], with_truth: bool) -> list[Any]:
+    """An entry for all that is drawn, with counts."""
+    entries: list[Any] = [
+        Patch(facecolor=ROOF_COLOURS[RoofType(kind)], edgecolor="#55504a", label=f"{kind} {count}")
+        for kind, count in statistics["roof_types"].items()
+        if kind != RoofType.NONE
+    ]
+    statuses = statistics["statuses"]
+    hatches = ((Status.FALLBACK, "////", "#333333"), (Status.FAILED, "xxxx", FAILED_COLOUR))
+    for status, hatch, colour in hatches:
+        label = f"{status.value} {statuses[status.value]}"
+        entries.append(Patch(facecolor="none", edgecolor=colour, hatch=hatch, label=label))
+    entries.append(Line2D([], [], color="#9a9a9a", linewidth=1.0, label=f"rejected {statistics['rejected']}"))
+    if with_truth:
+        entries.append(Line2D([], [], color="#0050a0", linestyle=(0, (4, 2)), label="truth"))
+    return entries

@@ -1,0 +1,84 @@
+"""Faces in a plane: corners projected along the dominant axis of the normal, where millimetres stay integers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import IntArray
+
+
+@njit(cache=True, nogil=True)
+def area_vector(corners: IntArray, start: int, stop: int) -> tuple[int, int, int]:
+    """Twice the vector area of the ring corners[start:stop] (Newell's normal), in mm2: exact."""
+    x = y = z = 0
+    for i in range(start + 1, stop - 1):
+        ax, ay, az = (
+            corners[i, 0] - corners[start, 0],
+            corners[i, 1] - corners[start, 1],
+            corners[i, 2] - corners[start, 2],
+        )
+        bx, by, bz = (
+            corners[i + 1, 0] - corners[start, 0],
+            corners[i + 1, 1] - corners[start, 1],
+            corners[i + 1, 2] - corners[start, 2],
+        )
+        x += ay * bz - az * by
+        y += az * bx - ax * bz
+        z += ax * by - ay * bx
+    return x, y, z
+
+
+@njit(cache=True, nogil=True)
+def project_along_dominant_axis(corners: IntArray, outer_stop: int) -> tuple[IntArray, bool]:
+    """Drop the coordinate in which the outer ring's normal is longest.
+
+    Parameters
+    ----------
+    corners : (n, 3) int64
+        Corners of all rings in mm, outer ring first.
+    outer_stop : int
+        Number of corners of the outer ring.
+
+    Returns
+    -------
+    (n, 2) int64 and bool
+        Corners in the plane, the outer ring counter-clockwise; False where it encloses no area.
+    """
+    x, y, z = area_vector(corners, 0, outer_stop)
+    flat = np.empty((len(corners), 2), np.int64)
+    if abs(z) >= abs(x) and abs(z) >= abs(y):
+        first, second, turn = 0, 1, z
+    elif abs(y) >= abs(x):
+        first, second, turn = 2, 0, y
+    else:
+        first, second, turn = 1, 2, x
+    if turn < 0:
+        first, second = second, first
+    for i in range(len(corners)):
+        flat[i, 0] = corners[i, first] - corners[0, first]
+        flat[i, 1] = corners[i, second] - corners[0, second]
+    return flat, turn != 0
+
+
+@njit(cache=True, nogil=True)
+def turn_of(flat: IntArray, a: int, b: int, c: int) -> int:
+    """Twice the signed area of the triangle a, b, c in mm2: positive where it turns left."""
+    right, up = flat[b, 0] - flat[a, 0], flat[b, 1] - flat[a, 1]
+    return int(right * (flat[c, 1] - flat[a, 1]) - up * (flat[c, 0] - flat[a, 0]))
+
+
+@njit(cache=True, nogil=True)
+def same_place(flat: IntArray, a: int, b: int) -> bool:
+    """Whether two corners coincide."""
+    return bool(flat[a, 0] == flat[b, 0] and flat[a, 1] == flat[b, 1])
+
+
+@njit(cache=True, nogil=True)
+def in_cone(flat: IntArray, before: int, node: int, after: int, target: int) -> bool:
+    """Whether the way from node to target starts strictly inside the polygon on the left of before, node, after."""
+    left_of_first = turn_of(flat, before, node, target)
+    left_of_second = turn_of(flat, node, after, target)
+    if turn_of(flat, before, node, after) > 0:
+        return left_of_first > 0 and left_of_second > 0
+    return left_of_first > 0 or left_of_second > 0

@@ -1,0 +1,186 @@
+"""Footprints of three formats, in metres of the run's CRS, with ids and attributes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import geopandas
+import numpy as np
+import pytest
+from shapely import LineString, MultiPolygon, Point, Polygon, box
+from shapely.affinity import scale
+
+from pipeline.errors import CrsError, EmptyInputError, InconsistentInputError, UnreadableInputError
+from pipeline.io import SpatialReference, read_area, read_footprints
+from pipeline.io.crs import resolve_reference
+
+HOUSES = [box(85_000, 447_000, 85_010, 447_008), box(85_020, 447_000, 85_030, 447_010)]
+
+
+def reference(crs="EPSG:7415"):
+    return resolve_reference(path="points", crs=crs)[0]
+
+
+def write(path, geometries=HOUSES, crs="EPSG:28992", layer=None, **columns):
+    """Writes with geopandas: an independent writer."""
+    frame = geopandas.GeoDataFrame(columns, geometry=list(geometries), crs=crs)
+    frame.to_file(path, **({} if layer is None else {"layer": layer}))
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".gpkg", ".shp", ".geojson"])
+def test_three_formats_give_the_same_polygons(tmp_path, suffix):
+    path = write(tmp_path / f"a{suffix}", identifi=["one", "two"], year=[1900, 1950])
+    found = read_footprints(path, reference(), id_column="identifi")
+    assert found.ids == ("one", "two")
+    assert [row["year"] for row in found.attributes] == [1900, 1950]
+    for polygon, expected in zip(found.polygons, HOUSES, strict=True):
+        assert polygon.symmetric_difference(expected).area < 1e-6
+        assert not polygon.has_z
+    assert len(found) == 2
+
+
+def test_geojson_in_degrees_is_reprojected_and_told(tmp_path):
+    path = tmp_path / "a.geojson"
+    write(path, np.array(geopandas.GeoSeries(HOUSES, crs="EPSG:28992").to_crs("EPSG:4326")), crs="EPSG:4326")
+    found = read_footprints(path, reference())
+    # GeoJSON keeps seven decimals of a degree.
+    assert max(a.hausdorff_distance(b) for a, b in zip(found.polygons, HOUSES, strict=True)) < 0.02
+    assert any("reprojected from 'WGS 84' to 'Amersfoort / RD New'" in warning for warning in found.warnings)
+
+
+def test_a_run_in_feet_gets_metres(tmp_path):
+    path = write(tmp_path / "a.gpkg", crs="EPSG:2992")
+    found = read_footprints(path, reference("EPSG:2992"))
+    expected = scale(HOUSES[0], 0.3048, 0.3048, origin=(0, 0))
+    assert found.polygons[0].symmetric_difference(expected).area < 1e-6
+    area = read_area(path, reference("EPSG:2992"))
+    assert area.symmetric_difference(MultiPolygon(HOUSES)).area < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        ({"identificatie": ["a", "b"], "id": [1, 2]}, ("a", "b")),
+        ({"gml_id": ["g1", "g2"]}, ("g1", "g2")),
+        ({"ID": [7, 8]}, ("7", "8")),
+        ({"id": [7, 7]}, ("1", "2")),
+        ({"id": ["x", None], "osm_id": [3, 4]}, ("3", "4")),
+        ({"name": ["a", "b"]}, ("1", "2")),
+    ],
+)
+def test_ids_come_from_the_first_common_column_that_identifies_else_the_feature_id(tmp_path, columns, expected):
+    assert read_footprints(write(tmp_path / "a.gpkg", **columns), reference()).ids == expected
+
+
+def test_a_named_column_must_be_there_and_identify(tmp_path):
+    path = write(tmp_path / "a.gpkg", street=["x", "x"])
+    with pytest.raises(UnreadableInputError, match=r"'number' is not there.*street"):
+        read_footprints(path, reference(), id_column="number")
+    with pytest.raises(InconsistentInputError, match="empty or not unique"):
+        read_footprints(path, reference(), id_column="street")
+
+
+def test_attributes_are_plain_values(tmp_path):
+    import pandas
+
+    built = pandas.to_datetime(["1999-12-31", None])
+    path = write(tmp_path / "a.gpkg", built=built, height=[1.5, np.nan], storeys=np.array([2, 3]), note=["x", None])
+    first, second = read_footprints(path, reference()).attributes
+    assert first["built"].startswith("1999-12-31")
+    assert (first["height"], first["storeys"], first["note"]) == (1.5, 2, "x")
+    assert (second["built"], second["height"], second["note"]) == (None, None, None)
+    json.dumps([first, second])
+
+
+def test_invalid_polygons_are_repaired_and_told(tmp_path):
+    bow_tie = Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])
+    spike = Polygon([(0, 0), (10, 0), (10, 10), (10, 20), (10, 10), (0, 10)])
+    flat = Polygon([(0, 0), (5, 5), (10, 10)])
+    found = read_footprints(write(tmp_path / "a.gpkg", [bow_tie, spike, flat, HOUSES[0]], id=[1, 2, 3, 4]), reference())
+    assert found.ids == ("1", "2", "4")
+    assert all(polygon.is_valid and polygon.area > 0 for polygon in found.polygons)
+    assert isinstance(found.polygons[0], MultiPolygon)
+    assert found.polygons[1].equals(box(0, 0, 10, 10))
+    assert any("3 footprints are invalid: 1 without area" in warning for warning in found.warnings)
+
+
+def test_elevations_holes_and_several_parts_are_kept_in_plan(tmp_path):
+    ring = Polygon(box(0, 0, 10, 10).exterior, [box(4, 4, 6, 6).exterior])
+    raised = Polygon([(20, 0, 5), (30, 0, 5), (30, 10, 9)])
+    found = read_footprints(write(tmp_path / "a.gpkg", [MultiPolygon([ring, box(12, 0, 14, 2)]), raised]), reference())
+    assert found.polygons[0].area == 96 + 4
+    assert not found.polygons[1].has_z
+
+
+def test_other_geometries_are_left_out_and_told(tmp_path):
+    mixed = [Point(0, 0), LineString([(0, 0), (1, 1)]), HOUSES[0], None, Polygon()]
+    found = read_footprints(write(tmp_path / "a.geojson", mixed, crs="EPSG:28992", id=[1, 2, 3, 4, 5]), reference())
+    assert found.ids == ("3",)
+    assert any("4 features are no polygons" in warning for warning in found.warnings)
+    lines = write(tmp_path / "b.gpkg", [LineString([(0, 0), (1, 1)])])
+    with pytest.raises(EmptyInputError, match="none of the 1 features is a polygon"):
+        read_footprints(lines, reference())
+
+
+def test_several_layers_must_be_named(tmp_path):
+    path = write(tmp_path / "a.gpkg", layer="houses")
+    write(path, [HOUSES[0]], layer="sheds")
+    with pytest.raises(UnreadableInputError, match=r"2 layers could be.*houses, sheds"):
+        read_footprints(path, reference())
+    assert len(read_footprints(path, reference(), layer="sheds")) == 1
+    with pytest.raises(UnreadableInputError, match="'barns' is not there"):
+        read_footprints(path, reference(), layer="barns")
+
+
+def test_a_layer_of_points_beside_does_not_disturb(tmp_path):
+    path = write(tmp_path / "a.gpkg", layer="houses")
+    write(path, [Point(0, 0)], layer="trees")
+    assert len(read_footprints(path, reference())) == 2
+
+
+def test_footprints_without_crs_are_assumed_to_be_the_run_s_and_told(tmp_path):
+    path = write(tmp_path / "a.shp", crs=None)
+    found = read_footprints(path, reference())
+    assert found.polygons[0].equals(HOUSES[0])
+    assert any("no CRS" in warning for warning in found.warnings)
+
+
+def test_degrees_cannot_meet_points_of_an_unknown_crs(tmp_path):
+    path = tmp_path / "a.geojson"
+    write(path, [box(4.3, 52.0, 4.4, 52.1)], crs="EPSG:4326")
+    with pytest.raises(CrsError, match="geographic"):
+        read_footprints(path, SpatialReference())
+    metres = read_footprints(write(tmp_path / "b.gpkg"), SpatialReference())
+    assert any("the points' CRS is unknown" in warning for warning in metres.warnings)
+    with pytest.raises(CrsError, match="another unit"):
+        read_footprints(write(tmp_path / "c.gpkg", crs="EPSG:2992"), SpatialReference())
+
+
+def test_what_is_no_vector_file_is_refused_and_the_valid_ones_listed(tmp_path):
+    text = tmp_path / "a.geojson"
+    text.write_text('{"type": "FeatureCollection", "features": [')
+    for path in (text, tmp_path / "missing.gpkg"):
+        with pytest.raises(UnreadableInputError) as caught:
+            read_footprints(path, reference())
+        assert str(path) in str(caught.value)
+    with pytest.raises(UnreadableInputError, match=r"GeoPackage.*GeoJSON.*Shapefile"):
+        read_footprints(text, reference())
+
+
+def test_the_delft_footprints_read_as_geopandas_reads_them(shared_data):
+    path = shared_data / "ahn3" / "footprints.gpkg"
+    found, frame = read_footprints(path, reference()), geopandas.read_file(path)
+    assert len(found) == len(frame) == 160
+    assert found.ids == tuple(frame["bgt_id"])
+    assert found.warnings == ()
+    assert all(a.equals(b) for a, b in zip(found.polygons, frame.geometry, strict=True))
+    assert [row["status"] for row in found.attributes] == frame["status"].tolist()
+
+
+def test_importing_the_reader_needs_neither_pandas_nor_the_format_libraries():
+    code = "import sys, pipeline.io; print([m for m in ('pandas', 'geopandas', 'pyogrio', 'laspy', 'scipy', 'pyproj') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

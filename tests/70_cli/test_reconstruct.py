@@ -1,0 +1,119 @@
+"""The main job on the command line: a simulated tile in, a run directory out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+
+
+def invoke(*words: str) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a command line."""
+    result = CliRunner().invoke(app, list(words))
+    return result.exit_code, result.stdout, result.stderr
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a simulated gable roof."""
+    folder = tmp_path_factory.mktemp("scene")
+    code, said, _ = invoke("simulate", "gable", "--out", str(folder), "--size", "40", "40", "--json")
+    assert code == 0
+    assert json.loads(said)["buildings"] == 1
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], list[dict[str, Any]]]:
+    """A run on it in this process: directory, JSON document, events."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    tile = str(scene / "gable.laz")
+    code, said, events = invoke("reconstruct", tile, "--out", str(folder), "--workers", "0", "--json")
+    assert code == 0
+    return folder, json.loads(said), [json.loads(line) for line in events.splitlines()]
+
+
+def test_the_gable_becomes_one_gable(run: tuple[Path, dict[str, Any], Any]) -> None:
+    _, summary, _ = run
+    assert summary["statuses"] == {"ok": 1}
+    assert summary["roof_types"] == {"gable": 1}
+    assert summary["failed_tiles"] == []
+
+
+def test_the_run_directory_is_laid_out_as_documented(run: tuple[Path, Any, Any]) -> None:
+    folder, _, _ = run
+    page = Path(__file__).resolve().parents[2] / "docs" / "run_directory.md"
+    documented = {line.split("/")[0].split(" ")[0] for line in page.read_text().split("```")[1].splitlines() if line}
+    assert {entry.name for entry in folder.iterdir()} == documented
+    assert len(list(folder.glob("meshes/*/*.obj"))) == 1
+
+
+def test_the_stages_are_told_in_order(run: tuple[Path, Any, list[dict[str, Any]]]) -> None:
+    stages = [event["stage"] for event in run[2] if event["kind"] == "stage"]
+    assert stages == ["ingest", "split", "join", "reconstruct", "publish"]
+
+
+def test_digest_prints_what_the_run_told(run: tuple[Path, dict[str, Any], Any]) -> None:
+    folder, summary, _ = run
+    assert invoke("digest", str(folder)) == (0, f"{summary['digest']}\n", "")
+
+
+def test_a_second_run_needs_leave_to_overwrite_and_gives_the_same(
+    scene: Path, run: tuple[Path, dict[str, Any], Any], tmp_path: Path
+) -> None:
+    folder, summary, _ = run
+    again = ("reconstruct", str(scene), "--out", str(folder), "--workers", "0", "--json")
+    code, said, _ = invoke(*again)
+    assert code == 4
+    assert "--overwrite" in json.loads(said)["error"]["message"]
+    code, said, _ = invoke(*again, "--overwrite", "--meshes", "none")
+    assert code == 0
+    assert json.loads(said)["digest"] == summary["digest"]
+    assert not list(folder.glob("meshes/*/*.obj"))
+
+
+def test_a_settings_file_decides_and_the_command_line_wins(scene: Path, tmp_path: Path) -> None:
+    settings = tmp_path / "run.toml"
+    settings.write_text('[settings]\nclasses = "ignore"\n[settings.candidates]\nmin_area_m2 = 900.0\n')
+    tile = str(scene / "gable.laz")
+    words = ("--out", str(tmp_path / "run"), "--workers", "0", "--settings", str(settings), "--classes", "audit")
+    code, said, _ = invoke("reconstruct", tile, *words, "--json")
+    assert code == 0
+    assert json.loads(said)["statuses"] == {}
+    manifest = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert manifest["settings"]["general"]["classes"] == "audit"
+    assert manifest["settings"]["candidates"]["min_area_m2"] == 900.0
+
+
+def test_people_get_tables(scene: Path, tmp_path: Path) -> None:
+    words = ("--out", str(tmp_path / "run"), "--workers", "0", "--licence", "CC0")
+    code, said, log = invoke("reconstruct", str(scene / "gable.laz"), *words)
+    assert code == 0
+    assert "Roof types" in said
+    assert str(tmp_path / "run") in said
+    assert "reconstruct 1/1" in log
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["source_licence"] == "CC0"
+
+
+@pytest.mark.parametrize(
+    ("bbox", "code"),
+    [(("0", "0", "1", "1"), 3), (("9", "9", "1", "1"), 2)],
+    ids=["nothing inside", "upside down"],
+)
+def test_a_rectangle_without_points_or_sense_is_refused(
+    scene: Path, tmp_path: Path, bbox: tuple[str, ...], code: int
+) -> None:
+    words = ("--out", str(tmp_path / "run"), "--workers", "0", "--bbox", *bbox)
+    assert invoke("reconstruct", str(scene / "gable.laz"), *words)[0] == code
+
+
+@pytest.mark.slow
+def test_warm_up_compiles_and_models_one_building() -> None:
+    code, said, _ = invoke("warm-up", "--json")
+    assert code == 0
+    assert json.loads(said)["statuses"] == {"ok": 1}
