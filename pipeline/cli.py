@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -119,6 +119,7 @@ def reconstruct(
         )
         summary = run(request, console.on_event)
         show_summary(console, summary)
+        console.document(dataclasses.asdict(summary))
         if summary.failed_tiles:
             raise typer.Exit(ExitCode.TILES_FAILED)
 
@@ -133,20 +134,20 @@ def _run_settings(path: str | None, **overrides: str | None) -> RunSettings:
 
 def show_summary(console: Console, summary: RunSummary) -> None:
     """What a run found, as tables or as the JSON document."""
-    counts = summary.counts
-    told = {**summary.reasons, **{f"rejected: {reason}": n for reason, n in summary.rejected.items()}}
-    console.table("Candidates", ["status", "count"], sorted(summary.statuses.items()))
-    console.table("Reasons", ["reason", "count"], sorted(told.items()))
-    console.table("Roof types", ["type", "count"], sorted(summary.roof_types.items()))
-    seconds = [(stage, f"{taken:.1f} s") for stage, taken in summary.timings_s.items()]
-    console.table("Time", ["stage", "wall clock"], seconds)
+    from pipeline.report.table import run_statistics, statistics_tables
+
+    for table in statistics_tables(run_statistics(summary.run_dir)):
+        console.show(table)
+    console.table(
+        "Time", ["stage", "wall clock"], [(k, f"{seconds:.1f} s") for k, seconds in summary.timings_s.items()]
+    )
+    points, tiles = summary.counts["points"], summary.counts["tiles"]
     largest = max(summary.peak_memory_bytes.values(), default=0) / 2**30
-    console.say(f"{counts['points']} points in {counts['tiles']} tiles; peak memory of a process {largest:.2f} GiB")
+    console.say(f"{points} points, tiles: {tiles}, peak memory of a process: {largest:.2f} GiB")
     for tile in summary.failed_tiles:
         console.warn(f"tile {tile} failed")
     console.say(f"content sha256 {summary.digest}")
     console.say(f"results are in {summary.run_dir}")
-    console.document(dataclasses.asdict(summary))
 
 
 @app.command()
@@ -245,7 +246,7 @@ def warm_up(as_json: AsJson = False, quiet: Quiet = False) -> None:
 
 
 @app.command()
-def report(
+def evaluate(
     run: Annotated[str, typer.Argument(metavar="RUN", help="A run directory.")],
     truth: Annotated[
         str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: score the models against it.")
@@ -255,16 +256,12 @@ def report(
 ) -> None:
     """Tell what a finished run found, as tables and as a picture."""
     with Console(as_json=as_json) as console:
-        from pipeline.report.table import run_statistics
+        from pipeline.report.table import run_statistics, statistics_tables
 
-        found = run_statistics(run)
-        document: dict[str, Any] = {"run": run, "statistics": found}
-        console.table(run, ["status", "count"], list(found["statuses"].items()))
-        quantiles = [
-            (name, *(figures[q] for q in ("n", "p10", "p50", "p90", "max")))
-            for name, figures in found["quantiles"].items()
-        ]
-        console.table("Over the buildings", ["figure", "n", "p10", "p50", "p90", "max"], quantiles)
+        statistics = run_statistics(run)
+        document: dict[str, Any] = {"run": run, "statistics": statistics}
+        for table in statistics_tables(statistics):
+            console.show(table)
         if truth is not None:
             from pipeline.report.roof_models import read_roof_models
             from pipeline.report.truth_score import score_against_truth
@@ -285,7 +282,7 @@ def show_score(console: Console, score: TruthScore) -> None:
     """Models against the truth, as tables."""
     console.table("Against the truth", ["figure", "value"], score.table())
     confused = [(str(true), str(model), n) for (true, model), n in score.confusion().items()]
-    console.table("Roof types", ["truth", "model", "buildings"], confused)
+    console.table("Roof types against the truth", ["truth", "model", "buildings"], confused)
 
 
 @app.command()

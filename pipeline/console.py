@@ -26,12 +26,17 @@ import typer
 from pipeline.errors import GableworkError, InputError, RunError, SettingsError
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
     from rich.progress import Progress, TaskID
 
     from pipeline.runtime.events import Event
 
 LOG_INTERVAL_S = 2.0
 """A log line of progress follows the last one of its stage after this time at the earliest."""
+
+
+LOG_WIDTH = 120
+"""Columns of a table that is not printed on a terminal."""
 
 
 class ExitCode(IntEnum):
@@ -192,13 +197,27 @@ class Console:
             print(message, flush=True)
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-        """Print a table for people; silent with `--json`. Columns of numbers only are set to the right."""
-        if self.as_json or not rows:
+        """Show a table for people; nothing without rows. Columns of figures only are set to the right."""
+        if not rows or self.as_json:
             return
+        from rich.table import Table
+
+        table = Table(title=title or None, title_justify="left")
+        for name, *cells in zip(header, *rows, strict=True):
+            table.add_column(name, justify="right" if all(is_figure(str(cell)) for cell in cells) else "left")
+        for row in rows:
+            table.add_row(*map(str, row))
+        self.show(table)
+
+    def show(self, renderable: RenderableType) -> None:
+        """Print what rich can render, for people; silent with `--json`."""
+        if self.as_json:
+            return
+        from rich.console import Console as RichConsole
+
         self._close_bars()
-        for line in table_lines(title, header, rows):
-            print(line)
-        print(flush=True)
+        width = None if sys.stdout.isatty() else LOG_WIDTH
+        RichConsole(file=sys.stdout, width=width, markup=False, highlight=False).print(renderable)
 
     def document(self, content: Mapping[str, Any]) -> None:
         """Print the JSON document of `--json`; silent without."""
@@ -222,26 +241,6 @@ class Console:
             print("This is a fault of gablework, not of your input: please report it.", file=sys.stderr, flush=True)
 
 
-def table_lines(title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
-    """Lay out a table as plain lines, the same on a terminal and in a log.
-
-    >>> table_lines("Roofs", ["type", "count"], [["gable", 12], ["flat", 3]])
-    ['Roofs', '  type   count', '  gable     12', '  flat       3']
-    """
-    cells = [[str(cell) for cell in row] for row in rows]
-    widths = [max(len(row[i]) for row in [list(header), *cells]) for i in range(len(header))]
-    numeric = [
-        all(isinstance(row[i], int | float) or _is_figure(str(row[i])) for row in rows) for i in range(len(header))
-    ]
-    lines = [title] if title else []
-    for row in [list(header), *cells]:
-        padded = [
-            cell.rjust(w) if right else cell.ljust(w) for cell, w, right in zip(row, widths, numeric, strict=True)
-        ]
-        lines.append(("  " + "  ".join(padded)).rstrip())
-    return lines
-
-
 def _json_value(value: Any) -> Any:
     """A value as JSON knows it: what is not finite becomes null, what is unknown its text.
 
@@ -257,11 +256,15 @@ def _json_value(value: Any) -> Any:
     return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 
-def _is_figure(text: str) -> bool:
-    """Whether a cell reads as a number, a unit allowed behind it."""
-    head = text.split(" ", maxsplit=1)[0].rstrip("%")
+def is_figure(text: str) -> bool:
+    """Whether a cell reads as a figure, a unit allowed behind it.
+
+    >>> [is_figure(text) for text in ("12", "98.5 %", "0.3 m", "gable", "")]
+    [True, True, True, False, True]
+    """
+    head = text.split(" ", maxsplit=1)[0]
     try:
-        float(head.replace(",", ""))
+        float(head.replace(",", "") or 0)
     except ValueError:
         return False
     return True

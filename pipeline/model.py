@@ -16,6 +16,7 @@ IntArray = npt.NDArray[np.int64]
 LabelArray = npt.NDArray[np.int32]
 BoolArray = npt.NDArray[np.bool_]
 ByteArray = npt.NDArray[np.uint8]
+KindArray = npt.NDArray[np.int8]
 
 
 class Status(StrEnum):

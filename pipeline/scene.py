@@ -90,7 +90,7 @@ class SplitTile:
 
     fragments: Fragments
     """Descriptors for the join."""
-    core_index: npt.NDArray[np.int64]
+    core_index: IntArray
     """(n,) int64, indices into the window's points of those that the core owns."""
     point_fragment: LabelArray
     """(n,) int32, their fragments; -1 where none."""
@@ -139,9 +139,7 @@ def terrain_of(
         usable = kept & (points.classification == GROUND_CLASS)
     else:
         usable = kept & (points.return_number >= points.return_count)
-    terrain = ground_of(
-        points.x_mm, points.y_mm, points.z_mm, usable, lattice, settings.ground, trusted=classes.ground
-    )
+    terrain = ground_of(points.x_mm, points.y_mm, points.z_mm, usable, lattice, settings.ground, trusted=classes.ground)
     return terrain, kept, _occupied(points, kept, lattice)
 
 
@@ -185,9 +183,7 @@ def split_tile(
     last = points.return_number >= points.return_count
     building = (points.classification == BUILDING_CLASS) & classes.building
     used = in_near & known & (last | building)
-    chosen = highest_per_cell(
-        points.x_mm, points.y_mm, points.z_mm, building, used, settings.surfaces.thinning_m
-    )
+    chosen = highest_per_cell(points.x_mm, points.y_mm, points.z_mm, building, used, settings.surfaces.thinning_m)
     x, y, z = points.x_mm[chosen], points.y_mm[chosen], points.z_mm[chosen]
     kind = np.full(len(chosen), VertexKind.OBJECT, np.int8)
     chosen_class = points.classification[chosen]

@@ -19,7 +19,15 @@ def slot_of_key(key: int, mask: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _first_of_each(x_mm, y_mm, z_mm, return_number, gps_bits, source_id, classification):  # type: ignore[no-untyped-def]
+def _first_of_each(
+    x_mm: IntArray,
+    y_mm: IntArray,
+    z_mm: IntArray,
+    return_number: ByteArray,
+    gps_bits: IntArray,
+    source_id: npt.NDArray[np.uint16],
+    classification: ByteArray,
+) -> BoolArray:
     """Kernel: open addressing; of equal points the one of the lowest source, then class, stays."""
     n = x_mm.size
     keep = np.zeros(n, np.bool_)

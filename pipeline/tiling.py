@@ -67,9 +67,7 @@ class Window:
 
     def contains(self, x_mm: IntArray, y_mm: IntArray) -> BoolArray:
         """Mask of the points inside; arrays of one shape."""
-        inside: BoolArray = (
-            (x_mm >= self.x0_mm) & (x_mm < self.x1_mm) & (y_mm >= self.y0_mm) & (y_mm < self.y1_mm)
-        )
+        inside: BoolArray = (x_mm >= self.x0_mm) & (x_mm < self.x1_mm) & (y_mm >= self.y0_mm) & (y_mm < self.y1_mm)
         return inside
 
     def grown(self, margin_mm: int) -> Window:

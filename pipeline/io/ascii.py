@@ -124,6 +124,12 @@ class AsciiFile:
 
     def _parse(self, lines: list[bytes], line_number: int) -> FloatArray:
         """The numbers of some lines."""
+        if max(map(len, lines)) > LINE_LIMIT:
+            raise UnreadableInputError(
+                str(self._path),
+                f"a line after line {line_number} has more than {LINE_LIMIT} bytes",
+                "Give one point a line",
+            )
         try:
             return _to_table(lines, self._width, self._separator)
         except ValueError:

@@ -21,7 +21,7 @@ from pipeline.errors import InconsistentInputError, UnreadableInputError
 from pipeline.io import copc
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.las_header import REWRITE, header_crs, read_header_block
-from pipeline.io.laz_chunks import CHUNK_SIZE_LIMIT, ChunkTable, check_last_chunk, read_chunk_table
+from pipeline.io.laz_chunks import CHUNK_SIZE_LIMIT, ChunkTable, check_chunks, read_chunk_table
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class LasFile:
             if self._block.compressed:
                 self._laszip_record = self._read_laszip_record()
                 self._chunks = read_chunk_table(path, stream, self._block, self._laszip_record)
-                check_last_chunk(path, stream, self._block, self._laszip_record, self._chunks)
+                check_chunks(path, stream, self._block, self._laszip_record, self._chunks)
                 self._copc = copc.octree_info(self._header)
             else:
                 self._check_room()

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 CHUNK_SIZE_LIMIT = 4_000_000
 """Points a chunk beyond which chunks are not decoded at once: writers use 50,000, COPC some 100,000."""
+LAYERS = {6: (30, 9), 7: (36, 10), 8: (38, 11), 9: (59, 10), 10: (67, 12)}
+"""Bytes a record without extra bytes, and compressed layers, by point format; each extra byte is a layer of its own."""
 FIX = "Get the file again, or rewrite it with a LAZ tool"
 
 
@@ -120,32 +122,63 @@ def _table_offset(stream: BinaryIO, block: HeaderBlock) -> int:
     return at
 
 
-def check_last_chunk(path: Path, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes, table: ChunkTable) -> None:
-    """Hold the header's count against the last chunk of a file of a fixed chunk size, to the point.
-
-    Point formats 6 and above store the count of a chunk after its first record. The older ones do not, but their
-    arithmetic coder uses up its bytes exactly: the right count fails with one byte less, and with one point more.
+def check_chunks(path: Path, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes, table: ChunkTable) -> None:
+    """Hold the header's count against the chunks, to the point.
 
     Raises
     ------
     InconsistentInputError
-        If the last chunk holds another number of points.
+        If the chunks hold another number of points.
     UnreadableInputError
-        If it cannot be decoded.
+        If a chunk is damaged.
+    """
+    if block.point_format >= 6:
+        _check_layers(path, stream, block, table)
+    elif not table.variable and table.counts[-1] <= CHUNK_SIZE_LIMIT:
+        _check_last_chunk(path, stream, block, laszip_record, table)
+
+
+def _check_layers(path: Path, stream: BinaryIO, block: HeaderBlock, table: ChunkTable) -> None:
+    """Point formats 6 and above: a chunk has one record, its count, the sizes of its layers, and the layers.
+
+    lazrs asks for as much memory as a layer's size says, so a damaged one must not get there.
+    """
+    base_size, layers = LAYERS[block.point_format]
+    layers += table.item_size - base_size
+    head = np.dtype([("count", "<u4"), ("sizes", "<u4", (layers,))])
+    rows = zip(table.offsets.tolist(), table.sizes.tolist(), table.counts.tolist(), strict=True)
+    held = 0
+    for offset, size, count in rows:
+        if count == 0:
+            continue
+        stream.seek(offset + table.item_size)
+        raw = stream.read(head.itemsize)
+        if len(raw) < head.itemsize:
+            raise UnreadableInputError(str(path), f"truncated: the chunk at byte {offset} has no layers", FIX)
+        found = np.frombuffer(raw, dtype=head)[0]
+        if table.item_size + head.itemsize + int(found["sizes"].sum(dtype=np.int64)) != size:
+            raise UnreadableInputError(str(path), f"the layers of the chunk at byte {offset} are damaged", FIX)
+        held += int(found["count"])
+        if found["count"] != count and offset != table.offsets[-1]:
+            raise InconsistentInputError(
+                str(path), f"the chunk at byte {offset} has {found['count']} points, the chunk table says {count}", FIX
+            )
+    if held != block.point_count:
+        raise InconsistentInputError(
+            str(path), f"the header promises {block.point_count} points, its chunks hold {held}", FIX
+        )
+
+
+def _check_last_chunk(
+    path: Path, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes, table: ChunkTable
+) -> None:
+    """Older point formats: a chunk does not store its count, but its arithmetic coder uses up its bytes exactly.
+
+    So the right count fails with one byte less, and with one point more.
     """
     count, size = int(table.counts[-1]), int(table.sizes[-1])
-    if table.variable or count > CHUNK_SIZE_LIMIT:
-        return
     stream.seek(int(table.offsets[-1]))
     chunk = stream.read(size)
-    before = block.point_count - count
-    if block.point_format >= 6:
-        held = struct.unpack_from("<I", chunk, table.item_size)[0] if size >= table.item_size + 4 else 0
-        if held != count:
-            raise InconsistentInputError(
-                str(path), f"the header promises {block.point_count} points, its chunks hold {before + held}", FIX
-            )
-        return
     if size > table.item_size and _decodes(chunk[:-1], count, laszip_record, table.item_size):
         if _decodes(chunk, count + 1, laszip_record, table.item_size):
             raise InconsistentInputError(

@@ -201,13 +201,15 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
 
     # 3.3: best-fit planes on the original elevations, merging, absorption of outliers, straight ridges.
     fewest_points = settings.fewest_points(spacing_m)
-    refined = {"distance_m": distance_m, "fewest_points": fewest_points}
-    planes, labels = refine_planes(roof, neighbours, rough, **refined, settings=settings)
+    planes, labels = refine_planes(
+        roof, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=settings
+    )
     if settings.leftover_rounds > 0:
-        with_leftovers = cluster_leftovers(roof, neighbours, labels, distance_m, fewest_points)
-        if (with_leftovers != labels).any():
-            again = dataclasses.replace(settings, rounds=settings.leftover_rounds)
-            planes, labels = refine_planes(roof, neighbours, with_leftovers, **refined, settings=again)
+        rough = cluster_leftovers(roof, neighbours, labels, distance_m, fewest_points)
+        again = dataclasses.replace(settings, rounds=settings.leftover_rounds)
+        planes, labels = refine_planes(
+            roof, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=again
+        )
     reach_m = settings.ridge_reach_spacings * spacing_m
     ridges = find_ridges(roof, planes, labels, neighbours, distance_m=distance_m, reach_m=reach_m)
     labels = label_by_ridges(roof, planes, labels, ridges, distance_m=distance_m, reach_m=reach_m)

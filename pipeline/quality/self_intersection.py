@@ -3,8 +3,9 @@
 Two triangles of different faces may have in common what they share as vertices: nothing, a vertex or an edge. Every
 further point, also mere touching, is an intersection. Candidate pairs come from a sweep over bounding boxes.
 
-Orientation tests are determinants of 3 x 3 differences. Their value modulo 2^64 is exact in wrapping integers, so it
-is the value itself wherever a float estimate says that it is small; where it is large the estimate's sign is right.
+Orientation tests are determinants of 3 x 3 differences, which need up to 80 bits: the normal is split into a high and
+a low part, so that no sum leaves an int64 for solids of up to 60 km. (Integers must not wrap: the compiler relies on
+signed sums that do not overflow.)
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from numba import njit
 from pipeline.model import IntArray
 from pipeline.triangulation.edge_flips import ascending_order
 
-_SURELY_EXACT = 4.0e18
-"""A determinant whose float estimate is below this fits an int64, whatever the estimate's error."""
+_LOW_BITS = 20
+_LOW_MASK = (1 << _LOW_BITS) - 1
 
 
 @njit(cache=True, nogil=True)
@@ -26,15 +27,12 @@ def side_of_plane(vertices: IntArray, a: int, b: int, c: int, d: int) -> int:
     vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
     wx, wy, wz = vertices[d, 0] - vertices[a, 0], vertices[d, 1] - vertices[a, 1], vertices[d, 2] - vertices[a, 2]
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    estimate = float(nx) * float(wx) + float(ny) * float(wy) + float(nz) * float(wz)
-    if estimate > _SURELY_EXACT:
-        return 1
-    if estimate < -_SURELY_EXACT:
+    high = (nx >> _LOW_BITS) * wx + (ny >> _LOW_BITS) * wy + (nz >> _LOW_BITS) * wz
+    low = (nx & _LOW_MASK) * wx + (ny & _LOW_MASK) * wy + (nz & _LOW_MASK) * wz
+    high += low >> _LOW_BITS
+    if high < 0:
         return -1
-    exact = nx * wx + ny * wy + nz * wz
-    if exact > 0:
-        return 1
-    return -1 if exact < 0 else 0
+    return 1 if high > 0 or (low & _LOW_MASK) > 0 else 0
 
 
 @njit(cache=True, nogil=True)

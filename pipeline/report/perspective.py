@@ -27,6 +27,7 @@ VIEW_SUN = (245.0, 48.0)
 _AMBIENT = 0.5
 _SHADOW = "#c9cdc4"
 _EDGE_SHARE = 0.72
+_GRAZING = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -106,7 +107,7 @@ def draw_view(axes: Axes, buildings: Sequence[Sequence[ViewedFace]], view: View)
         visible = []
         for face in buildings[index]:
             normal = face_normal(face.rings)
-            if float(normal @ towards) > 0.0:
+            if float(normal @ towards) > _GRAZING * math.hypot(*normal):
                 visible.append((float(np.mean(face.rings[0] @ towards)), face, normal))
         for _, face, normal in sorted(visible, key=lambda entry: entry[0]):
             paths.append(drawn_path([ring @ screen.T for ring in face.rings]))

@@ -41,6 +41,10 @@ VIEW_SIDE_M = 180.0
 """The bird's-eye view shows a square of this side, the one with the most roof faces."""
 WHOLE_BELOW_M = 260.0
 """It shows the whole run where that is no wider and no longer than this."""
+Window = tuple[float, float, float, float]
+"""West, south, east, north."""
+NO_WINDOW: Window = (0.0, 0.0, 0.0, 0.0)
+"""Of a run without roof faces."""
 _SURFACE_KINDS = {"RoofSurface", "WallSurface"}
 
 
@@ -49,6 +53,7 @@ def render_run(
     png_path: str | Path,
     truth: str | Path | None = None,
     filesystem: pafs.FileSystem | None = None,
+    dpi: int = 120,
 ) -> None:
     """Draw a finished run to a PNG file.
 
@@ -65,6 +70,8 @@ def render_run(
         A local run directory of true models, whose footprints are drawn as dashed lines.
     filesystem : pyarrow.fs.FileSystem, optional
         Where the run lies; local by default.
+    dpi : int
+        Pixels an inch of a picture of 20 by 10.5 inches.
 
     Raises
     ------
@@ -77,15 +84,16 @@ def render_run(
     rejected = read_table(run, "rejected", filesystem)
     outlines = None if truth is None else _geometries(read_table(str(truth), "buildings"))
     units = _units(run, filesystem)
-    figure = Figure(figsize=(20.0, 10.5), dpi=120, facecolor="white")
+    figure = Figure(figsize=(20.0, 10.5), dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     plan, view = figure.subplots(1, 2, gridspec_kw={"width_ratios": [0.85, 1.0], "wspace": 0.02})
     figure.subplots_adjust(left=0.01, right=0.99, top=0.94, bottom=0.06)
-    window = _densest_window(planes, units[0])
+    window, is_part = _window(planes, units[0])
     _draw_map(plan, buildings, planes, rejected, outlines)
     _draw_scale_bar(plan, units[0])
-    if window is not None:
+    if is_part:
         _draw_window(plan, window)
+    if window != NO_WINDOW:
         models = _solids(run, buildings, window, units, filesystem)
         if models:
             draw_view(view, models, View())
@@ -111,18 +119,18 @@ def _units(run_dir: str, filesystem: pafs.FileSystem | None) -> tuple[float, flo
     return float(crs.get("horizontal_unit_m", 1.0)), float(crs.get("vertical_unit_m", 1.0))
 
 
-def _densest_window(planes: pa.Table, unit_m: float) -> tuple[float, float, float, float] | None:
-    """The square of the given side with the most roof faces, in CRS units; None without faces.
+def _window(planes: pa.Table, unit_m: float) -> tuple[Window, bool]:
+    """What the bird's-eye view shows, in CRS units, and whether that is less than the whole run.
 
-    Faces are counted on a lattice of half the side; the first of equals is taken. A run that is small is taken whole.
+    The square with the most roof faces is found on a lattice of half its side; the first of equals is taken.
     """
     found = _geometries(planes)
     present = found[~shapely.is_missing(found)]
     if len(present) == 0:
-        return None
+        return NO_WINDOW, False
     west, south, east, north = (float(v) for v in shapely.total_bounds(present))
     if max(east - west, north - south) <= WHOLE_BELOW_M / unit_m:
-        return west, south, east, north
+        return (west, south, east, north), False
     side = VIEW_SIDE_M / unit_m
     cell = np.floor((shapely.get_coordinates(shapely.centroid(present)) - [west, south]) / (side / 2.0)).astype(int)
     counts = np.zeros(cell.max(axis=0) + 2, dtype=np.int64)
@@ -131,7 +139,7 @@ def _densest_window(planes: pa.Table, unit_m: float) -> tuple[float, float, floa
     column, row = np.unravel_index(int(np.argmax(pooled)), pooled.shape)
     left = max(west, min(west + float(column) * side / 2.0, east - side))
     bottom = max(south, min(south + float(row) * side / 2.0, north - side))
-    return left, bottom, left + side, bottom + side
+    return (left, bottom, left + side, bottom + side), True
 
 
 def _rings(polygon: shapely.Polygon) -> list[Any]:
@@ -171,7 +179,7 @@ def _draw_map(axes: Axes, buildings: pa.Table, planes: pa.Table, rejected: pa.Ta
             marked.set_hatch("////" if status is Status.FALLBACK else "xxxx")
             axes.add_collection(marked)
     if truth is not None:
-        _draw_outlines(axes, truth, color="#0050a0", linewidths=0.9, linestyles=(0, (4, 2)))
+        _draw_outlines(axes, truth, color="#0050a0", linewidths=1.4, linestyles=(0, (4, 2)))
     axes.set_aspect("equal")
     axes.autoscale_view()
     axes.set_xticks([])
@@ -205,7 +213,7 @@ def _draw_scale_bar(axes: Axes, unit_m: float) -> None:
     axes.text(x, y + 2.0 * height, f"{length_m:g} m", fontsize=11, color="#222222", zorder=5)
 
 
-def _draw_window(axes: Axes, window: tuple[float, float, float, float]) -> None:
+def _draw_window(axes: Axes, window: Window) -> None:
     """The square that the bird's-eye view shows."""
     west, south, east, north = window
     axes.add_patch(
@@ -216,7 +224,7 @@ def _draw_window(axes: Axes, window: tuple[float, float, float, float]) -> None:
 def _solids(
     run_dir: str,
     buildings: pa.Table,
-    window: tuple[float, float, float, float],
+    window: Window,
     units: tuple[float, float],
     filesystem: pafs.FileSystem | None,
 ) -> list[list[ViewedFace]]:
@@ -261,7 +269,8 @@ def _title(statistics: dict[str, Any], buildings: pa.Table) -> str:
     """Counts and residuals in two lines."""
     statuses, rmse = statistics["statuses"], statistics["quantiles"]["rmse_m"]
     methods = ", ".join(sorted(set(buildings["method"].to_pylist()))) or "no method"
-    told = f"{statistics['candidates']} candidates by {methods}: " + ", ".join(f"{n} {s}" for s, n in statuses.items())
+    noun = "candidate" if statistics["candidates"] == 1 else "candidates"
+    told = f"{statistics['candidates']} {noun} by {methods}: " + ", ".join(f"{n} {s}" for s, n in statuses.items())
     if rmse["p50"] is None:
         return told
     coverage = statistics["quantiles"]["coverage"]["p50"]

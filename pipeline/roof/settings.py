@@ -17,20 +17,20 @@ class RoofSettings(Parameters):
         1.5, "Points lower than this above the floor are no roof points.", unit="m", minimum=0.2, maximum=10.0
     )
     gap_spacings: float = parameter(
-        1.3,
+        1.5,
         "A place farther than this from every roof point is not roof.",
         unit="point spacings",
         minimum=0.7,
         maximum=5.0,
     )
     outside_fraction: float = parameter(
-        0.3,
+        0.27,
         "Where on the way from a roof point to the nearest empty place the eave lies, without a footprint.",
         minimum=0.05,
         maximum=0.95,
     )
     step_offset_spacings: float = parameter(
-        0.35,
+        0.5,
         "Distance of a high step edge from the outermost points of its upper face.",
         unit="point spacings",
         minimum=0.0,
@@ -40,7 +40,7 @@ class RoofSettings(Parameters):
         True, "Whether the outline is drawn with straight lines where no footprint is given."
     )
     eave_tolerance_spacings: float = parameter(
-        1.0,
+        1.2,
         "How far the raw outline may lie from its straight lines.",
         unit="point spacings",
         minimum=0.2,

@@ -50,9 +50,7 @@ def measure(function: Callable[[Task], Result], task: Task) -> Measured[Result]:
 class Executor(Protocol):
     """What a run needs of an engine."""
 
-    def map(
-        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]
-    ) -> Iterator[Measured[Result]]:
+    def map(self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Measured[Result]]:
         """Results of all tasks, in the order in which they finish."""
 
     @property
@@ -71,9 +69,7 @@ class Executor(Protocol):
 class SerialExecutor:
     """One task after the other, in this process."""
 
-    def map(
-        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]
-    ) -> Iterator[Measured[Result]]:
+    def map(self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Measured[Result]]:
         """Results in the order of the tasks."""
         del stage
         for task in tasks:
@@ -159,9 +155,7 @@ class DaskExecutor:
         limits = [w["memory_limit"] for w in self._client.scheduler_info(n_workers=-1)["workers"].values()]
         return min((limit for limit in limits if limit), default=None)
 
-    def map(
-        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]
-    ) -> Iterator[Measured[Result]]:
+    def map(self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Measured[Result]]:
         """Results as they come, with a bounded window of tasks in flight.
 
         Raises

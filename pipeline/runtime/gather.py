@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
+import datetime as dt
 import hashlib
 from collections.abc import Mapping
 
@@ -129,9 +129,7 @@ def gather(
         high = np.array([round(x1 * MM), round(y1 * MM), 0], np.int64)
     origin_mm = low // MM * MM
     margin = _VIEW_MARGIN_M * MM
-    view = Window(
-        x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1
-    ).grown(margin)
+    view = Window(x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1).grown(margin)
     around = surroundings_of(scratch, grid, view)
     roof = np.zeros(around.occupied.shape, np.bool_)
     roof[xyz[:, 1] // CELL_MM - around.row0, xyz[:, 0] // CELL_MM - around.column0] = True
@@ -172,7 +170,7 @@ def gather(
     return candidate, CandidateFacts(input_hash=digest.hexdigest(), **_acquired(points, gps_kind))
 
 
-def _acquired(points: npt.NDArray[np.void], kind: GpsTimeKind) -> Mapping[str, datetime.datetime | None]:
+def _acquired(points: npt.NDArray[np.void], kind: GpsTimeKind) -> Mapping[str, dt.datetime | None]:
     """First and last time of the points where GPS times tell dates."""
     if kind is not GpsTimeKind.ADJUSTED or len(points) == 0:
         return {"acquired_from": None, "acquired_to": None}

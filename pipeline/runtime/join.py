@@ -174,7 +174,9 @@ def whole_surfaces(splits: Sequence[Split]) -> tuple[Surfaces, npt.NDArray[np.in
     order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], surface))
     _, first = np.unique(surface[order], return_index=True)
     along = [
-        f.along_steps + np.array([offset, offset, 0]) for f, offset in _with_offsets(splits, offsets) if len(f.along_steps)
+        f.along_steps + np.array([offset, offset, 0])
+        for f, offset in _with_offsets(splits, offsets)
+        if len(f.along_steps)
     ]
     pairs = _summed_pairs(np.concatenate(along), surface) if along else np.empty((0, 3), np.int64)
     whole = Surfaces(

@@ -62,9 +62,7 @@ def publish(task: PublishTask) -> Published:
     stored: list[StoredResult] = []
     for number in task.batches:
         stored.extend(task.scratch.get_object(f"results/{task.tile.key}/{number}.pickle"))
-    context = dataclasses.replace(
-        task.context, facts={entry.result.building_id: entry.facts for entry in stored}
-    )
+    context = dataclasses.replace(task.context, facts={entry.result.building_id: entry.facts for entry in stored})
     files = write_tile(
         task.run_dir,
         task.tile.key,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
+import datetime as dt
 import shutil
 import time
 from collections import Counter
@@ -172,7 +172,7 @@ def run(request: RunRequest, on_event: Listener = ignore) -> RunSummary:
     RunError
         The run directory cannot be used, or workers died.
     """
-    started_at = datetime.datetime.now(tz=datetime.UTC)
+    started_at = dt.datetime.now(tz=dt.UTC)
     driver = _Driver(on_event)
     began = time.perf_counter()
     driver.tell("run", "plan", f"run into {request.out}")
@@ -231,7 +231,7 @@ def run(request: RunRequest, on_event: Listener = ignore) -> RunSummary:
         dataclasses.replace(
             manifest,
             status=RunStatus.FINISHED,
-            finished_at=datetime.datetime.now(tz=datetime.UTC),
+            finished_at=dt.datetime.now(tz=dt.UTC),
             inputs=tuple(inputs),
             tiles=tuple(tiles),
             counts=counts,

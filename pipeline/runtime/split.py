@@ -22,7 +22,7 @@ from pipeline.scene import (
     terrain_of,
 )
 from pipeline.spatial_hash import first_of_each
-from pipeline.terrain.ground import CELL_MM, NO_DATA, Terrain, height_above
+from pipeline.terrain.ground import NO_DATA, Terrain, height_above
 from pipeline.terrain.surfaces import Fragments
 from pipeline.tiling import MM, Tile, TileGrid, Window
 

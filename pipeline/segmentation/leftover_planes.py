@@ -1,7 +1,7 @@
 """A second look at points that no plane explains: small faces whose facets were too few or too noisy to cluster.
 
-An extension of the paper, whose small houses "are unable to be reconstructed due to under sampling": clusters grow among the
-leftover points from the flattest neighbourhoods on, and go through the same refinement as those of the facets.
+An extension of the paper, which tells that small, under-sampled faces are lost: clusters grow among the leftovers,
+from the flattest neighbourhoods on, and go through the same refinement as those of the facets.
 """
 
 from __future__ import annotations

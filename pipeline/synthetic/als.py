@@ -26,7 +26,7 @@ _FIRST_GPS_TIME_S = 427_536_018.0
 _TURN_S = 120.0
 """From the end of a strip to the start of the next."""
 _PULSES_A_BLOCK = 131_072
-"""Work unit of a thread: what it holds in memory is this many pulses."""
+"""Work unit of a thread: it holds at most this many pulses in memory."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -146,7 +146,7 @@ def scan(
     """
     arrays = scene_arrays(scene, settings.max_lean, settings.beam_radius_m + settings.pulse_spacing_m)
     pending: list[ScanBlock] = []
-    for block in _in_order(_jobs(scene, settings, seed), arrays, scene, settings, seed, threads):
+    for block in _in_order(_jobs(scene, settings, seed, chunk_points), arrays, scene, settings, seed, threads):
         if len(block):
             pending.append(block)
         if sum(len(one) for one in pending) >= chunk_points:
@@ -218,10 +218,10 @@ def _flight_lines(scene: Scene, settings: ScannerSettings, seed: int) -> list[Fl
     return lines
 
 
-def _jobs(scene: Scene, settings: ScannerSettings, seed: int) -> Iterator[_Job]:
+def _jobs(scene: Scene, settings: ScannerSettings, seed: int, chunk_points: int) -> Iterator[_Job]:
     spacing = settings.pulse_spacing_m
     per_line = math.ceil(2 * settings.half_swath_m / spacing)
-    step = max(1, _PULSES_A_BLOCK // per_line)
+    step = max(1, min(_PULSES_A_BLOCK, chunk_points) // per_line)
     for line in _flight_lines(scene, settings, seed):
         count = math.ceil(line.length / spacing)
         for first in range(0, count, step):

@@ -11,9 +11,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import numpy.typing as npt
 
-from pipeline.model import IntArray, Reason
+from pipeline.model import IntArray, KindArray, Reason
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.surfaces import FacetKind, Sum
 
@@ -32,9 +31,7 @@ class CandidateSettings(Parameters):
     min_area_m2: float = parameter(
         10.0, "Least plan area of a building's surface.", unit="m2", minimum=1.0, maximum=1000.0
     )
-    min_height_m: float = parameter(
-        2.0, "Least mean height above the terrain.", unit="m", minimum=0.5, maximum=20.0
-    )
+    min_height_m: float = parameter(2.0, "Least mean height above the terrain.", unit="m", minimum=0.5, maximum=20.0)
     min_width_m: float = parameter(
         1.5, "Least mean width, twice the area over the outline.", unit="m", minimum=0.0, maximum=20.0
     )
@@ -44,9 +41,7 @@ class CandidateSettings(Parameters):
     max_canopy_share: float = parameter(
         0.35, "Largest share of earlier returns above the surface.", minimum=0.0, maximum=1.0
     )
-    min_wall_share: float = parameter(
-        0.15, "Least share of the outline that touches walls.", minimum=0.0, maximum=1.0
-    )
+    min_wall_share: float = parameter(0.15, "Least share of the outline that touches walls.", minimum=0.0, maximum=1.0)
     min_top_share: float = parameter(
         0.3,
         "Least share of the touching walls at whose top the surface lies (the Z_avg rule by surface).",
@@ -75,7 +70,7 @@ class CandidateSettings(Parameters):
 class Surfaces:
     """Whole surfaces, merged over tiles."""
 
-    kind: npt.NDArray[np.int8]
+    kind: KindArray
     """(k,) FacetKind."""
     sums: IntArray
     """(k, N_SUMS) columns as in Sum."""
@@ -134,9 +129,7 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
             return Verdict(reason=Reason.TOO_LOW, detail="ground")
         return None
     if f["area_m2"] < settings.min_area_m2:
-        return Verdict(
-            reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {settings.min_area_m2:g}"
-        )
+        return Verdict(reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {settings.min_area_m2:g}")
     if kind == FacetKind.BUILDING:
         return None
     if f["height_m"] < settings.min_height_m:
@@ -193,9 +186,7 @@ def _joins(kind: int, sums: IntArray, verdict: Verdict | None, settings: Candida
     return kind != FacetKind.GROUND and small_roof and f["step_share"] >= settings.unite_share
 
 
-def unite_levels(
-    surfaces: Surfaces, verdicts: list[Verdict | None], settings: CandidateSettings
-) -> npt.NDArray[np.int64]:
+def unite_levels(surfaces: Surfaces, verdicts: list[Verdict | None], settings: CandidateSettings) -> IntArray:
     """The candidate that each surface belongs to: its own index, or that of a larger roof across a step.
 
     Parameters

@@ -53,9 +53,7 @@ class GroundSettings(Parameters):
         minimum=0.2,
         maximum=20.0,
     )
-    bridge_m: int = parameter(
-        24, "Farthest that the terrain is drawn under objects.", unit="m", minimum=4, maximum=80
-    )
+    bridge_m: int = parameter(24, "Farthest that the terrain is drawn under objects.", unit="m", minimum=4, maximum=80)
     tolerance_m: float = parameter(
         0.5, "Points closer than this to the terrain are ground.", unit="m", minimum=0.05, maximum=3.0
     )
@@ -75,7 +73,9 @@ class GroundSettings(Parameters):
 
 
 @njit(cache=True, nogil=True)
-def lowest_per_cell(x_mm, y_mm, z_mm, used, column0, row0, columns, rows):  # type: ignore[no-untyped-def]
+def lowest_per_cell(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, used: BoolArray, column0: int, row0: int, columns: int, rows: int
+) -> Elevations:
     """Elevation of the lowest used point of each cell, int32 (rows, columns), NO_DATA where there is none."""
     lowest = np.full((rows, columns), NO_DATA, np.int32)
     for i in range(x_mm.size):
@@ -88,7 +88,7 @@ def lowest_per_cell(x_mm, y_mm, z_mm, used, column0, row0, columns, rows):  # ty
 
 
 @njit(cache=True, nogil=True)
-def _without_pits(lowest, depth_mm):  # type: ignore[no-untyped-def]
+def _without_pits(lowest: Elevations, depth_mm: int) -> Elevations:
     """Clear cells that lie deeper than depth_mm below all but at most two of the 24 cells around."""
     rows, columns = lowest.shape
     out = lowest.copy()
@@ -112,7 +112,7 @@ def _without_pits(lowest, depth_mm):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _extreme_along_rows(values, half, want_low):  # type: ignore[no-untyped-def]
+def _extreme_along_rows(values: Elevations, half: int, want_low: bool) -> Elevations:
     """Sliding minimum (or maximum) over 2 half + 1 cells of each row, skipping NO_DATA (monotonic queue)."""
     rows, columns = values.shape
     out = np.full((rows, columns), NO_DATA, np.int32)
@@ -139,7 +139,7 @@ def _extreme_along_rows(values, half, want_low):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _opened(values, half):  # type: ignore[no-untyped-def]
+def _opened(values: Elevations, half: int) -> Elevations:
     """Morphological opening by a square of 2 half + 1 cells; separable."""
     for low in (True, False):
         values = _extreme_along_rows(values, half, low)
@@ -148,7 +148,7 @@ def _opened(values, half):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _objects(lowest, windows, max_slope, min_step_mm):  # type: ignore[no-untyped-def]
+def _objects(lowest: Elevations, windows: IntArray, max_slope: float, min_step_mm: float) -> BoolArray:
     """Mask of the cells that some step of the growing opening cuts off by more than slope allows."""
     rows, columns = lowest.shape
     flagged = np.zeros((rows, columns), np.bool_)
@@ -167,7 +167,7 @@ def _objects(lowest, windows, max_slope, min_step_mm):  # type: ignore[no-untype
 
 
 @njit(cache=True, nogil=True)
-def _terrain(lowest, is_ground, bridge):  # type: ignore[no-untyped-def]
+def _terrain(lowest: Elevations, is_ground: BoolArray, bridge: int) -> Elevations:
     """Draw local least-squares planes through the ground cells of the smallest box that holds enough.
 
     All sums are integers about the box's own centre: the result does not depend on where the lattice's
@@ -227,19 +227,21 @@ def _terrain(lowest, is_ground, bridge):  # type: ignore[no-untyped-def]
                 b = (vyz * vxx - vxz * vxy) / det
                 # towards the box's edge a plane is trusted, far outside its own points it is not
                 z = mean - (a * sx + b * sy) / n
-                low, high = np.int64(2**31), np.int64(-(2**31))
+                low, high = 1e12, -1e12
                 for rr in range(r0, r1):
                     for cc in range(c0, c1):
                         if is_ground[rr, cc]:
-                            low = min(low, np.int64(lowest[rr, cc]))
-                            high = max(high, np.int64(lowest[rr, cc]))
-                z = min(max(z, float(low)), float(high))
+                            low = min(low, float(lowest[rr, cc]))
+                            high = max(high, float(lowest[rr, cc]))
+                z = min(max(z, low), high)
             terrain[r, c] = np.int32(round(z))
     return terrain
 
 
 @njit(cache=True, nogil=True)
-def height_above(x_mm, y_mm, z_mm, terrain, column0, row0):  # type: ignore[no-untyped-def]
+def height_above(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, terrain: Elevations, column0: int, row0: int
+) -> IntArray:
     """Heights of points above the bilinear terrain in mm, int64 (n,); NO_DATA where there is no terrain."""
     rows, columns = terrain.shape
     out = np.empty(x_mm.size, np.int64)
@@ -323,4 +325,3 @@ def ground_of(
         column0=column0,
         row0=row0,
     )
-

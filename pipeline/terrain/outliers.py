@@ -39,7 +39,7 @@ class OutlierSettings(Parameters):
 
 
 @njit(cache=True, nogil=True)
-def _dense_enough(x_mm, y_mm, z_mm, cube_mm, min_neighbours):  # type: ignore[no-untyped-def]
+def _dense_enough(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, cube_mm: int, min_neighbours: int) -> BoolArray:
     """Kernel: count points a cube, then sum the 27 cubes around each occupied cube once."""
     n = x_mm.size
     keep = np.zeros(n, np.bool_)

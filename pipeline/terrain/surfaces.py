@@ -13,10 +13,9 @@ import math
 from enum import IntEnum
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-from pipeline.model import BoolArray, IntArray, LabelArray, Tin
+from pipeline.model import BoolArray, IntArray, KindArray, LabelArray, Tin
 from pipeline.parameters import Parameters, parameter
 
 
@@ -92,9 +91,7 @@ class SurfaceSettings(Parameters):
     max_circumradius_m: float = parameter(
         6.0, "Facets with a wider circumcircle bridge a gap in the data.", unit="m", minimum=1.0, maximum=30.0
     )
-    wall_m: float = parameter(
-        2.0, "MX_zdiff from which a facet is a wall.", unit="m", minimum=0.5, maximum=10.0
-    )
+    wall_m: float = parameter(2.0, "MX_zdiff from which a facet is a wall.", unit="m", minimum=0.5, maximum=10.0)
     steep_deg: float = parameter(
         70.0, "Facets steeper than this cut too, from steep_m on.", unit="deg", minimum=45.0, maximum=90.0
     )
@@ -119,7 +116,19 @@ class SurfaceSettings(Parameters):
 
 
 @njit(cache=True, nogil=True)
-def classify_facets(x, y, z, height, kind, facets, max_radius_mm, wall_mm, steep_slope, steep_mm, step_mm):  # type: ignore[no-untyped-def]
+def classify_facets(
+    x: IntArray,
+    y: IntArray,
+    z: IntArray,
+    height: IntArray,
+    kind: KindArray,
+    facets: LabelArray,
+    max_radius_mm: float,
+    wall_mm: int,
+    steep_slope: float,
+    steep_mm: int,
+    step_mm: int,
+) -> KindArray:
     """Kind of every facet, int8 (m,), from vertices in mm; steep_slope is rise over run."""
     m = facets.shape[0]
     out = np.empty(m, np.int8)
@@ -163,7 +172,9 @@ def classify_facets(x, y, z, height, kind, facets, max_radius_mm, wall_mm, steep
 
 
 @njit(cache=True, nogil=True)
-def _marks(x, y, facets, kinds, core, far_mm):  # type: ignore[no-untyped-def]
+def _marks(
+    x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArray, core: tuple[int, int, int, int], far_mm: int
+) -> tuple[BoolArray, BoolArray]:
     """Masks of the vertices that the core's points may refer to, and of those that another tile's may refer to too.
 
     Points refer to the vertices of the facet around them and to vertices within far_mm. Facets across gaps do not
@@ -190,7 +201,7 @@ def _marks(x, y, facets, kinds, core, far_mm):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _with_vertex(facets, marked):  # type: ignore[no-untyped-def]
+def _with_vertex(facets: LabelArray, marked: BoolArray) -> BoolArray:
     """Mask of the facets with at least one marked vertex."""
     out = np.empty(facets.shape[0], np.bool_)
     for f in range(facets.shape[0]):
@@ -199,7 +210,7 @@ def _with_vertex(facets, marked):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def label_fragments(kinds, neighbours, considered):  # type: ignore[no-untyped-def]
+def label_fragments(kinds: KindArray, neighbours: LabelArray, considered: BoolArray) -> tuple[LabelArray, KindArray]:
     """Fragment of every considered facet of a surface kind (-1 for others), and the kind of each fragment."""
     m = kinds.size
     label = np.full(m, -1, np.int32)
@@ -227,7 +238,7 @@ def label_fragments(kinds, neighbours, considered):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def label_vertices(x, y, facets, kinds, label):  # type: ignore[no-untyped-def]
+def label_vertices(x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArray, label: LabelArray) -> LabelArray:
     """Fragment of every vertex: that of its largest object or building facet; -1 where there is none.
 
     Equal areas are decided by the smallest centroid, so that all tiles agree.
@@ -257,7 +268,21 @@ def label_vertices(x, y, facets, kinds, label):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def sum_fragments(x, y, z, height, planar, facets, neighbours, kinds, label, vertex_label, count, core, wall_mm):  # type: ignore[no-untyped-def]
+def sum_fragments(
+    x: IntArray,
+    y: IntArray,
+    z: IntArray,
+    height: IntArray,
+    planar: KindArray,
+    facets: LabelArray,
+    neighbours: LabelArray,
+    kinds: KindArray,
+    label: LabelArray,
+    vertex_label: LabelArray,
+    count: int,
+    core: tuple[int, int, int, int],
+    wall_mm: int,
+) -> tuple[IntArray, IntArray, IntArray]:
     """Sums of the fragments over what the core owns, bounding boxes, and their lengths along steps.
 
     A facet is owned through its smallest (x, y) vertex, a vertex through itself.
@@ -334,7 +359,9 @@ def sum_fragments(x, y, z, height, planar, facets, neighbours, kinds, label, ver
 
 
 @njit(cache=True, nogil=True)
-def _facet_containing(px, py, start, x, y, facets, neighbours):  # type: ignore[no-untyped-def]
+def _facet_containing(
+    px: int, py: int, start: int, x: IntArray, y: IntArray, facets: LabelArray, neighbours: LabelArray
+) -> tuple[int, int]:
     """Walk to the facet that contains a point, -1 outside the hull; and the edge it lies on, -1 if inside."""
     f = start
     came_from = -1
@@ -363,7 +390,7 @@ def _facet_containing(px, py, start, x, y, facets, neighbours):  # type: ignore[
 
 
 @njit(cache=True, nogil=True)
-def _nearest_vertex(px, py, pz, x, y, z, far_mm):  # type: ignore[no-untyped-def]
+def _nearest_vertex(px: int, py: int, pz: int, x: IntArray, y: IntArray, z: IntArray, far_mm: int) -> int:
     """Nearest vertex in plan within far_mm, equal distances by elevation, then by coordinates; -1 where none.
 
     The vertices come sorted by (x, y).
@@ -385,10 +412,29 @@ def _nearest_vertex(px, py, pz, x, y, z, far_mm):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def assign_points(  # type: ignore[no-untyped-def]
-    px, py, pz, above_ground, last, allowed, x, y, z, facets, neighbours, kinds, label, vertex_label, fragment_kind,
-    reach_mm, canopy_mm, ground_mm, far_mm, sums, lowest_point
-):
+def assign_points(
+    px: IntArray,
+    py: IntArray,
+    pz: IntArray,
+    above_ground: IntArray,
+    last: BoolArray,
+    allowed: KindArray,
+    x: IntArray,
+    y: IntArray,
+    z: IntArray,
+    facets: LabelArray,
+    neighbours: LabelArray,
+    kinds: KindArray,
+    label: LabelArray,
+    vertex_label: LabelArray,
+    fragment_kind: KindArray,
+    reach_mm: int,
+    canopy_mm: int,
+    ground_mm: int,
+    far_mm: int,
+    sums: IntArray,
+    lowest_point: IntArray,
+) -> LabelArray:
     """Fragment of every point of the core, int32 (n,), -1 where none; fills the columns POINTS and CANOPY of sums.
 
     A point belongs to the surface of the facet around it, or at walls and borders to that of the vertex
@@ -444,38 +490,37 @@ def assign_points(  # type: ignore[no-untyped-def]
         elif at_vertex >= 0:
             if abs(pz[i] - z[at_vertex]) <= reach_mm:
                 fragment = vertex_label[at_vertex]
+        elif kinds[f] == 3 or kinds[f] == 4:
+            k = 0
+            for q in range(1, 3):
+                v, w = facets[f, q], facets[f, k]
+                if x[v] < x[w] or (x[v] == x[w] and y[v] < y[w]):
+                    k = q
+            a, b, c3 = facets[f, k], facets[f, (k + 1) % 3], facets[f, (k + 2) % 3]
+            ux, uy, uz = x[b] - x[a], y[b] - y[a], z[b] - z[a]
+            vx, vy, vz = x[c3] - x[a], y[c3] - y[a], z[c3] - z[a]
+            det = float(ux * vy - uy * vx)
+            gx, gy = float(uz * vy - vz * uy) / det, float(ux * vz - vx * uz) / det
+            over = float(pz[i] - z[a]) - gx * (px[i] - x[a]) - gy * (py[i] - y[a])
+            if abs(over) <= reach_mm:
+                fragment = label[f]
+            elif over > canopy_mm and not last[i]:
+                sums[label[f], 14] += 1
         else:
-            if kinds[f] == 3 or kinds[f] == 4:
-                k = 0
-                for q in range(1, 3):
-                    v, w = facets[f, q], facets[f, k]
-                    if x[v] < x[w] or (x[v] == x[w] and y[v] < y[w]):
-                        k = q
-                a, b, c3 = facets[f, k], facets[f, (k + 1) % 3], facets[f, (k + 2) % 3]
-                ux, uy, uz = x[b] - x[a], y[b] - y[a], z[b] - z[a]
-                vx, vy, vz = x[c3] - x[a], y[c3] - y[a], z[c3] - z[a]
-                det = float(ux * vy - uy * vx)
-                gx, gy = float(uz * vy - vz * uy) / det, float(ux * vz - vx * uz) / det
-                over = float(pz[i] - z[a]) - gx * (px[i] - x[a]) - gy * (py[i] - y[a])
-                if abs(over) <= reach_mm:
-                    fragment = label[f]
-                elif over > canopy_mm and not last[i]:
-                    sums[label[f], 14] += 1
-            else:
-                best = reach_mm + 1
-                best_distance = np.int64(2**62)
-                for q in range(3):
-                    v = facets[f, q]
-                    if vertex_label[v] < 0:
-                        continue
-                    dz = abs(pz[i] - z[v])
-                    distance = (px[i] - x[v]) ** 2 + (py[i] - y[v]) ** 2
-                    if dz < best or (dz == best and distance < best_distance):
-                        best = dz
-                        best_distance = distance
-                        fragment = vertex_label[v]
-                if best > reach_mm:
-                    fragment = -1
+            best = reach_mm + 1
+            best_distance = np.int64(2**62)
+            for q in range(3):
+                v = facets[f, q]
+                if vertex_label[v] < 0:
+                    continue
+                dz = abs(pz[i] - z[v])
+                distance = (px[i] - x[v]) ** 2 + (py[i] - y[v]) ** 2
+                if dz < best or (dz == best and distance < best_distance):
+                    best = dz
+                    best_distance = distance
+                    fragment = vertex_label[v]
+            if best > reach_mm:
+                fragment = -1
         if fragment < 0 or (fragment_kind[fragment] != 3 and fragment_kind[fragment] != 4):
             continue
         if fragment_kind[fragment] == 4 and allowed[i] != 2:
@@ -489,7 +534,7 @@ def assign_points(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def facet_keys(x, y, facets, chosen):  # type: ignore[no-untyped-def]
+def facet_keys(x: IntArray, y: IntArray, facets: LabelArray, chosen: IntArray) -> IntArray:
     """Coordinates (k, 6) of the vertices of the chosen facets, from the smallest on, counter-clockwise.
 
     The same facet gives the same coordinates in every tile that sees it: that is how fragments of one
@@ -514,7 +559,7 @@ def facet_keys(x, y, facets, chosen):  # type: ignore[no-untyped-def]
 class Fragments:
     """The surface fragments of one tile: small descriptors that add up over tile borders."""
 
-    kind: npt.NDArray[np.int8]
+    kind: KindArray
     """(k,) int8, FacetKind of each fragment."""
     sums: IntArray
     """(k, N_SUMS) int64, columns as in Sum."""
@@ -539,9 +584,9 @@ class SceneVertices:
     z_mm: IntArray
     height_mm: IntArray
     """Height above the terrain."""
-    kind: npt.NDArray[np.int8]
+    kind: KindArray
     """VertexKind."""
-    planar: npt.NDArray[np.int8]
+    planar: KindArray
     """1 planar surroundings, 0 rough, -1 unknown."""
 
 
@@ -556,7 +601,7 @@ class ScenePoints:
     """Height above the terrain."""
     last: BoolArray
     """Last return of its pulse."""
-    allowed: npt.NDArray[np.int8]
+    allowed: KindArray
     """By the trusted classes: 0 may not belong to a building, 2 is building, 1 anything else."""
 
 

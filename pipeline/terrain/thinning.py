@@ -8,7 +8,6 @@ and lets trees fall apart. Sparse clouds pass unchanged: thinning adapts by itse
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from pipeline.model import BoolArray, IntArray
@@ -18,7 +17,9 @@ _BITS = 31
 
 
 @njit(cache=True, nogil=True)
-def _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, cell_mm):  # type: ignore[no-untyped-def]
+def _highest_per_cell(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, preferred: BoolArray, used: BoolArray, cell_mm: int
+) -> IntArray:
     """Kernel: of each cell the point that is preferred, highest, then southernmost, then westernmost."""
     n = x_mm.size
     size = 2
@@ -64,7 +65,7 @@ def _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, cell_mm):  # type: igno
 
 def highest_per_cell(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, preferred: BoolArray, used: BoolArray, cell_m: float
-) -> npt.NDArray[np.int64]:
+) -> IntArray:
     """Indices of one point a cell, ordered by (x, y).
 
     Parameters
@@ -85,5 +86,5 @@ def highest_per_cell(
     """
     chosen = _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, round(cell_m * 1000))
     order = np.lexsort((y_mm[chosen], x_mm[chosen]))
-    result: npt.NDArray[np.int64] = chosen[order]
+    result: IntArray = chosen[order]
     return result

@@ -10,10 +10,9 @@ import dataclasses
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-from pipeline.model import BoolArray, IntArray
+from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.parameters import Parameters, parameter
 
 _SCALES = 3
@@ -65,7 +64,16 @@ def smallest_eigenvalue(xx: float, xy: float, xz: float, yy: float, yz: float, z
 
 
 @njit(cache=True, nogil=True)
-def _planar(x_mm, y_mm, z_mm, wanted, radius_mm, min_points, roughness_mm, out):  # type: ignore[no-untyped-def]
+def _planar(
+    x_mm: IntArray,
+    y_mm: IntArray,
+    z_mm: IntArray,
+    wanted: BoolArray,
+    radius_mm: int,
+    min_points: int,
+    roughness_mm: float,
+    out: KindArray,
+) -> None:
     """Kernel for one scale: fills the wanted entries of out that are still -1 with 1 (planar) or 0 (rough)."""
     n = x_mm.size
     if n == 0:
@@ -138,7 +146,7 @@ def _planar(x_mm, y_mm, z_mm, wanted, radius_mm, min_points, roughness_mm, out):
 
 def planarity(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, wanted: BoolArray, settings: VegetationSettings
-) -> npt.NDArray[np.int8]:
+) -> KindArray:
     """Whether the surroundings of each vertex are planar.
 
     A vertex is judged by the most planar of nine windows: one around it and eight shifted by 0.8 of

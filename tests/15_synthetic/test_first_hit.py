@@ -69,11 +69,11 @@ def test_a_leaning_line_hits_where_walking_down_along_it_ends(scene: Scene) -> N
     for _ in range(120):
         target = buildings[int(random.integers(len(buildings)))]
         lean_x, lean_y = random.uniform(-0.3, 0.3, 2)
-        start_x, start_y = random.uniform(-9, 9, 2) + (target.x, target.y)
+        start_x, start_y = random.uniform(-9, 9, 2) + np.array([target.x, target.y])
         x, y, z = terrain_hit(arrays, start_x, start_y, arrays.terrain[0], lean_x, lean_y)
         assert scene.terrain.elevation(np.array([x]), np.array([y]))[0] == pytest.approx(z, abs=1e-5)
         got, kind, _, _ = first_hit(arrays, cell_of(arrays, x, y), x, y, z, lean_x, lean_y, np.uint64(0), -1)
-        heights = np.arange(25.0, -step, -step)
+        heights = np.arange(25.0, -0.1, -step)
         top = top_surface(scene, x + heights * lean_x, y + heights * lean_y).z
         walked = z + heights[np.argmax(top >= z + heights)]
         assert got == pytest.approx(walked, abs=0.05 if kind == GROUND else step * 2.5)
@@ -94,7 +94,9 @@ def test_a_crown_lets_beams_pass_as_the_law_of_attenuation_says() -> None:
     )
     arrays = scene_arrays(scene)
     cell, tries = cell_of(arrays, 10.0, 10.0), 20_000
-    hits = [first_hit(arrays, cell, 10.0, 10.0, 0.0, 0.0, 0.0, mixed_bits(np.uint64(k)), 0) for k in range(tries)]
+    hits = [
+        first_hit(arrays, cell, 10.0, 10.0, 0.0, 0.0, 0.0, np.uint64(mixed_bits(np.uint64(k))), 0) for k in range(tries)
+    ]
     depth = 10.0 - np.array([z for z, kind, _, _ in hits if kind == TREE])
     assert len(depth) / tries == pytest.approx(1 - math.exp(-4.0 / 2.5), abs=0.015)
     assert depth.min() >= 0
@@ -104,7 +106,7 @@ def test_a_crown_lets_beams_pass_as_the_law_of_attenuation_says() -> None:
 
 
 def test_random_numbers_are_uniform_and_independent_of_one_another() -> None:
-    states = [mixed_bits(np.uint64(k)) for k in range(2000)]
+    states = [np.uint64(mixed_bits(np.uint64(k))) for k in range(2000)]
     draws = np.array([[uniform_of(state, draw) for draw in range(6)] for state in states])
     assert draws.min() > 0
     assert draws.max() < 1

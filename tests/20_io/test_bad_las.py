@@ -193,25 +193,46 @@ def test_a_count_of_records_that_cannot_fit_is_refused_at_once(tmp_path, points,
         open_source(path)
 
 
-def test_data_broken_in_the_middle_of_a_laz_are_told_while_reading(tmp_path, points, write_las):
-    path = write_las(tmp_path / "a.laz", points(120_000), version="1.4", point_format=6)
-    raw = bytearray(path.read_bytes())
-    offset = struct.unpack_from("<I", raw, 96)[0]
-    # The sizes of the layers of the first chunk: after its first record and its count.
-    struct.pack_into("<2I", raw, offset + 8 + 30 + 4, 2**31, 2**31)
-    path.write_bytes(raw)
+def test_layers_that_claim_gigabytes_are_refused_before_they_are_decoded(tmp_path, points, write_las):
+    for point_format in (6, 7, 8):
+        path = write_las(tmp_path / "a.laz", points(60_000), version="1.4", point_format=point_format)
+        raw = bytearray(path.read_bytes())
+        offset, item_size = struct.unpack_from("<I", raw, 96)[0], struct.unpack_from("<H", raw, 105)[0]
+        # The sizes of the layers of the first chunk stand after its first record and its count.
+        struct.pack_into("<2I", raw, offset + 8 + item_size + 4, 2**31, 2**31)
+        path.write_bytes(raw)
+        with pytest.raises(UnreadableInputError, match=r"layers of the chunk .* are damaged") as caught:
+            open_source(path)
+        assert_names_file_and_fix(caught.value, path)
+
+
+def test_a_chunk_whose_own_count_is_another_is_refused(tmp_path, points, write_las):
+    path = write_las(tmp_path / "a.laz", points(60_000), version="1.4", point_format=6)
+    offset = struct.unpack_from("<I", path.read_bytes(), 96)[0]
+    patch(path, "<I", offset + 8 + 30, 49_000)
+    with pytest.raises(InconsistentInputError, match="has 49000 points, the chunk table says 50000"):
+        open_source(path)
+
+
+@pytest.mark.parametrize(("version", "point_format"), FORMATS)
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_a_file_that_ends_while_it_is_read_is_told(tmp_path, points, write_las, version, point_format, suffix):
+    path = write_las(tmp_path / f"a{suffix}", points(120_000), version=version, point_format=point_format)
+    source = open_source(path)
+    raw = path.read_bytes()
+    path.write_bytes(raw[: len(raw) // 2])
     with pytest.raises(UnreadableInputError, match="damaged or truncated") as caught:
-        read_through(path)
+        list(source.chunks(10_000))
     assert_names_file_and_fix(caught.value, path)
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_no_single_damaged_byte_of_a_header_escapes_as_another_error(tmp_path, points, write_las, suffix):
-    path = write_las(tmp_path / f"a{suffix}", points(300), version="1.4", point_format=6, crs="EPSG:7415")
+    path = write_las(tmp_path / f"a{suffix}", points(300), version="1.4", point_format=6)
     raw, bad = path.read_bytes(), tmp_path / f"b{suffix}"
     rng = np.random.default_rng(3)
     n_refused = 0
-    for at in [*range(4, 375), *rng.integers(375, len(raw), 120).tolist()]:
+    for at in [*range(4, 375), *rng.integers(375, len(raw), 60).tolist()]:
         damaged = bytearray(raw)
         damaged[at] ^= 0xFF
         bad.write_bytes(damaged)

@@ -19,8 +19,8 @@ from pipeline.io.crs import US_SURVEY_FOOT_M, SpatialReference, resolve_referenc
 FOOT_M = 0.3048
 
 
-def resolve(crs=None, **more):
-    header = None if crs is None else pyproj.CRS.from_user_input(crs)
+def resolve(in_header=None, **more):
+    header = None if in_header is None else pyproj.CRS.from_user_input(in_header)
     return resolve_reference(path="tile.laz", header_crs=header, **more)
 
 
@@ -91,8 +91,8 @@ def test_the_given_crs_replaces_the_header_s_and_says_so_only_where_they_differ(
 
 
 def test_wkt_overrides_work_like_codes():
-    by_code, _ = resolve(crs="EPSG:7415") if False else resolve_reference(path="t", crs="EPSG:7415")
-    by_wkt, _ = resolve_reference(path="t", crs=pyproj.CRS("EPSG:7415").to_wkt())
+    by_code, _ = resolve(crs="EPSG:7415")
+    by_wkt, _ = resolve(crs=pyproj.CRS("EPSG:7415").to_wkt())
     assert by_code == by_wkt
 
 

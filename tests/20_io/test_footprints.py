@@ -141,6 +141,7 @@ def test_a_layer_of_points_beside_does_not_disturb(tmp_path):
     assert len(read_footprints(path, reference())) == 2
 
 
+@pytest.mark.filterwarnings("ignore:'crs' was not provided")
 def test_footprints_without_crs_are_assumed_to_be_the_run_s_and_told(tmp_path):
     path = write(tmp_path / "a.shp", crs=None)
     found = read_footprints(path, reference())

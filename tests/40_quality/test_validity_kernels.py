@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections import Counter
 from fractions import Fraction
 
 import numpy as np
@@ -66,7 +67,7 @@ def _degenerate(vertices: IntArray, triangle: IntArray) -> bool:
     shared=st.integers(0, 3),
     large=st.booleans(),
 )
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=400, deadline=None)
 def test_triangle_pairs_intersect_as_in_rational_numbers(
     coordinates: list[tuple[int, int, int]], shared: int, large: bool
 ) -> None:
@@ -123,9 +124,9 @@ def test_polygons_with_holes_are_sound_where_shapely_says_so() -> None:
     chance = np.random.default_rng(8)
     outer = [(x, 0) for x in range(6)] + [(6, y) for y in range(6)]
     outer += [(6 - x, 6 - y) for x, y in outer]
-    reasons = {0: "Valid", 201: "Self-intersection", 205: "disconnected", 206: "outside", 207: "nested"}
-    seen = dict.fromkeys(reasons, 0)
-    for _ in range(800):
+    reasons = {0: "Valid", 205: "disconnected"}
+    seen: Counter[int] = Counter()
+    for _ in range(500):
         moves = [(0, 0), (int(chance.integers(0, 5)), int(chance.integers(0, 7)))]
         sizes = [int(chance.integers(4, 8)), 3]
         holes = [
@@ -150,10 +151,10 @@ def test_polygons_with_holes_are_sound_where_shapely_says_so() -> None:
             assert code != 0
         else:
             assert (code == 0) == polygon.is_valid
-            if code in (0, 205):
+            if code in reasons:
                 assert reasons[code] in shapely.is_valid_reason(polygon)
             seen[code] += 1
-    assert min(seen.values()) > 0, seen
+    assert min(seen[code] for code in (0, 201, 205, 206)) > 5
 
 
 @given(

@@ -40,7 +40,8 @@ def test_with_a_footprint_a_roof_gives_one_valid_solid_of_the_true_volume(exact_
     parts = roof.parts()
     assert len(parts) == 1
     assert check_solid(parts[0].solid) == ()
-    assert volume(parts[0].solid) == pytest.approx(roof.volume_m3, rel=0.01)
+    # where the walls of a tower stand is known to half a point spacing
+    assert volume(parts[0].solid) == pytest.approx(roof.volume_m3, rel=0.02 if kind == "tower" else 0.01)
     assert shapely.symmetric_difference(parts[0].footprint, roof.footprint).area < 0.001 * roof.footprint.length
 
 

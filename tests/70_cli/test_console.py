@@ -8,7 +8,7 @@ import json
 import pytest
 import typer
 
-from pipeline.console import EXIT_CODES, LOG_INTERVAL_S, Console, ExitCode, exit_code_of, table_lines
+from pipeline.console import EXIT_CODES, LOG_INTERVAL_S, Console, ExitCode, exit_code_of
 from pipeline.errors import (
     BuildingError,
     CrsError,
@@ -152,6 +152,13 @@ def test_tables_are_silent_for_machines(capsys: pytest.CaptureFixture[str]) -> N
     assert json.loads(capsys.readouterr().out) == {"buildings": 1}
 
 
-def test_figures_are_set_to_the_right_and_words_to_the_left() -> None:
-    lines = table_lines("", ["roof", "share"], [["gable", "98.5 %"], ["hip", "1 %"]])
-    assert lines == ["  roof    share", "  gable  98.5 %", "  hip       1 %"]
+def test_figures_are_set_to_the_right_and_words_to_the_left(capsys: pytest.CaptureFixture[str]) -> None:
+    Console().table("", ["roof", "share"], [["gable", "98.5 %"], ["hip", "1 %"]])
+    lines = [line.strip("│┃ ") for line in capsys.readouterr().out.splitlines()]
+    assert "gable │ 98.5 %" in lines
+    assert "hip   │    1 %" in lines
+
+
+def test_a_table_without_rows_is_not_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    Console().table("Reasons", ["reason", "count"], [])
+    assert capsys.readouterr().out == ""

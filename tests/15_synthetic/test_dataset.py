@@ -1,0 +1,179 @@
+"""Simulated tiles on disk: read back by others, aligned with their truth, the same bytes again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import shapely
+
+from pipeline.errors import InputError, SettingsError
+from pipeline.io import open_source
+from pipeline.report.roof_models import read_roof_models
+from pipeline.report.truth_score import score_against_truth
+from pipeline.synthetic.dataset import ScenePaths, read_truth, simulate
+from pipeline.synthetic.suites import SUITES
+
+SIZE = (110.0, 90.0)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> ScenePaths:
+    return simulate("suburb", tmp_path_factory.mktemp("suburb"), 5, size_m=SIZE)
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_the_tile_reads_back_with_counts_crs_and_units(made: ScenePaths) -> None:
+    tile = laspy.read(made.laz)
+    assert made.laz.name == "suburb.laz"
+    assert (tile.header.version.major, tile.header.version.minor, tile.header.point_format.id) == (1, 4, 6)
+    assert len(tile) == tile.header.point_count == made.points == sum(tile.header.number_of_points_by_return)
+    assert tile.header.global_encoding.wkt
+    assert tile.header.scales.tolist() == [0.001] * 3
+    crs = tile.header.parse_crs()
+    assert crs.is_compound
+    assert [part.to_epsg() for part in crs.sub_crs_list] == [25832, 7837]
+    assert tile.header.mins[0] >= 565_000 - 1
+    assert tile.header.maxs[1] <= 5_934_090 + 1
+    assert 7 < len(tile) / (SIZE[0] * SIZE[1]) < 9
+
+
+def test_the_tile_is_read_by_our_own_reader(made: ScenePaths) -> None:
+    info = open_source(str(made.laz)).info
+    assert info.reference.horizontal_unit_m == info.reference.vertical_unit_m == 1.0
+    assert info.point_count == made.points
+    assert info.acquired_from is not None
+    assert info.acquired_from.date().isoformat() == "2025-04-01"
+    assert info.warnings == ()
+
+
+def test_the_tile_is_raw_and_holds_classes_only_when_asked(made: ScenePaths, tmp_path: Path) -> None:
+    assert set(np.asarray(laspy.read(made.laz).classification).tolist()) == {1}
+    told = simulate("suburb", tmp_path, 5, size_m=SIZE, with_classes=True)
+    truth = read_truth(told.truth)
+    assert np.array_equal(np.asarray(laspy.read(told.laz).classification), truth.classification)
+
+
+def test_labels_stand_in_the_order_of_the_points(made: ScenePaths) -> None:
+    xyz = laspy.read(made.laz).xyz
+    truth = read_truth(made.truth)
+    assert len(truth.classification) == len(xyz)
+    models = {model.building_id: model for model in read_roof_models(made.truth)}
+    assert sorted(models) == list(truth.building_ids)
+    for number, name in enumerate(truth.building_ids):
+        mine = (truth.building == number) & (truth.face >= 0) & ~truth.mixed
+        x, y, z = xyz[mine].T
+        assert np.nanstd(z - models[name].top(x, y)) < 0.06, name
+    assert truth.wall.any()
+    assert (truth.suite, truth.seed, truth.crs) == ("suburb", 5, "EPSG:25832+7837")
+    assert truth.extent == (565_000.0, 5_934_000.0, 565_110.0, 5_934_090.0)
+
+
+def test_the_truth_is_a_run_directory_of_the_exact_models(made: ScenePaths) -> None:
+    scene = SUITES["suburb"].make(5, SIZE)
+    models = read_roof_models(made.truth)
+    assert made.buildings == len(models) == len(scene.buildings)
+    for model, building in zip(models, sorted(scene.buildings, key=lambda b: b.building_id), strict=True):
+        outline = shapely.transform(building.footprint, lambda xy: xy + np.array(scene.origin[:2]))
+        assert shapely.hausdorff_distance(model.footprint, outline) < 0.002
+        assert model.roof_type is building.roof_type
+        assert len(model.surfaces) == len(building.planes)
+    lines = (made.truth / "cityjson" / "tile=part00000" / "part-0.city.jsonl").read_text().splitlines()
+    assert len(lines) == 1 + len(models)
+    assert (made.truth / "meshes" / "part00000" / "part00000.obj").read_text().count("\no ") == len(models)
+
+
+def test_the_truth_scored_against_itself_is_perfect(made: ScenePaths) -> None:
+    models = read_roof_models(made.truth)
+    score = score_against_truth(models, models, sample_m=0.5)
+    assert all(one.type_right and one.iou > 0.999 and one.within_good == 1.0 for one in score.buildings)
+    assert score.rmse_m < 1e-9
+
+
+def test_the_same_call_gives_the_same_bytes_whatever_the_chunks(made: ScenePaths, tmp_path: Path) -> None:
+    again = simulate("suburb", tmp_path / "again", 5, size_m=SIZE)
+    small = simulate("suburb", tmp_path / "small", 5, size_m=SIZE, chunk_points=7_000)
+    assert digest(again.laz) == digest(small.laz) == digest(made.laz)
+    assert digest(again.labels) == digest(made.labels)
+    assert pq.ParquetFile(small.labels).num_row_groups > 3
+    ours, theirs = read_truth(small.truth), read_truth(made.truth)
+    assert np.array_equal(ours.building, theirs.building)
+    assert np.array_equal(ours.face, theirs.face)
+
+
+def test_density_and_noise_can_be_chosen(tmp_path: Path) -> None:
+    told: list[int] = []
+    paths = simulate("gable", tmp_path, 2, density_per_m2=20.0, noise_m=0.0, chunk_points=5_000, on_points=told.append)
+    assert paths.points / 1600 == pytest.approx(20.0, rel=0.25)
+    assert told[-1] == paths.points
+    assert told == sorted(told)
+    assert len(told) > 2
+    truth, models = read_truth(paths.truth), read_roof_models(paths.truth)
+    roof = (truth.face >= 0) & ~truth.mixed
+    x, y, z = laspy.read(paths.laz).xyz[roof].T
+    assert np.nanmedian(np.abs(z - models[0].top(x, y))) < 0.001
+    assert json.loads((paths.truth / "scene.json").read_text())["scanner"]["range_noise_m"] == 0.0
+
+
+def test_buildings_cut_by_the_end_of_the_data_are_marked(tmp_path: Path) -> None:
+    paths = simulate("town", tmp_path, 11, size_m=(120.0, 100.0), density_per_m2=1.0)
+    edge = shapely.box(566_000, 5_935_000, 566_120, 5_935_100)
+    models = read_roof_models(paths.truth)
+    assert {m.touches_data_edge for m in models} == {True, False}
+    for model in models:
+        assert model.touches_data_edge != edge.contains(model.footprint)
+
+
+def test_a_tile_without_a_crs_says_so(tmp_path: Path) -> None:
+    paths = simulate("cube", tmp_path)
+    header = laspy.open(paths.laz).header
+    assert header.parse_crs() is None
+    assert [vlr.record_id for vlr in header.vlrs if vlr.user_id == "LASF_Projection"] == []
+
+
+def test_unknown_suites_and_impossible_sizes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        SettingsError, match=r"suite is 'subrub': use one of suburb, town, cube, flat, pent, gable, hip"
+    ):
+        simulate("subrub", tmp_path)
+    with pytest.raises(SettingsError, match=r"size is 5 m.*; seed is -1"):
+        simulate("suburb", tmp_path, -1, size_m=(5.0, 100.0))
+    with pytest.raises(SettingsError, match="pulse_density_per_m2 is 0"):
+        simulate("suburb", tmp_path, density_per_m2=0.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_truth_is_an_error_that_names_the_fix(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no readable truth.*gablework simulate"):
+        read_truth(tmp_path)
+
+
+@pytest.mark.slow
+def test_ten_million_points_are_streamed_in_bounded_memory(tmp_path: Path) -> None:
+    """Measured in a process of its own: the peak may not grow with the number of points."""
+    program = (
+        "import resource, sys\n"
+        "from pipeline.synthetic.dataset import simulate\n"
+        "made = simulate('town', sys.argv[1], size_m=(float(sys.argv[2]),) * 2, chunk_points=500_000)\n"
+        "print(made.points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    figures = []
+    for size in (350, 1100):
+        done = subprocess.run(
+            [sys.executable, "-c", program, str(tmp_path), str(size)], capture_output=True, text=True, check=True
+        )
+        figures.append([int(word) for word in done.stdout.split()])
+    (few, small_kb), (many, large_kb) = figures
+    assert few < 1_200_000
+    assert many > 9_000_000
+    assert large_kb - small_kb < 300_000

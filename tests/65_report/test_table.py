@@ -1,0 +1,70 @@
+"""Tables of a run: every candidate is counted once, and nothing is claimed of what is unknown."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import small_buildings as small
+from rich.console import Console
+
+from pipeline.errors import RunError
+from pipeline.report.table import run_statistics, statistics_tables
+
+
+def test_statuses_reasons_and_types_are_counted(street_run: Path) -> None:
+    told = run_statistics(str(street_run))
+    assert (told["candidates"], told["rejected"]) == (4, 1)
+    assert told["statuses"] == {"ok": 2, "fallback": 1, "failed": 1}
+    assert told["shares"] == {"ok": 0.5, "fallback": 0.25, "failed": 0.25}
+    assert told["reasons"] == {"failed": {"too_few_points": 1}, "fallback": {"invalid_solid": 1}}
+    assert told["rejected_reasons"] == {"vegetation": 1}
+    assert told["roof_types"] == {"flat": 1, "gable": 2, "none": 1}
+    assert told["lods"] == {"2.2": 2, "1.2": 1}
+    assert told["validity_codes"] == {"104": 1, "203": 1}
+
+
+def test_sums_and_quantiles_are_of_what_is_known(street_run: Path) -> None:
+    told = run_statistics(str(street_run))
+    assert told["sums"]["volume_m3"] == 360.0 + 2700.0 + 720.0
+    assert told["sums"]["n_planes"] == 7
+    assert told["quantiles"]["rmse_m"] == {"n": 3, "p10": 0.031, "p50": 0.031, "p90": 0.031, "max": 0.031}
+    assert told["quantiles"]["coverage"]["n"] == 4
+    assert told["quantiles"]["coverage"]["p10"] < 0.5
+
+
+def test_the_figures_are_plain_json(street_run: Path) -> None:
+    told = run_statistics(str(street_run))
+    assert json.loads(json.dumps(told, allow_nan=False)) == told
+
+
+def test_a_run_that_found_nothing_is_told_as_such(make_run: Callable[..., Path]) -> None:
+    told = run_statistics(str(make_run([])))
+    assert told["candidates"] == 0
+    assert set(told["shares"].values()) == {None}
+    assert told["quantiles"]["rmse_m"] == {"n": 0, "p10": None, "p50": None, "p90": None, "max": None}
+    assert told["sums"]["volume_m3"] == 0.0
+    assert statistics_tables(told)
+
+
+def test_the_tables_show_the_counts(street_run: Path) -> None:
+    screen = io.StringIO()
+    console = Console(file=screen, width=100)
+    for table in statistics_tables(run_statistics(str(street_run))):
+        console.print(table)
+    lines = [" ".join(line.replace("│", " ").split()) for line in screen.getvalue().splitlines()]
+    for wanted in ("ok 2 50.0%", "fallback 1 25.0%", "invalid_solid 1 25.0%", "gable 2", "vegetation 1", "all 4"):
+        assert wanted in lines
+
+
+def test_units_of_the_crs_do_not_change_the_figures(make_run: Callable[..., Path]) -> None:
+    built = [small.gable(), small.courtyard()]
+    assert run_statistics(str(make_run(built, "feet", 0.3048))) == run_statistics(str(make_run(built, "metres")))
+
+
+def test_a_folder_without_a_run_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="no folder"):
+        run_statistics(str(tmp_path))
