@@ -26,15 +26,15 @@ MOST_CELLS = 4_000_000
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rates:
-    """What a run costs, measured on two cores of 2.x GHz (docs/how-to/plan_a_run.md tells with what)."""
+    """What a run with two workers costs on two cores; docs/how_to/plan_a_run.md tells how it was measured."""
 
-    seconds_start: float = 6.0
+    seconds_start: float = 5.0
     """Start of a run with two workers, kernels compiled."""
-    seconds_per_million_points: float = 6.0
-    """Ingest, split and join, both cores busy."""
-    seconds_per_object: float = 0.02
-    """Reconstruction of a candidate, both cores busy."""
-    gib_base: float = 0.45
+    seconds_per_million_points: float = 4.0
+    """Ingest, split and join."""
+    seconds_per_object: float = 0.06
+    """Reconstruction and publishing of a candidate."""
+    gib_base: float = 0.3
     """A worker with its libraries and kernels; the largest task of the plan comes on top."""
 
 

@@ -124,7 +124,7 @@ def _own_solids(
         try:
             drawn, own_planes = level_dipping_faces(form(), roof, planes, candidate.ground_z_m, settings)
             parts = large_parts(solid_parts(drawn, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
-        except BuildingError:
+        except (BuildingError, shapely.errors.GEOSException):
             continue
         faults = {code for part in parts for code in check_solid(part.solid)}
         if parts and not faults:
@@ -160,7 +160,7 @@ def _block(
                 parts = block_parts(
                     footprint, plane, candidate.ground_z_m, factor * tolerance, settings.minimum_part_area_m2
                 )
-            except BuildingError:
+            except (BuildingError, shapely.errors.GEOSException):
                 continue
             if not any(check_solid(part.solid) for part in parts):
                 return parts, [plane]

@@ -8,14 +8,16 @@ from numba import njit
 
 from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 
-# 2^64 / golden ratio, as a signed 64-bit number: Fibonacci hashing (Knuth, TAOCP 3, 6.4).
-_GOLDEN = -7046029254386353131
+# 2^64 / golden ratio: Fibonacci hashing (Knuth, TAOCP 3, 6.4). Unsigned, since only that wraps safely.
+_GOLDEN = np.uint64(11400714819323198485)
+_SHIFT = np.uint64(20)
+_PRIMES = (np.uint64(73856093), np.uint64(19349663), np.uint64(83492791), np.uint64(2654435761))
 
 
 @njit(cache=True, nogil=True)
-def slot_of_key(key: int, mask: int) -> int:
+def slot_of_key(key: int | np.int64, mask: int) -> np.int64:
     """First slot of a key in an open-addressing table of mask + 1 (a power of two) slots."""
-    return ((key * _GOLDEN) >> 20) & mask
+    return np.int64((np.uint64(key) * _GOLDEN) >> _SHIFT) & mask
 
 
 @njit(cache=True, nogil=True)
@@ -37,9 +39,9 @@ def _first_of_each(
     mask = size - 1
     holder = np.full(size, -1, np.int64)
     for i in range(n):
-        mixed = (x_mm[i] * 73856093) ^ (y_mm[i] * 19349663) ^ (z_mm[i] * 83492791)
-        mixed ^= gps_bits[i] * 2654435761 + return_number[i]
-        s = slot_of_key(mixed, mask)
+        mixed = (np.uint64(x_mm[i]) * _PRIMES[0]) ^ (np.uint64(y_mm[i]) * _PRIMES[1])
+        mixed ^= (np.uint64(z_mm[i]) * _PRIMES[2]) ^ (np.uint64(gps_bits[i]) * _PRIMES[3]) ^ np.uint64(return_number[i])
+        s = slot_of_key(np.int64(mixed), mask)
         while True:
             j = holder[s]
             if j < 0:

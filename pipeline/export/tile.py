@@ -44,7 +44,7 @@ def put_local(run_dir: str | Path) -> Put:
     def put(path: str, data: bytes) -> None:
         target = root / path
         target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}")
+        temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
         try:
             temporary.write_bytes(data)
             temporary.replace(target)

@@ -177,8 +177,8 @@ class LasFile:
         stream.seek(self._block.offset_to_points)
         if self._chunks is None:
             return stream
-        # The parallel one decodes whole chunks into memory, so chunks without measure go to the sequential one.
-        parallel = int(self._chunks.counts.max()) <= CHUNK_SIZE_LIMIT
+        # The parallel one makes room for a whole chunk, so chunks without measure go to the sequential one.
+        parallel = self._chunks.largest <= CHUNK_SIZE_LIMIT
         make = lazrs.ParLasZipDecompressor if parallel else lazrs.LasZipDecompressor
         try:
             return make(stream, self._laszip_record, self._selection())

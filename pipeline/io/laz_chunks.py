@@ -39,6 +39,8 @@ class ChunkTable:
     """(c,) byte at which a chunk begins."""
     item_size: int
     """Bytes a record, uncompressed."""
+    largest: int
+    """Points that a decoder makes room for: the fixed chunk size, or the largest count."""
     variable: bool
     """True where each chunk has a count of its own (COPC)."""
 
@@ -106,7 +108,10 @@ def read_chunk_table(path: Path, stream: BinaryIO, block: HeaderBlock, laszip_re
             name, f"the header promises {block.point_count} points, its compressed chunks hold {counts.sum()}", FIX
         )
     offsets = start + 8 + np.concatenate(([0], np.cumsum(sizes)[:-1]))
-    return ChunkTable(counts=counts, sizes=sizes, offsets=offsets, item_size=item_size, variable=variable)
+    largest = int(counts.max()) if variable else chunk_size
+    return ChunkTable(
+        counts=counts, sizes=sizes, offsets=offsets, item_size=item_size, largest=largest, variable=variable
+    )
 
 
 def _table_offset(stream: BinaryIO, block: HeaderBlock) -> int:

@@ -22,7 +22,7 @@ from pipeline.geometry import (
     point_spacing_m,
     top_visible,
 )
-from pipeline.model import BoolArray, Candidate, FloatArray, Reason, Segmentation
+from pipeline.model import BoolArray, Candidate, FloatArray, Plane, Reason, Segmentation
 from pipeline.parameters import parameter
 from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
 from pipeline.segmentation.fuzzy_sart import (
@@ -216,8 +216,14 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
 
     all_labels = np.full(len(points), -1, np.int32)
     all_labels[visible] = labels
-    planes[:, 2] += shift[2] - planes[:, 0] * shift[0] - planes[:, 1] * shift[1]
-    return Segmentation(planes=describe_planes(candidate.points, planes, all_labels), labels=all_labels)
+    described = describe_planes(points, planes, all_labels)
+    return Segmentation(planes=tuple(_moved(plane, shift) for plane in described), labels=all_labels)
+
+
+def _moved(plane: Plane, shift: FloatArray) -> Plane:
+    """The plane over the candidate's own origin."""
+    x, y, z = shift.tolist()
+    return dataclasses.replace(plane, c=plane.c + z - plane.a * x - plane.b * y)
 
 
 def _local_metres(points: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -25,7 +25,7 @@ OUTSIDE = -1
 
 SHADING_RADIUS_M = 0.5
 SHADING_HEIGHT_M = 1.1
-"""Points with a point this much higher within this distance are not among those that are partitioned (`top_visible`)."""
+"""Points with another this much higher within this distance are not partitioned: see `top_visible`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

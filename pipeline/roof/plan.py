@@ -69,8 +69,12 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
     ------
     BuildingError
         `too_few_points`, `too_complex` or `no_footprint`.
+    ValueError
+        Where a coordinate is not finite.
     """
     points = candidate.points
+    if not np.isfinite(points).all():
+        raise ValueError("a point of the candidate has a coordinate that is not finite")
     if len(points) > settings.maximum_points:
         raise BuildingError(
             Reason.TOO_COMPLEX, f"{len(points)} points, more than maximum_points = {settings.maximum_points}"

@@ -221,7 +221,7 @@ def _terrain(lowest: Elevations, is_ground: BoolArray, bridge: int) -> Elevation
             vxz = (m[7] - c * m[3]) - sx * mean
             vyz = (m[8] - r * m[3]) - sy * mean
             det = vxx * vyy - vxy * vxy
-            z = mean
+            z = float(mean)
             if count >= 5 and det > 0.05 * (vxx + vyy) * (vxx + vyy):
                 a = (vxz * vyy - vyz * vxy) / det
                 b = (vyz * vxx - vxz * vxy) / det

@@ -9,6 +9,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from pipeline.errors import BuildingError
 from pipeline.model import FaceKind, Reason
 from pipeline.quality.validity import check_solid
@@ -19,27 +20,27 @@ from pipeline.roof.partition import RoofPartition
 SQUARE = RoofPartition(polygons=(shapely.box(0, 0, 10_000, 10_000),), labels=np.array([0], np.int32))
 
 
-def test_a_bow_tie_footprint_is_made_valid():
+def test_a_bow_tie_footprint_is_made_valid() -> None:
     bow = shapely.Polygon([(0, 0), (4, 4), (4, 0), (0, 4)])
     cleaned = footprint_in_mm(bow)
     assert cleaned.is_valid
     assert cleaned.area * 1e-6 == pytest.approx(8.0)
 
 
-def test_repeated_vertices_and_elevations_go():
+def test_repeated_vertices_and_elevations_go() -> None:
     ring = [(0, 0, 1), (4, 0, 1), (4.002, 0.001, 1), (4, 4, 1), (0, 4, 1)]
     cleaned = footprint_in_mm(shapely.Polygon(ring))
     assert not cleaned.has_z
     assert shapely.get_num_coordinates(cleaned) == 5
 
 
-def test_a_footprint_without_area_is_refused():
+def test_a_footprint_without_area_is_refused() -> None:
     with pytest.raises(BuildingError) as caught:
         footprint_in_mm(shapely.Polygon([(0, 0), (1, 0), (2, 0)]))
     assert caught.value.reason is Reason.NO_FOOTPRINT
 
 
-def test_clipping_cuts_faces_and_small_pieces_join_their_neighbour():
+def test_clipping_cuts_faces_and_small_pieces_join_their_neighbour() -> None:
     left = shapely.Polygon([(0, 0), (5000, 0), (5000, 5000), (0, 5000)])
     right = shapely.Polygon([(5000, 0), (9000, 0), (9000, 5000), (5000, 5000)])
     coverage = RoofPartition(polygons=(left, right), labels=np.array([0, 1], np.int32))
@@ -52,29 +53,29 @@ def test_clipping_cuts_faces_and_small_pieces_join_their_neighbour():
     assert sum(p.area for p in both.polygons) == footprint.area
 
 
-def test_a_face_that_a_footprint_cuts_apart_becomes_two():
+def test_a_face_that_a_footprint_cuts_apart_becomes_two() -> None:
     footprint = shapely.box(-1000, 2000, 11_000, 8000).difference(shapely.box(4000, 0, 6000, 20_000))
     clipped = clip_partition(SQUARE, footprint, 1.0)
     assert clipped.labels.tolist() == [0, 0]
 
 
-def test_nothing_inside_the_footprint_is_an_error():
+def test_nothing_inside_the_footprint_is_an_error() -> None:
     with pytest.raises(BuildingError, match="no roof face lies inside"):
         clip_partition(SQUARE, shapely.MultiPolygon([shapely.box(20_000, 0, 30_000, 1000)]), 1.0)
 
 
-def test_collinear_points_have_no_hull():
+def test_collinear_points_have_no_hull() -> None:
     assert hull_of_points(np.array([[0.0, 0, 0], [1, 1, 5], [2, 2, 9]])) is None
     assert hull_of_points(np.zeros((0, 3))) is None
 
 
-def test_a_block_reaches_the_percentile_of_the_points_and_never_the_floor():
+def test_a_block_reaches_the_percentile_of_the_points_and_never_the_floor() -> None:
     points = np.column_stack((np.zeros(10), np.zeros(10), np.arange(10.0)))
     assert block_plane(points, 0.0, 70.0).c == 7.0
     assert block_plane(points, 20.0, 70.0).c == 20.1
 
 
-def test_a_block_with_a_courtyard_has_ten_faces():
+def test_a_block_with_a_courtyard_has_ten_faces() -> None:
     ring = shapely.box(0, 0, 9000, 9000).difference(shapely.box(3000, 3000, 6000, 6000))
     plane = block_plane(np.full((3, 3), 5.0), 0.0, 50.0)
     (part,) = block_parts(shapely.MultiPolygon([ring]), plane, 0.0, 0.0, 4.0)
@@ -84,7 +85,7 @@ def test_a_block_with_a_courtyard_has_ten_faces():
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 1.0]))
 @settings(max_examples=80, deadline=None)
-def test_a_block_is_valid_over_any_footprint(seed, tolerance_m):
+def test_a_block_is_valid_over_any_footprint(seed: int, tolerance_m: float) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(3, 30))
     angle = np.sort(rng.uniform(0, math.tau, n))

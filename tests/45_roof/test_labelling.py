@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels, nearest_points
 from pipeline.tin.delaunay import triangulate
 
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=40, deadline=None)
-def test_the_nearest_point_is_that_of_a_plain_search(seed):
+def test_the_nearest_point_is_that_of_a_plain_search(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.integers(-20, 20, (int(rng.integers(1, 60)), 2)) * 250
     queries = rng.integers(-9000, 9000, (30, 2))
@@ -22,13 +23,13 @@ def test_the_nearest_point_is_that_of_a_plain_search(seed):
     assert distance * 1e3 == pytest.approx(np.sqrt(squared.min(axis=1)))
 
 
-def test_unlabelled_points_take_the_nearest_label():
+def test_unlabelled_points_take_the_nearest_label() -> None:
     xy = np.array([[0, 0], [1000, 0], [400, 0], [700, 0]])
     assert fill_labels(xy, np.array([3, 5, -1, -1], np.int32)).tolist() == [3, 5, 3, 5]
     assert fill_labels(xy, np.full(4, -1, np.int32)).tolist() == [-1] * 4
 
 
-def test_samples_keep_their_distance_and_leave_no_gap_wider_than_it():
+def test_samples_keep_their_distance_and_leave_no_gap_wider_than_it() -> None:
     rng = np.random.default_rng(0)
     points = rng.integers(0, 5000, (40, 2))
     samples, nearest, distance = empty_samples(points, np.array([-2000, -2000]), np.array([7000, 7000]), 300, 0.5)
@@ -40,7 +41,7 @@ def test_samples_keep_their_distance_and_leave_no_gap_wider_than_it():
     assert np.array_equal(shifted, samples + 7000)
 
 
-def test_a_ridge_goes_on_straight_beyond_its_points():
+def test_a_ridge_goes_on_straight_beyond_its_points() -> None:
     rng = np.random.default_rng(7)
     points = rng.integers(0, 8000, (300, 2))
     points = np.unique(points, axis=0)

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from pipeline.errors import BuildingError
-from pipeline.model import Candidate, Plane, Reason
+from pipeline.model import Candidate, IntArray, LabelArray, Plane, Reason, Solid, Tin
 from pipeline.quality.validity import check_solid
 from pipeline.roof.partition import RoofPartition, absorb_small_regions, connected_regions, march
 from pipeline.roof.plan import level_dipping_faces, partition_roof, plan_forms, roof_points
@@ -22,7 +26,7 @@ from pipeline.tin.delaunay import triangulate
 FLAT = np.zeros((3, 3))
 
 
-def grid_with_frame(n, pitch=500):
+def grid_with_frame(n: int, pitch: int = 500) -> IntArray:
     axis = np.arange(n) * pitch
     inner = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
     inner = inner + np.column_stack((inner[:, 1] // pitch % 2 * (pitch // 2), np.zeros(len(inner), np.int64)))
@@ -31,19 +35,19 @@ def grid_with_frame(n, pitch=500):
     return np.concatenate((inner, frame)).astype(np.int64)
 
 
-def labelled(n, values):
+def labelled(n: int, values: npt.ArrayLike) -> tuple[IntArray, Tin, LabelArray]:
     xy = grid_with_frame(n)
     labels = np.full(len(xy), -1, np.int32)
     labels[: n * n] = np.asarray(values, np.int32).ravel()
     return xy, triangulate(xy), labels
 
 
-def polygons_are_a_coverage(partition):
+def polygons_are_a_coverage(partition: RoofPartition) -> bool:
     array = np.array(partition.polygons, dtype=object)
     return bool(shapely.is_valid(array).all() and shapely.coverage_is_valid(array))
 
 
-def slow_regions(facets, labels):
+def slow_regions(facets: LabelArray, labels: Any) -> list[frozenset[int]]:
     adjacent = {v: set() for v in range(len(labels))}
     for a, b, c in facets.tolist():
         for p, q in ((a, b), (b, c), (c, a)):
@@ -67,10 +71,10 @@ def slow_regions(facets, labels):
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=40, deadline=None)
-def test_any_labels_give_a_coverage_with_one_polygon_a_region(seed):
+def test_any_labels_give_a_coverage_with_one_polygon_a_region(seed: int) -> None:
     rng = np.random.default_rng(seed)
     xy, tin, labels = labelled(7, rng.integers(-1, 3, (7, 7)))
-    planes = rng.uniform(-1, 1, (3, 3)) + [0, 0, 5]
+    planes = rng.uniform(-1, 1, (3, 3)) + np.array([0, 0, 5])
     if (labels < 0).all():
         return
     partition = march(xy, tin, labels, planes, 0.4, 0.1)
@@ -88,7 +92,7 @@ def test_any_labels_give_a_coverage_with_one_polygon_a_region(seed):
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=20, deadline=None)
-def test_regions_are_those_of_a_plain_search(seed):
+def test_regions_are_those_of_a_plain_search(seed: int) -> None:
     _, tin, labels = labelled(6, np.random.default_rng(seed).integers(-1, 2, (6, 6)))
     regions, count = connected_regions(tin.facets, labels)
     groups = slow_regions(tin.facets, labels)
@@ -96,7 +100,7 @@ def test_regions_are_those_of_a_plain_search(seed):
     assert all(len({int(regions[v]) for v in group}) == 1 for group in groups)
 
 
-def test_the_border_of_two_planes_runs_where_they_cross():
+def test_the_border_of_two_planes_runs_where_they_cross() -> None:
     values = np.zeros((8, 8), np.int32)
     values[4:] = 1
     xy, tin, labels = labelled(8, values)
@@ -106,7 +110,7 @@ def test_the_border_of_two_planes_runs_where_they_cross():
     assert np.abs(shapely.get_coordinates(border)[1:-1, 1] - 1800.0).max() <= 1.0
 
 
-def test_a_lone_vertex_in_a_roof_is_absorbed_and_a_courtyard_stays():
+def test_a_lone_vertex_in_a_roof_is_absorbed_and_a_courtyard_stays() -> None:
     values = np.zeros((12, 12), np.int32)
     values[2, 2] = 1
     values[5:10, 5:10] = -1
@@ -123,7 +127,7 @@ def test_a_lone_vertex_in_a_roof_is_absorbed_and_a_courtyard_stays():
     assert (filled[12 * 12 :] == -1).all()
 
 
-def test_a_small_region_joins_the_plane_that_fits_it():
+def test_a_small_region_joins_the_plane_that_fits_it() -> None:
     values = np.zeros((9, 9), np.int32)
     values[:, 4] = 2
     values[:, 5:] = 1
@@ -131,20 +135,18 @@ def test_a_small_region_joins_the_plane_that_fits_it():
     z = np.where(labels == 0, 3.0, 9.0)
     planes = np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 9.0], [0.0, 0.0, 6.0]])
     counted = np.ones(len(xy), np.int32)
-    cleaned = absorb_small_regions(
-        xy[:, 0].copy(), xy[:, 1].copy(), z, tin.facets, labels, counted, planes, 5.0, 5.0
-    )
+    cleaned = absorb_small_regions(xy[:, 0].copy(), xy[:, 1].copy(), z, tin.facets, labels, counted, planes, 5.0, 5.0)
     assert (cleaned[np.flatnonzero(labels == 2)] == 1).all()
 
 
-def test_no_roof_vertex_is_an_error_with_its_reason():
+def test_no_roof_vertex_is_an_error_with_its_reason() -> None:
     xy, tin, labels = labelled(4, np.full((4, 4), -1))
     with pytest.raises(BuildingError) as caught:
         march(xy, tin, labels, FLAT, 0.4, 0.1)
     assert caught.value.reason is Reason.NO_PARTITION
 
 
-def test_simplification_keeps_the_coverage_and_drops_vertices(exact_roof):
+def test_simplification_keeps_the_coverage_and_drops_vertices(exact_roof: Callable[..., Any]) -> None:
     plan, roof, _ = exact_roof("stepped", noise_m=0.03).partition()
     simple = simplify_partition(plan.raw, roof.spacing_m)
     assert polygons_are_a_coverage(simple)
@@ -154,7 +156,7 @@ def test_simplification_keeps_the_coverage_and_drops_vertices(exact_roof):
     assert kept <= {tuple(v) for p in plan.raw.polygons for v in shapely.get_coordinates(p).tolist()}
 
 
-def test_vertices_a_few_millimetres_apart_become_one_in_both_polygons():
+def test_vertices_a_few_millimetres_apart_become_one_in_both_polygons() -> None:
     left = shapely.Polygon([(0, 0), (1000, 0), (1003, 500), (1002, 502), (1000, 1000), (0, 1000)])
     right = shapely.Polygon([(1000, 0), (2000, 0), (2000, 1000), (1000, 1000), (1002, 502), (1003, 500)])
     united = unite_close_vertices(RoofPartition(polygons=(left, right), labels=np.array([0, 1], np.int32)), 5.0)
@@ -162,27 +164,23 @@ def test_vertices_a_few_millimetres_apart_become_one_in_both_polygons():
     assert sum(shapely.get_num_coordinates(list(united.polygons))) == 6 + 6
 
 
-def test_a_shift_by_whole_metres_shifts_the_solid_to_the_bit(exact_roof):
+def test_a_shift_by_whole_metres_shifts_the_solid_to_the_bit(exact_roof: Callable[..., Any]) -> None:
     roof = exact_roof("l", noise_m=0.02, turn_deg=23.0)
     shift = np.array([137.0, -64.0, 0.0])
     moved = dataclasses.replace(
         roof,
-        candidate=dataclasses.replace(
-            roof.candidate, points=np.rint((roof.candidate.points + shift) * 1e3) / 1e3
-        ),
+        candidate=dataclasses.replace(roof.candidate, points=np.rint((roof.candidate.points + shift) * 1e3) / 1e3),
         planes=tuple(dataclasses.replace(p, c=p.c - p.a * shift[0] - p.b * shift[1]) for p in roof.planes),
     )
     for here, there in zip(roof.parts(), moved.parts(), strict=True):
         assert here.solid.faces == there.solid.faces
-        assert np.array_equal(
-            np.rint((here.solid.vertices + shift) * 1e3), np.rint(there.solid.vertices * 1e3)
-        )
+        assert np.array_equal(np.rint((here.solid.vertices + shift) * 1e3), np.rint(there.solid.vertices * 1e3))
 
 
-def test_the_order_of_points_does_not_matter(exact_roof):
+def test_the_order_of_points_does_not_matter(exact_roof: Callable[..., Any]) -> None:
     roof = exact_roof("dormer", noise_m=0.02)
 
-    def faces(some_roof):
+    def faces(some_roof: Any) -> list[tuple[int, str]]:
         return sorted(
             (face.plane, shapely.normalize(face.polygon).wkb_hex) for p in some_roof.parts() for face in p.faces
         )
@@ -197,7 +195,9 @@ def test_the_order_of_points_does_not_matter(exact_roof):
 
 
 @pytest.mark.parametrize("kind", ["hip", "l", "dormer"])
-def test_a_mirrored_roof_gives_a_valid_solid_of_the_same_volume(exact_roof, volume, kind):
+def test_a_mirrored_roof_gives_a_valid_solid_of_the_same_volume(
+    exact_roof: Callable[..., Any], volume: Callable[[Solid], float], kind: str
+) -> None:
     roof = exact_roof(kind, with_footprint=True)
     mirrored = dataclasses.replace(
         roof,
@@ -215,7 +215,7 @@ def test_a_mirrored_roof_gives_a_valid_solid_of_the_same_volume(exact_roof, volu
 
 @given(st.integers(0, 2**32 - 1), st.booleans())
 @settings(max_examples=60, deadline=None)
-def test_random_labels_and_planes_always_give_some_valid_form(seed, with_footprint):
+def test_random_labels_and_planes_always_give_some_valid_form(seed: int, with_footprint: bool) -> None:
     rng = np.random.default_rng(seed)
     n, k = int(rng.integers(20, 400)), int(rng.integers(1, 10))
     size = rng.uniform(4.0, 20.0, 2)

@@ -94,7 +94,7 @@ def test_a_cut_off_put_leaves_the_old_file_and_no_rest(tmp_path: Path, monkeypat
 
 def test_a_temporary_file_is_seen_by_no_reader(tmp_path: Path, contexts: Contexts) -> None:
     write_tile(tmp_path, "t1", [small.gable()], [], contexts["compound"])
-    (tmp_path / "buildings" / "tile=t1" / ".part-0.parquet.17-abcd").write_bytes(b"half a file")
+    (tmp_path / "buildings" / "tile=t1" / ".part-0.parquet.17-abcd.part").write_bytes(b"half a file")
     assert read_table(str(tmp_path), "buildings").num_rows == 1
 
 

@@ -1,0 +1,260 @@
+"""One building end to end: models, fallbacks, failures, and that every candidate gives a record."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import shapely
+from shapely import Polygon
+
+from pipeline import reconstruct
+from pipeline.errors import BuildingError, SettingsError
+from pipeline.methods import METHODS, Method, ReconstructSettings, method_named
+from pipeline.model import Candidate, FaceKind, Plane, Reason, RoofType, Segmentation, Status
+from pipeline.parameters import Parameters
+from pipeline.quality.validity import check_solid
+from pipeline.reconstruct import reconstruct_building
+from pipeline.roof.settings import RoofSettings
+
+DEFAULTS = ReconstructSettings()
+
+
+def candidate(points: npt.ArrayLike, **fields: Any) -> Candidate:
+    points = np.rint(np.asarray(points, np.float64).reshape(-1, 3) * 1e3) / 1e3
+    points = points[np.lexsort((points[:, 2], points[:, 1], points[:, 0]))]
+    values = {
+        "building_id": "b",
+        "origin": (84_000.0, 447_000.0, 0.0),
+        "points": points,
+        "ground": np.zeros((0, 3)),
+        "ground_z_m": 0.0,
+    }
+    return Candidate(**(values | fields))
+
+
+def gable(n: int = 800, noise_m: float = 0.03, seed: int = 0, **fields: Any) -> Candidate:
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 12, n), rng.uniform(0, 8, n)
+    z = 3.0 + 0.7 * np.minimum(y, 8.0 - y) + rng.normal(0, noise_m, n)
+    return candidate(np.column_stack((x, y, z)), **fields)
+
+
+@pytest.fixture
+def stub(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Candidate], Segmentation]], None]:
+    """`stub(function)` makes a segmentation function the method `stub`."""
+
+    def install(segment: Callable[[Candidate], Segmentation]) -> None:
+        method = Method(name="stub", settings_type=Parameters, segment=lambda c, _: segment(c))
+        monkeypatch.setattr(reconstruct, "method_named", lambda _: method)
+
+    return install
+
+
+def one_plane(c: Candidate) -> Segmentation:
+    return Segmentation(
+        planes=(Plane(a=0.0, b=0.0, c=5.0, n_points=len(c.points), rmse_m=0.0),),
+        labels=np.zeros(len(c.points), np.int32),
+    )
+
+
+@pytest.mark.parametrize("footprint", [None, shapely.box(0, 0, 12, 8)])
+def test_a_gable_becomes_an_lod2_model(footprint: Polygon | None) -> None:
+    c = gable(footprint=footprint, source_id="17", touches_data_edge=True)
+    result = reconstruct_building(c, "fuzzy-sart", DEFAULTS)
+    assert (result.status, result.reason, result.reason_detail) == (Status.OK, None, "")
+    assert (result.lod, result.roof_type, result.method) == ("2.2", RoofType.GABLE, "fuzzy-sart")
+    assert len(result.planes) == len(result.faces) == 2
+    assert len(result.solids) == 1
+    assert check_solid(result.solids[0]) == ()
+    assert result.coverage > 0.97
+    assert result.rmse_m < 0.05 < result.p95_m < 0.1
+    assert result.density_per_m2 == pytest.approx(800 / result.footprint.area)
+    assert (result.source_id, result.touches_data_edge, result.origin) == ("17", True, c.origin)
+    assert {face.plane for face in result.faces} == {0, 1}
+    used = {f.plane for f in result.solids[0].faces if f.kind is FaceKind.ROOF}
+    assert used == {0, 1}
+
+
+def test_the_footprint_of_the_result_is_the_plan_of_the_ground_faces() -> None:
+    result = reconstruct_building(gable(), "fuzzy-sart", DEFAULTS)
+    ground = [
+        shapely.Polygon(solid.vertices[list(face.rings[0]), :2], [solid.vertices[list(r), :2] for r in face.rings[1:]])
+        for solid in result.solids
+        for face in solid.faces
+        if face.kind is FaceKind.GROUND
+    ]
+    assert shapely.union_all(ground).equals(result.footprint)
+
+
+def test_the_same_candidate_gives_the_same_result_to_the_bit() -> None:
+    first, second = (reconstruct_building(gable(seed=4), "fuzzy-sart", DEFAULTS) for _ in range(2))
+    assert first.planes == second.planes
+    assert first.solids[0].faces == second.solids[0].faces
+    assert first.solids[0].vertices.tobytes() == second.solids[0].vertices.tobytes()
+    assert first.footprint.wkb == second.footprint.wkb
+
+
+def test_two_buildings_of_one_candidate_are_two_solids() -> None:
+    rng = np.random.default_rng(1)
+    here = np.column_stack((rng.uniform(0, 8, (500, 2)), rng.normal(5, 0.02, 500)))
+    result = reconstruct_building(
+        candidate(np.vstack((here, here + np.array([14.0, 0.0, 1.0])))), "fuzzy-sart", DEFAULTS
+    )
+    assert result.status is Status.OK
+    assert len(result.solids) == 2
+    assert result.footprint.geom_type == "MultiPolygon"
+
+
+@pytest.mark.parametrize("n", [0, 1, 3, 9])
+def test_too_few_points_are_told(n: int) -> None:
+    points = np.column_stack((np.arange(n), np.arange(n) ** 2, np.full(n, 5.0)))
+    result = reconstruct_building(candidate(points), "fuzzy-sart", DEFAULTS)
+    assert (result.status, result.reason, result.lod) == (Status.FAILED, Reason.TOO_FEW_POINTS, "")
+    assert f"{n} roof points, fewer than minimum_points = 10" in result.reason_detail
+    assert (result.solids, result.roof_type, result.coverage) == ((), RoofType.NONE, 0.0)
+    assert math.isnan(result.rmse_m)
+    assert (result.footprint is None) == (n < 3)
+
+
+def test_too_many_points_are_too_complex() -> None:
+    settings = ReconstructSettings(roof=RoofSettings(maximum_points=1000))
+    result = reconstruct_building(gable(n=1500), "fuzzy-sart", settings)
+    assert (result.status, result.reason) == (Status.FAILED, Reason.TOO_COMPLEX)
+    assert "1500 points, more than maximum_points = 1000" in result.reason_detail
+
+
+def test_without_a_plane_there_is_a_block(stub: Callable[[Callable[[Candidate], Segmentation]], None]) -> None:
+    stub(lambda c: Segmentation(planes=(), labels=np.full(len(c.points), -1, np.int32)))
+    result = reconstruct_building(gable(), "stub", DEFAULTS)
+    assert (result.status, result.reason, result.lod) == (Status.FALLBACK, Reason.NO_PLANE, "1.2")
+    assert result.roof_type is RoofType.FLAT
+    assert check_solid(result.solids[0]) == ()
+    assert result.footprint.area == pytest.approx(96.0, rel=0.1)
+    assert result.planes[0].c == pytest.approx(3.0 + 0.7 * 2.8, abs=0.2)
+
+
+def test_a_method_that_gives_up_leaves_a_block_with_its_reason(
+    stub: Callable[[Callable[[Candidate], Segmentation]], None],
+) -> None:
+    def give_up(_: Candidate) -> Segmentation:
+        raise BuildingError(Reason.TOO_COMPLEX, "7 rounds, the limit is 6")
+
+    stub(give_up)
+    result = reconstruct_building(gable(footprint=shapely.box(0, 0, 12, 8)), "stub", DEFAULTS)
+    assert (result.status, result.reason, result.reason_detail) == (
+        Status.FALLBACK, Reason.TOO_COMPLEX, "7 rounds, the limit is 6",
+    )  # fmt: skip
+    assert result.footprint.area == pytest.approx(96.0, rel=0.01)
+
+
+def test_a_solid_that_stays_invalid_becomes_a_block_with_the_codes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def judge(solid: Solid) -> tuple[int, ...]:
+        return (204, 303) if sum(face.kind is FaceKind.ROOF for face in solid.faces) > 1 else ()
+
+    monkeypatch.setattr(reconstruct, "check_solid", judge)
+    result = reconstruct_building(gable(), "fuzzy-sart", DEFAULTS)
+    assert (result.status, result.reason, result.lod) == (Status.FALLBACK, Reason.INVALID_SOLID, "1.2")
+    assert result.validity_codes == (204, 303)
+    assert "204, 303" in result.reason_detail
+
+
+def test_nothing_invalid_is_delivered_even_where_no_block_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reconstruct, "check_solid", lambda _: (305,))
+    result = reconstruct_building(gable(), "fuzzy-sart", DEFAULTS)
+    assert (result.status, result.reason, result.solids) == (Status.FAILED, Reason.NO_FOOTPRINT, ())
+
+
+def test_an_unexpected_error_is_told_with_its_place(
+    stub: Callable[[Callable[[Candidate], Segmentation]], None],
+) -> None:
+    def break_down(c: Any) -> Segmentation:
+        return c.no_such_attribute
+
+    stub(break_down)
+    result = reconstruct_building(gable(), "stub", DEFAULTS)
+    assert (result.status, result.reason) == (Status.FAILED, Reason.INTERNAL_ERROR)
+    assert "AttributeError" in result.reason_detail
+    assert "no_such_attribute" in result.reason_detail
+    assert "test_reconstruct.py:" in result.reason_detail
+
+
+def test_nan_coordinates_are_an_internal_error_not_a_crash() -> None:
+    c = gable()
+    points = c.points.copy()
+    points[5] = np.nan
+    result = reconstruct_building(dataclasses.replace(c, points=points), "fuzzy-sart", DEFAULTS)
+    assert (result.status, result.reason) == (Status.FAILED, Reason.INTERNAL_ERROR)
+    assert "not finite" in result.reason_detail
+    assert result.footprint.area == pytest.approx(96.0, rel=0.1)
+
+
+@pytest.mark.parametrize("error", [MemoryError, KeyboardInterrupt])
+def test_lack_of_memory_and_interrupts_are_passed_on(
+    stub: Callable[[Callable[[Candidate], Segmentation]], None], error: type[BaseException]
+) -> None:
+    def stop(_: Candidate) -> Segmentation:
+        raise error
+
+    stub(stop)
+    with pytest.raises(error):
+        reconstruct_building(gable(), "stub", DEFAULTS)
+
+
+def test_points_on_one_line_or_one_place_give_a_record() -> None:
+    line = np.column_stack((np.linspace(0, 9, 40), np.linspace(0, 9, 40), np.full(40, 5.0)))
+    for points in (line, np.repeat([[1.0, 2.0, 5.0]], 40, axis=0), line * [1, 0, 1]):
+        result = reconstruct_building(candidate(points), "fuzzy-sart", DEFAULTS)
+        assert result.reason is not Reason.INTERNAL_ERROR, result.reason_detail
+        assert all(check_solid(solid) == () for solid in result.solids)
+
+
+def test_a_steep_plane_that_dips_under_the_floor_becomes_level(
+    stub: Callable[[Callable[[Candidate], Segmentation]], None],
+) -> None:
+    def steep(c: Any) -> Segmentation:
+        plane = Plane(a=1.4, b=0.0, c=-2.0, n_points=1, rmse_m=0.0)
+        return Segmentation(planes=(plane,), labels=np.zeros(len(c.points), np.int32))
+
+    stub(steep)
+    result = reconstruct_building(gable(), "stub", DEFAULTS)
+    assert result.status is Status.OK
+    assert [plane.slope_deg for plane in result.planes] == [0.0]
+    assert result.solids[0].vertices[:, 2].min() == 0.0
+
+
+def test_an_empty_footprint_is_told() -> None:
+    result = reconstruct_building(gable(footprint=shapely.Polygon()), "fuzzy-sart", DEFAULTS)
+    assert (result.status, result.reason) == (Status.FAILED, Reason.NO_FOOTPRINT)
+
+
+def test_a_footprint_away_from_the_points_gives_a_record() -> None:
+    result = reconstruct_building(gable(footprint=shapely.box(40, 40, 50, 50)), "fuzzy-sart", DEFAULTS)
+    assert result.reason is not Reason.INTERNAL_ERROR
+    assert all(check_solid(solid) == () for solid in result.solids)
+    assert result.coverage == 0.0
+
+
+def test_an_unknown_method_names_the_valid_ones() -> None:
+    with pytest.raises(SettingsError, match="fuzzy-sart"):
+        reconstruct_building(gable(), "magic", DEFAULTS)
+    assert method_named("fuzzy-sart") is METHODS["fuzzy-sart"]
+
+
+def test_settings_of_another_method_are_refused() -> None:
+    with pytest.raises(SettingsError, match="RoofSettings: use FuzzySartSettings"):
+        reconstruct_building(gable(), "fuzzy-sart", ReconstructSettings(method=RoofSettings()))
+
+
+def test_one_plane_over_everything_is_one_roof_face(
+    stub: Callable[[Callable[[Candidate], Segmentation]], None],
+) -> None:
+    stub(one_plane)
+    result = reconstruct_building(gable(footprint=shapely.box(0, 0, 12, 8)), "stub", DEFAULTS)
+    assert len(result.faces) == 1
+    assert len(result.solids[0].vertices) == 8
