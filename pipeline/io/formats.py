@@ -21,6 +21,8 @@ FOREIGN_MAGIC = {
     b"\x89HDF": "an HDF5 file, not points",
     b"SQLi": "a GeoPackage or SQLite file: give it as footprints",
     b"%PDF": "a PDF file",
+    b"ncols": "an ESRI ASCII raster, not points",
+    b"NCOLS": "an ESRI ASCII raster, not points",
 }
 """What is often mistaken for points, and what to do with it."""
 LAS_SUFFIXES = (".las", ".laz")

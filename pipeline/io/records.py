@@ -45,7 +45,7 @@ class PointRecords:
     """Points as the file has them. All arrays have one length n; None where the file has no such field."""
 
     xyz: FloatArray
-    """(n, 3) float64, in the units of the CRS, easting, northing, elevation."""
+    """(n, 3) float64, in the units of the CRS, easting, northing, elevation; finite, every reader sees to it."""
     return_number: ByteArray | None = None
     """(n,) uint8, 1 is the first return."""
     return_count: ByteArray | None = None

@@ -11,18 +11,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from pipeline.errors import InconsistentInputError, SettingsError
+from pipeline.errors import CrsError, SettingsError
 from pipeline.io.crs import SpatialReference, resolve_reference
 from pipeline.io.formats import recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
-from pipeline.io.records import PointFile, PointRecords, Window
-from pipeline.model import BoolArray, ByteArray, PointCloud
+from pipeline.io.records import FileFacts, PointFile, PointRecords, Window
+from pipeline.model import BoolArray, ByteArray, FloatArray, PointCloud
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
 
 NOISE_CLASSES = (7, 18)
 """ASPRS low point (noise) and high noise."""
+ROUNDING = 0.02
+"""Units of the CRS by which writers round the bounds in their headers."""
+IMPOSSIBLE_DENSITY = 1e5
+"""Points a square unit that no airborne survey has in metres or feet; one point a square metre is 1e10 a degree."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -211,7 +215,6 @@ class Source:
         factors = np.array([reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m])
         n_read = 0
         for records in self._file.records(chunk_size, window):
-            self._check_finite(records, n_read)
             n_read += len(records)
             n_beyond += self._count_beyond_bounds(records)
             kept = _select(records, self._wanted(records, window))
@@ -243,24 +246,16 @@ class Source:
             keep &= ~noise
         return keep
 
-    def _check_finite(self, records: PointRecords, n_before: int) -> None:
-        """Refuse NaN and infinite coordinates."""
-        finite = np.isfinite(records.xyz)
-        if not finite.all():
-            row = int(np.argmin(finite.all(axis=1)))
-            raise InconsistentInputError(
-                str(self._path),
-                f"point {n_before + row + 1} has the coordinates {records.xyz[row].tolist()}",
-                "Remove points whose coordinates are NaN or infinite",
-            )
-
     def _count_beyond_bounds(self, records: PointRecords) -> int:
         """Points outside the bounds that the file claims, by more than rounding."""
-        bounds = self._file.facts.bounds
-        low, high = np.array(bounds[:3]) - 0.02, np.array(bounds[3:]) + 0.02
-        if (records.xyz.min(axis=0) >= low).all() and (records.xyz.max(axis=0) <= high).all():
-            return 0
-        return int((~((records.xyz >= low) & (records.xyz <= high)).all(axis=1)).sum())
+        beyond: BoolArray | None = None
+        for axis in range(3):
+            low, high = self._file.facts.bounds[axis] - ROUNDING, self._file.facts.bounds[axis + 3] + ROUNDING
+            values = records.xyz[:, axis]
+            if values.min() < low or values.max() > high:
+                outside = (values < low) | (values > high)
+                beyond = outside if beyond is None else beyond | outside
+        return 0 if beyond is None else int(beyond.sum())
 
 
 def open_source(path: str | Path, options: ReadOptions | None = None) -> Source:
@@ -298,6 +293,7 @@ def _info_of(path: Path, file: PointFile, options: ReadOptions) -> SourceInfo:
         crs=options.crs,
         vertical_unit=options.vertical_unit,
     )
+    _refuse_degrees(path, facts, reference)
     plan, up = reference.horizontal_unit_m, reference.vertical_unit_m
     x_min, y_min, z_min, x_max, y_max, z_max = facts.bounds
     bounds_m = (x_min * plan, y_min * plan, z_min * up, x_max * plan, y_max * plan, z_max * up)
@@ -324,6 +320,20 @@ def _info_of(path: Path, file: PointFile, options: ReadOptions) -> SourceInfo:
     )
 
 
+def _refuse_degrees(path: Path, facts: FileFacts, reference: SpatialReference) -> None:
+    """Refuse coordinates without a CRS that can only be degrees, before they are taken for metres."""
+    x_min, y_min, _, x_max, y_max, _ = facts.bounds
+    area = (x_max - x_min) * (y_max - y_min)
+    on_the_globe = max(-x_min, x_max) <= 180.0 and max(-y_min, y_max) <= 90.0
+    if reference.wkt is None and on_the_globe and facts.point_count > IMPOSSIBLE_DENSITY * area > 0.0:
+        raise CrsError(
+            str(path),
+            f"no CRS, and coordinates that look like degrees: {facts.point_count} points in"
+            f" {x_max - x_min:g} by {y_max - y_min:g} units at x {x_min:g}, y {y_min:g}",
+            "Reproject the file to a projected CRS, or give --crs EPSG:n where these are lengths",
+        )
+
+
 def _select(records: PointRecords, keep: BoolArray) -> PointRecords:
     """The records of a mask; the very same where it keeps all."""
     if keep.all():
@@ -345,9 +355,14 @@ def _to_cloud(records: PointRecords, factors: np.ndarray[tuple[int], np.dtype[np
         return_number=number,
         return_count=count,
         classification=_or(records.classification, n),
-        gps_time=np.zeros(n) if records.gps_time is None else records.gps_time,
+        gps_time=np.zeros(n) if records.gps_time is None else _finite(records.gps_time),
         source_id=np.zeros(n, dtype=np.uint16) if records.source_id is None else records.source_id,
     )
+
+
+def _finite(times: FloatArray) -> FloatArray:
+    """The times, 0 where the file has no number."""
+    return np.where(np.isfinite(times), times, 0.0)
 
 
 def _or(values: ByteArray | None, n: int) -> ByteArray:

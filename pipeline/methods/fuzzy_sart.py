@@ -69,6 +69,15 @@ class FuzzySartSettings(FuzzySartClusteringSettings, PlaneRefinementSettings):
         minimum=0.0,
         maximum=100.0,
     )
+    ground_gap_spacings: float = parameter(
+        1.3,
+        "Terrain samples nearer to a roof point than this many mean point spacings count as beneath the roof.",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    ground_gap_min_m: float = parameter(
+        1.0, "Terrain samples nearer to a roof point than this count so too.", unit="m", minimum=0.01, maximum=100.0
+    )
     height_rule: str = parameter(
         "separated",
         "Which facets can be roof: those that touch no terrain, or those above the Z_avg of the scene.",
@@ -175,7 +184,8 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     distance_m = settings.plane_distance_m(sigma_m)
 
     # 3.1: the TIN of the building with its ground; points near a facet are absorbed by it.
-    ground = _ground_around(candidate, shift, roof, spacing_m)
+    gap_m = max(settings.ground_gap_spacings * spacing_m, settings.ground_gap_min_m)
+    ground = _ground_around(candidate, shift, roof, gap_m)
     building_with_ground = np.concatenate([roof, ground])
     _check_extent(building_with_ground)
     greedy = insert_greedily(building_with_ground, settings.insertion(sigma_m), candidate.ground_z_m - float(shift[2]))
@@ -204,8 +214,8 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     planes, labels = refine_planes(
         roof, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=settings
     )
-    if settings.leftover_rounds > 0:
-        rough = cluster_leftovers(roof, neighbours, labels, distance_m, fewest_points)
+    rough = cluster_leftovers(roof, neighbours, labels, distance_m, fewest_points)
+    if settings.leftover_rounds > 0 and (rough != labels).any():
         again = dataclasses.replace(settings, rounds=settings.leftover_rounds)
         planes, labels = refine_planes(
             roof, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=again
@@ -214,6 +224,9 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     ridges = find_ridges(roof, planes, labels, neighbours, distance_m=distance_m, reach_m=reach_m)
     labels = label_by_ridges(roof, planes, labels, ridges, distance_m=distance_m, reach_m=reach_m)
 
+    # A sliver along a ridge can lose all its points to the two sides: it is no plane any more.
+    kept = np.unique(labels[labels >= 0])
+    planes, labels = planes[kept], np.where(labels >= 0, np.searchsorted(kept, labels), -1)
     all_labels = np.full(len(points), -1, np.int32)
     all_labels[visible] = labels
     described = describe_planes(points, planes, all_labels)
@@ -229,7 +242,7 @@ def _moved(plane: Plane, shift: FloatArray) -> Plane:
 def _local_metres(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points about an origin of their own, in whole metres: the outcome is the same wherever the building stands."""
     millimetres = np.rint(points * 1000.0).astype(np.int64)
-    shift_m = millimetres.min(axis=0) // 1000
+    shift_m = millimetres.min(axis=0) // 1000 if len(points) else np.zeros(3, np.int64)
     return (millimetres - shift_m * 1000) / 1000.0, shift_m.astype(np.float64)
 
 
@@ -242,10 +255,10 @@ def _check_extent(points: FloatArray) -> None:
         )
 
 
-def _ground_around(candidate: Candidate, shift: FloatArray, roof: FloatArray, spacing_m: float) -> FloatArray:
+def _ground_around(candidate: Candidate, shift: FloatArray, roof: FloatArray, gap_m: float) -> FloatArray:
     """Samples of the terrain beside the building, and in its courtyards, about the same origin."""
     ground = (np.rint(candidate.ground * 1000.0) - shift * 1000.0) / 1000.0
-    return np.asarray(ground[far_from(ground, roof, max(1.3 * spacing_m, 1.0))])
+    return np.asarray(ground[far_from(ground, roof, gap_m)])
 
 
 def _roof_facets(greedy: GreedyTin, normals: FloatArray, n_roof: int, settings: FuzzySartSettings) -> BoolArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,8 @@ class RoofModel:
     """Its roof faces."""
     touches_data_edge: bool = False
     """True where it is cut: as truth it need not be found, as a model it is not wrong."""
+    source_id: str | None = None
+    """As in the record; in simulated truth the block, which buildings that touch share."""
 
     def top(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Elevation of the highest roof face at places x, y; nan where there is none."""
@@ -96,7 +99,36 @@ def read_roof_models(run_dir: str | Path) -> list[RoofModel]:
             roof_type=RoofType(row["roof_type"]),
             surfaces=tuple(surfaces.get(row["building_id"], ())),
             touches_data_edge=row["touches_data_edge"],
+            source_id=row["source_id"],
         )
         for row in read_table(str(run_dir), "buildings").to_pylist()
         if row["geometry"] is not None
     ]
+
+
+def joined_blocks(models: Sequence[RoofModel]) -> list[RoofModel]:
+    """Models that share a source_id as one, in the order of their first ones; those without one stay alone.
+
+    Without given footprints nothing tells where one house of a row ends: a run without them is to be compared with
+    blocks. The roof type of a block is that of its parts where they agree, else combination.
+    """
+    groups: dict[str, list[RoofModel]] = {}
+    for number, model in enumerate(models):
+        groups.setdefault(model.source_id or f"alone {number}", []).append(model)
+    joined = []
+    for parts in groups.values():
+        if len(parts) == 1:
+            joined.append(parts[0])
+            continue
+        types = {part.roof_type for part in parts}
+        joined.append(
+            RoofModel(
+                building_id=parts[0].building_id,
+                footprint=shapely.union_all([part.footprint for part in parts], grid_size=0.001),
+                roof_type=types.pop() if len(types) == 1 else RoofType.COMBINATION,
+                surfaces=tuple(surface for part in parts for surface in part.surfaces),
+                touches_data_edge=any(part.touches_data_edge for part in parts),
+                source_id=parts[0].source_id,
+            )
+        )
+    return joined

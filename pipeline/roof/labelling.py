@@ -9,6 +9,9 @@ from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 _MAX_CELLS = 4_000_000
 
+SAME_ROOF_M = 0.15
+"""Planes that differ by less than this at a point are equally good for it."""
+
 
 @njit(cache=True, nogil=True)
 def _bucket(x: IntArray, y: IntArray, cell: int) -> tuple[LabelArray, LabelArray, int, int, int, int]:
@@ -156,7 +159,7 @@ def empty_samples(
 
 @njit(cache=True, nogil=True)
 def _pairs_that_cross(
-    x: IntArray, y: IntArray, facets: LabelArray, labels: LabelArray, n_points: int, planes: FloatArray
+    x: IntArray, y: IntArray, facets: LabelArray, labels: LabelArray, known: BoolArray, planes: FloatArray
 ) -> tuple[IntArray, LabelArray]:
     """Pairs of planes whose border between points is where they cross: keys low * k + high, -1 ridge, +1 valley."""
     k = len(planes)
@@ -167,7 +170,7 @@ def _pairs_that_cross(
         for e in range(3):
             p = facets[t, e]
             q = facets[t, (e + 1) % 3]
-            if p >= n_points or q >= n_points or labels[p] < 0 or labels[q] < 0 or labels[p] == labels[q]:
+            if not known[p] or not known[q] or labels[p] < 0 or labels[q] < 0 or labels[p] == labels[q]:
                 continue
             if labels[p] > labels[q]:
                 p, q = q, p
@@ -213,13 +216,14 @@ def _pairs_that_cross(
 
 @njit(cache=True, nogil=True)
 def continue_crossings(
-    x: IntArray, y: IntArray, facets: LabelArray, labels: LabelArray, n_points: int, planes: FloatArray
+    x: IntArray, y: IntArray, facets: LabelArray, labels: LabelArray, known: BoolArray, planes: FloatArray
 ) -> LabelArray:
-    """Labels in which borders of two planes that cross go on straight where there are no points.
+    """Labels in which borders of two planes that cross run straight, also where there are no points.
 
-    A place without points takes the label of the nearest point; there a ridge would leave its line. Whether two planes
-    meet in a ridge (the lower one is the roof) or a valley (the upper one) is told by the edges between their points;
-    a sample whose label contradicts it takes the label of the neighbour that does not.
+    A place without points, or with a point that no plane explains, has the label of the nearest point that has one;
+    there a ridge would leave its line. Whether two planes meet in a ridge (the lower one is the roof) or a valley (the
+    upper one) is told by the edges between their points; a vertex whose label contradicts it takes the label of the
+    neighbour that does not.
 
     Parameters
     ----------
@@ -229,8 +233,8 @@ def continue_crossings(
         The TIN.
     labels : (n,) int32
         Planes; -1 outside.
-    n_points : int
-        How many of the vertices are points; only the others change.
+    known : (n,) bool
+        True for points whose label comes from the segmentation: they change only where both planes are equally good.
     planes : (k, 3) float64
         Coefficients in metres.
 
@@ -240,7 +244,7 @@ def continue_crossings(
         The new labels.
     """
     labels = labels.copy()
-    pair_keys, kinds = _pairs_that_cross(x, y, facets, labels, n_points, planes)
+    pair_keys, kinds = _pairs_that_cross(x, y, facets, labels, known, planes)
     if len(pair_keys) == 0:
         return labels
     k = len(planes)
@@ -252,7 +256,7 @@ def continue_crossings(
                 w = facets[t, (e + 1 + e // 3) % 3]
                 a = labels[v]
                 b = labels[w]
-                if v < n_points or a < 0 or b < 0 or a == b:
+                if a < 0 or b < 0 or a == b:
                     continue
                 key = np.int64(min(a, b)) * k + max(a, b)
                 i = np.searchsorted(pair_keys, key)
@@ -260,7 +264,7 @@ def continue_crossings(
                     continue
                 above = (planes[a, 0] - planes[b, 0]) * x[v] + (planes[a, 1] - planes[b, 1]) * y[v]
                 above = above * 1e-3 + planes[a, 2] - planes[b, 2]
-                if above * kinds[i] < 0.0:
+                if above * kinds[i] < 0.0 and (not known[v] or abs(above) < SAME_ROOF_M):
                     labels[v] = b
                     changed = True
         if not changed:

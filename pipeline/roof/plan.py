@@ -154,6 +154,8 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     n, m = len(roof.xy_mm), len(samples)
     labels = np.full(len(xy_mm), OUTSIDE, np.int32)
     labels[:n] = fill_labels(roof.xy_mm, roof.labels)
+    known = np.zeros(len(xy_mm), np.bool_)
+    known[:n] = roof.labels >= 0
     counted = np.zeros(len(xy_mm), np.int32)
     if given is None:
         counted[: n + m] = 1
@@ -167,7 +169,7 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     x, y = np.ascontiguousarray(xy_mm[:, 0]), np.ascontiguousarray(xy_mm[:, 1])
     area = minimum_face_area(roof, settings)
     step_offset_m = settings.step_offset_spacings * roof.spacing_m
-    labels = continue_crossings(x, y, tin.facets, labels, n, coefficients)
+    labels = continue_crossings(x, y, tin.facets, labels, known, coefficients)
     labels = absorb_small_regions(x, y, z, tin.facets, labels, counted, coefficients, area, settings.minimum_void_m2)
     partition = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     if given is not None:
@@ -178,7 +180,7 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     labels[:n] = fill_labels(roof.xy_mm, labels[:n])
     outside = np.flatnonzero(labels[n : n + m] < 0)
     labels[n + outside] = labels[nearest[outside]]
-    labels = continue_crossings(x, y, tin.facets, labels, n, coefficients)
+    labels = continue_crossings(x, y, tin.facets, labels, known, coefficients)
     continued_faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     return RoofPlan(faces=continued_faces, outline_mm=straighten(around, roof.spacing_m, settings), raw=partition)
 

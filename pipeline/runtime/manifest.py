@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
-import hashlib
 import json
 from collections.abc import Mapping
 from enum import StrEnum
@@ -18,14 +17,13 @@ from typing import Any
 
 import pyarrow.fs as pafs
 
-from pipeline.errors import RunError, UnreadableInputError
+from pipeline.errors import RunError
 from pipeline.export.tile import Put, put_local
 
 NAME = "run.json"
 """File name of the manifest in the run directory."""
 FORMAT = 1
 """Version of the run directory's layout; a reader refuses others."""
-_BYTES_A_READ = 1 << 20
 
 
 class RunStatus(StrEnum):
@@ -152,25 +150,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dt.datetime):
         return value.isoformat()
     return value
-
-
-def input_file(path: str | Path, n_points: int | None = None) -> InputFile:
-    """Describe a local input file; it is read once, in pieces.
-
-    Raises
-    ------
-    UnreadableInputError
-        The file cannot be read.
-    """
-    digest, size = hashlib.sha256(), 0
-    try:
-        with Path(path).open("rb") as stream:
-            while piece := stream.read(_BYTES_A_READ):
-                digest.update(piece)
-                size += len(piece)
-    except OSError as error:
-        raise UnreadableInputError(str(path), f"cannot be read ({error.strerror})", "Check path and rights") from error
-    return InputFile(path=str(path), sha256=digest.hexdigest(), size_bytes=size, n_points=n_points)
 
 
 def write_manifest(run_dir: str | Path, manifest: RunManifest, put: Put | None = None) -> None:

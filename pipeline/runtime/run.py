@@ -17,7 +17,7 @@ from pipeline import __version__
 from pipeline.errors import EmptyInputError, InconsistentInputError, RunError
 from pipeline.export.records import RecordContext
 from pipeline.io import ReadOptions, SpatialReference, find_inputs, open_source
-from pipeline.io.footprints import read_footprints
+from pipeline.io.footprints import read_area, read_footprints
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.io.storage import sha256_of
 from pipeline.runtime.digest import run_digest
@@ -148,7 +148,7 @@ class _Driver:
         return results
 
 
-def run(request: RunRequest, on_event: Listener = ignore) -> RunSummary:
+def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | None = None) -> RunSummary:
     """Reconstruct all buildings of the inputs into a run directory.
 
     Parameters
@@ -157,6 +157,8 @@ def run(request: RunRequest, on_event: Listener = ignore) -> RunSummary:
         What is to be done.
     on_event : callable
         Gets an `Event` for every stage, step and warning.
+    executor : Executor, optional
+        Where tasks run; by default what the request asks for.
 
     Returns
     -------
@@ -192,15 +194,15 @@ def run(request: RunRequest, on_event: Listener = ignore) -> RunSummary:
     )
     write_manifest(run_dir, manifest)
     driver.timings["plan"] = time.perf_counter() - began
-    executor = executor_for(
+    engine = executor or executor_for(
         workers=request.workers, scheduler=request.scheduler, local_directory=str(run_dir / "scratch" / "dask")
     )
     try:
         starting = time.perf_counter()
-        with executor:
+        with engine:
             driver.timings["start workers"] = time.perf_counter() - starting
-            check_memory(plan, executor.memory_limit_bytes)
-            stages = _Stages(request=request, plan=plan, driver=driver, executor=executor, scratch=scratch)
+            check_memory(plan, engine.memory_limit_bytes)
+            stages = _Stages(request=request, plan=plan, driver=driver, executor=engine, scratch=scratch)
             ingested = stages.ingest(paths)
             footprints = stages.read_footprints(reference)
             splits = stages.split(ingested, footprints)
@@ -262,9 +264,7 @@ def _plan(request: RunRequest, driver: _Driver) -> tuple[Plan, list[str]]:
     options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit, bbox=request.bbox)
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
-        areas = shapely.union_all(read_footprints(request.aoi, reference).polygons)
-        unit = 1.0 / reference.horizontal_unit_m
-        options = dataclasses.replace(options, aoi=shapely.transform(areas, lambda xy: xy * unit))
+        options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
     plan = make_plan(paths, options, request.settings)
     for warning in plan.warnings:
         driver.warn("plan", warning)

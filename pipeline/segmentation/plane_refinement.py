@@ -14,10 +14,12 @@ import numpy as np
 from numba import njit
 
 from pipeline.errors import BuildingError
-from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Plane, Reason
+from pipeline.model import BoolArray, FloatArray, LabelArray, Plane, Reason
 from pipeline.parameters import Parameters, parameter
 from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_reach, touching_pairs
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
+from pipeline.segmentation.point_assignment import distance_to_plane, nearest_plane, vote_among_neighbours
+from pipeline.segmentation.redundant_planes import dissolve_redundant
 
 _LEAST_SEED_POINTS = 4
 """In the first round a cluster may still be small: its points have not been assigned by planes yet."""
@@ -259,23 +261,27 @@ def _refine(
         if work > work_limit:
             return planes, labels, work
         if all_planes:
-            labels = _nearest_plane(points, planes, usable, distance_m)
+            labels = nearest_plane(points, planes, usable, distance_m)
         else:
             if round_ > 0:
-                _dissolve(points, neighbours, labels, planes, usable, distance_m, plane_cost)
-            labels = _vote(points, neighbours, labels, planes, usable, distance_m, vote_weight, voting_passes)
+                dissolve_redundant(points, neighbours, labels, planes, usable, distance_m, plane_cost)
+            labels = vote_among_neighbours(
+                points, neighbours, labels, planes, usable, distance_m, vote_weight, voting_passes
+            )
     sums = cluster_sums(points, labels, n_clusters)
     _fit_all(sums, planes, usable, fewest_points, min_cosine)
     if not all_planes:
-        _dissolve(points, neighbours, labels, planes, usable, distance_m, plane_cost)
-        labels = _vote(points, neighbours, labels, planes, usable, distance_m, vote_weight, voting_passes)
+        dissolve_redundant(points, neighbours, labels, planes, usable, distance_m, plane_cost)
+        labels = vote_among_neighbours(
+            points, neighbours, labels, planes, usable, distance_m, vote_weight, voting_passes
+        )
     planes, labels = _renumber(points, labels, planes, usable)
     return planes, labels, work
 
 
 @njit(cache=True, nogil=True)
 def _fit_all(sums: FloatArray, planes: FloatArray, usable: BoolArray, fewest: int, min_cosine: float) -> None:
-    """Best-fit plane of every cluster, in place; usable where there are points enough and it is not too steep."""
+    """Best-fit plane of every cluster, in place; usable where it has points enough and is not too steep."""
     for k in range(sums.shape[0]):
         a, b, c, fitted = best_fit_plane(sums[k])
         planes[k, 0] = a
@@ -285,181 +291,14 @@ def _fit_all(sums: FloatArray, planes: FloatArray, usable: BoolArray, fewest: in
 
 
 @njit(cache=True, nogil=True)
-def _distance(points: FloatArray, i: int, planes: FloatArray, k: int) -> float:
-    """Perpendicular distance of a point to a plane (Eq. 1)."""
-    vertical = points[i, 2] - planes[k, 0] * points[i, 0] - planes[k, 1] * points[i, 1] - planes[k, 2]
-    return float(abs(vertical) * cosine_of_slope(planes[k, 0], planes[k, 1]))
-
-
-@njit(cache=True, nogil=True)
 def _drop_outliers(
     points: FloatArray, labels: LabelArray, planes: FloatArray, usable: BoolArray, limit_m: float
 ) -> None:
     """Take the label from points that are far from their plane or have none, in place."""
     for i in range(labels.size):
         k = labels[i]
-        if k >= 0 and (not usable[k] or _distance(points, i, planes, k) > limit_m):
+        if k >= 0 and (not usable[k] or distance_to_plane(points, i, planes, k) > limit_m):
             labels[i] = -1
-
-
-@njit(cache=True, nogil=True)
-def _dissolve(
-    points: FloatArray,
-    neighbours: LabelArray,
-    labels: LabelArray,
-    planes: FloatArray,
-    usable: BoolArray,
-    distance_m: float,
-    plane_cost: float,
-) -> None:
-    """Give up planes whose points the planes around explain nearly as well, the smallest first, in place.
-
-    The noise of a large plane leaves clusters of its outliers, and the edge between two planes a plane across it. The
-    worth of a plane is the sum over its points of (distance / limit)^2 to the nearest touching plane, at most 1, less
-    the same to itself. Points of a plane that is given up take the nearest touching plane, or none.
-    """
-    n = usable.size
-    pairs = touching_pairs(neighbours, labels, usable)
-    if plane_cost <= 0.0 or pairs.size == 0:
-        return
-    first, partner = _partners(pairs, n)
-    size = np.zeros(n, np.int64)
-    for k in labels:
-        if k >= 0:
-            size[k] += 1
-    # Points by label, in their order.
-    begin = np.zeros(n + 1, np.int64)
-    for k in range(n):
-        begin[k + 1] = begin[k] + size[k]
-    fill = begin[:-1].copy()
-    member = np.empty(begin[n], np.int64)
-    for i in range(labels.size):
-        k = labels[i]
-        if k >= 0:
-            member[fill[k]] = i
-            fill[k] += 1
-    for k in np.argsort(size, kind="mergesort"):
-        if not usable[k] or first[k] == first[k + 1]:
-            continue
-        worth = 0.0
-        for m in range(begin[k], begin[k + 1]):
-            i = member[m]
-            least = distance_m
-            for p in range(first[k], first[k + 1]):
-                if usable[partner[p]]:
-                    least = min(least, _distance(points, i, planes, partner[p]))
-            own = min(distance_m, _distance(points, i, planes, k))
-            worth += (least * least - own * own) / (distance_m * distance_m)
-            if worth > 4.0 * plane_cost:
-                break
-        if worth >= plane_cost:
-            continue
-        usable[k] = False
-        for m in range(begin[k], begin[k + 1]):
-            i = member[m]
-            least = distance_m
-            labels[i] = -1
-            for p in range(first[k], first[k + 1]):
-                if not usable[partner[p]]:
-                    continue
-                distance = _distance(points, i, planes, partner[p])
-                if distance < least:
-                    least = distance
-                    labels[i] = partner[p]
-
-
-@njit(cache=True, nogil=True)
-def _partners(pairs: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Pairs as lists: where the partners of every cluster begin, (n + 1,), and the partners, ascending."""
-    first = np.zeros(n + 1, np.int64)
-    for code in pairs:
-        first[code // n + 1] += 1
-        first[code % n + 1] += 1
-    for k in range(n):
-        first[k + 1] += first[k]
-    fill = first[:-1].copy()
-    partner = np.empty(2 * pairs.size, np.int64)
-    for side in range(2):
-        for code in pairs:
-            low = code // n
-            high = code % n
-            owner = high if side == 0 else low
-            partner[fill[owner]] = low if side == 0 else high
-            fill[owner] += 1
-    return first, partner
-
-
-@njit(cache=True, nogil=True)
-def _vote(
-    points: FloatArray,
-    neighbours: LabelArray,
-    labels: LabelArray,
-    planes: FloatArray,
-    usable: BoolArray,
-    distance_m: float,
-    vote_weight: float,
-    passes: int,
-) -> LabelArray:
-    """Every point takes the plane of its neighbourhood with the least (distance / limit)^2 minus weight times votes.
-
-    All points choose at once from the labels before, so the outcome does not depend on their order. A plane beyond
-    the distance is no choice; a point without any choice is an outlier.
-    """
-    width = neighbours.shape[1]
-    old = labels.copy()
-    kind = np.empty(width + 1, np.int32)
-    votes = np.empty(width + 1, np.int32)
-    for _ in range(passes):
-        new = np.full(old.size, -1, np.int32)
-        changes = 0
-        for i in range(old.size):
-            kinds = 0
-            for q in range(-1, width):
-                j = i if q < 0 else neighbours[i, q]
-                if j < 0 or (q >= 0 and j == i):
-                    continue
-                k = old[j]
-                if k < 0 or not usable[k]:
-                    continue
-                at = 0
-                while at < kinds and kind[at] != k:
-                    at += 1
-                if at == kinds:
-                    kind[at] = k
-                    votes[at] = 0
-                    kinds += 1
-                if q >= 0:
-                    votes[at] += 1
-            least = 1.0
-            for s in range(kinds):
-                ratio = _distance(points, i, planes, kind[s]) / distance_m
-                if ratio > 1.0:
-                    continue
-                cost = ratio * ratio - vote_weight * votes[s]
-                if cost < least or (cost == least and kind[s] < new[i]):
-                    least = cost
-                    new[i] = kind[s]
-            changes += new[i] != old[i]
-        old = new
-        if changes == 0:
-            break
-    return old
-
-
-@njit(cache=True, nogil=True)
-def _nearest_plane(points: FloatArray, planes: FloatArray, usable: BoolArray, distance_m: float) -> LabelArray:
-    """The nearest of all planes within the distance (the paper's merging of points with planes), -1 for none."""
-    labels = np.full(points.shape[0], -1, np.int32)
-    for i in range(points.shape[0]):
-        least = distance_m
-        for k in range(usable.size):
-            if not usable[k]:
-                continue
-            distance = _distance(points, i, planes, k)
-            if distance < least or (distance == least and labels[i] < 0):
-                least = distance
-                labels[i] = k
-    return labels
 
 
 @njit(cache=True, nogil=True)

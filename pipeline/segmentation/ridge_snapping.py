@@ -8,18 +8,18 @@ border between two planes becomes exactly their intersection. Both forms are her
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
+from numba import njit
 
-from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.segmentation.plane_regression import cosine_of_slope
+from pipeline.model import FloatArray, IntArray, LabelArray
+from pipeline.segmentation.point_assignment import distance_to_plane
 
 _LEAST_GRADIENT = 0.02
 """Rise a metre by which two planes must part: about 1 degree; below it their intersection is anywhere."""
-_LEAST_LINKS = 3
-"""Neighbouring pairs of points, one on each plane, that make a border."""
+_LEAST_BORDER_POINTS = 3
+"""Points beside the other plane that make a border."""
 _LEAST_AGREEMENT = 0.7
 """Share of the points along a border that must lie on their plane's own side."""
 
@@ -72,13 +72,13 @@ def find_ridges(
         By rising plane indices. Planes that do not touch, are nearly parallel, or meet elsewhere than at their
         border (a step) give none.
     """
-    links = _links(labels, neighbours)
-    ridges = []
-    for low, high, begin, end in _groups(links):
-        ridge = _ridge(points, planes, labels, links[begin:end, 2:], low, high, distance_m, reach_m)
-        if ridge is not None:
-            ridges.append(ridge)
-    return tuple(ridges)
+    segments = _segments(
+        np.ascontiguousarray(points), planes, labels, np.ascontiguousarray(neighbours), distance_m, reach_m
+    )
+    return tuple(
+        Ridge(plane_low=int(low), plane_high=int(high), start=(x0, y0), end=(x1, y1), is_valley=valley > 0.0)
+        for low, high, x0, y0, x1, y1, valley in segments.tolist()
+    )
 
 
 def label_by_ridges(
@@ -103,8 +103,9 @@ def label_by_ridges(
     """
     snapped = labels.copy()
     nearest_m = np.full(len(points), np.inf)
+    members = _members(labels, len(planes))
     for ridge in ridges:
-        near, distance = _near(points, planes, labels, ridge, distance_m, reach_m)
+        near, distance = _near(points, planes, members, ridge, distance_m, reach_m)
         closer = np.abs(distance) < nearest_m[near]
         near, distance = near[closer], distance[closer]
         nearest_m[near] = np.abs(distance)
@@ -139,8 +140,9 @@ def snap_to_ridges(
     coefficients = planes[labels[on_plane]]
     moved[on_plane, 2] = _elevation(coefficients, points[on_plane])
     nearest_m = np.full(len(points), np.inf)
+    members = _members(labels, len(planes))
     for ridge in ridges:
-        near, distance = _near(points, planes, labels, ridge, distance_m, reach_m)
+        near, distance = _near(points, planes, members, ridge, distance_m, reach_m)
         closer = np.abs(distance) < nearest_m[near]
         near, distance = near[closer], distance[closer]
         nearest_m[near] = np.abs(distance)
@@ -157,98 +159,171 @@ def _elevation(coefficients: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(coefficients[:, 0] * points[:, 0] + coefficients[:, 1] * points[:, 1] + coefficients[:, 2])
 
 
-def _links(labels: LabelArray, neighbours: LabelArray) -> IntArray:
-    """Neighbouring points of different planes: rows (low label, high label, point, neighbour), sorted."""
-    source = np.repeat(np.arange(len(labels)), neighbours.shape[1])
-    target = neighbours.ravel().astype(np.int64)
-    valid = target >= 0
-    source, target = source[valid], target[valid]
-    a, b = labels[source].astype(np.int64), labels[target].astype(np.int64)
-    mixed = (a >= 0) & (b >= 0) & (a != b)
-    source, target, a, b = source[mixed], target[mixed], a[mixed], b[mixed]
-    rows = np.column_stack([np.minimum(a, b), np.maximum(a, b), source, target])
-    return rows[np.lexsort((rows[:, 3], rows[:, 2], rows[:, 1], rows[:, 0]))]
-
-
-def _groups(links: IntArray) -> list[tuple[int, int, int, int]]:
-    """(low, high, begin, end) of the runs of links between the same two planes."""
-    if len(links) == 0:
-        return []
-    change = np.flatnonzero((links[1:, :2] != links[:-1, :2]).any(axis=1)) + 1
-    bounds = [0, *change.tolist(), len(links)]
-    return [(int(links[s, 0]), int(links[s, 1]), s, e) for s, e in itertools.pairwise(bounds)]
-
-
-def _ridge(
-    points: FloatArray,
-    planes: FloatArray,
-    labels: LabelArray,
-    links: IntArray,
-    low: int,
-    high: int,
-    distance_m: float,
-    reach_m: float,
-) -> Ridge | None:
-    """The ridge between two planes, or None where they do not meet along their border."""
-    gradient = planes[low] - planes[high]
-    steepness = math.hypot(gradient[0], gradient[1])
-    if steepness < _LEAST_GRADIENT:
-        return None
-    border = np.unique(links)
-    difference_m = _elevation(gradient[None, :], points[border])
-    near = np.abs(difference_m) / steepness <= reach_m
-    near &= _explained(points[border], planes[low], distance_m) | _explained(points[border], planes[high], distance_m)
-    border, difference_m = border[near], difference_m[near]
-    if len(border) < _LEAST_LINKS:
-        return None
-    is_low = labels[border] == low
-    if is_low.all() or not is_low.any():
-        return None
-    # A point of the low-numbered plane lies where that plane is the upper one: a valley.
-    above = difference_m > 0.0
-    valley_votes = int(np.count_nonzero(above == is_low))
-    is_valley = 2 * valley_votes > len(border)
-    if max(valley_votes, len(border) - valley_votes) < _LEAST_AGREEMENT * len(border):
-        return None
-    along = np.array([-gradient[1], gradient[0]]) / steepness
-    foot = -gradient[2] * gradient[:2] / steepness**2
-    position = (points[border, 0] - foot[0]) * along[0] + (points[border, 1] - foot[1]) * along[1]
-    start, end = foot + along * position.min(), foot + along * position.max()
-    return Ridge(
-        plane_low=low,
-        plane_high=high,
-        start=(float(start[0]), float(start[1])),
-        end=(float(end[0]), float(end[1])),
-        is_valley=is_valley,
-    )
-
-
-def _explained(points: FloatArray, plane: FloatArray, distance_m: float) -> BoolArray:
-    """Points within a perpendicular distance of a plane."""
-    vertical = points[:, 2] - _elevation(plane[None, :], points)
-    return np.asarray(np.abs(vertical) * cosine_of_slope(plane[0], plane[1]) <= distance_m)
+def _members(labels: LabelArray, n_planes: int) -> tuple[IntArray, IntArray]:
+    """Points by plane: where those of each begin, (n_planes + 1,), and their indices, ascending."""
+    order = np.argsort(labels, kind="stable")
+    return np.searchsorted(labels[order], np.arange(n_planes + 1)), order
 
 
 def _near(
-    points: FloatArray, planes: FloatArray, labels: LabelArray, ridge: Ridge, distance_m: float, reach_m: float
+    points: FloatArray,
+    planes: FloatArray,
+    members: tuple[IntArray, IntArray],
+    ridge: Ridge,
+    distance_m: float,
+    reach_m: float,
 ) -> tuple[IntArray, FloatArray]:
     """Points of the two planes that lie near the ridge and that both explain, and their distance in plan from its line.
 
     The distance is positive where the low-numbered plane is the upper one.
     """
-    gradient = planes[ridge.plane_low] - planes[ridge.plane_high]
-    index = np.flatnonzero((labels == ridge.plane_low) | (labels == ridge.plane_high))
-    distance = _elevation(gradient[None, :], points[index]) / math.hypot(gradient[0], gradient[1])
-    near = np.abs(distance) <= reach_m
-    index, distance = index[near], distance[near]
-    start, end = np.array(ridge.start), np.array(ridge.end)
-    length = math.hypot(*(end - start))
-    if length > 0.0:
-        along = (end - start) / length
-        offset = points[index, :2] - start
-        position = offset[:, 0] * along[0] + offset[:, 1] * along[1]
-        inside = (position >= 0.0) & (position <= length)
-        index, distance = index[inside], distance[inside]
-    explained = _explained(points[index], planes[ridge.plane_low], distance_m)
-    explained &= _explained(points[index], planes[ridge.plane_high], distance_m)
-    return index[explained], distance[explained]
+    begin, order = members
+    low, high = ridge.plane_low, ridge.plane_high
+    index = np.concatenate([order[begin[low] : begin[low + 1]], order[begin[high] : begin[high + 1]]])
+    return _near_segment(points, planes, index, low, high, *ridge.start, *ridge.end, distance_m, reach_m)
+
+
+@njit(cache=True, nogil=True)
+def _near_segment(
+    points: FloatArray,
+    planes: FloatArray,
+    index: IntArray,
+    low: int,
+    high: int,
+    start_x: float,
+    start_y: float,
+    end_x: float,
+    end_y: float,
+    distance_m: float,
+    reach_m: float,
+) -> tuple[IntArray, FloatArray]:
+    """The kernel of `_near` over the points of an index."""
+    gradient_x = planes[low, 0] - planes[high, 0]
+    gradient_y = planes[low, 1] - planes[high, 1]
+    steepness = math.hypot(gradient_x, gradient_y)
+    length = math.hypot(end_x - start_x, end_y - start_y)
+    near = np.empty(index.size, np.int64)
+    distance = np.empty(index.size)
+    count = 0
+    for i in index:
+        offset = _difference(points, i, planes, low, high) / steepness
+        if abs(offset) > reach_m:
+            continue
+        along = (points[i, 0] - start_x) * (end_x - start_x) + (points[i, 1] - start_y) * (end_y - start_y)
+        if along < 0.0 or along > length * length:
+            continue
+        if max(distance_to_plane(points, i, planes, low), distance_to_plane(points, i, planes, high)) > distance_m:
+            continue
+        near[count] = i
+        distance[count] = offset
+        count += 1
+    return near[:count].copy(), distance[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _difference(points: FloatArray, i: int, planes: FloatArray, low: int, high: int) -> float:
+    """Elevation of the low-numbered plane above the other at a point; its zero is the line of intersection."""
+    return float(
+        (planes[low, 0] - planes[high, 0]) * points[i, 0]
+        + (planes[low, 1] - planes[high, 1]) * points[i, 1]
+        + (planes[low, 2] - planes[high, 2])
+    )
+
+
+@njit(cache=True, nogil=True)
+def _segments(
+    points: FloatArray,
+    planes: FloatArray,
+    labels: LabelArray,
+    neighbours: LabelArray,
+    distance_m: float,
+    reach_m: float,
+) -> FloatArray:
+    """Rows (low, high, start x, y, end x, y, valley or not) of the ridges of all touching planes."""
+    n = labels.size
+    n_planes = planes.shape[0]
+    border = _borders(labels, neighbours, n_planes)
+    rows = np.empty((border.size, 7))
+    count = 0
+    begin = 0
+    while begin < border.size:
+        pair = border[begin] // n
+        end = begin
+        while end < border.size and border[end] // n == pair:
+            end += 1
+        low = pair // n_planes
+        high = pair % n_planes
+        if _segment(points, planes, labels, border[begin:end] % n, low, high, distance_m, reach_m, rows[count]):
+            count += 1
+        begin = end
+    return rows[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _borders(labels: LabelArray, neighbours: LabelArray, n_planes: int) -> IntArray:
+    """Codes (low plane * planes + high plane) * points + point of the points beside another plane, ascending, once."""
+    n = labels.size
+    count = 0
+    codes = np.empty(64, np.int64)
+    for i in range(n):
+        for q in range(neighbours.shape[1]):
+            j = neighbours[i, q]
+            if j < 0 or labels[i] < 0 or labels[j] < 0 or labels[i] == labels[j]:
+                continue
+            if count + 2 > codes.size:
+                codes = np.concatenate((codes, np.empty(codes.size, np.int64)))
+            pair = np.int64(min(labels[i], labels[j])) * n_planes + max(labels[i], labels[j])
+            codes[count] = pair * n + i
+            codes[count + 1] = pair * n + j
+            count += 2
+    return np.unique(codes[:count])
+
+
+@njit(cache=True, nogil=True)
+def _segment(
+    points: FloatArray,
+    planes: FloatArray,
+    labels: LabelArray,
+    border: IntArray,
+    low: int,
+    high: int,
+    distance_m: float,
+    reach_m: float,
+    row: FloatArray,
+) -> bool:
+    """Fill the row of the ridge between two planes; False where they do not meet along their border."""
+    gradient_x = planes[low, 0] - planes[high, 0]
+    gradient_y = planes[low, 1] - planes[high, 1]
+    steepness = math.hypot(gradient_x, gradient_y)
+    if steepness < _LEAST_GRADIENT:
+        return False
+    offset = (planes[low, 2] - planes[high, 2]) / (steepness * steepness)
+    count = 0
+    count_low = 0
+    valley_votes = 0
+    first = np.inf
+    last = -np.inf
+    for i in border:
+        difference_m = _difference(points, i, planes, low, high)
+        if abs(difference_m) > reach_m * steepness:
+            continue
+        if min(distance_to_plane(points, i, planes, low), distance_to_plane(points, i, planes, high)) > distance_m:
+            continue
+        count += 1
+        is_low = labels[i] == low
+        count_low += is_low
+        # A point of the low-numbered plane lies where that plane is the upper one: a valley.
+        valley_votes += (difference_m > 0.0) == is_low
+        position = (points[i, 1] * gradient_x - points[i, 0] * gradient_y) / steepness
+        first = min(first, position)
+        last = max(last, position)
+    agreeing = max(valley_votes, count - valley_votes)
+    if count < _LEAST_BORDER_POINTS or count_low in {0, count} or agreeing < _LEAST_AGREEMENT * count:
+        return False
+    row[0] = low
+    row[1] = high
+    for entry, position in ((2, first), (4, last)):
+        row[entry] = -offset * gradient_x - position * gradient_y / steepness
+        row[entry + 1] = -offset * gradient_y + position * gradient_x / steepness
+    row[6] = 1.0 if 2 * valley_votes > count else 0.0
+    return True

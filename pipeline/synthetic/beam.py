@@ -15,6 +15,7 @@ from pipeline.synthetic.first_hit import (
     TREE,
     cell_of,
     first_hit,
+    is_clear,
     mixed_bits,
     terrain_hit,
     uniform_of,
@@ -22,12 +23,14 @@ from pipeline.synthetic.first_hit import (
 from pipeline.synthetic.scene_arrays import SceneArrays
 
 LINES_A_BEAM = 7
-"""One in the middle, six around it."""
+"""One in the middle, six around it; a beam that meets no edge and no crown needs only the one in the middle."""
 MAX_RETURNS = LINES_A_BEAM
 """No more returns than lines."""
 COLUMNS = 7
 """Integer columns: return number, return count, class, intensity, building, face, mixed."""
 
+_CLEAR_RADII = 1.5
+"""A sloping face is met a little farther out than a level one."""
 _DRAWS_BEFORE_CROWNS = 4 + 2 * MAX_RETURNS
 _DRAWS_A_LINE = 4096
 """More than entries in any cell, so that no two lines of a beam share a chance."""
@@ -143,7 +146,7 @@ def scan_lines(
             x, y, z = terrain_hit(scene, x, y, base_z, lean_x, lean_y)
             cell = cell_of(scene, x, y)
             lines = 1
-            if cell >= 0 and scene.cell_start[cell + 1] > scene.cell_start[cell]:
+            if cell >= 0 and not is_clear(scene, cell, x, y, z, lean_x, lean_y, _CLEAR_RADII * radius):
                 lines = LINES_A_BEAM
             turn = 2.0 * math.pi * uniform_of(state, 3)
             for k in range(lines):

@@ -78,9 +78,64 @@ def _inside(scene: SceneArrays, face: int, x: float, y: float) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _passes_by(scene: SceneArrays, prism: int, x: float, y: float, z: float, lean: float, radius: float) -> bool:
+    """Whether a line stays out of the circle around a prism by more than a radius: most do."""
+    away_x, away_y = x - scene.circles[prism, 0], y - scene.circles[prism, 1]
+    reach = scene.circles[prism, 2] + max(0.0, scene.circles[prism, 3] - z) * lean + radius
+    return bool(away_x * away_x + away_y * away_y > reach * reach)
+
+
+@njit(cache=True, nogil=True)
+def is_clear(
+    scene: SceneArrays, cell: int, x: float, y: float, z: float, lean_x: float, lean_y: float, radius: float
+) -> bool:
+    """Whether a beam of a radius around a line meets no edge of a roof face and no crown.
+
+    Each face is looked at in its own plane, whether it is hit or hidden, so a beam past an eave is not clear. Edges of
+    walls alone (the vertical corners of a house) are not looked at.
+    """
+    lean = math.sqrt(lean_x * lean_x + lean_y * lean_y)
+    for entry in range(scene.cell_start[cell], scene.cell_start[cell + 1]):
+        number = scene.cell_entries[entry]
+        if number < 0:
+            tree = ~number
+            wide, tall = scene.trees[tree, 3] + radius, scene.trees[tree, 4] + radius
+            from_x, from_y = (x - scene.trees[tree, 0]) / wide, (y - scene.trees[tree, 1]) / wide
+            from_z = (z - scene.trees[tree, 2]) / tall
+            to_x, to_y, to_z = lean_x / wide, lean_y / wide, 1.0 / tall
+            linear = from_x * to_x + from_y * to_y + from_z * to_z
+            square = to_x * to_x + to_y * to_y + to_z * to_z
+            if linear * linear > square * (from_x * from_x + from_y * from_y + from_z * from_z - 1.0):
+                return False
+            continue
+        if _passes_by(scene, number, x, y, z, lean, radius):
+            continue
+        for face in range(scene.face_start[number], scene.face_start[number + 1]):
+            a, b, c = scene.planes[face, 0], scene.planes[face, 1], scene.planes[face, 2]
+            leaning = 1.0 - a * lean_x - b * lean_y
+            if leaning <= 1e-9:
+                return False
+            up = (a * x + b * y + c - z) / leaning
+            at_x, at_y = x + up * lean_x, y + up * lean_y
+            before = scene.ring_start[face + 1] - 1
+            for k in range(scene.ring_start[face], scene.ring_start[face + 1]):
+                x1, y1 = scene.ring_x[before], scene.ring_y[before]
+                edge_x, edge_y = scene.ring_x[k] - x1, scene.ring_y[k] - y1
+                before = k
+                along = ((at_x - x1) * edge_x + (at_y - y1) * edge_y) / (edge_x * edge_x + edge_y * edge_y)
+                along = min(1.0, max(0.0, along))
+                off_x, off_y = at_x - x1 - along * edge_x, at_y - y1 - along * edge_y
+                if off_x * off_x + off_y * off_y < radius * radius:
+                    return False
+    return True
+
+
+@njit(cache=True, nogil=True)
 def _prism_hit(scene: SceneArrays, prism: int, x: float, y: float, z: float, lean_x: float, lean_y: float) -> Any:
     """Highest hit of a line with the prisms under the faces: elevation (-inf for none), face or -1 for a wall."""
     best, hit = -np.inf, -1
+    if _passes_by(scene, prism, x, y, z, math.sqrt(lean_x * lean_x + lean_y * lean_y), 0.0):
+        return best, hit
     first = scene.face_start[prism]
     for face in range(first, scene.face_start[prism + 1]):
         a, b, c = scene.planes[face, 0], scene.planes[face, 1], scene.planes[face, 2]

@@ -35,6 +35,8 @@ class SceneArrays(NamedTuple):
     """(vertices,) float64."""
     planes: FloatArray
     """(faces, 3) float64: a, b, c."""
+    circles: FloatArray
+    """(prisms, 4) float64, circle around each prism: x, y, radius; and its highest elevation."""
     trees: FloatArray
     """(trees, 6) float64: x, y, z, radius, half height, free path."""
     grid: FloatArray
@@ -63,6 +65,7 @@ def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5) -> 
     """
     face_start, ring_start = [0], [0]
     rings: list[FloatArray] = []
+    circles: list[tuple[float, float, float, float]] = []
     planes: list[tuple[float, float, float]] = []
     bounds: list[tuple[float, float, float, float]] = []
     for building in scene.buildings:
@@ -73,12 +76,14 @@ def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5) -> 
             ring_start.append(ring_start[-1] + len(face))
         face_start.append(len(planes))
         bounds.append(_reach(low, high, (high[2] - building.floor_z_m) * max_lean + margin_m))
+        circles.append(_circle(building.vertices[:, :2], building.ridge_z_m))
     for box in scene.boxes:
         rings.append(box.corners)
         planes.append((0.0, 0.0, box.top_z_m))
         ring_start.append(ring_start[-1] + len(box.corners))
         face_start.append(len(planes))
         bounds.append(_reach(box.corners.min(axis=0), box.corners.max(axis=0), 5.0 * max_lean + margin_m))
+        circles.append(_circle(box.corners, box.top_z_m))
     trees = np.array([dataclasses.astuple(tree) for tree in scene.trees]).reshape(-1, 6)
     ground = scene.terrain.elevation(trees[:, 0], trees[:, 1])
     for row, z in zip(trees, ground, strict=True):
@@ -97,6 +102,7 @@ def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5) -> 
         ring_x=np.ascontiguousarray(vertices[:, 0]),
         ring_y=np.ascontiguousarray(vertices[:, 1]),
         planes=np.array(planes, dtype=np.float64).reshape(-1, 3),
+        circles=np.array(circles, dtype=np.float64).reshape(-1, 4),
         trees=trees,
         grid=grid,
         cells_across=across,
@@ -108,6 +114,12 @@ def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5) -> 
 
 def _reach(low: FloatArray, high: FloatArray, reach_m: float) -> tuple[float, float, float, float]:
     return (low[0] - reach_m, low[1] - reach_m, high[0] + reach_m, high[1] + reach_m)
+
+
+def _circle(corners: FloatArray, top_z_m: float) -> tuple[float, float, float, float]:
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    radius = np.hypot(*(corners - middle).T).max()
+    return float(middle[0]), float(middle[1]), float(radius), top_z_m
 
 
 def _cells(

@@ -101,6 +101,8 @@ def suburb(seed: int, *, size_m: tuple[float, float] = (200.0, 200.0), name: str
     rows = math.ceil(reach / (2 * LOT_DEPTH_M + STREET_M)) + 1
     columns = math.ceil(reach / LOT_WIDTH_M) + 1
     buildings: list[Building] = []
+    outlines: list[shapely.Polygon] = []
+    back_to_back = 4 * columns + 2  # houses of two rows: no other can be near
     trees: list[Tree] = []
     boxes: list[Box] = []
     mix: list[RoofShape] = []
@@ -120,15 +122,16 @@ def suburb(seed: int, *, size_m: tuple[float, float] = (200.0, 200.0), name: str
                     mix = [_MIX[k] for k in random.permutation(len(_MIX))]
                 house = _house(f"{name}-{len(buildings):05d}", mix[-1], centre, azimuth, side, terrain, random)
                 footprint = house.footprint
-                if not inside.contains(footprint) or _near(footprint, buildings, CLEARANCE_M):
+                if not inside.contains(footprint) or _near(footprint, outlines[-back_to_back:], CLEARANCE_M):
                     continue
                 mix.pop()
                 buildings.append(house)
+                outlines.append(footprint)
                 trees += _garden(house, footprint, terrain, random)
                 if random.random() < 0.5:
-                    boxes += _parked(lot[0], street, side, middle, azimuth, terrain, buildings, random)
-    footprints = shapely.STRtree([building.footprint for building in buildings])
-    trees = [tree for tree in trees if _tree_stands_free(tree, buildings, footprints)]
+                    boxes += _parked(lot[0], street, side, middle, azimuth, terrain, outlines[-back_to_back:], random)
+    footprints = shapely.STRtree(outlines)
+    trees = [tree for tree in trees if _tree_stands_free(tree, footprints)]
     return Scene(
         name=name,
         origin=(565_000.0, 5_934_000.0, 0.0),
@@ -141,9 +144,9 @@ def suburb(seed: int, *, size_m: tuple[float, float] = (200.0, 200.0), name: str
     )
 
 
-def _near(footprint: shapely.Polygon, buildings: list[Building], distance_m: float) -> bool:
-    """Whether one of the last buildings (a street and its back row) is too close."""
-    return any(footprint.distance(other.footprint) < distance_m for other in buildings[-80:])
+def _near(footprint: shapely.Polygon, others: list[shapely.Polygon], distance_m: float) -> bool:
+    """Whether one of the others is too close."""
+    return bool(others) and bool((shapely.distance(footprint, others) < distance_m).any())
 
 
 def _house(
@@ -214,18 +217,17 @@ def _parked(
     middle: FloatArray,
     azimuth: float,
     terrain: Terrain,
-    buildings: list[Building],
+    outlines: list[shapely.Polygon],
     random: np.random.Generator,
 ) -> list[Box]:
     """A car at the kerb in front of the lot."""
     place = np.array([(lot[0] + random.uniform(-5.0, 5.0), street + side * (STREET_M / 2 - 1.5))])
     x, y = turned(place, float(middle[0]), float(middle[1]), azimuth)[0]
     car = car_at(float(x), float(y), azimuth, terrain, random)
-    return [] if _near(shapely.Polygon(car.corners), buildings, 0.5) else [car]
+    return [] if _near(shapely.Polygon(car.corners), outlines, 0.5) else [car]
 
 
-def _tree_stands_free(tree: Tree, buildings: list[Building], footprints: shapely.STRtree) -> bool:
+def _tree_stands_free(tree: Tree, footprints: shapely.STRtree) -> bool:
     """Whether the trunk stands outside of all houses, and the crown does not sink deep into one."""
     trunk = shapely.Point(tree.x, tree.y)
-    near = footprints.query(trunk.buffer(tree.crown_radius_m))
-    return all(buildings[k].footprint.distance(trunk) > 0.55 * tree.crown_radius_m for k in near)
+    return len(footprints.query(trunk, predicate="dwithin", distance=0.55 * tree.crown_radius_m)) == 0

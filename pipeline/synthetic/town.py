@@ -32,7 +32,7 @@ def town(seed: int, *, size_m: tuple[float, float] = (400.0, 400.0), name: str =
     seed : int
         Seed of the layout; not negative.
     size_m : tuple of float
-        Extent east and north. A square kilometre has about 3,000 buildings.
+        Extent east and north. A square kilometre has about 2,300 buildings.
     name : str
         Name of the scene, and of its buildings.
     """

@@ -221,20 +221,20 @@ def _terrain(lowest: Elevations, is_ground: BoolArray, bridge: int) -> Elevation
             vxz = (m[7] - c * m[3]) - sx * mean
             vyz = (m[8] - r * m[3]) - sy * mean
             det = vxx * vyy - vxy * vxy
-            z = float(mean)
+            level = float(mean)
             if count >= 5 and det > 0.05 * (vxx + vyy) * (vxx + vyy):
                 a = (vxz * vyy - vyz * vxy) / det
                 b = (vyz * vxx - vxz * vxy) / det
                 # towards the box's edge a plane is trusted, far outside its own points it is not
-                z = mean - (a * sx + b * sy) / n
+                level = mean - (a * sx + b * sy) / n
                 low, high = 1e12, -1e12
                 for rr in range(r0, r1):
                     for cc in range(c0, c1):
                         if is_ground[rr, cc]:
                             low = min(low, float(lowest[rr, cc]))
                             high = max(high, float(lowest[rr, cc]))
-                z = min(max(z, low), high)
-            terrain[r, c] = np.int32(round(z))
+                level = min(max(level, low), high)
+            terrain[r, c] = np.int32(round(level))
     return terrain
 
 

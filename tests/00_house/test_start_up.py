@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
+import resource
 import subprocess
 import sys
-import time
-
-import pytest
 
 HEAVY = ("dask", "distributed", "pandas", "geopandas", "pyarrow", "matplotlib", "fastapi", "laspy", "pyogrio")
 
@@ -31,11 +29,15 @@ def test_the_check_sees_a_heavy_import() -> None:
     assert "pandas" in modules_after("import pandas")
 
 
-@pytest.mark.slow
 def test_help_comes_at_once() -> None:
+    def spent_s() -> float:
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return used.ru_utime + used.ru_stime
+
     seconds = []
     for _ in range(3):
-        start = time.perf_counter()
+        before = spent_s()
         subprocess.run([sys.executable, "-m", "service.cli", "--help"], capture_output=True, check=True)
-        seconds.append(time.perf_counter() - start)
+        seconds.append(spent_s() - before)
+    # processor time, not the clock: a busy machine must not fail the test
     assert min(seconds) < 0.5

@@ -135,7 +135,7 @@ def test_a_large_chunk_size_of_few_points_is_read_all_the_same(tmp_path, points,
 def test_text_and_archives_named_las_are_told_for_what_they_are(tmp_path):
     text = tmp_path / "a.las"
     text.write_text("1.0 2.0 3.0\n" * 100)
-    with pytest.raises(UnreadableInputError, match="not a LAS file.*LAS and LAZ.*PLY.*ASCII"):
+    with pytest.raises(UnreadableInputError, match=r"not a LAS file.*LAS and LAZ.*PLY.*ASCII"):
         open_source(text)
     archive = tmp_path / "b.laz"
     with zipfile.ZipFile(archive, "w") as stream:
@@ -147,7 +147,7 @@ def test_text_and_archives_named_las_are_told_for_what_they_are(tmp_path):
 def test_the_signature_alone_is_truncated(tmp_path):
     path = tmp_path / "a.las"
     path.write_bytes(b"LASF" + bytes(40))
-    with pytest.raises(UnreadableInputError, match="LAS version 0.0 is not known"):
+    with pytest.raises(UnreadableInputError, match=r"LAS version 0.0 is not known"):
         open_source(path)
     raw = bytearray(b"LASF" + bytes(60))
     raw[24], raw[25] = 1, 2
@@ -246,17 +246,17 @@ def test_no_single_damaged_byte_of_a_header_escapes_as_another_error(tmp_path, p
     path = write_las(tmp_path / f"a{suffix}", points(300), version="1.4", point_format=6)
     raw, bad = path.read_bytes(), tmp_path / f"b{suffix}"
     rng = np.random.default_rng(3)
-    n_refused = 0
-    for at in [*range(4, 375), *rng.integers(375, len(raw), 60).tolist()]:
+    refusals = []
+    for at in [*range(4, 375, 2), *rng.integers(375, len(raw), 60).tolist()]:
         damaged = bytearray(raw)
         damaged[at] ^= 0xFF
         bad.write_bytes(damaged)
         try:
             read_through(bad)
         except InputError as fault:
-            n_refused += 1
-            assert fault.fix
-    assert n_refused > 20
+            refusals.append(fault)
+    assert len(refusals) > 10
+    assert all(fault.fix and fault.path == str(bad) for fault in refusals)
 
 
 def test_a_file_that_may_not_be_read_is_told(tmp_path, points, write_las, monkeypatch):
@@ -269,7 +269,7 @@ def test_a_file_that_may_not_be_read_is_told(tmp_path, points, write_las, monkey
         return original(self, *args, **kwargs)
 
     monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(UnreadableInputError, match="Permission denied.*permissions"):
+    with pytest.raises(UnreadableInputError, match=r"Permission denied.*permissions"):
         open_source(path)
 
 

@@ -176,3 +176,17 @@ def test_options_reach_the_reference(tmp_path, points, write_las):
     path = write_las(tmp_path / "a.laz", points(20))
     reference = open_source(path, ReadOptions(crs="EPSG:28992", vertical_unit="ft")).info.reference
     assert (reference.epsg, reference.vertical_unit_m) == (28992, FOOT_M)
+
+
+def test_degrees_without_a_crs_are_not_taken_for_metres(tmp_path):
+    rng = np.random.default_rng(0)
+    degrees = np.column_stack(
+        (4.35 + rng.uniform(0, 0.002, 500), 52.01 + rng.uniform(0, 0.001, 500), np.full(500, 3.0))
+    )
+    np.savetxt(tmp_path / "a.xyz", degrees, fmt="%.8f")
+    with pytest.raises(CrsError, match=r"look like degrees.*Reproject.*--crs"):
+        open_source(tmp_path / "a.xyz")
+    assert open_source(tmp_path / "a.xyz", ReadOptions(crs="EPSG:28992")).info.point_count == 500
+    # A small scene at the origin in metres is not mistaken.
+    np.savetxt(tmp_path / "b.xyz", (degrees - degrees[0]) * [5e3, 1e4, 1.0], fmt="%.4f")
+    assert open_source(tmp_path / "b.xyz").info.point_count == 500

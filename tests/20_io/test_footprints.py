@@ -8,6 +8,7 @@ import sys
 
 import geopandas
 import numpy as np
+import pandas as pd
 import pytest
 from shapely import LineString, MultiPolygon, Point, Polygon, box
 from shapely.affinity import scale
@@ -84,9 +85,7 @@ def test_a_named_column_must_be_there_and_identify(tmp_path):
 
 
 def test_attributes_are_plain_values(tmp_path):
-    import pandas
-
-    built = pandas.to_datetime(["1999-12-31", None])
+    built = pd.to_datetime(["1999-12-31", None])
     path = write(tmp_path / "a.gpkg", built=built, height=[1.5, np.nan], storeys=np.array([2, 3]), note=["x", None])
     first, second = read_footprints(path, reference()).attributes
     assert first["built"].startswith("1999-12-31")
@@ -182,6 +181,7 @@ def test_the_delft_footprints_read_as_geopandas_reads_them(shared_data):
 
 
 def test_importing_the_reader_needs_neither_pandas_nor_the_format_libraries():
-    code = "import sys, pipeline.io; print([m for m in ('pandas', 'geopandas', 'pyogrio', 'laspy', 'scipy', 'pyproj') if m in sys.modules])"
+    heavy = ("pandas", "geopandas", "pyogrio", "laspy", "scipy", "pyproj")
+    code = f"import sys, pipeline.io; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -100,6 +99,7 @@ def test_the_content_decides_and_not_the_name(tmp_path, points, write_las):
         ("a.gpkg", b"SQLite format 3\0", "footprints"),
         ("a.e57", b"ASTM-E57", "convert"),
         ("a.ply", b"solid", "not a PLY file"),
+        ("a.asc", b"ncols 3\nnrows 2\n1 2 3\n4 5 6\n", "raster"),
         ("a.foo", b"\0\1\2\3", "format not known"),
         ("a.foo", b"hello world\n", "format not known"),
         ("a.txt", b"1 2 3\0", "format not known"),
@@ -123,7 +123,7 @@ def test_every_format_has_its_reader(tmp_path):
 
 def test_links_to_one_file_are_one_input(folder):
     link = folder / "z.laz"
-    os.symlink(folder / "b.laz", link)
+    link.symlink_to(folder / "b.laz")
     assert names(find_inputs([folder / "b.laz", link])) == ["b.laz"]
 
 

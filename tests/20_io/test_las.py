@@ -161,3 +161,9 @@ def test_memory_is_bounded_by_the_piece_and_not_by_the_file(tmp_path, points, wr
     assert n == 600_000
     # 600,000 points are 24 MB as records and coordinates; a piece is 30 times smaller.
     assert peak < 6e6
+
+
+def test_times_that_are_no_numbers_become_zero(tmp_path, points, write_las):
+    times = np.linspace(1.0, 2.0, 100)
+    times[7] = np.nan
+    assert read_all(write_las(tmp_path / "a.laz", points(100), gps_time=times)).gps_time[7] == 0.0

@@ -255,6 +255,25 @@ def test_the_literal_recipe_is_worse_on_a_house_as_the_paper_says() -> None:
     assert share(FuzzySartSettings.literal()) < share(FuzzySartSettings())
 
 
+def test_a_candidate_without_points_has_too_few() -> None:
+    empty = Candidate(
+        building_id="empty", origin=(0.0, 0.0, 0.0), points=np.zeros((0, 3)), ground=np.zeros((0, 3)), ground_z_m=0.0
+    )
+    with pytest.raises(BuildingError, match="0 of 0 points"):
+        segment(empty, FuzzySartSettings())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_plane_has_points_and_every_label_a_plane(seed: int) -> None:
+    points = np.random.default_rng(seed).uniform(-4, 4, (300, 3)) * np.array([1, 1, 0.2]) + np.array([0, 0, 6])
+    for settings in (FuzzySartSettings(), FuzzySartSettings.literal()):
+        found = segment(candidate_of(points), settings)
+        assert set(found.labels.tolist()) - {-1} == set(range(len(found.planes)))
+        assert [plane.n_points for plane in found.planes] == np.bincount(
+            found.labels[found.labels >= 0], minlength=len(found.planes)
+        ).tolist()
+
+
 def test_too_few_visible_points_are_told_with_their_number() -> None:
     with pytest.raises(BuildingError, match="5 of 5 points are visible from above, least_points is 6") as caught:
         segment(candidate_of(np.array([[0.0, 0, 5], [1, 0, 5], [0, 1, 5], [1, 1, 5], [2, 2, 5]])), FuzzySartSettings())

@@ -23,6 +23,9 @@ from pipeline.roof.simplification import simplify_partition, unite_close_vertice
 from pipeline.roof.solid import solid_parts
 from pipeline.tin.delaunay import triangulate
 
+ExactRoofs = Callable[..., Any]
+Volume = Callable[[Solid], float]
+
 FLAT = np.zeros((3, 3))
 
 
@@ -146,7 +149,7 @@ def test_no_roof_vertex_is_an_error_with_its_reason() -> None:
     assert caught.value.reason is Reason.NO_PARTITION
 
 
-def test_simplification_keeps_the_coverage_and_drops_vertices(exact_roof: Callable[..., Any]) -> None:
+def test_simplification_keeps_the_coverage_and_drops_vertices(exact_roof: ExactRoofs) -> None:
     plan, roof, _ = exact_roof("stepped", noise_m=0.03).partition()
     simple = simplify_partition(plan.raw, roof.spacing_m)
     assert polygons_are_a_coverage(simple)
@@ -164,7 +167,7 @@ def test_vertices_a_few_millimetres_apart_become_one_in_both_polygons() -> None:
     assert sum(shapely.get_num_coordinates(list(united.polygons))) == 6 + 6
 
 
-def test_a_shift_by_whole_metres_shifts_the_solid_to_the_bit(exact_roof: Callable[..., Any]) -> None:
+def test_a_shift_by_whole_metres_shifts_the_solid_to_the_bit(exact_roof: ExactRoofs) -> None:
     roof = exact_roof("l", noise_m=0.02, turn_deg=23.0)
     shift = np.array([137.0, -64.0, 0.0])
     moved = dataclasses.replace(
@@ -177,7 +180,7 @@ def test_a_shift_by_whole_metres_shifts_the_solid_to_the_bit(exact_roof: Callabl
         assert np.array_equal(np.rint((here.solid.vertices + shift) * 1e3), np.rint(there.solid.vertices * 1e3))
 
 
-def test_the_order_of_points_does_not_matter(exact_roof: Callable[..., Any]) -> None:
+def test_the_order_of_points_does_not_matter(exact_roof: ExactRoofs) -> None:
     roof = exact_roof("dormer", noise_m=0.02)
 
     def faces(some_roof: Any) -> list[tuple[int, str]]:
@@ -196,7 +199,7 @@ def test_the_order_of_points_does_not_matter(exact_roof: Callable[..., Any]) -> 
 
 @pytest.mark.parametrize("kind", ["hip", "l", "dormer"])
 def test_a_mirrored_roof_gives_a_valid_solid_of_the_same_volume(
-    exact_roof: Callable[..., Any], volume: Callable[[Solid], float], kind: str
+    exact_roof: ExactRoofs, volume: Volume, kind: str
 ) -> None:
     roof = exact_roof(kind, with_footprint=True)
     mirrored = dataclasses.replace(

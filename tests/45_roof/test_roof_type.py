@@ -10,6 +10,8 @@ import pytest
 from pipeline.model import RoofType
 from pipeline.roof.roof_type import RoofTypeSettings, roof_type
 
+ExactRoofs = Callable[..., Any]
+
 TYPES = {
     "flat": RoofType.FLAT,
     "pent": RoofType.PENT,
@@ -24,16 +26,14 @@ TYPES = {
 @pytest.mark.parametrize("kind", list(TYPES))
 @pytest.mark.parametrize("turn_deg", [0.0, 200.0])
 @pytest.mark.parametrize("with_footprint", [True, False])
-def test_an_exact_roof_has_its_type(
-    exact_roof: Callable[..., Any], kind: str, turn_deg: float, with_footprint: bool
-) -> None:
+def test_an_exact_roof_has_its_type(exact_roof: ExactRoofs, kind: str, turn_deg: float, with_footprint: bool) -> None:
     roof = exact_roof(kind, turn_deg=turn_deg, with_footprint=with_footprint, density=6.0)
     parts = roof.parts()
     faces = [face for part in parts for face in part.faces]
     assert roof_type(roof.planes, faces, [part.solid for part in parts], RoofTypeSettings()) is TYPES[kind]
 
 
-def test_two_pent_roofs_that_fall_towards_one_another_are_no_gable(exact_roof: Callable[..., Any]) -> None:
+def test_two_pent_roofs_that_fall_towards_one_another_are_no_gable(exact_roof: ExactRoofs) -> None:
     roof = exact_roof("gable", with_footprint=True)
     parts = roof.parts()
     faces = [face for part in parts for face in part.faces]

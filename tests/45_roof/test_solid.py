@@ -17,6 +17,9 @@ from pipeline.quality.validity import check_solid
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import solid_parts
 
+ExactRoofs = Callable[..., Any]
+Volume = Callable[[Solid], float]
+
 KINDS = ["flat", "pent", "gable", "hip", "l", "stepped", "courtyard", "dormer", "tower"]
 
 
@@ -40,7 +43,7 @@ def oriented_edges(solid: Solid) -> collections.Counter[tuple[int, int]]:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("turn_deg", [0.0, 31.0])
 def test_with_a_footprint_a_roof_gives_one_valid_solid_of_the_true_volume(
-    exact_roof: Callable[..., Any], volume: Callable[[Solid], float], kind: str, turn_deg: float
+    exact_roof: ExactRoofs, volume: Volume, kind: str, turn_deg: float
 ) -> None:
     roof = exact_roof(kind, turn_deg=turn_deg, with_footprint=True)
     parts = roof.parts()
@@ -54,7 +57,7 @@ def test_with_a_footprint_a_roof_gives_one_valid_solid_of_the_true_volume(
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("turn_deg", [0.0, 31.0])
 def test_without_a_footprint_the_volume_is_near_the_truth(
-    exact_roof: Callable[..., Any], volume: Callable[[Solid], float], kind: str, turn_deg: float
+    exact_roof: ExactRoofs, volume: Volume, kind: str, turn_deg: float
 ) -> None:
     roof = exact_roof(kind, turn_deg=turn_deg)
     parts = roof.parts()
@@ -66,16 +69,14 @@ def test_without_a_footprint_the_volume_is_near_the_truth(
 
 
 @pytest.mark.parametrize("kind", ["gable", "dormer", "courtyard"])
-def test_every_edge_of_a_solid_belongs_to_two_faces_that_run_it_both_ways(
-    exact_roof: Callable[..., Any], kind: str
-) -> None:
+def test_every_edge_of_a_solid_belongs_to_two_faces_that_run_it_both_ways(exact_roof: ExactRoofs, kind: str) -> None:
     for part in exact_roof(kind).parts():
         edges = oriented_edges(part.solid)
         assert set(edges.values()) == {1}
         assert all((b, a) in edges for a, b in edges)
 
 
-def test_the_ridge_of_a_gable_runs_exactly_where_its_planes_cross(exact_roof: Callable[..., Any]) -> None:
+def test_the_ridge_of_a_gable_runs_exactly_where_its_planes_cross(exact_roof: ExactRoofs) -> None:
     roof = exact_roof("gable", with_footprint=True)
     (part,) = roof.parts()
     ridge = [v for v in part.solid.vertices.tolist() if v[2] > 5.75]
@@ -83,7 +84,7 @@ def test_the_ridge_of_a_gable_runs_exactly_where_its_planes_cross(exact_roof: Ca
     assert all(abs(y - 4.0) < 0.003 and abs(z - 5.8) < 0.003 for _, y, z in ridge)
 
 
-def test_vertices_lie_on_the_millimetre_grid_and_on_their_planes(exact_roof: Callable[..., Any]) -> None:
+def test_vertices_lie_on_the_millimetre_grid_and_on_their_planes(exact_roof: ExactRoofs) -> None:
     roof = exact_roof("hip", turn_deg=17.0)
     (part,) = roof.parts()
     vertices = part.solid.vertices
@@ -94,7 +95,7 @@ def test_vertices_lie_on_the_millimetre_grid_and_on_their_planes(exact_roof: Cal
             assert np.abs(plane.a * p[:, 0] + plane.b * p[:, 1] + plane.c - p[:, 2]).max() < 0.0025
 
 
-def test_a_courtyard_is_a_hole_of_roof_and_floor_with_walls_around_it(exact_roof: Callable[..., Any]) -> None:
+def test_a_courtyard_is_a_hole_of_roof_and_floor_with_walls_around_it(exact_roof: ExactRoofs) -> None:
     (part,) = exact_roof("courtyard", with_footprint=True).parts()
     assert len(part.footprint.interiors) == 1
     ground = [face for face in part.solid.faces if face.kind is FaceKind.GROUND]
@@ -102,12 +103,12 @@ def test_a_courtyard_is_a_hole_of_roof_and_floor_with_walls_around_it(exact_roof
     assert len(ground[0].rings) == 2
 
 
-def test_parts_that_do_not_touch_are_solids_of_their_own(volume: Callable[[Solid], float]) -> None:
+def test_parts_that_do_not_touch_are_solids_of_their_own(volume: Volume) -> None:
     parts = solid_parts(partition(shapely.box(0, 0, 4, 4), shapely.box(6, 0, 9, 4)), [level(3.0), level(5.0)], 1.0)
     assert [volume(part.solid) for part in parts] == pytest.approx([32.0, 48.0])
 
 
-def test_a_third_level_on_the_way_is_inserted_into_the_wall(volume: Callable[[Solid], float]) -> None:
+def test_a_third_level_on_the_way_is_inserted_into_the_wall(volume: Volume) -> None:
     whole = shapely.box(0, 0, 4, 4)
     left, low, high = shapely.box(0, 0, 2, 4), shapely.box(2, 0, 4, 2), shapely.box(2, 2, 4, 4)
     left = shapely.Polygon([(0, 0), (2, 0), (2, 2), (2, 4), (0, 4)])
@@ -119,7 +120,7 @@ def test_a_third_level_on_the_way_is_inserted_into_the_wall(volume: Callable[[So
     assert sorted(part.solid.vertices[middle, 2].tolist()) == [3.0, 6.0, 9.0]
 
 
-def test_planes_that_cross_over_a_border_get_a_vertex_at_the_crossing(volume: Callable[[Solid], float]) -> None:
+def test_planes_that_cross_over_a_border_get_a_vertex_at_the_crossing(volume: Volume) -> None:
     left, right = shapely.box(0, 0, 3, 4), shapely.box(3, 0, 6, 4)
     slope = Plane(a=0.0, b=0.5, c=4.0, n_points=1, rmse_m=0.0)
     (part,) = solid_parts(partition(left, right), [slope, level(5.0)], 0.0)

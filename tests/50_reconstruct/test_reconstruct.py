@@ -16,11 +16,13 @@ from shapely import Polygon
 from pipeline import reconstruct
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.methods import METHODS, Method, ReconstructSettings, method_named
-from pipeline.model import Candidate, FaceKind, Plane, Reason, RoofType, Segmentation, Status
+from pipeline.model import Candidate, FaceKind, Plane, Reason, RoofType, Segmentation, Solid, Status
 from pipeline.parameters import Parameters
 from pipeline.quality.validity import check_solid
 from pipeline.reconstruct import reconstruct_building
 from pipeline.roof.settings import RoofSettings
+
+Install = Callable[[Callable[[Candidate], Segmentation]], None]
 
 DEFAULTS = ReconstructSettings()
 
@@ -46,7 +48,7 @@ def gable(n: int = 800, noise_m: float = 0.03, seed: int = 0, **fields: Any) -> 
 
 
 @pytest.fixture
-def stub(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Candidate], Segmentation]], None]:
+def stub(monkeypatch: pytest.MonkeyPatch) -> Install:
     """`stub(function)` makes a segmentation function the method `stub`."""
 
     def install(segment: Callable[[Candidate], Segmentation]) -> None:
@@ -129,7 +131,7 @@ def test_too_many_points_are_too_complex() -> None:
     assert "1500 points, more than maximum_points = 1000" in result.reason_detail
 
 
-def test_without_a_plane_there_is_a_block(stub: Callable[[Callable[[Candidate], Segmentation]], None]) -> None:
+def test_without_a_plane_there_is_a_block(stub: Install) -> None:
     stub(lambda c: Segmentation(planes=(), labels=np.full(len(c.points), -1, np.int32)))
     result = reconstruct_building(gable(), "stub", DEFAULTS)
     assert (result.status, result.reason, result.lod) == (Status.FALLBACK, Reason.NO_PLANE, "1.2")
@@ -140,7 +142,7 @@ def test_without_a_plane_there_is_a_block(stub: Callable[[Callable[[Candidate], 
 
 
 def test_a_method_that_gives_up_leaves_a_block_with_its_reason(
-    stub: Callable[[Callable[[Candidate], Segmentation]], None],
+    stub: Install,
 ) -> None:
     def give_up(_: Candidate) -> Segmentation:
         raise BuildingError(Reason.TOO_COMPLEX, "7 rounds, the limit is 6")
@@ -171,7 +173,7 @@ def test_nothing_invalid_is_delivered_even_where_no_block_passes(monkeypatch: py
 
 
 def test_an_unexpected_error_is_told_with_its_place(
-    stub: Callable[[Callable[[Candidate], Segmentation]], None],
+    stub: Install,
 ) -> None:
     def break_down(c: Any) -> Segmentation:
         return c.no_such_attribute
@@ -195,9 +197,7 @@ def test_nan_coordinates_are_an_internal_error_not_a_crash() -> None:
 
 
 @pytest.mark.parametrize("error", [MemoryError, KeyboardInterrupt])
-def test_lack_of_memory_and_interrupts_are_passed_on(
-    stub: Callable[[Callable[[Candidate], Segmentation]], None], error: type[BaseException]
-) -> None:
+def test_lack_of_memory_and_interrupts_are_passed_on(stub: Install, error: type[BaseException]) -> None:
     def stop(_: Candidate) -> Segmentation:
         raise error
 
@@ -215,7 +215,7 @@ def test_points_on_one_line_or_one_place_give_a_record() -> None:
 
 
 def test_a_steep_plane_that_dips_under_the_floor_becomes_level(
-    stub: Callable[[Callable[[Candidate], Segmentation]], None],
+    stub: Install,
 ) -> None:
     def steep(c: Any) -> Segmentation:
         plane = Plane(a=1.4, b=0.0, c=-2.0, n_points=1, rmse_m=0.0)
@@ -252,7 +252,7 @@ def test_settings_of_another_method_are_refused() -> None:
 
 
 def test_one_plane_over_everything_is_one_roof_face(
-    stub: Callable[[Callable[[Candidate], Segmentation]], None],
+    stub: Install,
 ) -> None:
     stub(one_plane)
     result = reconstruct_building(gable(footprint=shapely.box(0, 0, 12, 8)), "stub", DEFAULTS)

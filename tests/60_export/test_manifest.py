@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import datetime as dt
-import hashlib
 import json
 from pathlib import Path
 
 import pytest
 
-from pipeline.errors import RunError, UnreadableInputError
+from pipeline.errors import RunError
 from pipeline.runtime.manifest import (
     InputFile,
     RunManifest,
     RunStatus,
-    input_file,
     read_manifest,
     write_manifest,
 )
@@ -63,20 +61,6 @@ def test_the_end_replaces_the_start(tmp_path: Path, manifest: RunManifest) -> No
     write_manifest(tmp_path, manifest)
     assert read_manifest(tmp_path).status is RunStatus.INCOMPLETE
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
-
-
-def test_an_input_is_described_by_its_bytes(tmp_path: Path) -> None:
-    path = tmp_path / "tile.laz"
-    path.write_bytes(b"x" * 3_000_000)
-    told = input_file(path, n_points=7)
-    assert told == InputFile(
-        path=str(path), sha256=hashlib.sha256(b"x" * 3_000_000).hexdigest(), size_bytes=3_000_000, n_points=7
-    )
-
-
-def test_a_missing_input_is_an_input_error(tmp_path: Path) -> None:
-    with pytest.raises(UnreadableInputError, match=r"no\.laz: cannot be read"):
-        input_file(tmp_path / "no.laz")
 
 
 def test_a_directory_without_manifest_is_no_run(tmp_path: Path) -> None:

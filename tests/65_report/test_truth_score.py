@@ -10,7 +10,7 @@ import pytest
 import shapely
 
 from pipeline.model import RoofType
-from pipeline.report.roof_models import RoofModel, RoofSurface
+from pipeline.report.roof_models import RoofModel, RoofSurface, joined_blocks
 from pipeline.report.truth_score import (
     lattice_inside,
     match_footprints,
@@ -172,3 +172,19 @@ def test_no_models_at_all_score_nothing() -> None:
     score = score_against_truth([], TRUTH)
     assert dict(score.table())["buildings found (IoU >= 0.5)"] == "0 of 3"
     assert dict(score_against_truth(TRUTH, []).table())["models where no building is"] == "3"
+
+
+def test_houses_of_a_row_become_one_block() -> None:
+    row = [dataclasses.replace(gable(name, x), source_id="row") for name, x in (("a", 0.0), ("b", 12.0))]
+    flat = dataclasses.replace(gable("c", 24.0, edge=True), roof_type=RoofType.FLAT, source_id="row")
+    alone = gable("d", 80.0)
+    block, single = joined_blocks([*row, alone])
+    assert single is alone
+    assert block.footprint.equals(shapely.box(1000, 2000, 1024, 2008))
+    assert (block.building_id, block.roof_type, len(block.surfaces)) == ("a", RoofType.GABLE, 4)
+    mixed, _ = joined_blocks([*row, flat, alone])
+    assert mixed.roof_type is RoofType.COMBINATION
+    assert mixed.touches_data_edge
+    score = score_against_truth([block], row)
+    assert [one.found for one in score.buildings] == [True, False]
+    assert score_against_truth([block], [block]).buildings[0].type_right

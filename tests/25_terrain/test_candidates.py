@@ -1,0 +1,318 @@
+"""Whole surfaces are judged by hand-made sums: each reason has its threshold, and levels unite whatever their numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import SettingsError
+from pipeline.model import IntArray, Reason
+from pipeline.terrain.candidates import (
+    CandidateSettings,
+    Surfaces,
+    Verdict,
+    is_object,
+    judge_surface,
+    unite_levels,
+)
+from pipeline.terrain.surfaces import N_SUMS, FacetKind, Sum
+
+SETTINGS = CandidateSettings()
+
+ROOF = {
+    Sum.FACETS: 800,
+    Sum.AREA2: 200_000_000,
+    Sum.VERTICES: 400,
+    Sum.HEIGHT: 400 * 5000,
+    Sum.PLANAR: 380,
+    Sum.ROUGH: 20,
+    Sum.BOUNDARY: 40_000,
+    Sum.WALL: 40_000,
+    Sum.WALL_TOP: 39_000,
+    Sum.WALLS: 80,
+    Sum.WALLS_Z_MX: 80 * 8200,
+    Sum.WALLS_OWN_Z: 80 * 8100,
+    Sum.POINTS: 1600,
+}
+"""A flat roof of 100 m2, 5 m above the ground, walls all around."""
+
+
+def sums_of(changes: dict[Sum, int] | None = None) -> IntArray:
+    sums = np.zeros(N_SUMS, np.int64)
+    for column, value in {**ROOF, **(changes or {})}.items():
+        sums[column] = value
+    return sums
+
+
+def judged(changes: dict[Sum, int], kind: FacetKind = FacetKind.OBJECT) -> Verdict | None:
+    return judge_surface(kind, sums_of(changes), SETTINGS)
+
+
+def test_a_roof_with_walls_around_it_is_a_candidate() -> None:
+    assert judged({}) is None
+    assert judged({}, FacetKind.BUILDING) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason", "detail"),
+    [
+        ({Sum.AREA2: 19_800_000}, Reason.TOO_SMALL, "area 9.9 m2, at least 10"),
+        ({Sum.HEIGHT: 400 * 1500}, Reason.TOO_LOW, "mean height 1.50 m, at least 2"),
+        ({Sum.PLANAR: 40, Sum.ROUGH: 60}, Reason.VEGETATION, "planar share 0.40, at least 0.5"),
+        ({Sum.CANOPY: 1600}, Reason.VEGETATION, "canopy share 0.50, at most 0.35"),
+        ({Sum.BOUNDARY: 200_000, Sum.WALL: 200_000}, Reason.TOO_NARROW, "mean width 1.00 m, at least 1.5"),
+        ({Sum.WALL: 4000, Sum.WALL_TOP: 4000}, Reason.NO_WALLS, "walls along 0.10 of the outline, at least 0.15"),
+        (
+            {Sum.WALL_TOP: 8000},
+            Reason.BELOW_Z_AVG,
+            "at the top of 0.20 of its walls, at least 0.3 (own 8.10 m, Z_avg 8.20 m)",
+        ),
+    ],
+)
+def test_each_reason_names_its_figure_and_threshold(changes: dict[Sum, int], reason: Reason, detail: str) -> None:
+    assert judged(changes) == Verdict(reason=reason, detail=detail)
+
+
+@pytest.mark.parametrize(
+    ("at_limit", "beyond"),
+    [
+        (
+            {Sum.AREA2: 20_000_000, Sum.BOUNDARY: 13_000, Sum.WALL: 13_000, Sum.WALL_TOP: 13_000},
+            {Sum.AREA2: 19_999_999, Sum.BOUNDARY: 13_000, Sum.WALL: 13_000, Sum.WALL_TOP: 13_000},
+        ),
+        ({Sum.HEIGHT: 400 * 2000}, {Sum.HEIGHT: 400 * 2000 - 1}),
+        ({Sum.PLANAR: 50, Sum.ROUGH: 50}, {Sum.PLANAR: 49, Sum.ROUGH: 51}),
+        ({Sum.POINTS: 65, Sum.CANOPY: 35}, {Sum.POINTS: 64, Sum.CANOPY: 36}),
+        ({Sum.WALL: 6000, Sum.WALL_TOP: 6000}, {Sum.WALL: 5999, Sum.WALL_TOP: 5999}),
+        ({Sum.WALL_TOP: 12_000}, {Sum.WALL_TOP: 11_999}),
+    ],
+)
+def test_a_figure_at_its_threshold_passes_and_one_beyond_fails(
+    at_limit: dict[Sum, int], beyond: dict[Sum, int]
+) -> None:
+    assert judged(at_limit) is None
+    assert judged(beyond) is not None
+
+
+def test_what_nothing_tells_about_planarity_is_not_called_vegetation() -> None:
+    assert judged({Sum.PLANAR: 0, Sum.ROUGH: 0}) is None
+
+
+def test_building_by_trusted_classes_needs_only_its_area() -> None:
+    bare = {column: 0 for column in ROOF if column not in {Sum.AREA2, Sum.POINTS}}
+    assert judged(bare, FacetKind.BUILDING) is None
+    small = judged({**bare, Sum.AREA2: 10_000_000}, FacetKind.BUILDING)
+    assert small is not None
+    assert small.reason == Reason.TOO_SMALL
+
+
+def test_a_large_surface_on_the_ground_is_a_roof_where_walls_fall_off_around_it() -> None:
+    large = {Sum.AREA2: 1_000_000_000, Sum.HEIGHT: 0, Sum.BOUNDARY: 90_000, Sum.WALL: 80_000, Sum.WALL_TOP: 70_000}
+    assert judged(large, FacetKind.GROUND) is None
+    assert judged({**large, Sum.WALL_TOP: 50_000}, FacetKind.GROUND) == Verdict(reason=Reason.TOO_LOW, detail="ground")
+    assert judged({**large, Sum.AREA2: 790_000_000}, FacetKind.GROUND) is not None
+    # a share of the whole outline: walls that are all topped but touch only half of it do not suffice
+    assert judged({**large, Sum.WALL: 45_000, Sum.WALL_TOP: 45_000}, FacetKind.GROUND) is not None
+
+
+@pytest.mark.parametrize(
+    ("kind", "area_m2", "listed"),
+    [
+        (FacetKind.OBJECT, 4.0, True),
+        (FacetKind.OBJECT, 3.9, False),
+        (FacetKind.BUILDING, 4.0, True),
+        (FacetKind.STEP, 100.0, False),
+        (FacetKind.GROUND, 100.0, False),
+        (FacetKind.GROUND, 500.0, True),
+    ],
+)
+def test_an_object_is_a_surface_of_some_size_or_a_large_roof(kind: FacetKind, area_m2: float, listed: bool) -> None:
+    assert is_object(kind, sums_of({Sum.AREA2: round(area_m2 * 2e6)}), SETTINGS) is listed
+
+
+def test_a_share_beyond_one_is_refused() -> None:
+    with pytest.raises(SettingsError, match="min_planar_share is 1.5"):
+        CandidateSettings(min_planar_share=1.5)
+
+
+# -- levels ------------------------------------------------------------------------------------------------------------
+
+
+def surfaces_of(rows: list[dict[Sum, int]], along: list[tuple[int, int]], kinds: list[int] | None = None) -> Surfaces:
+    count = len(rows)
+    return Surfaces(
+        kind=np.array([FacetKind.OBJECT] * count if kinds is None else kinds, np.int8),
+        sums=np.array([sums_of(changes) for changes in rows]).reshape(count, N_SUMS),
+        boxes_mm=np.zeros((count, 4), np.int64),
+        lowest_point_mm=np.array([[1000 * k, 0, 0] for k in range(count)], np.int64).reshape(count, 3),
+        along_steps=np.array([(s, step, 1000) for s, step in along], np.int64).reshape(-1, 3),
+    )
+
+
+def leaders(surfaces: Surfaces) -> list[int]:
+    verdicts = [
+        Verdict(reason=Reason.TOO_FEW_POINTS, detail="a step")
+        if kind == FacetKind.STEP
+        else judge_surface(int(kind), sums, SETTINGS)
+        for kind, sums in zip(surfaces.kind, surfaces.sums, strict=True)
+    ]
+    return [int(k) for k in unite_levels(surfaces, verdicts, SETTINGS)]
+
+
+DORMER = {Sum.AREA2: 12_000_000, Sum.BOUNDARY: 10_000, Sum.WALL: 9000, Sum.WALL_TOP: 9000, Sum.STEP: 9000}
+STEP_ROW = {Sum.AREA2: 1_000_000}
+
+
+def test_a_dormer_joins_the_roof_across_its_step() -> None:
+    surfaces = surfaces_of([{}, DORMER, STEP_ROW], [(0, 2), (1, 2)], [3, 3, 5])
+    assert judge_surface(3, surfaces.sums[1], SETTINGS) is not None
+    assert leaders(surfaces) == [0, 0, -1]
+
+
+def test_a_dormer_joins_the_largest_of_the_roofs_beside_it() -> None:
+    rows = [{Sum.AREA2: 150_000_000}, {}, DORMER, STEP_ROW, STEP_ROW]
+    assert leaders(surfaces_of(rows, [(1, 3), (2, 3), (2, 4), (0, 4)], [3, 3, 3, 5, 5])) == [0, 1, 1, -1, -1]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {Sum.STEP: 4900},
+        {Sum.HEIGHT: 400 * 1900},
+        {Sum.PLANAR: 10, Sum.ROUGH: 90},
+        {Sum.CANOPY: 3000},
+    ],
+)
+def test_what_is_hardly_along_steps_or_like_no_roof_stays_out(changes: dict[Sum, int]) -> None:
+    assert leaders(surfaces_of([{}, {**DORMER, **changes}, STEP_ROW], [(0, 2), (1, 2)], [3, 3, 5])) == [0, -1, -1]
+
+
+def test_a_chain_of_storeys_ends_at_the_largest() -> None:
+    storey = {Sum.STEP: 30_000}
+    rows = [
+        {**storey, Sum.AREA2: 60_000_000},
+        {**storey, Sum.AREA2: 120_000_000},
+        {**storey, Sum.AREA2: 200_000_000},
+        STEP_ROW,
+        STEP_ROW,
+    ]
+    assert leaders(surfaces_of(rows, [(0, 3), (1, 3), (1, 4), (2, 4)], [3, 3, 3, 5, 5])) == [2, 2, 2, -1, -1]
+
+
+def test_two_equal_roofs_across_a_step_join_at_the_smaller_point() -> None:
+    rows = [{Sum.STEP: 30_000}, {Sum.STEP: 30_000}, STEP_ROW]
+    assert leaders(surfaces_of(rows, [(0, 2), (1, 2)], [3, 3, 5])) == [0, 0, -1]
+
+
+def test_a_candidate_beside_something_that_is_none_leads_itself() -> None:
+    rows = [{Sum.PLANAR: 0, Sum.ROUGH: 100, Sum.AREA2: 800_000_000}, {Sum.STEP: 40_000}, STEP_ROW]
+    assert leaders(surfaces_of(rows, [(0, 2), (1, 2)], [3, 3, 5])) == [-1, 1, -1]
+
+
+def test_no_surfaces_have_no_leaders() -> None:
+    assert leaders(surfaces_of([], [])) == []
+
+
+scenes = st.lists(
+    st.tuples(
+        st.sampled_from([8_000_000, 60_000_000, 60_000_000, 200_000_000, 900_000_000]),
+        st.sampled_from([0, 20_000, 40_000]),
+        st.sampled_from([0, 39_000]),
+        st.sampled_from([FacetKind.OBJECT, FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.GROUND]),
+    ),
+    min_size=1,
+    max_size=7,
+)
+
+
+def drawn(members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int, int]]) -> Surfaces:
+    """Surfaces first, then four steps."""
+    rows = [{Sum.AREA2: area, Sum.STEP: step, Sum.WALL_TOP: top} for area, step, top, _ in members]
+    kinds = [int(kind) for *_, kind in members] + [int(FacetKind.STEP)] * 4
+    along = sorted({(s % len(members), len(members) + step) for s, step in links})
+    return surfaces_of([*rows, *[STEP_ROW] * 4], along, kinds)
+
+
+link_lists = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 3)), max_size=14)
+
+
+def slow_twin(surfaces: Surfaces) -> list[int]:
+    """Climb from each surface to the largest larger candidate across a step, while it is one that joins."""
+    found = []
+    for k in range(len(surfaces.kind)):
+        here: int = k
+        while True:
+            sums, kind = surfaces.sums[here], surfaces.kind[here]
+            verdict = None if kind == FacetKind.STEP else judge_surface(int(kind), sums, SETTINGS)
+            accepted = kind != FacetKind.STEP and verdict is None
+            roof_like = accepted or (
+                verdict is not None and verdict.reason in {Reason.TOO_SMALL, Reason.TOO_NARROW, Reason.BELOW_Z_AVG}
+            )
+            larger = []
+            if roof_like and kind != FacetKind.GROUND and 2 * sums[Sum.STEP] >= sums[Sum.BOUNDARY]:
+                steps = {step for s, step, _ in surfaces.along_steps.tolist() if s == here}
+                for s, step, _ in surfaces.along_steps.tolist():
+                    other = surfaces.sums[s, Sum.AREA2]
+                    is_larger = other > sums[Sum.AREA2] or (other == sums[Sum.AREA2] and s < here)
+                    if (
+                        step in steps
+                        and is_larger
+                        and judge_surface(int(surfaces.kind[s]), surfaces.sums[s], SETTINGS) is None
+                    ):
+                        larger.append((-int(other), s))
+            if not larger:
+                found.append(here if accepted else -1)
+                break
+            here = min(larger)[1]
+    return found
+
+
+@settings(deadline=None, max_examples=200)
+@given(members=scenes, links=link_lists)
+def test_uniting_agrees_with_climbing_from_each_surface(
+    members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int, int]]
+) -> None:
+    surfaces = drawn(members, links)
+    assert leaders(surfaces) == slow_twin(surfaces)
+
+
+@settings(deadline=None, max_examples=200)
+@given(members=scenes, links=link_lists)
+def test_every_leader_is_a_candidate_that_leads_itself(
+    members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int, int]]
+) -> None:
+    surfaces = drawn(members, links)
+    found = leaders(surfaces)
+    for k, lead in enumerate(found):
+        if lead >= 0:
+            assert found[lead] == lead
+            assert judge_surface(int(surfaces.kind[lead]), surfaces.sums[lead], SETTINGS) is None
+        else:
+            assert surfaces.kind[k] == FacetKind.STEP or judge_surface(
+                int(surfaces.kind[k]), surfaces.sums[k], SETTINGS
+            )
+
+
+@settings(deadline=None, max_examples=200)
+@given(members=scenes, links=link_lists, seed=st.integers(0, 10_000))
+def test_the_numbering_of_the_surfaces_does_not_matter(
+    members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int, int]], seed: int
+) -> None:
+    surfaces = drawn(members, links)
+    count = len(surfaces.kind)
+    random = np.random.default_rng(seed)
+    order = random.permutation(count)
+    number_of = np.argsort(order)
+    along = surfaces.along_steps.copy()
+    along[:, 0], along[:, 1] = number_of[along[:, 0]], number_of[along[:, 1]]
+    renumbered = Surfaces(
+        kind=surfaces.kind[order],
+        sums=surfaces.sums[order],
+        boxes_mm=surfaces.boxes_mm[order],
+        lowest_point_mm=surfaces.lowest_point_mm[order],
+        along_steps=random.permutation(along),
+    )
+    back = [order[lead] if lead >= 0 else -1 for lead in leaders(renumbered)]
+    assert [back[number_of[k]] for k in range(count)] == leaders(surfaces)

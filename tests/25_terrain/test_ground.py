@@ -1,0 +1,371 @@
+"""The ground filter: openings, pits, local planes, heights; nothing depends on where the window ends."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.ndimage import grey_opening, map_coordinates
+
+from pipeline.terrain import ground
+from pipeline.terrain.ground import CELL_MM, NO_DATA, GroundSettings, Terrain, ground_of, height_above, lowest_per_cell
+
+Grid = npt.NDArray[np.int32]
+Points = npt.NDArray[np.int64]
+
+SMALL = GroundSettings(max_window_m=4, bridge_m=6)
+
+elevations = st.integers(-3000, 3000)
+grids = arrays(np.int32, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=elevations)
+
+
+def with_gaps(grid: Grid, seed: int, share: float = 0.4) -> Grid:
+    holes = np.random.default_rng(seed).random(grid.shape) < share
+    return np.where(holes, NO_DATA, grid).astype(np.int32)
+
+
+def one_point_a_cell(columns: int, rows: int, z_mm: npt.ArrayLike, column0: int = 0, row0: int = 0) -> Points:
+    """A point at the centre of every cell, `z_mm` by row and column."""
+    c, r = np.meshgrid(np.arange(columns) + column0, np.arange(rows) + row0)
+    z = np.broadcast_to(np.asarray(z_mm, np.int64), (rows, columns))
+    return np.column_stack((c.ravel() * CELL_MM + 500, r.ravel() * CELL_MM + 500, z.ravel())).astype(np.int64)
+
+
+def terrain_under(
+    points: Points,
+    window: tuple[int, int, int, int],
+    filter_settings: GroundSettings | None = None,
+    *,
+    trusted: bool = False,
+) -> Terrain:
+    x, y, z = (np.ascontiguousarray(points[:, k]) for k in range(3))
+    usable = np.ones(len(points), np.bool_)
+    return ground_of(x, y, z, usable, window, filter_settings or GroundSettings(), trusted=trusted)
+
+
+def wild_points(random: np.random.Generator, columns: int, rows: int, *, per_cell: float = 1.2) -> Points:
+    """Rolling terrain with houses, gaps and a few strays below, at random positions."""
+    n = round(columns * rows * per_cell)
+    x, y = random.integers(0, columns * 1000, n), random.integers(0, rows * 1000, n)
+    z = 2000 * np.sin(x / 17_000) + 0.1 * y + random.normal(0, 30, n)
+    house = (x // 9000 + 2 * (y // 7000)) % 5 == 0
+    z = z + np.where(house, 6000, 0)
+    strays = random.random(n) < 0.003
+    z = np.where(strays, z - 9000, z)
+    away = (x // 5000) % 6 + (y // 4000) % 7 > 1
+    return np.column_stack((x, y, np.rint(z)))[away].astype(np.int64)
+
+
+# -- lowest points and pits --------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 10_000), n=st.integers(0, 80))
+def test_the_lowest_used_point_of_a_cell_is_kept(seed: int, n: int) -> None:
+    random = np.random.default_rng(seed)
+    x, y, z = random.integers(-4000, 4000, (3, n))
+    used = random.random(n) < 0.7
+    lowest = lowest_per_cell(x, y, z, used, -3, -2, 6, 5)
+    expected = np.full((5, 6), NO_DATA, np.int64)
+    for px, py, pz, wanted in zip(x.tolist(), y.tolist(), z.tolist(), used.tolist(), strict=True):
+        c, r = px // 1000 + 3, py // 1000 + 2
+        if wanted and 0 <= c < 6 and 0 <= r < 5:
+            expected[r, c] = min(expected[r, c], pz)
+    np.testing.assert_array_equal(lowest, expected)
+
+
+@pytest.mark.parametrize("cells", [[(10, 10)], [(10, 10), (10, 11)], [(10, 10), (9, 11), (12, 10)]])
+def test_a_pit_of_up_to_three_cells_is_cleared(cells: list[tuple[int, int]]) -> None:
+    z = np.full((20, 20), 5000)
+    for r, c in cells:
+        z[r, c] = 2000
+    terrain = terrain_under(one_point_a_cell(20, 20, z), (0, 0, 20, 20))
+    assert not any(terrain.measured[r, c] for r, c in cells)
+    assert terrain.measured.sum() == 400 - len(cells)
+    assert (terrain.elevation_mm == 5000).all()
+
+
+def test_a_ditch_of_a_whole_row_is_no_pit() -> None:
+    z = np.full((20, 20), 5000)
+    z[10, :] = 2000
+    cleaned = ground._without_pits(z.astype(np.int32), 1000)
+    # at the data's edge the ditch has but two neighbours of its own depth: there it looks like a pit
+    np.testing.assert_array_equal(cleaned[:, 1:-1], z[:, 1:-1])
+
+
+@settings(deadline=None)
+@given(grid=grids, seed=st.integers(0, 100))
+def test_pits_agree_with_a_plain_loop(grid: Grid, seed: int) -> None:
+    lowest = with_gaps(grid, seed)
+    expected = lowest.copy()
+    for r, c in np.argwhere(lowest != NO_DATA):
+        block = lowest[max(r - 2, 0) : r + 3, max(c - 2, 0) : c + 3].astype(np.int64)
+        around = np.sort(block[block != NO_DATA])
+        others = np.delete(around, np.searchsorted(around, lowest[r, c]))
+        if len(others) > 2 and (others - lowest[r, c] <= 1000).sum() <= 2:
+            expected[r, c] = NO_DATA
+    np.testing.assert_array_equal(ground._without_pits(lowest, 1000), expected)
+
+
+# -- openings ----------------------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(grid=grids, half=st.integers(1, 11))
+def test_an_opening_of_full_data_is_that_of_scipy(grid: Grid, half: int) -> None:
+    np.testing.assert_array_equal(ground._opened(grid, half), grey_opening(grid, size=2 * half + 1))
+
+
+@settings(deadline=None)
+@given(grid=grids, half=st.integers(1, 4), seed=st.integers(0, 100))
+def test_cells_without_data_are_skipped(grid: Grid, half: int, seed: int) -> None:
+    def extreme(values: Grid, pick: str) -> Grid:
+        out = np.full(values.shape, NO_DATA, np.int32)
+        for r, c in np.ndindex(values.shape):
+            block = values[max(r - half, 0) : r + half + 1, max(c - half, 0) : c + half + 1]
+            data = block[block != NO_DATA]
+            if len(data):
+                out[r, c] = getattr(data, pick)()
+        return out
+
+    values = with_gaps(grid, seed, 0.7)
+    np.testing.assert_array_equal(ground._opened(values, half), extreme(extreme(values, "min"), "max"))
+
+
+@settings(deadline=None)
+@given(grid=grids, half=st.integers(1, 5), seed=st.integers(0, 100))
+def test_an_opening_lies_below_its_data_and_opening_again_changes_nothing(grid: Grid, half: int, seed: int) -> None:
+    values = with_gaps(grid, seed)
+    opened = ground._opened(values, half)
+    data = values != NO_DATA
+    assert (opened[data] <= values[data]).all()
+    again = ground._opened(opened, half)
+    np.testing.assert_array_equal(again[data], opened[data])
+
+
+def test_objects_are_what_a_step_of_the_openings_of_scipy_cuts_off() -> None:
+    random = np.random.default_rng(7)
+    lowest = random.integers(0, 500, (60, 50)).astype(np.int32)
+    lowest[20:32, 10:30] += 6000
+    lowest[40:43, 40:43] += 900
+    windows = GroundSettings().windows
+    expected = np.zeros(lowest.shape, np.bool_)
+    before, half_before = lowest, 0
+    for half in windows:
+        after = grey_opening(lowest, size=2 * half + 1)
+        expected |= before - after > 350.0 + 250.0 * (half - half_before)
+        before, half_before = after, half
+    flagged = ground._objects(lowest, np.array(windows, np.int64), 0.25, 350.0)
+    np.testing.assert_array_equal(flagged, expected)
+    assert flagged[20:32, 10:30].all()
+
+
+@pytest.mark.parametrize("max_window_m", [2, 3, 20, 60])
+def test_windows_grow_to_the_largest(max_window_m: int) -> None:
+    windows = GroundSettings(max_window_m=max_window_m).windows
+    assert windows[0] == 1
+    assert windows[-1] == max_window_m
+    assert list(windows) == sorted(set(windows))
+
+
+# -- terrain -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [(12, 9), (30, 24), (38, 36)])
+def test_the_terrain_under_a_block_on_flat_ground_is_the_ground(size: tuple[int, int]) -> None:
+    random = np.random.default_rng(5)
+    width, depth = size
+    z = 3200 + random.integers(-20, 21, (100, 100))
+    z[30 : 30 + depth, 30 : 30 + width] += 8000
+    terrain = terrain_under(one_point_a_cell(100, 100, z), (0, 0, 100, 100))
+    assert not terrain.measured[30 : 30 + depth, 30 : 30 + width].any()
+    assert terrain.measured.sum() == 100 * 100 - width * depth
+    assert np.abs(terrain.elevation_mm - 3200).max() <= 50
+
+
+@pytest.mark.parametrize("aspect_deg", [0.0, 90.0, 180.0, 270.0])
+def test_a_plane_slope_of_15_degrees_survives(aspect_deg: float) -> None:
+    fall = math.tan(math.radians(15.0))
+    c, r = np.meshgrid(np.arange(80) + 0.5, np.arange(80) + 0.5)
+    along = c * math.cos(math.radians(aspect_deg)) + r * math.sin(math.radians(aspect_deg))
+    z = np.rint(1000 * fall * along).astype(np.int64)
+    terrain = terrain_under(one_point_a_cell(80, 80, z), (0, 0, 80, 80))
+    assert terrain.measured.all()
+    assert np.abs(terrain.elevation_mm - z).max() <= 2
+
+
+def test_a_house_on_a_slope_of_10_degrees_is_cut_off_and_the_slope_is_drawn_under_it() -> None:
+    c, _ = np.meshgrid(np.arange(90) + 0.5, np.arange(90) + 0.5)
+    slope = np.rint(1000 * math.tan(math.radians(10.0)) * c).astype(np.int64)
+    z = slope.copy()
+    z[40:50, 40:52] = slope[40:50, 40:52].max() + 5000
+    terrain = terrain_under(one_point_a_cell(90, 90, z), (0, 0, 90, 90))
+    assert not terrain.measured[40:50, 40:52].any()
+    error = np.abs(terrain.elevation_mm - slope)
+    assert error[~terrain.measured].mean() <= 250
+    # no plane is drawn beyond the elevations of its own points: 4 m uphill from the last ground cell of a box are lost
+    assert error.max() <= 1000 * 4 * math.tan(math.radians(10.0)) + 1
+    assert error[terrain.measured].max() <= 1
+
+
+def test_local_planes_agree_with_least_squares_of_numpy() -> None:
+    random = np.random.default_rng(9)
+    lowest = (random.integers(-200, 200, (26, 31)) + 90 * np.arange(31)).astype(np.int32)
+    is_ground = random.random(lowest.shape) < 0.22
+    is_ground[:10, 12:24] = False
+    bridge = 6
+    terrain = ground._terrain(lowest, is_ground, bridge)
+    fitted = 0
+    for r, c in np.ndindex(lowest.shape):
+        for half in (1, 2, 4, 6):
+            box = (slice(max(r - half, 0), r + half + 1), slice(max(c - half, 0), c + half + 1))
+            if is_ground[box].sum() >= 5:
+                break
+        rows, columns = np.nonzero(is_ground[box])
+        z = lowest[box][is_ground[box]].astype(np.float64)
+        if len(z) == 0:
+            assert terrain[r, c] == NO_DATA
+            continue
+        dx, dy = columns + box[1].start - c, rows + box[0].start - r
+        expected = z.mean()
+        scatter = np.cov(np.stack((dx, dy)), bias=True) if len(z) > 1 else np.zeros((2, 2))
+        if len(z) >= 5 and np.linalg.det(scatter) > 0.05 * np.trace(scatter) ** 2:
+            design = np.column_stack((dx, dy, np.ones(len(z))))
+            expected = np.clip(np.linalg.lstsq(design, z, rcond=None)[0][2], z.min(), z.max())
+            fitted += 1
+        assert terrain[r, c] == pytest.approx(expected, abs=0.51)
+    assert fitted > 500
+
+
+def test_terrain_ends_at_the_bridge() -> None:
+    z = np.full((60, 60), 1000)
+    points = one_point_a_cell(60, 60, z)
+    points = points[points[:, 0] < 10_000]
+    terrain = terrain_under(points, (0, 0, 60, 60), GroundSettings(bridge_m=8))
+    assert (terrain.elevation_mm[:, :18] == 1000).all()
+    assert (terrain.elevation_mm[:, 18:] == NO_DATA).all()
+
+
+def test_points_that_may_not_be_ground_leave_no_trace() -> None:
+    random = np.random.default_rng(11)
+    points = wild_points(random, 40, 40)
+    x, y, z = (np.ascontiguousarray(points[:, k]) for k in range(3))
+    usable = random.random(len(points)) < 0.6
+    window = (0, 0, 40, 40)
+    masked = ground_of(x, y, z, usable, window, SMALL, trusted=False)
+    alone = terrain_under(points[usable], window, SMALL)
+    np.testing.assert_array_equal(masked.elevation_mm, alone.elevation_mm)
+    np.testing.assert_array_equal(masked.measured, alone.measured)
+
+
+def test_no_points_give_no_terrain() -> None:
+    terrain = terrain_under(np.empty((0, 3), np.int64), (5, 5, 4, 3))
+    assert terrain.elevation_mm.shape == (3, 4)
+    assert (terrain.elevation_mm == NO_DATA).all()
+    assert not terrain.measured.any()
+
+
+def test_where_classes_are_trusted_the_filter_only_interpolates() -> None:
+    z = np.full((40, 40), 1000)
+    z[10:20, 10:20] = 7000
+    z[30, 30] = -4000
+    points = one_point_a_cell(40, 40, z)
+    missing = (points[:, 0] // 1000 == 5) & (points[:, 1] // 1000 == 5)
+    terrain = terrain_under(points[~missing], (0, 0, 40, 40), trusted=True)
+    assert terrain.measured.sum() == 40 * 40 - 1
+    assert not terrain.measured[5, 5]
+    assert terrain.elevation_mm[5, 5] == 1000
+    assert (terrain.elevation_mm[12:18, 12:18] == 7000).all()
+    assert terrain.elevation_mm[30, 30] < 1000
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_terrain_does_not_depend_on_the_window_beyond_its_support(seed: int, trusted: bool) -> None:
+    points = wild_points(np.random.default_rng(seed), 100, 90)
+    whole = terrain_under(points, (0, 0, 100, 90), SMALL, trusted=trusted)
+    column0, row0, columns, rows = 23 + seed, 19, 62, 60
+    inside = (points[:, 0] // 1000 >= column0) & (points[:, 0] // 1000 < column0 + columns)
+    inside &= (points[:, 1] // 1000 >= row0) & (points[:, 1] // 1000 < row0 + rows)
+    part = terrain_under(points[inside], (column0, row0, columns, rows), SMALL, trusted=trusted)
+    margin = math.ceil(SMALL.support_m)
+    inner = (slice(margin, rows - margin), slice(margin, columns - margin))
+    same = (slice(row0 + margin, row0 + rows - margin), slice(column0 + margin, column0 + columns - margin))
+    assert part.elevation_mm[inner].size > 300
+    np.testing.assert_array_equal(part.elevation_mm[inner], whole.elevation_mm[same])
+    np.testing.assert_array_equal(part.measured[inner], whole.measured[same])
+    if not trusted:
+        assert 0.2 < part.measured[inner].mean() < 0.9
+
+
+@pytest.mark.parametrize("shift", [(-7, 4), (84_000, 447_000), (-1000, -2000)])
+def test_a_shift_by_whole_metres_shifts_the_terrain_bit_for_bit(shift: tuple[int, int]) -> None:
+    points = wild_points(np.random.default_rng(21), 50, 45)
+    before = terrain_under(points, (0, 0, 50, 45), SMALL)
+    moved = points + np.array([shift[0] * 1000, shift[1] * 1000, 0])
+    after = terrain_under(moved, (shift[0], shift[1], 50, 45), SMALL)
+    np.testing.assert_array_equal(after.elevation_mm, before.elevation_mm)
+    np.testing.assert_array_equal(after.measured, before.measured)
+
+
+def test_swapping_easting_and_northing_transposes_the_terrain() -> None:
+    points = wild_points(np.random.default_rng(22), 50, 45)
+    before = terrain_under(points, (0, 0, 50, 45), SMALL)
+    after = terrain_under(points[:, [1, 0, 2]], (0, 0, 45, 50), SMALL)
+    np.testing.assert_array_equal(after.measured.T, before.measured)
+    np.testing.assert_allclose(after.elevation_mm.T, before.elevation_mm, atol=1)
+
+
+def test_the_order_of_the_points_does_not_matter() -> None:
+    random = np.random.default_rng(23)
+    points = wild_points(random, 50, 45)
+    before = terrain_under(points, (0, 0, 50, 45), SMALL)
+    after = terrain_under(random.permutation(points), (0, 0, 50, 45), SMALL)
+    np.testing.assert_array_equal(after.elevation_mm, before.elevation_mm)
+
+
+# -- heights -----------------------------------------------------------------------------------------------------------
+
+
+def test_heights_agree_with_bilinear_interpolation_of_scipy() -> None:
+    random = np.random.default_rng(13)
+    terrain = random.integers(-2000, 2000, (30, 40)).astype(np.int32)
+    n = 2000
+    x = random.integers(-7000 + 500, -7000 + 39_500, n)
+    y = random.integers(3000 + 500, 3000 + 29_500, n)
+    z = random.integers(-9000, 9000, n)
+    places = np.stack(((y - 3000 - 500) / 1000.0, (x + 7000 - 500) / 1000.0))
+    surface = map_coordinates(terrain.astype(np.float64), places, order=1)
+    np.testing.assert_allclose(height_above(x, y, z, terrain, -7, 3), z - surface, atol=0.51)
+
+
+def test_heights_agree_with_a_slow_twin_where_cells_are_missing() -> None:
+    random = np.random.default_rng(14)
+    terrain = with_gaps(random.integers(-2000, 2000, (8, 9)).astype(np.int32), 2, 0.5)
+    n = 600
+    x, y, z = random.integers(-2000, 11_000, n), random.integers(-2000, 10_000, n), random.integers(-99, 99, n)
+    heights = height_above(x, y, z, terrain, 0, 0)
+    unknown = 0
+    for px, py, pz, height in zip(x.tolist(), y.tolist(), z.tolist(), heights.tolist(), strict=True):
+        weights, values = [], []
+        for r, c in np.argwhere(terrain != NO_DATA):
+            w = max(0.0, 1 - abs(px - 500 - 1000 * c) / 1000) * max(0.0, 1 - abs(py - 500 - 1000 * r) / 1000)
+            weights.append(w)
+            values.append(float(terrain[r, c]))
+        if sum(weights) > 1e-9:
+            assert height == pytest.approx(pz - np.average(values, weights=weights), abs=0.51)
+        else:
+            unknown += 1
+            assert height == NO_DATA
+    assert 0 < unknown < n
+
+
+def test_a_point_at_the_centre_of_a_cell_stands_on_that_cell() -> None:
+    terrain = np.array([[100, 900], [NO_DATA, 400]], np.int32)
+    x, y = np.array([500, 1500, 500, 1500]), np.array([500, 500, 1500, 1500])
+    assert height_above(x, y, np.full(4, 1000), terrain, 0, 0).tolist() == [900, 100, NO_DATA, 600]

@@ -1,0 +1,123 @@
+"""Gross outliers: alone in the 27 cubes around them."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import convolve
+
+from pipeline.errors import SettingsError
+from pipeline.model import BoolArray
+from pipeline.terrain.outliers import OutlierSettings, dense_enough
+
+Points = npt.NDArray[np.int64]
+
+
+def kept_of(points: Points, outliers: OutlierSettings | None = None) -> BoolArray:
+    columns = [np.ascontiguousarray(points[:, k]) for k in range(3)]
+    return dense_enough(*columns, outliers or OutlierSettings())
+
+
+def slow_twin(points: Points, cube_mm: int, min_neighbours: int) -> list[bool]:
+    """Each point against each other one, by Python's whole numbers."""
+    cubes = [tuple(int(v) // cube_mm for v in p) for p in points]
+    kept = []
+    for a in cubes:
+        near = sum(all(abs(u - v) <= 1 for u, v in zip(a, b, strict=True)) for b in cubes)
+        kept.append(near - 1 >= min_neighbours)
+    return kept
+
+
+def town(random: np.random.Generator, n: int = 3000, side_mm: int = 40_000) -> Points:
+    xy = random.integers(0, side_mm, (n, 2)) + [84_000_000, 447_000_000]
+    roof = ((xy // 10_000).sum(axis=1) % 2) * 7000
+    return np.column_stack((xy, roof + random.integers(-100, 100, n))).astype(np.int64)
+
+
+point_lists = st.lists(st.tuples(*[st.integers(-12_000, 12_000)] * 3), min_size=0, max_size=40)
+
+
+@settings(deadline=None)
+@given(points=point_lists, cube_m=st.sampled_from([1.0, 2.5, 5.0]), min_neighbours=st.integers(0, 5))
+def test_it_agrees_with_each_point_against_each_other(
+    points: list[tuple[int, int, int]], cube_m: float, min_neighbours: int
+) -> None:
+    cloud = np.array(points, np.int64).reshape(-1, 3)
+    kept = kept_of(cloud, OutlierSettings(cube_m=cube_m, min_neighbours=min_neighbours))
+    assert kept.tolist() == slow_twin(cloud, round(cube_m * 1000), min_neighbours)
+
+
+def test_it_agrees_with_a_convolution_of_the_counts() -> None:
+    random = np.random.default_rng(3)
+    cloud = random.integers(-60_000, 60_000, (6000, 3))
+    cubes = np.floor_divide(cloud, 5000) + 12
+    counts = np.zeros((24, 24, 24), np.int64)
+    np.add.at(counts, tuple(cubes.T), 1)
+    around = convolve(counts, np.ones((3, 3, 3), np.int64), mode="constant")
+    expected = around[tuple(cubes.T)] - 1 >= 12
+    assert 0.1 < expected.mean() < 0.9
+    np.testing.assert_array_equal(kept_of(cloud, OutlierSettings(min_neighbours=12)), expected)
+
+
+def test_points_far_below_and_above_a_town_are_dropped_and_the_town_stays() -> None:
+    random = np.random.default_rng(1)
+    cloud = town(random)
+    strays = cloud[[5, 700, 1400, 2100]].copy()
+    strays[:, 2] += [-180_000, 180_000, -180_000, 180_000]
+    kept = kept_of(np.concatenate((cloud, strays)))
+    assert kept[: len(cloud)].all()
+    assert not kept[len(cloud) :].any()
+
+
+def test_a_lone_pair_is_dropped_and_five_close_points_stay() -> None:
+    pair = np.array([[0, 0, 0], [10, 10, 10]])
+    assert not kept_of(pair).any()
+    five = np.column_stack((np.arange(5) * 100, np.zeros((5, 2), np.int64))).astype(np.int64)
+    assert kept_of(five).all()
+    assert not kept_of(five[:4]).any()
+
+
+@settings(deadline=None, max_examples=25)
+@given(points=point_lists, seed=st.integers(0, 1000), shift=st.tuples(*[st.integers(-400, 400)] * 3))
+def test_neither_order_nor_a_shift_by_whole_cubes_matters(
+    points: list[tuple[int, int, int]], seed: int, shift: tuple[int, int, int]
+) -> None:
+    cloud = np.array(points, np.int64).reshape(-1, 3)
+    kept = kept_of(cloud)
+    order = np.random.default_rng(seed).permutation(len(cloud))
+    np.testing.assert_array_equal(kept_of(cloud[order]), kept[order])
+    np.testing.assert_array_equal(kept_of(cloud + np.array(shift) * 5000), kept)
+
+
+def test_the_decision_looks_no_further_than_its_support() -> None:
+    random = np.random.default_rng(4)
+    cloud = random.integers(-80_000, 80_000, (4000, 3))
+    cloud[:, 2] //= 4
+    outliers = OutlierSettings()
+    near = np.abs(cloud[:, :2]).max(axis=1) <= 20_000 + 1000 * outliers.support_m
+    inner = np.abs(cloud[:, :2]).max(axis=1) <= 20_000
+    expected = kept_of(cloud)
+    assert 0 < expected[inner].sum() < inner.sum()
+    cut = np.zeros(len(cloud), np.bool_)
+    cut[near] = kept_of(cloud[near])
+    np.testing.assert_array_equal(cut[inner], expected[inner])
+
+
+def test_no_points_give_an_empty_mask() -> None:
+    kept = kept_of(np.empty((0, 3), np.int64))
+    assert kept.shape == (0,)
+    assert kept.dtype == np.bool_
+
+
+def test_a_single_point_is_an_outlier_unless_no_neighbour_is_asked_for() -> None:
+    point = np.array([[1, 2, 3]])
+    assert not kept_of(point)[0]
+    assert kept_of(point, OutlierSettings(min_neighbours=0))[0]
+
+
+def test_cubes_out_of_range_are_refused() -> None:
+    with pytest.raises(SettingsError, match="cube_m is 0.5"):
+        OutlierSettings(cube_m=0.5)

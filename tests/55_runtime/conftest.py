@@ -1,0 +1,80 @@
+"""A small simulated suburb for runs that take seconds."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pytest
+
+from pipeline.runtime.executors import Measured, SerialExecutor, measure
+from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.settings import RunSettings
+from pipeline.synthetic.dataset import simulate
+
+
+@pytest.fixture(scope="session")
+def suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A LAZ tile of about 70 x 70 m with a few houses and trees."""
+    folder = tmp_path_factory.mktemp("suburb")
+    simulate("suburb", folder, 3, size_m=(70.0, 70.0), density_per_m2=4.0)
+    return folder / "suburb.laz"
+
+
+@pytest.fixture(scope="session")
+def halves(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The same points in two files whose points overlap and come in another order."""
+    folder = tmp_path_factory.mktemp("halves")
+    las = laspy.read(suburb)
+    order = np.random.default_rng(5).permutation(len(las.points))
+    cut = len(order) // 2
+    paths = folder / "b.laz", folder / "a.laz"
+    for path, chosen in zip(paths, (order[: cut + 500], order[cut - 500 :]), strict=True):
+        part = laspy.LasData(las.header)
+        part.points = las.points[chosen]
+        part.write(path)
+    return paths
+
+
+class ShuffledExecutor(SerialExecutor):
+    """Runs tasks, and hands out results, in an order that a seed decides."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = random.Random(seed)
+
+    def map(self, stage: str, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Measured[Any]]:
+        """Run all tasks in random order, then yield them in another one."""
+        del stage
+        results = [measure(function, task) for task in self._random.sample(list(tasks), len(tasks))]
+        yield from self._random.sample(results, len(results))
+
+
+@pytest.fixture
+def shuffled() -> type[ShuffledExecutor]:
+    """An executor whose order a seed decides."""
+    return ShuffledExecutor
+
+
+Reconstruct = Callable[..., RunSummary]
+
+
+@pytest.fixture
+def reconstruct(tmp_path: Path) -> Reconstruct:
+    """Run serially into a fresh directory: `reconstruct(*paths, settings={...}, executor=..., **request fields)`."""
+    numbers = iter(range(1000))
+
+    def go(*paths: Path, settings: dict[str, Any] | None = None, executor: Any = None, **fields: Any) -> RunSummary:
+        request = RunRequest(
+            inputs=tuple(str(path) for path in paths),
+            out=fields.pop("out", str(tmp_path / f"run-{next(numbers)}")),
+            settings=RunSettings.from_mapping(settings or {}),
+            workers=fields.pop("workers", 0),
+            **fields,
+        )
+        return run(request, executor=executor)
+
+    return go

@@ -1,0 +1,84 @@
+"""Ingest: every point lands in its own tile, once, also when a task runs twice."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+from pipeline.errors import InconsistentInputError
+from pipeline.io import ReadOptions
+from pipeline.model import PointCloud
+from pipeline.runtime.ingest import IngestTask, ingest, spread_m, to_records
+from pipeline.runtime.scratch import POINT, Scratch
+from pipeline.tiling import TileGrid
+
+
+def task(path: Path, folder: Path, index: int = 0) -> IngestTask:
+    grid = TileGrid(size_mm=30_000, halo_mm=10_000)
+    return IngestTask(index=index, path=str(path), options=ReadOptions(), grid=grid, scratch=Scratch(str(folder)))
+
+
+def stored(folder: Path) -> dict[str, np.ndarray]:
+    return {path.parent.name: np.fromfile(path, POINT) for path in sorted(folder.glob("points/*/*.bin"))}
+
+
+def test_points_land_in_their_own_tile(suburb: Path, tmp_path: Path) -> None:
+    job = task(suburb, tmp_path)
+    found = ingest(job)
+    buckets = stored(tmp_path)
+    assert sum(map(len, buckets.values())) == len(laspy.read(suburb).points)
+    assert {tile.key: n for tile, n in found.points_by_tile.items()} == {key: len(p) for key, p in buckets.items()}
+    for key, points in buckets.items():
+        assert {job.grid.tile_of(int(x), int(y)).key for x, y in zip(points["x"], points["y"], strict=True)} == {key}
+
+
+def test_coordinates_are_whole_millimetres_of_the_file(suburb: Path, tmp_path: Path) -> None:
+    ingest(task(suburb, tmp_path))
+    las = laspy.read(suburb)
+    expected = np.rint(np.column_stack((las.x, las.y, las.z)) * 1000).astype(np.int64)
+    points = np.concatenate(list(stored(tmp_path).values()))
+    got = np.column_stack([points[name].astype(np.int64) for name in "xyz"])
+    assert (got[np.lexsort(got.T)] == expected[np.lexsort(expected.T)]).all()
+
+
+def test_a_task_that_runs_twice_leaves_every_point_once(suburb: Path, tmp_path: Path) -> None:
+    first = ingest(task(suburb, tmp_path))
+    before = stored(tmp_path)
+    assert ingest(task(suburb, tmp_path)) == first
+    after = stored(tmp_path)
+    assert {key: len(p) for key, p in after.items()} == {key: len(p) for key, p in before.items()}
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_a_line_has_no_spread_wherever_it_is_cut(tmp_path: Path) -> None:
+    results = []
+    for index, shift in enumerate((0.0, 400.0)):
+        path = tmp_path / f"{index}.xyz"
+        along = np.arange(300) + shift
+        np.savetxt(path, np.column_stack((4e5 + 0.6 * along, 5e6 + 0.8 * along, along % 5)), fmt="%.3f")
+        results.append(ingest(task(path, tmp_path / "scratch", index)))
+    assert spread_m(results) < 0.01
+
+
+def test_a_town_has_the_spread_that_numpy_finds(suburb: Path, tmp_path: Path) -> None:
+    found = ingest(task(suburb, tmp_path))
+    las = laspy.read(suburb)
+    covariance = np.cov(np.column_stack((las.x, las.y)).T, bias=True)
+    assert spread_m([found]) == pytest.approx(np.sqrt(np.linalg.eigvalsh(covariance)[0]), rel=1e-6)
+
+
+def test_an_elevation_beyond_32_bits_of_millimetres_is_refused() -> None:
+    n = 2
+    cloud = PointCloud(
+        xyz=np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 3e6]]),
+        return_number=np.ones(n, np.uint8),
+        return_count=np.ones(n, np.uint8),
+        classification=np.zeros(n, np.uint8),
+        gps_time=np.zeros(n),
+        source_id=np.zeros(n, np.uint16),
+    )
+    with pytest.raises(InconsistentInputError, match="elevation 3e\\+06 m"):
+        to_records(cloud, "tile.las")

@@ -1,0 +1,173 @@
+"""A run as a user sees it: records for every candidate, clear refusals, nothing lost."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.dataset as ds
+import pytest
+import shapely
+
+import pipeline.reconstruct
+from pipeline.errors import EmptyInputError, InconsistentInputError, RunError
+from pipeline.runtime.events import Event
+from pipeline.runtime.run import RunRequest, run
+from pipeline.settings import RunSettings
+
+
+def rows(run_dir: str, table: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = ds.dataset(f"{run_dir}/{table}", partitioning="hive").to_table().to_pylist()
+    return found
+
+
+def test_every_candidate_has_a_record_and_a_mesh(suburb: Path, reconstruct: Any) -> None:
+    summary = reconstruct(suburb)
+    buildings = rows(summary.run_dir, "buildings")
+    assert len(buildings) == summary.counts["candidates"] == sum(summary.statuses.values())
+    for row in buildings:
+        assert (Path(summary.run_dir) / row["mesh_path"]).is_file() == (row["status"] != "failed")
+        assert row["valid"] == (row["status"] != "failed")
+    assert len(rows(summary.run_dir, "rejected")) == sum(summary.rejected.values())
+
+
+def test_the_state_of_each_tile_names_files_that_are_there(suburb: Path, reconstruct: Any) -> None:
+    run_dir = Path(reconstruct(suburb, settings={"tile_size_m": 40.0}).run_dir)
+    states = [json.loads(path.read_text()) for path in sorted((run_dir / "state").glob("*.json"))]
+    assert len(states) > 1
+    assert all((run_dir / name).is_file() for state in states for name in state["files"])
+    assert not (run_dir / "scratch").exists()
+
+
+def test_one_broken_building_costs_only_itself(suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = reconstruct(suburb)
+    victim = min(row["building_id"] for row in rows(whole.run_dir, "buildings"))
+    real = pipeline.reconstruct.method_named
+
+    def sabotaged(name: str) -> Any:
+        method = real(name)
+
+        def segment(candidate: Any, settings: Any) -> Any:
+            if candidate.building_id == victim:
+                raise ZeroDivisionError("on purpose")
+            return method.segment(candidate, settings)
+
+        return type(method)(**{**vars(method), "segment": segment})
+
+    monkeypatch.setattr(pipeline.reconstruct, "method_named", sabotaged)
+    hurt = {row["building_id"]: row for row in rows(reconstruct(suburb).run_dir, "buildings")}
+    assert hurt[victim]["status"] == "failed"
+    assert hurt[victim]["reason"] == "internal_error"
+    assert "on purpose" in hurt[victim]["reason_detail"]
+    assert sum(row["status"] == "failed" for row in hurt.values()) == 1
+    assert len(hurt) == whole.counts["candidates"]
+
+
+def test_given_footprints_are_the_candidates_also_where_there_are_no_points(
+    suburb: Path, reconstruct: Any, tmp_path: Path
+) -> None:
+    found = [row for row in rows(reconstruct(suburb).run_dir, "buildings") if row["status"] == "ok"]
+    outlines = [shapely.from_wkb(row["geometry"]) for row in found[:2]]
+    bare = shapely.box(*(np.array(outlines[0].bounds[:2]) - 6.0), *(np.array(outlines[0].bounds[:2]) - 3.0))
+    features = [
+        {"type": "Feature", "properties": {"id": name}, "geometry": shapely.geometry.mapping(outline)}
+        for name, outline in zip(("one", "two", "bare"), [*outlines, bare], strict=True)
+    ]
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
+    path = tmp_path / "footprints.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": features}))
+    summary = reconstruct(suburb, footprints=str(path))
+    records = {row["source_id"]: row for row in rows(summary.run_dir, "buildings")}
+    assert set(records) == {"one", "two", "bare"}
+    assert records["one"]["status"] == records["two"]["status"] == "ok"
+    assert (records["bare"]["status"], records["bare"]["reason"]) == ("failed", "too_few_points")
+
+
+def test_points_on_one_line_are_refused(tmp_path: Path, reconstruct: Any) -> None:
+    path = tmp_path / "line.xyz"
+    path.write_text("".join(f"{500000 + k * 0.6:.3f} {5800000 + k * 0.8:.3f} {10 + k % 7:.2f}\n" for k in range(500)))
+    with pytest.raises(InconsistentInputError, match=r"all 500 points lie on one line .* Check the columns"):
+        reconstruct(path)
+
+
+def test_a_box_without_points_is_refused_and_told(suburb: Path, reconstruct: Any) -> None:
+    with pytest.raises(EmptyInputError, match=r"no usable point is left .*outside"):
+        reconstruct(suburb, bbox=(0.0, 0.0, 10.0, 10.0))
+
+
+def test_an_earlier_run_is_kept_unless_told_otherwise(suburb: Path, reconstruct: Any, tmp_path: Path) -> None:
+    out = str(tmp_path / "run")
+    first = reconstruct(suburb, out=out)
+    with pytest.raises(RunError, match="is not empty"):
+        reconstruct(suburb, out=out)
+    assert reconstruct(suburb, out=out, overwrite=True).digest == first.digest
+
+
+def test_a_folder_that_is_no_run_is_never_replaced(suburb: Path, reconstruct: Any, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    with pytest.raises(RunError, match=r"holds thesis.txt and no run.json"):
+        reconstruct(suburb, out=str(tmp_path / "mine"), overwrite=True)
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
+
+
+def test_progress_is_told_by_stage_and_never_runs_backwards(suburb: Path, tmp_path: Path) -> None:
+    events: list[Event] = []
+    settings = RunSettings.from_mapping({"tile_size_m": 40.0})
+    run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "run"), settings=settings, workers=0), events.append)
+    stages = [event.stage for event in events if event.kind == "stage"]
+    assert stages == ["ingest", "split", "join", "reconstruct", "publish"]
+    for stage in ("ingest", "split", "reconstruct", "publish"):
+        steps = [event for event in events if event.kind == "progress" and event.stage == stage]
+        assert [s.done for s in steps] == sorted(s.done for s in steps)
+        assert steps[-1].done == steps[-1].total > 0
+    assert events[-1].kind == "finished"
+
+
+def test_one_return_only_and_no_classes_are_used_and_told(tmp_path: Path, suburb: Path, reconstruct: Any) -> None:
+    import laspy
+
+    las = laspy.read(suburb)
+    first = np.asarray(las.return_number) == 1
+    path = tmp_path / "first.xyz"
+    np.savetxt(path, np.column_stack((las.x, las.y, las.z))[first], fmt="%.3f")
+    summary = reconstruct(path, crs="EPSG:25832")
+    # a tree over a roof hides it from first returns: one house may go
+    assert summary.statuses["ok"] >= reconstruct(suburb).statuses["ok"] - 1
+    assert any("one return a pulse" in warning for warning in summary.warnings)
+    assert any("no classes" in warning for warning in summary.warnings)
+
+
+def test_gross_outliers_are_left_out_and_told(tmp_path: Path, suburb: Path, reconstruct: Any) -> None:
+    import laspy
+
+    las = laspy.read(suburb)
+    xyz = np.column_stack((las.x, las.y, las.z))
+    centre = xyz.mean(axis=0)
+    wild = centre + np.array([[3.0, 4.0, 180.0], [-20.0, 11.0, -180.0], [15.0, -15.0, 95.0]])
+    for name, points in (("clean", xyz), ("wild", np.vstack((xyz, wild)))):
+        np.savetxt(tmp_path / f"{name}.xyz", points, fmt="%.3f")
+    clean, hurt = (reconstruct(tmp_path / f"{name}.xyz", crs="EPSG:25832") for name in ("clean", "wild"))
+    assert hurt.counts["outliers"] == 3
+    assert any("3 gross outliers" in warning for warning in hurt.warnings)
+    assert hurt.digest == clean.digest
+
+
+def test_feet_give_the_buildings_of_metres(tmp_path: Path, suburb: Path, reconstruct: Any) -> None:
+    import laspy
+
+    las = laspy.read(suburb)
+    xyz = np.column_stack((las.x - 450000, las.y - 5500000, las.z))
+    np.savetxt(tmp_path / "metres.xyz", xyz, fmt="%.3f")
+    np.savetxt(tmp_path / "feet.xyz", xyz / 0.3048, fmt="%.5f")
+    metres = reconstruct(tmp_path / "metres.xyz", crs="EPSG:25832")
+    feet = reconstruct(tmp_path / "feet.xyz", crs="EPSG:2994")
+    assert feet.statuses == metres.statuses
+    height = {r["building_id"]: r for r in rows(metres.run_dir, "buildings")}
+    areas = sorted(row["footprint_area_m2"] for row in height.values())
+    in_feet = rows(feet.run_dir, "buildings")
+    assert sorted(row["footprint_area_m2"] for row in in_feet) == pytest.approx(areas, rel=0.02)
+    ratio = np.array(sorted(r["ridge_z"] for r in in_feet)) / np.array(sorted(r["ridge_z"] for r in height.values()))
+    assert ratio == pytest.approx(1 / 0.3048, rel=0.01)

@@ -1,0 +1,76 @@
+"""Settings: all faults at once, a hash of what can change geometry and of nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import SettingsError
+from pipeline.settings import RunSettings
+
+
+def test_all_faults_are_told_at_once() -> None:
+    with pytest.raises(SettingsError) as caught:
+        RunSettings.from_mapping(
+            {
+                "method": "magic",
+                "tile_size_m": -5,
+                "ground": {"max_slope": 9.0, "windows": 3},
+                "roofs": {},
+                "fuzzy-sart": {"vigilance": "high"},
+            }
+        )
+    text = str(caught.value)
+    for part in (
+        "method is 'magic': use one of fuzzy-sart",
+        "tile_size_m is -5",
+        "[ground] max_slope is 9",
+        "[ground] windows is no setting",
+        "[roofs] is no table of settings",
+        "[fuzzy-sart] vigilance is 'high'",
+    ):
+        assert part in text
+
+
+def test_the_hash_ignores_what_cannot_change_results() -> None:
+    plain = RunSettings()
+    assert RunSettings.from_mapping({"tile_size_m": 77.0, "lattice_x_m": 3.0}).settings_hash == plain.settings_hash
+    assert RunSettings.from_mapping({"classes": "ignore"}).settings_hash != plain.settings_hash
+
+
+@pytest.mark.parametrize("section", sorted(RunSettings().sections()))
+def test_every_setting_of_geometry_changes_the_hash(section: str) -> None:
+    plain = RunSettings()
+    for field in dataclasses.fields(plain.sections()[section]):
+        value = getattr(plain.sections()[section], field.name)
+        if not field.metadata["changes_geometry"] or isinstance(value, str | bool):
+            continue
+        low, high = field.metadata["minimum"], field.metadata["maximum"]
+        other = next(v for v in (low, high, value + 1) if v is not None and v != value)
+        table = {field.name: type(value)(other)}
+        try:
+            changed = RunSettings.from_mapping(table if section == "general" else {section: table})
+        except SettingsError as fault:
+            # bounds of one range depend on each other: the fault must say so
+            assert field.name.rsplit("_", 2)[0] in str(fault)  # noqa: PT017
+            continue
+        assert changed.settings_hash != plain.settings_hash, field.name
+
+
+def test_a_toml_file_and_the_command_line_meet(tmp_path: Path) -> None:
+    path = tmp_path / "run.toml"
+    path.write_text('[settings]\nclasses = "audit"\ntile_size_m = 200\n[settings.ground]\nmax_window_m = 30\n')
+    settings = RunSettings.from_toml(str(path), {"classes": "ignore"})
+    assert settings.general.classes == "ignore"
+    assert settings.general.tile_size_m == 200.0
+    assert settings.scene.ground.max_window_m == 30
+    assert settings.halo_m == RunSettings().halo_m + 20
+
+
+def test_a_settings_file_that_is_no_toml_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "run.toml"
+    path.write_text("classes = trust")
+    with pytest.raises(SettingsError, match=r"run.toml is no TOML"):
+        RunSettings.from_toml(str(path), {})

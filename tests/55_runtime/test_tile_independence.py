@@ -1,0 +1,88 @@
+"""The promise of the whole design: the same content whatever the tiles, the order and the workers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import SettingsError
+from pipeline.settings import RunSettings
+
+SUPPORT_M = RunSettings().scene.support_m
+
+grids = st.fixed_dictionaries(
+    {
+        "tile_size_m": st.floats(21.0, 150.0).map(lambda size: round(size, 2)),
+        "lattice_x_m": st.floats(-80.0, 80.0).map(lambda shift: round(shift, 3)),
+        "lattice_y_m": st.floats(-80.0, 80.0).map(lambda shift: round(shift, 3)),
+        "halo_m": st.sampled_from([0.0, SUPPORT_M, SUPPORT_M + 17.3]),
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def seen() -> dict[str, Any]:
+    """Digests of this module's runs."""
+    return {}
+
+
+@settings(
+    max_examples=6,
+    deadline=None,
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # a smaller failing grid is no clearer, and costs minutes
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(grid=grids, order=st.integers(0, 99))
+def test_any_grid_halo_and_order_give_the_same_content(
+    grid: dict[str, float], order: int, suburb: Path, reconstruct: Any, shuffled: Any, seen: dict[str, Any]
+) -> None:
+    whole = seen.setdefault("whole", reconstruct(suburb, settings={"tile_size_m": 1000.0}))
+    assert whole.statuses.get("ok", 0) >= 3
+    cut = reconstruct(suburb, settings=grid, executor=shuffled(order))
+    assert cut.digest == whole.digest
+    assert cut.rejected == whole.rejected
+
+
+def test_overlapping_shuffled_files_give_the_content_of_one_file(
+    suburb: Path, halves: tuple[Path, Path], reconstruct: Any
+) -> None:
+    whole = reconstruct(suburb)
+    split = reconstruct(*halves)
+    assert split.digest == whole.digest
+    assert split.counts["duplicates"] == 1000
+    assert any("1000 duplicated points" in warning for warning in split.warnings)
+
+
+def test_a_halo_below_the_support_is_refused() -> None:
+    with pytest.raises(SettingsError, match=f"halo_m is 20: use at least {SUPPORT_M:g}"):
+        RunSettings.from_mapping({"halo_m": 20.0})
+
+
+def test_two_dask_workers_give_the_content_of_a_serial_run(suburb: Path, reconstruct: Any) -> None:
+    serial = reconstruct(suburb, settings={"tile_size_m": 40.0})
+    cluster = reconstruct(suburb, settings={"tile_size_m": 40.0}, workers=2)
+    assert cluster.digest == serial.digest
+    assert len(cluster.peak_memory_bytes) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "grid",
+    [
+        {"tile_size_m": 100.0},
+        {"tile_size_m": 173.3, "lattice_x_m": 31.7, "lattice_y_m": -12.9, "halo_m": SUPPORT_M + 25.0},
+    ],
+)
+def test_delft_in_any_grid_gives_the_same_content(
+    grid: dict[str, float], shared_data: Path, reconstruct: Any, shuffled: Any, seen: dict[str, Any]
+) -> None:
+    tiles = [shared_data / "ahn3" / name for name in ("delft_west.laz", "delft_east.laz")]
+    if "delft" not in seen:
+        seen["delft"] = reconstruct(*tiles, crs="EPSG:7415", settings={"tile_size_m": 1000.0})
+    cut = reconstruct(*reversed(tiles), crs="EPSG:7415", settings=grid, executor=shuffled(1))
+    assert cut.digest == seen["delft"].digest
+    assert cut.statuses["ok"] > 50

@@ -1,0 +1,77 @@
+"""The demo of the README, on a smaller suburb."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder of a demo on two workers, and what it told."""
+    folder = tmp_path_factory.mktemp("demo") / "out"
+    words = ["demo", "--out", str(folder), "--size", "110", "110", "--workers", "2", "--json"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.stderr
+    return folder, json.loads(result.stdout)
+
+
+def test_every_house_is_found_and_nothing_else(made: tuple[Path, dict[str, Any]]) -> None:
+    score = made[1]["score"]
+    found, houses = score["buildings found (IoU >= 0.5)"].split(" of ")
+    assert found == houses
+    assert int(houses) >= 5
+    assert score["models where no building is"] == "0"
+
+
+def test_the_roofs_lie_where_they_are(made: tuple[Path, dict[str, Any]]) -> None:
+    assert float(made[1]["score"]["vertical difference, median"].split(" ")[0]) < 0.05
+
+
+def test_what_the_demo_points_at_is_there(made: tuple[Path, dict[str, Any]]) -> None:
+    folder, told = made
+    assert Path(told["picture"]).read_bytes().startswith(b"\x89PNG")
+    assert (folder / "scene" / "suburb.laz").is_file()
+    assert len(list((folder / "run" / "meshes").glob("*/*.obj"))) == told["statuses"]["ok"] + told["statuses"].get(
+        "fallback", 0
+    )
+
+
+def test_one_process_gives_the_same_content_as_two_workers(made: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    folder, told = made
+    words = [
+        "reconstruct",
+        str(folder / "scene" / "suburb.laz"),
+        "--out",
+        str(tmp_path / "run"),
+        "--workers",
+        "0",
+        "--json",
+    ]
+    result = CliRunner().invoke(app, words)
+    assert json.loads(result.stdout)["digest"] == told["digest"]
+
+
+def test_the_same_picture_and_score_come_from_the_run_alone(made: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    folder, told = made
+    picture = tmp_path / "again.png"
+    words = [
+        "evaluate",
+        str(folder / "run"),
+        "--truth",
+        str(folder / "scene" / "truth"),
+        "--picture",
+        str(picture),
+        "--json",
+    ]
+    result = CliRunner().invoke(app, words)
+    assert json.loads(result.stdout)["score"] == told["score"]
+    assert picture.read_bytes() == (folder / "demo.png").read_bytes()
