@@ -10,9 +10,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import numpy.typing as npt
 
-from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray, LabelArray
+from pipeline.model import BoolArray, ByteArray, IntArray, LabelArray
 from pipeline.terrain.candidates import CandidateSettings
 from pipeline.terrain.ground import CELL_MM, NO_DATA, GroundSettings, Terrain, ground_of, height_above
 from pipeline.terrain.outliers import OutlierSettings, dense_enough
@@ -76,12 +75,14 @@ class WindowPoints:
     return_number: ByteArray
     return_count: ByteArray
     classification: ByteArray
-    gps_time: FloatArray
-    source_id: npt.NDArray[np.uint16]
 
     def __len__(self) -> int:
         """Number of points."""
         return len(self.x_mm)
+
+    def take(self, index: IntArray) -> WindowPoints:
+        """The points of an index array."""
+        return WindowPoints(**{f.name: getattr(self, f.name)[index] for f in dataclasses.fields(self)})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -167,22 +168,16 @@ def split_tile(
         Fragments and the assignment of the core's points.
     """
     terrain, kept, occupied = terrain_of(points, window, settings, classes)
+    outliers = int((core.contains(points.x_mm, points.y_mm) & ~kept).sum())
+    # from here on only the core and what its fragments can reach; most of the halo served the terrain
     near = core.grown(round(1000 * (settings.surfaces.support_m + settings.vegetation.support_m)))
-    in_near = near.contains(points.x_mm, points.y_mm) & kept
-    height = np.full(len(points), NO_DATA, np.int64)
-    index = np.flatnonzero(in_near)
-    height[index] = height_above(
-        points.x_mm[index],
-        points.y_mm[index],
-        points.z_mm[index],
-        terrain.elevation_mm,
-        terrain.column0,
-        terrain.row0,
-    )
+    near_index = np.flatnonzero(near.contains(points.x_mm, points.y_mm) & kept)
+    points = points.take(near_index)
+    height = height_above(points.x_mm, points.y_mm, points.z_mm, terrain.elevation_mm, terrain.column0, terrain.row0)
     known = height != NO_DATA
     last = points.return_number >= points.return_count
     building = (points.classification == BUILDING_CLASS) & classes.building
-    used = in_near & known & (last | building)
+    used = known & (last | building)
     chosen = highest_per_cell(points.x_mm, points.y_mm, points.z_mm, building, used, settings.surfaces.thinning_m)
     x, y, z = points.x_mm[chosen], points.y_mm[chosen], points.z_mm[chosen]
     kind = np.full(len(chosen), VertexKind.OBJECT, np.int8)
@@ -229,9 +224,9 @@ def split_tile(
     )
     return SplitTile(
         fragments=fragments,
-        core_index=core_index,
+        core_index=near_index[core_index],
         point_fragment=point_fragment,
         terrain=terrain,
         occupied=occupied,
-        outliers=int((in_core & ~kept).sum()),
+        outliers=outliers,
     )

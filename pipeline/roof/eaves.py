@@ -22,7 +22,7 @@ _PARALLEL = math.sin(math.radians(20.0))
 
 
 @dataclasses.dataclass
-class _Run:
+class Run:
     """A stretch of the raw outline and the line through it."""
 
     first: int
@@ -58,13 +58,13 @@ def straighten(outline_mm: MultiPolygon, spacing_m: float, settings: RoofSetting
     tolerance = max(settings.eave_tolerance_spacings * spacing_m, 0.2) * 1e3
     straightened = []
     for polygon in outline_mm.geoms:
-        dominant = _dominant_direction([_runs(ring, tolerance) for ring in _rings(polygon)])
+        dominant = dominant_direction([_runs(ring, tolerance) for ring in _rings(polygon)])
         rings = []
         for ring in _rings(polygon):
             runs = _runs(ring, tolerance)
-            _square(runs, dominant, math.radians(settings.square_within_deg), tolerance)
+            square_runs(runs, dominant, math.radians(settings.square_within_deg), tolerance)
             runs = _merged(ring, runs, tolerance)
-            _square(runs, dominant, math.radians(settings.square_within_deg), tolerance)
+            square_runs(runs, dominant, math.radians(settings.square_within_deg), tolerance)
             rings.append(_accepted(ring, _corners(ring, runs, tolerance), tolerance))
         drawn = Polygon(rings[0], rings[1:])
         straightened.append(drawn if drawn.is_valid else polygon)
@@ -82,7 +82,7 @@ def _rings(polygon: Polygon) -> list[FloatArray]:
     return rings
 
 
-def _runs(ring: FloatArray, tolerance: float) -> list[_Run]:
+def _runs(ring: FloatArray, tolerance: float) -> list[Run]:
     """Cut a ring into runs that stay within the tolerance of their chords."""
     n = len(ring)
     closed = np.vstack((ring, ring[:1]))
@@ -95,10 +95,10 @@ def _runs(ring: FloatArray, tolerance: float) -> list[_Run]:
         at += 1
     if len(index) < 4:
         return []
-    return [_fitted(ring, a, b) for a, b in zip(index[:-1], [*index[1:-1], n], strict=True)]
+    return [fitted_run(ring, a, b) for a, b in zip(index[:-1], [*index[1:-1], n], strict=True)]
 
 
-def _fitted(ring: FloatArray, first: int, last: int) -> _Run:
+def fitted_run(ring: FloatArray, first: int, last: int) -> Run:
     """The line of least squares through the stretch between two vertices, every piece by its length."""
     n = len(ring)
     path = ring[np.arange(first, last + 1) % n]
@@ -116,10 +116,10 @@ def _fitted(ring: FloatArray, first: int, last: int) -> _Run:
     direction = 0.5 * math.atan2(2.0 * sxy, sxx - syy)
     if math.cos(direction) * chord_x + math.sin(direction) * chord_y < 0.0:
         direction += math.pi
-    return _Run(first=first, last=last, x=cx, y=cy, direction=direction, length=math.hypot(chord_x, chord_y))
+    return Run(first=first, last=last, x=cx, y=cy, direction=direction, length=math.hypot(chord_x, chord_y))
 
 
-def _dominant_direction(rings: Sequence[Sequence[_Run]]) -> float | None:
+def dominant_direction(rings: Sequence[Sequence[Run]]) -> float | None:
     """The direction, modulo a right angle, that most of the outline follows; None where there is none."""
     runs = [run for ring in rings for run in ring]
     weights = [run.length**2 for run in runs]
@@ -132,7 +132,7 @@ def _dominant_direction(rings: Sequence[Sequence[_Run]]) -> float | None:
     return math.atan2(sine, cosine) / 4.0
 
 
-def _square(runs: Sequence[_Run], dominant: float | None, within: float, tolerance: float) -> None:
+def square_runs(runs: Sequence[Run], dominant: float | None, within: float, tolerance: float) -> None:
     """Give runs near the dominant direction, or square to it, that direction; short ones are less certain."""
     if dominant is None:
         return
@@ -144,12 +144,12 @@ def _square(runs: Sequence[_Run], dominant: float | None, within: float, toleran
             run.direction = dominant + turns * quarter
 
 
-def _turn(a: _Run, b: _Run) -> float:
+def _turn(a: Run, b: Run) -> float:
     """Angle from the one direction to the other, -pi to pi."""
     return math.remainder(b.direction - a.direction, 2.0 * math.pi)
 
 
-def _merged(ring: FloatArray, runs: Sequence[_Run], tolerance: float) -> list[_Run]:
+def _merged(ring: FloatArray, runs: Sequence[Run], tolerance: float) -> list[Run]:
     """Unite neighbouring runs that lie on nearly one line."""
     merged = list(runs)
     k = 0
@@ -158,7 +158,7 @@ def _merged(ring: FloatArray, runs: Sequence[_Run], tolerance: float) -> list[_R
         offset = abs(math.cos(a.direction) * (b.y - a.y) - math.sin(a.direction) * (b.x - a.x))
         if abs(_turn(a, b)) < 0.1 and offset < 0.7 * tolerance:
             last = b.last if b.last > a.first else b.last + len(ring)
-            merged[k] = _fitted(ring, a.first, last)
+            merged[k] = fitted_run(ring, a.first, last)
             del merged[(k + 1) % len(merged)]
             k = max(0, k - 1)
         else:
@@ -166,7 +166,7 @@ def _merged(ring: FloatArray, runs: Sequence[_Run], tolerance: float) -> list[_R
     return merged
 
 
-def _corners(ring: FloatArray, runs: Sequence[_Run], tolerance: float) -> list[tuple[float, float]]:
+def _corners(ring: FloatArray, runs: Sequence[Run], tolerance: float) -> list[tuple[float, float]]:
     """Where neighbouring lines meet; lines that (nearly) do not are joined by a short piece at their common vertex."""
     corners: list[tuple[float, float]] = []
     for a, b in zip([*runs[-1:], *runs[:-1]], runs, strict=True):

@@ -13,6 +13,7 @@ from shapely import MultiPolygon
 from pipeline.errors import BuildingError
 from pipeline.geometry import point_spacing_m, top_visible
 from pipeline.model import Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
+from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
 from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
@@ -107,6 +108,8 @@ class RoofPlan:
 
     faces: RoofPartition
     """Continued beyond the outline, to be clipped by it."""
+    planes: tuple[Plane, ...]
+    """What the labels of the faces number."""
     outline_mm: MultiPolygon
     """The given footprint, or the outline around the roof points; integer millimetres."""
     raw: RoofPartition | None
@@ -173,22 +176,29 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     labels = absorb_small_regions(x, y, z, tin.facets, labels, counted, coefficients, area, settings.minimum_void_m2)
     partition = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     if given is not None:
-        return RoofPlan(faces=partition, outline_mm=given, raw=None)
+        return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=given, raw=None)
     around = outline(partition)
     if not settings.straight_eaves:
-        return RoofPlan(faces=partition, outline_mm=around, raw=partition)
+        return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=around, raw=partition)
     labels[:n] = fill_labels(roof.xy_mm, labels[:n])
     outside = np.flatnonzero(labels[n : n + m] < 0)
     labels[n + outside] = labels[nearest[outside]]
     labels = continue_crossings(x, y, tin.facets, labels, known, coefficients)
     continued_faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
-    return RoofPlan(faces=continued_faces, outline_mm=straighten(around, roof.spacing_m, settings), raw=partition)
+    return RoofPlan(
+        planes=tuple(planes),
+        faces=continued_faces,
+        outline_mm=straighten(around, roof.spacing_m, settings),
+        raw=partition,
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PlanForm:
     """One way to draw the final plan: the forms are tried one after another until the solid is valid."""
 
+    straight: bool = False
+    """Whether borders are straightened."""
     simplification: float
     """Times the simplification of the settings."""
     shrink_mm: float
@@ -198,6 +208,8 @@ class PlanForm:
 
 
 FORMS = (
+    PlanForm(straight=True, simplification=1.0, shrink_mm=0.0, unite_mm=10.0),
+    PlanForm(straight=True, simplification=1.0, shrink_mm=7.0, unite_mm=2.5),
     PlanForm(simplification=1.0, shrink_mm=0.0, unite_mm=10.0),
     PlanForm(simplification=1.0, shrink_mm=0.0, unite_mm=2.5),
     PlanForm(simplification=1.0, shrink_mm=7.0, unite_mm=2.5),
@@ -256,6 +268,8 @@ def draw_clipped(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings, form:
         drawn_back = shapely.set_precision(shapely.buffer(outline_mm, -form.shrink_mm, join_style="mitre"), 1.0)
         outline_mm = MultiPolygon(polygons_of(drawn_back))
     partition = clip_partition(plan.faces, outline_mm, minimum_face_area(roof, settings))
+    if form.straight and settings.straight_borders:
+        partition = straighten_borders(partition, plan.planes, roof.spacing_m, settings)
     tolerance = form.simplification * settings.simplification_spacings * roof.spacing_m
     return unite_close_vertices(simplify_partition(partition, tolerance, outline_too=False), form.unite_mm)
 

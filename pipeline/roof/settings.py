@@ -46,6 +46,14 @@ class RoofSettings(Parameters):
         minimum=0.2,
         maximum=5.0,
     )
+    straight_borders: bool = parameter(True, "Whether borders between roof faces are drawn with straight lines.")
+    border_tolerance_spacings: float = parameter(
+        0.9,
+        "How far a border between roof faces may lie from its straight lines.",
+        unit="point spacings",
+        minimum=0.1,
+        maximum=5.0,
+    )
     square_within_deg: float = parameter(
         12.0,
         "An outline's line takes the dominant direction, or the one square to it, when it is this close.",

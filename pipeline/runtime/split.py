@@ -72,45 +72,73 @@ class Split:
     """Points of the core: assigned and class 6, assigned and not, class 6 and not assigned."""
 
 
-def load_window(scratch: Scratch, grid: TileGrid, tile: Tile) -> tuple[WindowPoints, int]:
-    """The points of a tile's window without exact duplicates, and how many duplicates its core had."""
-    window, core = grid.window(tile), grid.core(tile)
-    pieces = []
-    for other in grid.tiles_over(window):
-        folder = Path(scratch.root, "points", other.key)
-        if not folder.is_dir():
-            continue
-        for part in sorted(folder.glob("*.bin")):
-            records = np.fromfile(part, POINT)
-            pieces.append(records if other == tile else records[window.contains(records["x"], records["y"])])
-    records = np.concatenate(pieces) if pieces else np.empty(0, POINT)
-    del pieces
-    columns = {name: np.ascontiguousarray(records[name]) for name in POINT.names or ()}
-    del records
-    columns["z"] = columns["z"].astype(np.int64)
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LoadedWindow:
+    """The points of a tile's window, those of the core first."""
+
+    points: WindowPoints
+    """All of them."""
+    core: npt.NDArray[np.void]
+    """(n,) POINT, the core's records without exact duplicates: the first n of `points`, in that order."""
+    duplicates: int
+    """Exact duplicates that were dropped from the core."""
+
+
+_WINDOW_COLUMNS = ("x", "y", "z", "return_number", "return_count", "classification")
+
+
+def _without_duplicates(records: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+    """One of each set of equal points."""
     kept = first_of_each(
-        columns["x"],
-        columns["y"],
-        columns["z"],
-        columns["return_number"],
-        columns["gps_time"],
-        columns["source"],
-        columns["classification"],
+        np.ascontiguousarray(records["x"]),
+        np.ascontiguousarray(records["y"]),
+        records["z"].astype(np.int64),
+        np.ascontiguousarray(records["return_number"]),
+        np.ascontiguousarray(records["gps_time"]),
+        np.ascontiguousarray(records["source"]),
+        np.ascontiguousarray(records["classification"]),
     )
-    duplicates = int((~kept & core.contains(columns["x"], columns["y"])).sum())
-    if not kept.all():
-        columns = {name: values[kept] for name, values in columns.items()}
+    return records if kept.all() else records[kept]
+
+
+def load_window(scratch: Scratch, grid: TileGrid, tile: Tile) -> LoadedWindow:
+    """Read the core and its halo.
+
+    The halo keeps its exact duplicates: lowest and highest points are the same with them. Only its few needed
+    columns are held, since a halo can be many times its core.
+    """
+    window = grid.window(tile)
+    own = [np.fromfile(part, POINT) for part in _parts(scratch, tile)]
+    records = np.concatenate(own) if own else np.empty(0, POINT)
+    core = _without_duplicates(records)
+    duplicates = len(records) - len(core)
+    del own, records
+    columns = {name: [np.ascontiguousarray(core[name])] for name in _WINDOW_COLUMNS}
+    for other in grid.tiles_over(window):
+        if other == tile:
+            continue
+        for part in _parts(scratch, other):
+            records = np.fromfile(part, POINT)
+            records = records[window.contains(records["x"], records["y"])]
+            for name, pieces in columns.items():
+                pieces.append(np.ascontiguousarray(records[name]))
+    whole = {}
+    for name in _WINDOW_COLUMNS:
+        whole[name] = np.concatenate(columns.pop(name))
     points = WindowPoints(
-        x_mm=columns["x"],
-        y_mm=columns["y"],
-        z_mm=columns["z"],
-        return_number=columns["return_number"],
-        return_count=columns["return_count"],
-        classification=columns["classification"],
-        gps_time=columns["gps_time"],
-        source_id=columns["source"],
+        x_mm=whole["x"],
+        y_mm=whole["y"],
+        z_mm=whole["z"].astype(np.int64),
+        return_number=whole["return_number"],
+        return_count=whole["return_count"],
+        classification=whole["classification"],
     )
-    return points, duplicates
+    return LoadedWindow(points=points, core=core, duplicates=duplicates)
+
+
+def _parts(scratch: Scratch, tile: Tile) -> list[Path]:
+    """The buckets of a tile, in the order of the inputs."""
+    return sorted(Path(scratch.root, "points", tile.key).glob("*.bin"))
 
 
 def split(task: SplitTask) -> Split:
@@ -121,7 +149,8 @@ def split(task: SplitTask) -> Split:
     Split
         Descriptors; arrays are in scratch under `tiles/<tile>/`.
     """
-    points, duplicates = load_window(task.scratch, task.grid, task.tile)
+    loaded = load_window(task.scratch, task.grid, task.tile)
+    points = loaded.points
     core, window = task.grid.core(task.tile), task.grid.window(task.tile)
     fragments: Fragments | None = None
     if task.footprints is None:
@@ -140,7 +169,7 @@ def split(task: SplitTask) -> Split:
         int((assigned & ~is_building).sum()),
         int((~assigned & is_building).sum()),
     )
-    keys, starts, lowest = _store(task, points, index[assigned], owner[assigned])
+    keys, starts, lowest = _store(task, loaded.core[index[assigned]], owner[assigned])
     _store_terrain(task, terrain, occupied, core)
     return Split(
         tile=task.tile,
@@ -148,26 +177,19 @@ def split(task: SplitTask) -> Split:
         starts=starts,
         keys=keys,
         lowest_points_mm=lowest,
-        points=int(core.contains(points.x_mm, points.y_mm).sum()),
-        duplicates=duplicates,
+        points=len(loaded.core),
+        duplicates=loaded.duplicates,
         outliers=outliers,
         audit=audit,
     )
 
 
 def _store(
-    task: SplitTask, points: WindowPoints, index: npt.NDArray[np.int64], owner: npt.NDArray[np.int64]
+    task: SplitTask, records: npt.NDArray[np.void], owner: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Store points sorted by owner; the owners, where each one's points start, and their smallest points."""
-    order = np.lexsort((points.z_mm[index], points.y_mm[index], points.x_mm[index], owner))
-    index, owner = index[order], owner[order]
-    records = np.empty(len(index), POINT)
-    records["x"], records["y"], records["z"] = points.x_mm[index], points.y_mm[index], points.z_mm[index]
-    records["source"] = points.source_id[index]
-    records["return_number"] = points.return_number[index]
-    records["return_count"] = points.return_count[index]
-    records["gps_time"] = points.gps_time[index]
-    records["classification"] = points.classification[index]
+    order = np.lexsort((records["z"], records["y"], records["x"], owner))
+    records, owner = records[order], owner[order]
     task.scratch.put_arrays(f"tiles/{task.tile.key}", {"points": records.view(np.uint8)})
     keys, starts = np.unique(owner, return_index=True)
     lowest = np.column_stack([records[name][starts] for name in "xyz"]).astype(np.int64)

@@ -39,48 +39,66 @@ class OutlierSettings(Parameters):
 
 
 @njit(cache=True, nogil=True)
+def _find(keys: IntArray, key: int, mask: int) -> np.int64:
+    """Slot that holds a key, or the empty one where it belongs."""
+    s = slot_of_key(key, mask)
+    while keys[s] != _EMPTY and keys[s] != key:
+        s = (s + 1) & mask
+    return s
+
+
+@njit(cache=True, nogil=True)
+def _grown(keys: IntArray, counts: IntArray) -> tuple[IntArray, IntArray]:
+    """The table in twice the slots."""
+    size = 2 * keys.size
+    new_keys = np.full(size, _EMPTY, np.int64)
+    new_counts = np.zeros(size, np.int64)
+    for s in range(keys.size):
+        if keys[s] != _EMPTY:
+            t = _find(new_keys, keys[s], size - 1)
+            new_keys[t] = keys[s]
+            new_counts[t] = counts[s]
+    return new_keys, new_counts
+
+
+@njit(cache=True, nogil=True)
 def _dense_enough(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, cube_mm: int, min_neighbours: int) -> BoolArray:
     """Kernel: count points a cube, then sum the 27 cubes around each occupied cube once."""
     n = x_mm.size
     keep = np.zeros(n, np.bool_)
     if n == 0:
         return keep
-    size = 1
-    while size < 2 * n:
-        size *= 2
-    mask = size - 1
-    keys = np.full(size, _EMPTY, np.int64)
-    counts = np.zeros(size, np.int64)
-    enough = np.zeros(size, np.int8)  # 0 unknown, 1 yes, 2 no
-    slot_of = np.empty(n, np.int64)
+    # far fewer cubes than points: the table starts small and grows
+    keys = np.full(4096, _EMPTY, np.int64)
+    counts = np.zeros(4096, np.int64)
+    cubes = 0
     low_x, low_y, low_z = x_mm.min() // cube_mm - 1, y_mm.min() // cube_mm - 1, z_mm.min() // cube_mm - 1
     for i in range(n):
         a, b, c = x_mm[i] // cube_mm - low_x, y_mm[i] // cube_mm - low_y, z_mm[i] // cube_mm - low_z
         key = (a << (2 * _BITS)) | (b << _BITS) | c
-        s = slot_of_key(key, mask)
-        while keys[s] != _EMPTY and keys[s] != key:
-            s = (s + 1) & mask
-        keys[s] = key
+        s = _find(keys, key, keys.size - 1)
+        if keys[s] == _EMPTY:
+            keys[s] = key
+            cubes += 1
         counts[s] += 1
-        slot_of[i] = s
+        if 2 * cubes > keys.size:
+            keys, counts = _grown(keys, counts)
+    mask = keys.size - 1
+    enough = np.zeros(keys.size, np.bool_)
+    for s in range(keys.size):
+        if keys[s] == _EMPTY:
+            continue
+        total = np.int64(0)
+        for da in range(-1, 2):
+            for db in range(-1, 2):
+                for dc in range(-1, 2):
+                    t = _find(keys, keys[s] + (da << (2 * _BITS)) + (db << _BITS) + dc, mask)
+                    if keys[t] != _EMPTY:
+                        total += counts[t]
+        enough[s] = total > min_neighbours
     for i in range(n):
-        s = slot_of[i]
-        if enough[s] == 0:
-            total = counts[s]
-            key = keys[s]
-            for da in range(-1, 2):
-                for db in range(-1, 2):
-                    for dc in range(-1, 2):
-                        if total > min_neighbours or (da == 0 and db == 0 and dc == 0):
-                            continue
-                        other = key + (da << (2 * _BITS)) + (db << _BITS) + dc
-                        t = slot_of_key(other, mask)
-                        while keys[t] != _EMPTY and keys[t] != other:
-                            t = (t + 1) & mask
-                        if keys[t] == other:
-                            total += counts[t]
-            enough[s] = 1 if total > min_neighbours else 2
-        keep[i] = enough[s] == 1
+        a, b, c = x_mm[i] // cube_mm - low_x, y_mm[i] // cube_mm - low_y, z_mm[i] // cube_mm - low_z
+        keep[i] = enough[_find(keys, (a << (2 * _BITS)) | (b << _BITS) | c, mask)]
     return keep
 
 

@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from pipeline.errors import SettingsError
-from pipeline.model import PointCloud
+from pipeline.model import FloatArray, PointCloud
 from pipeline.synthetic.als import ScanBlock, ScannerSettings, scan, scan_all, strip_count
 from pipeline.synthetic.roofs import RoofDimensions, RoofShape
 from pipeline.synthetic.scene import Scene, Terrain
@@ -32,8 +32,9 @@ def block() -> ScanBlock:
     return scan_all(SUBURB, SUITES["suburb"].scanner, 3)
 
 
-def local(block: ScanBlock, scene: Scene) -> np.ndarray:
-    return block.points.xyz - np.array(scene.origin)
+def local(block: ScanBlock, scene: Scene) -> FloatArray:
+    xyz: FloatArray = block.points.xyz - np.array(scene.origin)
+    return xyz
 
 
 def same(a: ScanBlock, b: ScanBlock) -> bool:

@@ -1,4 +1,4 @@
-"""Whole surfaces are judged by hand-made sums: each reason has its threshold, and levels unite whatever their numbers."""
+"""Whole surfaces are judged by hand-made sums; levels unite whatever their numbers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pipeline.terrain.surfaces import N_SUMS, FacetKind, Sum
 
 SETTINGS = CandidateSettings()
 
-ROOF = {
+ROOF: dict[Sum, int] = {
     Sum.FACETS: 800,
     Sum.AREA2: 200_000_000,
     Sum.VERTICES: 400,
@@ -101,7 +101,7 @@ def test_what_nothing_tells_about_planarity_is_not_called_vegetation() -> None:
 
 
 def test_building_by_trusted_classes_needs_only_its_area() -> None:
-    bare = {column: 0 for column in ROOF if column not in {Sum.AREA2, Sum.POINTS}}
+    bare: dict[Sum, int] = {column: 0 for column in ROOF if column not in {Sum.AREA2, Sum.POINTS}}
     assert judged(bare, FacetKind.BUILDING) is None
     small = judged({**bare, Sum.AREA2: 10_000_000}, FacetKind.BUILDING)
     assert small is not None
@@ -133,7 +133,7 @@ def test_an_object_is_a_surface_of_some_size_or_a_large_roof(kind: FacetKind, ar
 
 
 def test_a_share_beyond_one_is_refused() -> None:
-    with pytest.raises(SettingsError, match="min_planar_share is 1.5"):
+    with pytest.raises(SettingsError, match=r"min_planar_share is 1\.5"):
         CandidateSettings(min_planar_share=1.5)
 
 

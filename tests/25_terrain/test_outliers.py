@@ -17,8 +17,8 @@ Points = npt.NDArray[np.int64]
 
 
 def kept_of(points: Points, outliers: OutlierSettings | None = None) -> BoolArray:
-    columns = [np.ascontiguousarray(points[:, k]) for k in range(3)]
-    return dense_enough(*columns, outliers or OutlierSettings())
+    x, y, z = (np.ascontiguousarray(points[:, k]) for k in range(3))
+    return dense_enough(x, y, z, outliers or OutlierSettings())
 
 
 def slow_twin(points: Points, cube_mm: int, min_neighbours: int) -> list[bool]:
@@ -32,7 +32,7 @@ def slow_twin(points: Points, cube_mm: int, min_neighbours: int) -> list[bool]:
 
 
 def town(random: np.random.Generator, n: int = 3000, side_mm: int = 40_000) -> Points:
-    xy = random.integers(0, side_mm, (n, 2)) + [84_000_000, 447_000_000]
+    xy = random.integers(0, side_mm, (n, 2)) + np.array([84_000_000, 447_000_000])
     roof = ((xy // 10_000).sum(axis=1) % 2) * 7000
     return np.column_stack((xy, roof + random.integers(-100, 100, n))).astype(np.int64)
 
@@ -119,5 +119,5 @@ def test_a_single_point_is_an_outlier_unless_no_neighbour_is_asked_for() -> None
 
 
 def test_cubes_out_of_range_are_refused() -> None:
-    with pytest.raises(SettingsError, match="cube_m is 0.5"):
+    with pytest.raises(SettingsError, match=r"cube_m is 0\.5"):
         OutlierSettings(cube_m=0.5)

@@ -316,8 +316,8 @@ def test_sums_agree_with_a_walk_over_all_edges(heights: Height) -> None:
             expected[label[f], Sum.FACETS] += 1
             area = shapely.Polygon(np.column_stack((v.x_mm, v.y_mm))[corners]).area
             expected[label[f], Sum.AREA2] += round(2 * area)
-    for edge, beside in sides.items():
-        a, b = edge
+    for ends, beside in sides.items():
+        a, b = ends
         length = round(math.dist((v.x_mm[a], v.y_mm[a]), (v.x_mm[b], v.y_mm[b])))
         for f, g in [(f, g) for f in beside for g in ([k for k in beside if k != f] or [-1])]:
             if label[f] < 0 or (g >= 0 and kinds[f] == kinds[g]):

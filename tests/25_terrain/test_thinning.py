@@ -14,8 +14,8 @@ Points = npt.NDArray[np.int64]
 
 
 def thinned(points: Points, preferred: BoolArray, used: BoolArray, cell_m: float = 0.5) -> npt.NDArray[np.int64]:
-    columns = [np.ascontiguousarray(points[:, k]) for k in range(3)]
-    return highest_per_cell(*columns, preferred, used, cell_m)
+    x, y, z = (np.ascontiguousarray(points[:, k]) for k in range(3))
+    return highest_per_cell(x, y, z, preferred, used, cell_m)
 
 
 def slow_twin(points: Points, preferred: BoolArray, used: BoolArray, cell_mm: int) -> list[tuple[int, int, int]]:

@@ -22,11 +22,17 @@ def verdicts(points: Points, wanted: npt.NDArray[np.bool_] | None = None) -> Kin
 
 
 def in_mm(x: npt.ArrayLike, y: npt.ArrayLike, z: npt.ArrayLike) -> Points:
-    return np.rint(1000 * np.column_stack((np.asarray(x), np.asarray(y), np.asarray(z)))).astype(np.int64)
+    metres = np.column_stack((np.asarray(x), np.asarray(y), np.asarray(z)))
+    return np.asarray(np.rint(1000 * metres), dtype=np.int64)
 
 
 def scattered(random: np.random.Generator, side_m: float, per_m2: float) -> npt.NDArray[np.float64]:
     return random.uniform(0, side_m, (round(side_m * side_m * per_m2), 2))
+
+
+def flat(random: np.random.Generator, per_m2: float) -> Points:
+    xy = scattered(random, 10.0, per_m2)
+    return in_mm(xy[:, 0], xy[:, 1], np.zeros(len(xy)))
 
 
 def slow_twin(points: Points, index: int, vegetation: VegetationSettings) -> int:
@@ -125,7 +131,7 @@ def test_more_noise_makes_less_of_a_roof_planar() -> None:
     random = np.random.default_rng(4)
     xy = scattered(random, 15.0, 4.0)
     unit = random.normal(0, 1, len(xy))
-    shares = [(verdicts(in_mm(*xy.T, 5.0 + noise * unit)) == 1).mean() for noise in (0.02, 0.12, 0.2, 0.5)]
+    shares = [(verdicts(in_mm(xy[:, 0], xy[:, 1], 5.0 + noise * unit)) == 1).mean() for noise in (0.02, 0.12, 0.2, 0.5)]
     assert shares == sorted(shares, reverse=True)
     assert shares[0] > 0.99
     assert shares[-1] < 0.2
@@ -133,7 +139,7 @@ def test_more_noise_makes_less_of_a_roof_planar() -> None:
 
 def test_only_wanted_vertices_are_judged_but_all_are_neighbours() -> None:
     random = np.random.default_rng(5)
-    points = np.concatenate((in_mm(*scattered(random, 10.0, 4.0).T, np.zeros(400)), crown(random, 340)))
+    points = np.concatenate((flat(random, 4.0), crown(random, 340)))
     wanted = random.random(len(points)) < 0.3
     found = verdicts(points, wanted)
     assert (found[~wanted] == -1).all()
@@ -143,13 +149,13 @@ def test_only_wanted_vertices_are_judged_but_all_are_neighbours() -> None:
 def test_too_few_neighbours_give_no_verdict() -> None:
     five = in_mm([0, 0.2, 0.4, 0, 0.2], [0, 0, 0.1, 0.3, 0.4], np.zeros(5))
     assert (verdicts(five) == -1).all()
-    assert (verdicts(np.concatenate((five, five[:1] + [10, 10, 0]))) == 1).all()
+    assert (verdicts(np.concatenate((five, five[:1] + np.array([10, 10, 0])))) == 1).all()
     assert verdicts(np.empty((0, 3), np.int64)).shape == (0,)
 
 
 def test_neither_order_nor_a_shift_matters() -> None:
     random = np.random.default_rng(6)
-    points = np.concatenate((in_mm(*scattered(random, 10.0, 2.0).T, np.zeros(200)), crown(random, 200)))
+    points = np.concatenate((flat(random, 2.0), crown(random, 200)))
     expected = verdicts(points)
     order = random.permutation(len(points))
     np.testing.assert_array_equal(verdicts(points[order]), expected[order])

@@ -89,8 +89,6 @@ def make_town(*, seed: int = 0, side_m: float = 110.0, per_m2: float = 5.0, nois
         return_number=number.astype(np.uint8),
         return_count=count.astype(np.uint8),
         classification=truth,
-        gps_time=np.arange(len(x_mm), dtype=np.float64),
-        source_id=np.zeros(len(x_mm), np.uint16),
     )
     return Town(points=points, truth=truth, house=_inside(xyz[:, 0], xyz[:, 1], HOUSE) & (truth == BUILDING))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -110,6 +111,34 @@ def test_a_rectangle_without_points_or_sense_is_refused(
 ) -> None:
     words = ("--out", str(tmp_path / "run"), "--workers", "0", "--bbox", *bbox)
     assert invoke("reconstruct", str(scene / "gable.laz"), *words)[0] == code
+
+
+def test_the_query_of_the_docs_finds_the_building(run: tuple[Path, Any, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    import duckdb
+
+    page = Path(__file__).resolve().parents[2] / "docs" / "run_directory.md"
+    query = page.read_text().split("```sql")[1].split("```")[0]
+    monkeypatch.chdir(run[0].parent)
+    rows = duckdb.sql(query).fetchall()
+    assert [row[1] for row in rows] == ["gable"]
+    assert rows[0][4].startswith("x")
+
+
+def test_a_failed_tile_is_exit_code_1(
+    scene: Path, run: tuple[Path, Any, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    import pipeline.runtime.run as module
+
+    whole = module.run
+
+    def run_with_a_failed_tile(request: module.RunRequest, listener: Any) -> module.RunSummary:
+        return dataclasses.replace(whole(request, listener), failed_tiles=("x1_y2",))
+
+    monkeypatch.setattr(module, "run", run_with_a_failed_tile)
+    words = ("--out", str(tmp_path / "run"), "--workers", "0")
+    code, _, log = invoke("reconstruct", str(scene / "gable.laz"), *words)
+    assert code == 1
+    assert "tile x1_y2 failed" in log
 
 
 @pytest.mark.slow

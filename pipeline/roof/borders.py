@@ -1,0 +1,284 @@
+"""Straight borders between roof faces: ridges where planes cross, steps along fitted lines.
+
+The borders of a partition are arcs between nodes, where three or more borders meet. An arc is cut into runs by Douglas
+and Peucker's rule; a run along which the two planes cross takes their line of intersection, another one the line of
+least squares through it, turned to the building's dominant direction where it is near. Nodes move to where their
+lines meet, along the outline where they lie on it. What breaks is put back arc by arc: the result is a coverage again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import shapely
+
+from pipeline.model import FloatArray, Plane
+from pipeline.roof.eaves import Run, dominant_direction, fitted_run, square_runs
+from pipeline.roof.partition import RoofPartition
+from pipeline.roof.settings import RoofSettings
+
+Point = tuple[float, float]
+_PARALLEL = math.sin(math.radians(20.0))
+_ROUNDS = 4
+
+
+@dataclasses.dataclass
+class _Arc:
+    """A border between two nodes, or a closed one that starts at any vertex."""
+
+    path: list[Point]
+    """Its vertices, both ends included; equal ends where it is closed."""
+    left: int
+    right: int
+    """The faces beside it; -1 is outside."""
+    runs: list[Run] = dataclasses.field(default_factory=list)
+    exact: list[bool] = dataclasses.field(default_factory=list)
+    """Whether a run is a line of intersection."""
+    straight: bool = False
+    """Whether the runs replace the path."""
+
+
+def straighten_borders(
+    partition: RoofPartition, planes: Sequence[Plane], spacing_m: float, settings: RoofSettings
+) -> RoofPartition:
+    """Draw the borders between roof faces as straight lines, leaving the outline.
+
+    Parameters
+    ----------
+    partition : RoofPartition
+        A coverage in integer millimetres, clipped to its outline.
+    planes : sequence of Plane
+        The labels' planes.
+    spacing_m : float
+        Point spacing; the tolerances are multiples of it.
+    settings : RoofSettings
+        `border_tolerance_spacings`, `square_within_deg`.
+
+    Returns
+    -------
+    RoofPartition
+        A coverage with the same faces; the same object where nothing could be straightened.
+    """
+    tolerance = settings.border_tolerance_spacings * spacing_m * 1e3
+    arcs, rings = _arcs(partition)
+    outline_runs = [
+        fitted_run(np.array([a, b]), 0, 1)
+        for arc in arcs
+        if min(arc.left, arc.right) < 0
+        for a, b in zip(arc.path[:-1], arc.path[1:], strict=True)
+    ]
+    dominant = dominant_direction([outline_runs])
+    within = math.radians(settings.square_within_deg)
+    for arc in arcs:
+        if min(arc.left, arc.right) >= 0 and arc.path[0] != arc.path[-1]:
+            _fit(arc, planes[partition.labels[arc.left]], planes[partition.labels[arc.right]], tolerance)
+            inexact = [run for run, exact in zip(arc.runs, arc.exact, strict=True) if not exact]
+            square_runs(inexact, dominant, within, tolerance)
+            arc.straight = bool(arc.runs)
+    before = np.array(partition.polygons, dtype=object)
+    for _ in range(_ROUNDS):
+        if not any(arc.straight for arc in arcs):
+            return partition
+        moved = _moved_nodes(arcs, tolerance)
+        drawn = _drawn(arcs, rings, moved, tolerance)
+        broken = _broken_faces(drawn, before, tolerance)
+        if not broken:
+            return RoofPartition(polygons=tuple(drawn), labels=partition.labels)
+        for arc in arcs:
+            if arc.left in broken or arc.right in broken:
+                arc.straight = False
+    return partition
+
+
+def _arcs(partition: RoofPartition) -> tuple[list[_Arc], list[list[list[tuple[int, bool]]]]]:
+    """The arcs of a coverage, and every polygon's rings as (arc, forwards)."""
+    face_rings = [
+        [[(x, y) for x, y in shapely.get_coordinates(line)[:-1].tolist()] for line in (p.exterior, *p.interiors)]
+        for p in shapely.orient_polygons(np.array(partition.polygons, dtype=object)).tolist()
+    ]
+    owner: dict[tuple[Point, Point], int] = {}
+    neighbours: dict[Point, set[Point]] = {}
+    for face, rings in enumerate(face_rings):
+        for ring in rings:
+            for a, b in zip(ring, ring[1:] + ring[:1], strict=True):
+                owner[a, b] = face
+                neighbours.setdefault(a, set()).add(b)
+                neighbours.setdefault(b, set()).add(a)
+    arcs: list[_Arc] = []
+    arc_of: dict[tuple[Point, Point], tuple[int, bool]] = {}
+    rings_of_arcs: list[list[list[tuple[int, bool]]]] = []
+    for face, rings in enumerate(face_rings):
+        as_arcs = []
+        for ring in rings:
+            nodes = [k for k, v in enumerate(ring) if len(neighbours[v]) != 2]
+            start = nodes[0] if nodes else 0
+            turned = [*ring[start:], *ring[:start], ring[start]]
+            stops = [k for k, v in enumerate(turned) if len(neighbours[v]) != 2] if nodes else [0, len(turned) - 1]
+            sequence = []
+            for i, j in itertools.pairwise(stops):
+                path = turned[i : j + 1]
+                known = arc_of.get((path[0], path[1]))
+                if known is None or not nodes:
+                    # a closed border may start elsewhere in the neighbour's ring: each keeps its own
+                    known = (len(arcs), True)
+                    arcs.append(_Arc(path=path, left=face, right=owner.get((path[1], path[0]), -1)))
+                    arc_of[path[-1], path[-2]] = (known[0], False)
+                sequence.append(known)
+            as_arcs.append(sequence)
+        rings_of_arcs.append(as_arcs)
+    return arcs, rings_of_arcs
+
+
+def _fit(arc: _Arc, left: Plane, right: Plane, tolerance: float) -> None:
+    """Cut an arc into runs and give each its line."""
+    path = np.array(arc.path)
+    kept = shapely.get_coordinates(shapely.simplify(shapely.linestrings(path), tolerance, preserve_topology=False))
+    index, at = [], 0
+    for x, y in kept.tolist():
+        while path[at, 0] != x or path[at, 1] != y:
+            at += 1
+        index.append(at)
+        at += 1
+    index[-1] = len(path) - 1
+    da, db, dc = left.a - right.a, left.b - right.b, (left.c - right.c) * 1e3
+    slope = math.hypot(da, db)
+    for first, last in itertools.pairwise(index):
+        run = fitted_run(path, first, last)
+        off = math.inf
+        if slope > 0.05:
+            piece = path[first : last + 1]
+            off = float(np.median(np.abs(piece[:, 0] * da + piece[:, 1] * db + dc))) / slope
+        exact = off <= 0.5 * tolerance
+        if exact:
+            shift = (run.x * da + run.y * db + dc) / (slope * slope)
+            run.x -= shift * da
+            run.y -= shift * db
+            along = math.atan2(da, -db)
+            run.direction = along if math.cos(along - run.direction) >= 0.0 else along + math.pi
+        if exact and arc.exact and arc.exact[-1]:
+            arc.runs[-1].last = last
+            arc.runs[-1].length += run.length
+            continue
+        arc.runs.append(run)
+        arc.exact.append(exact)
+
+
+def _crossing(a: Run, b: Run) -> Point | None:
+    """Where two lines meet; None where they are nearly parallel."""
+    ux, uy = math.cos(a.direction), math.sin(a.direction)
+    wx, wy = math.cos(b.direction), math.sin(b.direction)
+    determinant = ux * wy - uy * wx
+    if abs(determinant) < _PARALLEL:
+        return None
+    t = ((b.x - a.x) * wy - (b.y - a.y) * wx) / determinant
+    return a.x + t * ux, a.y + t * uy
+
+
+def _moved_nodes(arcs: Sequence[_Arc], tolerance: float) -> dict[Point, Point]:
+    """New places of the nodes at which straight arcs end."""
+    lines: dict[Point, list[tuple[bool, float, Run]]] = {}
+    fixed: dict[Point, list[tuple[Point, Point]]] = {}
+    for arc in arcs:
+        if arc.straight:
+            lines.setdefault(arc.path[0], []).append((arc.exact[0], arc.runs[0].length, arc.runs[0]))
+            lines.setdefault(arc.path[-1], []).append((arc.exact[-1], arc.runs[-1].length, arc.runs[-1]))
+        else:
+            fixed.setdefault(arc.path[0], []).append((arc.path[0], arc.path[1]))
+            fixed.setdefault(arc.path[-1], []).append((arc.path[-1], arc.path[-2]))
+    moved: dict[Point, Point] = {}
+    for node, candidates in lines.items():
+        candidates.sort(key=lambda line: (not line[0], -line[1], line[2].x, line[2].y))
+        held = fixed.get(node, [])
+        place: Point | None = None
+        if not held:
+            pairs = [(a[2], b[2]) for k, a in enumerate(candidates) for b in candidates[k + 1 :]]
+            place = next((p for p in (_crossing(a, b) for a, b in pairs) if p is not None), None)
+        elif len(held) == 2 and _is_straight(held[0][1], node, held[1][1]):
+            # on a straight piece of the outline: slide along it
+            place = next((p for p in (_slide(held, run) for _, _, run in candidates) if p is not None), None)
+        if place is not None and math.dist(place, node) <= 2.0 * tolerance:
+            moved[node] = (float(round(place[0])), float(round(place[1])))
+    return moved
+
+
+def _is_straight(a: Point, b: Point, c: Point) -> bool:
+    """Whether b lies within two millimetres of the line from a to c, between them."""
+    ux, uy = c[0] - a[0], c[1] - a[1]
+    length = math.hypot(ux, uy)
+    if length == 0.0:
+        return False
+    return abs(ux * (b[1] - a[1]) - uy * (b[0] - a[0])) <= 2.0 * length
+
+
+def _slide(held: Sequence[tuple[Point, Point]], run: Run) -> Point | None:
+    """Where a line meets the straight outline through a node, between the node's neighbours on it."""
+    (ax, ay), (bx, by) = held[0][1], held[1][1]
+    length = math.hypot(bx - ax, by - ay)
+    outline = Run(first=0, last=1, x=ax, y=ay, direction=math.atan2(by - ay, bx - ax), length=length)
+    place = _crossing(outline, run)
+    if place is None:
+        return None
+    along = ((place[0] - ax) * (bx - ax) + (place[1] - ay) * (by - ay)) / length
+    return place if 50.0 < along < length - 50.0 else None
+
+
+def _new_path(arc: _Arc, moved: dict[Point, Point], tolerance: float) -> list[Point]:
+    """The vertices of an arc between its nodes' new places."""
+    start, end = moved.get(arc.path[0], arc.path[0]), moved.get(arc.path[-1], arc.path[-1])
+    if not arc.straight:
+        return [start, *arc.path[1:-1], end]
+    corners: list[Point] = []
+    for a, b in zip(arc.runs[:-1], arc.runs[1:], strict=True):
+        vertex = arc.path[b.first]
+        corner = _crossing(a, b)
+        if corner is not None and math.dist(corner, vertex) <= 2.0 * tolerance:
+            corners.append(corner)
+            continue
+        for run in (a, b):
+            along = (vertex[0] - run.x) * math.cos(run.direction) + (vertex[1] - run.y) * math.sin(run.direction)
+            corners.append((run.x + along * math.cos(run.direction), run.y + along * math.sin(run.direction)))
+    rounded = [(float(round(x)), float(round(y))) for x, y in corners]
+    path = [start]
+    for point in [*rounded, end]:
+        if point != path[-1]:
+            path.append(point)
+    return path
+
+
+def _drawn(
+    arcs: Sequence[_Arc],
+    rings: Sequence[Sequence[Sequence[tuple[int, bool]]]],
+    moved: dict[Point, Point],
+    tolerance: float,
+) -> list[shapely.Polygon]:
+    """The faces from their arcs; an empty polygon where a ring collapsed."""
+    paths = [_new_path(arc, moved, tolerance) for arc in arcs]
+    polygons = []
+    for face in rings:
+        lines = []
+        for ring in face:
+            vertices: list[Point] = []
+            for number, forwards in ring:
+                path = paths[number] if forwards else paths[number][::-1]
+                vertices.extend(path[:-1])
+            lines.append(vertices)
+        collapsed = any(len(vertices) < 3 for vertices in lines)
+        polygons.append(shapely.Polygon() if collapsed else shapely.Polygon(lines[0], lines[1:]))
+    return polygons
+
+
+def _broken_faces(drawn: Sequence[shapely.Polygon], before: Iterable[shapely.Polygon], tolerance: float) -> set[int]:
+    """Faces that are not sound, overlap others, or moved by more than the tolerance allows."""
+    after = np.array(drawn, dtype=object)
+    broken = ~shapely.is_valid(after) | shapely.is_empty(after)
+    if not broken.any():
+        broken |= ~shapely.is_empty(shapely.coverage_invalid_edges(after))
+    sound = ~broken
+    old: FloatArray = np.array(list(before), dtype=object)
+    area = shapely.area(shapely.symmetric_difference(after[sound], old[sound]))
+    broken[sound] |= area > tolerance * shapely.length(old[sound])
+    return set(np.flatnonzero(broken).tolist())

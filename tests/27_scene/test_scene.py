@@ -1,0 +1,337 @@
+"""A town of points to surfaces: the buildings are found, the trees are not, and tiles change nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.model import IntArray, Reason
+from pipeline.runtime.join import whole_surfaces
+from pipeline.runtime.split import Split
+from pipeline.scene import ClassesInUse, SceneSettings, SplitTile, WindowPoints, lattice_of, split_tile
+from pipeline.terrain.candidates import CandidateSettings, Surfaces, Verdict, judge_surface, unite_levels
+from pipeline.terrain.ground import NO_DATA, GroundSettings
+from pipeline.terrain.outliers import OutlierSettings
+from pipeline.terrain.surfaces import FacetKind, Fragments, Sum, SurfaceSettings
+from pipeline.terrain.vegetation import VegetationSettings
+from pipeline.tiling import Tile, TileGrid, Window
+
+GROUND, TREE, BUILDING = 2, 5, 6
+
+IGNORED = ClassesInUse()
+TRUSTED = ClassesInUse(ground=True, building=True)
+
+WHOLE = Window(x0_mm=0, y0_mm=0, x1_mm=110_000, y1_mm=110_000)
+
+NARROW = SceneSettings(
+    outliers=OutlierSettings(cube_m=1.0),
+    ground=GroundSettings(max_window_m=6, bridge_m=8),
+    vegetation=VegetationSettings(radius_m=0.5),
+    surfaces=SurfaceSettings(max_circumradius_m=2.0),
+)
+"""Settings that look 40 m far, so that the windows of a small town's tiles do not all see the whole town."""
+
+
+def taken(points: WindowPoints, index: npt.NDArray[Any]) -> WindowPoints:
+    return WindowPoints(**{f.name: getattr(points, f.name)[index] for f in dataclasses.fields(points)})
+
+
+def changed(points: WindowPoints, **columns: npt.NDArray[Any]) -> WindowPoints:
+    return dataclasses.replace(points, **columns)
+
+
+def with_points(points: WindowPoints, more: IntArray) -> WindowPoints:
+    """The points and single returns at (k, 3) further places."""
+    k = len(more)
+    extra = {"x_mm": more[:, 0], "y_mm": more[:, 1], "z_mm": more[:, 2]}
+    extra |= {"return_number": np.ones(k, np.uint8), "return_count": np.ones(k, np.uint8)}
+    return WindowPoints(
+        **{
+            f.name: np.concatenate(
+                (getattr(points, f.name), extra.get(f.name, np.zeros(k)).astype(getattr(points, f.name).dtype))
+            )
+            for f in dataclasses.fields(points)
+        }
+    )
+
+
+def split_whole(
+    points: WindowPoints, classes: ClassesInUse = IGNORED, settings: SceneSettings | None = None
+) -> SplitTile:
+    return split_tile(points, WHOLE, WHOLE, settings or SceneSettings(), classes)
+
+
+def surfaces_of(f: Fragments) -> Surfaces:
+    return Surfaces(
+        kind=f.kind, sums=f.sums, boxes_mm=f.boxes_mm, lowest_point_mm=f.lowest_point_mm, along_steps=f.along_steps
+    )
+
+
+def judged(fragments: Fragments) -> list[Verdict | None]:
+    step = Verdict(reason=Reason.TOO_FEW_POINTS, detail="a step")
+    return [
+        step if kind == FacetKind.STEP else judge_surface(int(kind), sums, CandidateSettings())
+        for kind, sums in zip(fragments.kind, fragments.sums, strict=True)
+    ]
+
+
+def candidate_of_points(found: SplitTile) -> IntArray:
+    """Leader of the candidate of every point of the window, -1 where none; the core is the window."""
+    leader = unite_levels(surfaces_of(found.fragments), judged(found.fragments), CandidateSettings())
+    out = np.full(found.core_index.max() + 1, -1, np.int64)
+    assigned = found.point_fragment >= 0
+    out[found.core_index[assigned]] = leader[found.point_fragment[assigned]]
+    return out
+
+
+# -- what is found -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("classes", [IGNORED, TRUSTED])
+def test_the_buildings_are_found_and_the_trees_are_not(town: Any, classes: ClassesInUse) -> None:
+    candidate = candidate_of_points(split_whole(town.points, classes))
+    truth = town.truth[: len(candidate)]
+    leaders = np.unique(candidate[candidate >= 0])
+    # the gable house, and the block that takes in the storey on it
+    assert len(leaders) == 2
+    assert (truth[candidate >= 0] == BUILDING).all()
+    assert (candidate[truth == BUILDING] >= 0).mean() > 0.98
+    (house,) = np.unique(candidate[town.house[: len(candidate)] & (candidate >= 0)])
+    assert (town.house[: len(candidate)] | (candidate != house)).all()
+
+
+@pytest.mark.parametrize("per_m2", [2.0, 12.0])
+def test_density_does_not_decide_what_is_found(town_of: Callable[..., Any], per_m2: float) -> None:
+    sample = town_of(seed=2, per_m2=per_m2)
+    candidate = candidate_of_points(split_whole(sample.points))
+    truth = sample.truth[: len(candidate)]
+    assert len(np.unique(candidate[candidate >= 0])) == 2
+    assert (truth[candidate >= 0] == BUILDING).all()
+    assert (candidate[truth == BUILDING] >= 0).mean() > 0.95
+
+
+def test_the_terrain_is_the_ground_also_under_buildings_and_trees(town: Any) -> None:
+    terrain = split_whole(town.points).terrain
+    column, row = np.meshgrid(np.arange(110) + 0.5, np.arange(110) + 0.5)
+    truth = 1000 * (0.03 * column - 0.02 * row + 0.5 * np.sin(column / 30) * np.cos(row / 25))
+    error = np.abs(terrain.elevation_mm - truth)
+    assert (terrain.elevation_mm != NO_DATA).all()
+    assert np.median(error) < 40
+    assert np.percentile(error, 99) < 200
+    assert error.max() < 500
+
+
+def test_strays_far_above_and_below_are_counted_and_change_nothing(town: Any) -> None:
+    random = np.random.default_rng(1)
+    strays = np.column_stack((random.integers(5000, 105_000, (12, 2)), np.repeat([-180_000, 180_000], 6)))
+    before, after = split_whole(town.points), split_whole(with_points(town.points, strays.astype(np.int64)))
+    assert (before.outliers, after.outliers) == (0, 12)
+    np.testing.assert_array_equal(after.terrain.elevation_mm, before.terrain.elevation_mm)
+    np.testing.assert_array_equal(after.fragments.sums, before.fragments.sums)
+    np.testing.assert_array_equal(after.core_index, before.core_index)
+    np.testing.assert_array_equal(after.point_fragment, before.point_fragment)
+    np.testing.assert_array_equal(after.occupied, before.occupied)
+
+
+def test_a_cell_is_occupied_where_a_point_lies_in_it(town: Any) -> None:
+    hole = taken(town.points, ~((town.points.x_mm // 1000 == 7) & (town.points.y_mm // 1000 == 9)))
+    occupied = split_whole(hole).occupied
+    expected = np.zeros((110, 110), np.bool_)
+    expected[hole.y_mm // 1000, hole.x_mm // 1000] = True
+    assert not expected[9, 7]
+    np.testing.assert_array_equal(occupied, expected)
+
+
+def test_a_tile_without_points_has_no_fragments(town: Any) -> None:
+    found = split_whole(taken(town.points, np.zeros(len(town.points), np.bool_)))
+    assert len(found.fragments.kind) == len(found.core_index) == len(found.point_fragment) == found.outliers == 0
+    assert (found.terrain.elevation_mm == NO_DATA).all()
+    assert not found.occupied.any()
+
+
+# -- classes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("excluded", [3, 5, 9, 17])
+def test_where_classes_are_trusted_excluded_ones_never_enter(town: Any, excluded: int) -> None:
+    classification = town.points.classification.copy()
+    part = (town.truth == BUILDING) & (np.random.default_rng(excluded).random(len(classification)) < 0.3)
+    classification[part] = excluded
+    points = changed(town.points, classification=classification)
+    found = split_whole(points, TRUSTED)
+    assigned = np.zeros(len(points), np.bool_)
+    assigned[found.core_index] = found.point_fragment >= 0
+    assert not assigned[classification == excluded].any()
+    assert not assigned[classification == GROUND].any()
+    assert assigned[classification == BUILDING].mean() > 0.9
+    ignored = split_whole(points)
+    entered = np.zeros(len(points), np.bool_)
+    entered[ignored.core_index] = ignored.point_fragment >= 0
+    assert entered[part].mean() > 0.9
+
+
+@pytest.mark.parametrize("neutral", [0, 1, 12, 19])
+def test_neutral_classes_are_judged_by_their_own_evidence(town: Any, neutral: int) -> None:
+    classification = np.where(town.house, neutral, town.points.classification).astype(np.uint8)
+    found = split_whole(changed(town.points, classification=classification), TRUSTED)
+    candidate = candidate_of_points(found)
+    (house,) = np.unique(candidate[town.house[: len(candidate)] & (candidate >= 0)])
+    assert found.fragments.kind[house] == FacetKind.OBJECT
+    assert (candidate[town.house[: len(candidate)]] == house).mean() > 0.95
+
+
+def test_classes_that_are_not_trusted_change_nothing(town: Any) -> None:
+    wrong = np.random.default_rng(3).integers(0, 20, len(town.points)).astype(np.uint8)
+    here, there = split_whole(town.points), split_whole(changed(town.points, classification=wrong))
+    np.testing.assert_array_equal(there.fragments.sums, here.fragments.sums)
+    np.testing.assert_array_equal(there.point_fragment, here.point_fragment)
+
+
+def test_trusted_ground_alone_replaces_the_filter(town: Any) -> None:
+    classification = town.points.classification.copy()
+    raised = (town.truth == BUILDING) & ~town.house
+    classification[raised] = GROUND
+    found = split_whole(changed(town.points, classification=classification), ClassesInUse(ground=True))
+    # the block counts as ground where the file says so, and only the house is left
+    candidate = candidate_of_points(found)
+    assert len(np.unique(candidate[candidate >= 0])) == 1
+    assert (candidate[raised[: len(candidate)]] == -1).all()
+    assert found.terrain.measured[27, 70]
+    assert found.terrain.elevation_mm[27, 70] == pytest.approx(9000, abs=100)
+
+
+# -- invariants --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shift_m", [(110, 220), (-3, 17), (84_000, 447_001), (-1000, -5)])
+def test_a_shift_by_whole_metres_gives_the_same_fragments_there(town: Any, shift_m: tuple[int, int]) -> None:
+    dx, dy = 1000 * shift_m[0], 1000 * shift_m[1]
+    moved = changed(town.points, x_mm=town.points.x_mm + dx, y_mm=town.points.y_mm + dy)
+    window = Window(x0_mm=dx, y0_mm=dy, x1_mm=dx + 110_000, y1_mm=dy + 110_000)
+    here = split_whole(town.points)
+    there = split_tile(moved, window, window, SceneSettings(), IGNORED)
+    np.testing.assert_array_equal(there.terrain.elevation_mm, here.terrain.elevation_mm)
+    np.testing.assert_array_equal(there.core_index, here.core_index)
+    np.testing.assert_array_equal(there.point_fragment, here.point_fragment)
+    np.testing.assert_array_equal(there.fragments.kind, here.fragments.kind)
+    np.testing.assert_array_equal(there.fragments.sums, here.fragments.sums)
+    np.testing.assert_array_equal(there.fragments.along_steps, here.fragments.along_steps)
+    np.testing.assert_array_equal(there.fragments.crossing_keys, here.fragments.crossing_keys + [dx, dy] * 3)
+    owning = here.fragments.sums[:, Sum.FACETS] > 0
+    np.testing.assert_array_equal(there.fragments.boxes_mm[owning], here.fragments.boxes_mm[owning] + [dx, dy] * 2)
+    holding = here.fragments.sums[:, Sum.POINTS] > 0
+    lowest = here.fragments.lowest_point_mm[holding] + [dx, dy, 0]
+    np.testing.assert_array_equal(there.fragments.lowest_point_mm[holding], lowest)
+
+
+@pytest.mark.parametrize("classes", [IGNORED, TRUSTED])
+def test_the_order_of_the_points_does_not_matter(town: Any, classes: ClassesInUse) -> None:
+    order = np.random.default_rng(5).permutation(len(town.points))
+    here, there = split_whole(town.points, classes), split_whole(taken(town.points, order), classes)
+    np.testing.assert_array_equal(there.fragments.sums, here.fragments.sums)
+    np.testing.assert_array_equal(there.fragments.lowest_point_mm, here.fragments.lowest_point_mm)
+    fragment = np.full(len(town.points), -2, np.int64)
+    fragment[order[there.core_index]] = there.point_fragment
+    np.testing.assert_array_equal(fragment[here.core_index], here.point_fragment)
+
+
+@given(
+    x0=st.integers(-(10**9), 10**9),
+    y0=st.integers(-(10**9), 10**9),
+    width=st.integers(1, 10**6),
+    depth=st.integers(1, 10**6),
+)
+def test_the_lattice_of_the_terrain_covers_its_window_and_no_more(x0: int, y0: int, width: int, depth: int) -> None:
+    column0, row0, columns, rows = lattice_of(Window(x0_mm=x0, y0_mm=y0, x1_mm=x0 + width, y1_mm=y0 + depth))
+    assert column0 == math.floor(x0 / 1000)
+    assert row0 == math.floor(y0 / 1000)
+    assert (column0 + columns - 1) * 1000 < x0 + width <= (column0 + columns) * 1000
+    assert (row0 + rows - 1) * 1000 < y0 + depth <= (row0 + rows) * 1000
+
+
+def test_every_stage_widens_the_support() -> None:
+    base = SceneSettings()
+    wider = [
+        SceneSettings(outliers=OutlierSettings(cube_m=6.0)),
+        SceneSettings(ground=GroundSettings(max_window_m=21)),
+        SceneSettings(ground=GroundSettings(bridge_m=25)),
+        SceneSettings(surfaces=SurfaceSettings(max_circumradius_m=7.0)),
+        SceneSettings(vegetation=VegetationSettings(radius_m=1.2)),
+    ]
+    assert all(settings.support_m > base.support_m for settings in wider)
+
+
+# -- tiles -------------------------------------------------------------------------------------------------------------
+
+
+def described(tile: Tile, found: SplitTile) -> Split:
+    """What the join reads of a split."""
+    nothing = np.empty(0, np.int64)
+    return Split(
+        tile=tile,
+        fragments=found.fragments,
+        starts=np.zeros(1, np.int64),
+        keys=nothing,
+        lowest_points_mm=np.empty((0, 3), np.int64),
+        points=len(found.core_index),
+        duplicates=0,
+        outliers=found.outliers,
+        audit=(0, 0, 0),
+    )
+
+
+def in_tiles(
+    points: WindowPoints, grid: TileGrid, settings: SceneSettings, classes: ClassesInUse
+) -> tuple[list[tuple[int, ...]], IntArray]:
+    """Rows that describe every whole surface, sorted, and for every point the smallest point of its surface."""
+    columns, rows = grid.columns_rows(points.x_mm, points.y_mm)
+    tiles = sorted({Tile(c, r) for c, r in zip(columns.tolist(), rows.tolist(), strict=True)})
+    splits, owners = [], []
+    for tile in tiles:
+        window = grid.window(tile)
+        seen = np.flatnonzero(window.contains(points.x_mm, points.y_mm))
+        found = split_tile(taken(points, seen), grid.core(tile), window, settings, classes)
+        splits.append(described(tile, found))
+        owners.append((seen[found.core_index], found.point_fragment))
+    surfaces, surface_of_fragment, offsets = whole_surfaces(splits)
+    whose = np.full((len(points), 3), -1, np.int64)
+    for (index, fragment), offset in zip(owners, offsets[:-1], strict=True):
+        held = fragment >= 0
+        whose[index[held]] = surfaces.lowest_point_mm[surface_of_fragment[offset + fragment[held]]]
+    described_rows = np.column_stack((surfaces.kind, surfaces.sums, surfaces.boxes_mm, surfaces.lowest_point_mm))
+    steps = np.zeros((len(surfaces.kind), 2), np.int64)
+    for column in (0, 1):
+        np.add.at(steps[:, column], surfaces.along_steps[:, column], surfaces.along_steps[:, 2])
+    owning = (surfaces.sums != 0).any(axis=1)
+    return sorted(map(tuple, np.column_stack((described_rows, steps))[owning].tolist())), whose
+
+
+@pytest.mark.parametrize("classes", [IGNORED, TRUSTED])
+@pytest.mark.parametrize(("size_mm", "origin_mm"), [(30_000, (0, 0)), (37_000, (-11_123, 4_567))])
+def test_tiles_give_the_surfaces_of_the_whole(
+    town_of: Callable[..., Any], classes: ClassesInUse, size_mm: int, origin_mm: tuple[int, int]
+) -> None:
+    sample = town_of(seed=7, per_m2=4.0, noise_m=0.05)
+    p = sample.points
+    random = np.random.default_rng(7)
+    # water without returns, and strays of which some have company
+    dry = ~((p.x_mm > 30_000) & (p.x_mm < 41_000) & (p.y_mm > 75_000)) | (random.random(len(p)) < 0.02)
+    strays = np.column_stack((random.integers(0, 110_000, (60, 2)), random.integers(-9000, 30_000, 60)))
+    points = with_points(taken(p, dry), np.repeat(strays, 3, axis=0) + random.integers(0, 900, (180, 3)))
+    points = taken(points, WHOLE.contains(points.x_mm, points.y_mm))
+    support_mm = math.ceil(1000 * NARROW.support_m)
+    everything = TileGrid(size_mm=400_000, halo_mm=support_mm, origin_x_mm=-100_000, origin_y_mm=-100_000)
+    expected, expected_owner = in_tiles(points, everything, NARROW, classes)
+    grid = TileGrid(size_mm=size_mm, halo_mm=support_mm, origin_x_mm=origin_mm[0], origin_y_mm=origin_mm[1])
+    found, owner = in_tiles(points, grid, NARROW, classes)
+    assert len(expected) > 15
+    assert found == expected
+    np.testing.assert_array_equal(owner, expected_owner)
