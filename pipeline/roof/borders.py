@@ -202,7 +202,25 @@ def _moved_nodes(arcs: Sequence[_Arc], tolerance: float) -> dict[Point, Point]:
             place = next((p for p in (_slide(held, run) for _, _, run in candidates) if p is not None), None)
         if place is not None and math.dist(place, node) <= 2.0 * tolerance:
             moved[node] = (float(round(place[0])), float(round(place[1])))
+    _keep_order(arcs, moved, tolerance)
     return moved
+
+
+def _keep_order(arcs: Sequence[_Arc], moved: dict[Point, Point], tolerance: float) -> None:
+    """Put nodes back that would pass, or come too near to, the other end of a short arc."""
+    ends = [(arc.path[0], arc.path[-1]) for arc in arcs if math.dist(arc.path[0], arc.path[-1]) <= 5.0 * tolerance]
+    put_back = True
+    while put_back:
+        put_back = False
+        for start, end in ends:
+            if start not in moved and end not in moved:
+                continue
+            (x0, y0), (x1, y1) = moved.get(start, start), moved.get(end, end)
+            along = (x1 - x0) * (end[0] - start[0]) + (y1 - y0) * (end[1] - start[1])
+            if along <= 0.0 or math.hypot(x1 - x0, y1 - y0) < max(0.4 * tolerance, 50.0):
+                moved.pop(start, None)
+                moved.pop(end, None)
+                put_back = True
 
 
 def _is_straight(a: Point, b: Point, c: Point) -> bool:
@@ -241,12 +259,13 @@ def _new_path(arc: _Arc, moved: dict[Point, Point], tolerance: float) -> list[Po
         for run in (a, b):
             along = (vertex[0] - run.x) * math.cos(run.direction) + (vertex[1] - run.y) * math.sin(run.direction)
             corners.append((run.x + along * math.cos(run.direction), run.y + along * math.sin(run.direction)))
-    rounded = [(float(round(x)), float(round(y))) for x, y in corners]
+    # a corner next to a node or to another corner would make a spike
+    near = max(0.4 * tolerance, 50.0)
     path = [start]
-    for point in [*rounded, end]:
-        if point != path[-1]:
-            path.append(point)
-    return path
+    for x, y in corners:
+        if math.dist((x, y), path[-1]) > near and math.dist((x, y), end) > near:
+            path.append((float(round(x)), float(round(y))))
+    return [*path, end]
 
 
 def _drawn(

@@ -85,17 +85,17 @@ def _dense_enough(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, cube_mm: int, 
             keys, counts = _grown(keys, counts)
     mask = keys.size - 1
     enough = np.zeros(keys.size, np.bool_)
-    for s in range(keys.size):
-        if keys[s] == _EMPTY:
+    for slot in range(keys.size):
+        if keys[slot] == _EMPTY:
             continue
-        total = np.int64(0)
+        total = 0
         for da in range(-1, 2):
             for db in range(-1, 2):
                 for dc in range(-1, 2):
-                    t = _find(keys, keys[s] + (da << (2 * _BITS)) + (db << _BITS) + dc, mask)
+                    t = _find(keys, keys[slot] + (da << (2 * _BITS)) + (db << _BITS) + dc, mask)
                     if keys[t] != _EMPTY:
-                        total += counts[t]
-        enough[s] = total > min_neighbours
+                        total += int(counts[t])
+        enough[slot] = total > min_neighbours
     for i in range(n):
         a, b, c = x_mm[i] // cube_mm - low_x, y_mm[i] // cube_mm - low_y, z_mm[i] // cube_mm - low_z
         keep[i] = enough[_find(keys, (a << (2 * _BITS)) | (b << _BITS) | c, mask)]
