@@ -19,7 +19,7 @@ from pipeline.quality.residuals import summarise, vertical_residuals
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_parts, block_plane
 from pipeline.roof.footprint import hull_of_points, outline
-from pipeline.roof.plan import RoofPlan, RoofPoints, level_dipping_faces, partition_roof, plan_forms, roof_points
+from pipeline.roof.plan import RoofPlan, RoofPoints, level_unsupported_faces, partition_roof, plan_forms, roof_points
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.solid import SolidPart, solid_parts
@@ -122,7 +122,7 @@ def _own_solids(
     codes: set[int] = set()
     for form in plan_forms(plan, roof, settings):
         try:
-            drawn, own_planes = level_dipping_faces(form(), roof, planes, candidate.ground_z_m, settings)
+            drawn, own_planes = level_unsupported_faces(form(), roof, planes, candidate.ground_z_m, settings)
             parts = large_parts(solid_parts(drawn, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
         except (BuildingError, shapely.errors.GEOSException):
             continue

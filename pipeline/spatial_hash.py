@@ -11,13 +11,17 @@ from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 # 2^64 / golden ratio: Fibonacci hashing (Knuth, TAOCP 3, 6.4). Unsigned, since only that wraps safely.
 _GOLDEN = np.uint64(11400714819323198485)
 _SHIFT = np.uint64(20)
+_FOLD = np.uint64(32)
 _PRIMES = (np.uint64(73856093), np.uint64(19349663), np.uint64(83492791), np.uint64(2654435761))
 
 
 @njit(cache=True, nogil=True)
 def slot_of_key(key: int | np.int64, mask: int) -> np.int64:
     """First slot of a key in an open-addressing table of mask + 1 (a power of two) slots."""
-    return np.int64((np.uint64(key) * _GOLDEN) >> _SHIFT) & mask
+    mixed = np.uint64(key) * _GOLDEN
+    # bits of a product hang on lower bits of the key only: fold, so that a column packed high counts in small tables
+    mixed = (mixed ^ (mixed >> _FOLD)) * _GOLDEN
+    return np.int64(mixed >> _SHIFT) & mask
 
 
 @njit(cache=True, nogil=True)

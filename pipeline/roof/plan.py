@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
@@ -299,10 +300,12 @@ def _frame(low: IntArray, high: IntArray, margin: int) -> IntArray:
     )
 
 
-def level_dipping_faces(
+def level_unsupported_faces(
     partition: RoofPartition, roof: RoofPoints, planes: Sequence[Plane], ground_z_m: float, settings: RoofSettings
 ) -> tuple[RoofPartition, list[Plane]]:
-    """Replace the plane of every face that dips (nearly) under the floor by a horizontal one.
+    """Replace the plane of every face that leaves its data by a horizontal one.
+
+    Steep planes that are continued a little too far dip (nearly) under the floor, or rise far above all points.
 
     Parameters
     ----------
@@ -315,7 +318,7 @@ def level_dipping_faces(
     ground_z_m : float
         The floor.
     settings : RoofSettings
-        `minimum_clearance_m`.
+        `minimum_clearance_m`, `maximum_overshoot_m`.
 
     Returns
     -------
@@ -326,18 +329,31 @@ def level_dipping_faces(
     """
     labels = partition.labels.copy()
     extended = list(planes)
-    lowest = ground_z_m + settings.minimum_clearance_m
+    floor = ground_z_m + settings.minimum_clearance_m
+    known = roof.labels >= 0
+    lowest, highest = np.full(len(planes), np.inf), np.full(len(planes), -np.inf)
+    np.minimum.at(lowest, roof.labels[known], roof.points[known, 2])
+    np.maximum.at(highest, roof.labels[known], roof.points[known, 2])
     for k, polygon in enumerate(partition.polygons):
-        plane = planes[labels[k]]
+        label = int(labels[k])
+        plane = planes[label]
         xy = shapely.get_coordinates(polygon) * 1e-3
-        if float((plane.a * xy[:, 0] + plane.b * xy[:, 1] + plane.c).min()) >= lowest:
+        z = plane.a * xy[:, 0] + plane.b * xy[:, 1] + plane.c
+        bottom, top = float(z.min()), float(z.max())
+        low, high = float(lowest[label]), float(highest[label])
+        if bottom >= max(floor, low - settings.maximum_overshoot_m) and top <= high + settings.maximum_overshoot_m:
             continue
-        shapely.prepare(polygon)
-        inside = shapely.intersects_xy(polygon, roof.xy_mm[:, 0], roof.xy_mm[:, 1])
-        own = inside & (roof.labels == labels[k])
-        z = np.sort(roof.points[own if own.any() else inside, 2])
-        height = round(max(float(z[len(z) // 2]) if len(z) else plane.c, lowest), 3)
-        rmse = float(np.sqrt(np.mean((z - height) ** 2))) if len(z) else 0.0
         labels[k] = len(extended)
-        extended.append(Plane(a=0.0, b=0.0, c=height, n_points=len(z), rmse_m=rmse))
+        extended.append(_level_plane(polygon, label, roof, max(floor, min(0.5 * (bottom + top), high)), floor))
     return RoofPartition(polygons=partition.polygons, labels=labels), extended
+
+
+def _level_plane(polygon: shapely.Polygon, label: int, roof: RoofPoints, otherwise: float, floor: float) -> Plane:
+    """The horizontal plane through a face's own points, else all points within it, else at a given height."""
+    shapely.prepare(polygon)
+    inside = shapely.intersects_xy(polygon, roof.xy_mm[:, 0], roof.xy_mm[:, 1])
+    own = inside & (roof.labels == label)
+    z = np.sort(roof.points[own if own.any() else inside, 2])
+    height = round(max(float(z[len(z) // 2]) if len(z) else otherwise, floor), 3)
+    rmse = math.sqrt(math.fsum(((z - height) ** 2).tolist()) / len(z)) if len(z) else 0.0
+    return Plane(a=0.0, b=0.0, c=height, n_points=len(z), rmse_m=rmse)

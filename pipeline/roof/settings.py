@@ -48,7 +48,7 @@ class RoofSettings(Parameters):
     )
     straight_borders: bool = parameter(True, "Whether borders between roof faces are drawn with straight lines.")
     border_tolerance_spacings: float = parameter(
-        0.9,
+        0.75,
         "How far a border between roof faces may lie from its straight lines.",
         unit="point spacings",
         minimum=0.1,
@@ -97,6 +97,13 @@ class RoofSettings(Parameters):
         unit="m",
         minimum=0.05,
         maximum=5.0,
+    )
+    maximum_overshoot_m: float = parameter(
+        2.0,
+        "A roof face that goes farther than this above or below the points of its plane becomes horizontal.",
+        unit="m",
+        minimum=0.1,
+        maximum=100.0,
     )
     block_height_percentile: float = parameter(
         70.0, "Height of a fallback block: this percentile of the roof points.", unit="%", minimum=1.0, maximum=100.0

@@ -35,16 +35,18 @@ class Measured(Generic[Result]):
     """Largest resident size of the process so far."""
 
 
+def peak_of_process() -> tuple[str, int]:
+    """This process as host:pid, and its largest resident size so far in bytes."""
+    return f"{socket.gethostname()}:{os.getpid()}", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
 def measure(function: Callable[[Task], Result], task: Task) -> Measured[Result]:
     """Run one task and measure it."""
     started = time.perf_counter()
     result = function(task)
-    return Measured(
-        result=result,
-        seconds=time.perf_counter() - started,
-        process=f"{socket.gethostname()}:{os.getpid()}",
-        peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-    )
+    seconds = time.perf_counter() - started
+    process, peak_bytes = peak_of_process()
+    return Measured(result=result, seconds=seconds, process=process, peak_bytes=peak_bytes)
 
 
 class Executor(Protocol):
@@ -128,7 +130,7 @@ class DaskExecutor:
                 n_workers=self._workers,
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",
                 local_directory=self._local_directory,
                 silence_logs="ERROR",
             )

@@ -7,40 +7,28 @@ import datetime as dt
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
-
-import shapely
 
 from pipeline import __version__
-from pipeline.errors import EmptyInputError, InconsistentInputError, RunError
-from pipeline.export.records import RecordContext
+from pipeline.errors import RunError
 from pipeline.io import ReadOptions, SpatialReference, find_inputs, open_source
-from pipeline.io.footprints import read_area, read_footprints
-from pipeline.io.gps_time import GpsTimeKind
+from pipeline.io.footprints import read_area
 from pipeline.io.storage import sha256_of
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.events import Event, Listener, ignore
-from pipeline.runtime.executors import Executor, executor_for
-from pipeline.runtime.ingest import Ingested, IngestTask, ingest, spread_m
-from pipeline.runtime.join import Joined, join, join_footprints
+from pipeline.runtime.events import Listener, ignore
+from pipeline.runtime.executors import Executor, executor_for, peak_of_process
+from pipeline.runtime.ingest import Ingested
+from pipeline.runtime.join import Joined
 from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_manifest
-from pipeline.runtime.modelling import BatchTask, Footprints, Modelled, batches, model_batch
+from pipeline.runtime.modelling import Modelled
 from pipeline.runtime.plan import Plan, check_memory, make_plan
-from pipeline.runtime.publish import PublishTask, publish
 from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.split import Split, SplitTask, split
-from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse
+from pipeline.runtime.split import Split
+from pipeline.runtime.stages import Progress, Stages
 from pipeline.settings import RunSettings
-from pipeline.tiling import MM, Tile
 
-Task = TypeVar("Task")
-Result = TypeVar("Result")
-
-_LINE_SPREAD_M = 0.05
 _OWN_FOLDERS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state", "scratch")
-_FOOTPRINTS = "footprints.pickle"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -103,51 +91,6 @@ class RunSummary:
     """Tiles that could not be published."""
 
 
-class _Driver:
-    """The state of one run on the driver's side: timings, memory, warnings, events."""
-
-    def __init__(self, listener: Listener) -> None:
-        self._listener = listener
-        self.timings: dict[str, float] = {}
-        self.task_seconds: dict[str, float] = {}
-        self.peaks: dict[str, int] = {}
-        self.warnings: list[str] = []
-
-    def tell(self, kind: str, stage: str, message: str = "", done: int = 0, total: int = 0) -> None:
-        """Send an event."""
-        self._listener(Event(kind=kind, stage=stage, done=done, total=total, message=message))  # type: ignore[arg-type]
-
-    def warn(self, stage: str, message: str) -> None:
-        """Keep and send a warning."""
-        if message not in self.warnings:
-            self.warnings.append(message)
-            self.tell("warning", stage, message)
-
-    def stage(
-        self,
-        executor: Executor,
-        name: str,
-        function: Callable[[Task], Result],
-        tasks: Sequence[Task],
-        weight: Callable[[Result], int] = lambda _: 1,
-        total: int | None = None,
-    ) -> list[Result]:
-        """Run a stage's tasks and report its progress in units of `weight`."""
-        started = time.perf_counter()
-        whole = len(tasks) if total is None else total
-        done = 0
-        self.tell("stage", name, total=whole)
-        results = []
-        for measured in executor.map(name, function, tasks):
-            results.append(measured.result)
-            self.peaks[measured.process] = max(self.peaks.get(measured.process, 0), measured.peak_bytes)
-            self.task_seconds[name] = self.task_seconds.get(name, 0.0) + measured.seconds
-            done += weight(measured.result)
-            self.tell("progress", name, done=done, total=whole)
-        self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started
-        return results
-
-
 def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | None = None) -> RunSummary:
     """Reconstruct all buildings of the inputs into a run directory.
 
@@ -175,10 +118,10 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
         The run directory cannot be used, or workers died.
     """
     started_at = dt.datetime.now(tz=dt.UTC)
-    driver = _Driver(on_event)
+    progress = Progress(on_event)
     began = time.perf_counter()
-    driver.tell("run", "plan", f"run into {request.out}")
-    plan, paths = _plan(request, driver)
+    progress.tell("run", "plan", f"run into {request.out}")
+    plan, paths = _plan(request, progress)
     run_dir = _prepared(request)
     scratch = Scratch(str(run_dir / "scratch"))
     reference = plan.sources[0].reference
@@ -193,16 +136,24 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
         source_licence=request.licence,
     )
     write_manifest(run_dir, manifest)
-    driver.timings["plan"] = time.perf_counter() - began
+    progress.timings["plan"] = time.perf_counter() - began
     engine = executor or executor_for(
         workers=request.workers, scheduler=request.scheduler, local_directory=str(run_dir / "scratch" / "dask")
     )
     try:
         starting = time.perf_counter()
         with engine:
-            driver.timings["start workers"] = time.perf_counter() - starting
+            progress.timings["start workers"] = time.perf_counter() - starting
             check_memory(plan, engine.memory_limit_bytes)
-            stages = _Stages(request=request, plan=plan, driver=driver, executor=engine, scratch=scratch)
+            stages = Stages(
+                settings=request.settings,
+                footprints_path=request.footprints,
+                meshes=request.meshes,
+                plan=plan,
+                progress=progress,
+                executor=engine,
+                scratch=scratch,
+            )
             ingested = stages.ingest(paths)
             footprints = stages.read_footprints(reference)
             splits = stages.split(ingested, footprints)
@@ -213,8 +164,10 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
         scratch.clear()
     finishing = time.perf_counter()
     digest = run_digest(str(run_dir))
-    driver.timings["digest"] = time.perf_counter() - finishing
-    driver.timings["total"] = time.perf_counter() - began
+    progress.timings["digest"] = time.perf_counter() - finishing
+    progress.timings["total"] = time.perf_counter() - began
+    driver, peak_bytes = peak_of_process()
+    progress.peaks[driver] = peak_bytes
     counts = _counts(plan, ingested, splits, joined, modelled)
     inputs = [
         InputFile(
@@ -237,13 +190,13 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
             inputs=tuple(inputs),
             tiles=tuple(tiles),
             counts=counts,
-            timings_s={name: round(seconds, 3) for name, seconds in driver.timings.items()},
-            peak_memory_bytes=driver.peaks,
-            warnings=tuple(driver.warnings),
+            timings_s={name: round(seconds, 3) for name, seconds in progress.timings.items()},
+            peak_memory_bytes=progress.peaks,
+            warnings=tuple(progress.warnings),
             content_sha256=digest,
         ),
     )
-    driver.tell("finished", "", f"{counts['candidates']} candidates in {driver.timings['total']:.1f} s")
+    progress.tell("finished", "", f"{counts['candidates']} candidates in {progress.timings['total']:.1f} s")
     return RunSummary(
         run_dir=str(run_dir),
         digest=digest,
@@ -252,13 +205,13 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
         rejected=dict(Counter(site.verdict.reason.value for site in joined.rejected)),
         roof_types=dict(Counter(m.roof_type for m in modelled)),
         counts=counts,
-        timings_s=driver.timings,
-        peak_memory_bytes=driver.peaks,
-        warnings=tuple(driver.warnings),
+        timings_s=progress.timings,
+        peak_memory_bytes=progress.peaks,
+        warnings=tuple(progress.warnings),
     )
 
 
-def _plan(request: RunRequest, driver: _Driver) -> tuple[Plan, list[str]]:
+def _plan(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
     """The plan and the input files in order."""
     paths = sorted(str(path) for path in find_inputs(request.inputs))
     options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit, bbox=request.bbox)
@@ -267,11 +220,11 @@ def _plan(request: RunRequest, driver: _Driver) -> tuple[Plan, list[str]]:
         options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
     plan = make_plan(paths, options, request.settings)
     for warning in plan.warnings:
-        driver.warn("plan", warning)
+        progress.warn("plan", warning)
     if not any(info.has_returns for info in plan.sources):
-        driver.warn("plan", "the inputs have one return a pulse: vegetation is told by its roughness alone")
+        progress.warn("plan", "the inputs have one return a pulse: vegetation is told by its roughness alone")
     if not any(info.has_classes for info in plan.sources) and request.settings.general.classes == "trust":
-        driver.warn("plan", "the inputs have no classes: ground and buildings are found in the points alone")
+        progress.warn("plan", "the inputs have no classes: ground and buildings are found in the points alone")
     return plan, paths
 
 
@@ -334,170 +287,3 @@ def _counts(
         "other_classes_in_candidates": sum(s.audit[1] for s in splits),
         "class_6_elsewhere": sum(s.audit[2] for s in splits),
     }
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Stages:
-    """The stages of one run, each a map over tasks or a step of the driver."""
-
-    request: RunRequest
-    plan: Plan
-    driver: _Driver
-    executor: Executor
-    scratch: Scratch
-
-    def ingest(self, paths: Sequence[str]) -> list[Ingested]:
-        """Bucket all points by tile, and look at what they are."""
-        tasks = [
-            IngestTask(index=k, path=path, options=self.plan.options, grid=self.plan.grid, scratch=self.scratch)
-            for k, path in enumerate(paths)
-        ]
-        ingested = sorted(self.driver.stage(self.executor, "ingest", ingest, tasks), key=lambda found: found.index)
-        for found in ingested:
-            for warning in found.warnings:
-                self.driver.warn("ingest", f"{paths[found.index]}: {warning}")
-        kept = sum(sum(found.points_by_tile.values()) for found in ingested)
-        if kept == 0:
-            causes = Counter[str]()
-            for found in ingested:
-                causes.update(found.dropped)
-            told = ", ".join(f"{count} {cause}" for cause, count in causes.items() if count)
-            raise EmptyInputError(
-                paths[0], f"no usable point is left ({told or 'none in the files'})", "Check --bbox, --aoi and classes"
-            )
-        spread = spread_m(ingested)
-        if spread < _LINE_SPREAD_M:
-            raise InconsistentInputError(
-                paths[0],
-                f"all {kept} points lie on one line (they stray {spread:.3f} m from it)",
-                "Check the columns and the scale of the file",
-            )
-        return ingested
-
-    def read_footprints(self, reference: SpatialReference) -> Footprints | None:
-        """The given footprints, stored for the workers."""
-        if self.request.footprints is None:
-            return None
-        found = read_footprints(self.request.footprints, reference)
-        for warning in found.warnings:
-            self.driver.warn("split", warning)
-        low_x, low_y = min(i.bounds_m[0] for i in self.plan.sources), min(i.bounds_m[1] for i in self.plan.sources)
-        high_x, high_y = max(i.bounds_m[3] for i in self.plan.sources), max(i.bounds_m[4] for i in self.plan.sources)
-        box = shapely.box(low_x, low_y, high_x, high_y)
-        inside = [k for k, polygon in enumerate(found.polygons) if polygon.intersects(box)]
-        if len(inside) < len(found.polygons):
-            self.driver.warn(
-                "split", f"{len(found.polygons) - len(inside)} of {len(found.polygons)} footprints lie off the data"
-            )
-        # one order, whatever the file's: overlaps are decided by it
-        inside.sort(key=lambda k: (found.polygons[k].bounds, found.ids[k]))
-        footprints = Footprints(
-            polygons=tuple(found.polygons[k] for k in inside), ids=tuple(found.ids[k] for k in inside)
-        )
-        self.scratch.put_object(_FOOTPRINTS, footprints)
-        return footprints
-
-    def split(self, ingested: Sequence[Ingested], footprints: Footprints | None) -> list[Split]:
-        """Fragments of all tiles."""
-        histogram: Counter[int] = Counter()
-        tiles: Counter[Tile] = Counter()
-        for found in ingested:
-            histogram.update(found.classes)
-            tiles.update(found.points_by_tile)
-        trust = self.request.settings.general.classes == "trust"
-        classes = ClassesInUse(
-            ground=trust and histogram[GROUND_CLASS] > 0, building=trust and histogram[BUILDING_CLASS] > 0
-        )
-        tasks = [
-            SplitTask(
-                tile=tile,
-                grid=self.plan.grid,
-                settings=self.request.settings.scene,
-                classes=classes,
-                scratch=self.scratch,
-                footprints=None if footprints is None else _FOOTPRINTS,
-            )
-            # the fullest first, so that no long task is left for the end
-            for tile, _ in sorted(tiles.items(), key=lambda item: (-item[1], item[0]))
-        ]
-        splits = self.driver.stage(self.executor, "split", split, tasks)
-        duplicates, outliers = sum(s.duplicates for s in splits), sum(s.outliers for s in splits)
-        if duplicates:
-            self.driver.warn("split", f"{duplicates} duplicated points were dropped")
-        if outliers:
-            self.driver.warn("split", f"{outliers} gross outliers were left out")
-        return splits
-
-    def join(self, splits: Sequence[Split], footprints: Footprints | None, reference: SpatialReference) -> Joined:
-        """Whole surfaces, judged."""
-        started = time.perf_counter()
-        self.driver.tell("stage", "join", total=1)
-        crs_name = f"EPSG:{reference.epsg}" if reference.epsg is not None else reference.name
-        if footprints is None:
-            joined = join(splits, self.plan.grid, self.request.settings.scene.candidates, crs_name)
-        else:
-            corners = []
-            for number, polygon in enumerate(footprints.polygons):
-                x, y = min(map(tuple, shapely.get_coordinates(polygon).tolist()))
-                corners.append((round(x * MM), round(y * MM), number))
-            joined = join_footprints(splits, self.plan.grid, corners, crs_name)
-        self.driver.timings["join"] = time.perf_counter() - started
-        self.driver.tell("progress", "join", done=1, total=1, message=f"{len(joined.candidates)} candidates")
-        return joined
-
-    def reconstruct(self, joined: Joined, footprints: Footprints | None) -> list[Modelled]:
-        """All candidates, largest first."""
-        kinds = {info.gps_time_kind for info in self.plan.sources}
-        kind = kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
-        tasks = [
-            BatchTask(
-                number=number,
-                sites=sites,
-                method=self.request.settings.general.method,
-                settings=self.request.settings.building,
-                grid=self.plan.grid,
-                scratch=self.scratch,
-                footprints=None if footprints is None else _FOOTPRINTS,
-                gps_kind=kind,
-            )
-            for number, sites in enumerate(batches(joined.candidates))
-        ]
-        parts = self.driver.stage(
-            self.executor, "reconstruct", model_batch, tasks, weight=len, total=len(joined.candidates)
-        )
-        return [building for part in parts for building in part]
-
-    def publish(
-        self, joined: Joined, modelled: Sequence[Modelled], reference: SpatialReference, run_dir: str
-    ) -> list[str]:
-        """Write every tile that owns something; their keys."""
-        batch_of = {
-            site.building_id: number for number, sites in enumerate(batches(joined.candidates)) for site in sites
-        }
-        numbers: dict[Tile, set[int]] = {}
-        for building in modelled:
-            numbers.setdefault(building.owner, set()).add(batch_of[building.building_id])
-        owners = sorted({*numbers, *(site.owner for site in joined.rejected)})
-        times = [(i.acquired_from, i.acquired_to) for i in self.plan.sources]
-        known = [(a, b) for a, b in times if a is not None and b is not None]
-        context = RecordContext(
-            reference=reference,
-            settings_hash=self.request.settings.settings_hash,
-            engine_version=__version__,
-            acquired_from=min((a for a, _ in known), default=None),
-            acquired_to=max((b for _, b in known), default=None),
-        )
-        tasks = [
-            PublishTask(
-                tile=tile,
-                run_dir=run_dir,
-                scratch=self.scratch,
-                batches=tuple(sorted(numbers.get(tile, ()))),
-                rejected=tuple(site for site in joined.rejected if site.owner == tile),
-                context=context,
-                meshes=self.request.meshes,
-            )
-            for tile in owners
-        ]
-        published = self.driver.stage(self.executor, "publish", publish, tasks)
-        return sorted(p.tile.key for p in published)

@@ -106,6 +106,19 @@ def test_the_decision_looks_no_further_than_its_support() -> None:
     np.testing.assert_array_equal(cut[inner], expected[inner])
 
 
+def test_a_table_of_many_cubes_grows_and_agrees_with_the_convolution() -> None:
+    random = np.random.default_rng(5)
+    cloud = random.integers(0, 120_000, (60_000, 3))
+    cubes = cloud // 2000
+    counts = np.zeros((60, 60, 60), np.int64)
+    np.add.at(counts, tuple(cubes.T), 1)
+    assert (counts > 0).sum() > 40_000
+    around = convolve(counts, np.ones((3, 3, 3), np.int64), mode="constant")
+    expected = around[tuple(cubes.T)] - 1 >= 8
+    assert 0.1 < expected.mean() < 0.9
+    np.testing.assert_array_equal(kept_of(cloud, OutlierSettings(cube_m=2.0, min_neighbours=8)), expected)
+
+
 def test_no_points_give_an_empty_mask() -> None:
     kept = kept_of(np.empty((0, 3), np.int64))
     assert kept.shape == (0,)

@@ -118,6 +118,27 @@ def test_density_does_not_decide_what_is_found(town_of: Callable[..., Any], per_
     assert (candidate[truth == BUILDING] >= 0).mean() > 0.95
 
 
+@pytest.mark.parametrize("width_m", [8, 24, 40])
+def test_a_flat_roof_up_to_twice_the_largest_window_wide_is_found(width_m: int) -> None:
+    random = np.random.default_rng(width_m)
+    x, y = random.integers(0, 110_000, (2, 40_000))
+    low, high = 55_000 - 500 * width_m, 55_000 + 500 * width_m
+    roof = (x >= low) & (x < high) & (y >= low) & (y < high)
+    once = np.ones(len(x), np.uint8)
+    points = WindowPoints(
+        x_mm=x,
+        y_mm=y,
+        z_mm=np.where(roof, 8000, 0) + random.integers(-30, 31, len(x)),
+        return_number=once,
+        return_count=once,
+        classification=np.zeros_like(once),
+    )
+    candidate = candidate_of_points(split_whole(points))
+    assert len(np.unique(candidate[candidate >= 0])) == 1
+    assert not (candidate[~roof[: len(candidate)]] >= 0).any()
+    assert (candidate[roof[: len(candidate)]] >= 0).mean() > 0.995
+
+
 def test_the_terrain_is_the_ground_also_under_buildings_and_trees(town: Any) -> None:
     terrain = split_whole(town.points).terrain
     column, row = np.meshgrid(np.arange(110) + 0.5, np.arange(110) + 0.5)
@@ -315,11 +336,12 @@ def in_tiles(
 
 
 @pytest.mark.parametrize("classes", [IGNORED, TRUSTED])
+@pytest.mark.parametrize("per_m2", [4.0, 0.3])
 @pytest.mark.parametrize(("size_mm", "origin_mm"), [(30_000, (0, 0)), (37_000, (-11_123, 4_567))])
 def test_tiles_give_the_surfaces_of_the_whole(
-    town_of: Callable[..., Any], classes: ClassesInUse, size_mm: int, origin_mm: tuple[int, int]
+    town_of: Callable[..., Any], classes: ClassesInUse, per_m2: float, size_mm: int, origin_mm: tuple[int, int]
 ) -> None:
-    sample = town_of(seed=7, per_m2=4.0, noise_m=0.05)
+    sample = town_of(seed=7, per_m2=per_m2, noise_m=0.05)
     p = sample.points
     random = np.random.default_rng(7)
     # water without returns, and strays of which some have company

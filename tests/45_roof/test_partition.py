@@ -17,7 +17,7 @@ from pipeline.errors import BuildingError
 from pipeline.model import Candidate, IntArray, LabelArray, Plane, Reason, Solid, Tin
 from pipeline.quality.validity import check_solid
 from pipeline.roof.partition import RoofPartition, absorb_small_regions, connected_regions, march
-from pipeline.roof.plan import level_dipping_faces, partition_roof, plan_forms, roof_points
+from pipeline.roof.plan import level_unsupported_faces, partition_roof, plan_forms, roof_points
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.simplification import simplify_partition, unite_close_vertices
 from pipeline.roof.solid import solid_parts
@@ -251,7 +251,7 @@ def test_random_labels_and_planes_always_give_some_valid_form(seed: int, with_fo
     plan = partition_roof(roof, planes, roof_settings)
     for form in plan_forms(plan, roof, roof_settings):
         try:
-            drawn, all_planes = level_dipping_faces(form(), roof, planes, 0.0, roof_settings)
+            drawn, all_planes = level_unsupported_faces(form(), roof, planes, 0.0, roof_settings)
             parts = solid_parts(drawn, all_planes, 0.0)
         except BuildingError:
             continue

@@ -66,7 +66,7 @@ def test_two_dask_workers_give_the_content_of_a_serial_run(suburb: Path, reconst
     serial = reconstruct(suburb, settings={"tile_size_m": 40.0})
     cluster = reconstruct(suburb, settings={"tile_size_m": 40.0}, workers=2)
     assert cluster.digest == serial.digest
-    assert len(cluster.peak_memory_bytes) == 2
+    assert len(cluster.peak_memory_bytes) == 3  # two workers and the driver
 
 
 @pytest.mark.slow
