@@ -75,6 +75,7 @@ check: $(VENV)/.test-stamp
 	$(BIN)/lint-imports --no-cache
 
 unit: $(VENV)/.test-stamp
+	@mkdir -p .cache/numba && find .cache/numba -mindepth 1 -maxdepth 1 ! -name '$(KERNELS)' -exec rm -rf {} +
 	$(TEST_ENV) $(BIN)/python -m pytest -m "not slow" --durations=15
 
 slow: $(VENV)/.test-stamp

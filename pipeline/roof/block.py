@@ -10,7 +10,7 @@ from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, Plane, Reason
-from pipeline.roof.footprint import polygons_of
+from pipeline.roof.footprint import polygons_of, without_repeated
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart, solid_parts
 
@@ -76,8 +76,8 @@ def block_parts(
     drawn = shapely.buffer(opened, -2.0, join_style="mitre")
     if tolerance_m > 0.0:
         drawn = shapely.simplify(drawn, tolerance_m * 1e3, preserve_topology=True)
-    snapped = shapely.remove_repeated_points(shapely.set_precision(drawn, 1.0), 5.0)
-    polygons = polygons_of(snapped if snapped.is_valid else shapely.make_valid(snapped))
+    snapped = polygons_of(shapely.set_precision(drawn, 1.0))
+    polygons = [thinned for polygon in snapped for thinned in without_repeated(polygon, 5.0) if thinned.is_valid]
     large = [p for p in polygons if p.area >= minimum_area_m2 * 1e6]
     if not large and polygons:
         large = [max(polygons, key=lambda p: p.area)]

@@ -1,9 +1,9 @@
 """Straight borders between roof faces: ridges where planes cross, steps along fitted lines.
 
-The borders of a partition are arcs between nodes, where three or more borders meet. An arc is cut into runs by Douglas
-and Peucker's rule; a run along which the two planes cross takes their line of intersection, another one the line of
-least squares through it, turned to the building's dominant direction where it is near. Nodes move to where their
-lines meet, along the outline where they lie on it. What breaks is put back arc by arc: the result is a coverage again.
+The borders of a partition are arcs between nodes, where three or more borders meet. An arc is cut into runs; one along
+which the two planes cross takes their line of intersection, another the line of least squares through it, turned to
+the building's dominant direction where it is near. Nodes move to where their lines meet, along the outline where they
+lie on it. What breaks is put back arc by arc: the result is a coverage again.
 """
 
 from __future__ import annotations
@@ -17,13 +17,15 @@ import numpy as np
 import shapely
 
 from pipeline.model import FloatArray, Plane
-from pipeline.roof.eaves import Run, dominant_direction, fitted_run, square_runs
+from pipeline.roof.lines import Point, Run, corners, crossing, dominant_direction, fitted_run, merge, split, square
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import RoofSettings
 
-Point = tuple[float, float]
-_PARALLEL = math.sin(math.radians(20.0))
 _ROUNDS = 4
+_MERGE = 1.3
+"""Runs are one while a single line passes within this many tolerances of all their vertices."""
+_LEAST_SLOPE = 0.05
+"""Planes whose slopes differ by less cross nowhere exactly."""
 
 
 @dataclasses.dataclass
@@ -36,10 +38,13 @@ class _Arc:
     right: int
     """The faces beside it; -1 is outside."""
     runs: list[Run] = dataclasses.field(default_factory=list)
-    exact: list[bool] = dataclasses.field(default_factory=list)
-    """Whether a run is a line of intersection."""
     straight: bool = False
     """Whether the runs replace the path."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether the border has no node."""
+        return self.path[0] == self.path[-1]
 
 
 def straighten_borders(
@@ -69,15 +74,14 @@ def straighten_borders(
         fitted_run(np.array([a, b]), 0, 1)
         for arc in arcs
         if min(arc.left, arc.right) < 0
-        for a, b in zip(arc.path[:-1], arc.path[1:], strict=True)
+        for a, b in itertools.pairwise(arc.path)
     ]
-    dominant = dominant_direction([outline_runs])
+    dominant = dominant_direction(outline_runs)
     within = math.radians(settings.square_within_deg)
     for arc in arcs:
-        if min(arc.left, arc.right) >= 0 and arc.path[0] != arc.path[-1]:
+        if min(arc.left, arc.right) >= 0:
             _fit(arc, planes[partition.labels[arc.left]], planes[partition.labels[arc.right]], tolerance)
-            inexact = [run for run, exact in zip(arc.runs, arc.exact, strict=True) if not exact]
-            square_runs(inexact, dominant, within, tolerance)
+            square(arc.runs, dominant, within, tolerance)
             arc.straight = bool(arc.runs)
     before = np.array(partition.polygons, dtype=object)
     for _ in range(_ROUNDS):
@@ -115,15 +119,15 @@ def _arcs(partition: RoofPartition) -> tuple[list[_Arc], list[list[list[tuple[in
         as_arcs = []
         for ring in rings:
             nodes = [k for k, v in enumerate(ring) if len(neighbours[v]) != 2]
-            start = nodes[0] if nodes else 0
+            # a closed border starts at the same vertex in both its faces
+            start = nodes[0] if nodes else ring.index(min(ring))
             turned = [*ring[start:], *ring[:start], ring[start]]
             stops = [k for k, v in enumerate(turned) if len(neighbours[v]) != 2] if nodes else [0, len(turned) - 1]
             sequence = []
             for i, j in itertools.pairwise(stops):
                 path = turned[i : j + 1]
                 known = arc_of.get((path[0], path[1]))
-                if known is None or not nodes:
-                    # a closed border may start elsewhere in the neighbour's ring: each keeps its own
+                if known is None:
                     known = (len(arcs), True)
                     arcs.append(_Arc(path=path, left=face, right=owner.get((path[1], path[0]), -1)))
                     arc_of[path[-1], path[-2]] = (known[0], False)
@@ -135,71 +139,57 @@ def _arcs(partition: RoofPartition) -> tuple[list[_Arc], list[list[list[tuple[in
 
 def _fit(arc: _Arc, left: Plane, right: Plane, tolerance: float) -> None:
     """Cut an arc into runs and give each its line."""
-    path = np.array(arc.path)
-    kept = shapely.get_coordinates(shapely.simplify(shapely.linestrings(path), tolerance, preserve_topology=False))
-    index, at = [], 0
-    for x, y in kept.tolist():
-        while path[at, 0] != x or path[at, 1] != y:
-            at += 1
-        index.append(at)
-        at += 1
-    index[-1] = len(path) - 1
+    border = np.array(arc.path[:-1] if arc.closed else arc.path)
+    runs = split(border, tolerance, closed=arc.closed)
     da, db, dc = left.a - right.a, left.b - right.b, (left.c - right.c) * 1e3
     slope = math.hypot(da, db)
-    for first, last in itertools.pairwise(index):
-        run = fitted_run(path, first, last)
-        off = math.inf
-        if slope > 0.05:
-            piece = path[first : last + 1]
+    if slope > _LEAST_SLOPE:
+        for run in runs:
+            piece = border[np.arange(run.first, run.last + 1) % len(border)]
             off = float(np.median(np.abs(piece[:, 0] * da + piece[:, 1] * db + dc))) / slope
-        exact = off <= 0.5 * tolerance
-        if exact:
-            shift = (run.x * da + run.y * db + dc) / (slope * slope)
-            run.x -= shift * da
-            run.y -= shift * db
-            along = math.atan2(da, -db)
-            run.direction = along if math.cos(along - run.direction) >= 0.0 else along + math.pi
-        if exact and arc.exact and arc.exact[-1]:
-            arc.runs[-1].last = last
+            if off <= 0.6 * tolerance:
+                run.exact = True
+                shift = (run.x * da + run.y * db + dc) / (slope * slope)
+                run.x -= shift * da
+                run.y -= shift * db
+                along = math.atan2(da, -db)
+                run.direction = along if math.cos(along - run.direction) >= 0.0 else along + math.pi
+    runs = merge(border, runs, _MERGE * tolerance, closed=arc.closed)
+    for run in runs:
+        if arc.runs and run.exact and arc.runs[-1].exact:
+            # one line of intersection, whatever the number of runs along it
+            arc.runs[-1].last = run.last
             arc.runs[-1].length += run.length
-            continue
-        arc.runs.append(run)
-        arc.exact.append(exact)
-
-
-def _crossing(a: Run, b: Run) -> Point | None:
-    """Where two lines meet; None where they are nearly parallel."""
-    ux, uy = math.cos(a.direction), math.sin(a.direction)
-    wx, wy = math.cos(b.direction), math.sin(b.direction)
-    determinant = ux * wy - uy * wx
-    if abs(determinant) < _PARALLEL:
-        return None
-    t = ((b.x - a.x) * wy - (b.y - a.y) * wx) / determinant
-    return a.x + t * ux, a.y + t * uy
+        else:
+            arc.runs.append(run)
+    if arc.closed and len(arc.runs) < 3:
+        arc.runs.clear()
 
 
 def _moved_nodes(arcs: Sequence[_Arc], tolerance: float) -> dict[Point, Point]:
     """New places of the nodes at which straight arcs end."""
-    lines: dict[Point, list[tuple[bool, float, Run]]] = {}
+    lines: dict[Point, list[Run]] = {}
     fixed: dict[Point, list[tuple[Point, Point]]] = {}
     for arc in arcs:
+        if arc.closed:
+            continue
         if arc.straight:
-            lines.setdefault(arc.path[0], []).append((arc.exact[0], arc.runs[0].length, arc.runs[0]))
-            lines.setdefault(arc.path[-1], []).append((arc.exact[-1], arc.runs[-1].length, arc.runs[-1]))
+            lines.setdefault(arc.path[0], []).append(arc.runs[0])
+            lines.setdefault(arc.path[-1], []).append(arc.runs[-1])
         else:
             fixed.setdefault(arc.path[0], []).append((arc.path[0], arc.path[1]))
             fixed.setdefault(arc.path[-1], []).append((arc.path[-1], arc.path[-2]))
     moved: dict[Point, Point] = {}
     for node, candidates in lines.items():
-        candidates.sort(key=lambda line: (not line[0], -line[1], line[2].x, line[2].y))
+        candidates.sort(key=lambda run: (not run.exact, -run.length, run.x, run.y))
         held = fixed.get(node, [])
         place: Point | None = None
         if not held:
-            pairs = [(a[2], b[2]) for k, a in enumerate(candidates) for b in candidates[k + 1 :]]
-            place = next((p for p in (_crossing(a, b) for a, b in pairs) if p is not None), None)
+            pairs = itertools.combinations(candidates, 2)
+            place = next((p for p in (crossing(a, b) for a, b in pairs) if p is not None), None)
         elif len(held) == 2 and _is_straight(held[0][1], node, held[1][1]):
             # on a straight piece of the outline: slide along it
-            place = next((p for p in (_slide(held, run) for _, _, run in candidates) if p is not None), None)
+            place = next((p for p in (_slide(held, run) for run in candidates) if p is not None), None)
         if place is not None and math.dist(place, node) <= 2.0 * tolerance:
             moved[node] = (float(round(place[0])), float(round(place[1])))
     _keep_order(arcs, moved, tolerance)
@@ -237,7 +227,7 @@ def _slide(held: Sequence[tuple[Point, Point]], run: Run) -> Point | None:
     (ax, ay), (bx, by) = held[0][1], held[1][1]
     length = math.hypot(bx - ax, by - ay)
     outline = Run(first=0, last=1, x=ax, y=ay, direction=math.atan2(by - ay, bx - ax), length=length)
-    place = _crossing(outline, run)
+    place = crossing(outline, run)
     if place is None:
         return None
     along = ((place[0] - ax) * (bx - ax) + (place[1] - ay) * (by - ay)) / length
@@ -249,20 +239,15 @@ def _new_path(arc: _Arc, moved: dict[Point, Point], tolerance: float) -> list[Po
     start, end = moved.get(arc.path[0], arc.path[0]), moved.get(arc.path[-1], arc.path[-1])
     if not arc.straight:
         return [start, *arc.path[1:-1], end]
-    corners: list[Point] = []
-    for a, b in zip(arc.runs[:-1], arc.runs[1:], strict=True):
-        vertex = arc.path[b.first]
-        corner = _crossing(a, b)
-        if corner is not None and math.dist(corner, vertex) <= 2.0 * tolerance:
-            corners.append(corner)
-            continue
-        for run in (a, b):
-            along = (vertex[0] - run.x) * math.cos(run.direction) + (vertex[1] - run.y) * math.sin(run.direction)
-            corners.append((run.x + along * math.cos(run.direction), run.y + along * math.sin(run.direction)))
+    border = np.array(arc.path[:-1] if arc.closed else arc.path)
+    places = corners(border, arc.runs, 2.0 * tolerance, closed=arc.closed)
+    if arc.closed:
+        rounded = [(float(round(x)), float(round(y))) for x, y in places]
+        return [*rounded, rounded[0]]
     # a corner next to a node or to another corner would make a spike
     near = max(0.4 * tolerance, 50.0)
     path = [start]
-    for x, y in corners:
+    for x, y in places:
         if math.dist((x, y), path[-1]) > near and math.dist((x, y), end) > near:
             path.append((float(round(x)), float(round(y))))
     return [*path, end]

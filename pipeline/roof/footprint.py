@@ -11,6 +11,8 @@ from pipeline.model import FloatArray, IntArray, Reason
 from pipeline.roof.partition import RoofPartition
 
 _REPEATED_MM = 10.0
+_STRAIGHT_MM = 1.5
+"""Vertices this near to the line through their neighbours are not corners."""
 
 
 def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
@@ -35,11 +37,24 @@ def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
     if not scaled.is_valid:
         scaled = shapely.make_valid(scaled, method="structure", keep_collapsed=False)
     snapped = shapely.set_precision(scaled, 1.0)
-    thinned = shapely.remove_repeated_points(snapped, _REPEATED_MM)
-    cleaned = polygons_of(thinned if thinned.is_valid else snapped)
+    straight = shapely.simplify(snapped, _STRAIGHT_MM, preserve_topology=True)
+    cleaned = [thinned for polygon in polygons_of(straight) for thinned in without_repeated(polygon, _REPEATED_MM)]
+    thinned_all = MultiPolygon(cleaned)
+    cleaned = cleaned if thinned_all.is_valid else polygons_of(snapped)
     if not cleaned:
         raise BuildingError(Reason.NO_FOOTPRINT, f"the given footprint has an area of {footprint.area:g} m2")
     return MultiPolygon(cleaned)
+
+
+def without_repeated(polygon: Polygon, distance_mm: float) -> list[Polygon]:
+    """The polygon without vertices that repeat the one before; holes that vanish go, and so does the whole."""
+    rings = []
+    for line in (polygon.exterior, *polygon.interiors):
+        path = shapely.remove_repeated_points(shapely.linestrings(shapely.get_coordinates(line)), distance_mm)
+        rings.append(shapely.get_coordinates(path))
+    if len(rings[0]) < 4:
+        return []
+    return [Polygon(rings[0], [ring for ring in rings[1:] if len(ring) >= 4])]
 
 
 def polygons_of(geometry: shapely.Geometry) -> list[Polygon]:

@@ -48,7 +48,7 @@ class RoofSettings(Parameters):
     )
     straight_borders: bool = parameter(True, "Whether borders between roof faces are drawn with straight lines.")
     border_tolerance_spacings: float = parameter(
-        0.75,
+        0.65,
         "How far a border between roof faces may lie from its straight lines.",
         unit="point spacings",
         minimum=0.1,

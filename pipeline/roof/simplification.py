@@ -9,6 +9,7 @@ import shapely
 
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, Reason
+from pipeline.roof.footprint import without_repeated
 from pipeline.roof.partition import RoofPartition
 
 
@@ -88,8 +89,9 @@ def unite_close_vertices(partition: RoofPartition, distance_mm: float) -> RoofPa
     def moved(xy: FloatArray) -> FloatArray:
         return np.array([representative.get((x, y), (x, y)) for x, y in xy.tolist()]).reshape(-1, 2)
 
-    united = shapely.remove_repeated_points(shapely.transform(polygons, moved))
-    kept = ~shapely.is_empty(united)
-    if not shapely.is_valid(united[kept]).all() or not kept.any():
+    united = [without_repeated(polygon, 0.0) for polygon in shapely.transform(polygons, moved).tolist()]
+    kept = [k for k, parts in enumerate(united) if parts]
+    drawn = [united[k][0] for k in kept]
+    if not drawn or not shapely.is_valid(drawn).all():
         raise BuildingError(Reason.NO_PARTITION, f"a roof face breaks when vertices within {distance_mm:g} mm are one")
-    return RoofPartition(polygons=tuple(united[kept]), labels=partition.labels[kept])
+    return RoofPartition(polygons=tuple(drawn), labels=partition.labels[kept])

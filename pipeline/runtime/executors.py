@@ -36,7 +36,7 @@ class Measured(Generic[Result]):
 
 
 def peak_of_process() -> tuple[str, int]:
-    """This process as host:pid, and its largest resident size so far in bytes."""
+    """The process as host:pid, and its largest resident size so far in bytes."""
     return f"{socket.gethostname()}:{os.getpid()}", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 

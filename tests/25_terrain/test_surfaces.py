@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 
@@ -128,6 +129,8 @@ def town(x: FloatArray, y: FloatArray) -> FloatArray:
     z = np.where(in_box(x, y, 4, 4, 16, 14), 5.0 + 0.5 * (y - 4), 0.0)
     z = np.where(in_box(x, y, 8, 8, 12, 12), 14.0, z)
     z = np.where(in_box(x, y, 20, 3, 36, 18), 7.0, z)
+    z = np.where(in_box(x, y, 1, 29, 8, 38), 2.5, z)
+    z = np.where(in_box(x, y, 3, 31, 6, 36), 6.0, z)
     z = np.where(in_box(x, y, 5, 20, 30, 24), 1.5 + np.sin(2 * x) * np.cos(3 * y), z)
     return np.where(in_box(x, y, 10, 28, 37, 37), 4.0 + 3.0 * (x > 22), z)
 
@@ -459,8 +462,11 @@ def quarters(scene: Scene, x_mm: int, y_mm: int) -> list[Core]:
 
 @pytest.mark.parametrize("heights", [box, two_levels, canyon, town])
 @pytest.mark.parametrize("at_mm", [(20_000, 20_000), (17_123, 20_999), (12_000, 26_000)])
-def test_the_sums_of_four_tiles_add_up_to_those_of_the_whole(heights: Height, at_mm: tuple[int, int]) -> None:
-    scene = built(heights, seed=14)
+@pytest.mark.parametrize("spacing_m", [0.5, 2.5])
+def test_the_sums_of_four_tiles_add_up_to_those_of_the_whole(
+    heights: Height, at_mm: tuple[int, int], spacing_m: float
+) -> None:
+    scene = built(heights, seed=14, spacing_m=spacing_m)
     whole, labels = scene.cut()
     parts = [scene.cut(core) for core in quarters(scene, *at_mm)]
     for kind in (FacetKind.GROUND, FacetKind.OBJECT, FacetKind.STEP):
@@ -473,6 +479,29 @@ def test_the_sums_of_four_tiles_add_up_to_those_of_the_whole(heights: Height, at
     for _, part in parts:
         pairs = np.unique(np.column_stack((part, labels))[part >= 0], axis=0)
         assert len(pairs) == len(np.unique(pairs[:, 0]))
+
+
+@pytest.mark.parametrize("heights", [two_levels, town])
+@pytest.mark.parametrize("spacing_m", [0.5, 2.5])
+@pytest.mark.parametrize("at_mm", [(20_000, 20_000), (17_123, 20_999), (9_000, 11_000)])
+def test_shared_facets_unite_the_fragments_of_four_tiles_to_whole_surfaces(
+    heights: Height, spacing_m: float, at_mm: tuple[int, int]
+) -> None:
+    scene = built(heights, seed=16, spacing_m=spacing_m)
+    whole, _ = scene.cut()
+    parts = [scene.cut(core)[0] for core in quarters(scene, *at_mm)]
+    start = np.cumsum([0, *(len(f.kind) for f in parts)])
+    held: dict[tuple[int, ...], list[int]] = {}
+    for fragments, first in zip(parts, start, strict=False):
+        for key, fragment in zip(fragments.crossing_keys.tolist(), fragments.crossing_fragment.tolist(), strict=True):
+            held.setdefault(tuple(key), []).append(int(first) + fragment)
+    pairs = np.array([(a, b) for members in held.values() for a, b in itertools.pairwise(members)]).reshape(-1, 2)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(start[-1], start[-1]))
+    count, component = connected_components(graph, directed=False)
+    united = np.zeros((count, N_SUMS), np.int64)
+    np.add.at(united, component, np.concatenate([f.sums for f in parts]))
+    rows = sorted(row for row in united.tolist() if row[Sum.FACETS] > 0)
+    assert rows == sorted(row for row in whole.sums.tolist() if row[Sum.FACETS] > 0)
 
 
 def test_a_shift_changes_nothing_but_coordinates() -> None:

@@ -35,9 +35,9 @@ NARROW = SceneSettings(
     outliers=OutlierSettings(cube_m=1.0),
     ground=GroundSettings(max_window_m=6, bridge_m=8),
     vegetation=VegetationSettings(radius_m=0.5),
-    surfaces=SurfaceSettings(max_circumradius_m=2.0),
+    surfaces=SurfaceSettings(max_circumradius_m=4.0),
 )
-"""Settings that look 40 m far, so that the windows of a small town's tiles do not all see the whole town."""
+"""Settings that look 48 m far, so that the windows of a small town's tiles do not all see the whole town."""
 
 
 def taken(points: WindowPoints, index: npt.NDArray[Any]) -> WindowPoints:
@@ -197,6 +197,23 @@ def test_where_classes_are_trusted_excluded_ones_never_enter(town: Any, excluded
     entered = np.zeros(len(points), np.bool_)
     entered[ignored.core_index] = ignored.point_fragment >= 0
     assert entered[part].mean() > 0.9
+
+
+def test_excluded_points_between_neutral_ones_do_not_enter_either(town: Any) -> None:
+    classification = np.where(town.truth == BUILDING, 1, town.truth).astype(np.uint8)
+    part = (town.truth == BUILDING) & (np.random.default_rng(9).random(len(classification)) < 0.1)
+    classification[part] = TREE
+    found = split_whole(changed(town.points, classification=classification), TRUSTED)
+    assigned = np.zeros(len(town.points), np.bool_)
+    assigned[found.core_index] = found.point_fragment >= 0
+    assert not assigned[classification == TREE].any()
+    assert assigned[classification == 1].mean() > 0.5
+
+
+def test_what_is_excluded_as_a_whole_is_no_surface(town: Any) -> None:
+    classification = np.where(town.truth == BUILDING, 17, town.truth).astype(np.uint8)
+    found = split_whole(changed(town.points, classification=classification), TRUSTED)
+    assert not np.isin(found.fragments.kind, (FacetKind.OBJECT, FacetKind.BUILDING)).any()
 
 
 @pytest.mark.parametrize("neutral", [0, 1, 12, 19])

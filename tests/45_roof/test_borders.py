@@ -95,7 +95,7 @@ def test_the_outline_stays(exact_roof: ExactRoofs) -> None:
     before, after = (shapely.union_all(list(p.polygons)) for p in (clipped, straight))
     assert shapely.symmetric_difference(before, after).area < 2.0 * before.length
     n_before, n_after = (sum(shapely.get_num_coordinates(list(p.polygons))) for p in (clipped, straight))
-    assert n_after < 0.4 * n_before
+    assert n_after < 0.3 * n_before
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -110,6 +110,8 @@ def test_any_partition_stays_a_coverage_with_the_same_faces(seed: int) -> None:
     labels[: len(inner)] = rng.integers(0, k, len(inner))
     coefficients = np.column_stack((rng.uniform(-1, 1, (k, 2)), rng.uniform(3, 9, k)))
     partition = march(xy, triangulate(xy), labels, coefficients, 0.3, 0.2)
+    if not is_coverage(partition):
+        return  # points a few millimetres apart, cut and rounded
     planes = [plane(*row) for row in coefficients.tolist()]
     straight = straighten_borders(partition, planes, float(rng.uniform(0.2, 1.5)), SETTINGS)
     assert straight.labels.tolist() == partition.labels.tolist()
@@ -133,5 +135,13 @@ def test_borders_can_be_left_as_they_are(exact_roof: ExactRoofs) -> None:
         sum(shapely.get_num_coordinates(list(roof.drawn(dataclasses.replace(SETTINGS, straight_borders=on)).polygons)))
         for on in (False, True)
     )
-    assert straight == 10
-    assert ragged > straight
+    assert straight <= 14
+    assert ragged > 1.5 * straight
+
+
+def test_an_island_is_drawn_with_straight_sides(exact_roof: ExactRoofs) -> None:
+    roof = exact_roof("tower", with_footprint=True, density=12.0)
+    outer, tower = roof.drawn().polygons
+    assert shapely.get_num_coordinates(tower) <= 8
+    assert tower.area * 1e-6 == pytest.approx(16.0, rel=0.15)
+    assert shapely.Polygon(outer.interiors[0]).equals(tower)

@@ -1,0 +1,229 @@
+"""Straight lines through stretches of a ragged border.
+
+A border is cut into runs by Douglas and Peucker's rule (1973). Its chords end at the extremes of the zigzag, so
+neighbouring runs are united again while one line of least squares passes near all their vertices.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+
+from pipeline.model import FloatArray
+
+Point = tuple[float, float]
+
+_PARALLEL = math.sin(math.radians(20.0))
+
+
+@dataclasses.dataclass
+class Run:
+    """A stretch of a border and the line through it."""
+
+    first: int
+    """Index of its first vertex on the border."""
+    last: int
+    """Index of its last one, which is the first of the next run; may exceed the length of a closed border."""
+    x: float
+    """The line's point: centroid of the stretch."""
+    y: float
+    direction: float
+    """Of the line along the border, radians."""
+    length: float
+    """From the first to the last vertex."""
+    exact: bool = False
+    """Whether the line is known otherwise than by the stretch."""
+
+
+def fitted_run(border: FloatArray, first: int, last: int) -> Run:
+    """The line of least squares through the stretch between two vertices, every piece by its length.
+
+    Parameters
+    ----------
+    border : (n, 2) float64
+        Vertices; of a closed border the first is not repeated.
+    first, last : int
+        Indices, `last` greater than `first`; taken modulo n.
+
+    Returns
+    -------
+    Run
+        Not exact.
+    """
+    path = border[np.arange(first, last + 1) % len(border)]
+    middle = 0.5 * (path[1:] + path[:-1])
+    step = path[1:] - path[:-1]
+    weight = np.hypot(step[:, 0], step[:, 1])
+    total = math.fsum(weight.tolist())
+    cx, cy = (math.fsum((weight * middle[:, k]).tolist()) / total for k in range(2))
+    dx, dy = middle[:, 0] - cx, middle[:, 1] - cy
+    # second moments of pieces: their middles and their own extent
+    sxx = math.fsum((weight * (dx * dx + step[:, 0] ** 2 / 12.0)).tolist())
+    sxy = math.fsum((weight * (dx * dy + step[:, 0] * step[:, 1] / 12.0)).tolist())
+    syy = math.fsum((weight * (dy * dy + step[:, 1] ** 2 / 12.0)).tolist())
+    chord_x, chord_y = (path[-1] - path[0]).tolist()
+    direction = 0.5 * math.atan2(2.0 * sxy, sxx - syy)
+    if math.cos(direction) * chord_x + math.sin(direction) * chord_y < 0.0:
+        direction += math.pi
+    return Run(first=first, last=last, x=cx, y=cy, direction=direction, length=math.hypot(chord_x, chord_y))
+
+
+def split(border: FloatArray, tolerance: float, *, closed: bool) -> list[Run]:
+    """Cut a border into runs whose vertices lie within the tolerance of their chords.
+
+    Parameters
+    ----------
+    border : (n, 2) float64
+        Vertices; of a closed border the first is not repeated, and a run starts there.
+    tolerance : float
+        In the unit of the coordinates.
+    closed : bool
+        Whether the last vertex is joined to the first.
+
+    Returns
+    -------
+    list of Run
+        In order; of a closed border none where it has fewer than three.
+    """
+    path = np.vstack((border, border[:1])) if closed else border
+    kept = shapely.get_coordinates(shapely.simplify(shapely.linestrings(path), tolerance, preserve_topology=False))
+    index, at = [], 0
+    for x, y in kept.tolist():
+        while path[at, 0] != x or path[at, 1] != y:
+            at += 1
+        index.append(at)
+        at += 1
+    index[-1] = len(path) - 1
+    if closed and len(index) < 4:
+        return []
+    return [fitted_run(border, first, last) for first, last in itertools.pairwise(index)]
+
+
+def _off_line(border: FloatArray, run: Run) -> float:
+    """Largest distance of a stretch's vertices from its line."""
+    path = border[np.arange(run.first, run.last + 1) % len(border)]
+    return float(
+        np.abs(math.cos(run.direction) * (path[:, 1] - run.y) - math.sin(run.direction) * (path[:, 0] - run.x)).max()
+    )
+
+
+def merge(border: FloatArray, runs: Sequence[Run], tolerance: float, *, closed: bool) -> list[Run]:
+    """Unite neighbouring runs while one line passes within the tolerance of all their vertices, the best pair first.
+
+    Parameters
+    ----------
+    border : (n, 2) float64
+        Vertices, as for `split`.
+    runs : sequence of Run
+        Its runs; exact ones stay.
+    tolerance : float
+        In the unit of the coordinates.
+    closed : bool
+        Whether the last run is followed by the first; then at least three runs stay.
+
+    Returns
+    -------
+    list of Run
+        In order.
+    """
+    merged = list(runs)
+    least = 3 if closed else 1
+
+    def united(k: int) -> tuple[float, Run] | None:
+        a, b = merged[k], merged[(k + 1) % len(merged)]
+        if a.exact or b.exact or len(merged) <= least or (k + 1 == len(merged) and not closed):
+            return None
+        last = b.last if b.last > a.first else b.last + len(border)
+        run = fitted_run(border, a.first, last)
+        return _off_line(border, run), run
+
+    pairs = [united(k) for k in range(len(merged))]
+    while True:
+        off, k = min(((pair[0], k) for k, pair in enumerate(pairs) if pair is not None), default=(math.inf, -1))
+        pair = pairs[k] if k >= 0 else None
+        if pair is None or off > tolerance or len(merged) <= least:
+            return merged
+        merged[k] = pair[1]
+        following = (k + 1) % len(merged)
+        del merged[following], pairs[following]
+        if following < k:
+            k -= 1
+        for j in {k, (k - 1) % len(merged)}:
+            pairs[j] = united(j)
+
+
+def dominant_direction(runs: Sequence[Run]) -> float | None:
+    """The direction, modulo a right angle, that most of the runs' squared length follows; None where there is none."""
+    weights = [run.length**2 for run in runs]
+    cosine = math.fsum(w * math.cos(4.0 * run.direction) for w, run in zip(weights, runs, strict=True))
+    sine = math.fsum(w * math.sin(4.0 * run.direction) for w, run in zip(weights, runs, strict=True))
+    if not runs or math.hypot(cosine, sine) < 0.5 * math.fsum(weights):
+        return None
+    return math.atan2(sine, cosine) / 4.0
+
+
+def square(runs: Sequence[Run], dominant: float | None, within: float, tolerance: float) -> None:
+    """Give runs near the dominant direction, or square to it, that direction; exact ones stay.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        Changed in place.
+    dominant : float or None
+        Radians; None changes nothing.
+    within : float
+        Radians. A short run is less certain: it may be off by the tolerance over its length.
+    tolerance : float
+        In the unit of the coordinates.
+    """
+    if dominant is None:
+        return
+    quarter = 0.5 * math.pi
+    for run in runs:
+        turns = round((run.direction - dominant) / quarter)
+        off = abs(run.direction - dominant - turns * quarter)
+        if not run.exact and off <= max(within, math.atan2(tolerance, run.length)):
+            run.direction = dominant + turns * quarter
+
+
+def crossing(a: Run, b: Run) -> Point | None:
+    """Where two lines meet; None where they are nearly parallel."""
+    ux, uy = math.cos(a.direction), math.sin(a.direction)
+    wx, wy = math.cos(b.direction), math.sin(b.direction)
+    determinant = ux * wy - uy * wx
+    if abs(determinant) < _PARALLEL:
+        return None
+    t = ((b.x - a.x) * wy - (b.y - a.y) * wx) / determinant
+    return a.x + t * ux, a.y + t * uy
+
+
+def projected(point: Point, run: Run) -> Point:
+    """The nearest point of a line."""
+    ux, uy = math.cos(run.direction), math.sin(run.direction)
+    t = (point[0] - run.x) * ux + (point[1] - run.y) * uy
+    return run.x + t * ux, run.y + t * uy
+
+
+def corners(border: FloatArray, runs: Sequence[Run], reach: float, *, closed: bool) -> list[Point]:
+    """Where neighbouring lines meet.
+
+    Lines that meet nowhere, or farther than `reach` from the vertex between their runs, are joined there by a short
+    piece square to them. Of a closed border the first corner is that of the last run and the first.
+    """
+    pairs = list(itertools.pairwise(runs))
+    if closed:
+        pairs.insert(0, (runs[-1], runs[0]))
+    found: list[Point] = []
+    for a, b in pairs:
+        x, y = border[b.first % len(border)].tolist()
+        corner = crossing(a, b)
+        if corner is not None and math.dist(corner, (x, y)) <= reach:
+            found.append(corner)
+        else:
+            found.extend((projected((x, y), a), projected((x, y), b)))
+    return found
