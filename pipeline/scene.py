@@ -13,16 +13,10 @@ import numpy as np
 
 from pipeline.model import BoolArray, ByteArray, IntArray, LabelArray
 from pipeline.terrain.candidates import CandidateSettings
+from pipeline.terrain.facets import VertexKind
 from pipeline.terrain.ground import CELL_MM, NO_DATA, GroundSettings, Terrain, ground_of, height_above
 from pipeline.terrain.outliers import OutlierSettings, dense_enough
-from pipeline.terrain.surfaces import (
-    Fragments,
-    ScenePoints,
-    SceneVertices,
-    SurfaceSettings,
-    VertexKind,
-    fragments_of,
-)
+from pipeline.terrain.surfaces import Fragments, ScenePoints, SceneVertices, SurfaceSettings, fragments_of
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.terrain.vegetation import VegetationSettings, planarity
 from pipeline.tiling import Window
@@ -178,14 +172,19 @@ def split_tile(
     last = points.return_number >= points.return_count
     building = (points.classification == BUILDING_CLASS) & classes.building
     used = known & (last | building)
-    chosen = highest_per_cell(points.x_mm, points.y_mm, points.z_mm, building, used, settings.surfaces.thinning_m)
-    x, y, z = points.x_mm[chosen], points.y_mm[chosen], points.z_mm[chosen]
-    kind = np.full(len(chosen), VertexKind.OBJECT, np.int8)
-    chosen_class = points.classification[chosen]
     excluded = np.zeros(len(points), np.bool_)
     if classes.building:
         excluded = ~np.isin(points.classification, (*NEUTRAL_CLASSES, GROUND_CLASS, BUILDING_CLASS))
-        kind[excluded[chosen]] = VertexKind.EXCLUDED
+    # equal coordinates of different classes must not be decided by the order of the points
+    preferred = np.zeros(len(points), np.int8)
+    if classes.building or classes.ground:
+        preferred = np.where(building, 3, np.where(points.classification == GROUND_CLASS, 1, 2)).astype(np.int8)
+        preferred[excluded] = 0
+    chosen = highest_per_cell(points.x_mm, points.y_mm, points.z_mm, preferred, used, settings.surfaces.thinning_m)
+    x, y, z = points.x_mm[chosen], points.y_mm[chosen], points.z_mm[chosen]
+    kind = np.full(len(chosen), VertexKind.OBJECT, np.int8)
+    chosen_class = points.classification[chosen]
+    kind[excluded[chosen]] = VertexKind.EXCLUDED
     kind[height[chosen] < round(settings.ground.tolerance_m * 1000)] = VertexKind.GROUND
     if classes.ground:
         kind[chosen_class == GROUND_CLASS] = VertexKind.GROUND

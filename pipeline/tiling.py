@@ -18,7 +18,7 @@ from pipeline.model import BoolArray, IntArray
 MM = 1000
 """Millimetres a metre."""
 
-_KEY = re.compile(r"x(-?\d+)_y(-?\d+)")
+_KEY = re.compile(r"x(0|-?[1-9]\d*)_y(0|-?[1-9]\d*)")
 
 
 @dataclasses.dataclass(frozen=True, order=True)
@@ -94,7 +94,9 @@ class TileGrid:
     """Northing of that corner."""
 
     def __post_init__(self) -> None:
-        """Refuse a lattice without extent."""
+        """Refuse a lattice without extent, and a halo that shrinks."""
+        if self.halo_mm < 0:
+            raise SettingsError([f"halo_m is {self.halo_mm / MM:g}: use 0 or more"])
         if self.size_mm < MM:
             raise SettingsError([f"tile_size_m is {self.size_mm / MM:g}: use at least 1 m"])
 

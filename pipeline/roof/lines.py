@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
+from numba import njit
 
 from pipeline.model import FloatArray
 
@@ -55,22 +56,57 @@ def fitted_run(border: FloatArray, first: int, last: int) -> Run:
     Run
         Not exact.
     """
-    path = border[np.arange(first, last + 1) % len(border)]
-    middle = 0.5 * (path[1:] + path[:-1])
-    step = path[1:] - path[:-1]
-    weight = np.hypot(step[:, 0], step[:, 1])
-    total = math.fsum(weight.tolist())
-    cx, cy = (math.fsum((weight * middle[:, k]).tolist()) / total for k in range(2))
-    dx, dy = middle[:, 0] - cx, middle[:, 1] - cy
-    # second moments of pieces: their middles and their own extent
-    sxx = math.fsum((weight * (dx * dx + step[:, 0] ** 2 / 12.0)).tolist())
-    sxy = math.fsum((weight * (dx * dy + step[:, 0] * step[:, 1] / 12.0)).tolist())
-    syy = math.fsum((weight * (dy * dy + step[:, 1] ** 2 / 12.0)).tolist())
-    chord_x, chord_y = (path[-1] - path[0]).tolist()
+    x, y, direction, length = _fit(border, first, last)
+    return Run(first=first, last=last, x=x, y=y, direction=direction, length=length)
+
+
+@njit(cache=True, nogil=True)
+def _fit(border: FloatArray, first: int, last: int) -> tuple[float, float, float, float]:
+    """Centroid, direction and chord of a stretch: second moments of its pieces' middles and of their own extent."""
+    n = len(border)
+    x0, y0 = border[first % n, 0], border[first % n, 1]
+    total = 0.0
+    cx = 0.0
+    cy = 0.0
+    for turn in range(2):
+        sxx = 0.0
+        sxy = 0.0
+        syy = 0.0
+        for i in range(first, last):
+            ax, ay = border[i % n, 0] - x0, border[i % n, 1] - y0
+            bx, by = border[(i + 1) % n, 0] - x0, border[(i + 1) % n, 1] - y0
+            ux, uy = bx - ax, by - ay
+            weight = math.sqrt(ux * ux + uy * uy)
+            mx, my = 0.5 * (ax + bx) - cx, 0.5 * (ay + by) - cy
+            if turn == 0:
+                total += weight
+                sxx += weight * mx
+                syy += weight * my
+            else:
+                sxx += weight * (mx * mx + ux * ux / 12.0)
+                sxy += weight * (mx * my + ux * uy / 12.0)
+                syy += weight * (my * my + uy * uy / 12.0)
+        if total == 0.0:
+            return x0, y0, 0.0, 0.0
+        if turn == 0:
+            cx = sxx / total
+            cy = syy / total
     direction = 0.5 * math.atan2(2.0 * sxy, sxx - syy)
+    chord_x, chord_y = border[last % n, 0] - x0, border[last % n, 1] - y0
     if math.cos(direction) * chord_x + math.sin(direction) * chord_y < 0.0:
         direction += math.pi
-    return Run(first=first, last=last, x=cx, y=cy, direction=direction, length=math.hypot(chord_x, chord_y))
+    return cx + x0, cy + y0, direction, math.sqrt(chord_x * chord_x + chord_y * chord_y)
+
+
+@njit(cache=True, nogil=True)
+def _off_line(border: FloatArray, first: int, last: int, x: float, y: float, direction: float) -> float:
+    """Largest distance of a stretch's vertices from a line."""
+    ux, uy = math.cos(direction), math.sin(direction)
+    largest = 0.0
+    for i in range(first, last + 1):
+        k = i % len(border)
+        largest = max(largest, abs(ux * (border[k, 1] - y) - uy * (border[k, 0] - x)))
+    return largest
 
 
 def split(border: FloatArray, tolerance: float, *, closed: bool) -> list[Run]:
@@ -104,14 +140,6 @@ def split(border: FloatArray, tolerance: float, *, closed: bool) -> list[Run]:
     return [fitted_run(border, first, last) for first, last in itertools.pairwise(index)]
 
 
-def _off_line(border: FloatArray, run: Run) -> float:
-    """Largest distance of a stretch's vertices from its line."""
-    path = border[np.arange(run.first, run.last + 1) % len(border)]
-    return float(
-        np.abs(math.cos(run.direction) * (path[:, 1] - run.y) - math.sin(run.direction) * (path[:, 0] - run.x)).max()
-    )
-
-
 def merge(border: FloatArray, runs: Sequence[Run], tolerance: float, *, closed: bool) -> list[Run]:
     """Unite neighbouring runs while one line passes within the tolerance of all their vertices, the best pair first.
 
@@ -140,7 +168,8 @@ def merge(border: FloatArray, runs: Sequence[Run], tolerance: float, *, closed: 
             return None
         last = b.last if b.last > a.first else b.last + len(border)
         run = fitted_run(border, a.first, last)
-        return _off_line(border, run), run
+        off: float = _off_line(border, run.first, run.last, run.x, run.y, run.direction)
+        return off, run
 
     pairs = [united(k) for k in range(len(merged))]
     while True:

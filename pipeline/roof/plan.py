@@ -32,6 +32,8 @@ from pipeline.tin.delaunay import triangulate, unique_xy
 
 _PITCH_SPACINGS = 1.2
 _MARGIN_SPACINGS = 4.0
+_MAX_EXTENT_M = 1900.0
+"""What the triangulation takes, less the frame around."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -140,7 +142,7 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     Raises
     ------
     BuildingError
-        `no_partition` where nothing is left.
+        `no_partition` where nothing is left, `too_complex` beyond 1.9 km.
     """
     given = roof.footprint_mm
     margin = round(_MARGIN_SPACINGS * roof.spacing_m * 1e3)
@@ -148,6 +150,9 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     if given is not None:
         bounds = np.rint(given.bounds).astype(np.int64)
         low, high = np.minimum(low, bounds[:2] - margin), np.maximum(high, bounds[2:] + margin)
+    extent_m = float((high - low).max()) * 1e-3
+    if extent_m > _MAX_EXTENT_M:
+        raise BuildingError(Reason.TOO_COMPLEX, f"extends over {extent_m:.0f} m, more than {_MAX_EXTENT_M:.0f} m")
     pitch = max(50, round(_PITCH_SPACINGS * roof.spacing_m * 1e3))
     gap_m = settings.gap_spacings * roof.spacing_m
     samples, nearest, distance_m = empty_samples(roof.xy_mm, low, high, pitch, gap_m)

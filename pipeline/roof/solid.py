@@ -94,7 +94,8 @@ def _mesh(partition: RoofPartition) -> _Mesh:
                 vertex = number.setdefault((x, y), len(xy))
                 if vertex == len(xy):
                     xy.append((x, y))
-                ring.append(vertex)
+                if not ring or ring[-1] != vertex:
+                    ring.append(vertex)
             rings.append(ring)
         faces.append(rings)
     return _Mesh(xy=xy, faces=faces, planes=[int(label) for label in partition.labels])

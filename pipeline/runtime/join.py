@@ -20,13 +20,14 @@ from pipeline.terrain.candidates import (
     judge_surface,
     unite_levels,
 )
-from pipeline.terrain.surfaces import N_SUMS, FacetKind, Fragments, Sum
+from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.surfaces import N_SUMS, Fragments, Sum
 from pipeline.tiling import Tile, TileGrid
 
 NOWHERE = 2**62
 """Coordinate of the smallest point of a surface that has none."""
 
-_NOT_JUDGED = Verdict(reason=Reason.TOO_FEW_POINTS, detail="a step between levels, or a surface without points")
+_NOT_JUDGED = Verdict(reason=Reason.TOO_FEW_POINTS, detail="ground, a step between levels, or a surface without points")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -236,7 +237,8 @@ def join(splits: Sequence[Split], grid: TileGrid, settings: CandidateSettings, c
     verdicts: list[Verdict | None] = []
     for k in range(count):
         kind = int(surfaces.kind[k])
-        verdict = _NOT_JUDGED if kind == FacetKind.STEP else judge_surface(kind, surfaces.sums[k], settings)
+        judged = kind in {FacetKind.OBJECT, FacetKind.BUILDING}
+        verdict = judge_surface(kind, surfaces.sums[k], settings) if judged else _NOT_JUDGED
         if verdict is None and surfaces.lowest_point_mm[k, 0] == NOWHERE:
             verdict = _NOT_JUDGED
         verdicts.append(verdict)

@@ -19,7 +19,7 @@ from pipeline.io.gps_time import GpsTimeKind
 from pipeline.runtime.events import Event, EventKind, Listener
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.ingest import Ingested, IngestTask, ingest, spread_m
-from pipeline.runtime.join import Joined, join, join_footprints
+from pipeline.runtime.join import Joined, RejectedSite, join, join_footprints
 from pipeline.runtime.modelling import BatchTask, Footprints, Modelled, batches, model_batch
 from pipeline.runtime.plan import Plan
 from pipeline.runtime.publish import PublishTask, publish
@@ -230,7 +230,10 @@ class Stages:
         numbers: dict[Tile, set[int]] = {}
         for building in modelled:
             numbers.setdefault(building.owner, set()).add(batch_of[building.building_id])
-        owners = sorted({*numbers, *(site.owner for site in joined.rejected)})
+        rejected: dict[Tile, list[RejectedSite]] = {}
+        for site in joined.rejected:
+            rejected.setdefault(site.owner, []).append(site)
+        owners = sorted({*numbers, *rejected})
         times = [(i.acquired_from, i.acquired_to) for i in self.plan.sources]
         known = [(a, b) for a, b in times if a is not None and b is not None]
         context = RecordContext(
@@ -246,7 +249,7 @@ class Stages:
                 run_dir=run_dir,
                 scratch=self.scratch,
                 batches=tuple(sorted(numbers.get(tile, ()))),
-                rejected=tuple(site for site in joined.rejected if site.owner == tile),
+                rejected=tuple(rejected.get(tile, ())),
                 context=context,
                 meshes=self.meshes,
             )

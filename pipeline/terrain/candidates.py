@@ -14,7 +14,8 @@ import numpy as np
 
 from pipeline.model import IntArray, KindArray, Reason
 from pipeline.parameters import Parameters, parameter
-from pipeline.terrain.surfaces import FacetKind, Sum
+from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.surfaces import Sum
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,16 +48,6 @@ class CandidateSettings(Parameters):
         "Least share of the touching walls at whose top the surface lies (the Z_avg rule by surface).",
         minimum=0.0,
         maximum=1.0,
-    )
-    large_roof_m2: float = parameter(
-        400.0,
-        "A surface on the filter's ground of at least this area is a roof where walls fall off all around it.",
-        unit="m2",
-        minimum=50.0,
-        maximum=100000.0,
-    )
-    large_roof_top_share: float = parameter(
-        0.6, "Share of the whole outline of such a roof that lies at the top of walls.", minimum=0.3, maximum=1.0
     )
     unite_share: float = parameter(
         0.5,
@@ -106,7 +97,6 @@ def _figures(sums: IntArray) -> dict[str, float]:
         "canopy_share": float(sums[Sum.CANOPY]) / max(1, int(sums[Sum.CANOPY] + sums[Sum.POINTS])),
         "wall_share": float(sums[Sum.WALL]) / outline_mm,
         "top_share": float(sums[Sum.WALL_TOP]) / max(1, int(sums[Sum.WALL])),
-        "top_of_outline": float(sums[Sum.WALL_TOP]) / outline_mm,
         "step_share": float(sums[Sum.STEP]) / outline_mm,
     }
 
@@ -117,17 +107,13 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
     Parameters
     ----------
     kind : int
-        FacetKind of the surface: GROUND, OBJECT or BUILDING.
+        FacetKind of the surface: OBJECT or BUILDING.
     sums : (N_SUMS,) int64
         Its sums.
     settings : CandidateSettings
         The thresholds.
     """
     f = _figures(sums)
-    if kind == FacetKind.GROUND:
-        if f["area_m2"] < settings.large_roof_m2 or f["top_of_outline"] < settings.large_roof_top_share:
-            return Verdict(reason=Reason.TOO_LOW, detail="ground")
-        return None
     if f["area_m2"] < settings.min_area_m2:
         return Verdict(reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {settings.min_area_m2:g}")
     if kind == FacetKind.BUILDING:
@@ -168,8 +154,6 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
 
 def is_object(kind: int, sums: IntArray, settings: CandidateSettings) -> bool:
     """Whether a surface is large enough to be listed at all, as candidate or rejected."""
-    if kind == FacetKind.GROUND:
-        return judge_surface(kind, sums, settings) is None
     large_enough = bool(sums[Sum.AREA2] >= 2e6 * settings.min_object_area_m2)
     return kind in {FacetKind.OBJECT, FacetKind.BUILDING} and large_enough
 
@@ -183,7 +167,7 @@ def _joins(kind: int, sums: IntArray, verdict: Verdict | None, settings: Candida
         and f["planar_share"] >= settings.min_planar_share
         and f["canopy_share"] <= settings.max_canopy_share
     )
-    return kind != FacetKind.GROUND and small_roof and f["step_share"] >= settings.unite_share
+    return kind in {FacetKind.OBJECT, FacetKind.BUILDING} and small_roof and f["step_share"] >= settings.unite_share
 
 
 def unite_levels(surfaces: Surfaces, verdicts: list[Verdict | None], settings: CandidateSettings) -> IntArray:

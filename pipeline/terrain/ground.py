@@ -53,7 +53,13 @@ class GroundSettings(Parameters):
         minimum=0.2,
         maximum=20.0,
     )
-    bridge_m: int = parameter(24, "Farthest that the terrain is drawn under objects.", unit="m", minimum=4, maximum=80)
+    bridge_m: int = parameter(
+        24,
+        "Farthest that the terrain is drawn under objects, where max_window_m asks for no more.",
+        unit="m",
+        minimum=4,
+        maximum=80,
+    )
     tolerance_m: float = parameter(
         0.5, "Points closer than this to the terrain are ground.", unit="m", minimum=0.05, maximum=3.0
     )
@@ -67,9 +73,14 @@ class GroundSettings(Parameters):
         return tuple(sizes)
 
     @property
+    def reach_m(self) -> int:
+        """Farthest that the terrain is drawn under objects: at least to the middle of the widest that are cut off."""
+        return max(self.bridge_m, self.max_window_m + 1)
+
+    @property
     def support_m(self) -> float:
         """How far a terrain elevation looks: the pit test, erosion and dilation, the local planes, cell sizes."""
-        return float(_PIT_CELLS + 2 * self.max_window_m + self.bridge_m + 3)
+        return float(_PIT_CELLS + 2 * self.max_window_m + self.reach_m + 3)
 
 
 @njit(cache=True, nogil=True)
@@ -167,7 +178,7 @@ def _objects(lowest: Elevations, windows: IntArray, max_slope: float, min_step_m
 
 
 @njit(cache=True, nogil=True)
-def _terrain(lowest: Elevations, is_ground: BoolArray, bridge: int) -> Elevations:
+def _terrain(lowest: Elevations, is_ground: BoolArray, bridge: int, max_slope: float) -> Elevations:
     """Draw local least-squares planes through the ground cells of the smallest box that holds enough.
 
     All sums are integers about the box's own centre: the result does not depend on where the lattice's
@@ -200,32 +211,35 @@ def _terrain(lowest: Elevations, is_ground: BoolArray, bridge: int) -> Elevation
             while True:
                 r0, r1 = max(r - half, 0), min(r + half, rows - 1) + 1
                 c0, c1 = max(c - half, 0), min(c + half, columns - 1) + 1
-                count = sums[0, r1, c1] - sums[0, r0, c1] - sums[0, r1, c0] + sums[0, r0, c0]
-                if count >= 5 or half == bridge:
+                for k in range(9):
+                    m[k] = sums[k, r1, c1] - sums[k, r0, c1] - sums[k, r1, c0] + sums[k, r0, c0]
+                n = m[0]
+                # moments about the cell (r, c), exact
+                sx = m[1] - n * c
+                sy = m[2] - n * r
+                xx = m[4] - 2 * c * m[1] + n * c * c
+                xy = m[5] - c * m[2] - r * m[1] + n * c * r
+                yy = m[6] - 2 * r * m[2] + n * r * r
+                vxx, vxy, vyy, det = 0.0, 0.0, 0.0, 0.0
+                if n >= 5:
+                    vxx, vxy, vyy = xx - sx * sx / n, xy - sx * sy / n, yy - sy * sy / n
+                    det = vxx * vyy - vxy * vxy
+                # cells in a row carry no plane: under an object a wider box is needed
+                carries = n >= 5 and det > 0.05 * (vxx + vyy) * (vxx + vyy)
+                if carries or half == bridge or (n >= 5 and is_ground[r, c]):
                     break
                 half = min(2 * half, bridge)
-            if count == 0:
+            if n == 0:
                 continue
-            for k in range(9):
-                m[k] = sums[k, r1, c1] - sums[k, r0, c1] - sums[k, r1, c0] + sums[k, r0, c0]
-            n = m[0]
-            # moments about the cell (r, c), exact
-            sx = m[1] - n * c
-            sy = m[2] - n * r
-            xx = m[4] - 2 * c * m[1] + n * c * c
-            xy = m[5] - c * m[2] - r * m[1] + n * c * r
-            yy = m[6] - 2 * r * m[2] + n * r * r
             mean = m[3] / n
             # about the centroid; z about its mean to keep the float products small
-            vxx, vxy, vyy = xx - sx * sx / n, xy - sx * sy / n, yy - sy * sy / n
             vxz = (m[7] - c * m[3]) - sx * mean
             vyz = (m[8] - r * m[3]) - sy * mean
-            det = vxx * vyy - vxy * vxy
             level = float(mean)
-            if count >= 5 and det > 0.05 * (vxx + vyy) * (vxx + vyy):
+            if carries:
                 a = (vxz * vyy - vyz * vxy) / det
                 b = (vyz * vxx - vxz * vxy) / det
-                # towards the box's edge a plane is trusted, far outside its own points it is not
+                # a plane is trusted as far as the terrain may rise within the box, not farther
                 level = mean - (a * sx + b * sy) / n
                 low, high = 1e12, -1e12
                 for rr in range(r0, r1):
@@ -233,7 +247,8 @@ def _terrain(lowest: Elevations, is_ground: BoolArray, bridge: int) -> Elevation
                         if is_ground[rr, cc]:
                             low = min(low, float(lowest[rr, cc]))
                             high = max(high, float(lowest[rr, cc]))
-                level = min(max(level, low), high)
+                slack = max_slope * CELL_MM * half
+                level = min(max(level, low - slack), high + slack)
             terrain[r, c] = np.int32(round(level))
     return terrain
 
@@ -320,7 +335,7 @@ def ground_of(
         flagged = _objects(lowest, windows, settings.max_slope, settings.min_step_m * 1000.0)
         is_ground = (lowest != NO_DATA) & ~flagged
     return Terrain(
-        elevation_mm=_terrain(lowest, is_ground, settings.bridge_m),
+        elevation_mm=_terrain(lowest, is_ground, settings.reach_m, settings.max_slope),
         measured=is_ground,
         column0=column0,
         row0=row0,

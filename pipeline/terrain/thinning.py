@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pipeline.model import BoolArray, IntArray
+from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.spatial_hash import slot_of_key
 
 _BITS = 31
@@ -18,9 +18,9 @@ _BITS = 31
 
 @njit(cache=True, nogil=True)
 def _highest_per_cell(
-    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, preferred: BoolArray, used: BoolArray, cell_mm: int
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, preferred: KindArray, used: BoolArray, cell_mm: int
 ) -> IntArray:
-    """Kernel: of each cell the point that is preferred, highest, then southernmost, then westernmost."""
+    """Kernel: of each cell the point that is preferred most, highest, then southernmost, then westernmost."""
     n = x_mm.size
     size = 2
     while size < 2 * n:
@@ -48,7 +48,7 @@ def _highest_per_cell(
             count += 1
             continue
         if preferred[i] != preferred[j]:
-            better = preferred[i]
+            better = preferred[i] > preferred[j]
         elif z_mm[i] != z_mm[j]:
             better = z_mm[i] > z_mm[j]
         elif y_mm[i] != y_mm[j]:
@@ -64,7 +64,7 @@ def _highest_per_cell(
 
 
 def highest_per_cell(
-    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, preferred: BoolArray, used: BoolArray, cell_m: float
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, preferred: KindArray, used: BoolArray, cell_m: float
 ) -> IntArray:
     """Indices of one point a cell, ordered by (x, y).
 
@@ -72,8 +72,8 @@ def highest_per_cell(
     ----------
     x_mm, y_mm, z_mm : (n,) int64
         Absolute coordinates in millimetres; the lattice is anchored at the CRS's origin.
-    preferred : (n,) bool
-        Points that win their cell whatever their height (the file's building class where it is trusted).
+    preferred : (n,) int8
+        Points of the greater number win their cell whatever their height (by the file's classes where trusted).
     used : (n,) bool
         Points that may be chosen at all.
     cell_m : float

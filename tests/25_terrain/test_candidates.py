@@ -17,7 +17,8 @@ from pipeline.terrain.candidates import (
     judge_surface,
     unite_levels,
 )
-from pipeline.terrain.surfaces import N_SUMS, FacetKind, Sum
+from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.surfaces import N_SUMS, Sum
 
 SETTINGS = CandidateSettings()
 
@@ -108,15 +109,6 @@ def test_building_by_trusted_classes_needs_only_its_area() -> None:
     assert small.reason == Reason.TOO_SMALL
 
 
-def test_a_large_surface_on_the_ground_is_a_roof_where_walls_fall_off_around_it() -> None:
-    large = {Sum.AREA2: 1_000_000_000, Sum.HEIGHT: 0, Sum.BOUNDARY: 90_000, Sum.WALL: 80_000, Sum.WALL_TOP: 70_000}
-    assert judged(large, FacetKind.GROUND) is None
-    assert judged({**large, Sum.WALL_TOP: 50_000}, FacetKind.GROUND) == Verdict(reason=Reason.TOO_LOW, detail="ground")
-    assert judged({**large, Sum.AREA2: 790_000_000}, FacetKind.GROUND) is not None
-    # a share of the whole outline: walls that are all topped but touch only half of it do not suffice
-    assert judged({**large, Sum.WALL: 45_000, Sum.WALL_TOP: 45_000}, FacetKind.GROUND) is not None
-
-
 @pytest.mark.parametrize(
     ("kind", "area_m2", "listed"),
     [
@@ -125,10 +117,10 @@ def test_a_large_surface_on_the_ground_is_a_roof_where_walls_fall_off_around_it(
         (FacetKind.BUILDING, 4.0, True),
         (FacetKind.STEP, 100.0, False),
         (FacetKind.GROUND, 100.0, False),
-        (FacetKind.GROUND, 500.0, True),
+        (FacetKind.GROUND, 500.0, False),
     ],
 )
-def test_an_object_is_a_surface_of_some_size_or_a_large_roof(kind: FacetKind, area_m2: float, listed: bool) -> None:
+def test_an_object_is_a_surface_of_some_size_above_the_ground(kind: FacetKind, area_m2: float, listed: bool) -> None:
     assert is_object(kind, sums_of({Sum.AREA2: round(area_m2 * 2e6)}), SETTINGS) is listed
 
 

@@ -207,9 +207,7 @@ def test_a_house_on_a_slope_of_10_degrees_is_cut_off_and_the_slope_is_drawn_unde
     terrain = terrain_under(one_point_a_cell(90, 90, z), (0, 0, 90, 90))
     assert not terrain.measured[40:50, 40:52].any()
     error = np.abs(terrain.elevation_mm - slope)
-    assert error[~terrain.measured].mean() <= 250
-    # no plane is drawn beyond the elevations of its own points: 4 m uphill from the last ground cell of a box are lost
-    assert error.max() <= 1000 * 4 * math.tan(math.radians(10.0)) + 1
+    assert error.max() <= 30
     assert error[terrain.measured].max() <= 1
 
 
@@ -219,12 +217,16 @@ def test_local_planes_agree_with_least_squares_of_numpy() -> None:
     is_ground = random.random(lowest.shape) < 0.22
     is_ground[:10, 12:24] = False
     bridge = 6
-    terrain = ground._terrain(lowest, is_ground, bridge)
+    slope = 0.15
+    terrain = ground._terrain(lowest, is_ground, bridge, slope)
     fitted = 0
     for r, c in np.ndindex(lowest.shape):
         for half in (1, 2, 4, 6):
             box = (slice(max(r - half, 0), r + half + 1), slice(max(c - half, 0), c + half + 1))
-            if is_ground[box].sum() >= 5:
+            rows, columns = np.nonzero(is_ground[box])
+            scatter = np.cov(np.stack((rows, columns)), bias=True) if len(rows) > 1 else np.zeros((2, 2))
+            carries = len(rows) >= 5 and np.linalg.det(scatter) > 0.05 * np.trace(scatter) ** 2
+            if carries or (len(rows) >= 5 and is_ground[r, c]):
                 break
         rows, columns = np.nonzero(is_ground[box])
         z = lowest[box][is_ground[box]].astype(np.float64)
@@ -233,10 +235,10 @@ def test_local_planes_agree_with_least_squares_of_numpy() -> None:
             continue
         dx, dy = columns + box[1].start - c, rows + box[0].start - r
         expected = z.mean()
-        scatter = np.cov(np.stack((dx, dy)), bias=True) if len(z) > 1 else np.zeros((2, 2))
-        if len(z) >= 5 and np.linalg.det(scatter) > 0.05 * np.trace(scatter) ** 2:
+        if carries:
             design = np.column_stack((dx, dy, np.ones(len(z))))
-            expected = np.clip(np.linalg.lstsq(design, z, rcond=None)[0][2], z.min(), z.max())
+            slack = slope * 1000 * half
+            expected = np.clip(np.linalg.lstsq(design, z, rcond=None)[0][2], z.min() - slack, z.max() + slack)
             fitted += 1
         assert terrain[r, c] == pytest.approx(expected, abs=0.51)
     assert fitted > 500
@@ -246,7 +248,7 @@ def test_terrain_ends_at_the_bridge() -> None:
     z = np.full((60, 60), 1000)
     points = one_point_a_cell(60, 60, z)
     points = points[points[:, 0] < 10_000]
-    terrain = terrain_under(points, (0, 0, 60, 60), GroundSettings(bridge_m=8))
+    terrain = terrain_under(points, (0, 0, 60, 60), GroundSettings(bridge_m=8, max_window_m=5))
     assert (terrain.elevation_mm[:, :18] == 1000).all()
     assert (terrain.elevation_mm[:, 18:] == NO_DATA).all()
 

@@ -18,9 +18,10 @@ from pipeline.runtime.join import whole_surfaces
 from pipeline.runtime.split import Split
 from pipeline.scene import ClassesInUse, SceneSettings, SplitTile, WindowPoints, lattice_of, split_tile
 from pipeline.terrain.candidates import CandidateSettings, Surfaces, Verdict, judge_surface, unite_levels
+from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.ground import NO_DATA, GroundSettings
 from pipeline.terrain.outliers import OutlierSettings
-from pipeline.terrain.surfaces import FacetKind, Fragments, Sum, SurfaceSettings
+from pipeline.terrain.surfaces import Fragments, Sum, SurfaceSettings
 from pipeline.terrain.vegetation import VegetationSettings
 from pipeline.tiling import Tile, TileGrid, Window
 

@@ -75,5 +75,5 @@ def test_any_outline_stays_valid_and_near(seed: int, spacing_m: float) -> None:
     drawn = straighten(shapely.MultiPolygon([raw]), spacing_m, SETTINGS)
     assert drawn.is_valid
     tolerance = max(SETTINGS.eave_tolerance_spacings * spacing_m, 0.2) * 1e3
-    assert shapely.symmetric_difference(drawn, raw).area <= 0.5 * tolerance * raw.length
+    assert shapely.symmetric_difference(drawn, raw).area <= 0.41 * tolerance * raw.length + raw.length
     assert np.array_equal(shapely.get_coordinates(drawn), np.rint(shapely.get_coordinates(drawn)))

@@ -131,6 +131,13 @@ def test_too_many_points_are_too_complex() -> None:
     assert "1500 points, more than maximum_points = 1000" in result.reason_detail
 
 
+def test_a_candidate_of_kilometres_is_too_complex() -> None:
+    c = gable()
+    far = np.vstack((c.points, c.points + np.array([2500.0, 0.0, 0.0])))
+    result = reconstruct_building(candidate(far), "fuzzy-sart", DEFAULTS)
+    assert (result.status, result.reason) == (Status.FAILED, Reason.TOO_COMPLEX)
+
+
 def test_without_a_plane_there_is_a_block(stub: Install) -> None:
     stub(lambda c: Segmentation(planes=(), labels=np.full(len(c.points), -1, np.int32)))
     result = reconstruct_building(gable(), "stub", DEFAULTS)

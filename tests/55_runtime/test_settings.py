@@ -66,7 +66,8 @@ def test_a_toml_file_and_the_command_line_meet(tmp_path: Path) -> None:
     assert settings.general.classes == "ignore"
     assert settings.general.tile_size_m == 200.0
     assert settings.scene.ground.max_window_m == 30
-    assert settings.halo_m == RunSettings().halo_m + 20
+    # twice ten metres for the opening, seven for the terrain under the widest roof
+    assert settings.halo_m == RunSettings().halo_m + 27
 
 
 def test_a_settings_file_that_is_no_toml_is_named(tmp_path: Path) -> None:
