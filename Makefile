@@ -18,7 +18,8 @@ COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generat
 
 # numba keeps compiled kernels per source file and does not notice when a kernel in another file changed:
 # tests therefore use a cache named after the content of all kernels.
-KERNELS = $(shell grep -rl --include='*.py' njit pipeline | LC_ALL=C sort | xargs cat | cksum | tr ' ' '-')
+KERNEL_SOURCES := $(shell grep -rl --include='*.py' njit pipeline | LC_ALL=C sort)
+KERNELS = $(shell cat $(KERNEL_SOURCES) | cksum | tr ' ' '-')
 TEST_ENV = NUMBA_CACHE_DIR="$(CURDIR)/.cache/numba/$(KERNELS)" OPENBLAS_NUM_THREADS=1
 
 .DEFAULT_GOAL := help
@@ -54,6 +55,12 @@ $(VENV)/.test-stamp: requirements-test.lock $(VENV)/.build-stamp pyproject.toml
 	$(INSTALL_SELF)
 	@touch $@ $(VENV)/.run-stamp
 
+# The kernels, compiled once by one process: two workers that meet a cold cache would both compile all of them.
+$(VENV)/.warm-stamp: $(VENV)/.run-stamp $(KERNEL_SOURCES)
+	@echo "compiling the kernels, once: about a minute"
+	@$(BIN)/gablework warm-up --quiet
+	@touch $@
+
 lock: $(VENV)/.build-stamp
 	$(COMPILE) --group test -o requirements-test.lock
 	$(COMPILE) -c requirements-test.lock -o requirements.lock
@@ -63,7 +70,7 @@ lock: $(VENV)/.build-stamp
 
 # --- the two commands ------------------------------------------------------------------------------------------------
 
-demo: $(VENV)/.run-stamp
+demo: $(VENV)/.warm-stamp
 	@$(BIN)/gablework demo --out $(OUT) --workers 2 --overwrite
 
 test: check unit

@@ -33,8 +33,9 @@ def _first_of_each(
     gps_bits: IntArray,
     source_id: npt.NDArray[np.uint16],
     classification: ByteArray,
+    return_count: ByteArray,
 ) -> BoolArray:
-    """Kernel: open addressing; of equal points the one of the lowest source, then class, stays."""
+    """Kernel: open addressing; of equal points the one of the lowest source, then class, then return count, stays."""
     n = x_mm.size
     keep = np.zeros(n, np.bool_)
     size = 2
@@ -60,9 +61,8 @@ def _first_of_each(
                 and gps_bits[i] == gps_bits[j]
             )
             if same:
-                if source_id[i] < source_id[j] or (
-                    source_id[i] == source_id[j] and classification[i] < classification[j]
-                ):
+                mine = (source_id[i], classification[i], return_count[i])
+                if mine < (source_id[j], classification[j], return_count[j]):
                     holder[s] = i
                     keep[i] = True
                     keep[j] = False
@@ -79,6 +79,7 @@ def first_of_each(
     gps_time: FloatArray,
     source_id: npt.NDArray[np.uint16],
     classification: ByteArray,
+    return_count: ByteArray,
 ) -> BoolArray:
     """Mask that keeps one of each set of equal points.
 
@@ -89,7 +90,7 @@ def first_of_each(
     ----------
     x_mm, y_mm, z_mm : (n,) int64
         Coordinates in millimetres.
-    return_number, gps_time, source_id, classification : (n,) arrays
+    return_number, gps_time, source_id, classification, return_count : (n,) arrays
         As in `PointCloud`.
 
     Returns
@@ -97,7 +98,6 @@ def first_of_each(
     (n,) bool
         True for the points that stay.
     """
-    kept: BoolArray = _first_of_each(
-        x_mm, y_mm, z_mm, return_number, np.ascontiguousarray(gps_time).view(np.int64), source_id, classification
-    )
+    gps_bits = np.ascontiguousarray(gps_time).view(np.int64)
+    kept: BoolArray = _first_of_each(x_mm, y_mm, z_mm, return_number, gps_bits, source_id, classification, return_count)
     return kept

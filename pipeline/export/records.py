@@ -93,12 +93,11 @@ REJECTED = pa.schema(
         pa.field("area_m2", pa.float64()),
         pa.field("height_m", pa.float64()),
         pa.field("n_points", pa.int64(), nullable=False),
-        pa.field("touches_data_edge", pa.bool_(), nullable=False),
         pa.field("settings_hash", pa.string(), nullable=False),
         pa.field("engine_version", pa.string(), nullable=False),
     ]
 )
-"""One row an object that was judged to be no building: its id is made as a building's, `geometry` is its outline."""
+"""One row an object that was judged to be no building: its id is made as a building's, `geometry` is its box."""
 
 KEYS: Mapping[str, tuple[str, ...]] = {
     "buildings": ("building_id",),
@@ -153,15 +152,13 @@ class RejectedObject:
     reason_detail: str
     """The measured figure and the threshold."""
     outline: Polygon | MultiPolygon | None
-    """Outline or convex hull in local metres; None where its points span no area."""
+    """Box around the object in local metres; None where its points span no area."""
     area_m2: float
     """Plan area in square metres; nan where it was not measured."""
     height_m: float
     """Height above ground in metres; nan where it was not measured."""
     n_points: int
     """Points of the object."""
-    touches_data_edge: bool = False
-    """True where the data end at the object: it may be cut."""
 
 
 def _or_none(value: float, digits: int = 3) -> float | None:
@@ -287,7 +284,6 @@ def rejected_row(rejected: RejectedObject, context: RecordContext) -> dict[str, 
         "area_m2": _or_none(rejected.area_m2),
         "height_m": _or_none(rejected.height_m),
         "n_points": rejected.n_points,
-        "touches_data_edge": rejected.touches_data_edge,
         "settings_hash": context.settings_hash,
         "engine_version": context.engine_version,
     }

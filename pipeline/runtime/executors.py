@@ -124,25 +124,28 @@ class DaskExecutor:
         from distributed import Client, LocalCluster
 
         quiet = {"distributed.admin.log-format": "%(message)s", "distributed.logging.distributed": "error"}
-        self._stack.enter_context(dask.config.set(quiet))
-        if self._scheduler is None:
-            cluster = LocalCluster(
-                n_workers=self._workers,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address="127.0.0.1:0",
-                local_directory=self._local_directory,
-                silence_logs="ERROR",
-            )
-            self._stack.enter_context(cluster)
-            self._client = self._stack.enter_context(Client(cluster))
-        else:
-            try:
-                self._client = self._stack.enter_context(Client(self._scheduler, timeout="20s"))
-            except OSError as error:
-                raise RunError(
-                    f"the scheduler {self._scheduler} does not answer: {error}. Check the address, or use --workers"
-                ) from error
+        # what was entered before a fault is left again
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(dask.config.set(quiet))
+            if self._scheduler is None:
+                cluster = LocalCluster(
+                    n_workers=self._workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address="127.0.0.1:0",
+                    local_directory=self._local_directory,
+                    silence_logs="ERROR",
+                )
+                stack.enter_context(cluster)
+                self._client = stack.enter_context(Client(cluster))
+            else:
+                try:
+                    self._client = stack.enter_context(Client(self._scheduler, timeout="20s"))
+                except OSError as error:
+                    raise RunError(
+                        f"the scheduler {self._scheduler} does not answer: {error}. Check the address, or use --workers"
+                    ) from error
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(
@@ -179,14 +182,20 @@ class DaskExecutor:
             try:
                 measured = future.result()
             except KilledWorker as error:
+                task = tasks[int(str(future.key).removeprefix(f"{stage}-").split("-")[0])]
                 raise RunError(
-                    f"stage {stage}: workers died while they ran {future.key}. Give them more memory, or set a "
-                    "smaller tile_size_m"
+                    f"stage {stage}: workers died again and again on one task: {_told(task)}. Give them more memory"
+                    + (", or set a smaller tile_size_m" if stage == "split" else "")
                 ) from error
             future.release()
             for item in itertools.islice(waiting, 1):
                 running.add(submit(*item))
             yield measured
+
+
+def _told(task: object) -> str:
+    """A task in a message: its first plain facts."""
+    return repr(task)[:300]
 
 
 def executor_for(*, workers: int, scheduler: str | None, local_directory: str) -> Executor:

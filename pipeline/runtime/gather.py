@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import hashlib
+import math
 from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
-from shapely import MultiPolygon, Polygon
 from shapely.affinity import translate
 
 from pipeline.export.records import CandidateFacts
@@ -21,7 +21,7 @@ from pipeline.terrain.ground import CELL_MM, NO_DATA
 from pipeline.tiling import MM, TileGrid, Window
 
 _GROUND_MARGIN_M = 4
-_VIEW_MARGIN_M = 10
+_VIEW_MARGIN_M = 14
 _OUTLINE_CELLS = 2
 _EMPTY_CELLS = 4
 _EDGE_CELLS = 5
@@ -100,8 +100,6 @@ def gather(
     scratch: Scratch,
     grid: TileGrid,
     site: CandidateSite,
-    footprints: tuple[Polygon | MultiPolygon, ...] | None,
-    source_ids: tuple[str, ...] | None,
     gps_kind: GpsTimeKind,
 ) -> tuple[Candidate, CandidateFacts]:
     """One candidate with the terrain around it.
@@ -112,14 +110,11 @@ def gather(
         Where the tiles' points and terrain are.
     site : CandidateSite
         Which points.
-    footprints, source_ids : tuples or None
-        The given footprints in metres and their ids.
     gps_kind : GpsTimeKind
         Whether GPS times tell dates.
     """
     points = points_of(scratch, site)
-    footprint = None if site.footprint is None or footprints is None else footprints[site.footprint]
-    source_id = None if site.footprint is None or source_ids is None else source_ids[site.footprint]
+    footprint = site.footprint
     xyz = np.column_stack((points["x"], points["y"], points["z"].astype(np.int64)))
     if len(xyz):
         low, high = xyz.min(axis=0), xyz.max(axis=0)
@@ -147,12 +142,15 @@ def gather(
             around.elevation_mm[rows, columns].astype(np.int64),
         )
     )
+    ground_z: int | None
     if outline.any():
         ground_z = int(around.elevation_mm[outline].min())
     elif len(ground_mm):
         ground_z = int(ground_mm[:, 2].min())
-    else:
+    elif len(xyz):
         ground_z = int(low[2]) - _HEIGHT_WITHOUT_TERRAIN_MM
+    else:
+        ground_z = None
     digest = hashlib.sha256(points.tobytes())
     digest.update(np.ascontiguousarray(ground_mm).tobytes())
     candidate = Candidate(
@@ -160,11 +158,11 @@ def gather(
         origin=(float(origin_mm[0] // MM), float(origin_mm[1] // MM), float(origin_mm[2] // MM)),
         points=(xyz - origin_mm) / MM,
         ground=(ground_mm - origin_mm) / MM,
-        ground_z_m=(ground_z - int(origin_mm[2])) / MM,
+        ground_z_m=math.nan if ground_z is None else (ground_z - int(origin_mm[2])) / MM,
         footprint=None
         if footprint is None
         else translate(footprint, -float(origin_mm[0] // MM), -float(origin_mm[1] // MM)),
-        source_id=source_id,
+        source_id=site.source_id,
         touches_data_edge=_touches_data_edge(roof, around.occupied),
     )
     return candidate, CandidateFacts(input_hash=digest.hexdigest(), **_acquired(points, gps_kind))

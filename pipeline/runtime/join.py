@@ -9,6 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+import shapely
+from shapely import MultiPolygon, Polygon
 
 from pipeline.model import IntArray, Reason
 from pipeline.runtime.split import Split
@@ -22,7 +24,7 @@ from pipeline.terrain.candidates import (
 )
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.surfaces import N_SUMS, Fragments, Sum
-from pipeline.tiling import Tile, TileGrid
+from pipeline.tiling import MM, Tile, TileGrid
 
 NOWHERE = 2**62
 """Coordinate of the smallest point of a surface that has none."""
@@ -51,8 +53,10 @@ class CandidateSite:
     """Its points in scratch."""
     points: int
     """How many they are."""
-    footprint: int | None = None
-    """Number of the given footprint; None where none was given."""
+    footprint: Polygon | MultiPolygon | None = None
+    """Given footprint in metres; None where none was given."""
+    source_id: str | None = None
+    """Its own id."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -293,7 +297,11 @@ def join(splits: Sequence[Split], grid: TileGrid, settings: CandidateSettings, c
 
 
 def join_footprints(
-    splits: Sequence[Split], grid: TileGrid, corners_mm: Sequence[tuple[int, int, int]], crs_name: str
+    splits: Sequence[Split],
+    grid: TileGrid,
+    footprints: Sequence[Polygon | MultiPolygon],
+    source_ids: Sequence[str],
+    crs_name: str,
 ) -> Joined:
     """The candidates where footprints were given: one a footprint, also where it holds no point.
 
@@ -303,11 +311,10 @@ def join_footprints(
         All tiles, in any order.
     grid : TileGrid
         The lattice, for the owners.
-    corners_mm : sequence of tuple of int
-        A point of each footprint that stands in for its smallest point where it holds none; its third value
-        is the footprint's number, so that equal corners differ.
+    footprints, source_ids : sequences
+        The given outlines in metres, in the order of their numbers, and their own ids.
     crs_name : str
-        Goes into the ids.
+        Goes into the ids. A footprint without points is named by its smallest corner and its own id.
     """
     splits = sorted(splits, key=lambda s: s.tile)
     numbers = {(t, key): key for t, s in enumerate(splits) for key in s.keys.tolist()}
@@ -317,16 +324,20 @@ def join_footprints(
         for key, point in zip(s.keys.tolist(), s.lowest_points_mm.tolist(), strict=True):
             lowest[key] = min(lowest.get(key, tuple(point)), tuple(point))
     candidates = []
-    for number, corner in enumerate(corners_mm):
-        point = lowest.get(number, corner)
+    for number, (footprint, source_id) in enumerate(zip(footprints, source_ids, strict=True)):
+        name, point = crs_name, lowest.get(number)
+        if point is None:
+            corner = min(map(tuple, shapely.get_coordinates(footprint).tolist()))
+            name, point = f"{crs_name}|{source_id}", (round(corner[0] * MM), round(corner[1] * MM), 0)
         found = ranges.get(number, [])
         candidates.append(
             CandidateSite(
-                building_id=object_id(crs_name, point),
+                building_id=object_id(name, point),
                 owner=grid.tile_of(point[0], point[1]),
                 ranges=tuple(found),
                 points=sum(r.stop - r.start for r in found),
-                footprint=number,
+                footprint=footprint,
+                source_id=source_id,
             )
         )
     return Joined(

@@ -35,6 +35,8 @@ class RunStatus(StrEnum):
     """All tiles are published."""
     INCOMPLETE = "incomplete"
     """Ended, but some tiles failed."""
+    FAILED = "failed"
+    """Ended with an error, told in `warnings`; what is there is not to be used."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -70,7 +72,7 @@ class RunManifest:
     finished_at: dt.datetime | None = None
     """With a time zone; None while running."""
     crs: Mapping[str, Any] | None = None
-    """epsg, name, wkt, horizontal_unit_m, vertical_unit_m of the outputs; None where unknown and in metres."""
+    """epsg, name, wkt, horizontal_unit_m, vertical_unit_m of the outputs; wkt is None where it is unknown."""
     inputs: tuple[InputFile, ...] = ()
     """Point clouds and footprints."""
     source_licence: str | None = None

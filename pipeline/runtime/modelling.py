@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Sequence
-
-from shapely import MultiPolygon, Polygon
 
 from pipeline.export.records import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.methods import ReconstructSettings
-from pipeline.model import BuildingResult
+from pipeline.model import BuildingResult, Reason, RoofType, Status
 from pipeline.reconstruct import reconstruct_building
 from pipeline.runtime.gather import gather
 from pipeline.runtime.join import CandidateSite
@@ -20,16 +19,6 @@ from pipeline.tiling import Tile, TileGrid
 
 _POINTS_PER_BATCH = 20_000
 _MAX_PER_BATCH = 64
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Footprints:
-    """Given footprints as the workers need them."""
-
-    polygons: tuple[Polygon | MultiPolygon, ...]
-    """In metres of the CRS."""
-    ids: tuple[str, ...]
-    """Their own ids."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,8 +35,6 @@ class BatchTask:
     """Its settings and those of the roof."""
     grid: TileGrid
     scratch: Scratch
-    footprints: str | None
-    """Name of the stored footprints' `Footprints`; None where none were given."""
     gps_kind: GpsTimeKind
     """Whether GPS times tell dates."""
 
@@ -96,24 +83,53 @@ def batches(sites: Sequence[CandidateSite]) -> list[tuple[CandidateSite, ...]]:
     return groups
 
 
+def _model(task: BatchTask, site: CandidateSite) -> tuple[BuildingResult, CandidateFacts]:
+    """One candidate's result; a fault of its own becomes its record, and only the loss of scratch is the run's."""
+    try:
+        candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind)
+        return reconstruct_building(candidate, task.method, task.settings), facts
+    except MemoryError as error:
+        return failed_site(site, task.method, f"memory ran out: {error}"), CandidateFacts()
+    except OSError:
+        raise
+    except Exception as error:  # noqa: BLE001 - told in the record
+        return failed_site(site, task.method, f"{type(error).__name__}: {error}"), CandidateFacts()
+
+
+def failed_site(site: CandidateSite, method: str, detail: str) -> BuildingResult:
+    """The record of a candidate that could not even be put together."""
+    return BuildingResult(
+        building_id=site.building_id,
+        origin=(0.0, 0.0, 0.0),
+        source_id=site.source_id,
+        status=Status.FAILED,
+        reason=Reason.INTERNAL_ERROR,
+        reason_detail=detail,
+        method=method,
+        roof_type=RoofType.NONE,
+        lod="",
+        footprint=site.footprint,
+        planes=(),
+        faces=(),
+        solids=(),
+        validity_codes=(),
+        ground_z_m=math.nan,
+        n_points=site.points,
+        density_per_m2=math.nan,
+        rmse_m=math.nan,
+        p95_m=math.nan,
+        coverage=0.0,
+        touches_data_edge=False,
+    )
+
+
 def model_batch(task: BatchTask) -> tuple[Modelled, ...]:
     """Model a batch; the results are stored under `results/<tile>/<batch>` for their tiles to publish."""
-    footprints: Footprints | None = None
-    if task.footprints is not None:
-        footprints = task.scratch.get_object(task.footprints)
     by_tile: dict[Tile, list[StoredResult]] = {}
     told = []
     for site in task.sites:
         started = time.perf_counter()
-        candidate, facts = gather(
-            task.scratch,
-            task.grid,
-            site,
-            None if footprints is None else footprints.polygons,
-            None if footprints is None else footprints.ids,
-            task.gps_kind,
-        )
-        result = reconstruct_building(candidate, task.method, task.settings)
+        result, facts = _model(task, site)
         by_tile.setdefault(site.owner, []).append(StoredResult(result=result, facts=facts))
         told.append(
             Modelled(

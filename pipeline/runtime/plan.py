@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from pipeline.errors import CrsError, InputError
 from pipeline.io import ReadOptions, SourceInfo, open_source
 from pipeline.settings import RunSettings
-from pipeline.tiling import MM, TileGrid
+from pipeline.tiling import MM, Tile, TileGrid
 
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
 _POINTS_PER_WINDOW = 12_000_000
@@ -129,3 +129,42 @@ def check_memory(plan: Plan, limit_bytes: int | None) -> None:
         f"its limit is {limit_bytes / 1e9:.1f} GB",
         "Set a smaller tile_size_m, or give the workers more memory",
     )
+
+
+def check_windows(plan: Plan, points_by_tile: Mapping[Tile, int], limit_bytes: int | None) -> None:
+    """Refuse tiles whose windows hold more points than a worker can, now that the points are counted.
+
+    Headers can claim wide bounds and hide dense corners, so the plan's own check is not the last word.
+
+    Parameters
+    ----------
+    plan : Plan
+        The plan.
+    points_by_tile : mapping
+        Points of each tile.
+    limit_bytes : int or None
+        A worker's memory limit; None where there is none.
+
+    Raises
+    ------
+    InputError
+        Naming the tile, its points and the fix.
+    """
+    if limit_bytes is None:
+        return
+    area = plan.grid.size_mm**2
+    for tile in points_by_tile:
+        window = plan.grid.window(tile)
+        seen = 0.0
+        for other in plan.grid.tiles_over(window):
+            core = plan.grid.core(other)
+            width = min(core.x1_mm, window.x1_mm) - max(core.x0_mm, window.x0_mm)
+            depth = min(core.y1_mm, window.y1_mm) - max(core.y0_mm, window.y0_mm)
+            seen += points_by_tile.get(other, 0) * (width * depth / area)
+        if seen * _BYTES_PER_POINT > limit_bytes:
+            raise InputError(
+                plan.sources[0].path,
+                f"tile {tile.key} and its halo hold about {seen:.0f} points, more than a worker's "
+                f"{limit_bytes / 1e9:.1f} GB can take",
+                "Set a smaller tile_size_m, or give the workers more memory",
+            )

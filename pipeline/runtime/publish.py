@@ -32,10 +32,12 @@ class PublishTask:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Published:
-    """One tile's files."""
+    """One tile's files, or why there are none."""
 
     tile: Tile
-    files: TileFiles
+    files: TileFiles | None
+    error: str = ""
+    """Why the tile failed; empty where it did not."""
 
 
 def _rejected_object(site: RejectedSite) -> RejectedObject:
@@ -58,12 +60,35 @@ def _rejected_object(site: RejectedSite) -> RejectedObject:
 
 
 def publish(task: PublishTask) -> Published:
-    """Write one tile's tables, meshes and city objects, then its state; may run twice."""
+    """Write one tile's tables, meshes and city objects, then its state; may run twice.
+
+    A tile that fails costs only itself: its state says so, and why. A tile that owns nothing has a state and no files.
+    """
+    put = put_local(task.run_dir)
+    files: TileFiles | None = None
+    error = ""
+    try:
+        if task.batches or task.rejected:
+            files = _write(task)
+    except Exception as fault:  # noqa: BLE001 - told in the tile's state, the manifest and the exit code
+        error = f"{type(fault).__name__}: {fault}"
+    state = {
+        "tile": task.tile.key,
+        "state": "failed" if error else "done",
+        "error": error,
+        "files": {} if files is None else dict(files.digests),
+    }
+    put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
+    return Published(tile=task.tile, files=files, error=error)
+
+
+def _write(task: PublishTask) -> TileFiles:
+    """Write the files of a tile that owns something."""
     stored: list[StoredResult] = []
     for number in task.batches:
         stored.extend(task.scratch.get_object(f"results/{task.tile.key}/{number}.pickle"))
     context = dataclasses.replace(task.context, facts={entry.result.building_id: entry.facts for entry in stored})
-    files = write_tile(
+    return write_tile(
         task.run_dir,
         task.tile.key,
         [entry.result for entry in stored],
@@ -71,6 +96,3 @@ def publish(task: PublishTask) -> Published:
         context,
         meshes=task.meshes,
     )
-    state = {"tile": task.tile.key, "state": "done", "files": dict(files.digests)}
-    put_local(task.run_dir)(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
-    return Published(tile=task.tile, files=files)

@@ -20,15 +20,16 @@ from pipeline.runtime.events import Listener, ignore
 from pipeline.runtime.executors import Executor, executor_for, peak_of_process
 from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.join import Joined
-from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_manifest
+from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, write_manifest
 from pipeline.runtime.modelling import Modelled
 from pipeline.runtime.plan import Plan, check_memory, make_plan
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.split import Split
-from pipeline.runtime.stages import Progress, Stages
+from pipeline.runtime.stages import Progress, Stages, given_footprints
 from pipeline.settings import RunSettings
 
-_OWN_FOLDERS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state", "scratch")
+_RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state")
+_SCRATCH = "scratch"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -122,8 +123,11 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
     began = time.perf_counter()
     progress.tell("run", "plan", f"run into {request.out}")
     plan, paths = _plan(request, progress)
-    run_dir = _prepared(request)
-    scratch = Scratch(str(run_dir / "scratch"))
+    footprints = None if request.footprints is None else given_footprints(request.footprints, plan)
+    for warning in () if footprints is None else footprints.warnings:
+        progress.warn("plan", warning)
+    run_dir = _checked(request)
+    scratch = Scratch(str(run_dir / _SCRATCH))
     reference = plan.sources[0].reference
     manifest = RunManifest(
         status=RunStatus.RUNNING,
@@ -135,31 +139,36 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
         crs=_crs_facts(reference),
         source_licence=request.licence,
     )
-    write_manifest(run_dir, manifest)
     progress.timings["plan"] = time.perf_counter() - began
     engine = executor or executor_for(
-        workers=request.workers, scheduler=request.scheduler, local_directory=str(run_dir / "scratch" / "dask")
+        workers=request.workers, scheduler=request.scheduler, local_directory=str(run_dir / _SCRATCH / "dask")
     )
     try:
         starting = time.perf_counter()
         with engine:
             progress.timings["start workers"] = time.perf_counter() - starting
             check_memory(plan, engine.memory_limit_bytes)
+            # nothing of an earlier run goes before all that can be checked is checked
+            _clear_results(run_dir)
+            write_manifest(run_dir, manifest)
             stages = Stages(
                 settings=request.settings,
-                footprints_path=request.footprints,
                 meshes=request.meshes,
                 plan=plan,
                 progress=progress,
                 executor=engine,
                 scratch=scratch,
             )
-            ingested = stages.ingest(paths)
-            footprints = stages.read_footprints(reference)
-            splits = stages.split(ingested, footprints)
-            joined = stages.join(splits, footprints, reference)
-            modelled = stages.reconstruct(joined, footprints)
-            tiles = stages.publish(joined, modelled, reference, str(run_dir))
+            try:
+                ingested = stages.ingest(paths)
+                splits = stages.split(ingested, footprints)
+                joined = stages.join(splits, footprints, reference)
+                modelled = stages.reconstruct(joined)
+                tiles, failed_tiles = stages.publish(splits, joined, modelled, reference, str(run_dir))
+            except BaseException as error:
+                told = (*progress.warnings, f"{type(error).__name__}: {error}")
+                write_manifest(run_dir, dataclasses.replace(manifest, status=RunStatus.FAILED, warnings=told))
+                raise
     finally:
         scratch.clear()
     finishing = time.perf_counter()
@@ -185,10 +194,11 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
         run_dir,
         dataclasses.replace(
             manifest,
-            status=RunStatus.FINISHED,
+            status=RunStatus.INCOMPLETE if failed_tiles else RunStatus.FINISHED,
             finished_at=dt.datetime.now(tz=dt.UTC),
             inputs=tuple(inputs),
             tiles=tuple(tiles),
+            failed_tiles=tuple(failed_tiles),
             counts=counts,
             timings_s={name: round(seconds, 3) for name, seconds in progress.timings.items()},
             peak_memory_bytes=progress.peaks,
@@ -208,12 +218,14 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
         timings_s=progress.timings,
         peak_memory_bytes=progress.peaks,
         warnings=tuple(progress.warnings),
+        failed_tiles=tuple(failed_tiles),
     )
 
 
 def _plan(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
     """The plan and the input files in order."""
-    paths = sorted(str(path) for path in find_inputs(request.inputs))
+    # workers elsewhere do not share this process's folder
+    paths = sorted(str(path.absolute()) for path in find_inputs(request.inputs))
     options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit, bbox=request.bbox)
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
@@ -223,32 +235,48 @@ def _plan(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
         progress.warn("plan", warning)
     if not any(info.has_returns for info in plan.sources):
         progress.warn("plan", "the inputs have one return a pulse: vegetation is told by its roughness alone")
-    if not any(info.has_classes for info in plan.sources) and request.settings.general.classes == "trust":
-        progress.warn("plan", "the inputs have no classes: ground and buildings are found in the points alone")
     return plan, paths
 
 
-def _prepared(request: RunRequest) -> Path:
-    """The run directory, without what an earlier run left in it.
+def _checked(request: RunRequest) -> Path:
+    """The run directory, which may be written.
 
     Raises
     ------
     RunError
-        It holds something and `overwrite` is not asked for, or it cannot be written.
+        It holds something and `overwrite` is not asked for, it is no local path, or it cannot be written.
     """
-    run_dir = Path(request.out)
+    if "://" in request.out:
+        raise RunError(f"{request.out} is no local path: this version writes local run directories only")
+    run_dir = Path(request.out).absolute()
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
-        left = [entry.name for entry in run_dir.iterdir()]
+        left = sorted(entry.name for entry in run_dir.iterdir())
         if left and not request.overwrite:
             raise RunError(f"{run_dir} is not empty ({left[0]} …): give another --out, or --overwrite")
-        if left and "run.json" not in left:
+        if left and NAME not in left:
             raise RunError(f"{run_dir} holds {left[0]} and no run.json, so it is no run: give another --out")
-        for name in _OWN_FOLDERS:
-            shutil.rmtree(run_dir / name, ignore_errors=True)
+        if _SCRATCH in left:
+            shutil.rmtree(run_dir / _SCRATCH)
     except OSError as error:
         raise RunError(f"{run_dir} cannot be written: {error.strerror or error}. Give another --out") from error
     return run_dir
+
+
+def _clear_results(run_dir: Path) -> None:
+    """Remove what an earlier run left.
+
+    Raises
+    ------
+    RunError
+        Something cannot be removed.
+    """
+    for name in _RESULTS:
+        try:
+            if (run_dir / name).exists():
+                shutil.rmtree(run_dir / name)
+        except OSError as error:
+            raise RunError(f"{run_dir / name} cannot be removed: {error.strerror or error}") from error
 
 
 def _crs_facts(reference: SpatialReference) -> dict[str, object]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import shapely
+from shapely import MultiPolygon, Polygon
 
 from pipeline.model import BoolArray
 from pipeline.runtime.scratch import POINT, Scratch
@@ -44,8 +45,8 @@ class SplitTask:
     """Which of the file's classes are believed."""
     scratch: Scratch
     """Points in, fragments out."""
-    footprints: str | None
-    """Name of the stored footprints in scratch; None where none were given."""
+    footprints: tuple[tuple[int, Polygon | MultiPolygon], ...] | None
+    """Numbers and outlines in metres of the given footprints that meet the tile; None where none were given."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,6 +98,7 @@ def _without_duplicates(records: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
         np.ascontiguousarray(records["gps_time"]),
         np.ascontiguousarray(records["source"]),
         np.ascontiguousarray(records["classification"]),
+        np.ascontiguousarray(records["return_count"]),
     )
     return records if kept.all() else records[kept]
 
@@ -104,8 +106,8 @@ def _without_duplicates(records: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
 def load_window(scratch: Scratch, grid: TileGrid, tile: Tile) -> LoadedWindow:
     """Read the core and its halo.
 
-    The halo keeps its exact duplicates: lowest and highest points are the same with them. Only its few needed
-    columns are held, since a halo can be many times its core.
+    Equal points share a tile, so each tile's buckets are freed of duplicates on their own. Of the halo only the few
+    needed columns are held, since it can be many times its core.
     """
     window = grid.window(tile)
     own = [np.fromfile(part, POINT) for part in _parts(scratch, tile)]
@@ -117,9 +119,9 @@ def load_window(scratch: Scratch, grid: TileGrid, tile: Tile) -> LoadedWindow:
     for other in grid.tiles_over(window):
         if other == tile:
             continue
-        for part in _parts(scratch, other):
-            records = np.fromfile(part, POINT)
-            records = records[window.contains(records["x"], records["y"])]
+        seen = [_inside(np.fromfile(part, POINT), window) for part in _parts(scratch, other)]
+        if seen:
+            records = _without_duplicates(np.concatenate(seen))
             for name, pieces in columns.items():
                 pieces.append(np.ascontiguousarray(records[name]))
     whole = {}
@@ -134,6 +136,11 @@ def load_window(scratch: Scratch, grid: TileGrid, tile: Tile) -> LoadedWindow:
         classification=whole["classification"],
     )
     return LoadedWindow(points=points, core=core, duplicates=duplicates)
+
+
+def _inside(records: npt.NDArray[np.void], window: Window) -> npt.NDArray[np.void]:
+    """The records of a window."""
+    return records[window.contains(records["x"], records["y"])]
 
 
 def _parts(scratch: Scratch, tile: Tile) -> list[Path]:
@@ -223,7 +230,6 @@ def _inside_footprints(
 
     Inside a footprint all points above the ground count, or those of class 6 where it is believed.
     """
-    polygons = task.scratch.get_object(task.footprints or "").polygons
     index = np.flatnonzero(usable)
     owner = np.full(len(index), -1, np.int64)
     x, y = points.x_mm[index], points.y_mm[index]
@@ -233,12 +239,8 @@ def _inside_footprints(
         above = points.classification[index] == BUILDING_CLASS
     elif task.classes.ground:
         above &= points.classification[index] != GROUND_CLASS
-    core = task.grid.core(task.tile)
-    tree = shapely.STRtree(polygons)
-    box = shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM)
     # the smaller number wins where footprints overlap, whatever the tile
-    for number in sorted((int(k) for k in tree.query(box)), reverse=True):
-        polygon = polygons[number]
+    for number, polygon in sorted(task.footprints or (), key=lambda item: item[0], reverse=True):
         x0, y0, x1, y1 = (round(v * MM) for v in polygon.bounds)
         near = np.flatnonzero(above & (x >= x0 - 1) & (x <= x1 + 1) & (y >= y0 - 1) & (y <= y1 + 1))
         if len(near):

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import shapely
+from shapely import MultiPolygon, Polygon
 
 from pipeline import __version__
 from pipeline.errors import EmptyInputError, InconsistentInputError
@@ -20,8 +21,8 @@ from pipeline.runtime.events import Event, EventKind, Listener
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.ingest import Ingested, IngestTask, ingest, spread_m
 from pipeline.runtime.join import Joined, RejectedSite, join, join_footprints
-from pipeline.runtime.modelling import BatchTask, Footprints, Modelled, batches, model_batch
-from pipeline.runtime.plan import Plan
+from pipeline.runtime.modelling import BatchTask, Modelled, batches, model_batch
+from pipeline.runtime.plan import Plan, check_windows
 from pipeline.runtime.publish import PublishTask, publish
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.split import Split, SplitTask, split
@@ -33,7 +34,78 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _LINE_SPREAD_M = 0.05
-_FOOTPRINTS = "footprints.pickle"
+_CLASSIFIED_SHARE = 0.05
+"""Least share of ground points (class 2) from which a file counts as classified."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GivenFootprints:
+    """Given outlines that meet the data, in an order that does not depend on the file's."""
+
+    polygons: tuple[Polygon | MultiPolygon, ...]
+    """In metres of the CRS."""
+    ids: tuple[str, ...]
+    """Their own ids."""
+    warnings: tuple[str, ...]
+    """What is odd but usable."""
+
+
+def given_footprints(path: str, plan: Plan) -> GivenFootprints:
+    """Read the footprints of a run.
+
+    Parameters
+    ----------
+    path : str
+        A vector file.
+    plan : Plan
+        Tells where data are wanted: the inputs' bounds, cut by --bbox and --aoi.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used.
+    """
+    found = read_footprints(path, plan.sources[0].reference)
+    area = shapely.union_all([shapely.box(*i.bounds_m[:2], *i.bounds_m[3:5]) for i in plan.sources])
+    unit = plan.sources[0].reference.horizontal_unit_m
+    if plan.options.bbox is not None:
+        area &= shapely.box(*(v * unit for v in plan.options.bbox))
+    if plan.options.aoi is not None:
+        area &= shapely.transform(plan.options.aoi, lambda xy: xy * unit)
+    inside = [k for k, polygon in enumerate(found.polygons) if polygon.intersects(area)]
+    warnings = list(found.warnings)
+    if len(inside) < len(found.polygons):
+        warnings.append(f"{len(found.polygons) - len(inside)} of {len(found.polygons)} footprints lie off the data")
+    # overlaps are decided by this order
+    inside.sort(key=lambda k: (found.polygons[k].bounds, found.ids[k]))
+    return GivenFootprints(
+        polygons=tuple(found.polygons[k] for k in inside),
+        ids=tuple(found.ids[k] for k in inside),
+        warnings=tuple(warnings),
+    )
+
+
+def classes_in_use(ingested: Sequence[Ingested], *, trust: bool) -> tuple[ClassesInUse, str]:
+    """Which classes are believed, and a sentence on why.
+
+    Ground and buildings are believed only where every input is classified: in each at least 5 % of the points are
+    ground. A file with stray codes, or one that was never classified, is not taken at its word.
+    """
+    if not trust:
+        return ClassesInUse(), ""
+    bare = [
+        found.index
+        for found in ingested
+        if found.classes and found.classes.get(GROUND_CLASS, 0) < _CLASSIFIED_SHARE * sum(found.classes.values())
+    ]
+    if bare:
+        some = len(bare) < len(ingested) or any(
+            found.classes.get(code, 0) for found in ingested for code in (GROUND_CLASS, BUILDING_CLASS)
+        )
+        told = "the inputs have no classes" if not some else f"{len(bare)} of {len(ingested)} inputs are not classified"
+        return ClassesInUse(), f"{told}: ground and buildings are found in the points alone"
+    buildings = any(found.classes.get(BUILDING_CLASS, 0) for found in ingested)
+    return ClassesInUse(ground=True, building=buildings), ""
 
 
 class Progress:
@@ -92,7 +164,6 @@ class Stages:
     """The stages of one run, each a map over tasks or a step of the driver."""
 
     settings: RunSettings
-    footprints_path: str | None
     meshes: str
     plan: Plan
     progress: Progress
@@ -116,7 +187,9 @@ class Stages:
                 causes.update(found.dropped)
             told = ", ".join(f"{count} {cause}" for cause, count in causes.items() if count)
             raise EmptyInputError(
-                paths[0], f"no usable point is left ({told or 'none in the files'})", "Check --bbox, --aoi and classes"
+                paths[0],
+                f"no usable point is left ({told or 'none in the files'})",
+                "Check --bbox and --aoi; points that are withheld or of the noise classes 7 and 18 are never used",
             )
         spread = spread_m(ingested)
         if spread < _LINE_SPREAD_M:
@@ -127,40 +200,22 @@ class Stages:
             )
         return ingested
 
-    def read_footprints(self, reference: SpatialReference) -> Footprints | None:
-        """The given footprints, stored for the workers."""
-        if self.footprints_path is None:
-            return None
-        found = read_footprints(self.footprints_path, reference)
-        for warning in found.warnings:
-            self.progress.warn("split", warning)
-        low_x, low_y = min(i.bounds_m[0] for i in self.plan.sources), min(i.bounds_m[1] for i in self.plan.sources)
-        high_x, high_y = max(i.bounds_m[3] for i in self.plan.sources), max(i.bounds_m[4] for i in self.plan.sources)
-        box = shapely.box(low_x, low_y, high_x, high_y)
-        inside = [k for k, polygon in enumerate(found.polygons) if polygon.intersects(box)]
-        if len(inside) < len(found.polygons):
-            self.progress.warn(
-                "split", f"{len(found.polygons) - len(inside)} of {len(found.polygons)} footprints lie off the data"
-            )
-        # one order, whatever the file's: overlaps are decided by it
-        inside.sort(key=lambda k: (found.polygons[k].bounds, found.ids[k]))
-        footprints = Footprints(
-            polygons=tuple(found.polygons[k] for k in inside), ids=tuple(found.ids[k] for k in inside)
-        )
-        self.scratch.put_object(_FOOTPRINTS, footprints)
-        return footprints
-
-    def split(self, ingested: Sequence[Ingested], footprints: Footprints | None) -> list[Split]:
+    def split(self, ingested: Sequence[Ingested], footprints: GivenFootprints | None) -> list[Split]:
         """Fragments of all tiles."""
-        histogram: Counter[int] = Counter()
         tiles: Counter[Tile] = Counter()
         for found in ingested:
-            histogram.update(found.classes)
             tiles.update(found.points_by_tile)
-        trust = self.settings.general.classes == "trust"
-        classes = ClassesInUse(
-            ground=trust and histogram[GROUND_CLASS] > 0, building=trust and histogram[BUILDING_CLASS] > 0
-        )
+        check_windows(self.plan, tiles, self.executor.memory_limit_bytes)
+        classes, told = classes_in_use(ingested, trust=self.settings.general.classes == "trust")
+        if told:
+            self.progress.warn("split", told)
+        numbers_of: dict[Tile, list[int]] = {}
+        if footprints is not None:
+            tree = shapely.STRtree(footprints.polygons)
+            for tile in tiles:
+                core = self.plan.grid.core(tile)
+                box = shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM)
+                numbers_of[tile] = sorted(int(k) for k in tree.query(box))
         tasks = [
             SplitTask(
                 tile=tile,
@@ -168,7 +223,7 @@ class Stages:
                 settings=self.settings.scene,
                 classes=classes,
                 scratch=self.scratch,
-                footprints=None if footprints is None else _FOOTPRINTS,
+                footprints=None if footprints is None else tuple((k, footprints.polygons[k]) for k in numbers_of[tile]),
             )
             # the fullest first, so that no long task is left for the end
             for tile, _ in sorted(tiles.items(), key=lambda item: (-item[1], item[0]))
@@ -181,7 +236,7 @@ class Stages:
             self.progress.warn("split", f"{outliers} gross outliers were left out")
         return splits
 
-    def join(self, splits: Sequence[Split], footprints: Footprints | None, reference: SpatialReference) -> Joined:
+    def join(self, splits: Sequence[Split], footprints: GivenFootprints | None, reference: SpatialReference) -> Joined:
         """Whole surfaces, judged."""
         started = time.perf_counter()
         self.progress.tell("stage", "join", total=1)
@@ -189,16 +244,12 @@ class Stages:
         if footprints is None:
             joined = join(splits, self.plan.grid, self.settings.scene.candidates, crs_name)
         else:
-            corners = []
-            for number, polygon in enumerate(footprints.polygons):
-                x, y = min(map(tuple, shapely.get_coordinates(polygon).tolist()))
-                corners.append((round(x * MM), round(y * MM), number))
-            joined = join_footprints(splits, self.plan.grid, corners, crs_name)
+            joined = join_footprints(splits, self.plan.grid, footprints.polygons, footprints.ids, crs_name)
         self.progress.timings["join"] = time.perf_counter() - started
         self.progress.tell("progress", "join", done=1, total=1, message=f"{len(joined.candidates)} candidates")
         return joined
 
-    def reconstruct(self, joined: Joined, footprints: Footprints | None) -> list[Modelled]:
+    def reconstruct(self, joined: Joined) -> list[Modelled]:
         """All candidates, largest first."""
         kinds = {info.gps_time_kind for info in self.plan.sources}
         kind = kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
@@ -210,7 +261,6 @@ class Stages:
                 settings=self.settings.building,
                 grid=self.plan.grid,
                 scratch=self.scratch,
-                footprints=None if footprints is None else _FOOTPRINTS,
                 gps_kind=kind,
             )
             for number, sites in enumerate(batches(joined.candidates))
@@ -221,9 +271,14 @@ class Stages:
         return [building for part in parts for building in part]
 
     def publish(
-        self, joined: Joined, modelled: Sequence[Modelled], reference: SpatialReference, run_dir: str
-    ) -> list[str]:
-        """Write every tile that owns something; their keys."""
+        self,
+        splits: Sequence[Split],
+        joined: Joined,
+        modelled: Sequence[Modelled],
+        reference: SpatialReference,
+        run_dir: str,
+    ) -> tuple[list[str], list[str]]:
+        """Write every tile; the keys of all, and of those that failed."""
         batch_of = {
             site.building_id: number for number, sites in enumerate(batches(joined.candidates)) for site in sites
         }
@@ -233,7 +288,7 @@ class Stages:
         rejected: dict[Tile, list[RejectedSite]] = {}
         for site in joined.rejected:
             rejected.setdefault(site.owner, []).append(site)
-        owners = sorted({*numbers, *rejected})
+        owners = sorted({*numbers, *rejected, *(s.tile for s in splits)})
         times = [(i.acquired_from, i.acquired_to) for i in self.plan.sources]
         known = [(a, b) for a, b in times if a is not None and b is not None]
         context = RecordContext(
@@ -256,4 +311,8 @@ class Stages:
             for tile in owners
         ]
         published = self.progress.stage(self.executor, "publish", publish, tasks)
-        return sorted(p.tile.key for p in published)
+        failed = sorted(p.tile.key for p in published if p.error)
+        for p in published:
+            if p.error:
+                self.progress.warn("publish", f"tile {p.tile.key} failed: {p.error}")
+        return sorted(p.tile.key for p in published), failed

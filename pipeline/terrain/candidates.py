@@ -55,6 +55,9 @@ class CandidateSettings(Parameters):
         minimum=0.1,
         maximum=1.0,
     )
+    unite_reach_m: float = parameter(
+        3.0, "Farthest that this roof may be, between the boxes around both.", unit="m", minimum=0.0, maximum=50.0
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -189,22 +192,40 @@ def unite_levels(surfaces: Surfaces, verdicts: list[Verdict | None], settings: C
     """
     count = len(surfaces.kind)
     leader = np.array([k if verdicts[k] is None else -1 for k in range(count)], np.int64)
-    by_step: dict[int, list[int]] = {}
+    # the largest first; equal areas by the smallest point, so that numbering does not matter
+    order = np.lexsort((*surfaces.lowest_point_mm.T[::-1], -surfaces.sums[:, Sum.AREA2]))
+    rank = np.empty(count, np.int64)
+    rank[order] = np.arange(count)
+    roofs_at: dict[int, list[int]] = {}
     steps_of: dict[int, list[int]] = {}
     for surface, step, _length in surfaces.along_steps.tolist():
-        by_step.setdefault(step, []).append(surface)
         steps_of.setdefault(surface, []).append(step)
-
-    def rank(k: int) -> tuple[int, tuple[int, ...]]:
-        # the largest first; equal areas by the smallest point, so that numbering does not matter
-        return -int(surfaces.sums[k, Sum.AREA2]), tuple(surfaces.lowest_point_mm[k].tolist())
-
+        if verdicts[surface] is None:
+            roofs_at.setdefault(step, []).append(surface)
+    ranked = {step: np.array(sorted(roofs, key=lambda k: rank[k]), np.int64) for step, roofs in roofs_at.items()}
+    reach_mm = round(settings.unite_reach_m * 1000)
     for k in sorted(steps_of):
         if not _joins(int(surfaces.kind[k]), surfaces.sums[k], verdicts[k], settings):
             continue
-        beside = {s for step in steps_of[k] for s in by_step[step] if verdicts[s] is None and rank(s) < rank(k)}
-        if beside:
-            leader[k] = min(beside, key=rank)
+        x0, y0, x1, y1 = (int(v) for v in surfaces.boxes_mm[k])
+        best = -1
+        for step in steps_of[k]:
+            roofs = ranked.get(step, np.empty(0, np.int64))
+            boxes = surfaces.boxes_mm[roofs]
+            # one step can run through a whole town: only roofs that come near count
+            near = (
+                (boxes[:, 0] <= x1 + reach_mm)
+                & (boxes[:, 2] >= x0 - reach_mm)
+                & (boxes[:, 1] <= y1 + reach_mm)
+                & (boxes[:, 3] >= y0 - reach_mm)
+                & (rank[roofs] < rank[k])
+            )
+            if near.any():
+                first = int(roofs[int(near.argmax())])
+                if best < 0 or rank[first] < rank[best]:
+                    best = first
+        if best >= 0:
+            leader[k] = best
     # a leader may itself have joined a larger one: follow to the end; ranks strictly fall, so there is no cycle
     for k in range(count):
         top = int(leader[k])

@@ -16,7 +16,7 @@ from pipeline.model import BoolArray, IntArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.spatial_hash import slot_of_key
 
-# 21 bits a coordinate pack a cube into one key: 2^21 cubes of 4 m are 8000 km, more than any CRS spans.
+# 21 bits a coordinate pack a cube into one key: 2^21 cubes are wider than any tile with its halo.
 _BITS = 21
 _EMPTY = -1
 

@@ -30,7 +30,14 @@ rows = st.lists(
 def kept_of(table: Rows) -> BoolArray:
     x, y, z, number, time, source, class_ = (np.ascontiguousarray(column) for column in table.reshape(-1, 7).T)
     return first_of_each(
-        x, y, z, number.astype(np.uint8), time / 3.0, source.astype(np.uint16), class_.astype(np.uint8)
+        x,
+        y,
+        z,
+        number.astype(np.uint8),
+        time / 3.0,
+        source.astype(np.uint16),
+        class_.astype(np.uint8),
+        np.ones(len(x), np.uint8),
     )
 
 

@@ -323,7 +323,7 @@ def test_contradicting_settings_of_all_stages_are_named_at_once() -> None:
 
 
 @pytest.mark.slow
-def test_a_city_block_of_100_000_points_costs_no_more_a_point_than_a_house() -> None:
+def test_a_city_block_of_100_000_points_is_segmented_whole() -> None:
     house, _ = gable(density=8.0)
     copies = [house.points + np.array([24.0 * i, 20.0 * j, 0]) for i in range(11) for j in range(10)]
     points = np.concatenate(copies)

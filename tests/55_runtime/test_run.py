@@ -6,13 +6,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 import pyarrow.dataset as ds
 import pytest
 import shapely
 
 import pipeline.reconstruct
-from pipeline.errors import EmptyInputError, InconsistentInputError, RunError
+import pipeline.runtime.publish
+from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, RunError
 from pipeline.runtime.events import Event
 from pipeline.runtime.run import RunRequest, run
 from pipeline.settings import RunSettings
@@ -127,8 +129,6 @@ def test_progress_is_told_by_stage_and_never_runs_backwards(suburb: Path, tmp_pa
 
 
 def test_one_return_only_and_no_classes_are_used_and_told(tmp_path: Path, suburb: Path, reconstruct: Any) -> None:
-    import laspy
-
     las = laspy.read(suburb)
     first = np.asarray(las.return_number) == 1
     path = tmp_path / "first.xyz"
@@ -141,8 +141,6 @@ def test_one_return_only_and_no_classes_are_used_and_told(tmp_path: Path, suburb
 
 
 def test_gross_outliers_are_left_out_and_told(tmp_path: Path, suburb: Path, reconstruct: Any) -> None:
-    import laspy
-
     las = laspy.read(suburb)
     xyz = np.column_stack((las.x, las.y, las.z))
     centre = xyz.mean(axis=0)
@@ -156,8 +154,6 @@ def test_gross_outliers_are_left_out_and_told(tmp_path: Path, suburb: Path, reco
 
 
 def test_feet_give_the_buildings_of_metres(tmp_path: Path, suburb: Path, reconstruct: Any) -> None:
-    import laspy
-
     las = laspy.read(suburb)
     xyz = np.column_stack((las.x - 450000, las.y - 5500000, las.z))
     np.savetxt(tmp_path / "metres.xyz", xyz, fmt="%.3f")
@@ -171,3 +167,74 @@ def test_feet_give_the_buildings_of_metres(tmp_path: Path, suburb: Path, reconst
     assert sorted(row["footprint_area_m2"] for row in in_feet) == pytest.approx(areas, rel=0.02)
     ratio = np.array(sorted(r["ridge_z"] for r in in_feet)) / np.array(sorted(r["ridge_z"] for r in height.values()))
     assert ratio == pytest.approx(1 / 0.3048, rel=0.01)
+
+
+def test_stray_class_codes_are_not_believed(suburb: Path, tmp_path: Path, reconstruct: Any) -> None:
+    las = laspy.read(suburb)
+    las.classification[100] = 2
+    las.write(tmp_path / "stray.laz")
+    plain, stray = reconstruct(suburb), reconstruct(tmp_path / "stray.laz")
+    assert stray.statuses == plain.statuses
+    assert any("1 of 1 inputs are not classified" in warning for warning in stray.warnings)
+
+
+def test_footprints_outside_the_box_are_left_out_and_told(suburb: Path, tmp_path: Path, reconstruct: Any) -> None:
+    found = [shapely.from_wkb(row["geometry"]) for row in rows(reconstruct(suburb).run_dir, "buildings")]
+    x0, y0, x1, y1 = found[0].bounds
+    far = [outline for outline in found[1:] if not outline.intersects(shapely.box(x0 - 2, y0 - 2, x1 + 2, y1 + 2))]
+    features = [
+        {"type": "Feature", "properties": {"id": str(k)}, "geometry": shapely.geometry.mapping(outline)}
+        for k, outline in enumerate([found[0], *far])
+    ]
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
+    path = tmp_path / "footprints.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": features}))
+    summary = reconstruct(suburb, footprints=str(path), bbox=(x0 - 2, y0 - 2, x1 + 2, y1 + 2))
+    assert summary.counts["candidates"] == 1
+    assert any(f"{len(far)} of {len(far) + 1} footprints lie off the data" in w for w in summary.warnings)
+
+
+def test_a_request_that_cannot_work_leaves_the_earlier_run_alone(
+    suburb: Path, tmp_path: Path, reconstruct: Any
+) -> None:
+    out = tmp_path / "run"
+    first = reconstruct(suburb, out=str(out))
+    with pytest.raises(InputError):
+        reconstruct(suburb, out=str(out), overwrite=True, footprints=str(tmp_path / "nowhere.gpkg"))
+    assert json.loads((out / "run.json").read_text())["status"] == "finished"
+    assert len(rows(str(out), "buildings")) == first.counts["candidates"]
+
+
+def test_a_run_that_breaks_says_so_in_its_manifest(suburb: Path, tmp_path: Path, reconstruct: Any) -> None:
+    with pytest.raises(EmptyInputError):
+        reconstruct(suburb, out=str(tmp_path / "run"), bbox=(0.0, 0.0, 10.0, 10.0))
+    manifest = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert manifest["status"] == "failed"
+    assert "no usable point is left" in manifest["warnings"][-1]
+
+
+def test_a_tile_that_cannot_be_written_costs_only_itself(
+    suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = reconstruct(suburb, settings={"tile_size_m": 40.0})
+    tiles = sorted({row["tile"] for row in rows(whole.run_dir, "buildings")})
+    real = pipeline.runtime.publish.write_tile
+
+    def sabotaged(run_dir: str, tile_key: str, *rest: Any, **options: Any) -> Any:
+        if tile_key == tiles[0]:
+            raise RunError("the disk is full, on purpose")
+        return real(run_dir, tile_key, *rest, **options)
+
+    monkeypatch.setattr(pipeline.runtime.publish, "write_tile", sabotaged)
+    hurt = reconstruct(suburb, settings={"tile_size_m": 40.0})
+    assert hurt.failed_tiles == (tiles[0],)
+    state = json.loads((Path(hurt.run_dir) / "state" / f"{tiles[0]}.json").read_text())
+    assert (state["state"], state["files"]) == ("failed", {})
+    assert "on purpose" in state["error"]
+    assert json.loads((Path(hurt.run_dir) / "run.json").read_text())["status"] == "incomplete"
+    assert sorted({row["tile"] for row in rows(hurt.run_dir, "buildings")}) == tiles[1:]
+
+
+def test_an_object_store_is_refused_at_once(suburb: Path, reconstruct: Any) -> None:
+    with pytest.raises(RunError, match=r"s3://bucket/run is no local path"):
+        reconstruct(suburb, out="s3://bucket/run")

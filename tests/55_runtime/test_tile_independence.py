@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import laspy
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
@@ -40,7 +42,9 @@ def seen() -> dict[str, Any]:
 def test_any_grid_halo_and_order_give_the_same_content(
     grid: dict[str, float], order: int, suburb: Path, reconstruct: Any, shuffled: Any, seen: dict[str, Any]
 ) -> None:
-    whole = seen.setdefault("whole", reconstruct(suburb, settings={"tile_size_m": 1000.0}))
+    if "whole" not in seen:
+        seen["whole"] = reconstruct(suburb, settings={"tile_size_m": 1000.0})
+    whole = seen["whole"]
     assert whole.statuses.get("ok", 0) >= 3
     cut = reconstruct(suburb, settings=grid, executor=shuffled(order))
     assert cut.digest == whole.digest
@@ -55,6 +59,19 @@ def test_overlapping_shuffled_files_give_the_content_of_one_file(
     assert split.digest == whole.digest
     assert split.counts["duplicates"] == 1000
     assert any("1000 duplicated points" in warning for warning in split.warnings)
+
+
+def test_overlaps_that_disagree_about_classes_do_not_depend_on_tiles(
+    suburb: Path, tmp_path: Path, reconstruct: Any
+) -> None:
+    las = laspy.read(suburb)
+    low = np.asarray(las.z) < np.percentile(las.z, 60)
+    for name, roofs in (("a.laz", 6), ("b.laz", 1)):
+        las.classification = np.where(low, 2, roofs).astype(np.uint8)
+        las.write(tmp_path / name)
+    paths = tmp_path / "a.laz", tmp_path / "b.laz"
+    digests = {reconstruct(*paths, settings={"tile_size_m": size}).digest for size in (1000.0, 31.0, 47.3)}
+    assert len(digests) == 1
 
 
 def test_a_halo_below_the_support_is_refused() -> None:
