@@ -26,6 +26,14 @@ def suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A LAZ tile of about 220 x 200 m: rows of touching houses at several levels, streets, trees."""
+    folder = tmp_path_factory.mktemp("town")
+    simulate("town", folder, 5, size_m=(220.0, 200.0), density_per_m2=3.0)
+    return folder / "town.laz"
+
+
+@pytest.fixture(scope="session")
 def halves(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The same points in two files whose points overlap and come in another order."""
     folder = tmp_path_factory.mktemp("halves")

@@ -86,20 +86,44 @@ def test_two_dask_workers_give_the_content_of_a_serial_run(suburb: Path, reconst
     assert len(cluster.peak_memory_bytes) == 3  # two workers and the driver
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "grid",
-    [
-        {"tile_size_m": 100.0},
-        {"tile_size_m": 173.3, "lattice_x_m": 31.7, "lattice_y_m": -12.9, "halo_m": SUPPORT_M + 25.0},
-    ],
+SLOW = settings(
+    max_examples=4,
+    deadline=None,
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
+wide_grids = st.fixed_dictionaries(
+    {
+        "tile_size_m": st.floats(55.0, 260.0).map(lambda size: round(size, 2)),
+        "lattice_x_m": st.floats(-130.0, 130.0).map(lambda shift: round(shift, 3)),
+        "lattice_y_m": st.floats(-130.0, 130.0).map(lambda shift: round(shift, 3)),
+        "halo_m": st.sampled_from([0.0, SUPPORT_M, SUPPORT_M + 31.9]),
+    }
+)
+
+
+@pytest.mark.slow
+@SLOW
+@given(grid=wide_grids, order=st.integers(0, 99))
+def test_a_town_of_rows_in_any_grid_gives_the_same_content(
+    grid: dict[str, float], order: int, town: Path, reconstruct: Any, shuffled: Any, seen: dict[str, Any]
+) -> None:
+    if "town" not in seen:
+        seen["town"] = reconstruct(town, settings={"tile_size_m": 1000.0})
+    cut = reconstruct(town, settings=grid, executor=shuffled(order))
+    assert cut.digest == seen["town"].digest
+    assert cut.statuses["ok"] > 15
+
+
+@pytest.mark.slow
+@SLOW
+@given(grid=wide_grids, order=st.integers(0, 99))
 def test_delft_in_any_grid_gives_the_same_content(
-    grid: dict[str, float], shared_data: Path, reconstruct: Any, shuffled: Any, seen: dict[str, Any]
+    grid: dict[str, float], order: int, shared_data: Path, reconstruct: Any, shuffled: Any, seen: dict[str, Any]
 ) -> None:
     tiles = [shared_data / "ahn3" / name for name in ("delft_west.laz", "delft_east.laz")]
     if "delft" not in seen:
         seen["delft"] = reconstruct(*tiles, crs="EPSG:7415", settings={"tile_size_m": 1000.0})
-    cut = reconstruct(*reversed(tiles), crs="EPSG:7415", settings=grid, executor=shuffled(1))
+    cut = reconstruct(*reversed(tiles), crs="EPSG:7415", settings=grid, executor=shuffled(order))
     assert cut.digest == seen["delft"].digest
     assert cut.statuses["ok"] > 50
