@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 import shapely
-from shapely import MultiPolygon
+from shapely import MultiPolygon, Polygon
+from shapely.geometry.base import BaseGeometry
 
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, Plane, Reason
@@ -15,6 +16,7 @@ from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart, solid_parts
 
 _MINIMUM_HEIGHT_M = 0.1
+_DRAWN_BACK_MM = (2.0, 20.0, 100.0)
 
 
 def block_plane(points: FloatArray, ground_z_m: float, percentile: float) -> Plane:
@@ -72,16 +74,25 @@ def block_parts(
         `no_footprint` where no part has an area.
     """
     opened = shapely.buffer(shapely.buffer(footprint_mm, -25.0, join_style="mitre"), 25.0, join_style="mitre")
-    # the opening can leave two parts touching where it cut a neck: draw each back by 2 mm
-    drawn = shapely.buffer(opened, -2.0, join_style="mitre")
+    fault = BuildingError(Reason.NO_FOOTPRINT, f"the outline has an area of {footprint_mm.area * 1e-6:g} m2")
+    # the opening can leave parts or holes that touch: draw them back, in the last resort fill everything
+    for shape in (*(shapely.buffer(opened, -mm, join_style="mitre") for mm in _DRAWN_BACK_MM), opened.convex_hull):
+        large = _clean_parts(shape, tolerance_m, minimum_area_m2)
+        if not large:
+            continue
+        partition = RoofPartition(polygons=tuple(large), labels=np.zeros(len(large), np.int32))
+        try:
+            return solid_parts(partition, [plane], ground_z_m)
+        except BuildingError as error:
+            fault = error
+    raise fault
+
+
+def _clean_parts(shape: BaseGeometry, tolerance_m: float, minimum_area_m2: float) -> list[Polygon]:
+    """Simplified polygons on whole millimetres: those large enough, else the largest; none of an empty shape."""
     if tolerance_m > 0.0:
-        drawn = shapely.simplify(drawn, tolerance_m * 1e3, preserve_topology=True)
-    snapped = polygons_of(shapely.set_precision(drawn, 1.0))
+        shape = shapely.simplify(shape, tolerance_m * 1e3, preserve_topology=True)
+    snapped = polygons_of(shapely.set_precision(shape, 1.0))
     polygons = [thinned for polygon in snapped for thinned in without_repeated(polygon, 5.0) if thinned.is_valid]
     large = [p for p in polygons if p.area >= minimum_area_m2 * 1e6]
-    if not large and polygons:
-        large = [max(polygons, key=lambda p: p.area)]
-    if not large:
-        raise BuildingError(Reason.NO_FOOTPRINT, f"the outline has an area of {footprint_mm.area * 1e-6:g} m2")
-    partition = RoofPartition(polygons=tuple(large), labels=np.zeros(len(large), np.int32))
-    return solid_parts(partition, [plane], ground_z_m)
+    return large or sorted(polygons, key=lambda p: -p.area)[:1]

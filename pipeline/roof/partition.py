@@ -147,8 +147,9 @@ def absorb_small_regions(
                 break
             if areas[r] >= (minimum_void_m2 if label < 0 else minimum_area_m2) or r == regions[n - 1]:
                 continue
+            if touched[r] != 0:
+                continue  # it grew since its area was taken: the next round judges it
             border[:] = 0
-            stale = touched[r] != 0
             n_members = 0
             for m in range(first[r], first[r + 1]):
                 v = members[m]
@@ -157,10 +158,6 @@ def absorb_small_regions(
                     w = adjacent[s]
                     if labels[w] != label:
                         border[labels[w] + 1] += 1
-                        if touched[regions[w]] != 0:
-                            stale = True
-            if stale:
-                continue
             total = 0
             for k in range(n_planes + 1):
                 total += border[k]
@@ -188,7 +185,8 @@ def absorb_small_regions(
                 continue
             for m in range(first[r], first[r + 1]):
                 for s in range(starts[members[m]], starts[members[m] + 1]):
-                    touched[regions[adjacent[s]]] = 1
+                    if labels[adjacent[s]] == best:
+                        touched[regions[adjacent[s]]] = 1
                 labels[members[m]] = best
             changed = True
         if not changed:
