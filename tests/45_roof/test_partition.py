@@ -130,6 +130,17 @@ def test_a_lone_vertex_in_a_roof_is_absorbed_and_a_courtyard_stays() -> None:
     assert (filled[12 * 12 :] == -1).all()
 
 
+def test_any_number_of_gaps_in_one_roof_is_closed() -> None:
+    values = np.zeros((60, 60), np.int32)
+    values[2:-2:4, 2:-2:4] = -1
+    assert (values < 0).sum() > 150
+    xy, tin, labels = labelled(60, values)
+    counted = np.ones(len(xy), np.int32)
+    x, y, z = xy[:, 0].copy(), xy[:, 1].copy(), np.full(len(xy), 5.0)
+    closed = absorb_small_regions(x, y, z, tin.facets, labels, counted, np.array([[0.0, 0.0, 5.0]]), 1.0, 4.0)
+    assert (closed[: 60 * 60] == 0).all()
+
+
 def test_a_small_region_joins_the_plane_that_fits_it() -> None:
     values = np.zeros((9, 9), np.int32)
     values[:, 4] = 2
