@@ -62,7 +62,7 @@ class LocalStorage:
             final.parent.mkdir(parents=True, exist_ok=True)
         except OSError as fault:
             raise RunError(f"{final.parent}: the folder cannot be made ({fault.strerror or fault})") from fault
-        temporary = final.with_name(f"{final.name}.{uuid.uuid4().hex}{TEMPORARY_SUFFIX}")
+        temporary = final.with_name(f".{final.name}.{uuid.uuid4().hex}{TEMPORARY_SUFFIX}")
         try:
             yield temporary
             if not temporary.is_file():

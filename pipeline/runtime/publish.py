@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 
 import shapely
 
 from pipeline.export.records import RecordContext, RejectedObject
-from pipeline.export.tile import TileFiles, put_local, write_tile
+from pipeline.export.tile import TileFiles, write_tile
+from pipeline.io import LocalStorage
 from pipeline.runtime.join import RejectedSite
 from pipeline.runtime.modelling import StoredResult
 from pipeline.runtime.scratch import Scratch
@@ -64,12 +66,12 @@ def publish(task: PublishTask) -> Published:
 
     A tile that fails costs only itself: its state says so, and why. A tile that owns nothing has a state and no files.
     """
-    put = put_local(task.run_dir)
+    storage = LocalStorage(root=Path(task.run_dir))
     files: TileFiles | None = None
     error = ""
     try:
         if task.batches or task.rejected:
-            files = _write(task)
+            files = _write(task, storage)
     except Exception as fault:  # noqa: BLE001 - told in the tile's state, the manifest and the exit code
         error = f"{type(fault).__name__}: {fault}"
     state = {
@@ -78,11 +80,11 @@ def publish(task: PublishTask) -> Published:
         "error": error,
         "files": {} if files is None else dict(files.digests),
     }
-    put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
+    storage.put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
     return Published(tile=task.tile, files=files, error=error)
 
 
-def _write(task: PublishTask) -> TileFiles:
+def _write(task: PublishTask, storage: LocalStorage) -> TileFiles:
     """Write the files of a tile that owns something."""
     stored: list[StoredResult] = []
     for number in task.batches:
@@ -95,4 +97,5 @@ def _write(task: PublishTask) -> TileFiles:
         [_rejected_object(site) for site in task.rejected],
         context,
         meshes=task.meshes,
+        put=storage.put,
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pipeline import __version__
 from pipeline.errors import RunError
-from pipeline.io import ReadOptions, SpatialReference, find_inputs, open_source
+from pipeline.io import LocalStorage, ReadOptions, SpatialReference, find_inputs, open_source
 from pipeline.io.footprints import read_area
 from pipeline.io.storage import sha256_of
 from pipeline.runtime.digest import run_digest
@@ -150,7 +150,7 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
             check_memory(plan, engine.memory_limit_bytes)
             # nothing of an earlier run goes before all that can be checked is checked
             _clear_results(run_dir)
-            write_manifest(run_dir, manifest)
+            write_manifest(run_dir, manifest, LocalStorage(root=run_dir).put)
             stages = Stages(
                 settings=request.settings,
                 meshes=request.meshes,
@@ -167,7 +167,8 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
                 tiles, failed_tiles = stages.publish(splits, joined, modelled, reference, str(run_dir))
             except BaseException as error:
                 told = (*progress.warnings, f"{type(error).__name__}: {error}")
-                write_manifest(run_dir, dataclasses.replace(manifest, status=RunStatus.FAILED, warnings=told))
+                broken = dataclasses.replace(manifest, status=RunStatus.FAILED, warnings=told)
+                write_manifest(run_dir, broken, LocalStorage(root=run_dir).put)
                 raise
     finally:
         scratch.clear()
@@ -205,6 +206,7 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
             warnings=tuple(progress.warnings),
             content_sha256=digest,
         ),
+        LocalStorage(root=run_dir).put,
     )
     progress.tell("finished", "", f"{counts['candidates']} candidates in {progress.timings['total']:.1f} s")
     return RunSummary(
