@@ -227,7 +227,7 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
 def _plan(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
     """The plan and the input files in order."""
     # workers elsewhere do not share this process's folder
-    paths = sorted(str(path.absolute()) for path in find_inputs(request.inputs))
+    paths = sorted(str(path.resolve()) for path in find_inputs(request.inputs))
     options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit, bbox=request.bbox)
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
@@ -250,7 +250,7 @@ def _checked(request: RunRequest) -> Path:
     """
     if "://" in request.out:
         raise RunError(f"{request.out} is no local path: this version writes local run directories only")
-    run_dir = Path(request.out).absolute()
+    run_dir = Path(request.out).resolve()
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         left = sorted(entry.name for entry in run_dir.iterdir())
