@@ -180,16 +180,6 @@ class Candidate:
     touches_data_edge: bool = False
     """True where the data end at the candidate: it may be cut."""
 
-    @property
-    def area_hint_m2(self) -> float:
-        """Rough plan area: the footprint's, else that of the points' bounding box."""
-        if self.footprint is not None:
-            return float(self.footprint.area)
-        if len(self.points) == 0:
-            return 0.0
-        width, depth = np.ptp(self.points[:, :2], axis=0)
-        return float(width * depth)
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Segmentation:

@@ -120,7 +120,6 @@ class Progress:
     def __init__(self, listener: Listener) -> None:
         self._listener = listener
         self.timings: dict[str, float] = {}
-        self.task_seconds: dict[str, float] = {}
         self.peaks: dict[str, int] = {}
         self.warnings: list[str] = []
 
@@ -152,7 +151,6 @@ class Progress:
         for measured in executor.map(name, function, tasks):
             results.append(measured.result)
             self.peaks[measured.process] = max(self.peaks.get(measured.process, 0), measured.peak_bytes)
-            self.task_seconds[name] = self.task_seconds.get(name, 0.0) + measured.seconds
             done += weight(measured.result)
             self.tell("progress", name, done=done, total=whole)
         self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started
