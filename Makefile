@@ -14,7 +14,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/uv --no-progress
 COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml
+	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra postgres
 
 # numba keeps compiled kernels per source file and does not notice when a kernel in another file changed:
 # tests therefore use a cache named after the content of all kernels.
@@ -67,6 +67,9 @@ lock: $(VENV)/.build-stamp
 	$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-emit-find-links --custom-compile-command "make lock" --group build \
 		-c requirements-test.lock -o requirements-build.lock
+	$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		--no-emit-find-links --custom-compile-command "make lock" --group viewer \
+		-c requirements-test.lock -o requirements-viewer.lock
 
 # --- the two commands ------------------------------------------------------------------------------------------------
 

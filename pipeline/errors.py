@@ -9,6 +9,9 @@ GableworkError
 │   └── CrsError                 geographic, contradictory or unknown coordinate reference system
 ├── SettingsError         one or more settings are out of range: lists all faults at once
 ├── RunError              a run directory that cannot be written, read or resumed
+│   ├── RunCancelledError        whoever started the run called it off
+│   └── ClusterError             the scheduler does not answer, or was lost while the run was under way
+│       └── VersionMismatchError     client, scheduler and workers do not run the same versions
 └── BuildingError         one building could not be modelled; becomes its record's status and reason
 ```
 """
@@ -86,6 +89,18 @@ class SettingsError(GableworkError):
 
 class RunError(GableworkError):
     """A run directory that cannot be written, read or resumed."""
+
+
+class RunCancelledError(RunError):
+    """Whoever started the run called it off; what is in the run directory is not to be used."""
+
+
+class ClusterError(RunError):
+    """The scheduler does not answer, or was lost while the run was under way; the run may be tried again."""
+
+
+class VersionMismatchError(ClusterError):
+    """Client, scheduler and workers do not run the same versions of what matters."""
 
 
 class BuildingError(GableworkError):

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Literal
 
-EventKind = Literal["run", "stage", "progress", "warning", "finished"]
+EventKind = Literal["run", "stage", "progress", "warning", "waiting", "finished"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -14,7 +14,7 @@ class Event:
     """One thing that happened; carries no object of the engine, so that it can be logged, stored or sent."""
 
     kind: EventKind
-    """What happened."""
+    """What happened; `waiting` means that no worker is there to go on."""
     stage: str = ""
     """plan, ingest, split, join, reconstruct or publish; empty for the run as a whole."""
     done: int = 0

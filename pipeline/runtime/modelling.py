@@ -13,6 +13,7 @@ from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Reason, RoofType, Status
 from pipeline.reconstruct import reconstruct_building
 from pipeline.runtime.gather import gather
+from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import CandidateSite
 from pipeline.runtime.scratch import Scratch
 from pipeline.tiling import Tile, TileGrid
@@ -37,6 +38,10 @@ class BatchTask:
     scratch: Scratch
     gps_kind: GpsTimeKind
     """Whether GPS times tell dates."""
+    isolation: IsolationLimits | None = None
+    """Limits of the supervised child; None models in this process."""
+    quarantine: str = ""
+    """Folder for the bundles of buildings that cost their process; empty keeps none."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

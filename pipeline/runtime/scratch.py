@@ -17,6 +17,8 @@ from uuid import uuid4
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.errors import RunCancelledError
+
 POINT = np.dtype(
     [
         ("x", "<i8"),
@@ -30,6 +32,9 @@ POINT = np.dtype(
     ]
 )
 """A point in scratch: absolute millimetres and the attributes of `PointCloud`."""
+
+
+_CANCELLED = "cancelled"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +78,27 @@ class Scratch:
     def get_object(self, name: str) -> Any:
         """A record stored by this run. Never called on files that others wrote."""
         return pickle.loads(Path(self.root, name).read_bytes())  # noqa: S301
+
+    def cancel(self) -> None:
+        """Tell all tasks of the run to end: they look for this mark wherever they can stop."""
+        self.path(_CANCELLED).touch()
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether the run was called off, or is over: then there is no folder any more."""
+        root = Path(self.root)
+        return (root / _CANCELLED).exists() or not root.exists()
+
+    def check_cancelled(self) -> None:
+        """End a task of a run that was called off.
+
+        Raises
+        ------
+        RunCancelledError
+            It was called off.
+        """
+        if self.cancelled:
+            raise RunCancelledError("the run was called off")
 
     def clear(self) -> None:
         """Remove the folder."""

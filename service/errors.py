@@ -1,0 +1,112 @@
+"""The exceptions of the service. They know no HTTP: `service.problems` maps them to problem documents.
+
+```
+ServiceError
+├── NoSuchJobError, NoSuchProcessError, NoSuchUploadError, NoSuchBuildingError, NoSuchOutputError
+├── ResultNotReadyError      the job is not over yet, or was dismissed
+├── RequestError             inputs that do not fit the process: lists all faults at once
+├── InputRefusedError        an input that is not allowed: a path outside the roots, a host that is not listed
+├── LimitError               more than this service takes
+│   ├── TooLargeError        an upload or a body with too many bytes or points
+│   ├── QueueFullError       too many jobs wait
+│   └── TooManyRequestsError too many requests of one client
+├── UnauthorizedError        no key, or one that is not known
+├── ForbiddenError           a key without the scope
+├── LeaseLostError           a driver's claim on a job has passed to another
+└── StartUpError             settings with which the service must not start
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class ServiceError(Exception):
+    """Base of the service's own errors."""
+
+
+class NoSuchJobError(ServiceError):
+    """The job does not exist, or belongs to another key."""
+
+
+class NoSuchProcessError(ServiceError):
+    """The process does not exist."""
+
+
+class NoSuchUploadError(ServiceError):
+    """The upload does not exist, has expired, or belongs to another key."""
+
+
+class NoSuchBuildingError(ServiceError):
+    """The job's results hold no such building."""
+
+
+class NoSuchOutputError(ServiceError):
+    """The process has no such output, or the job was asked not to make it."""
+
+
+class ResultNotReadyError(ServiceError):
+    """The job has no results (yet)."""
+
+
+class RequestError(ServiceError):
+    """Inputs that do not fit the process; the message lists every fault.
+
+    Parameters
+    ----------
+    faults : sequence of str
+        One sentence a fault, each naming the input, its value and what is allowed.
+    """
+
+    def __init__(self, faults: Sequence[str]) -> None:
+        self.faults = tuple(faults)
+        super().__init__("; ".join(self.faults))
+
+
+class InputRefusedError(ServiceError):
+    """An input that this service is not allowed to read."""
+
+
+class LimitError(ServiceError):
+    """More than this service takes; the message names the value and the limit."""
+
+
+class TooLargeError(LimitError):
+    """An upload, a body or an input with too many bytes or points."""
+
+
+class QueueFullError(LimitError):
+    """Too many jobs wait already."""
+
+
+class TooManyRequestsError(LimitError):
+    """Too many requests of one client.
+
+    Parameters
+    ----------
+    message : str
+        What was counted, and the limit.
+    retry_after_s : float
+        Seconds until the next request is taken.
+    """
+
+    def __init__(self, message: str, retry_after_s: float) -> None:
+        self.retry_after_s = retry_after_s
+        super().__init__(message)
+
+
+class UnauthorizedError(ServiceError):
+    """No key was sent, or one that is not known."""
+
+
+class ForbiddenError(ServiceError):
+    """The key lacks the scope."""
+
+
+class LeaseLostError(ServiceError):
+    """A driver's claim on a job has passed to another driver, or the job is over."""
+
+
+class StartUpError(ServiceError):
+    """Settings with which the service must not start; the message names the fix."""

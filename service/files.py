@@ -1,0 +1,64 @@
+"""The state folder: where uploads, attempts and results lie. Paths only come from ids that we made."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+_ID = re.compile(r"[0-9a-f]{32}")
+
+
+def _checked(identifier: str) -> str:
+    """An id that we made; anything else is a fault of the caller, never a path.
+
+    Raises
+    ------
+    ValueError
+        It is no id.
+    """
+    if _ID.fullmatch(identifier) is None:
+        raise ValueError(f"{identifier!r} is no id of this service")
+    return identifier
+
+
+@dataclasses.dataclass(frozen=True)
+class StateFolder:
+    """Layout of the folder that API, drivers and workers share."""
+
+    root: Path
+    """The folder."""
+
+    @property
+    def uploads(self) -> Path:
+        """One folder an upload."""
+        return self.root / "uploads"
+
+    @property
+    def jobs(self) -> Path:
+        """One folder a job."""
+        return self.root / "jobs"
+
+    def upload(self, upload_id: str) -> Path:
+        """Folder of one upload; holds one file under its cleaned name."""
+        return self.uploads / _checked(upload_id)
+
+    def job(self, job_id: str) -> Path:
+        """Folder of a job."""
+        return self.jobs / _checked(job_id)
+
+    def attempt(self, job_id: str, attempt: int) -> Path:
+        """Folder of one attempt: two drivers never write into the same one."""
+        return self.job(job_id) / f"attempt-{attempt}"
+
+    def inputs(self, job_id: str, attempt: int) -> Path:
+        """What the attempt fetched."""
+        return self.attempt(job_id, attempt) / "inputs"
+
+    def run(self, job_id: str, attempt: int) -> Path:
+        """The run directory."""
+        return self.attempt(job_id, attempt) / "run"
+
+    def outputs(self, job_id: str, attempt: int) -> Path:
+        """The outputs, assembled for download."""
+        return self.attempt(job_id, attempt) / "outputs"

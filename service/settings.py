@@ -1,0 +1,118 @@
+"""Settings of the service: environment variables `GABLEWORK_…`, under the options of the command line."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+
+import platformdirs
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from service.errors import StartUpError
+
+_GIB = 2**30
+
+
+class ServiceSettings(BaseSettings):
+    """Everything that can be set about the service. Every field is an environment variable with the prefix `GABLEWORK_`."""
+
+    model_config = SettingsConfigDict(env_prefix="GABLEWORK_", frozen=True, extra="ignore")
+
+    # where
+    state: Path = Field(
+        default_factory=lambda: Path(platformdirs.user_data_dir("gablework", appauthor=False)),
+        description="Folder of the database (unless `database_url` names another), uploads, runs and results; "
+        "API, drivers and workers share it.",
+    )
+    database_url: str | None = Field(
+        default=None,
+        description="SQLAlchemy URL; default SQLite in the state folder. PostgreSQL: postgresql+pg8000://user:password@host/database",
+    )
+    host: str = Field(default="127.0.0.1", description="Address to listen on; anything but loopback needs keys.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
+    public_url: str | None = Field(
+        default=None, description="How clients reach the service, for links; default as the request says."
+    )
+    root_path: str = Field(default="", description="Path prefix behind a proxy.")
+
+    # who
+    open_without_keys: bool = Field(
+        default=False,
+        description="Answer without keys on other addresses than loopback. Only for networks closed by other means.",
+    )
+
+    # inputs
+    input_roots: tuple[Path, ...] = Field(
+        default=(), description="Folders below which jobs may name inputs by path; none by default."
+    )
+    input_hosts: tuple[str, ...] = Field(
+        default=(), description="Hosts (name or name:port) from which jobs may fetch inputs by URL; none by default."
+    )
+    max_upload_bytes: int = Field(default=4 * _GIB, gt=0, description="Largest upload or fetched input.")
+    max_body_bytes: int = Field(default=2**20, gt=0, description="Largest body of other requests, JSON and the like.")
+    max_points: int = Field(default=500_000_000, gt=0, description="Most points of all inputs of one job.")
+    max_inputs: int = Field(default=1000, gt=0, description="Most input files of one job.")
+    upload_days: float = Field(
+        default=7.0, gt=0.0, description="Days after which an upload that no job needs is removed."
+    )
+
+    # limits
+    max_queued: int = Field(default=1000, gt=0, description="Most jobs that may wait; more are refused.")
+    max_queued_per_key: int = Field(default=200, gt=0, description="Most jobs of one key that may wait.")
+    rate_limit: str = Field(
+        default="6000/minute", description="Requests of one key or address, in the notation of the library limits."
+    )
+    max_event_streams: int = Field(default=200, gt=0, description="Most event streams open at once.")
+
+    # the driver and its cluster
+    scheduler: str | None = Field(default=None, description="Address of a Dask scheduler; default an embedded cluster.")
+    workers: int = Field(default=2, ge=1, description="Processes of the embedded cluster.")
+    driver_jobs: int = Field(default=2, ge=1, description="Jobs that one driver runs at once.")
+    lease_s: float = Field(
+        default=30.0, gt=0.5, description="Seconds after which a silent driver's job passes to another."
+    )
+    max_attempts: int = Field(default=3, ge=1, description="Drivers that may die over a job before it is failed.")
+    poll_s: float = Field(
+        default=0.5, gt=0.0, description="Seconds between a driver's looks for work and for dismissals."
+    )
+    drain_s: float = Field(
+        default=600.0,
+        ge=0.0,
+        description="Seconds that SIGTERM leaves running jobs; then they are given back to the queue.",
+    )
+    building_timeout_s: float = Field(
+        default=600.0, gt=0.0, description="Seconds after which a building's work is stopped."
+    )
+    building_memory_bytes: int = Field(
+        default=4 * _GIB, gt=0, description="Resident memory at which a building's work is stopped."
+    )
+
+    @property
+    def database(self) -> str:
+        """The SQLAlchemy URL."""
+        return self.database_url or f"sqlite:///{(self.state / 'service.db').resolve()}"
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine can reach the address."""
+        if self.host == "localhost":
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+    def check_address(self, *, has_keys: bool) -> None:
+        """Refuse to listen to others without keys.
+
+        Raises
+        ------
+        StartUpError
+            The address is not loopback and there are no keys.
+        """
+        if not (self.is_loopback or has_keys or self.open_without_keys):
+            raise StartUpError(
+                f"{self.host} can be reached from elsewhere and there are no keys: make one with "
+                "`gablework keys create`, or listen on 127.0.0.1"
+            )
