@@ -1,11 +1,11 @@
-"""Jobs: frozen records, a status, and which transition is allowed. No SQL, no HTTP; time is an argument.
+r"""Jobs: frozen records, a status, and which transition is allowed. No SQL, no HTTP; time is an argument.
 
 ```
              claim                 succeed
  accepted ----------> running ---------------> successful
-   |  ^                 | | \\                       |
-   |  |  release, lost  | |  \\ fail, or lost        | remove
-   |  +-----------------+ |   \\ too often           v
+   |  ^                 | | \                       |
+   |  |  release, lost  | |  \ fail, or lost        | remove
+   |  +-----------------+ |   \ too often           v
    |                      |    +------------> failed --> (gone)
    |  dismiss             | dismiss
    +----------------------+------------> dismissed ------> (gone)

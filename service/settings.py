@@ -15,7 +15,7 @@ _GIB = 2**30
 
 
 class ServiceSettings(BaseSettings):
-    """Everything that can be set about the service. Every field is an environment variable with the prefix `GABLEWORK_`."""
+    """Everything that can be set about the service; each field is an environment variable, `GABLEWORK_` before it."""
 
     model_config = SettingsConfigDict(env_prefix="GABLEWORK_", frozen=True, extra="ignore")
 
