@@ -58,12 +58,20 @@ def default_of(parameter: Any) -> str:
     return "" if default is None or default is False or default == () else f"`{default}`"
 
 
+def commands(group: Any | None = None, prefix: str = "") -> dict[str, Any]:
+    """The commands of the console script by their words, those of groups included."""
+    found: dict[str, Any] = {}
+    for name, command in (group or typer.main.get_command(app)).commands.items():
+        words = f"{prefix}{name}"
+        found |= commands(command, f"{words} ") if hasattr(command, "commands") else {words: command}
+    return dict(sorted(found.items()))
+
+
 def command_line() -> str:
     """The page of the command line."""
-    group = typer.main.get_command(app)
     lines = [NOTE, "# The command line", ""]
     lines += ["`gablework COMMAND --help` prints the same. How commands end: [exit codes](exit_codes.md).", ""]
-    for name, command in sorted(group.commands.items()):  # type: ignore[attr-defined]
+    for name, command in commands().items():
         rows: list[list[object]] = [
             [option_names(parameter), default_of(parameter), getattr(parameter, "help", "") or ""]
             for parameter in command.params

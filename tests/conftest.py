@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator
+import shutil
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import hypothesis
@@ -19,6 +20,26 @@ SHARED_DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 
 REQUIRED = "GABLEWORK_REQUIRE_SHARED_DATA"
 """Environment variable of .ci/run: 1 makes a test that needs the real data fail where it would skip."""
+
+REQUIRED_PROGRAMS = "GABLEWORK_REQUIRE_PROGRAMS"
+"""Environment variable of .ci/run: 1 makes a test that needs PostgreSQL or Chromium fail where it would skip."""
+
+
+@pytest.fixture(scope="session")
+def needs_program() -> Callable[..., str]:
+    """The path of the first of some programs that is there; a test without any of them skips with their names."""
+
+    def find(*candidates: str) -> str:
+        for name in candidates:
+            found = shutil.which(name)
+            if found is not None:
+                return found
+        told = f"none of the programs {', '.join(candidates)} is installed"
+        if os.environ.get(REQUIRED_PROGRAMS) == "1":
+            pytest.fail(f"{told}, but {REQUIRED_PROGRAMS}=1")
+        pytest.skip(told)
+
+    return find
 
 
 @pytest.fixture(scope="session")
