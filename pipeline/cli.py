@@ -35,6 +35,19 @@ VerticalUnit = Annotated[
 Workers = Annotated[
     int, typer.Option(min=0, help="Processes of the embedded cluster; 0 runs serially in this process.")
 ]
+Isolate = typer.Option(
+    "--isolate/--no-isolate",
+    help="Model buildings in a supervised child process, so that a bad one costs only itself.",
+)
+BuildingTimeout = Annotated[
+    float, typer.Option(metavar="S", help="Seconds that a building may take in its child process.")
+]
+BuildingMemory = Annotated[
+    float, typer.Option(metavar="GIB", help="Memory that a building's child process may take, in GiB.")
+]
+BUILDING_TIMEOUT_S, BUILDING_MEMORY_GIB = 600.0, 4.0
+"""Defaults of `pipeline.runtime.isolation.IsolationLimits`, which is too slow to import for `--help`."""
+
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already there.")]
 
 
@@ -95,6 +108,9 @@ def reconstruct(
         str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
     ] = None,
     overwrite: Overwrite = False,
+    isolate: Annotated[bool | None, Isolate] = None,
+    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
+    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -116,6 +132,9 @@ def reconstruct(
             meshes=meshes,
             licence=licence,
             overwrite=overwrite,
+            isolate=isolate,
+            building_timeout_s=building_timeout,
+            building_memory_bytes=round(building_memory * 2**30),
         )
         summary = run(request, console.on_event)
         show_summary(console, summary)
@@ -286,6 +305,45 @@ def show_score(console: Console, score: TruthScore) -> None:
 
 
 @app.command()
+def replay(
+    bundle: Annotated[str, typer.Argument(metavar="BUNDLE", help="A file of a run's quarantine folder.")],
+    isolate: Annotated[bool, Isolate] = True,
+    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
+    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
+    out: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Write the record, and the model as OBJ and CityJSON, here.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Model one quarantined building again, from its bundle alone."""
+    with Console(as_json=as_json) as console:
+        from pipeline import __version__
+        from pipeline.runtime.bundle import read_bundle
+        from pipeline.runtime.isolation import IsolationLimits
+        from pipeline.runtime.replay import replay as replay_building
+        from pipeline.runtime.replay import replay_row, write_replay
+
+        limits = IsolationLimits(timeout_s=building_timeout, memory_bytes=round(building_memory * 2**30))
+        found = read_bundle(bundle)
+        if found.incident.engine_version != __version__:
+            console.warn(f"it happened to gablework {found.incident.engine_version}; this is {__version__}")
+        console.say(f"{found.candidate.building_id} in its run: {found.incident.reason}, {found.incident.detail}")
+        replayed = replay_building(found, limits if isolate else None)
+        row = replay_row(found, replayed)
+        console.table("This time", ["column", "value"], [(name, value) for name, value in row.items() if value != []])
+        if replayed.loss is not None and replayed.loss.stderr:
+            console.say(f"its process said last:\n{replayed.loss.stderr}")
+        written = [str(path) for path in write_replay(out, found, replayed)] if out is not None else []
+        for path in written:
+            console.say(f"wrote {path}")
+        incident = dataclasses.asdict(found.incident)
+        stderr = "" if replayed.loss is None else replayed.loss.stderr
+        console.document({"incident": incident, "record": dict(row), "stderr": stderr, "written": written})
+        if row["status"] == "failed":
+            raise typer.Exit(ExitCode.TILES_FAILED)
+
+
+@app.command()
 def demo(
     out: Annotated[str, typer.Option(metavar="DIR", help="The folder of everything the demo makes.")] = "demo",
     size: Annotated[
@@ -317,3 +375,41 @@ def demo(
         console.document(
             dataclasses.asdict(made.summary) | {"score": dict(made.score.table()), "picture": str(made.picture)}
         )
+
+
+@app.command()
+def worker(
+    scheduler: Annotated[str, typer.Option(metavar="ADDRESS", help="The Dask scheduler, as tcp://host:8786.")],
+    threads: Annotated[int, typer.Option(min=1, help="Tasks at once.")] = 1,
+    memory_limit: Annotated[
+        str, typer.Option(metavar="BYTES", help="Memory of the process, such as 4GiB; auto, or 0 for none.")
+    ] = "auto",
+    local_directory: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Where the worker keeps its own files; default temporary.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name in the scheduler's lists; default its address.")] = None,
+    host: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="To listen on; default what leads to the scheduler.")
+    ] = None,
+    drain_timeout: Annotated[
+        float | None, typer.Option(metavar="S", min=0, help="Longest wait for running tasks at the end; default none.")
+    ] = None,
+    give_up_after: Annotated[
+        float | None, typer.Option(metavar="S", min=0, help="End when the scheduler was away so long; default never.")
+    ] = None,
+) -> None:
+    """Work for a Dask scheduler; on SIGTERM finish what runs, then leave."""
+    with Console() as console:
+        from pipeline.runtime.worker import WorkerOptions, serve_worker
+
+        options = WorkerOptions(
+            scheduler=scheduler,
+            threads=threads,
+            memory_limit=memory_limit,
+            local_directory=local_directory,
+            name=name,
+            host=host,
+            drain_timeout_s=drain_timeout,
+            give_up_after_s=give_up_after,
+        )
+        serve_worker(options, console.say)

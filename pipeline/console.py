@@ -53,7 +53,10 @@ class ExitCode(IntEnum):
 
 EXIT_CODES: Mapping[ExitCode, str] = {
     ExitCode.DONE: "Done. Single buildings may still have failed: each has a record with its reason.",
-    ExitCode.TILES_FAILED: "The run finished, but at least one tile failed; all other tiles are complete.",
+    ExitCode.TILES_FAILED: (
+        "The run finished, but at least one tile failed; all other tiles are complete. Or: the building of a replay "
+        "failed again."
+    ),
     ExitCode.USAGE: "The command line or a setting is wrong; nothing was done.",
     ExitCode.INPUT: "An input cannot be used; the message names the file, the value and the fix.",
     ExitCode.RUN_DIRECTORY: "The run directory cannot be written, read or resumed.",

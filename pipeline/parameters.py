@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from pipeline.errors import SettingsError
@@ -99,3 +100,22 @@ class Parameters:
     def cross_faults(self) -> list[str]:
         """Faults that concern more than one field; overridden where there are any."""
         return []
+
+
+def build(kind: type[Parameters], section: str, values: Mapping[str, Any], faults: list[str]) -> Any:
+    """One settings object, or None with its faults appended, each under the name of its table."""
+    names = {field.name: field for field in dataclasses.fields(kind)}
+    prefix = f"[{section}] " if section else ""
+    unknown = [name for name in values if name not in names]
+    faults.extend(f"{prefix}{name} is no setting: use one of {', '.join(names)}" for name in unknown)
+    given = {}
+    for name, value in values.items():
+        if name in names:
+            # TOML writes 2 where a float is meant
+            wants_float = isinstance(names[name].default, float) and isinstance(value, int)
+            given[name] = float(value) if wants_float and not isinstance(value, bool) else value
+    try:
+        return kind(**given)
+    except SettingsError as error:
+        faults.extend(f"{prefix}{fault}" for fault in error.faults)
+        return None

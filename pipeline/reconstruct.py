@@ -24,7 +24,7 @@ from pipeline.roof.roof_type import roof_type
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.solid import SolidPart, solid_parts
 
-__all__ = ["ReconstructSettings", "reconstruct_building"]
+__all__ = ["ReconstructSettings", "failed_building", "reconstruct_building"]
 
 
 def reconstruct_building(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
@@ -60,11 +60,11 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
     try:
         return _reconstruct(candidate, method, segment, settings)
     except BuildingError as error:
-        return _failed(candidate, method, error.reason, error.detail)
+        return failed_building(candidate, method, error.reason, error.detail)
     except MemoryError:
         raise
     except Exception as error:  # noqa: BLE001 - told in the record, with its place
-        return _failed(candidate, method, Reason.INTERNAL_ERROR, _describe(error))
+        return failed_building(candidate, method, Reason.INTERNAL_ERROR, _describe(error))
 
 
 def _describe(error: Exception) -> str:
@@ -230,7 +230,7 @@ def _united(footprints: Sequence[Polygon]) -> Polygon | MultiPolygon:
     return united if isinstance(united, Polygon | MultiPolygon) else MultiPolygon(list(footprints))
 
 
-def _failed(candidate: Candidate, method: str, reason: Reason, detail: str) -> BuildingResult:
+def failed_building(candidate: Candidate, method: str, reason: Reason, detail: str) -> BuildingResult:
     """The record of a building without a model."""
     finite = candidate.points[np.isfinite(candidate.points).all(axis=1)]
     footprint = candidate.footprint if candidate.footprint is not None else hull_of_points(finite)

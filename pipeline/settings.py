@@ -12,7 +12,7 @@ from typing import Any
 
 from pipeline.errors import SettingsError
 from pipeline.methods import METHODS, ReconstructSettings, method_named
-from pipeline.parameters import Parameters, parameter
+from pipeline.parameters import Parameters, build, parameter
 from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings
 from pipeline.scene import SceneSettings
@@ -145,7 +145,7 @@ class RunSettings:
         """
         faults: list[str] = []
         general_values = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
-        general = _build(GeneralSettings, "", general_values, faults)
+        general = build(GeneralSettings, "", general_values, faults)
         method_name = general_values.get("method", GeneralSettings().method)
         known = {**SECTIONS, **{name: entry.settings_type for name, entry in METHODS.items()}}
         built: dict[str, Any] = {}
@@ -155,7 +155,7 @@ class RunSettings:
             if name not in known:
                 faults.append(f"[{name}] is no table of settings: use one of {', '.join(known)}")
             else:
-                built[name] = _build(known[name], name, values, faults)
+                built[name] = build(known[name], name, values, faults)
         if faults:
             raise SettingsError(faults)
         scene_names = {field.name for field in dataclasses.fields(SceneSettings)}
@@ -196,22 +196,3 @@ class RunSettings:
                 raise SettingsError([f"settings file {path} has no [settings] table; it has {', '.join(document)}"])
         table.update(overrides)
         return cls.from_mapping(table)
-
-
-def _build(kind: type[Parameters], section: str, values: Mapping[str, Any], faults: list[str]) -> Any:
-    """One settings object, or None with its faults appended, each under the name of its table."""
-    names = {field.name: field for field in dataclasses.fields(kind)}
-    prefix = f"[{section}] " if section else ""
-    unknown = [name for name in values if name not in names]
-    faults.extend(f"{prefix}{name} is no setting: use one of {', '.join(names)}" for name in unknown)
-    given = {}
-    for name, value in values.items():
-        if name in names:
-            # TOML writes 2 where a float is meant
-            wants_float = isinstance(names[name].default, float) and isinstance(value, int)
-            given[name] = float(value) if wants_float and not isinstance(value, bool) else value
-    try:
-        return kind(**given)
-    except SettingsError as error:
-        faults.extend(f"{prefix}{fault}" for fault in error.faults)
-        return None

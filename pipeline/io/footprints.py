@@ -38,6 +38,9 @@ ID_COLUMNS = (
 """Columns that hold a building's own id, in this order; one with gaps or repeats is passed over."""
 
 VALID = "Valid are GeoPackage (.gpkg), GeoJSON (.geojson, .json) and Shapefile (.shp with .shx and .dbf)"
+DRIVERS = {b"SQLi": "GPKG:", b"\0\0\x27\x0a": ""}
+"""How GDAL is told the format, by a file's first bytes; text in braces is GeoJSON. Left to itself GDAL goes by content,
+and there are formats that name other files and servers to read. Shapefiles have no such prefix and no such twins."""
 ACCURACY_LIMIT_M = 0.5
 """A coarser reprojection is told."""
 
@@ -123,9 +126,9 @@ def _read_layer(path: Path, layer: str | None) -> tuple[dict[str, Any], npt.NDAr
     import pyogrio
     from pyogrio.errors import DataLayerError, DataSourceError, FieldError, GeometryError
 
-    first_bytes(path)
+    source = _told_apart(path)
     try:
-        layers = {str(name): kind for name, kind in pyogrio.list_layers(path)}
+        layers = {str(name): kind for name, kind in pyogrio.list_layers(source)}
         if layer is None:
             # The kind is None for tables without geometry and "Unknown" where a layer does not say.
             found = [name for name, kind in layers.items() if kind and ("Polygon" in kind or "Unknown" in kind)]
@@ -138,10 +141,28 @@ def _read_layer(path: Path, layer: str | None) -> tuple[dict[str, Any], npt.NDAr
                 f"layer {layer!r} is not there" if layer else f"{len(found)} layers could be the footprints",
                 f"Name one of the layers {', '.join(sorted(layers)) or '(there are none)'}",
             )
-        meta, fids, wkb, columns = pyogrio.raw.read(path, layer=found[0], return_fids=True)
+        meta, fids, wkb, columns = pyogrio.raw.read(source, layer=found[0], return_fids=True)
     except (DataSourceError, DataLayerError, FieldError, GeometryError, OSError) as fault:
         raise UnreadableInputError(str(path), f"cannot be read as vector data ({str(fault)[:160]})", VALID) from fault
     return meta, fids, wkb, columns
+
+
+def _told_apart(path: Path) -> str:
+    """The path as GDAL is given it: with the one format that it may be.
+
+    Raises
+    ------
+    UnreadableInputError
+        If it is none of the three.
+    """
+    head = first_bytes(path)
+    where = path.resolve().as_posix()
+    if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
+        return f"GeoJSON:{where}"
+    driver = next((name for magic, name in DRIVERS.items() if head.startswith(magic)), None)
+    if driver is None:
+        raise UnreadableInputError(str(path), f"cannot be read as vector data: it begins with {head[:8]!r}", VALID)
+    return f"{driver}{where}"
 
 
 def _polygons_only(name: str, wkb: npt.NDArray[Any], told: list[str]) -> npt.NDArray[np.object_]:

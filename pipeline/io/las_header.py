@@ -23,6 +23,8 @@ HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
 """Smallest header in bytes by minor version."""
 VLR_HEADER_SIZE = 54
 EVLR_HEADER_SIZE = 60
+EVLR_LIMIT = 10_000
+"""Extended records looked at: files have a handful, and a damaged count is in the billions."""
 WKT_RECORD_ID = 2112
 WKT_SIZE_LIMIT = 1 << 20
 """A longer text is no CRS."""
@@ -168,11 +170,11 @@ def _check_scales(name: str, values: tuple[float, ...]) -> None:
 def _wkt_of_extended_records(stream: BinaryIO, block: HeaderBlock) -> str | None:
     """The WKT in the extended records, without reading the others (waveforms can be gigabytes)."""
     at = block.first_evlr
-    for _ in range(block.evlr_count):
+    for _ in range(min(block.evlr_count, EVLR_LIMIT)):
+        if at > block.file_size - EVLR_HEADER_SIZE:
+            return None
         stream.seek(at)
         head = stream.read(EVLR_HEADER_SIZE)
-        if len(head) < EVLR_HEADER_SIZE:
-            return None
         user_id = head[2:18].split(b"\0")[0]
         record_id, length = struct.unpack_from("<HQ", head, 18)
         if user_id == b"LASF_Projection" and record_id == WKT_RECORD_ID and length <= WKT_SIZE_LIMIT:

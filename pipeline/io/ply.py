@@ -51,6 +51,8 @@ PROPERTY_NAMES = {
 
 HEADER_LIMIT = 65_536
 LINE_LIMIT = 65_536
+NUMBER_LIMIT = 64
+"""Characters of a number; no row of numbers is longer than this allows, which bounds what is held at once."""
 SINGLE_PRECISION_FAULT = 0.01
 """Units of the CRS; single precision coarser than this is told."""
 FIX = "Get the file again, or write it again"
@@ -94,9 +96,9 @@ class PlyFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         with path.open("rb") as stream:
-            self._byte_order, self._elements = self._read_header(stream)
+            self._byte_order, self._elements = _read_header(path, stream)
             self._body = stream.tell()
-        self._vertex = self._check_vertex()
+        self._vertex = _vertex_of(path, self._elements)
         self._fields = self._find_fields()
         if self._byte_order:
             self._start = self._check_room()
@@ -124,62 +126,6 @@ class PlyFile:
                 )
             begin += len(table)
             yield records
-
-    def _read_header(self, stream: io.BufferedReader) -> tuple[str, list[Element]]:
-        """Byte order and elements; leaves the stream where the data begin."""
-        byte_order: str | None = None
-        elements: list[Element] = []
-        while stream.tell() < HEADER_LIMIT:
-            line = stream.readline(LINE_LIMIT)
-            if not line:
-                break
-            try:
-                words = line.decode("ascii").split()
-                match words:
-                    case [] | ["ply"] | ["comment" | "obj_info", *_]:
-                        continue
-                    case ["format", kind, _]:
-                        byte_order = BYTE_ORDERS[kind]
-                    case ["element", name, count]:
-                        elements.append(Element(name=name, count=int(count), properties=()))
-                    case ["property", "list", _, _, name]:
-                        elements[-1] = _with_property(elements[-1], name, "list")
-                    case ["property", kind, name] if kind in SCALARS:
-                        elements[-1] = _with_property(elements[-1], name.lower(), kind)
-                    case ["end_header"]:
-                        if byte_order is None:
-                            break
-                        return byte_order, elements
-                    case _:
-                        raise self._damaged(line)
-            except (UnicodeDecodeError, KeyError, ValueError, IndexError) as fault:
-                raise self._damaged(line) from fault
-        raise UnreadableInputError(str(self._path), "truncated: the PLY header has no end or no format", FIX)
-
-    def _damaged(self, line: bytes) -> UnreadableInputError:
-        """The error for a line of the header that means nothing."""
-        return UnreadableInputError(str(self._path), f"the PLY header has the line {line[:60]!r}", FIX)
-
-    def _check_vertex(self) -> Element:
-        """The vertex element, fit to be points."""
-        name = str(self._path)
-        found = [element for element in self._elements if element.name == "vertex"]
-        if len(found) != 1:
-            raise UnreadableInputError(name, f"the PLY has {len(found)} vertex elements", "Give a PLY with points")
-        vertex = found[0]
-        missing = {"x", "y", "z"} - {prop for prop, _ in vertex.properties}
-        names = [prop for prop, _ in vertex.properties]
-        if missing or vertex.has_lists or len(set(names)) != len(names):
-            raise UnreadableInputError(
-                name,
-                f"the vertices have the properties {' '.join(names)}",
-                "Give a PLY with x, y, z and no lists there",
-            )
-        if vertex.count == 0:
-            raise EmptyInputError(name, "the header promises 0 vertices", "Give a file with points")
-        if vertex.count < 0:
-            raise InconsistentInputError(name, f"the header promises {vertex.count} vertices", FIX)
-        return vertex
 
     def _check_room(self) -> int:
         """Byte at which the vertices begin in a binary file, when the promised bytes are there."""
@@ -223,7 +169,7 @@ class PlyFile:
                     break
             for begin in range(0, self._vertex.count, chunk_size):
                 count = min(chunk_size, self._vertex.count - begin)
-                lines = list(itertools.islice(iter(lambda: stream.readline(LINE_LIMIT), b""), count))
+                lines = list(itertools.islice(iter(lambda: stream.readline(width * NUMBER_LIMIT), b""), count))
                 try:
                     table = (
                         np.loadtxt(lines, dtype=np.float64, ndmin=2, comments=None) if lines else np.empty((0, width))
@@ -318,3 +264,75 @@ class PlyFile:
 def _with_property(element: Element, name: str, kind: str) -> Element:
     """The element with one more property."""
     return dataclasses.replace(element, properties=(*element.properties, (name, kind)))
+
+
+def promised_vertices(path: Path) -> int:
+    """The number of vertices that the header promises; nothing else is read.
+
+    Raises
+    ------
+    InputError
+        If the header is damaged or has no vertices.
+    """
+    with path.open("rb") as stream:
+        _, elements = _read_header(path, stream)
+    return _vertex_of(path, elements).count
+
+
+def _read_header(path: Path, stream: io.BufferedReader) -> tuple[str, list[Element]]:
+    """Byte order and elements; leaves the stream where the data begin."""
+    byte_order: str | None = None
+    elements: list[Element] = []
+    while stream.tell() < HEADER_LIMIT:
+        line = stream.readline(LINE_LIMIT)
+        if not line:
+            break
+        try:
+            words = line.decode("ascii").split()
+            match words:
+                case [] | ["ply"] | ["comment" | "obj_info", *_]:
+                    continue
+                case ["format", kind, _]:
+                    byte_order = BYTE_ORDERS[kind]
+                case ["element", name, count]:
+                    elements.append(Element(name=name, count=int(count), properties=()))
+                case ["property", "list", _, _, name]:
+                    elements[-1] = _with_property(elements[-1], name, "list")
+                case ["property", kind, name] if kind in SCALARS:
+                    elements[-1] = _with_property(elements[-1], name.lower(), kind)
+                case ["end_header"]:
+                    if byte_order is None:
+                        break
+                    return byte_order, elements
+                case _:
+                    raise _damaged(path, line)
+        except (UnicodeDecodeError, KeyError, ValueError, IndexError) as fault:
+            raise _damaged(path, line) from fault
+    raise UnreadableInputError(str(path), "truncated: the PLY header has no end or no format", FIX)
+
+
+def _damaged(path: Path, line: bytes) -> UnreadableInputError:
+    """The error for a line of the header that means nothing."""
+    return UnreadableInputError(str(path), f"the PLY header has the line {line[:60]!r}", FIX)
+
+
+def _vertex_of(path: Path, elements: list[Element]) -> Element:
+    """The vertex element, fit to be points."""
+    name = str(path)
+    found = [element for element in elements if element.name == "vertex"]
+    if len(found) != 1:
+        raise UnreadableInputError(name, f"the PLY has {len(found)} vertex elements", "Give a PLY with points")
+    vertex = found[0]
+    missing = {"x", "y", "z"} - {prop for prop, _ in vertex.properties}
+    names = [prop for prop, _ in vertex.properties]
+    if missing or vertex.has_lists or len(set(names)) != len(names):
+        raise UnreadableInputError(
+            name,
+            f"the vertices have the properties {' '.join(names)}",
+            "Give a PLY with x, y, z and no lists there",
+        )
+    if vertex.count == 0:
+        raise EmptyInputError(name, "the header promises 0 vertices", "Give a file with points")
+    if vertex.count < 0:
+        raise InconsistentInputError(name, f"the header promises {vertex.count} vertices", FIX)
+    return vertex

@@ -31,3 +31,24 @@ Listener = Callable[[Event], None]
 def ignore(event: Event) -> None:
     """Listen to nothing."""
     del event
+
+
+def never() -> bool:
+    """Call nothing off."""
+    return False
+
+
+def nothing() -> None:
+    """Stop nothing."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Watch:
+    """What an executor asks, tells and sets off while the tasks of a run are under way."""
+
+    cancelled: Callable[[], bool] = never
+    """Whether the run was called off; asked several times a second."""
+    stop: Callable[[], None] = nothing
+    """Tells the tasks in flight to end, because nobody waits for them any more."""
+    listener: Listener = ignore
+    """Gets events that no result tells: workers are missing, workers are back."""

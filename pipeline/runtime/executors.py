@@ -1,4 +1,4 @@
-"""Where tasks run: serially in this process, or on Dask. The only module that imports dask.
+"""Where tasks run: serially in this process, or on Dask.
 
 A plan is data and tasks are plain functions of one argument; an executor maps a function over tasks
 and yields results as they come, in any order. Nothing else of the engine shows.
@@ -7,52 +7,45 @@ and yields results as they come, in any order. Nothing else of the engine shows.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import itertools
-import os
-import resource
-import socket
+import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from types import TracebackType
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self
 
-from pipeline.errors import RunError
+from pipeline.errors import ClusterError, RunCancelledError, VersionMismatchError
+from pipeline.runtime import worker_setup
+from pipeline.runtime.events import Watch
+from pipeline.runtime.flight import SETTLE_INTERRUPTED_S, SETTLE_S, TICK_S, Flight, Lookout
+from pipeline.runtime.measured import Measured, Result, Task, measure, mismatch_told, peak_of_process
+from pipeline.runtime.versions import ENGINE, TALKING, WORKING, differences
 
-Task = TypeVar("Task")
-Result = TypeVar("Result")
+__all__ = [
+    "Cluster",
+    "DaskExecutor",
+    "Executor",
+    "Measured",
+    "SerialExecutor",
+    "executor_for",
+    "measure",
+    "peak_of_process",
+]
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Measured(Generic[Result]):
-    """A result and what it took."""
-
-    result: Result
-    seconds: float
-    process: str
-    """host:pid."""
-    peak_bytes: int
-    """Largest resident size of the process so far."""
-
-
-def peak_of_process() -> tuple[str, int]:
-    """The process as host:pid, and its largest resident size so far in bytes."""
-    return f"{socket.gethostname()}:{os.getpid()}", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
-def measure(function: Callable[[Task], Result], task: Task) -> Measured[Result]:
-    """Run one task and measure it."""
-    started = time.perf_counter()
-    result = function(task)
-    seconds = time.perf_counter() - started
-    process, peak_bytes = peak_of_process()
-    return Measured(result=result, seconds=seconds, process=process, peak_bytes=peak_bytes)
+CONNECT_S = 20.0
+"""A scheduler that does not answer within so long is not there."""
+_ANSWER_S = 30.0
+_MEND_S = 5.0
 
 
 class Executor(Protocol):
-    """What a run needs of an engine."""
+    """What a run needs of an engine. One executor serves one run at a time."""
 
-    def map(self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Measured[Result]]:
+    def prepare(self, stage: str, watch: Watch) -> None:
+        """Wait until tasks can run, and see that all processes run the same versions."""
+
+    def map(
+        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
+    ) -> Generator[Measured[Result], None, None]:
         """Results of all tasks, in the order in which they finish."""
 
     @property
@@ -71,10 +64,23 @@ class Executor(Protocol):
 class SerialExecutor:
     """One task after the other, in this process."""
 
-    def map(self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Measured[Result]]:
-        """Results in the order of the tasks."""
+    def prepare(self, stage: str, watch: Watch) -> None:
+        """Nothing to wait for."""
+
+    def map(
+        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
+    ) -> Generator[Measured[Result], None, None]:
+        """Results in the order of the tasks.
+
+        Raises
+        ------
+        RunCancelledError
+            The watch called the run off.
+        """
         del stage
         for task in tasks:
+            if watch.cancelled():
+                raise RunCancelledError("the run was called off")
             yield measure(function, task)
 
     @property
@@ -92,114 +98,280 @@ class SerialExecutor:
         """Nothing to stop."""
 
 
-class DaskExecutor:
-    """An embedded cluster of worker processes, or a scheduler that is already there.
+class Cluster:
+    """Workers for any number of runs, also several at once from several threads; a context manager.
+
+    Embedded, the scheduler lives in this process and every worker is a process of its own, restarted when it dies.
+    With the address of a scheduler nothing is started here, and each executor connects by itself: a scheduler that
+    comes back serves the next run.
 
     Parameters
     ----------
     workers : int
-        Processes of the embedded cluster, one thread each.
+        Processes of the embedded cluster, one thread each; unused with `scheduler`.
     scheduler : str or None
-        Address of a scheduler; then no cluster is embedded.
-    local_directory : str
-        Where the embedded workers spill.
+        Address of a scheduler that is already there.
+    local_directory : str or None
+        Where embedded workers spill; a temporary folder by default.
     """
 
-    def __init__(self, *, workers: int, scheduler: str | None, local_directory: str) -> None:
+    _starting = threading.Lock()
+
+    def __init__(self, *, workers: int = 2, scheduler: str | None = None, local_directory: str | None = None) -> None:
         self._workers = workers
         self._scheduler = scheduler
         self._local_directory = local_directory
-        self._stack = contextlib.ExitStack()
-        self._client: Any = None
+        self._embedded: Any = None
+        self._mended_s = 0.0
 
-    def __enter__(self) -> Self:
-        """Start the cluster or connect to the scheduler.
+    @property
+    def embedded(self) -> bool:
+        """Whether scheduler and workers belong to this process."""
+        return self._scheduler is None
+
+    @property
+    def address(self) -> str:
+        """The scheduler's address.
 
         Raises
         ------
-        RunError
-            The scheduler does not answer.
+        ClusterError
+            The embedded cluster was not started.
         """
+        if self._scheduler is not None:
+            return self._scheduler
+        if self._embedded is None:
+            raise ClusterError("the embedded cluster is not running: use it as a context manager")
+        return str(self._embedded.scheduler_address)
+
+    @property
+    def advice(self) -> str:
+        """What to do where no worker is there."""
+        if self.embedded:
+            return "Workers that die are started again by themselves; if they die again and again they lack memory"
+        return f"Start one by gablework worker --scheduler {self.address}"
+
+    def mend(self, workers: int) -> None:
+        """Start embedded workers anew that their keeper gave up: one that dies as soon as it starts is not restarted.
+
+        Parameters
+        ----------
+        workers : int
+            How many are there now.
+        """
+        if self._embedded is None or workers >= self._workers or time.monotonic() - self._mended_s < _MEND_S:
+            return
+        self._mended_s = time.monotonic()
+        self._embedded.scale(self._workers)
+
+    def executor(self, priority: int = 0) -> DaskExecutor:
+        """An executor for one run.
+
+        Parameters
+        ----------
+        priority : int
+            Tasks of a higher one go first where workers are scarce.
+        """
+        return DaskExecutor(self, priority=priority)
+
+    def __enter__(self) -> Self:
+        """Start the embedded workers; connect to nothing yet.
+
+        Raises
+        ------
+        ClusterError
+            The workers do not start.
+        """
+        if self._scheduler is not None:
+            return self
         import dask
-        from distributed import Client, LocalCluster
+        from distributed import LocalCluster
 
         quiet = {"distributed.admin.log-format": "%(message)s", "distributed.logging.distributed": "error"}
-        # what was entered before a fault is left again
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(dask.config.set(quiet))
-            if self._scheduler is None:
-                cluster = LocalCluster(
+        try:
+            # the configuration is the process's own, not the thread's, and workers copy it as they start
+            with self._starting, dask.config.set(quiet):
+                self._embedded = LocalCluster(
                     n_workers=self._workers,
                     threads_per_worker=1,
                     processes=True,
                     dashboard_address="127.0.0.1:0",
                     local_directory=self._local_directory,
                     silence_logs="ERROR",
+                    preload=[worker_setup.__name__],
                 )
-                stack.enter_context(cluster)
-                self._client = stack.enter_context(Client(cluster))
-            else:
-                try:
-                    self._client = stack.enter_context(Client(self._scheduler, timeout="20s"))
-                except OSError as error:
-                    raise RunError(
-                        f"the scheduler {self._scheduler} does not answer: {error}. Check the address, or use --workers"
-                    ) from error
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise ClusterError(f"the {self._workers} workers of this machine do not start: {error}") from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the embedded workers."""
+        if self._embedded is not None:
+            embedded, self._embedded = self._embedded, None
+            embedded.close()
+
+
+class DaskExecutor:
+    """One run's connection to a cluster.
+
+    Parameters
+    ----------
+    cluster : Cluster
+        Where tasks go.
+    priority : int
+        Tasks of a higher one go first where workers are scarce.
+    owned : bool
+        Whether the cluster lives and ends with this executor.
+    """
+
+    def __init__(self, cluster: Cluster, *, priority: int = 0, owned: bool = False) -> None:
+        self._cluster = cluster
+        self._priority = priority
+        self._owned = owned
+        self._stack = contextlib.ExitStack()
+        self._client: Any = None
+        self._lookout: Lookout | None = None
+
+    def __enter__(self) -> Self:
+        """Connect, and start the cluster if it is owned.
+
+        Raises
+        ------
+        ClusterError
+            The scheduler does not answer.
+        """
+        from distributed import Client
+
+        # what was entered before a fault is left again
+        with contextlib.ExitStack() as stack:
+            if self._owned:
+                stack.enter_context(self._cluster)
+            address = self._cluster.address
+            try:
+                client = Client(address, timeout=CONNECT_S, set_as_default=False)
+            except (OSError, TimeoutError, ValueError) as error:
+                raise ClusterError(
+                    f"the scheduler {address} does not answer: {error}. Check the address, or use --workers"
+                ) from error
+            self._client = stack.enter_context(client)
+            self._lookout = Lookout(client, address, self._cluster.mend, self._cluster.advice)
             self._stack = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close what was started."""
+        """Disconnect, and end the cluster if it is owned."""
         self._stack.__exit__(kind, error, trace)
 
     @property
     def memory_limit_bytes(self) -> int | None:
-        """The smallest worker's limit."""
+        """The smallest worker's limit; None where none has one, or where no worker is there."""
         limits = [w["memory_limit"] for w in self._client.scheduler_info(n_workers=-1)["workers"].values()]
         return min((limit for limit in limits if limit), default=None)
 
-    def map(self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Measured[Result]]:
-        """Results as they come, with a bounded window of tasks in flight.
+    def prepare(self, stage: str, watch: Watch) -> None:
+        """Wait for a worker, tell the waiting, and compare the versions of all processes.
 
         Raises
         ------
-        RunError
-            A worker died again and again on one task.
+        ClusterError
+            The scheduler is lost.
+        VersionMismatchError
+            Some process runs other versions than this one.
+        RunCancelledError
+            The watch called the run off.
         """
-        from distributed import as_completed
-        from distributed.scheduler import KilledWorker
+        lookout = self._started()
+        while not lookout.threads:
+            if watch.cancelled():
+                raise RunCancelledError("the run was called off")
+            lookout.look(stage, watch)
+            if not lookout.threads:
+                time.sleep(TICK_S)
+        if not self._cluster.embedded:
+            self._check_versions(lookout)
 
-        waiting = iter(enumerate(tasks))
-        threads = max(2, sum(self._client.nthreads().values()))
+    def map(
+        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
+    ) -> Generator[Measured[Result], None, None]:
+        """Results as they come; `Flight` tells what happens to tasks whose workers die.
 
-        def submit(number: int, task: Task) -> Any:
-            return self._client.submit(measure, function, task, key=f"{stage}-{number}-{id(self)}", pure=False)
+        Raises
+        ------
+        RunCancelledError
+            The watch called the run off.
+        ClusterError
+            The scheduler was lost.
+        VersionMismatchError
+            A worker that came late runs other versions than this process.
+        RunError
+            Workers died again and again on one task.
+        """
+        flight = Flight(
+            client=self._client,
+            lookout=self._started(),
+            stage=stage,
+            function=function,
+            tasks=tasks,
+            watch=watch,
+            priority=self._priority,
+            # workers that end with the run need not be waited for
+            settle_s=SETTLE_INTERRUPTED_S if self._owned and self._cluster.embedded else SETTLE_S,
+        )
+        yield from flight.results()
 
-        running = as_completed([submit(*item) for item in itertools.islice(waiting, 3 * threads)])
-        for future in running:
-            try:
-                measured = future.result()
-            except KilledWorker as error:
-                task = tasks[int(str(future.key).removeprefix(f"{stage}-").split("-")[0])]
-                raise RunError(
-                    f"stage {stage}: workers died again and again on one task: {_told(task)}. Give them more memory"
-                    + (", or set a smaller tile_size_m" if stage == "split" else "")
-                ) from error
-            future.release()
-            for item in itertools.islice(waiting, 1):
-                running.add(submit(*item))
-            yield measured
+    def _started(self) -> Lookout:
+        if self._lookout is None:
+            raise ClusterError("the executor is not connected: use it as a context manager")
+        return self._lookout
+
+    def _check_versions(self, lookout: Lookout) -> None:
+        """Compare this process with the scheduler and all workers.
+
+        Raises
+        ------
+        VersionMismatchError
+            They differ.
+        ClusterError
+            The scheduler is lost.
+        """
+        from distributed.versions import get_versions
+
+        packages = [ENGINE, *WORKING]
+        ours = _plain(get_versions(packages))
+        talking = {name: ours[name] for name in ("python", ENGINE, *TALKING) if name in ours}
+        message = {"op": "versions", "packages": packages}
+        try:
+            scheduler = self._client.sync(
+                self._client.scheduler.versions, packages=[ENGINE], callback_timeout=_ANSWER_S
+            )
+            workers = self._client.sync(
+                self._client.scheduler.broadcast, msg=message, on_error="ignore", callback_timeout=_ANSWER_S
+            )
+        except (OSError, TimeoutError) as error:
+            raise lookout.lost(f"it did not tell the versions of its processes ({error})") from error
+        told = {f"scheduler {self._cluster.address}": differences(talking, _plain(scheduler))}
+        for address, theirs in sorted(workers.items()):
+            told[f"worker {address}"] = differences(ours, _plain(theirs))
+        faults = [f"{process}: {', '.join(what)}" for process, what in told.items() if what]
+        if faults:
+            raise VersionMismatchError(mismatch_told(faults))
 
 
-def _told(task: object) -> str:
-    """A task in a message: its first plain facts."""
-    return repr(task)[:300]
+def _plain(found: Mapping[str, Any]) -> dict[str, str]:
+    """What a Dask process tells of its versions, by name; what it has not is left out."""
+    told = {name: str(version) for name, version in found["packages"].items() if version is not None}
+    major_minor = told["python"].split(".")[:2]
+    wanted = (ENGINE, *TALKING, *WORKING)
+    return {"python": ".".join(major_minor), **{name: told[name] for name in wanted if name in told}}
 
 
-def executor_for(*, workers: int, scheduler: str | None, local_directory: str) -> Executor:
+def executor_for(*, workers: int, scheduler: str | None, local_directory: str, priority: int = 0) -> Executor:
     """The executor that a request asks for: serial without workers and scheduler, else Dask."""
     if workers == 0 and scheduler is None:
         return SerialExecutor()
-    return DaskExecutor(workers=workers, scheduler=scheduler, local_directory=local_directory)
+    cluster = Cluster(workers=workers, scheduler=scheduler, local_directory=local_directory)
+    return DaskExecutor(cluster, priority=priority, owned=True)

@@ -103,7 +103,10 @@ def ingest(task: IngestTask) -> Ingested:
     ------
     InputError
         The file cannot be used.
+    RunCancelledError
+        The run was called off.
     """
+    task.scratch.check_cancelled()
     source = open_source(task.path, task.options)
     suffix = f".{uuid4().hex}.part"
     counts: Counter[Tile] = Counter()
@@ -114,6 +117,7 @@ def ingest(task: IngestTask) -> Ingested:
     first: tuple[int, int] | None = None
     multiple = False
     for cloud in source.chunks(_CHUNK_POINTS):
+        task.scratch.check_cancelled()
         records = to_records(cloud, task.path)
         x, y = records["x"], records["y"]
         for axis, name in enumerate("xyz"):

@@ -37,6 +37,8 @@ class RunStatus(StrEnum):
     """Ended, but some tiles failed."""
     FAILED = "failed"
     """Ended with an error, told in `warnings`; what is there is not to be used."""
+    CANCELLED = "cancelled"
+    """Called off, or interrupted from the keyboard; what is there is not to be used."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

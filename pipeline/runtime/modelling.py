@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
+
+from pipeline.errors import GableworkError
 from pipeline.export.records import CandidateFacts
+from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
-from pipeline.methods import ReconstructSettings
-from pipeline.model import BuildingResult, Reason, RoofType, Status
-from pipeline.reconstruct import reconstruct_building
+from pipeline.methods import METHODS, ReconstructSettings
+from pipeline.model import BuildingResult, Candidate, Reason, RoofType, Status
+from pipeline.reconstruct import failed_building, reconstruct_building
+from pipeline.runtime.bundle import Bundle, Incident, write_bundle
 from pipeline.runtime.gather import gather
-from pipeline.runtime.isolation import IsolationLimits
+from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
 from pipeline.runtime.join import CandidateSite
 from pipeline.runtime.scratch import Scratch
 from pipeline.tiling import Tile, TileGrid
 
 _POINTS_PER_BATCH = 20_000
 _MAX_PER_BATCH = 64
+_BUNDLE_TIMEOUT_S = 60.0
+_NO_BUNDLE = "there is no bundle, since its points cannot be put together"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,7 +49,9 @@ class BatchTask:
     isolation: IsolationLimits | None = None
     """Limits of the supervised child; None models in this process."""
     quarantine: str = ""
-    """Folder for the bundles of buildings that cost their process; empty keeps none."""
+    """Folder for the bundles of buildings that cost their process, or met a fault of ours; empty keeps none."""
+    reference: SpatialReference = dataclasses.field(default_factory=SpatialReference)
+    """Of the run, for its bundles."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,6 +74,8 @@ class StoredResult:
 
     result: BuildingResult
     facts: CandidateFacts
+    seconds: float = 0.0
+    """Wall clock that it took."""
 
 
 def batches(sites: Sequence[CandidateSite]) -> list[tuple[CandidateSite, ...]]:
@@ -88,27 +100,168 @@ def batches(sites: Sequence[CandidateSite]) -> list[tuple[CandidateSite, ...]]:
     return groups
 
 
-def _model(task: BatchTask, site: CandidateSite) -> tuple[BuildingResult, CandidateFacts]:
-    """One candidate's result; a fault of its own becomes its record, and only the loss of scratch is the run's."""
+def model_batch(task: BatchTask) -> tuple[Modelled, ...]:
+    """Model a batch; the results are stored under `results/<tile>/<batch>` for their tiles to publish.
+
+    Raises
+    ------
+    RunCancelledError
+        The run was called off.
+    OSError
+        Scratch cannot be read or written.
+    RunError
+        Child processes cannot be started.
+    """
+    models = _here(task) if task.isolation is None else _in_child(task, task.isolation)
+    try:
+        stored = dict(models)
+    except OSError:
+        task.scratch.check_cancelled()  # a run that is over has no scratch any more
+        raise
+    by_tile: dict[Tile, list[StoredResult]] = {}
+    for index, site in enumerate(task.sites):
+        by_tile.setdefault(site.owner, []).append(stored[index])
+    for tile, results in by_tile.items():
+        task.scratch.put_object(f"results/{tile.key}/{task.number}.pickle", results)
+    return tuple(_told(site, stored[index]) for index, site in enumerate(task.sites))
+
+
+def _told(site: CandidateSite, stored: StoredResult) -> Modelled:
+    result = stored.result
+    return Modelled(
+        building_id=result.building_id,
+        owner=site.owner,
+        status=result.status.value,
+        reason=None if result.reason is None else result.reason.value,
+        roof_type=result.roof_type.value,
+        faces=len(result.faces),
+        points=result.n_points,
+        seconds=stored.seconds,
+    )
+
+
+def _here(task: BatchTask) -> Iterator[tuple[int, StoredResult]]:
+    """Models made in this process: one that runs out of memory has a record, one that crashes takes all along."""
+    for index, site in enumerate(task.sites):
+        task.scratch.check_cancelled()
+        try:
+            yield index, model_site(task, site)
+        except MemoryError as error:
+            detail = f"memory ran out: {error}".removesuffix(": ")
+            yield (
+                index,
+                StoredResult(
+                    result=failed_site(site, task.method, Reason.OUT_OF_MEMORY, detail), facts=CandidateFacts()
+                ),
+            )
+
+
+def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, StoredResult]]:
+    """Models made in a supervised child process: each building can cost only itself."""
+    common = dataclasses.replace(task, sites=())
+    cancelled = functools.partial(_cancelled, task)
+    for index, model in supervise(functools.partial(model_site, common), task.sites, limits, cancelled):
+        if isinstance(model, Loss):
+            yield index, _lost(common, task.sites[index], model, limits, cancelled)
+        else:
+            yield index, model
+
+
+def _cancelled(task: BatchTask) -> bool:
+    return task.scratch.cancelled
+
+
+def model_site(task: BatchTask, site: CandidateSite) -> StoredResult:
+    """One candidate's model; a fault of its own becomes its record.
+
+    Raises
+    ------
+    MemoryError
+        As it came: alone in a fresh process it may be modelled.
+    OSError, GableworkError
+        Scratch cannot be read, the settings are none: that is the run's fault, not the candidate's.
+    """
+    started = time.perf_counter()
+    candidate: Candidate | None = None
+    facts = CandidateFacts()
     try:
         candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind)
-        return reconstruct_building(candidate, task.method, task.settings), facts
-    except MemoryError as error:
-        return failed_site(site, task.method, f"memory ran out: {error}"), CandidateFacts()
-    except OSError:
+        result = reconstruct_building(candidate, task.method, task.settings)
+    except (MemoryError, OSError, GableworkError):
         raise
     except Exception as error:  # noqa: BLE001 - told in the record
-        return failed_site(site, task.method, f"{type(error).__name__}: {error}"), CandidateFacts()
+        result = failed_site(site, task.method, Reason.INTERNAL_ERROR, f"{type(error).__name__}: {error}")
+    seconds = time.perf_counter() - started
+    if result.reason is Reason.INTERNAL_ERROR:
+        incident = Incident(reason=result.reason.value, detail=result.reason_detail, seconds=seconds)
+        result = _kept(task, candidate, result, incident)
+    return StoredResult(result=result, facts=facts, seconds=seconds)
 
 
-def failed_site(site: CandidateSite, method: str, detail: str) -> BuildingResult:
+def _lost(
+    task: BatchTask, site: CandidateSite, loss: Loss, limits: IsolationLimits, cancelled: Callable[[], bool]
+) -> StoredResult:
+    """The record and the bundle of a building that cost its process; made in a child, too."""
+    patient = dataclasses.replace(limits, timeout_s=max(limits.timeout_s, _BUNDLE_TIMEOUT_S))
+    describe = functools.partial(lost_site, task, loss)
+    ((_, described),) = supervise(describe, [site], patient, cancelled, second_chance=False)
+    if isinstance(described, StoredResult):
+        return described
+    detail = f"{loss.detail}; {_NO_BUNDLE}: {described.detail}"
+    return StoredResult(
+        result=failed_site(site, task.method, loss.reason, detail), facts=CandidateFacts(), seconds=loss.seconds
+    )
+
+
+def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> StoredResult:
+    """The record of a building that cost its process, and its bundle in the quarantine.
+
+    Raises
+    ------
+    MemoryError, OSError
+        Its points cannot be put together.
+    """
+    candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind)
+    result = failed_building(candidate, task.method, loss.reason, loss.detail)
+    incident = Incident(
+        reason=loss.reason.value,
+        detail=loss.detail,
+        seconds=loss.seconds,
+        memory_bytes=loss.memory_bytes,
+        stderr=loss.stderr,
+    )
+    return StoredResult(result=_kept(task, candidate, result, incident), facts=facts, seconds=loss.seconds)
+
+
+def _kept(task: BatchTask, candidate: Candidate | None, result: BuildingResult, incident: Incident) -> BuildingResult:
+    """The result, its building's bundle written; the record says where that failed."""
+    if not task.quarantine:
+        return result
+    if candidate is None:
+        return dataclasses.replace(result, reason_detail=f"{result.reason_detail}; {_NO_BUNDLE}")
+    bundle = Bundle(
+        candidate=candidate,
+        method=task.method,
+        settings=task.settings,
+        incident=incident,
+        reference=task.reference,
+    )
+    try:
+        write_bundle(task.quarantine, bundle)
+    except OSError as error:
+        detail = f"{result.reason_detail}; there is no bundle: {error.strerror or error}"
+        return dataclasses.replace(result, reason_detail=detail)
+    return result
+
+
+def failed_site(site: CandidateSite, method: str, reason: Reason, detail: str) -> BuildingResult:
     """The record of a candidate that could not even be put together."""
     return BuildingResult(
         building_id=site.building_id,
         origin=(0.0, 0.0, 0.0),
         source_id=site.source_id,
         status=Status.FAILED,
-        reason=Reason.INTERNAL_ERROR,
+        reason=reason,
         reason_detail=detail,
         method=method,
         roof_type=RoofType.NONE,
@@ -128,26 +281,30 @@ def failed_site(site: CandidateSite, method: str, detail: str) -> BuildingResult
     )
 
 
-def model_batch(task: BatchTask) -> tuple[Modelled, ...]:
-    """Model a batch; the results are stored under `results/<tile>/<batch>` for their tiles to publish."""
-    by_tile: dict[Tile, list[StoredResult]] = {}
-    told = []
-    for site in task.sites:
-        started = time.perf_counter()
-        result, facts = _model(task, site)
-        by_tile.setdefault(site.owner, []).append(StoredResult(result=result, facts=facts))
-        told.append(
-            Modelled(
-                building_id=result.building_id,
-                owner=site.owner,
-                status=result.status.value,
-                reason=None if result.reason is None else result.reason.value,
-                roof_type=result.roof_type.value,
-                faces=len(result.faces),
-                points=result.n_points,
-                seconds=time.perf_counter() - started,
-            )
-        )
-    for tile, results in by_tile.items():
-        task.scratch.put_object(f"results/{tile.key}/{task.number}.pickle", results)
-    return tuple(told)
+def model_bundle(bundle: Bundle) -> BuildingResult:
+    """The building of a bundle, modelled again.
+
+    Raises
+    ------
+    MemoryError
+        As it came.
+    """
+    return reconstruct_building(bundle.candidate, bundle.method, bundle.settings)
+
+
+def load() -> None:
+    """Load all that modelling needs, by modelling a small gable: libraries, and the compiled kernels."""
+    spacing = np.arange(0.25, 10.0, 0.5)
+    x, y = (axis.ravel() for axis in np.meshgrid(spacing, spacing, indexing="ij"))
+    z = 9.0 - 0.6 * np.abs(y - 5.0)
+    lattice = np.arange(-4.5, 15.0)
+    east, north = (axis.ravel() for axis in np.meshgrid(lattice, lattice, indexing="ij"))
+    gable = Candidate(
+        building_id="",
+        origin=(0.0, 0.0, 0.0),
+        points=np.rint(np.column_stack((x, y, z)) * 1e3) / 1e3,
+        ground=np.column_stack((east, north, np.zeros(len(east)))),
+        ground_z_m=0.0,
+    )
+    for method in METHODS:
+        reconstruct_building(gable, method, ReconstructSettings())

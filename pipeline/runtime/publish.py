@@ -8,8 +8,9 @@ from pathlib import Path
 
 import shapely
 
+from pipeline.errors import RunCancelledError
 from pipeline.export.records import RecordContext, RejectedObject
-from pipeline.export.tile import TileFiles, write_tile
+from pipeline.export.tile import Put, TileFiles, write_tile
 from pipeline.io import LocalStorage
 from pipeline.runtime.join import RejectedSite
 from pipeline.runtime.modelling import StoredResult
@@ -65,13 +66,26 @@ def publish(task: PublishTask) -> Published:
     """Write one tile's tables, meshes and city objects, then its state; may run twice.
 
     A tile that fails costs only itself: its state says so, and why. A tile that owns nothing has a state and no files.
+
+    Raises
+    ------
+    RunCancelledError
+        The run was called off, or is over: whoever comes so late must not touch what another run may have written.
     """
     storage = LocalStorage(root=Path(task.run_dir))
+
+    def put(key: str, content: bytes) -> None:
+        task.scratch.check_cancelled()
+        storage.put(key, content)
+
+    task.scratch.check_cancelled()
     files: TileFiles | None = None
     error = ""
     try:
         if task.batches or task.rejected:
-            files = _write(task, storage)
+            files = _write(task, put)
+    except RunCancelledError:
+        raise
     except Exception as fault:  # noqa: BLE001 - told in the tile's state, the manifest and the exit code
         error = f"{type(fault).__name__}: {fault}"
     state = {
@@ -80,11 +94,11 @@ def publish(task: PublishTask) -> Published:
         "error": error,
         "files": {} if files is None else dict(files.digests),
     }
-    storage.put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
+    put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
     return Published(tile=task.tile, files=files, error=error)
 
 
-def _write(task: PublishTask, storage: LocalStorage) -> TileFiles:
+def _write(task: PublishTask, put: Put) -> TileFiles:
     """Write the files of a tile that owns something."""
     stored: list[StoredResult] = []
     for number in task.batches:
@@ -97,5 +111,5 @@ def _write(task: PublishTask, storage: LocalStorage) -> TileFiles:
         [_rejected_object(site) for site in task.rejected],
         context,
         meshes=task.meshes,
-        put=storage.put,
+        put=put,
     )

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime as dt
 import shutil
+import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from uuid import uuid4
 
 from pipeline import __version__
-from pipeline.errors import RunError
+from pipeline.errors import RunCancelledError, RunError
 from pipeline.io import LocalStorage, ReadOptions, SpatialReference, find_inputs, open_source
 from pipeline.io.footprints import read_area
 from pipeline.io.storage import sha256_of
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.events import Listener, ignore
+from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.executors import Executor, executor_for, peak_of_process
+from pipeline.runtime.flight import TICK_S
 from pipeline.runtime.ingest import Ingested
+from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import Joined
 from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, write_manifest
 from pipeline.runtime.modelling import Modelled
@@ -28,8 +33,9 @@ from pipeline.runtime.split import Split
 from pipeline.runtime.stages import Progress, Stages, given_footprints
 from pipeline.settings import RunSettings
 
-_RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state")
+_RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state", "quarantine")
 _SCRATCH = "scratch"
+_QUARANTINE = "quarantine"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,6 +68,20 @@ class RunRequest:
     """Licence of the source data, in the user's words."""
     overwrite: bool = False
     """Replace what an earlier run left in `out`."""
+    isolate: bool | None = None
+    """Model buildings in supervised child processes; None does so with workers and not serially."""
+    building_timeout_s: float = IsolationLimits.timeout_s
+    """Wall-clock seconds that one building may take where buildings are isolated."""
+    building_memory_bytes: int = IsolationLimits.memory_bytes
+    """Memory that the process of one building may take where buildings are isolated."""
+
+    @property
+    def isolation(self) -> IsolationLimits | None:
+        """Limits of the supervised children; None where buildings are modelled in the workers themselves."""
+        serial = self.workers == 0 and self.scheduler is None
+        if not (not serial if self.isolate is None else self.isolate):
+            return None
+        return IsolationLimits(timeout_s=self.building_timeout_s, memory_bytes=self.building_memory_bytes)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -92,7 +112,12 @@ class RunSummary:
     """Tiles that could not be published."""
 
 
-def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | None = None) -> RunSummary:
+def run(
+    request: RunRequest,
+    on_event: Listener = ignore,
+    executor: Executor | None = None,
+    cancelled: Callable[[], bool] = never,
+) -> RunSummary:
     """Reconstruct all buildings of the inputs into a run directory.
 
     Parameters
@@ -103,6 +128,8 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
         Gets an `Event` for every stage, step and warning.
     executor : Executor, optional
         Where tasks run; by default what the request asks for.
+    cancelled : callable
+        Asked several times a second, from another thread; once it is true the run ends as soon as it can.
 
     Returns
     -------
@@ -116,7 +143,11 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
     SettingsError
         Settings are out of range.
     RunError
-        The run directory cannot be used, or workers died.
+        The run directory cannot be used, or workers died again and again on one task.
+    RunCancelledError
+        `cancelled` called the run off; its scratch is gone, and `run.json` says so.
+    ClusterError
+        The scheduler does not answer or was lost, or its processes run other versions; the run may be tried again.
     """
     started_at = dt.datetime.now(tz=dt.UTC)
     progress = Progress(on_event)
@@ -127,7 +158,7 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
     run_dir = _checked(request)
-    scratch = Scratch(str(run_dir / _SCRATCH))
+    scratch = Scratch(str(run_dir / _SCRATCH / uuid4().hex))
     reference = plan.sources[0].reference
     manifest = RunManifest(
         status=RunStatus.RUNNING,
@@ -143,9 +174,12 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
     engine = executor or executor_for(
         workers=request.workers, scheduler=request.scheduler, local_directory=str(run_dir / _SCRATCH / "dask")
     )
+    scratch.create()
     try:
         starting = time.perf_counter()
-        with engine:
+        with _calling_off(scratch, cancelled) as called_off, engine:
+            progress.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)
+            engine.prepare("plan", progress.watch)
             progress.timings["start workers"] = time.perf_counter() - starting
             check_memory(plan, engine.memory_limit_bytes)
             # nothing of an earlier run goes before all that can be checked is checked
@@ -158,6 +192,8 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
                 progress=progress,
                 executor=engine,
                 scratch=scratch,
+                isolation=request.isolation,
+                quarantine=str(run_dir / _QUARANTINE),
             )
             try:
                 ingested = stages.ingest(paths)
@@ -166,12 +202,15 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
                 modelled = stages.reconstruct(joined)
                 tiles, failed_tiles = stages.publish(splits, joined, modelled, reference, str(run_dir))
             except BaseException as error:
-                told = (*progress.warnings, f"{type(error).__name__}: {error}")
-                broken = dataclasses.replace(manifest, status=RunStatus.FAILED, warnings=told)
+                scratch.cancel()
+                told = (*progress.warnings, f"{type(error).__name__}: {error}".removesuffix(": "))
+                off = isinstance(error, RunCancelledError | KeyboardInterrupt)
+                status = RunStatus.CANCELLED if off else RunStatus.FAILED
+                broken = dataclasses.replace(manifest, status=status, warnings=told)
                 write_manifest(run_dir, broken, LocalStorage(root=run_dir).put)
                 raise
     finally:
-        scratch.clear()
+        _remove(run_dir / _SCRATCH)
     finishing = time.perf_counter()
     digest = run_digest(str(run_dir))
     progress.timings["digest"] = time.perf_counter() - finishing
@@ -224,6 +263,36 @@ def run(request: RunRequest, on_event: Listener = ignore, executor: Executor | N
     )
 
 
+@contextlib.contextmanager
+def _calling_off(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
+    """Watch for the end of a run from a thread of its own, so that a task in this very process learns of it, too.
+
+    Yields
+    ------
+    callable
+        Whether the run was called off; then its scratch is marked.
+    """
+    if cancelled is never:
+        yield never
+        return
+    over, off = threading.Event(), threading.Event()
+
+    def ask() -> None:
+        while not over.wait(TICK_S):
+            if cancelled():
+                off.set()
+                scratch.cancel()
+                return
+
+    asking = threading.Thread(target=ask, name="gablework-cancelled", daemon=True)
+    asking.start()
+    try:
+        yield off.is_set
+    finally:
+        over.set()
+        asking.join()
+
+
 def _plan(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
     """The plan and the input files in order."""
     # workers elsewhere do not share this process's folder
@@ -258,11 +327,18 @@ def _checked(request: RunRequest) -> Path:
             raise RunError(f"{run_dir} is not empty ({left[0]} …): give another --out, or --overwrite")
         if left and NAME not in left:
             raise RunError(f"{run_dir} holds {left[0]} and no run.json, so it is no run: give another --out")
-        if _SCRATCH in left:
-            shutil.rmtree(run_dir / _SCRATCH)
+        _remove(run_dir / _SCRATCH)
     except OSError as error:
         raise RunError(f"{run_dir} cannot be written: {error.strerror or error}. Give another --out") from error
     return run_dir
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder of scratch: renamed first, so that no late task of an earlier run finds it and fills it again."""
+    if folder.exists():
+        doomed = folder.with_name(f".{folder.name}.{uuid4().hex}")
+        folder.rename(doomed)
+        shutil.rmtree(doomed, ignore_errors=True)
 
 
 def _clear_results(run_dir: Path) -> None:

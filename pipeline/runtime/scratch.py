@@ -6,9 +6,9 @@ temporary name and renamed, so a task may run twice or die half way.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import pickle
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -44,10 +44,24 @@ class Scratch:
     root: str
     """Path of the folder; a string, so that tasks stay small and picklable."""
 
+    def create(self) -> None:
+        """Make the folder, once, by whoever starts the run; no task ever makes it again."""
+        Path(self.root).mkdir(parents=True, exist_ok=True)
+
     def path(self, *parts: str) -> Path:
-        """A path inside; its folder exists afterwards."""
+        """A path inside; its folder exists afterwards.
+
+        Raises
+        ------
+        RunCancelledError
+            The scratch itself is gone, and with it the run.
+        """
         path = Path(self.root, *parts)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            for folder in reversed(path.relative_to(self.root).parents[:-1]):
+                Path(self.root, folder).mkdir(exist_ok=True)
+        except FileNotFoundError:
+            raise RunCancelledError(f"{self.root} is gone: the run is over") from None
         return path
 
     def put_arrays(self, name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
@@ -80,8 +94,12 @@ class Scratch:
         return pickle.loads(Path(self.root, name).read_bytes())  # noqa: S301
 
     def cancel(self) -> None:
-        """Tell all tasks of the run to end: they look for this mark wherever they can stop."""
-        self.path(_CANCELLED).touch()
+        """Tell all tasks of the run to end: they look for this mark wherever they can stop.
+
+        Where it cannot be set, because the folder is gone or the disk is full, the folder's removal tells them.
+        """
+        with contextlib.suppress(OSError):
+            Path(self.root, _CANCELLED).touch()
 
     @property
     def cancelled(self) -> bool:
@@ -99,7 +117,3 @@ class Scratch:
         """
         if self.cancelled:
             raise RunCancelledError("the run was called off")
-
-    def clear(self) -> None:
-        """Remove the folder."""
-        shutil.rmtree(self.root, ignore_errors=True)

@@ -155,11 +155,18 @@ def split(task: SplitTask) -> Split:
     -------
     Split
         Descriptors; arrays are in scratch under `tiles/<tile>/`.
+
+    Raises
+    ------
+    RunCancelledError
+        The run was called off.
     """
+    task.scratch.check_cancelled()
     loaded = load_window(task.scratch, task.grid, task.tile)
     points = loaded.points
     core, window = task.grid.core(task.tile), task.grid.window(task.tile)
     fragments: Fragments | None = None
+    task.scratch.check_cancelled()
     if task.footprints is None:
         result = split_tile(points, core, window, task.settings, task.classes)
         index, owner = result.core_index, result.point_fragment.astype(np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections import Counter
@@ -17,9 +18,10 @@ from pipeline.export.records import RecordContext
 from pipeline.io import SpatialReference
 from pipeline.io.footprints import read_footprints
 from pipeline.io.gps_time import GpsTimeKind
-from pipeline.runtime.events import Event, EventKind, Listener
+from pipeline.runtime.events import Event, EventKind, Listener, Watch
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.ingest import Ingested, IngestTask, ingest, spread_m
+from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import Joined, RejectedSite, join, join_footprints
 from pipeline.runtime.modelling import BatchTask, Modelled, batches, model_batch
 from pipeline.runtime.plan import Plan, check_windows
@@ -115,10 +117,13 @@ class Progress:
     ----------
     listener : callable
         Gets the events.
+    watch : Watch
+        Handed to the executor with every map.
     """
 
-    def __init__(self, listener: Listener) -> None:
+    def __init__(self, listener: Listener, watch: Watch | None = None) -> None:
         self._listener = listener
+        self.watch = watch or Watch(listener=listener)
         self.timings: dict[str, float] = {}
         self.peaks: dict[str, int] = {}
         self.warnings: list[str] = []
@@ -148,11 +153,13 @@ class Progress:
         done = 0
         self.tell("stage", name, total=whole)
         results = []
-        for measured in executor.map(name, function, tasks):
-            results.append(measured.result)
-            self.peaks[measured.process] = max(self.peaks.get(measured.process, 0), measured.peak_bytes)
-            done += weight(measured.result)
-            self.tell("progress", name, done=done, total=whole)
+        # closed at once where the listener raises, so that no task goes on for nobody
+        with contextlib.closing(executor.map(name, function, tasks, self.watch)) as running:
+            for measured in running:
+                results.append(measured.result)
+                self.peaks[measured.process] = max(self.peaks.get(measured.process, 0), measured.peak_bytes)
+                done += weight(measured.result)
+                self.tell("progress", name, done=done, total=whole)
         self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started
         return results
 
@@ -167,6 +174,10 @@ class Stages:
     progress: Progress
     executor: Executor
     scratch: Scratch
+    isolation: IsolationLimits | None = None
+    """Limits of the supervised children that model buildings; None models in the workers themselves."""
+    quarantine: str = ""
+    """Folder for the bundles of buildings that cost their process; empty keeps none."""
 
     def ingest(self, paths: Sequence[str]) -> list[Ingested]:
         """Bucket all points by tile, and look at what they are."""
@@ -260,6 +271,9 @@ class Stages:
                 grid=self.plan.grid,
                 scratch=self.scratch,
                 gps_kind=kind,
+                isolation=self.isolation,
+                quarantine=self.quarantine,
+                reference=self.plan.sources[0].reference,
             )
             for number, sites in enumerate(batches(joined.candidates))
         ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +54,11 @@ class ShuffledExecutor(SerialExecutor):
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
 
-    def map(self, stage: str, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Measured[Any]]:
+    def map(
+        self, stage: str, function: Callable[[Any], Any], tasks: Sequence[Any], watch: Any
+    ) -> Generator[Measured[Any], None, None]:
         """Run all tasks in random order, then yield them in another one."""
-        del stage
+        del stage, watch
         results = [measure(function, task) for task in self._random.sample(list(tasks), len(tasks))]
         yield from self._random.sample(results, len(results))
 

@@ -18,7 +18,9 @@ from pipeline.tiling import TileGrid
 
 def task(path: Path, folder: Path, index: int = 0) -> IngestTask:
     grid = TileGrid(size_mm=30_000, halo_mm=10_000)
-    return IngestTask(index=index, path=str(path), options=ReadOptions(), grid=grid, scratch=Scratch(str(folder)))
+    scratch = Scratch(str(folder))
+    scratch.create()
+    return IngestTask(index=index, path=str(path), options=ReadOptions(), grid=grid, scratch=scratch)
 
 
 def stored(folder: Path) -> dict[str, np.ndarray]:

@@ -1,0 +1,200 @@
+"""Quarantine bundles: one building with all that modelling it needs, in one small file that can be mailed.
+
+A zip of `bundle.json` (names, settings, what happened), `points.npy`, `ground.npy` and `stderr.txt`. Reading one
+executes nothing of it: no pickles, sizes are checked before anything is unpacked.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+import platform
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline import __version__
+from pipeline.errors import UnreadableInputError
+from pipeline.io.crs import SpatialReference
+from pipeline.methods import ReconstructSettings, method_named
+from pipeline.model import Candidate, FloatArray
+from pipeline.settings import RunSettings
+
+SUFFIX = ".bundle"
+
+_FORMAT = "gablework bundle 1"
+_LARGEST_BYTES = 2 * 2**30
+_LARGEST_TEXT_BYTES = 64 * 2**20
+_FIX = "Use a file of a run's quarantine folder, whole and unchanged"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Incident:
+    """What happened to a building."""
+
+    reason: str
+    """As in its record."""
+    detail: str
+    """As in its record."""
+    engine_version: str = __version__
+    """Of the gablework that it happened to."""
+    seconds: float = math.nan
+    """From its beginning to its end; nan where it was not measured."""
+    memory_bytes: int = 0
+    """Largest private memory seen; 0 where it was not measured."""
+    stderr: str = ""
+    """The last lines that its process wrote: where Python was, if it could still be told."""
+    platform: str = dataclasses.field(default_factory=platform.platform)
+    """The machine's system."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Bundle:
+    """One building with all that modelling it needs."""
+
+    candidate: Candidate
+    method: str
+    settings: ReconstructSettings
+    incident: Incident
+    reference: SpatialReference = dataclasses.field(default_factory=SpatialReference)
+    """For its coordinates and units on the way out."""
+
+
+def write_bundle(folder: str, bundle: Bundle) -> Path:
+    """Write `<folder>/<building_id>.bundle`, whole or not at all; one that is there is replaced.
+
+    Raises
+    ------
+    OSError
+        It cannot be written.
+    """
+    candidate = bundle.candidate
+    footprint = candidate.footprint
+    own = bundle.settings.method or method_named(bundle.method).settings_type()
+    incident = dataclasses.asdict(bundle.incident)
+    stderr = incident.pop("stderr")
+    incident["seconds"] = None if math.isnan(bundle.incident.seconds) else round(bundle.incident.seconds, 3)
+    document = {
+        "format": _FORMAT,
+        "building_id": candidate.building_id,
+        "source_id": candidate.source_id,
+        "origin": list(candidate.origin),
+        "ground_z_m": candidate.ground_z_m if math.isfinite(candidate.ground_z_m) else None,
+        "footprint": None if footprint is None else shapely.to_wkb(footprint, hex=True),
+        "touches_data_edge": candidate.touches_data_edge,
+        "method": bundle.method,
+        "settings": {
+            bundle.method: dataclasses.asdict(own),
+            "roof": dataclasses.asdict(bundle.settings.roof),
+            "roof-type": dataclasses.asdict(bundle.settings.roof_type),
+        },
+        "incident": incident,
+        "reference": dataclasses.asdict(bundle.reference),
+    }
+    target = Path(folder, candidate.building_id + SUFFIX)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.{uuid4().hex}")
+    try:
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("bundle.json", json.dumps(document, indent=1, allow_nan=False))
+            archive.writestr("stderr.txt", stderr)
+            for name, array in (("points", candidate.points), ("ground", candidate.ground)):
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return target
+
+
+def read_bundle(path: str) -> Bundle:
+    """Read a bundle, also one that somebody else made: nothing of it is executed.
+
+    Raises
+    ------
+    UnreadableInputError
+        It is no bundle, broken, or larger than a building can be.
+    SettingsError
+        Its settings are none of this version's.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            document = json.loads(_member(archive, path, "bundle.json", _LARGEST_TEXT_BYTES))
+            stderr = _member(archive, path, "stderr.txt", _LARGEST_TEXT_BYTES).decode("utf-8", errors="replace")
+            points = _array(_member(archive, path, "points.npy", _LARGEST_BYTES))
+            ground = _array(_member(archive, path, "ground.npy", _LARGEST_BYTES))
+        if document["format"] != _FORMAT:
+            raise UnreadableInputError(path, f"its format is {document['format']!r}, not {_FORMAT!r}", _FIX)
+        return _bundle(document, points, ground, stderr)
+    except OSError as error:
+        raise UnreadableInputError(path, f"it cannot be read: {error.strerror or error}", _FIX) from error
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, NotImplementedError, RuntimeError) as error:
+        raise UnreadableInputError(path, f"it is no bundle, or broken: {error}", _FIX) from error
+    except (KeyError, ValueError, TypeError, AttributeError, shapely.errors.ShapelyError) as error:
+        raise UnreadableInputError(path, f"its content is odd: {type(error).__name__}: {error}", _FIX) from error
+
+
+def _member(archive: zipfile.ZipFile, path: str, name: str, largest_bytes: int) -> bytes:
+    """A member's content, unpacked only up to a bound: its own promise of a size is not believed."""
+    with archive.open(name) as member:
+        content = member.read(largest_bytes + 1)
+    if len(content) > largest_bytes:
+        raise UnreadableInputError(path, f"its {name} is larger than {largest_bytes // 2**20} MiB", _FIX)
+    return content
+
+
+def _array(content: bytes) -> FloatArray:
+    """Coordinates, shape (n, 3)."""
+    array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+    if array.dtype != np.float64 or array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"coordinates are {array.dtype} of shape {array.shape}: float64 of shape (n, 3) is wanted")
+    coordinates: FloatArray = array
+    return coordinates
+
+
+def _bundle(document: Mapping[str, Any], points: FloatArray, ground: FloatArray, stderr: str) -> Bundle:
+    """The bundle that a document and arrays describe."""
+    east, north, up = (float(value) for value in document["origin"])
+    footprint = None if document["footprint"] is None else shapely.from_wkb(document["footprint"])
+    if not isinstance(footprint, Polygon | MultiPolygon | None):
+        raise TypeError(f"its footprint is a {footprint.geom_type}")
+    building_id, method, source_id = document["building_id"], document["method"], document["source_id"]
+    if not (isinstance(building_id, str) and building_id.isalnum()):
+        raise ValueError(f"its building_id is {building_id!r}")
+    candidate = Candidate(
+        building_id=building_id,
+        origin=(east, north, up),
+        points=points,
+        ground=ground,
+        ground_z_m=math.nan if document["ground_z_m"] is None else float(document["ground_z_m"]),
+        footprint=footprint,
+        source_id=None if source_id is None else str(source_id),
+        touches_data_edge=bool(document["touches_data_edge"]),
+    )
+    return Bundle(
+        candidate=candidate,
+        method=method,
+        settings=RunSettings.from_mapping({"method": method, **document["settings"]}).building,
+        incident=_incident(document["incident"], stderr),
+        reference=SpatialReference(**document["reference"]),
+    )
+
+
+def _incident(told: Mapping[str, Any], stderr: str) -> Incident:
+    return Incident(
+        reason=str(told["reason"]),
+        detail=str(told["detail"]),
+        engine_version=str(told["engine_version"]),
+        seconds=math.nan if told["seconds"] is None else float(told["seconds"]),
+        memory_bytes=int(told["memory_bytes"]),
+        stderr=stderr,
+        platform=str(told["platform"]),
+    )

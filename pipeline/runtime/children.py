@@ -1,0 +1,170 @@
+"""The child processes of this process: one for each thread that is at work, kept from batch to batch."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import threading
+from collections.abc import Callable, Iterator
+
+from pipeline.errors import RunError
+from pipeline.runtime.supervised import SupervisedChild
+
+FRUITLESS_STARTS = 3
+"""Children that die in a row before they begin anything: then it is nobody's building that is at fault."""
+
+_LOADS = ("pipeline.runtime.modelling:load",)
+_START_TIMEOUT_S = 900.0
+"""With compiled kernels a child takes two seconds; without, it compiles them."""
+
+
+def start_fault(told: str, stderr: str) -> str:
+    """The message where children do not last."""
+    said = f". It said: {stderr}" if stderr else ""
+    return f"the process that models buildings does not last, {FRUITLESS_STARTS} times in a row: {told}{said}"
+
+
+class _Children:
+    """The children of this process: those that have nothing to do, and those that are lent out."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._idle: list[SupervisedChild] = []
+        self._all: set[SupervisedChild] = set()
+        self._closed = False
+
+    def prestart(self) -> None:
+        """Start a child if there is none, and do not wait for it."""
+        with self._lock:
+            if not self._all and not self._closed:
+                self._idle.append(self._started())
+
+    @contextlib.contextmanager
+    def lent(self, cancelled: Callable[[], bool], *, fresh: bool) -> Iterator[SupervisedChild]:
+        """A ready child, `fresh` where it must not have done anything yet; ended where its work broke off.
+
+        Raises
+        ------
+        RunCancelledError
+            `cancelled` turned true.
+        RunError
+            No child can be started.
+        """
+        child = self._ready_child(cancelled, fresh=fresh)
+        try:
+            yield child
+        except BaseException:
+            self._end(child)
+            raise
+        with self._lock:
+            kept = child.alive and not self._closed
+            if kept:
+                self._idle.append(child)
+        if not kept:
+            self._end(child)
+
+    def close(self) -> None:
+        """Kill all children and start no other; those that are lent out die under their users."""
+        self._closed = True
+        self.kill()
+
+    def kill(self) -> None:
+        """Kill all children; the next work starts others."""
+        with self._lock:
+            idle, lent = self._idle, self._all.difference(self._idle)
+            self._idle, self._all = [], set(lent)
+            for child in idle:
+                child.end()
+            for child in lent:
+                child.kill()
+
+    def _ready_child(self, cancelled: Callable[[], bool], *, fresh: bool) -> SupervisedChild:
+        """An idle child or a new one."""
+        fault = ""
+        for _ in range(FRUITLESS_STARTS):
+            child = self._idle_or_new(fresh=fresh)
+            try:
+                problem = child.wait_until_ready(_START_TIMEOUT_S, cancelled)
+            except BaseException:
+                self._end(child)
+                raise
+            if problem is None:
+                return child
+            fault = start_fault(problem, child.last_words)
+            self._end(child)
+        raise RunError(fault)
+
+    def _idle_or_new(self, *, fresh: bool) -> SupervisedChild:
+        with self._lock:
+            if self._closed:
+                raise RunError("this process is about to end: it models no buildings any more")
+            for child in tuple(self._idle):
+                if not child.alive:
+                    self._idle.remove(child)
+                    self._all.discard(child)
+                    child.end()
+                elif not (fresh and child.begun):
+                    self._idle.remove(child)
+                    return child
+            return self._started()
+
+    def _started(self) -> SupervisedChild:
+        child = SupervisedChild(_LOADS)
+        self._all.add(child)
+        return child
+
+    def _end(self, child: SupervisedChild) -> None:
+        child.end()
+        with self._lock:
+            self._all.discard(child)
+
+
+_children = _Children()
+
+
+def lent_child(cancelled: Callable[[], bool], *, fresh: bool) -> contextlib.AbstractContextManager[SupervisedChild]:
+    """A ready child of this process, for the time of a `with` block.
+
+    Parameters
+    ----------
+    cancelled : callable
+        Asked while the child gets ready.
+    fresh : bool
+        Whether it must not have done anything yet.
+
+    Raises
+    ------
+    RunCancelledError
+        `cancelled` turned true.
+    RunError
+        No child can be started.
+    """
+    return _children.lent(cancelled, fresh=fresh)
+
+
+def prestart() -> None:
+    """Start this process's child in the background, so that it is there when the first building comes.
+
+    For tasks of earlier stages: starting takes two seconds. Does nothing where there is one.
+    """
+    _children.prestart()
+
+
+def kill_children() -> None:
+    """Kill the children of this process; the next work starts others."""
+    _children.kill()
+
+
+def _forget_children() -> None:
+    """A forked copy of this process leaves the children to the original."""
+    global _children  # noqa: PLW0603 - one pool a process
+    _children = _Children()
+
+
+os.register_at_fork(after_in_child=_forget_children)
+
+
+@atexit.register
+def _close() -> None:
+    _children.close()

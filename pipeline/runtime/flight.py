@@ -1,0 +1,297 @@
+"""The tasks of one stage on a Dask cluster: a bounded window of them in flight, whatever happens to the workers.
+
+What may happen, and what comes of it:
+
+| event | outcome |
+| --- | --- |
+| a worker dies | its tasks go elsewhere, results that only it held are made again |
+| workers die of a task again and again | the task waits until the others are through and is tried alone |
+| they die of it alone, too | `RunError` that names the task |
+| no worker is left | told as `waiting`, again and again, until one is back |
+| the scheduler is lost, or is silent for long | `ClusterError` |
+| the run is called off | the tasks in flight are told, waited for with a bound, and taken back |
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from typing import Any, Generic
+
+from pipeline.errors import ClusterError, RunCancelledError, RunError
+from pipeline.runtime.events import Event, Watch
+from pipeline.runtime.measured import Measured, Result, Task, measure_packed, packed
+from pipeline.runtime.versions import fingerprint
+
+TICK_S = 0.2
+"""Seconds between two looks at what no result tells."""
+TASKS_A_THREAD = 3
+"""Tasks in flight for each thread of the cluster: one runs, the others are on their way."""
+SETTLE_S = 30.0
+"""Longest time that tasks in flight are waited for after the run was called off."""
+SETTLE_INTERRUPTED_S = 3.0
+"""The same after an interrupt from the keyboard."""
+_RESULT_S = 5.0
+_ENDED = frozenset({"finished", "error", "cancelled"})
+"""A future that is pending is still to come, and one that is lost is made again."""
+_SUSPECTS = "gablework-suspects"
+
+
+class Lookout:
+    """Looks after the cluster while nothing comes: whether workers are there, whether the scheduler answers.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        Connected to the scheduler.
+    address : str
+        The scheduler's, for messages.
+    on_count : callable
+        Gets the number of workers that take tasks, at every look.
+    advice : str
+        What to do where no worker is there.
+    """
+
+    grace_s = 3.0
+    """A cluster without workers for so long is told: a worker that is restarted takes about 2 s."""
+    repeat_s = 30.0
+    """It is told again after so long."""
+    silence_s = 60.0
+    """A scheduler that answers nothing for so long is lost."""
+    _every_s = 1.0
+    _answer_s = 5.0
+
+    def __init__(self, client: Any, address: str, on_count: Callable[[int], None], advice: str) -> None:
+        self._client = client
+        self._address = address
+        self._on_count = on_count
+        self._advice = advice
+        self._answered_s = time.monotonic()
+        self._looked_s = -1e9
+        self._bare_since_s: float | None = None
+        self._told_s: float | None = None
+        self.threads = 0
+        """Threads of the workers that take tasks, when last looked."""
+
+    def check(self) -> None:
+        """See that the scheduler is there.
+
+        Raises
+        ------
+        ClusterError
+            It is not.
+        """
+        if self._client.status != "running":
+            raise self.lost("the connection to it broke")
+
+    def lost(self, why: str) -> ClusterError:
+        """The error of a lost scheduler."""
+        return ClusterError(f"the scheduler {self._address} was lost: {why}. Start it, then the run again")
+
+    def look(self, stage: str, watch: Watch) -> None:
+        """Count the workers, at most once a second, and tell where none are left, or are back.
+
+        Raises
+        ------
+        ClusterError
+            The scheduler is lost.
+        """
+        self.check()
+        now = time.monotonic()
+        if now - self._looked_s < self._every_s:
+            return
+        try:
+            running = self._client.sync(self._client.scheduler.ncores_running, callback_timeout=self._answer_s)
+        except (OSError, TimeoutError) as error:
+            self.check()
+            if time.monotonic() - self._answered_s > self.silence_s:
+                raise self.lost(f"it did not answer for {time.monotonic() - self._answered_s:.0f} s") from error
+            return
+        finally:
+            self._looked_s = time.monotonic()
+        self._answered_s = self._looked_s
+        self.threads = sum(running.values())
+        self._on_count(len(running))
+        self._tell(stage, watch, self._looked_s)
+
+    def _tell(self, stage: str, watch: Watch, now: float) -> None:
+        if self.threads:
+            if self._told_s is not None and self._bare_since_s is not None:
+                message = f"workers are there after {now - self._bare_since_s:.0f} s, threads: {self.threads}"
+                watch.listener(Event(kind="run", stage=stage, message=message))
+            self._bare_since_s = self._told_s = None
+            return
+        if self._bare_since_s is None:
+            self._bare_since_s = now
+        bare_s = now - self._bare_since_s
+        if bare_s < self.grace_s or (self._told_s is not None and now - self._told_s < self.repeat_s):
+            return
+        self._told_s = now
+        message = f"no worker has been there for {bare_s:.0f} s: the run goes on as soon as one is. {self._advice}"
+        watch.listener(Event(kind="waiting", stage=stage, message=message))
+
+
+@dataclasses.dataclass
+class Flight(Generic[Task, Result]):
+    """The tasks of one stage, on their way through the cluster."""
+
+    client: Any
+    lookout: Lookout
+    stage: str
+    function: Callable[[Task], Result]
+    tasks: Sequence[Task]
+    watch: Watch
+    priority: int = 0
+    settle_s: float = SETTLE_S
+
+    def __post_init__(self) -> None:
+        """Nothing is on its way yet."""
+        self._waiting = deque(range(len(self.tasks)))
+        self._suspects: deque[int] = deque()
+        self._flying: dict[Any, int] = {}
+        self._alone: Any = None
+        self._wake = threading.Event()
+        self._name = uuid.uuid4().hex[:12]
+        self._submitted = 0
+
+    def results(self) -> Generator[Measured[Result], None, None]:
+        """Results as they come.
+
+        Raises
+        ------
+        RunCancelledError
+            The watch called the run off.
+        ClusterError
+            The scheduler was lost.
+        RunError
+            Workers died again and again on one task, also when it ran alone.
+        """
+        try:
+            while self._waiting or self._suspects or self._flying:
+                if self.watch.cancelled():
+                    raise RunCancelledError("the run was called off")
+                self.lookout.look(self.stage, self.watch)
+                self._submit()
+                self._wake.wait(TICK_S)
+                self._wake.clear()
+                for future in [future for future in self._flying if future.status in _ENDED]:
+                    yield from self._landed(future)
+        except KeyboardInterrupt:
+            self.settle_s = min(self.settle_s, SETTLE_INTERRUPTED_S)
+            raise
+        finally:
+            self._settle()
+
+    def _submit(self) -> None:
+        """Send off what may fly now: a window of tasks, or a suspect all alone."""
+        if self._suspects:
+            if not self._flying and self._take_turn():
+                self._send(self._suspects.popleft())
+            return
+        window = TASKS_A_THREAD * max(2, self.lookout.threads)
+        while self._waiting and len(self._flying) < window:
+            self._send(self._waiting.popleft())
+
+    def _send(self, number: int) -> None:
+        self._submitted += 1
+        future = self.client.submit(
+            measure_packed,
+            fingerprint(),
+            packed(self.function, self.tasks[number]),
+            key=f"{self.stage}-{self._name}-{number}-{self._submitted}",
+            pure=False,
+            priority=self.priority,
+        )
+        self._flying[future] = number
+        future.add_done_callback(lambda _: self._wake.set())
+
+    def _take_turn(self) -> bool:
+        """Whether it is this run's turn to try a suspect: one at a time on the whole cluster, lest two are blamed."""
+        from distributed import Lock
+
+        if self._alone is not None:
+            return True
+        lock = Lock(_SUSPECTS, scheduler_rpc=self.client.scheduler, loop=self.client.loop)
+        if lock.acquire(timeout=TICK_S):
+            self._alone = lock
+        return self._alone is not None
+
+    def _end_turn(self) -> None:
+        if self._alone is not None:
+            lock, self._alone = self._alone, None
+            lock.release()
+
+    def _landed(self, future: Any) -> Generator[Measured[Result], None, None]:
+        """What became of a task that is no longer pending: its result, or another try."""
+        from distributed.scheduler import KilledWorker
+
+        if future.status == "cancelled":
+            self.lookout.check()
+            raise self.lookout.lost("it no longer knows the tasks of this run")
+        number = self._flying[future]
+        if future.status == "error":
+            error = future.exception(timeout=_RESULT_S)
+            if not isinstance(error, KilledWorker):
+                raise error
+            if self._alone is not None:
+                raise RunError(self._blame(number)) from error
+            self._drop(future)
+            self._suspects.append(number)
+            return
+        try:
+            measured = future.result(timeout=_RESULT_S)
+        except (TimeoutError, OSError):
+            # its worker died with the result: it is made again, and looked at again
+            self.lookout.check()
+            return
+        self._drop(future)
+        self._end_turn()
+        yield measured
+
+    def _drop(self, future: Any) -> None:
+        del self._flying[future]
+        future.release()
+
+    def _blame(self, number: int) -> str:
+        told = repr(self.tasks[number])[:300]
+        smaller = ", or set a smaller tile_size_m" if self.stage == "split" else ""
+        return (
+            f"stage {self.stage}: workers died again and again on one task, also when it ran alone: {told}. "
+            f"Give them more memory{smaller}"
+        )
+
+    def _settle(self) -> None:
+        """Tell the tasks in flight to end, wait for those that run, take all back."""
+        if not self._flying:
+            return
+        self.watch.stop()
+        deadline = time.monotonic() + self.settle_s
+        flying = list(self._flying)
+        try:
+            while time.monotonic() < deadline and self.client.status == "running":
+                flying = [future for future in flying if future.status not in _ENDED]
+                if not flying or not self._executing(flying):
+                    break
+                self._wake.wait(TICK_S)
+                self._wake.clear()
+            if self.client.status == "running":
+                self.client.cancel(list(self._flying), force=True)
+                self._end_turn()
+        except (OSError, TimeoutError):
+            # the scheduler went away meanwhile, and the tasks with it
+            pass
+        self._flying.clear()
+
+    def _executing(self, futures: list[Any]) -> bool:
+        """Whether any of these runs just now; those that only queue are taken back without a wait."""
+        keys = [future.key for future in futures]
+        try:
+            stacks = self.client.sync(self.client.scheduler.call_stack, keys=keys, callback_timeout=_RESULT_S)
+        except KeyError:
+            # the scheduler did not take them
+            return False
+        return any(stacks.values())

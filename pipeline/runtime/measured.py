@@ -1,0 +1,77 @@
+"""A task run and measured, in whichever process."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pickle
+import resource
+import socket
+import time
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from pipeline.errors import VersionMismatchError
+from pipeline.runtime.versions import differences, fingerprint, versions_here, versions_of
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Measured(Generic[Result]):
+    """A result and what it took."""
+
+    result: Result
+    seconds: float
+    process: str
+    """host:pid."""
+    peak_bytes: int
+    """Largest resident size of the process so far."""
+
+
+def peak_of_process() -> tuple[str, int]:
+    """The process as host:pid, and its largest resident size so far in bytes."""
+    return f"{socket.gethostname()}:{os.getpid()}", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def measure(function: Callable[[Task], Result], task: Task) -> Measured[Result]:
+    """Run one task and measure it."""
+    started = time.perf_counter()
+    result = function(task)
+    seconds = time.perf_counter() - started
+    process, peak_bytes = peak_of_process()
+    return Measured(result=result, seconds=seconds, process=process, peak_bytes=peak_bytes)
+
+
+def packed(function: Callable[[Task], Result], task: Task) -> bytes:
+    """A task on its way to another process, opaque to whoever passes it on.
+
+    A Dask scheduler unpacks what it passes on; from bytes it needs not import what only workers need.
+    """
+    return pickle.dumps((function, task), protocol=pickle.HIGHEST_PROTOCOL)
+
+
+def measure_packed(client_fingerprint: str, task: bytes) -> Measured[Any]:
+    """Run a packed task of a client and measure it, if this process runs what the client runs.
+
+    Raises
+    ------
+    VersionMismatchError
+        It does not: a worker that came late must not mix other versions into a result. Told before the task is
+        unpacked, which may fail in strange ways then.
+    """
+    if client_fingerprint != fingerprint():
+        process, _ = peak_of_process()
+        told = differences(versions_of(client_fingerprint), versions_here())
+        raise VersionMismatchError(mismatch_told([f"worker {process}: {', '.join(told)}"]))
+    function, unpacked = pickle.loads(task)  # noqa: S301 - from the client, whose code the worker runs anyway
+    return measure(function, unpacked)
+
+
+def mismatch_told(faults: list[str]) -> str:
+    """The message of a version mismatch, from what is wrong in each process."""
+    return (
+        f"the processes do not run the same versions: {'; '.join(faults)}. "
+        "Install the same gablework with the same locks everywhere (one image), then start again"
+    )

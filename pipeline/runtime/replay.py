@@ -1,0 +1,98 @@
+"""Replay: one quarantined building again, on any machine, from its bundle alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline import __version__
+from pipeline.errors import RunError
+from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.obj import obj_text
+from pipeline.export.records import RecordContext, building_row
+from pipeline.model import BuildingResult, Reason
+from pipeline.reconstruct import failed_building
+from pipeline.runtime.bundle import Bundle
+from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
+from pipeline.runtime.modelling import model_bundle
+
+_OF_THE_RUN = ("geometry", "acquired_from", "acquired_to", "mesh_path", "input_hash", "settings_hash")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Replayed:
+    """What became of a building this time."""
+
+    result: BuildingResult
+    """As a run would have it."""
+    loss: Loss | None = None
+    """What it did to its process; None where it did no harm."""
+
+
+def replay(bundle: Bundle, limits: IsolationLimits | None) -> Replayed:
+    """Model a bundle's building.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        The building.
+    limits : IsolationLimits or None
+        Of the child process that it is modelled in; None models it in this process, where a debugger can see it and
+        where it may do all that it did.
+
+    Raises
+    ------
+    RunError
+        No child process can be started.
+    """
+    if limits is None:
+        try:
+            return Replayed(result=model_bundle(bundle))
+        except MemoryError as error:
+            return Replayed(result=_failed(bundle, Reason.OUT_OF_MEMORY, f"memory ran out: {error}"))
+    ((_, outcome),) = supervise(model_bundle, [bundle], limits)
+    if isinstance(outcome, Loss):
+        return Replayed(result=_failed(bundle, outcome.reason, outcome.detail), loss=outcome)
+    return Replayed(result=outcome)
+
+
+def _failed(bundle: Bundle, reason: Reason, detail: str) -> BuildingResult:
+    return failed_building(bundle.candidate, bundle.method, reason, detail)
+
+
+def replay_row(bundle: Bundle, replayed: Replayed) -> Mapping[str, Any]:
+    """The building's record, without the columns that only a run has."""
+    context = RecordContext(reference=bundle.reference, settings_hash="", engine_version=__version__)
+    row = building_row(replayed.result, context)
+    return {name: value for name, value in row.items() if name not in _OF_THE_RUN}
+
+
+def write_replay(folder: str, bundle: Bundle, replayed: Replayed) -> tuple[Path, ...]:
+    """Write `<building_id>.json`, and where there is a model `<building_id>.obj` and `<building_id>.city.jsonl`.
+
+    Raises
+    ------
+    RunError
+        The folder cannot be written.
+    """
+    result, row = replayed.result, replay_row(bundle, replayed)
+    texts = {".json": json.dumps(row, indent=1) + "\n"}
+    if result.solids:
+        lines = cityjson_lines([(result, row)], bundle.reference, f"building {result.building_id}")
+        texts |= {
+            ".obj": obj_text([result], bundle.reference),
+            ".city.jsonl": "".join(f"{line}\n" for line in lines),
+        }
+    written = []
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        for suffix, text in texts.items():
+            path = Path(folder, result.building_id + suffix)
+            path.write_text(text, encoding="utf-8")
+            written.append(path)
+    except OSError as error:
+        raise RunError(f"{folder} cannot be written: {error.strerror or error}. Give another --out") from error
+    return tuple(written)

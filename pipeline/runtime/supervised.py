@@ -1,0 +1,323 @@
+"""One supervised child process: started, given work, watched, ended."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import psutil  # type: ignore[import-untyped]
+
+from pipeline.errors import RunCancelledError
+from pipeline.runtime.messages import Batch, Begun, Finished, Frames, OutOfMemory, Raised, Ready, frame
+
+_PIECE = 2**20
+_TICK_S = 0.05
+"""Memory and time of the child are looked at this often."""
+_CANCEL_TICK_S = 0.25
+_TRACE_WAIT_S = 2.0
+_STDERR_KEPT_BYTES = 8 * 2**20
+_STDERR_TOLD_BYTES = 6000
+_DATA_MARGIN_BYTES = 2**30
+"""What a child may ask for beyond its limit: address space is more than what is used of it."""
+
+
+class Cause(StrEnum):
+    """What ended a child."""
+
+    DIED = "died"
+    TIME = "time"
+    MEMORY = "memory"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class End:
+    """How a child came to its end while it had work."""
+
+    cause: Cause
+    """What ended it."""
+    index: int | None
+    """The item that it had announced and not finished; None where there was none."""
+    told: str
+    """What happened, in the same words whenever it happens again."""
+    seconds: float
+    """Since that item was announced."""
+    memory_bytes: int
+    """Largest private memory seen meanwhile."""
+    stderr: str
+    """The last lines of its standard error: the place where Python was, if it could still be told."""
+
+
+class SupervisedChild:
+    """A process that runs `pipeline.runtime.child`.
+
+    Parameters
+    ----------
+    loads : sequence of str
+        Functions that it calls before it is ready, as `module:function`.
+    """
+
+    def __init__(self, loads: Sequence[str]) -> None:
+        self._stderr = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - closed in `end`
+        # both processes write behind the end, also after it was cut
+        fcntl.fcntl(self._stderr, fcntl.F_SETFL, fcntl.fcntl(self._stderr, fcntl.F_GETFL) | os.O_APPEND)
+        command = [sys.executable, "-P", "-m", "pipeline.runtime.child", str(os.getpid()), *loads]
+        self._process = _STARTER.submit(_spawn, command, self._stderr.fileno()).result()
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._stdin, self._stdout = self._process.stdin, self._process.stdout
+        self._poll = select.poll()
+        self._poll.register(self._stdout, select.POLLIN)
+        self._frames = Frames()
+        self._ready = False
+        self._nonsense = ""
+        self.begun = 0
+        """Items that it announced so far."""
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process is there."""
+        return self._process.poll() is None
+
+    @property
+    def memory_bytes(self) -> int:
+        """Its private memory: resident, without what it shares with files; 0 once it is gone."""
+        try:
+            info = psutil.Process(self._process.pid).memory_info()
+        except psutil.Error:
+            return 0
+        return int(info.rss) - int(getattr(info, "shared", 0))
+
+    def wait_until_ready(self, timeout_s: float, cancelled: Callable[[], bool]) -> str | None:
+        """Wait for the child to have loaded what it needs.
+
+        Returns
+        -------
+        str or None
+            Why it is not ready and never will be; None where it is.
+
+        Raises
+        ------
+        RunCancelledError
+            `cancelled` turned true.
+        """
+        if self._ready:
+            return None
+        deadline = time.monotonic() + timeout_s
+        for message in self._messages(cancelled):
+            if isinstance(message, Ready):
+                self._ready = True
+                return None
+            if time.monotonic() > deadline:
+                return f"it was not ready after {timeout_s:g} s"
+        return self._how_it_ended()
+
+    def work(
+        self,
+        function: Callable[[Any], Any],
+        items: Sequence[tuple[int, Any]],
+        *,
+        timeout_s: float,
+        memory_bytes: int,
+        cancelled: Callable[[], bool],
+    ) -> Iterator[Finished | End]:
+        """Work off items; every result as it comes, and an `End` as the last one where the child did not last.
+
+        Raises
+        ------
+        RunCancelledError
+            `cancelled` turned true.
+        Exception
+            What `function` raised.
+        """
+        batch = Batch(function=function, items=items, data_limit_bytes=memory_bytes + _DATA_MARGIN_BYTES)
+        with contextlib.suppress(BrokenPipeError):  # its end is told below
+            self._write(frame(batch))
+        allowed = f"the {memory_bytes / 2**30:g} GiB that a building may take"
+        kills = _system_kills()
+        left = len(items)
+        at_work: int | None = None
+        began = time.monotonic()
+        peak_bytes = 0
+
+        def ended(cause: Cause, told: str) -> End:
+            return End(
+                cause=cause,
+                index=at_work,
+                told=told,
+                seconds=time.monotonic() - began,
+                memory_bytes=peak_bytes,
+                stderr=self.last_words,
+            )
+
+        for message in self._messages(cancelled):
+            match message:
+                case Begun():
+                    at_work, began, peak_bytes = message.index, time.monotonic(), 0
+                    self.begun += 1
+                case Finished():
+                    at_work = None
+                    left -= 1
+                    yield message
+                    if left == 0:
+                        return
+                case OutOfMemory():
+                    peak_bytes = max(peak_bytes, self.memory_bytes)
+                    yield ended(Cause.MEMORY, f"it asked for more than {allowed}")
+                    return
+                case Raised():
+                    raise message.error
+                case _:
+                    used = self.memory_bytes
+                    peak_bytes = max(peak_bytes, used)
+                    if used > memory_bytes:
+                        yield ended(Cause.MEMORY, f"it took more than {allowed}")
+                        return
+                    if at_work is not None and time.monotonic() - began > timeout_s:
+                        self._ask_for_trace()
+                        yield ended(Cause.TIME, f"it took longer than {timeout_s:g} s, the limit that protects a run")
+                        return
+        told = self._how_it_ended()
+        if self._process.poll() == -signal.SIGKILL and _system_kills() > kills:
+            yield ended(Cause.MEMORY, "the system ran out of memory and ended its process")
+        else:
+            yield ended(Cause.DIED, told)
+
+    def kill(self) -> None:
+        """Kill the process and all that it started; harmless where it is gone."""
+        if self._process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+
+    def end(self) -> None:
+        """Kill the process, wait for its end and let go of all that belongs to it."""
+        self.kill()
+        self._process.wait()
+        for pipe in (self._stdin, self._stdout, self._stderr):
+            pipe.close()
+
+    def _write(self, content: bytes) -> None:
+        """Write a message whole."""
+        rest = memoryview(content)
+        while rest:
+            rest = rest[os.write(self._stdin.fileno(), rest) :]
+
+    def _messages(self, cancelled: Callable[[], bool]) -> Iterator[Any]:
+        """What the child says as it comes, and None every tick; ends when the child is gone."""
+        cancel_at = 0.0
+        tick_at = time.monotonic() + _TICK_S
+        while True:
+            if self._poll.poll(max(0.0, tick_at - time.monotonic()) * 1e3):
+                received = os.read(self._stdout.fileno(), _PIECE)
+                if not received:
+                    return
+                try:
+                    messages = list(self._frames.feed(received))
+                except Exception as error:  # noqa: BLE001 - a wild building can write anywhere
+                    self._nonsense = f"its process sent what cannot be read: {type(error).__name__}"
+                    return
+                yield from messages
+            now = time.monotonic()
+            if now < tick_at:
+                continue
+            tick_at = now + _TICK_S
+            self._cut_stderr()
+            yield None
+            if now >= cancel_at:
+                cancel_at = now + _CANCEL_TICK_S
+                if cancelled():
+                    raise RunCancelledError("the run was called off")
+
+    def _how_it_ended(self) -> str:
+        """Signal or exit code of a process whose pipe is closed."""
+        if self._nonsense:
+            return self._nonsense
+        try:
+            code = self._process.wait(timeout=_TRACE_WAIT_S)
+        except subprocess.TimeoutExpired:
+            return "its process closed its pipe"
+        if code >= 0:
+            return f"its process ended with exit code {code}"
+        try:
+            name = signal.Signals(-code).name
+        except ValueError:
+            name = "no name"
+        return f"its process was ended by signal {-code} ({name})"
+
+    def _ask_for_trace(self) -> None:
+        """Have the child write where it is; faulthandler does that also while a building holds the interpreter."""
+        before = os.fstat(self._stderr.fileno()).st_size
+        deadline = time.monotonic() + _TRACE_WAIT_S
+        os.kill(self._process.pid, signal.SIGUSR1)
+        while time.monotonic() < deadline:
+            if os.fstat(self._stderr.fileno()).st_size > before and not self._poll.poll(_TICK_S * 1e3):
+                return
+            time.sleep(_TICK_S)
+
+    def _cut_stderr(self) -> None:
+        """Keep a talkative child from filling the disk."""
+        if os.fstat(self._stderr.fileno()).st_size > _STDERR_KEPT_BYTES:
+            os.ftruncate(self._stderr.fileno(), 0)
+
+    @property
+    def last_words(self) -> str:
+        """The end of its standard error."""
+        size = os.fstat(self._stderr.fileno()).st_size
+        tail = os.pread(self._stderr.fileno(), _STDERR_TOLD_BYTES, max(0, size - _STDERR_TOLD_BYTES))
+        return tail.decode("utf-8", errors="replace").strip()
+
+
+def _system_kills() -> int:
+    """How many processes Linux has ended for lack of memory since it started; 0 where that is not told."""
+    try:
+        counts = dict(line.split() for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines())
+    except OSError:
+        return 0
+    return int(counts.get("oom_kill", 0))
+
+
+def _spawn(command: Sequence[str], stderr: int) -> subprocess.Popen[bytes]:
+    """Start the process, with the package that runs here before all others that may have its name."""
+    root = str(Path(__file__).resolve().parents[2])
+    paths = [root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    return subprocess.Popen(  # noqa: S603 - our own module
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=stderr,
+        bufsize=0,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+    )
+
+
+def _new_starter() -> ThreadPoolExecutor:
+    """One thread that lives as long as this process.
+
+    Linux ends a child with the *thread* that started it, and threads of a worker's pool may end any time.
+    """
+    return ThreadPoolExecutor(max_workers=1, thread_name_prefix="child-starter")
+
+
+_STARTER = _new_starter()
+
+
+def _after_fork() -> None:
+    """A forked copy of this process has no starter thread."""
+    global _STARTER  # noqa: PLW0603 - threads do not survive a fork
+    _STARTER = _new_starter()
+
+
+os.register_at_fork(after_in_child=_after_fork)

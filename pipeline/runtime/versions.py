@@ -1,0 +1,66 @@
+"""Which versions a process runs: those that can change a result, or that Dask's processes must share to talk."""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import sys
+from collections.abc import Mapping
+
+from pipeline import __version__
+
+ENGINE = "gablework"
+TALKING = ("dask", "distributed", "msgpack", "cloudpickle", "tornado", "toolz")
+"""Packages that client, scheduler and workers must share, beside the engine, to understand one another."""
+WORKING = ("numpy", "scipy", "numba", "shapely", "pyproj", "pyarrow", "pyogrio", "laspy", "lazrs")
+"""Packages whose versions can change what a task finds; a scheduler runs no task and needs none of them."""
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "none"
+
+
+@functools.cache
+def versions_here() -> Mapping[str, str]:
+    """Versions of this process: of the engine, of Python (major and minor), and of each package; `none` if absent."""
+    python = f"{sys.version_info.major}.{sys.version_info.minor}"
+    return {ENGINE: __version__, "python": python, **{name: _version(name) for name in (*TALKING, *WORKING)}}
+
+
+@functools.cache
+def fingerprint() -> str:
+    """The versions of this process as one line: equal where `versions_here` is equal.
+
+    >>> fingerprint().startswith("gablework=") and versions_of(fingerprint()) == dict(versions_here())
+    True
+    """
+    return ";".join(f"{name}={version}" for name, version in versions_here().items())
+
+
+def versions_of(line: str) -> dict[str, str]:
+    """The versions that a fingerprint tells.
+
+    >>> versions_of("gablework=0.1.0;numpy=2.1")
+    {'gablework': '0.1.0', 'numpy': '2.1'}
+    """
+    return dict(entry.split("=", 1) for entry in line.split(";"))
+
+
+def differences(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
+    """What differs, in words; only what both sides are asked about by `ours`.
+
+    >>> differences({"numpy": "2.1", "numba": "0.63"}, {"numpy": "2.0", "numba": "0.63"})
+    ['numpy 2.0 where the client has 2.1']
+    >>> differences({"numba": "0.63"}, {})
+    ['no numba where the client has 0.63']
+    """
+    told = []
+    for name, version in ours.items():
+        other = theirs.get(name, "none")
+        if other != version:
+            has = f"no {name}" if other == "none" else f"{name} {other}"
+            told.append(f"{has} where the client has {'none' if version == 'none' else version}")
+    return told

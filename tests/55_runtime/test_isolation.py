@@ -1,0 +1,381 @@
+"""Supervised children: each building can cost only itself, and nobody outlives whom they work for."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pyarrow.dataset as ds
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from faults.asked import environment
+
+from pipeline.errors import RunCancelledError, RunError, SettingsError
+from pipeline.model import Reason
+from pipeline.runtime import children
+from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
+from pipeline.runtime.messages import Frames, frame
+
+LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
+DEADLINE_S = 120.0
+
+
+@pytest.fixture(autouse=True)
+def no_children_left() -> Iterator[None]:
+    """Children that know no faults of other tests, and none afterwards."""
+    children.kill_children()
+    yield
+    children.kill_children()
+    assert child_processes() == []
+
+
+@pytest.fixture
+def bare(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Children that load nothing, and so start at once."""
+    monkeypatch.setattr(children, "_LOADS", ())
+
+
+def child_processes(of: int | None = None) -> list[psutil.Process]:
+    """The children of a process, of this one by default, that run our module."""
+    return [p for p in psutil.Process(of).children() if "pipeline.runtime.child" in " ".join(p.cmdline())]
+
+
+def wait_for(condition: Callable[[], Any], what: str) -> Any:
+    """What the condition gives once it is true."""
+    end = time.monotonic() + DEADLINE_S
+    while not (value := condition()):
+        assert time.monotonic() < end, f"waited in vain for {what}"
+        time.sleep(0.02)
+    return value
+
+
+def rows(run_dir: str, table: str = "buildings") -> dict[str, dict[str, Any]]:
+    found: list[dict[str, Any]] = ds.dataset(f"{run_dir}/{table}", partitioning="hive").to_table().to_pylist()
+    return {row["building_id"]: row for row in found}
+
+
+# --- with plain functions: what the supervisor promises ---------------------------------------------------------------
+
+
+def outcomes(function: Callable[[Any], Any], items: list[Any], limits: IsolationLimits = LIMITS) -> list[Any]:
+    """What became of each item, in their order."""
+    found = dict(supervise(function, items, limits))
+    return [found[index] for index in range(len(items))]
+
+
+PROGRAM = """
+import os, signal, time
+def double(n):
+    return 2 * n
+def do(order):
+    exec(order)
+    return order
+"""
+
+
+@pytest.fixture
+def orders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bare: None) -> Callable[[str], str]:
+    """A function that executes its item as Python in the child, and gives it back."""
+    (tmp_path / "orders_of_a_test.py").write_text(PROGRAM)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    import orders_of_a_test  # type: ignore[import-not-found]
+
+    do: Callable[[str], str] = orders_of_a_test.do
+    return do
+
+
+def test_results_come_from_one_child_that_stays(orders: Callable[[str], str]) -> None:
+    assert outcomes(orders, ["1", "2", "3"]) == ["1", "2", "3"]
+    (first,) = child_processes()
+    assert outcomes(orders, ["4"]) == ["4"]
+    assert child_processes() == [first]
+    assert outcomes(orders, []) == []
+
+
+@pytest.mark.parametrize(
+    ("order", "reason", "words"),
+    [
+        ("os.kill(os.getpid(), signal.SIGSEGV)", Reason.CRASHED, "signal 11 (SIGSEGV)"),
+        ("os.abort()", Reason.CRASHED, "signal 6 (SIGABRT)"),
+        ("os._exit(3)", Reason.CRASHED, "exit code 3"),
+        ("os.kill(os.getpid(), signal.SIGKILL)", Reason.CRASHED, "signal 9 (SIGKILL)"),
+        ("os.closerange(3, 100)", Reason.CRASHED, "process"),
+        ("held = [bytes(b'1' * 2**25) for _ in range(10**6)]", Reason.OUT_OF_MEMORY, "1 GiB"),
+        ("held = bytearray(2**46)", Reason.OUT_OF_MEMORY, "1 GiB"),
+        ("raise MemoryError", Reason.OUT_OF_MEMORY, "1 GiB"),
+    ],
+)
+def test_an_item_that_costs_its_process_costs_only_itself(
+    orders: Callable[[str], str], order: str, reason: Reason, words: str
+) -> None:
+    before, loss, after = outcomes(orders, ["1", order, "2"])
+    assert (before, after) == ("1", "2")
+    assert isinstance(loss, Loss)
+    assert loss.reason is reason
+    assert words in loss.detail
+
+
+@pytest.mark.parametrize(
+    "order", ["while True: pass", "import collections, itertools; collections.deque(itertools.repeat(0), maxlen=0)"]
+)
+def test_an_item_that_never_ends_is_ended_also_where_it_holds_the_interpreter(
+    orders: Callable[[str], str], order: str
+) -> None:
+    before, loss, after = outcomes(orders, ["1", order, "2"], IsolationLimits(timeout_s=1.5))
+    assert (before, after) == ("1", "2")
+    assert isinstance(loss, Loss)
+    assert loss.reason is Reason.TIMED_OUT
+    assert "1.5 s" in loss.detail
+    assert loss.seconds >= 1.5
+    assert "in do" in loss.stderr, "the place where it hung is told"
+
+
+def test_one_that_only_fails_in_company_is_no_loss(orders: Callable[[str], str], tmp_path: Path) -> None:
+    first_only = f"p = '{tmp_path}/mark'\nif not os.path.exists(p): open(p, 'w').close(); os.abort()"
+    assert outcomes(orders, ["1", first_only, "2"]) == ["1", first_only, "2"]
+
+
+def test_memory_that_others_piled_up_is_not_blamed_on_the_last(orders: Callable[[str], str]) -> None:
+    piles = (
+        "import sys; sys.modules['os'].__dict__.setdefault('pile', []).append(b'1' * (400 * 2**20)); time.sleep(0.2)"
+    )
+    assert outcomes(orders, [piles] * 4) == [piles] * 4
+
+
+def test_a_child_that_keeps_much_memory_is_replaced(orders: Callable[[str], str]) -> None:
+    piles = "import sys; sys.modules['os'].__dict__.setdefault('pile', []).append(b'1' * (700 * 2**20))"
+    assert outcomes(orders, [piles]) == [piles]
+    assert child_processes() == []
+
+
+def test_the_same_fault_is_told_in_the_same_words(orders: Callable[[str], str]) -> None:
+    limits = IsolationLimits(timeout_s=1.0, memory_bytes=2**29)
+    faults = ["os.abort()", "while True: pass", "held = [b'1' * 2**25 for _ in range(10**6)]"]
+    first, again = outcomes(orders, faults, limits), outcomes(orders, faults[::-1], limits)[::-1]
+    assert [loss.detail for loss in first] == [loss.detail for loss in again]
+
+
+def test_printing_does_not_disturb_the_pipe(orders: Callable[[str], str]) -> None:
+    loud = "print('x' * 10**6); os.write(1, b'y' * 10**6); os.system('echo z')"
+    assert outcomes(orders, [loud, "1"]) == [loud, "1"]
+
+
+def test_what_a_child_writes_does_not_pile_up(orders: Callable[[str], str]) -> None:
+    loud = "for _ in range(64): os.write(2, b'y' * 2**20); time.sleep(0.02)"
+    _, loss = outcomes(orders, [loud, loud + "\nprint('last words', flush=True); os.abort()"])
+    assert "last words" in loss.stderr
+    assert len(loss.stderr) <= 6000
+
+
+def test_an_error_of_the_function_is_raised_here(orders: Callable[[str], str]) -> None:
+    with pytest.raises(PermissionError, match="not yours"):
+        outcomes(orders, ["1", "raise PermissionError('not yours')"])
+    with pytest.raises(RunError, match="Own: told"):  # a class that this process cannot know
+        outcomes(orders, ["class Own(Exception): pass\nraise Own('told')"])
+
+
+def test_a_large_result_arrives_whole(tmp_path: Path, orders: Callable[[str], str]) -> None:
+    long = f"'{'a' * 5_000_000}'"
+    assert outcomes(orders, [long, "1"]) == [long, "1"]
+
+
+def test_calling_off_kills_the_child_within_an_item(orders: Callable[[str], str]) -> None:
+    began = time.monotonic()
+    with pytest.raises(RunCancelledError):
+        dict(supervise(orders, ["while True: pass"], LIMITS, lambda: time.monotonic() - began > 0.5))
+    assert child_processes() == []
+
+
+def test_a_child_killed_from_outside_costs_nothing(orders: Callable[[str], str], tmp_path: Path) -> None:
+    waits = f"open('{tmp_path}/reached', 'a').write('1')\nwhile not os.path.exists('{tmp_path}/go'): time.sleep(0.02)"
+    found: list[Any] = []
+    thread = threading.Thread(target=lambda: found.extend(outcomes(orders, ["1", waits, "2"])))
+    thread.start()
+    wait_for((tmp_path / "reached").exists, "the item")
+    (child,) = child_processes()
+    child.kill()
+    wait_for(lambda: len((tmp_path / "reached").read_text()) == 2, "the second trial")
+    (tmp_path / "go").touch()
+    thread.join(DEADLINE_S)
+    assert found == ["1", waits, "2"]
+
+
+def test_an_idle_child_that_was_killed_is_replaced(orders: Callable[[str], str]) -> None:
+    outcomes(orders, ["1"])
+    (child,) = child_processes()
+    child.kill()
+    child.wait()
+    assert outcomes(orders, ["2"]) == ["2"]
+
+
+def test_threads_have_children_of_their_own(orders: Callable[[str], str], tmp_path: Path) -> None:
+    def meeting(me: str, other: str) -> str:
+        return f"open('{tmp_path}/{me}', 'w').close()\nwhile not os.path.exists('{tmp_path}/{other}'): time.sleep(0.02)"
+
+    found: dict[str, list[Any]] = {}
+
+    def go(me: str, other: str) -> None:
+        found[me] = outcomes(orders, [meeting(me, other)])
+
+    threads = [threading.Thread(target=go, args=pair) for pair in (("a", "b"), ("b", "a"))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(DEADLINE_S)
+    assert found == {"a": [meeting("a", "b")], "b": [meeting("b", "a")]}
+    assert len(child_processes()) == 2
+
+
+def test_a_prestarted_child_is_the_one_that_works(orders: Callable[[str], str]) -> None:
+    children.prestart()
+    children.prestart()
+    (child,) = child_processes()
+    assert outcomes(orders, ["1"]) == ["1"]
+    assert child_processes() == [child]
+
+
+def test_children_that_cannot_start_are_an_error_that_tells_what_they_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(children, "_LOADS", ("no_such_module:load",))
+    with pytest.raises(RunError, match=r"3 times in a row.*No module named 'no_such_module'"):
+        outcomes(len, ["abc"])
+
+
+def test_children_that_die_whenever_they_get_work_are_an_error(
+    orders: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "orders_of_a_test.py").write_text("import os; os._exit(9)")
+    with pytest.raises(RunError, match="3 times in a row: its process ended with exit code 9"):
+        outcomes(orders, ["1"])
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"timeout_s": 0.0}, "0 s: use more than 0"),
+        ({"timeout_s": float("nan")}, "nan s"),
+        ({"memory_bytes": 2**20}, "use at least 0.5 GiB"),
+    ],
+)
+def test_limits_that_no_building_can_keep_are_refused(fields: dict[str, Any], words: str) -> None:
+    with pytest.raises(SettingsError, match=words):
+        IsolationLimits(**fields)
+
+
+def test_bytes_that_are_no_message_are_noticed() -> None:
+    with pytest.raises(ValueError, match="something else wrote"):
+        list(Frames().feed(b"\xff" * 20))
+    whole = frame({"a": 1})
+    frames = Frames()
+    assert [list(frames.feed(whole[i : i + 1])) for i in range(len(whole))][-1] == [{"a": 1}]
+
+
+# --- nobody outlives whom they work for -------------------------------------------------------------------------------
+
+WORKER = """
+import sys, time
+sys.path.insert(0, sys.argv[1])
+from pipeline.runtime import children
+from pipeline.runtime.isolation import IsolationLimits, supervise
+children._LOADS = ()
+import orders_of_a_test
+for _ in supervise(orders_of_a_test.do, [sys.argv[2]], IsolationLimits()):
+    print("done", flush=True)
+time.sleep(1000)
+"""
+
+
+@pytest.mark.parametrize(
+    "order",
+    ["1", "while True: pass", "import collections, itertools; collections.deque(itertools.repeat(0), maxlen=0)"],
+    ids=["idle", "busy", "busy with the lock"],
+)
+@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_child_is_gone_when_its_worker_is_killed(
+    orders: Callable[[str], str], tmp_path: Path, order: str, sign: signal.Signals
+) -> None:
+    told = f"open('{tmp_path}/reached', 'w').close(); {order}"
+    with subprocess.Popen([sys.executable, "-c", WORKER, str(tmp_path), told], stderr=subprocess.DEVNULL) as worker:
+        wait_for((tmp_path / "reached").exists, "the item")
+        (child,) = child_processes(worker.pid)
+        worker.send_signal(sign)
+    wait_for(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE, "the end of the child")
+
+
+def test_a_child_outlives_the_thread_that_asked_for_it(orders: Callable[[str], str]) -> None:
+    thread = threading.Thread(target=lambda: outcomes(orders, ["1"]))
+    thread.start()
+    thread.join(DEADLINE_S)
+    (child,) = child_processes()
+    assert outcomes(orders, ["2"]) == ["2"]
+    assert child_processes() == [child]
+
+
+# --- with buildings ---------------------------------------------------------------------------------------------------
+
+
+def test_isolation_changes_no_content(suburb: Path, reconstruct: Any) -> None:
+    bare, isolated = reconstruct(suburb, isolate=False), reconstruct(suburb, isolate=True)
+    assert bare.statuses["ok"] >= 1
+    assert isolated.digest == bare.digest
+    assert not (Path(isolated.run_dir) / "quarantine").exists()
+
+
+def test_a_building_of_ours_at_fault_is_kept_with_and_without_a_child(
+    suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    victim = min(rows(reconstruct(suburb).run_dir))
+    for name, value in environment(**{"raise": [victim]}).items():
+        monkeypatch.setenv(name, value)
+    isolated = reconstruct(suburb, isolate=True)
+    row = rows(isolated.run_dir)[victim]
+    assert (row["status"], row["reason"]) == ("failed", "internal_error")
+    assert "on purpose" in row["reason_detail"]
+    assert [path.name for path in Path(isolated.run_dir, "quarantine").iterdir()] == [f"{victim}.bundle"]
+
+
+@pytest.mark.slow
+def test_every_fault_costs_its_building_alone_and_is_told_and_kept(
+    town: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = reconstruct(town)
+    good = rows(whole.run_dir)
+    wanted = {
+        "crash": "crashed",
+        "abort": "crashed",
+        "exit": "crashed",
+        "endless": "timed_out",
+        "endless_native": "timed_out",
+        "eat_memory": "out_of_memory",
+        "ask_memory": "out_of_memory",
+        "raise": "internal_error",
+        "chatter": None,
+        "crash_gather": "crashed",
+    }
+    victims = dict(zip(wanted, sorted(name for name, row in good.items() if row["status"] == "ok"), strict=False))
+    assert len(victims) == len(wanted)
+    for name, value in environment(**{fault: [victim] for fault, victim in victims.items()}).items():
+        monkeypatch.setenv(name, value)
+    summary = reconstruct(town, isolate=True, building_timeout_s=20.0, building_memory_bytes=2**30)
+    hurt = rows(summary.run_dir)
+    assert {fault: hurt[victim]["reason"] for fault, victim in victims.items()} == wanted
+    assert "there is no bundle" in hurt[victims["crash_gather"]]["reason_detail"]
+    kept = {path.stem for path in Path(summary.run_dir, "quarantine").iterdir()}
+    assert kept == {victim for fault, victim in victims.items() if wanted[fault] and fault != "crash_gather"}
+    lost = {victim for fault, victim in victims.items() if wanted[fault]}
+    columns = [name for name in next(iter(good.values())) if name != "mesh_path"]
+    for name in good.keys() - lost:
+        assert [hurt[name][column] for column in columns] == [good[name][column] for column in columns]
+    for name in lost - {victims["crash_gather"]}:
+        assert hurt[name]["geometry"] is not None, "where it is, is known"
+        assert hurt[name]["input_hash"] == good[name]["input_hash"]

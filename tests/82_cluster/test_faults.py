@@ -1,0 +1,139 @@
+"""Real processes are killed at every stage of a job: none is lost, none ends twice, the content is the same.
+
+Every test adds its rows to a table; the last one holds docs/reference/faults.md against it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from deployment import Deployment, Ended
+from fault_table import FAULTS, Fault, Row, markdown, row, strike, without_seconds
+from processes import Programs, program
+
+from pipeline.synthetic.dataset import simulate
+
+pytestmark = pytest.mark.slow
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "faults.md"
+
+SETTINGS = {"tile_size_m": 60.0}
+"""Several tiles, so that both workers have work in every stage."""
+
+POISONS = {
+    "crashed": "a building crashes its process",
+    "timed_out": "a building never ends",
+    "out_of_memory": "a building eats all memory",
+}
+"""What a building does, by the reason in its record."""
+
+CASES = [(fault, stage) for fault in FAULTS for stage in fault.stages]
+
+
+@pytest.fixture(scope="module")
+def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A town of a few dozen buildings."""
+    return simulate("town", tmp_path_factory.mktemp("scene"), 5, size_m=(150.0, 150.0), density_per_m2=3.0).laz
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Deployment]:
+    """The service, for all faults one after the other."""
+    folder = tmp_path_factory.mktemp("service")
+    some = Programs(folder)
+    try:
+        deployment = Deployment(some, folder)
+        deployment.start_all()
+        yield deployment
+    finally:
+        some.end()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(service: Deployment, tile: Path) -> Ended:
+    """A job that nothing happens to; the second one, since the first also starts the children of the workers."""
+    service.ended(service.submit(tile, SETTINGS, "first"))
+    ended = service.ended(service.submit(tile, SETTINGS, "undisturbed"))
+    assert (ended.job.status, ended.job.attempt, ended.ends) == ("successful", 1, 1)
+    assert len(ended.buildings) >= 24
+    assert len(list((ended.run / "state").iterdir())) >= 6
+    return ended
+
+
+@pytest.fixture(scope="module")
+def table() -> list[Row]:
+    """The rows so far."""
+    return []
+
+
+@pytest.mark.parametrize(("fault", "stage"), CASES, ids=[f"{fault.name}: {stage}" for fault, stage in CASES])
+def test_a_job_outlives(
+    fault: Fault, stage: str, service: Deployment, undisturbed: Ended, tile: Path, table: list[Row]
+) -> None:
+    service.settle()
+    told = row(fault.name, stage, strike(service, fault, stage, tile, SETTINGS), undisturbed)
+    table.append(told)
+    begun = 2 if stage in fault.begun_again else 1
+    assert (told.status, told.begun, told.ended, told.content, told.marked) == ("successful", begun, 1, "same", "")
+
+
+def test_a_driver_that_was_frozen_lets_go_and_ends(service: Deployment, table: list[Row]) -> None:
+    if not any(told.fault.startswith("driver frozen") for told in table):
+        pytest.skip("needs the tests before it")
+    silent = service.running["driver-before"]
+    assert silent.stop() == 0
+    assert "attempt" in silent.text
+
+
+def test_no_job_is_lost_or_doubled_by_all_of_it(service: Deployment, undisturbed: Ended, table: list[Row]) -> None:
+    service.settle()
+    jobs = httpx.get(f"{service.url}/jobs", params={"limit": 1000}, timeout=60.0).json()["jobs"]
+    assert len(jobs) == len({job["jobID"] for job in jobs}) == 2 + len(table)
+    assert {job["status"] for job in jobs} == {"successful"}
+    for job in jobs:
+        assert sum(event.status == "successful" for event in service.events(job["jobID"])) == 1
+
+
+def test_buildings_that_cost_their_process_cost_only_themselves(
+    undisturbed: Ended, tile: Path, table: list[Row], tmp_path: Path, programs: Programs
+) -> None:
+    crashing, endless, eating = sorted(undisturbed.buildings)[3:24:8]
+    expected = {crashing: "crashed", endless: "timed_out", eating: "out_of_memory"}
+    variables = {"GABLEWORK_BUILDING_TIMEOUT_S": "15", "GABLEWORK_BUILDING_MEMORY_BYTES": str(2**30)}
+    faults = {"crash": [crashing], "endless": [endless], "eat_memory": [eating]}
+    service = Deployment(programs, tmp_path, faults=faults, variables=variables)
+    service.start_all()
+    ended = service.ended(service.submit(tile, SETTINGS, "poisonous buildings"))
+    marked = {name: reason for name, (status, reason) in ended.buildings.items() if status == "failed"}
+    assert marked == expected
+    assert {name: told for name, told in ended.buildings.items() if name not in expected} == {
+        name: told for name, told in undisturbed.buildings.items() if name not in expected
+    }
+    for name in service.workers:
+        assert service.running[name].alive, "a building cost a worker"
+    for name, reason in expected.items():
+        bundle = ended.run / "quarantine" / f"{name}.bundle"
+        replayed = subprocess.run(
+            [program("gablework"), "replay", bundle, "--json"], capture_output=True, text=True, check=False
+        )
+        assert replayed.returncode == 0, replayed.stderr
+        assert json.loads(replayed.stdout)["record"]["status"] == "ok"
+        told = row(POISONS[reason], "reconstruct", ended, undisturbed)
+        assert (told.status, told.begun, told.ended, told.content) == ("successful", 1, 1, "same but for them")
+        table.append(dataclasses.replace(told, content="same but for it", marked=f"it alone: `{reason}`; replayed: ok"))
+
+
+def test_the_page_tells_what_happens(table: list[Row], tmp_path: Path) -> None:
+    if len(table) != len(CASES) + len(POISONS):
+        pytest.skip(f"needs all rows, has {len(table)} of {len(CASES) + len(POISONS)}: run the whole file")
+    page = tmp_path / "faults.md"
+    before, after = PAGE.read_text().split("| fault |")[0], PAGE.read_text().rpartition(" |\n")[2]
+    page.write_text(before + markdown(table) + after)
+    print(page.read_text())
+    assert without_seconds(PAGE.read_text()) == without_seconds(page.read_text()), f"copy {page} to {PAGE}"

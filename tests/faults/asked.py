@@ -1,0 +1,17 @@
+"""What a test puts into the environment of a process that is to meet faults."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).resolve().parent
+"""To be put on PYTHONPATH."""
+
+
+def environment(**faults: Any) -> dict[str, str]:
+    """The variables that ask for faults; `sitecustomize.py` tells which there are."""
+    paths = [str(FOLDER), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    return {"PYTHONPATH": os.pathsep.join(paths), "GABLEWORK_FAULTS": json.dumps(faults)}

@@ -1,0 +1,392 @@
+"""Real programs for tests: found or skipped, each in a process group of its own, logged, ended by their ids.
+
+A folder of tests takes what it needs into its conftest: put this folder on `sys.path`, then
+`from processes import postgres_server, postgres_url, programs`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NoReturn, TypeVar
+from urllib.parse import quote
+
+import psutil
+import pytest
+
+Value = TypeVar("Value")
+
+REQUIRED = "GABLEWORK_REQUIRE_PROGRAMS"
+"""Environment variable of .ci/run: 1 makes a test fail where it would skip for want of a program."""
+
+LONG_S = 120.0
+"""A deadline for what takes seconds on a quiet machine; not a promise of speed."""
+
+_POSTGRES_FOLDERS = "/usr/lib/postgresql/*/bin"
+_LOG_TAIL_LINES = 60
+
+
+def missing(what: str) -> NoReturn:
+    """Skip the test for want of a program, or fail where programs are required."""
+    if os.environ.get(REQUIRED) == "1":
+        pytest.fail(f"{what}, and {REQUIRED}=1")
+    pytest.skip(what)
+
+
+def program(name: str, *elsewhere: str) -> Path:
+    """A program of this environment, of the PATH, or of the folders that match one of the patterns, newest last."""
+    beside = Path(sys.executable).parent / name
+    if beside.exists():
+        return beside
+    found = shutil.which(name)
+    if found is not None:
+        return Path(found)
+    for pattern in elsewhere:
+        for folder in sorted(Path("/").glob(pattern.lstrip("/")), reverse=True):
+            if (folder / name).exists():
+                return folder / name
+    missing(f"the program {name} is not installed")
+
+
+def free_port() -> int:
+    """A TCP port of the loopback that nobody listens on."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port: int = listener.getsockname()[1]
+        return port
+
+
+def wait_for(condition: Callable[[], Value | None], what: str, deadline_s: float = LONG_S) -> Value:
+    """What the condition returns once it is true; a failure that names what was waited for after the deadline."""
+    end = time.monotonic() + deadline_s
+    while True:
+        value = condition()
+        if value:
+            return value
+        if time.monotonic() > end:
+            pytest.fail(f"waited {deadline_s:g} s in vain for {what}")
+        time.sleep(0.02)
+
+
+def listens(port: int, host: str = "127.0.0.1") -> bool:
+    """Whether somebody listens."""
+    with contextlib.suppress(OSError), socket.create_connection((host, port), timeout=1.0):
+        return True
+    return False
+
+
+def lives(process: psutil.Process) -> bool:
+    """Whether a process still runs; one that only waits to be reaped does not."""
+    try:
+        return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
+
+
+class Program:
+    """One started program.
+
+    Parameters
+    ----------
+    name : str
+        What the test calls it; names its log.
+    command : sequence of str
+        Program and arguments; no shell.
+    log : Path
+        Gets standard output and standard error.
+    env : mapping, optional
+        The whole environment.
+    cwd : Path, optional
+        Working directory.
+    user : str or int, optional
+        Run as this user and the group of the same name or number.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        log: Path,
+        *,
+        env: Mapping[str, str] | None = None,
+        cwd: Path | None = None,
+        user: str | int | None = None,
+    ) -> None:
+        self.name = name
+        self.command = tuple(command)
+        self.log = log
+        with log.open("ab") as output:
+            self.process = subprocess.Popen(
+                self.command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=None if env is None else dict(env),
+                cwd=cwd,
+                user=user,
+                group=user,
+                extra_groups=None if user is None else [],
+                start_new_session=True,
+            )
+        self._seen: set[psutil.Process] = set()
+
+    @property
+    def pid(self) -> int:
+        """Process id, of the process group too."""
+        return self.process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process itself still runs."""
+        return self.process.poll() is None
+
+    @property
+    def text(self) -> str:
+        """The log so far."""
+        return self.log.read_text(errors="replace")
+
+    def children(self) -> list[psutil.Process]:
+        """All descendants that are alive."""
+        with contextlib.suppress(psutil.NoSuchProcess):
+            self._seen.update(psutil.Process(self.pid).children(recursive=True))
+        return [child for child in self._seen if lives(child)]
+
+    def wait_for(self, condition: Callable[[], Value | None], what: str, deadline_s: float = LONG_S) -> Value:
+        """Like `wait_for`, but fails at once where the program has ended."""
+
+        def alive_and_true() -> Value | None:
+            value = condition()
+            if not value and not self.alive:
+                pytest.fail(f"{self.name} ended with {self.process.returncode}, waited for {what}:\n{self.tail()}")
+            return value
+
+        return wait_for(alive_and_true, f"{what} of {self.name}", deadline_s)
+
+    def wait_for_port(self, port: int) -> None:
+        """Wait until somebody listens on a port of the loopback."""
+        self.wait_for(lambda: listens(port), f"port {port}")
+
+    def wait_for_text(self, words: str, deadline_s: float = LONG_S) -> None:
+        """Wait until the log holds some words."""
+        self.wait_for(lambda: words in self.text, f"the words {words!r} in the log", deadline_s)
+
+    def ended(self, deadline_s: float = LONG_S) -> int:
+        """The exit code, once the process has ended."""
+        try:
+            return self.process.wait(deadline_s)
+        except subprocess.TimeoutExpired:
+            pytest.fail(f"{self.name} has not ended after {deadline_s:g} s:\n{self.tail()}")
+
+    def stop(self, deadline_s: float = LONG_S) -> int:
+        """Ask it to end (SIGTERM) and wait for it; the exit code."""
+        self.children()
+        if self.alive:
+            self.process.send_signal(signal.SIGTERM)
+        return self.ended(deadline_s)
+
+    def kill(self, *, group: bool = True) -> None:
+        """Kill it (SIGKILL), its process group too, and wait until it is gone."""
+        self.children()
+        if group:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.pid, signal.SIGKILL)
+        elif self.alive:
+            self.process.kill()
+        self.process.wait(LONG_S)
+
+    def end(self) -> None:
+        """Leave nothing of it: the group and every descendant that was ever seen."""
+        self.children()
+        self.kill()
+        for child in self.children():
+            with contextlib.suppress(psutil.NoSuchProcess):
+                child.kill()
+
+    def tail(self) -> str:
+        """The end of the log."""
+        lines = self.text.splitlines()
+        return "\n".join([f"--- {self.name}: {' '.join(self.command)}", *lines[-_LOG_TAIL_LINES:]])
+
+
+class Programs:
+    """The programs of one test; all are ended when it is over, and their logs are shown if it failed.
+
+    Parameters
+    ----------
+    folder : Path
+        Gets the logs.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.started: list[Program] = []
+
+    def start(
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        env: Mapping[str, str] | None = None,
+        cwd: Path | None = None,
+        user: str | int | None = None,
+        inherit: bool = True,
+    ) -> Program:
+        """Start a program; `env` goes on top of this process's environment, or is all there is."""
+        log = self._folder / f"{name}.log"
+        whole = {**(os.environ if inherit else {}), **(env or {})}
+        one = Program(name, command, log, env=whole, cwd=cwd, user=user)
+        self.started.append(one)
+        return one
+
+    def end(self) -> None:
+        """End all, the last first; what is printed here shows up in the report of a failed test."""
+        for one in reversed(self.started):
+            one.end()
+        for name in dict.fromkeys(one.name for one in self.started):
+            print(next(one for one in self.started if one.name == name).tail())
+
+
+@pytest.fixture
+def programs(tmp_path: Path) -> Iterator[Programs]:
+    """Starts programs of one test."""
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    some = Programs(folder)
+    try:
+        yield some
+    finally:
+        some.end()
+
+
+class PostgresServer:
+    """A PostgreSQL server of our own: a fresh cluster in a folder, on a free port of the loopback, with a password.
+
+    PostgreSQL refuses to run as root; then it runs as the user `postgres`.
+
+    Parameters
+    ----------
+    folder : Path
+        Gets the data and the log; exists, and the parents let everybody pass.
+    """
+
+    user = "gablework"
+
+    def __init__(self, folder: Path) -> None:
+        self._bin = program("postgres", _POSTGRES_FOLDERS).resolve().parent
+        self._account = "postgres" if os.geteuid() == 0 else None
+        self._data = folder / "data"
+        self._log = folder / "postgres.log"
+        self.password = secrets.token_urlsafe(12)
+        self.port = free_port()
+        password_file = folder / "password"
+        password_file.write_text(self.password)
+        if self._account is not None:
+            for path in (folder, password_file):
+                shutil.chown(path, self._account)
+        self._check(
+            *("initdb", f"--pgdata={self._data}", f"--username={self.user}", f"--pwfile={password_file}", "--no-sync"),
+            *("--auth=scram-sha-256", "--encoding=UTF8", "--locale=C"),
+        )
+        password_file.unlink()
+        self.process = self._started()
+
+    def _check(self, name: str, *arguments: str) -> None:
+        """Run one of PostgreSQL's programs to its end."""
+        subprocess.run(
+            [self._bin / name, *arguments],
+            check=True,
+            capture_output=True,
+            cwd="/",
+            user=self._account,
+            group=self._account,
+            extra_groups=None if self._account is None else [],
+        )
+
+    def _started(self) -> Program:
+        # fsync guards against the loss of power, not of processes
+        options = {
+            "listen_addresses": "127.0.0.1",
+            "port": self.port,
+            "unix_socket_directories": "",
+            "fsync": "off",
+            "max_connections": 100,
+        }
+        command = [str(self._bin / "postgres"), "-D", str(self._data)]
+        command += [part for name, value in options.items() for part in ("-c", f"{name}={value}")]
+        process = Program("postgres", command, self._log, cwd=Path("/"), user=self._account)
+        process.wait_for(self._answers, "an answer")
+        return process
+
+    def _answers(self) -> bool:
+        arguments = ["--host=127.0.0.1", f"--port={self.port}", "--quiet"]
+        return subprocess.run([self._bin / "pg_isready", *arguments], check=False).returncode == 0
+
+    def url(self, database: str = "postgres") -> str:
+        """The SQLAlchemy URL of a database."""
+        return f"postgresql+pg8000://{self.user}:{quote(self.password)}@127.0.0.1:{self.port}/{database}"
+
+    def create_database(self) -> str:
+        """The SQLAlchemy URL of a fresh, empty database."""
+        import pg8000.native
+
+        name = f"test_{secrets.token_hex(6)}"
+        connection = pg8000.native.Connection(
+            self.user, host="127.0.0.1", port=self.port, database="postgres", password=self.password
+        )
+        try:
+            connection.run(f'CREATE DATABASE "{name}"')
+        finally:
+            connection.close()
+        return self.url(name)
+
+    def stop(self) -> None:
+        """Stop it, connections are cut; the data stay."""
+        if self.process.alive:
+            self.process.process.send_signal(signal.SIGINT)
+        self.process.ended()
+
+    def start(self) -> None:
+        """Start it again on the same port."""
+        self.process = self._started()
+
+
+@contextlib.contextmanager
+def _open_folder(purpose: str) -> Iterator[Path]:
+    # not below pytest's own folder: another user could not enter it
+    with tempfile.TemporaryDirectory(prefix=f"gablework-{purpose}-") as folder:
+        Path(folder).chmod(0o755)
+        yield Path(folder)
+
+
+@pytest.fixture(scope="module")
+def open_folder() -> Iterator[Path]:
+    """A temporary folder that other users may enter."""
+    with _open_folder("test") as folder:
+        yield folder
+
+
+@pytest.fixture(scope="session")
+def postgres_server() -> Iterator[PostgresServer]:
+    """A PostgreSQL server for all tests of the session; tests take a database each (`postgres_url`)."""
+    with _open_folder("postgres") as folder:
+        server = PostgresServer(folder)
+        try:
+            yield server
+        finally:
+            server.process.end()
+
+
+@pytest.fixture
+def postgres_url(postgres_server: PostgresServer) -> str:
+    """The SQLAlchemy URL of a fresh PostgreSQL database."""
+    return postgres_server.create_database()
