@@ -1,8 +1,260 @@
-"""The console script `gablework`: mounts the science commands and, later, the service's own; imports lazily."""
+"""The console script `gablework`: mounts the science commands, adds those of the service; imports lazily."""
 
 from __future__ import annotations
 
-from pipeline.cli import app
+import contextlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipeline.cli import AsJson, app
+from pipeline.console import Console
+from pipeline.errors import RunError, SettingsError
+
+if TYPE_CHECKING:
+    from service.settings import ServiceSettings
+    from service.store import JobStore
+
+keys = typer.Typer(
+    help="Keys with which clients are known to the service.", no_args_is_help=True, rich_markup_mode=None
+)
+app.add_typer(keys, name="keys")
+
+State = Annotated[
+    str | None, typer.Option(metavar="DIR", help="Folder of database, uploads and results; default GABLEWORK_STATE.")
+]
+DatabaseUrl = Annotated[
+    str | None, typer.Option(metavar="URL", help="SQLAlchemy URL of the database; default SQLite in the state folder.")
+]
+ServiceWorkers = Annotated[
+    int | None, typer.Option(metavar="N", min=1, help="Processes of the embedded cluster; default GABLEWORK_WORKERS.")
+]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
+]
+
+
+@contextlib.contextmanager
+def _service_errors() -> Iterator[None]:
+    """The service's errors as those that the console knows.
+
+    Raises
+    ------
+    SettingsError
+        Settings with which the service must not start.
+    RunError
+        The database does not answer.
+    """
+    from service.errors import ServiceError, StartUpError
+
+    try:
+        yield
+    except StartUpError as error:
+        raise SettingsError([str(error)]) from error
+    except ServiceError as error:
+        raise RunError(str(error)) from error
+
+
+def _settings(**options: Any) -> ServiceSettings:
+    """Settings of the environment, under the options of the command line.
+
+    Raises
+    ------
+    SettingsError
+        With all faults.
+    """
+    from pydantic import ValidationError
+
+    from service.settings import ServiceSettings
+
+    try:
+        return ServiceSettings(**{name: value for name, value in options.items() if value not in (None, [], ())})
+    except ValidationError as error:
+        faults = [
+            f"{'.'.join(map(str, fault['loc']))} is {fault['input']!r}: {fault['msg']}" for fault in error.errors()
+        ]
+        raise SettingsError(faults) from error
+
+
+def _log_to_stderr() -> None:
+    import logging
+
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+
+
+@app.command()
+def serve(
+    host: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Address to listen on; anything but loopback needs keys.")
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option(metavar="N", min=0, max=65535, help="Port to listen on; 0 takes a free one.")
+    ] = None,
+    state: State = None,
+    database_url: DatabaseUrl = None,
+    workers: ServiceWorkers = None,
+    scheduler: Scheduler = None,
+    driver: Annotated[
+        bool, typer.Option("--driver/--no-driver", help="Keep a driver beside it, or leave jobs to drivers elsewhere.")
+    ] = True,
+    public_url: Annotated[
+        str | None, typer.Option(metavar="URL", help="How clients reach the service, where a proxy stands before it.")
+    ] = None,
+    input_root: Annotated[
+        list[str] | None, typer.Option(metavar="DIR", help="Jobs may name inputs below this folder; repeatable.")
+    ] = None,
+    input_host: Annotated[
+        list[str] | None, typer.Option(metavar="HOST", help="Jobs may fetch inputs from this host; repeatable.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Answer REST requests and the web page, with a job driver and a cluster beside it."""
+    with Console(as_json=as_json) as console, _service_errors():
+        from service.supervisor import serve as serve_until_told
+
+        _log_to_stderr()
+        settings = _settings(
+            host=host,
+            port=port,
+            state=state,
+            database_url=database_url,
+            workers=workers,
+            scheduler=scheduler,
+            public_url=public_url,
+            input_roots=input_root,
+            input_hosts=input_host,
+        )
+
+        def on_ready(url: str) -> None:
+            console.say(f"gablework listens on {url}")
+            console.document({"url": url, "state": str(settings.state)})
+
+        serve_until_told(settings, on_ready, with_driver=driver)
+
+
+@app.command(name="driver")
+def drive(
+    state: State = None,
+    database_url: DatabaseUrl = None,
+    workers: ServiceWorkers = None,
+    scheduler: Scheduler = None,
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Name in logs and leases; default host and process.")
+    ] = None,
+    with_parent: Annotated[
+        bool, typer.Option("--with-parent", help="End when standard input closes, as `gablework serve` asks for.")
+    ] = False,
+) -> None:
+    """Run the jobs of a service: the driver alone, for an API that runs elsewhere."""
+    with Console(), _service_errors():
+        from service.driver import run_driver
+
+        _log_to_stderr()
+        settings = _settings(state=state, database_url=database_url, workers=workers, scheduler=scheduler)
+        if with_parent:
+            _end_with_parent()
+        code = run_driver(settings, name=name)
+        if code:
+            raise typer.Exit(code)
+
+
+def _end_with_parent() -> None:
+    """Send SIGTERM to this very process when standard input closes: its parent has ended."""
+    import os
+    import signal
+    import sys
+    import threading
+
+    def watch() -> None:
+        while sys.stdin.buffer.read(1):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _opened(state: str | None, database_url: str | None) -> Iterator[JobStore]:
+    """The store, with its tables in place."""
+    from service.store import JobStore
+
+    settings = _settings(state=state, database_url=database_url)
+    settings.state.mkdir(parents=True, exist_ok=True)
+    with JobStore(settings.database) as store:
+        store.migrate()
+        yield store
+
+
+@keys.command(name="create")
+def create_key(
+    name: Annotated[str, typer.Option(metavar="TEXT", help="Your own words for it.")],
+    scope: Annotated[
+        str, typer.Option(metavar="SCOPE", help="read, submit or admin; each includes those before it.")
+    ] = "submit",
+    state: State = None,
+    database_url: DatabaseUrl = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a key and show it, once: only its hash is stored."""
+    with Console(as_json=as_json) as console, _service_errors():
+        from service.keys import Scope, new_key
+
+        if scope not in list(Scope):
+            raise SettingsError([f"scope is {scope!r}: use one of {', '.join(Scope)}"])
+        with _opened(state, database_url) as store:
+            key, secret = new_key(name, Scope(scope), now=store.now())
+            store.add_key(key)
+        console.say(secret)
+        console.document({"id": key.key_id, "name": name, "scopes": sorted(key.scopes), "key": secret})
+
+
+@keys.command(name="list")
+def list_keys(state: State = None, database_url: DatabaseUrl = None, as_json: AsJson = False) -> None:
+    """List the keys; not the keys themselves, which are not stored."""
+    with Console(as_json=as_json) as console, _service_errors():
+        with _opened(state, database_url) as store:
+            found = store.keys()
+        rows: list[dict[str, Any]] = [
+            {
+                "id": key.key_id,
+                "name": key.name,
+                "scopes": sorted(key.scopes),
+                "created": key.created_at.isoformat(timespec="seconds"),
+                "revoked": None if key.revoked_at is None else key.revoked_at.isoformat(timespec="seconds"),
+            }
+            for key in found
+        ]
+        if not rows:
+            console.say("there are no keys")
+        console.table(
+            "Keys",
+            ["id", "name", "scopes", "created", "revoked"],
+            [[row["id"], row["name"], ", ".join(row["scopes"]), row["created"], row["revoked"] or ""] for row in rows],
+        )
+        console.document({"keys": rows})
+
+
+@keys.command(name="revoke")
+def revoke_key(
+    key_id: Annotated[str, typer.Argument(metavar="ID", help="As `gablework keys list` shows it.")],
+    state: State = None,
+    database_url: DatabaseUrl = None,
+    as_json: AsJson = False,
+) -> None:
+    """Revoke a key: it is refused from now on, its jobs stay."""
+    with Console(as_json=as_json) as console, _service_errors(), _opened(state, database_url) as store:
+        made = store.keys()
+        if key_id not in {key.key_id for key in made}:
+            raise SettingsError(
+                [f"there is no key {key_id!r}: `gablework keys list` shows the {len(made)} that there are"]
+            )
+        store.revoke_key(key_id)
+        console.say(f"revoked {key_id}")
+        console.document({"revoked": key_id})
 
 
 def main() -> None:

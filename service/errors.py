@@ -8,11 +8,14 @@ ServiceError
 ├── InputRefusedError        an input that is not allowed: a path outside the roots, a host that is not listed
 ├── LimitError               more than this service takes
 │   ├── TooLargeError        an upload or a body with too many bytes or points
+│   ├── NoSpaceError         the disk of the state folder is full
 │   ├── QueueFullError       too many jobs wait
 │   └── TooManyRequestsError too many requests of one client
 ├── UnauthorizedError        no key, or one that is not known
 ├── ForbiddenError           a key without the scope
+├── UploadInUseError         an upload that jobs which are not over still need
 ├── LeaseLostError           a driver's claim on a job has passed to another
+├── StoreError               the database does not answer, or is not migrated
 └── StartUpError             settings with which the service must not start
 ```
 """
@@ -76,6 +79,10 @@ class TooLargeError(LimitError):
     """An upload, a body or an input with too many bytes or points."""
 
 
+class NoSpaceError(LimitError):
+    """The disk of the state folder is full."""
+
+
 class QueueFullError(LimitError):
     """Too many jobs wait already."""
 
@@ -102,6 +109,14 @@ class UnauthorizedError(ServiceError):
 
 class ForbiddenError(ServiceError):
     """The key lacks the scope."""
+
+
+class UploadInUseError(ServiceError):
+    """An upload that jobs which are not over still need; the message names how many."""
+
+
+class StoreError(ServiceError):
+    """The database does not answer, or its tables are not those of this version; may pass."""
 
 
 class LeaseLostError(ServiceError):

@@ -175,6 +175,8 @@ class JobEvent:
     at: dt.datetime
     kind: str
     """status (accepted, running, ...), stage, progress, warning or waiting."""
+    status: JobStatus | None = None
+    """The status that the job came to; only of kind `status`."""
     stage: str = ""
     done: int = 0
     total: int = 0

@@ -81,6 +81,7 @@ class ServiceSettings(BaseSettings):
         ge=0.0,
         description="Seconds that SIGTERM leaves running jobs; then they are given back to the queue.",
     )
+    log_json: bool = Field(default=False, description="Log one JSON object a line in place of plain lines.")
     building_timeout_s: float = Field(
         default=600.0, gt=0.0, description="Seconds after which a building's work is stopped."
     )

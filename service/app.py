@@ -1,0 +1,105 @@
+"""The application: the one place that binds settings, store, limits and routes."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator
+
+from fastapi import APIRouter, FastAPI
+from fastapi.staticfiles import StaticFiles
+from starlette.concurrency import run_in_threadpool
+
+from pipeline import __version__
+from service import openapi, problems
+from service.files import StateFolder
+from service.guard import Guard
+from service.metrics import Measured, Metrics
+from service.rate_limits import RateLimiter
+from service.routes import buildings, events, health, jobs, landing, processes, results, uploads
+from service.routes.events import Streams
+from service.settings import ServiceSettings
+from service.store import JobStore
+
+ROUTERS: tuple[APIRouter, ...] = (
+    landing.router,
+    processes.router,
+    uploads.router,
+    jobs.router,
+    events.router,
+    results.router,
+    buildings.router,
+    health.router,
+)
+"""All routes, in the order of the documentation."""
+
+
+def create_app(settings: ServiceSettings, store: JobStore | None = None) -> FastAPI:
+    """The application.
+
+    Parameters
+    ----------
+    settings : ServiceSettings
+        All settings.
+    store : JobStore, optional
+        Where jobs are kept; by default what the settings name, migrated when the application starts.
+
+    Raises
+    ------
+    StartUpError
+        At start: the address can be reached from elsewhere, and there are no keys.
+    """
+    kept = JobStore(settings.database) if store is None else store
+    streams = Streams()
+    metrics = Metrics(kept, lambda: streams.count)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        await run_in_threadpool(start, settings, kept)
+        try:
+            yield
+        finally:
+            streams.closing = True
+            if store is None:
+                await run_in_threadpool(kept.close)
+
+    app = FastAPI(
+        title="gablework",
+        version=__version__,
+        lifespan=lifespan,
+        root_path=settings.root_path,
+        docs_url=None,  # both load scripts from elsewhere
+        redoc_url=None,
+        redirect_slashes=False,
+    )
+    app.state.settings = settings
+    app.state.store = kept
+    app.state.folder = StateFolder(settings.state)
+    app.state.limiter = RateLimiter(settings)
+    app.state.streams = streams
+    app.state.metrics = metrics
+    problems.install(app)
+    for router in ROUTERS:
+        app.include_router(router)
+    if landing.VIEWER.is_dir():
+        app.mount("/viewer", StaticFiles(directory=landing.VIEWER), name="viewer")
+    app.openapi = lambda: openapi.document(app)  # type: ignore[method-assign]
+    app.add_middleware(Guard, settings=settings)
+    app.add_middleware(Measured, metrics=metrics)
+    return app
+
+
+def start(settings: ServiceSettings, store: JobStore) -> None:
+    """Make the state folder and the tables, and refuse to listen to others without keys.
+
+    Raises
+    ------
+    StartUpError
+        The address can be reached from elsewhere, and there are no keys.
+    StoreError
+        The database does not answer.
+    """
+    folder = StateFolder(settings.state)
+    for path in (folder.root, folder.uploads, folder.jobs):
+        path.mkdir(parents=True, exist_ok=True)
+    store.migrate()
+    settings.check_address(has_keys=store.has_keys())

@@ -1,0 +1,150 @@
+"""Who asks: from the `Authorization` header to a principal with scopes.
+
+Where no key was ever made, and the service listens on loopback (or was told to stay open), everybody may do
+everything. As soon as there is a key, everybody needs one; revoking the last one does not open the door again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hmac
+import threading
+import time
+import weakref
+from typing import Protocol
+
+from service.errors import ForbiddenError, UnauthorizedError
+from service.keys import Key, Scope, digest_of, looks_like_key
+from service.settings import ServiceSettings
+
+TRUST_S = 2.0
+"""Seconds for which an answer of the key table is used again: a revoked key works no longer than this."""
+REMEMBERED = 4096
+"""Most keys remembered at once."""
+FIX = "Send the header `Authorization: Bearer gw_…` with a key from `gablework keys create`"
+
+
+class KeyTable(Protocol):
+    """What is asked of the store."""
+
+    def keys(self) -> list[Key]:
+        """All keys that were ever made, revoked ones included."""
+
+    def key_by_digest(self, digest: str) -> Key | None:
+        """The key, also a revoked one."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Principal:
+    """Who asks, and what they may do."""
+
+    key_id: str | None
+    """Id of the key; None where keys are not used."""
+    scopes: frozenset[Scope]
+    """What they may do."""
+
+    @property
+    def owner(self) -> str | None:
+        """Whose jobs and uploads they see: their own; None where they see all (admin, or no keys)."""
+        return None if Scope.ADMIN in self.scopes else self.key_id
+
+    def require(self, scope: Scope) -> None:
+        """Let nobody pass who lacks the scope.
+
+        Raises
+        ------
+        ForbiddenError
+            The key lacks it.
+        """
+        if scope not in self.scopes:
+            raise ForbiddenError(
+                f"this needs the scope {scope}, the key has {', '.join(sorted(self.scopes))}: "
+                f"make one with `gablework keys create --scope {scope}`"
+            )
+
+
+KEYLESS = Principal(key_id=None, scopes=frozenset(Scope))
+"""Whoever asks where keys are not used."""
+
+
+class _Memory:
+    """Answers of one key table, each for `TRUST_S` seconds; unknown keys are not remembered."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._keys: dict[str, tuple[Key, float]] = {}
+        self._has_keys: tuple[bool, float] = (False, float("-inf"))
+
+    def key(self, digest: str, table: KeyTable, now_s: float) -> Key | None:
+        """The key, from memory where that is fresh."""
+        with self._lock:
+            held = self._keys.get(digest)
+        if held is not None and now_s - held[1] < TRUST_S:
+            return held[0]
+        key = table.key_by_digest(digest)
+        with self._lock:
+            if key is None:
+                self._keys.pop(digest, None)
+            else:
+                if len(self._keys) >= REMEMBERED:
+                    self._keys.clear()
+                self._keys[digest] = (key, now_s)
+        return key
+
+    def has_keys(self, table: KeyTable, now_s: float) -> bool:
+        """Whether a key was ever made; a yes is final."""
+        held, since_s = self._has_keys
+        if held or now_s - since_s < TRUST_S:
+            return held
+        found = bool(table.keys())
+        self._has_keys = (found, now_s)
+        return found
+
+
+_memories: weakref.WeakKeyDictionary[KeyTable, _Memory] = weakref.WeakKeyDictionary()
+_memories_lock = threading.Lock()
+
+
+def _memory_of(table: KeyTable) -> _Memory:
+    with _memories_lock:
+        return _memories.setdefault(table, _Memory())
+
+
+def authenticate(
+    authorization: str | None, store: KeyTable, settings: ServiceSettings, *, now_s: float | None = None
+) -> Principal:
+    """The principal that a request's header stands for.
+
+    Parameters
+    ----------
+    authorization : str or None
+        The header's value; None where there is none.
+    store : KeyTable
+        The job store, which keeps the keys.
+    settings : ServiceSettings
+        Whether the address can do without keys.
+    now_s : float, optional
+        Seconds of a clock that only goes forward; the machine's by default.
+
+    Raises
+    ------
+    UnauthorizedError
+        A key is needed and none was sent, or it is malformed, unknown or revoked. The message never repeats it.
+    """
+    memory = _memory_of(store)
+    now_s = time.monotonic() if now_s is None else now_s
+    if not memory.has_keys(store, now_s) and (settings.is_loopback or settings.open_without_keys):
+        return KEYLESS
+    if authorization is None:
+        raise UnauthorizedError(f"this service needs a key. {FIX}")
+    scheme, _, secret = authorization.strip().partition(" ")
+    secret = secret.strip()
+    if scheme.lower() != "bearer" or not looks_like_key(secret):
+        raise UnauthorizedError(f"the header Authorization holds no key. {FIX}")
+    digest = digest_of(secret)
+    key = memory.key(digest, store, now_s)
+    if key is None or not hmac.compare_digest(key.digest, digest):
+        raise UnauthorizedError(f"the key is not known. {FIX}")
+    if key.revoked_at is not None:
+        raise UnauthorizedError(f"the key {key.name!r} was revoked. {FIX}")
+    return Principal(key_id=key.key_id, scopes=key.scopes)

@@ -1,0 +1,5 @@
+"""The driver: claims jobs, runs them on one cluster, and tells how they go. A process of its own."""
+
+from service.driver.process import Driver, run_driver
+
+__all__ = ["Driver", "run_driver"]

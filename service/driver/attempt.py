@@ -1,0 +1,171 @@
+"""One attempt at one job: a fresh folder, the inputs, the run, the outputs."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from pipeline import __version__
+from pipeline.errors import RunCancelledError
+from pipeline.runtime.events import Event, Listener
+from pipeline.runtime.executors import Executor
+from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.settings import RunSettings
+from service.driver.clusters import SharedCluster
+from service.driver.held import HeldJob
+from service.driver.wording import digest_of, outcome
+from service.fetching import Fetched, gather
+from service.files import StateFolder
+from service.jobs import JobRequest
+from service.outputs import write_outputs
+from service.settings import ServiceSettings
+from service.store import JobStore
+
+
+class Run(Protocol):
+    """`pipeline.runtime.run.run`."""
+
+    def __call__(
+        self, request: RunRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
+    ) -> RunSummary:
+        """Reconstruct all buildings."""
+
+
+class Gather(Protocol):
+    """`service.fetching.gather`."""
+
+    def __call__(
+        self,
+        request: JobRequest,
+        *,
+        store: JobStore,
+        folder: StateFolder,
+        settings: ServiceSettings,
+        target: Path,
+        cancelled: Callable[[], bool],
+    ) -> tuple[list[Fetched], Fetched | None]:
+        """All inputs on this machine's disk."""
+
+
+class WriteOutputs(Protocol):
+    """`service.outputs.write_outputs`."""
+
+    def __call__(
+        self, run_dir: Path, out_dir: Path, wanted: Sequence[str] | None, on_progress: Callable[[int, int], None]
+    ) -> None:
+        """Assemble the outputs."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tools:
+    """What an attempt is made of; tests put in their own."""
+
+    gather: Gather = gather
+    run: Run = run
+    write_outputs: WriteOutputs = write_outputs
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Workshop:
+    """What all attempts of a driver share."""
+
+    settings: ServiceSettings
+    folder: StateFolder
+    store: JobStore
+    cluster: SharedCluster
+    tools: Tools = Tools()
+
+
+def perform(held: HeldJob, shop: Workshop) -> tuple[str, dict[str, Any]]:
+    """Do all the work of a job.
+
+    Parameters
+    ----------
+    held : HeldJob
+        The job; learns how it goes, and may call it off.
+    shop : Workshop
+        Store, folder, cluster.
+
+    Returns
+    -------
+    tuple of str and dict
+        What came out in one sentence, and the summary to be stored. The results lie in the attempt's folder.
+
+    Raises
+    ------
+    RunCancelledError
+        It was called off.
+    Exception
+        Whatever ends the attempt: `faults` tells what comes of it.
+    """
+    job, folder = held.job, shop.folder
+    attempt = folder.attempt(job.job_id, job.attempt)
+    # an attempt's number is given once; what lies there was left by a database that was put back
+    shutil.rmtree(attempt, ignore_errors=True)
+    attempt.mkdir(parents=True)
+    scrub = held.scrub
+    # a folder whose name has blanks would not be seen as one path
+    scrub.name(f"{folder.root}/", "/state/")
+    held.tell(Event(kind="stage", stage="inputs"))
+    target = folder.inputs(job.job_id, job.attempt)
+    tiles, outlines = shop.tools.gather(
+        job.request,
+        store=shop.store,
+        folder=folder,
+        settings=shop.settings,
+        target=target,
+        cancelled=held.cancelled,
+    )
+    for fetched in [*tiles, *([] if outlines is None else [outlines])]:
+        scrub.name(str(fetched.path), fetched.path.name)
+    request = run_request(job.request, tiles, outlines, folder.run(job.job_id, job.attempt), shop.settings)
+    shop.cluster.wait_until_there(held)
+    held.tell(Event(kind="stage", stage="plan"))
+    summary = shop.tools.run(request, held.tell, shop.cluster.executor(job.priority), held.cancelled)
+    _check(held)
+    held.tell(Event(kind="stage", stage="outputs"))
+
+    def written(done: int, total: int) -> None:
+        _check(held)
+        held.tell(Event(kind="progress", stage="outputs", done=done, total=total))
+
+    out_dir = folder.outputs(job.job_id, job.attempt)
+    shop.tools.write_outputs(Path(request.out), out_dir, job.request.outputs, written)
+    _check(held)
+    shutil.rmtree(target, ignore_errors=True)
+    return outcome(summary), digest_of(summary, scrub, __version__)
+
+
+def run_request(
+    request: JobRequest, tiles: Sequence[Fetched], outlines: Fetched | None, out: Path, settings: ServiceSettings
+) -> RunRequest:
+    """A job's request as a run's, with the inputs where they lie now.
+
+    Raises
+    ------
+    SettingsError
+        Settings are out of range.
+    """
+    return RunRequest(
+        inputs=tuple(str(tile.path) for tile in tiles),
+        out=str(out),
+        settings=RunSettings.from_mapping(request.settings),
+        footprints=None if outlines is None else str(outlines.path),
+        crs=request.crs,
+        vertical_unit=request.vertical_unit,
+        bbox=request.bbox,
+        workers=settings.workers,
+        scheduler=settings.scheduler,
+        meshes=request.meshes,
+        licence=request.licence,
+        building_timeout_s=settings.building_timeout_s,
+        building_memory_bytes=settings.building_memory_bytes,
+    )
+
+
+def _check(held: HeldJob) -> None:
+    if held.cancelled():
+        raise RunCancelledError("the job was called off")

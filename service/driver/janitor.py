@@ -1,0 +1,106 @@
+"""Tidies the state folder: what no job and no upload needs any more. Never what a live lease may use."""
+
+from __future__ import annotations
+
+import logging
+import re
+import shutil
+import time
+from pathlib import Path
+
+from service.errors import UploadInUseError
+from service.files import StateFolder
+from service.jobs import JobStatus
+from service.store import JobStore
+from service.uploads import STALE_S, remove_file, remove_leftovers
+
+LOG = logging.getLogger("gablework.driver")
+
+_ID = re.compile(r"[0-9a-f]{32}")
+_ATTEMPT = re.compile(r"attempt-([0-9]+)")
+
+
+def tidy(store: JobStore, folder: StateFolder) -> list[Path]:
+    """Remove what is left over of jobs and uploads.
+
+    Several drivers may do so at once.
+
+    Parameters
+    ----------
+    store : JobStore
+        Knows the jobs and the uploads.
+    folder : StateFolder
+        Where they lie.
+
+    Returns
+    -------
+    list of Path
+        What was removed.
+    """
+    return [*tidy_jobs(store, folder), *tidy_uploads(store, folder)]
+
+
+def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
+    """Remove the folders of jobs that are gone or dismissed, and of attempts that are over.
+
+    Folders are listed before the database is asked, and a job is in the database before it has a folder: one that
+    the database does not know is of a job that was removed.
+    """
+    found = sorted(path.name for path in _entries(folder.jobs) if _ID.fullmatch(path.name))
+    known = store.attempts(found)
+    if found and not known and sum(store.counts().values()) == 0:
+        LOG.warning("the database has no jobs, but %s has: they are kept, in case it is the wrong one", folder.jobs)
+        return []
+    removed = []
+    for job_id in found:
+        if job_id not in known or known[job_id][0] is JobStatus.DISMISSED:
+            removed.append(folder.job(job_id))
+            continue
+        status, attempt = known[job_id]
+        # nobody holds a job that waits; of one that runs or is over only the last attempt counts
+        last = attempt if status is JobStatus.ACCEPTED else attempt - 1
+        for path in _entries(folder.job(job_id)):
+            number = _ATTEMPT.fullmatch(path.name)
+            if number is not None and int(number[1]) <= last:
+                removed.append(path)
+    for path in removed:
+        shutil.rmtree(path, ignore_errors=True)
+    return removed
+
+
+def tidy_uploads(store: JobStore, folder: StateFolder) -> list[Path]:
+    """Remove uploads whose time is over, and the files of uploads that no record knows."""
+    removed = []
+    for upload in store.expired_uploads(store.now()):
+        try:
+            store.remove_upload(upload.upload_id)
+        except UploadInUseError:
+            # a job was submitted meanwhile
+            continue
+        remove_file(upload.upload_id, folder)
+        removed.append(folder.upload(upload.upload_id))
+    now_s = time.time()
+    stale = [p for p in _entries(folder.uploads) if _ID.fullmatch(p.name) and _is_stale(p, now_s)]
+    known = store.upload_ids() if stale else set()
+    for path in stale:
+        if path.name not in known:
+            remove_file(path.name, folder)
+            removed.append(path)
+    if folder.uploads.is_dir():
+        removed += remove_leftovers(folder, now_s=now_s)
+    return removed
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except FileNotFoundError:
+        return []
+
+
+def _is_stale(path: Path, now_s: float) -> bool:
+    """A folder gets its record soon after its name; where that has not happened in a day, it never will."""
+    try:
+        return now_s - path.stat().st_mtime > STALE_S
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,380 @@
+"""The process: slots that claim and work, signals, draining, the janitor."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
+
+from pipeline.errors import ClusterError, GableworkError, RunCancelledError
+from service.driver.attempt import Tools, Workshop, perform
+from service.driver.clusters import SharedCluster
+from service.driver.faults import failure_of, pause_s, tried_again
+from service.driver.held import LOG, HeldJob, Stop
+from service.driver.janitor import tidy
+from service.driver.logs import configure
+from service.errors import LeaseLostError, ServiceError, StoreError
+from service.files import StateFolder
+from service.settings import ServiceSettings
+from service.store import JobStore
+
+TIDY_S = 180.0
+"""Seconds between two rounds of the janitor."""
+GRACE_S = 45.0
+"""Seconds that a run which was called off gets to end."""
+_TICK_S = 0.1
+_FIRST_PAUSE_S = 0.5
+_LONGEST_PAUSE_S = 15.0
+
+
+class Driver:
+    """Claims jobs and runs them, `driver_jobs` at once, until it is told to stop.
+
+    Parameters
+    ----------
+    settings : ServiceSettings
+        Database, state folder, cluster, lease.
+    name : str, optional
+        Name of this process, another for each; made up by default.
+    parent_pipe : int, optional
+        A file descriptor: when its other end closes, the parent is gone and the driver ends at once.
+    tools : Tools, optional
+        What an attempt is made of.
+    cluster : SharedCluster, optional
+        Where runs run.
+    """
+
+    def __init__(
+        self,
+        settings: ServiceSettings,
+        *,
+        name: str | None = None,
+        parent_pipe: int | None = None,
+        tools: Tools | None = None,
+        cluster: SharedCluster | None = None,
+    ) -> None:
+        self.name = name or f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
+        self._settings = settings
+        self._parent_pipe = parent_pipe
+        self._store = JobStore(settings.database)
+        self._cluster = cluster or SharedCluster(settings)
+        folder = StateFolder(settings.state.resolve())
+        self._shop = Workshop(
+            settings=settings, folder=folder, store=self._store, cluster=self._cluster, tools=tools or Tools()
+        )
+        self._held: dict[str, HeldJob] = {}
+        self._busy = 0
+        self._lock = threading.Lock()
+        self._stopping = threading.Event()
+        self._at_once = threading.Event()
+        # counted by the signal handler, which must not take a lock
+        self._stops = 0
+        self._parent_gone = False
+
+    # --- from outside
+
+    def stop(self, *, at_once: bool = False) -> None:
+        """End: no new jobs; those that run get `drain_s`, or nothing where it is to end at once."""
+        self._stops += 2 if at_once else 1
+
+    def run(self) -> int:
+        """Work until told to stop.
+
+        Returns
+        -------
+        int
+            0 when all jobs are done or given back, 1 where a run did not end when it was called off.
+        """
+        LOG.info("the driver starts", extra=self._facts)
+        slots = [
+            threading.Thread(target=self._slot, name=f"slot-{number}", daemon=True)
+            for number in range(self._settings.driver_jobs)
+        ]
+        janitor = threading.Thread(target=self._tidy, name="janitor", daemon=True)
+        if self._parent_pipe is not None:
+            threading.Thread(target=self._watch_parent, name="parent", daemon=True).start()
+        starter = threading.Thread(target=self._start, args=([*slots, janitor],), name="start", daemon=True)
+        starter.start()
+        self._wait_for_stop()
+        with self._lock:
+            self._stopping.set()
+        clean = self._drain()
+        starter.join(_TICK_S)
+        for thread in [*slots, janitor]:
+            if thread.ident is not None:
+                thread.join(1.0 if clean else _TICK_S)
+        self._cluster.close()
+        self._store.close()
+        LOG.info("the driver has ended", extra=self._facts)
+        return 0 if clean else 1
+
+    # --- start and end
+
+    def _start(self, threads: list[threading.Thread]) -> None:
+        """Wait for the database, start the workers, then let the slots claim."""
+        if not self._until_done(self._store.migrate, "the database cannot be migrated"):
+            return
+        try:
+            self._cluster.start()
+        except ClusterError:
+            LOG.exception("the workers do not start; it is tried again with the first job", extra=self._facts)
+        for thread in threads:
+            if not self._stopping.is_set():
+                thread.start()
+
+    def _wait_for_stop(self) -> None:
+        while self._stops == 0 and not self._parent_gone:
+            time.sleep(_TICK_S)
+
+    def _drain(self) -> bool:
+        """Let the jobs that run come to their end, or give them back; whether all did."""
+        began_s = time.monotonic()
+        held = self._all_held()
+        LOG.info("the driver ends: %d jobs run, they get %g s", len(held), self._settings.drain_s, extra=self._facts)
+        while self._is_busy():
+            out_of_time = time.monotonic() - began_s >= self._settings.drain_s
+            if out_of_time or self._stops > 1 or self._parent_gone:
+                break
+            time.sleep(_TICK_S)
+        self._at_once.set()
+        for one in self._all_held():
+            LOG.info("the job is given back", extra=one.facts)
+            one.stop(Stop.RELEASED)
+        deadline_s = time.monotonic() + GRACE_S
+        while self._is_busy() and time.monotonic() < deadline_s:
+            time.sleep(_TICK_S)
+        stuck = self._all_held()
+        for one in stuck:
+            LOG.error("the run does not end; the job is given back all the same", extra=one.facts)
+            with contextlib.suppress(LeaseLostError, StoreError):
+                self._store.release(one.job, lost=False)
+        return not stuck
+
+    def _is_busy(self) -> bool:
+        """Whether a slot claims or works."""
+        with self._lock:
+            return self._busy > 0
+
+    def _all_held(self) -> list[HeldJob]:
+        with self._lock:
+            return list(self._held.values())
+
+    def _watch_parent(self) -> None:
+        """Block until the other end of the pipe is closed."""
+        assert self._parent_pipe is not None
+        with contextlib.suppress(OSError):
+            while os.read(self._parent_pipe, 1):
+                continue
+        LOG.info("the parent is gone", extra=self._facts)
+        self._parent_gone = True
+
+    # --- the slots
+
+    def _slot(self) -> None:
+        """Claim and work, one job after the other."""
+        pause = _FIRST_PAUSE_S
+        while True:
+            with self._lock:
+                # under the lock, so that who ends the driver sees every claim
+                if self._stopping.is_set():
+                    return
+                self._busy += 1
+            try:
+                worked = self._claim_and_work()
+                pause = _FIRST_PAUSE_S
+                wait_s = 0.0 if worked else self._settings.poll_s
+            except StoreError as error:
+                LOG.warning("no job can be claimed, again in %g s: %s", pause, error, extra=self._facts)
+                wait_s, pause = pause, min(_LONGEST_PAUSE_S, 2.0 * pause)
+            finally:
+                with self._lock:
+                    self._busy -= 1
+            self._stopping.wait(wait_s)
+
+    def _claim_and_work(self) -> bool:
+        """One job, if there is one; whether there was.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer.
+        """
+        settings, claimed_s = self._settings, time.monotonic()
+        job = self._store.claim(self.name, lease_s=settings.lease_s, max_attempts=settings.max_attempts)
+        if job is None:
+            return False
+        held = HeldJob(self._store, job, lease_s=settings.lease_s, poll_s=settings.poll_s, claimed_s=claimed_s)
+        with self._lock:
+            self._held[job.job_id] = held
+        try:
+            # claimed while the driver began to end: nobody told this job
+            if self._at_once.is_set():
+                held.stop(Stop.RELEASED)
+            self._work(held)
+        finally:
+            with self._lock:
+                del self._held[job.job_id]
+        return True
+
+    def _work(self, held: HeldJob) -> None:
+        """One attempt, and what comes of it."""
+        LOG.info("the job runs", extra=held.facts)
+        with held:
+            try:
+                if held.cancelled():
+                    raise RunCancelledError("the job was called off")  # noqa: TRY301
+                message, summary = perform(held, self._shop)
+            except BaseException as error:  # noqa: BLE001 - whatever ends an attempt must become the job's end
+                self._ended(held, error)
+                return
+            done = self._settle(held, lambda: self._store.succeed(held.job, message=message, summary=summary))
+        if done:
+            LOG.info("the job succeeded: %s", message, extra=held.facts)
+            self._forget(held, before=True)
+        else:
+            self._forget(held)
+
+    def _ended(self, held: HeldJob, error: BaseException) -> None:
+        """An attempt that did not come to its end: dismissed, given back, tried again or failed."""
+        job, reason = held.job, held.stopped_for
+        if reason is not None:
+            level = "called off" if isinstance(error, RunCancelledError) else f"ended with {type(error).__name__}"
+            LOG.info("the attempt was %s: %s", level, reason.name.lower(), extra=held.facts)
+        if reason is Stop.DISMISSED:
+            self._forget(held, whole=True)
+            self._settle(held, lambda: self._store.dismissed(job))
+            return
+        if reason is not None:
+            self._forget(held)
+            told = f"driver {self.name} ended; the job waits for another" if reason is Stop.RELEASED else ""
+            self._settle(held, lambda: self._store.release(job, lost=reason is Stop.LOST, message=told))
+            return
+        reference = secrets.token_hex(4)
+        facts: dict[str, Any] = {**held.facts, "reference": reference}
+        expected = isinstance(error, GableworkError | ServiceError)
+        LOG.warning("the attempt failed: %s", error, extra=facts, exc_info=None if expected else error)
+        if isinstance(error, ClusterError):
+            self._cluster.replace()
+        self._forget(held)
+        if tried_again(error, job, self._settings.max_attempts):
+            pause = pause_s(job.lost_attempts)
+            told = f"waiting: {held.scrub(str(error))}; tried again in {pause:g} s"
+            lost = isinstance(error, ClusterError)
+            self._settle(held, lambda: self._store.release(job, lost=lost, message=told, retry_after_s=pause))
+            return
+        failure = failure_of(error, scrub=held.scrub, reference=reference, attempts=job.lost_attempts + 1)
+        self._settle(held, lambda: self._store.fail(job, failure))
+
+    def _settle(self, held: HeldJob, write: Callable[[], None]) -> bool:
+        """Write the end of an attempt, however long the database is away; False where the lease is lost."""
+        pause = _FIRST_PAUSE_S
+        while True:
+            try:
+                with contextlib.suppress(LeaseLostError):
+                    held.write()
+                write()
+            except LeaseLostError as error:
+                LOG.warning("the attempt does not count: %s", error, extra=held.facts)
+                return False
+            except StoreError as error:
+                LOG.warning("the end of the attempt cannot be written yet: %s", error, extra=held.facts)
+                if self._at_once.wait(pause):
+                    return False
+                pause = min(_LONGEST_PAUSE_S, 2.0 * pause)
+            else:
+                return True
+
+    def _forget(self, held: HeldJob, *, whole: bool = False, before: bool = False) -> None:
+        """Remove this attempt's folder, the whole job's, or those of the attempts before this one."""
+        job, folder = held.job, self._shop.folder
+        if whole:
+            shutil.rmtree(folder.job(job.job_id), ignore_errors=True)
+        elif before:
+            for number in range(1, job.attempt):
+                shutil.rmtree(folder.attempt(job.job_id, number), ignore_errors=True)
+        else:
+            shutil.rmtree(folder.attempt(job.job_id, job.attempt), ignore_errors=True)
+
+    # --- the janitor
+
+    def _tidy(self) -> None:
+        while True:
+            try:
+                removed = tidy(self._store, self._shop.folder)
+            except (StoreError, OSError) as error:
+                LOG.warning("the state folder could not be tidied: %s", error, extra=self._facts)
+            else:
+                if removed:
+                    LOG.info("tidied away %d folders", len(removed), extra=self._facts)
+            if self._stopping.wait(TIDY_S):
+                return
+
+    def _until_done(self, action: Callable[[], None], complaint: str) -> bool:
+        """Try again until the database is there; False where the driver is to end."""
+        pause = _FIRST_PAUSE_S
+        while not self._stopping.is_set():
+            try:
+                action()
+            except StoreError as error:
+                LOG.warning("%s, again in %g s: %s", complaint, pause, error, extra=self._facts)
+                self._stopping.wait(pause)
+                pause = min(_LONGEST_PAUSE_S, 2.0 * pause)
+            else:
+                return True
+        return False
+
+    @property
+    def _facts(self) -> dict[str, object]:
+        return {"driver": self.name}
+
+
+def run_driver(settings: ServiceSettings, *, name: str | None = None, parent_pipe: int | None = None) -> int:
+    """Claim jobs and run them until SIGTERM or SIGINT; a second signal ends it at once. Blocks.
+
+    Parameters
+    ----------
+    settings : ServiceSettings
+        Database, state folder, cluster, lease.
+    name : str, optional
+        Name of this process, another for each; made up by default.
+    parent_pipe : int, optional
+        A file descriptor: when its other end closes, the parent is gone and the driver ends at once.
+
+    Returns
+    -------
+    int
+        The process's exit code.
+
+    Raises
+    ------
+    StartUpError
+        The database URL cannot be used.
+    """
+    configure(as_json=settings.log_json)
+    driver = Driver(settings, name=name, parent_pipe=parent_pipe)
+    with _signals(driver):
+        return driver.run()
+
+
+@contextlib.contextmanager
+def _signals(driver: Driver) -> Iterator[None]:
+    """SIGTERM and SIGINT stop the driver."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        driver.stop()
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

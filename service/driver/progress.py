@@ -1,0 +1,63 @@
+"""From what a run tells of its stages to a percentage of the whole job, and to a sentence."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+WEIGHTS = MappingProxyType(
+    {
+        "inputs": 4,
+        "plan": 1,
+        "ingest": 10,
+        "split": 28,
+        "join": 2,
+        "reconstruct": 43,
+        "publish": 4,
+        "outputs": 8,
+    }
+)
+"""The stages of a job in their order, and what share of the time each takes, in percent: measured on city blocks."""
+
+WORDS = MappingProxyType(
+    {
+        "inputs": "inputs are made ready",
+        "plan": "the run is planned",
+        "ingest": "points are read",
+        "split": "surfaces are found in the tiles",
+        "join": "surfaces are united over the borders of tiles",
+        "reconstruct": "buildings are modelled",
+        "publish": "tiles are written",
+        "outputs": "outputs are assembled",
+    }
+)
+"""What a stage does, for people."""
+
+_LAST = 99
+
+
+def percent(stage: str, done: int, total: int) -> int:
+    """Progress of the whole job.
+
+    Parameters
+    ----------
+    stage : str
+        One of `WEIGHTS`; any other counts as not begun.
+    done, total : int
+        Units of this stage; a `total` of 0 is unknown and counts as nothing done.
+
+    Returns
+    -------
+    int
+        0 to 99: only the end of the job is 100.
+
+    Examples
+    --------
+    >>> percent("inputs", 0, 1), percent("reconstruct", 0, 80), percent("reconstruct", 40, 80), percent("outputs", 3, 3)
+    (0, 45, 66, 99)
+    """
+    if stage not in WEIGHTS:
+        return 0
+    names = list(WEIGHTS)
+    before = sum(WEIGHTS[name] for name in names[: names.index(stage)])
+    share = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
+    return min(_LAST, int(before + WEIGHTS[stage] * share))

@@ -1,0 +1,81 @@
+"""Sentences that clients read: what a run found, and messages without the paths of this machine."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipeline.runtime.run import RunSummary
+
+# two components or more, not within a URL, a fraction or a relative path
+_ABSOLUTE = re.compile(r"(?<![\w:/.\\])/(?:[^\s/:;,'\"()<>|]+/)+([^\s/:;,'\"()<>|]*)")
+_ADDRESS = re.compile(r" ?\b(?:tcp|tls|ucx|inproc)://(?:\[[^\]\s]*\]|[^\s/:]*)(?::[0-9]+)?(?:/[^\s:]*)?")
+_WARNINGS = 100
+"""Warnings that a job's summary keeps; `run.json` has all."""
+
+
+class Scrubber:
+    """Takes the paths of this machine, and the addresses of the cluster, out of messages.
+
+    Parameters
+    ----------
+    names : mapping of str to str, optional
+        What stands for a path instead; other absolute paths are cut to their last component.
+    """
+
+    def __init__(self, names: Mapping[str, str] | None = None) -> None:
+        self._names = dict(names or {})
+
+    def name(self, path: str, name: str) -> None:
+        """Let a name stand for a path."""
+        self._names[path] = name
+
+    def __call__(self, message: str) -> str:
+        """The message as clients may see it.
+
+        >>> scrub = Scrubber({"/state/uploads/0a/tile 1.laz": "tile 1.laz"})
+        >>> scrub("/state/uploads/0a/tile 1.laz: 12 m/s at https://host/a/b, see /tmp/x/run.json")
+        'tile 1.laz: 12 m/s at https://host/a/b, see run.json'
+        >>> scrub("the scheduler tcp://10.0.0.7:8786 was lost: start it")
+        'the scheduler was lost: start it'
+        """
+        for path in sorted(self._names, key=len, reverse=True):
+            message = message.replace(path, self._names[path])
+        return _ABSOLUTE.sub(lambda found: found[1] or "…", _ADDRESS.sub("", message))
+
+
+def outcome(summary: RunSummary) -> str:
+    """What came out, in one sentence."""
+    total = sum(summary.statuses.values())
+    parts = [f"{summary.statuses.get(status, 0)} {status}" for status in ("ok", "fallback", "failed")]
+    told = f"{total} {'building' if total == 1 else 'buildings'}: {', '.join(parts)}"
+    rejected = sum(summary.rejected.values())
+    if rejected:
+        told += f"; {rejected} {'object' if rejected == 1 else 'objects'} rejected"
+    if summary.failed_tiles:
+        count = len(summary.failed_tiles)
+        told += f"; {count} {'tile' if count == 1 else 'tiles'} could not be published: "
+        told += "its buildings are missing" if count == 1 else "their buildings are missing"
+    if summary.warnings:
+        told += f"; {len(summary.warnings)} {'warning' if len(summary.warnings) == 1 else 'warnings'}"
+    return told
+
+
+def digest_of(summary: RunSummary, scrub: Scrubber, engine_version: str) -> dict[str, Any]:
+    """What is kept of a run beside its files: plain JSON values."""
+    return {
+        "digest": summary.digest,
+        "engine_version": engine_version,
+        "statuses": dict(summary.statuses),
+        "reasons": {str(reason): count for reason, count in summary.reasons.items()},
+        "rejected": dict(summary.rejected),
+        "roof_types": dict(summary.roof_types),
+        "counts": dict(summary.counts),
+        "timings_s": {name: round(seconds, 3) for name, seconds in summary.timings_s.items()},
+        "peak_memory_bytes": max(summary.peak_memory_bytes.values(), default=0),
+        "warnings": [scrub(warning) for warning in summary.warnings[:_WARNINGS]],
+        "warnings_total": len(summary.warnings),
+        "failed_tiles": list(summary.failed_tiles),
+    }

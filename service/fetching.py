@@ -1,0 +1,244 @@
+"""Inputs of a job: checked when it is submitted, and again when it runs, for the world changes in between."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Protocol
+
+from pipeline.errors import InputError
+from pipeline.io.formats import POINT_SUFFIXES
+from service.downloads import Cancel, download, name_of
+from service.errors import InputRefusedError, NoSuchUploadError, RequestError, ServiceError, TooLargeError
+from service.files import StateFolder
+from service.input_policy import checked_path, checked_url
+from service.jobs import InputReference, JobRequest, Upload
+from service.preflight import preflight, promised_points
+from service.settings import ServiceSettings
+from service.vectors import VECTOR_SUFFIXES
+
+
+class UploadTable(Protocol):
+    """What is asked of the store."""
+
+    def upload(self, upload_id: str, *, owner: str | None = None) -> Upload:
+        """One upload, with an owner only its own."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fetched:
+    """An input on this machine's disk."""
+
+    reference: InputReference
+    """As it was named."""
+    path: Path
+    """Where it lies."""
+    points: int
+    """Points of a point cloud, by its header; 0 for footprints."""
+    sha256: str | None
+    """Hexadecimal; None for files that were read in place."""
+
+
+def resolve_inputs(
+    request: JobRequest, *, store: UploadTable, folder: StateFolder, settings: ServiceSettings, owner: str | None
+) -> None:
+    """Check the inputs of a job before it is taken.
+
+    Uploads are there, belong to the key and hold what they are named for; paths are files below a root; URLs lead to
+    listed hosts; and the points known by now are not too many.
+
+    Parameters
+    ----------
+    request : JobRequest
+        What was submitted.
+    store : UploadTable
+        The uploads.
+    folder : StateFolder
+        Their files.
+    settings : ServiceSettings
+        Roots, hosts and limits.
+    owner : str or None
+        Whose uploads may be used; None for all.
+
+    Raises
+    ------
+    RequestError
+        Listing all faults.
+    InputRefusedError
+        All that is wrong is that inputs are not allowed.
+    TooLargeError
+        Too many inputs or points.
+    """
+    sources: list[tuple[InputReference, tuple[str, ...]]] = [(tile, POINT_SUFFIXES) for tile in request.tiles]
+    if request.footprints is not None:
+        sources.append((request.footprints, VECTOR_SUFFIXES))
+    if len(sources) > settings.max_inputs:
+        raise TooLargeError(f"the job names {len(sources)} inputs, this service takes {settings.max_inputs}")
+    faults: list[str] = []
+    refusals, points = 0, 0
+    for source, suffixes in dict.fromkeys(sources):
+        try:
+            if source.kind == "upload":
+                points += _check_upload(source, suffixes, request, store, folder, owner)
+            elif source.kind == "path":
+                path = checked_path(source.value, settings)
+                _check_suffix(source, path.name, suffixes)
+                points += (promised_points(path) or 0) if suffixes is POINT_SUFFIXES else 0
+            else:
+                _check_suffix(source, name_of(checked_url(source.value, settings)), suffixes)
+        except TooLargeError:
+            raise
+        except (ServiceError, InputError) as fault:
+            faults.append(str(fault))
+            refusals += isinstance(fault, InputRefusedError)
+    if faults:
+        raise InputRefusedError("; ".join(faults)) if refusals == len(faults) else RequestError(faults)
+    _check_sum(points, settings)
+
+
+def _check_upload(
+    source: InputReference,
+    suffixes: tuple[str, ...],
+    request: JobRequest,
+    store: UploadTable,
+    folder: StateFolder,
+    owner: str | None,
+) -> int:
+    """The points of an upload that fits."""
+    upload = store.upload(source.value, owner=owner)
+    _upload_path(upload, folder)
+    _check_suffix(source, upload.filename, suffixes)
+    problems = [str(problem) for problem in upload.preflight.get("problems", ())]
+    if problems and request.crs is None:
+        raise RequestError([f"upload {upload.upload_id} ({upload.filename}): {'; '.join(problems)}"])
+    return int(upload.preflight.get("pointCount") or 0)
+
+
+def _upload_path(upload: Upload, folder: StateFolder) -> Path:
+    """The file of an upload, which is there and whole."""
+    path = folder.upload(upload.upload_id) / upload.filename
+    try:
+        size = path.stat().st_size
+    except FileNotFoundError:
+        size = -1
+    if size != upload.size_bytes:
+        raise NoSuchUploadError(f"the file of upload {upload.upload_id} is gone: upload {upload.filename} again")
+    return path
+
+
+def _check_suffix(source: InputReference, name: str, suffixes: tuple[str, ...]) -> None:
+    """Refuse points as footprints and the other way round, by the ending that decides how a file is read."""
+    if not name.lower().endswith(suffixes):
+        what = "point cloud" if suffixes is POINT_SUFFIXES else "file of footprints"
+        raise RequestError([f"{source.kind} {name[:80]!r} is no {what}: its name must end in {', '.join(suffixes)}"])
+
+
+def _check_sum(points: int, settings: ServiceSettings) -> None:
+    if points > settings.max_points:
+        raise TooLargeError(
+            f"the inputs have {points} points together, this service takes {settings.max_points} a job: "
+            "submit several jobs, or raise GABLEWORK_MAX_POINTS"
+        )
+
+
+def gather(
+    request: JobRequest,
+    *,
+    store: UploadTable,
+    folder: StateFolder,
+    settings: ServiceSettings,
+    target: Path,
+    cancelled: Cancel,
+) -> tuple[list[Fetched], Fetched | None]:
+    """All inputs of a job on this machine's disk, within the limits.
+
+    Parameters
+    ----------
+    request : JobRequest
+        What is to be done.
+    store : UploadTable
+        The uploads.
+    folder : StateFolder
+        Their files.
+    settings : ServiceSettings
+        Roots, hosts and limits.
+    target : Path
+        Folder for what is fetched; made when it is needed.
+    cancelled : callable
+        Asked often.
+
+    Returns
+    -------
+    tuple of list of Fetched, and Fetched or None
+        Tiles and footprints.
+
+    Raises
+    ------
+    As `materialise`.
+    """
+    tiles, points = [], 0
+    for tile in dict.fromkeys(request.tiles):
+        tiles.append(
+            materialise(tile, store=store, folder=folder, settings=settings, target=target, cancelled=cancelled)
+        )
+        points += tiles[-1].points
+        _check_sum(points, settings)
+    if request.footprints is None:
+        return tiles, None
+    outlines = materialise(
+        request.footprints, store=store, folder=folder, settings=settings, target=target, cancelled=cancelled
+    )
+    return tiles, outlines
+
+
+def materialise(
+    reference: InputReference,
+    *,
+    store: UploadTable,
+    folder: StateFolder,
+    settings: ServiceSettings,
+    target: Path,
+    cancelled: Cancel,
+) -> Fetched:
+    """One input on this machine's disk, checked again and examined.
+
+    Parameters
+    ----------
+    reference : InputReference
+        What the job names. Whose upload it is was checked when the job was submitted.
+    store : UploadTable
+        The uploads.
+    folder : StateFolder
+        Their files.
+    settings : ServiceSettings
+        Roots, hosts and limits.
+    target : Path
+        Folder for what is fetched; made when it is needed.
+    cancelled : callable
+        Asked often.
+
+    Raises
+    ------
+    NoSuchUploadError
+        The upload is gone.
+    InputRefusedError
+        The path or the URL, or what it redirects to, is not allowed.
+    TooLargeError
+        Too many bytes or points.
+    NoSpaceError
+        The disk is full.
+    InputError
+        It cannot be fetched or read.
+    RunCancelledError
+        The job was called off.
+    """
+    digest = None
+    if reference.kind == "upload":
+        upload = store.upload(reference.value)
+        path, digest = _upload_path(upload, folder), upload.sha256
+    elif reference.kind == "path":
+        path = checked_path(reference.value, settings)
+    else:
+        path, digest = download(reference.value, settings=settings, target=target, cancelled=cancelled)
+    told = preflight(path, settings.max_points)
+    return Fetched(reference=reference, path=path, points=int(told.get("pointCount") or 0), sha256=digest)

@@ -1,0 +1,57 @@
+"""Names of files that strangers give, made safe; and which endings are read."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+from pipeline.io.formats import POINT_SUFFIXES
+from service.errors import RequestError
+
+GEOJSON_SUFFIXES = (".geojson", ".json")
+"""Endings of GeoJSON."""
+FOOTPRINT_SUFFIXES = (".gpkg", *GEOJSON_SUFFIXES)
+"""Endings of footprints in one file; a Shapefile is several, and is taken by path only."""
+SUFFIXES = (*POINT_SUFFIXES, *FOOTPRINT_SUFFIXES)
+"""Endings of the files that are taken."""
+NAME_LIMIT = 120
+"""Bytes of a file's name; a longer one loses the end of its stem, not its ending."""
+DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
+"""Names that Windows keeps for itself, with any ending."""
+FORBIDDEN = re.compile(r'[<>:"|?*]')
+"""What Windows takes in no name."""
+
+
+def clean_filename(name: str) -> str:
+    r"""A name that is a file's own on every system: no path, no control characters, not too long.
+
+    Parameters
+    ----------
+    name : str
+        As the client sent it.
+
+    Raises
+    ------
+    RequestError
+        Nothing is left, or the ending is none of a format that is read.
+
+    >>> clean_filename("../../etc/passwd.laz")
+    'passwd.laz'
+    >>> clean_filename("C:\\tiles\\Straße 1.las")
+    'Straße 1.las'
+    >>> clean_filename("con.laz")
+    '_con.laz'
+    """
+    last = re.split(r"[/\\]", unicodedata.normalize("NFC", name))[-1]
+    kept = "".join(sign for sign in last if unicodedata.category(sign)[0] != "C")
+    cleaned = FORBIDDEN.sub("_", kept).strip(" .")
+    suffix = next((ending for ending in SUFFIXES if cleaned.lower().endswith(ending)), "")
+    stem = cleaned[: len(cleaned) - len(suffix)].strip(" .")
+    if not suffix or not stem:
+        raise RequestError(
+            [f"the file's name is {last[:80]!r}: give a name that ends in one of {', '.join(SUFFIXES)}, with a stem"]
+        )
+    if DEVICES.match(stem):
+        stem = "_" + stem
+    ending = cleaned[len(cleaned) - len(suffix) :]
+    return stem.encode()[: NAME_LIMIT - len(ending)].decode(errors="ignore").rstrip(" .") + ending

@@ -1,0 +1,143 @@
+"""What stands before all routes: who may address the service, how large a body may be, what browsers may do with it.
+
+A service on loopback without keys trusts whoever reaches it. A web page that a browser on the same machine shows must
+not: so the `Host` must be one of ours (else a page could name this address as its own, "DNS rebinding"), and what
+changes anything must not come from another origin.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Awaitable, Callable
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.errors import TooLargeError
+from service.problems import FOREIGN, KINDS, answer
+from service.settings import ServiceSettings
+
+STREAMED = frozenset({("POST", "/jobs"), ("POST", "/uploads")})
+"""Where files come in: their routes count for themselves."""
+
+READING = frozenset({"GET", "HEAD", "OPTIONS"})
+"""Methods that change nothing; without CORS another site cannot read their answers."""
+
+LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
+"""Names of this machine."""
+
+PAGE_POLICY = (
+    "default-src 'self'; img-src 'self' data: blob:; worker-src 'self' blob:; object-src 'none'; base-uri 'none'; "
+    "form-action 'self'; frame-ancestors 'none'"
+)
+"""Content security policy of the web page."""
+
+DATA_POLICY = "default-src 'none'; frame-ancestors 'none'"
+"""Content security policy of all else: whatever a file claims to be, a browser runs nothing of it."""
+
+
+class Guard:
+    """Checks every request before a route sees it; adds the headers that protect browsers.
+
+    Parameters
+    ----------
+    app : ASGI application
+        What is guarded.
+    settings : ServiceSettings
+        Address, public URL, largest body.
+    """
+
+    def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
+        self.app = app
+        self.settings = settings
+        public = urlsplit(settings.public_url or "")
+        self._public_origin = f"{public.scheme}://{public.netloc}".lower() if public.netloc else None
+        self._hosts = LOOPBACK | {settings.host.lower()} | ({public.hostname} if public.hostname else set())
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse, or pass on."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        guarded_send = functools.partial(self._send, send)
+        refusal = self._foreign(scope["method"], scope.get("scheme", "http"), headers)
+        if refusal is not None:
+            await answer(FOREIGN, refusal, scope["path"])(scope, receive, guarded_send)
+            return
+        if (scope["method"], self._path(scope)) in STREAMED:
+            await self.app(scope, receive, guarded_send)
+            return
+        most = self.settings.max_body_bytes
+        told = headers.get("content-length", "0")
+        if told.isdigit() and int(told) > most:
+            kind = KINDS[TooLargeError]
+            await answer(kind, _too_large(most), scope["path"])(scope, receive, guarded_send)
+            return
+        await self.app(scope, _counted(receive, most), guarded_send)
+
+    def _path(self, scope: Scope) -> str:
+        path: str = scope["path"]
+        return path.removeprefix(self.settings.root_path.rstrip("/"))
+
+    def _foreign(self, method: str, scheme: str, headers: Headers) -> str | None:
+        """Why a request is refused as that of another site; None where it is not."""
+        host = headers.get("host", "")
+        if self.settings.is_loopback and _hostname(host) not in self._hosts:
+            return (
+                f"the header Host is {host[:80]!r}: use {self.settings.host}, or set GABLEWORK_PUBLIC_URL to the URL "
+                "by which clients reach the service"
+            )
+        if method in READING:
+            return None
+        origin = headers.get("origin")
+        if origin is not None and origin.lower() not in {f"{scheme}://{host}".lower(), self._public_origin}:
+            return f"the header Origin is {origin[:80]!r}: only the service's own page may change anything"
+        if origin is None and headers.get("sec-fetch-site", "none") not in {"none", "same-origin"}:
+            return "the browser says that another site sends this: only the service's own page may change anything"
+        return None
+
+    @staticmethod
+    async def _send(send: Send, message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            is_page = headers.get("content-type", "").startswith("text/html")
+            headers["X-Content-Type-Options"] = "nosniff"
+            headers["Referrer-Policy"] = "no-referrer"
+            headers["Content-Security-Policy"] = PAGE_POLICY if is_page else DATA_POLICY
+            headers["Cross-Origin-Resource-Policy"] = "same-origin"
+        await send(message)
+
+
+def _hostname(host: str) -> str:
+    """The name in a Host header, without its port.
+
+    >>> _hostname("Localhost:8000"), _hostname("[::1]:8000"), _hostname("a b")
+    ('localhost', '::1', 'a b')
+    """
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return ""
+
+
+def _counted(receive: Receive, most: int) -> Callable[[], Awaitable[Message]]:
+    """The body as it comes, refused at the first byte too many."""
+    seen = 0
+
+    async def counting() -> Message:
+        nonlocal seen
+        message = await receive()
+        seen += len(message.get("body", b""))
+        if seen > most:
+            # an HTTPException passes the framework's parser of bodies, which makes anything else a 400
+            raise HTTPException(413, _too_large(most))
+        return message
+
+    return counting
+
+
+def _too_large(most: int) -> str:
+    return f"the body has more than {most} bytes: send files to /uploads, or raise GABLEWORK_MAX_BODY_BYTES"

@@ -1,0 +1,145 @@
+"""Which paths and URLs a job may name. Pure but for looking at the path itself.
+
+Hosts are listed in the setting `input_hosts`, each as the origin that it stands for:
+
+- `data.example.org` means `https://data.example.org`, its usual port and no other;
+- `data.example.org:8443` means https on that port;
+- `http://10.0.0.7:9000` means plain http there, for networks where that is meant.
+
+A listed host is trusted: where its name resolves to, and what it redirects to within the list, is its business.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import httpx
+
+from pipeline.errors import UnreadableInputError
+from service.errors import InputRefusedError, StartUpError
+from service.settings import ServiceSettings
+
+PORTS = {"https": 443, "http": 80}
+"""Ports of the schemes that are fetched."""
+LONGEST_URL = 4096
+
+Origin = tuple[str, str, int]
+"""Scheme, host in lower case, port."""
+
+
+def origin_of(entry: str) -> Origin:
+    """The origin that an entry of `input_hosts` stands for.
+
+    Raises
+    ------
+    StartUpError
+        It is no host.
+
+    >>> origin_of("Data.Example.org")
+    ('https', 'data.example.org', 443)
+    >>> origin_of("http://127.0.0.1:8080")
+    ('http', '127.0.0.1', 8080)
+    """
+    try:
+        url = httpx.URL(entry if "://" in entry else f"https://{entry}")
+        origin = _origin(url)
+    except (httpx.InvalidURL, ValueError):
+        origin = None
+    if origin is None or url.userinfo or url.raw_path not in {b"", b"/"} or url.fragment or "*" in entry:
+        raise StartUpError(f"input_hosts has {entry!r}: write a host, host:port or http://host:port")
+    return origin
+
+
+def _origin(url: httpx.URL) -> Origin | None:
+    """The origin of a URL; None where it has no host or another scheme."""
+    if url.scheme not in PORTS or not url.host:
+        return None
+    return url.scheme, url.host.lower(), url.port or PORTS[url.scheme]
+
+
+def checked_url(text: str, settings: ServiceSettings) -> httpx.URL:
+    """The URL, when it leads to a listed host.
+
+    Parameters
+    ----------
+    text : str
+        As the client, or a redirect, gives it.
+    settings : ServiceSettings
+        The listed hosts.
+
+    Raises
+    ------
+    InputRefusedError
+        It does not, or it is no such URL. The message does not repeat passwords or queries.
+    """
+    try:
+        url = httpx.URL(text) if len(text) <= LONGEST_URL and text.isprintable() else None
+    except (httpx.InvalidURL, ValueError):
+        url = None
+    origin = None if url is None else _origin(url)
+    if url is None or origin is None:
+        raise InputRefusedError(f"{text[:80]!r} is no URL that is fetched: give https://host/path")
+    if url.userinfo:
+        raise InputRefusedError(f"{shown(url)} carries a user or password: give a URL without")
+    allowed = {origin_of(entry) for entry in settings.input_hosts}
+    if origin not in allowed:
+        names = ", ".join(settings.input_hosts) or "none"
+        raise InputRefusedError(
+            f"{shown(url)}: the host {origin[0]}://{origin[1]}:{origin[2]} is not one from which inputs are fetched "
+            f"({names}): upload the file, or add the host to GABLEWORK_INPUT_HOSTS"
+        )
+    return url
+
+
+def shown(url: httpx.URL) -> str:
+    """The URL without what may be secret.
+
+    >>> shown(httpx.URL("https://me:pass@example.org/a.laz?token=1"))
+    'https://example.org/a.laz'
+    """
+    return str(url.copy_with(username=None, password=None, query=None, fragment=None))
+
+
+def checked_path(text: str, settings: ServiceSettings) -> Path:
+    """The path with its links resolved, when it is a file below one of the roots.
+
+    Outside the roots nothing is told of what is there.
+
+    Raises
+    ------
+    InputRefusedError
+        Not absolute, or it leads out of the roots.
+    UnreadableInputError
+        Below a root, but not a file that can be opened.
+    """
+    if "\0" in text or not text.startswith("/"):
+        raise InputRefusedError(f"{text[:200]!r} is no absolute path")
+    resolved = Path(os.path.realpath(text))
+    roots = [Path(os.path.realpath(root)) for root in settings.input_roots]
+    if not any(resolved != root and resolved.is_relative_to(root) for root in roots):
+        raise InputRefusedError(
+            f"{text[:200]!r} is not below a folder from which inputs are read "
+            f"({', '.join(map(str, settings.input_roots)) or 'none'}): upload the file, or add its folder to "
+            "GABLEWORK_INPUT_ROOTS"
+        )
+    try:
+        # Opening is the only honest test; without waiting, since a pipe would wait for its writer.
+        handle = os.open(resolved, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError as fault:
+        raise UnreadableInputError(text[:200], f"cannot be read ({fault.strerror})", "Check the path") from fault
+    try:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise UnreadableInputError(text[:200], "not a file", "Name the files one by one")
+        _check_same(text, handle, resolved)
+    finally:
+        os.close(handle)
+    return resolved
+
+
+def _check_same(text: str, handle: int, resolved: Path) -> None:
+    """Refuse a path that leads elsewhere than it did a moment ago."""
+    opened, now = os.fstat(handle), resolved.stat()
+    if (opened.st_dev, opened.st_ino) != (now.st_dev, now.st_ino) or Path(os.path.realpath(resolved)) != resolved:
+        raise InputRefusedError(f"{text[:200]!r} changes while it is looked at")

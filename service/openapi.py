@@ -1,0 +1,117 @@
+"""The OpenAPI document: what the framework finds, completed with what every path can answer, as version 3.0.
+
+OGC API - Processes asks for OpenAPI 3.0 and its clients read that; the framework writes 3.1. The two differ in a few
+words of JSON Schema, which are put back here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from pipeline import __version__
+from service.routes.documented import SCHEMAS, problems
+
+VERSION = "3.0.3"
+"""Of the document's format."""
+
+TAGS = (
+    {"name": "service", "description": "What is here, what is met, whether it works."},
+    {"name": "processes", "description": "What can be done, and how to ask for it."},
+    {"name": "uploads", "description": "Files that jobs read."},
+    {"name": "jobs", "description": "What was asked for: status, events, dismissal."},
+    {"name": "results", "description": "What came out: files and single buildings."},
+)
+"""Chapters of the document."""
+
+DESCRIPTION = (
+    "Valid LoD2 building models from raw airborne LiDAR tiles, by OGC API - Processes. Send tiles to `/uploads` or "
+    "`/jobs`, follow the job, fetch its results. Every error is a problem document (RFC 9457)."
+)
+
+_METHODS = ("get", "put", "post", "delete", "patch", "head", "options")
+
+
+def document(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document of an application; made once."""
+    if app.openapi_schema is None:
+        found = get_openapi(
+            title="gablework",
+            version=__version__,
+            description=DESCRIPTION,
+            routes=app.routes,
+            tags=[dict(tag) for tag in TAGS],
+        )
+        components = found.setdefault("components", {}).setdefault("schemas", {})
+        for name in ("HTTPValidationError", "ValidationError"):
+            components.pop(name, None)
+        components.update(SCHEMAS)
+        for operation in operations(found):
+            _complete(operation)
+        app.openapi_schema = as_version_3_0(found)
+        app.openapi_schema["openapi"] = VERSION
+    return app.openapi_schema
+
+
+def operations(found: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """All operations of a document."""
+    for path in found["paths"].values():
+        yield from (path[method] for method in _METHODS if method in path)
+
+
+def _complete(operation: dict[str, Any]) -> None:
+    """Add the problems that the application gives wherever they can come up."""
+    responses = operation["responses"]
+    if "HTTPValidationError" in str(responses.get("422")):
+        del responses["422"]
+    general = [429, 503]
+    if operation.get("parameters") or "requestBody" in operation:
+        general.append(400)
+    if "requestBody" in operation:
+        general += [413, 415]
+    if "security" in operation:
+        general += [401, 403]
+        # without keys on loopback nothing is asked for
+        operation["security"] = [{}, *operation["security"]]
+    elif "requestBody" in operation:
+        general.append(403)
+    for status, answer in problems(*general).items():
+        responses.setdefault(str(status), answer)
+    operation["responses"] = dict(sorted(responses.items(), key=lambda item: str(item[0])))
+
+
+def as_version_3_0(value: Any) -> Any:
+    """JSON Schema of OpenAPI 3.1 in the words of 3.0: nullable, one example, bounds as flags, no constants.
+
+    >>> as_version_3_0({"anyOf": [{"type": "string"}, {"type": "null"}], "title": "F"})
+    {'title': 'F', 'type': 'string', 'nullable': True}
+    >>> as_version_3_0({"type": "number", "exclusiveMinimum": 0})
+    {'type': 'number', 'minimum': 0, 'exclusiveMinimum': True}
+    """
+    if isinstance(value, list):
+        return [as_version_3_0(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    found = {name: item if name == "example" else as_version_3_0(item) for name, item in value.items()}
+    for word in ("anyOf", "oneOf"):
+        options = found.get(word)
+        if isinstance(options, list) and {"type": "null"} in options:
+            left = [option for option in options if option != {"type": "null"}]
+            del found[word]
+            found = {**found, **left[0]} if len(left) == 1 and "$ref" not in left[0] else {**found, word: left}
+            found["nullable"] = True
+    if isinstance(found.get("examples"), list):
+        examples = found.pop("examples")
+        found.setdefault("example", examples[0])
+    for word, bound in (("exclusiveMinimum", "minimum"), ("exclusiveMaximum", "maximum")):
+        limit = found.get(word)
+        if isinstance(limit, int | float) and not isinstance(limit, bool):
+            found |= {bound: limit, word: True}
+    if "const" in found and "type" in found:
+        found["enum"] = [found.pop("const")]
+    if found.pop("contentMediaType", None) == "application/octet-stream" and found.get("type") == "string":
+        found["format"] = "binary"
+    return found

@@ -1,0 +1,254 @@
+"""Pages of a job's buildings as GeoJSON, cut out of files that lie ready; reads the index and nothing numerical."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import math
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from service.errors import NoSuchOutputError, RequestError
+from service.outputs.building_index import FEATURES_NAME, NAME, Box
+from service.outputs.catalogue import ResultsCrs
+
+MAX_LIMIT = 10_000
+"""Most buildings of one page."""
+MAX_OFFSET = 10**12
+"""Most buildings before a page."""
+_CHUNK_BYTES = 1 << 16
+_NARROW_SHARE = 0.25
+"""Windows that meet tiles with fewer buildings than this share are looked up tile by tile."""
+
+
+class CoordinateChoice(StrEnum):
+    """Which coordinates a request speaks."""
+
+    CRS84 = "CRS84"
+    """Longitude and latitude in WGS 84."""
+    CRS84_URI = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
+    """The same by its full name."""
+    NATIVE = "native"
+    """Easting and northing of the tiles, in their own units."""
+
+    @property
+    def is_native(self) -> bool:
+        """Whether it is the tiles' own."""
+        return self is CoordinateChoice.NATIVE
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BuildingQuery:
+    """What a page is asked for."""
+
+    bbox: Box | None = None
+    """Buildings whose footprint's bounds meet this window, border included; those without a footprint never do."""
+    bbox_native: bool = False
+    """The window is in the tiles' own coordinates."""
+    native: bool = False
+    """Coordinates go out as the tiles' own."""
+    statuses: tuple[str, ...] = ()
+    """Any of these; empty for all."""
+    roof_types: tuple[str, ...] = ()
+    """Any of these; empty for all."""
+    reasons: tuple[str, ...] = ()
+    """Any of these; empty for all."""
+    limit: int = 100
+    """Most buildings of the page."""
+    offset: int = 0
+    """Buildings before it, in the order of their ids."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FeaturePart:
+    """Where a building's feature lies, and what takes the place of its geometry."""
+
+    start: int
+    size: int
+    geometry_start: int
+    geometry_size: int
+    native: bytes | None
+    """The geometry to be told; None for the one in the file."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BuildingPage:
+    """One page of buildings; `features` reads them as they are sent."""
+
+    matched: int
+    """Buildings that fit the request, on all pages."""
+    parts: tuple[FeaturePart, ...]
+    """Those of this page, by building_id."""
+    path: Path
+    """The file of features."""
+
+    def features(self) -> Iterator[bytes]:
+        """The features as GeoJSON texts."""
+        with self.path.open("rb") as stream:
+            for part in self.parts:
+                stream.seek(part.start)
+                text = stream.read(part.size)
+                if part.native is None:
+                    yield text
+                else:
+                    end = part.geometry_start + part.geometry_size
+                    yield text[: part.geometry_start] + part.native + text[end:]
+
+    def chunks(self, members: Mapping[str, Any]) -> Iterator[bytes]:
+        """The page as a feature collection, some kilobytes at a time.
+
+        Parameters
+        ----------
+        members : mapping
+            What stands beside type and features, such as links.
+        """
+        head = {"type": "FeatureCollection", "numberMatched": self.matched, "numberReturned": len(self.parts)}
+        waiting = bytearray(json.dumps({**head, **members}, ensure_ascii=False).encode()[:-1])
+        waiting += b', "features": ['
+        for number, text in enumerate(self.features()):
+            waiting += b",\n" if number else b"\n"
+            waiting += text
+            if len(waiting) >= _CHUNK_BYTES:
+                yield bytes(waiting)
+                waiting.clear()
+        yield bytes(waiting + b"\n]}\n")
+
+
+def parsed_bbox(text: str, *, native: bool) -> Box:
+    """A window from four numbers.
+
+    Parameters
+    ----------
+    text : str
+        West, south, east, north (or x_min, y_min, x_max, y_max), parted by commas.
+    native : bool
+        Whether the numbers are the tiles' own coordinates.
+
+    Raises
+    ------
+    RequestError
+        It is no window; one over the 180th meridian is to be asked for in two halves.
+
+    Examples
+    --------
+    >>> parsed_bbox("4.3,52,4.4,52.1", native=False)
+    (4.3, 52.0, 4.4, 52.1)
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 4 or not all(math.isfinite(value) for value in values):
+        raise RequestError([f"query bbox is {text[:80]!r}: give four numbers, such as 4.35,52.00,4.37,52.01"])
+    west, south, east, north = values
+    if south > north:
+        raise RequestError([f"query bbox is {text!r}: its south {south:g} lies north of its north {north:g}"])
+    if west > east:
+        hint = "" if native else "; a window over the 180th meridian is asked for in two halves"
+        raise RequestError([f"query bbox is {text!r}: its west {west:g} lies east of its east {east:g}{hint}"])
+    return west, south, east, north
+
+
+def checked_choice(choice: CoordinateChoice | None, crs: ResultsCrs, parameter: str) -> bool:
+    """Whether the tiles' own coordinates are meant; they are the only ones where the CRS is unknown.
+
+    Raises
+    ------
+    RequestError
+        WGS 84 is asked for by name, but the CRS of the tiles is unknown.
+    """
+    if crs.is_known:
+        return choice is not None and choice.is_native
+    if choice is not None and not choice.is_native:
+        raise RequestError(
+            [f"query {parameter} is {choice.value}, but the CRS of the tiles is unknown: use native, or leave it out"]
+        )
+    return True
+
+
+@contextlib.contextmanager
+def opened_index(out_dir: Path) -> Iterator[sqlite3.Connection]:
+    """The index of a folder of outputs, for reading.
+
+    Raises
+    ------
+    NoSuchOutputError
+        It is gone.
+    """
+    path = (out_dir / NAME).resolve()
+    if not path.is_file():
+        raise NoSuchOutputError("the buildings of this job are no longer in the state folder: submit it again")
+    connection = sqlite3.connect(f"{path.as_uri()}?mode=ro&immutable=1", uri=True)
+    try:
+        yield connection
+    finally:
+        connection.close()
+
+
+def building_page(out_dir: Path, query: BuildingQuery) -> BuildingPage:
+    """One page of buildings.
+
+    Raises
+    ------
+    NoSuchOutputError
+        The outputs are gone.
+    """
+    with opened_index(out_dir) as connection:
+        source, conditions, values = _selection(connection, query)
+        where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
+        (matched,) = connection.execute(f"SELECT count(*) FROM {source}{where}", values).fetchone()  # noqa: S608
+        native = "native" if query.native else "NULL"
+        found = connection.execute(
+            f"SELECT start, size, geometry_start, geometry_size, {native} FROM building JOIN"  # noqa: S608 - our own words
+            f" (SELECT key.building_id AS id, key.place AS at FROM {source}{where} ORDER BY 1 LIMIT ? OFFSET ?)"
+            " ON building.place = at ORDER BY id",
+            (*values, query.limit, query.offset),
+        ).fetchall()
+    parts = tuple(
+        FeaturePart(start=start, size=size, geometry_start=first, geometry_size=length, native=geometry)
+        for start, size, first, length, geometry in found
+    )
+    return BuildingPage(matched=matched, parts=parts, path=out_dir / FEATURES_NAME)
+
+
+def _selection(connection: sqlite3.Connection, query: BuildingQuery) -> tuple[str, list[str], list[Any]]:
+    """Tables, conditions and their values.
+
+    A narrow window looks at the tiles first and then at their buildings only; for a wide one a walk over all buildings
+    in the order of their ids is cheaper.
+    """
+    conditions: list[str] = []
+    values: list[Any] = []
+    source = "key"
+    if query.bbox is not None:
+        window, corners = _window(query)
+        (near,) = connection.execute(
+            f"SELECT total(n) FROM tile WHERE {window.format('tile')}",  # noqa: S608
+            corners,
+        ).fetchone()
+        (total,) = connection.execute("SELECT total(n) FROM tile").fetchone()
+        if near <= _NARROW_SHARE * total:
+            # CROSS JOIN keeps SQLite from turning the order round
+            source = "tile CROSS JOIN key ON key.tile = tile.tile"
+            conditions.append(window.format("tile"))
+            values += corners
+        conditions.append(window.format("key"))
+        values += corners
+    for column, allowed in (("status", query.statuses), ("roof_type", query.roof_types), ("reason", query.reasons)):
+        if allowed:
+            conditions.append(f"key.{column} IN ({', '.join('?' * len(allowed))})")
+            values += allowed
+    return source, conditions, values
+
+
+def _window(query: BuildingQuery) -> tuple[str, Sequence[float]]:
+    """The condition of the window, its table to be named, and its values."""
+    assert query.bbox is not None
+    low_x, low_y, high_x, high_y = query.bbox
+    names = ("x_min", "x_max", "y_min", "y_max") if query.bbox_native else ("west", "east", "south", "north")
+    text = " AND ".join(f"{{0}}.{name} {sign} ?" for name, sign in zip(names, ("<=", ">=", "<=", ">="), strict=True))
+    return text, (high_x, low_x, high_y, low_y)

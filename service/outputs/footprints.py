@@ -1,0 +1,192 @@
+"""Footprints as GeoJSON: the way to WGS 84, and one feature a building."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+import pyproj
+import shapely
+
+from service.outputs.catalogue import ResultsCrs
+
+DECIMALS = 9
+"""Of degrees: a tenth of a millimetre."""
+
+_NOT_PROPERTIES = ("geometry", "bbox")
+_UNKNOWN = (
+    "The coordinate reference system of the tiles is unknown: these coordinates are theirs, not WGS 84. "
+    "Give `crs` with the job to get degrees."
+)
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Way:
+    """From the CRS of a run to WGS 84."""
+
+    crs: ResultsCrs
+    """What is told of it."""
+    transformer: pyproj.Transformer | None
+    """None where the CRS is unknown."""
+    projjson: Mapping[str, Any] | None
+    """The CRS as PROJJSON; None where it is unknown."""
+
+    @classmethod
+    def of_run(cls, crs: Mapping[str, Any] | None) -> Way:
+        """The way for the `crs` entry of a run.json.
+
+        A compound CRS goes by its horizontal part: footprints have no elevation.
+        """
+        if crs is None or crs.get("wkt") is None:
+            unknown = ResultsCrs(name=None, uri=None, to_wgs84=None, accuracy_m=None)
+            return cls(crs=unknown, transformer=None, projjson=None)
+        whole = pyproj.CRS.from_wkt(crs["wkt"])
+        flat = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d()
+        code = flat.to_epsg()
+        transformer = pyproj.Transformer.from_crs(flat, "OGC:CRS84", always_xy=True)
+        accuracy_m = transformer.accuracy
+        told = ResultsCrs(
+            name=whole.name,
+            uri=None if code is None else f"http://www.opengis.net/def/crs/EPSG/0/{code}",
+            to_wgs84=transformer.description,
+            accuracy_m=None if accuracy_m is None or accuracy_m < 0 else float(accuracy_m),
+        )
+        return cls(crs=told, transformer=transformer, projjson=whole.to_json_dict())
+
+    def degrees(self, geometries: npt.NDArray[np.object_]) -> npt.NDArray[np.object_]:
+        """Geometries in longitude and latitude, exterior rings counter-clockwise; as they are where the CRS is unknown.
+
+        What has no place in WGS 84 becomes None.
+        """
+        if self.transformer is None:
+            return geometries
+
+        def moved(xy: FloatArray) -> FloatArray:
+            assert self.transformer is not None
+            return np.round(np.column_stack(self.transformer.transform(xy[:, 0], xy[:, 1])), DECIMALS) + 0.0
+
+        turned = shapely.orient_polygons(shapely.transform(geometries, moved))
+        lost = ~shapely.is_missing(turned) & ~np.isfinite(shapely.bounds(turned)).all(axis=-1)
+        turned[lost] = None
+        return np.asarray(turned, dtype=object)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FeatureText:
+    """The feature of one building, and what the index of buildings needs to know of it."""
+
+    building_id: str
+    record: Mapping[str, Any]
+    """The row without geometry and bbox."""
+    text: bytes
+    """The GeoJSON feature."""
+    geometry_start: int
+    """First byte of the geometry in `text`."""
+    geometry_size: int
+    """Bytes of the geometry."""
+    native: bytes
+    """The geometry in the coordinates of the tiles."""
+    bounds: tuple[float, float, float, float] | None
+    """In the coordinates of the tiles; None without a geometry."""
+    bounds_deg: tuple[float, float, float, float] | None
+    """West, south, east, north; as `bounds` where the CRS is unknown."""
+
+
+def feature_texts(rows: Sequence[Mapping[str, Any]], way: Way) -> list[FeatureText]:
+    """The features of the rows of a buildings table.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+        With `geometry` as ISO WKB or None, and `bbox`.
+    way : Way
+        To WGS 84.
+    """
+    if not rows:
+        return []
+    own = np.asarray(shapely.from_wkb(np.array([row["geometry"] for row in rows], dtype=object)), dtype=object)
+    degrees = way.degrees(own)
+    texts = []
+    for row, mine, turned, bounds, bounds_deg in zip(
+        rows, own, degrees, shapely.bounds(own), shapely.bounds(degrees), strict=True
+    ):
+        record = {name: _plain(value) for name, value in row.items() if name not in ("geometry", "bbox")}
+        properties = {name: value for name, value in record.items() if name not in _NOT_PROPERTIES}
+        geometry = _geojson(turned)
+        head = b'{"type":"Feature","id":' + _json(row["building_id"]) + b',"geometry":'
+        texts.append(
+            FeatureText(
+                building_id=row["building_id"],
+                record=record,
+                text=head + geometry + b',"properties":' + _json(properties) + b"}",
+                geometry_start=len(head),
+                geometry_size=len(geometry),
+                native=_geojson(mine),
+                bounds=_bounds(bounds),
+                bounds_deg=_bounds(bounds_deg),
+            )
+        )
+    return texts
+
+
+def _plain(value: Any) -> Any:
+    return value.isoformat() if isinstance(value, dt.datetime) else value
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+
+
+def _geojson(geometry: shapely.Geometry | None) -> bytes:
+    return b"null" if geometry is None else str(shapely.to_geojson(geometry)).encode()
+
+
+def _bounds(values: FloatArray) -> tuple[float, float, float, float] | None:
+    if not np.isfinite(values).all():
+        return None
+    west, south, east, north = (float(v) for v in values)
+    return west, south, east, north
+
+
+class FeatureCollectionFile:
+    """Writes features one a line as one GeoJSON feature collection, and tells where each lies.
+
+    Parameters
+    ----------
+    stream : binary file
+        To be written.
+    crs : ResultsCrs
+        Of the results: an unknown one is told.
+    """
+
+    def __init__(self, stream: BinaryIO, crs: ResultsCrs) -> None:
+        self._stream = stream
+        self._position = 0
+        self._put(b'{"type":"FeatureCollection",')
+        if not crs.is_known:
+            self._put(b'"coordRefSys":null,"note":' + _json(_UNKNOWN) + b",")
+        self._put(b'"features":[')
+        self._first = True
+
+    def add(self, feature: FeatureText) -> int:
+        """Append a feature; where it starts."""
+        self._put(b"\n" if self._first else b",\n")
+        self._first = False
+        start = self._position
+        self._put(feature.text)
+        return start
+
+    def close(self) -> None:
+        """Write the end."""
+        self._put(b"\n]}\n")
+
+    def _put(self, data: bytes) -> None:
+        self._stream.write(data)
+        self._position += len(data)

@@ -1,0 +1,132 @@
+"""The outputs of the process `reconstruct`: one table of what a finished job offers for download."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from service.errors import NoSuchOutputError
+
+GEOPARQUET = "application/vnd.apache.parquet"
+"""Media type of Parquet, GeoParquet included."""
+CITYJSONSEQ = "application/city+json-seq"
+"""Media type of CityJSONSeq: a line of metadata, then one CityJSONFeature a line."""
+CITYJSON = "application/city+json"
+"""Media type of a whole CityJSON document."""
+GEOJSON = "application/geo+json"
+"""Media type of RFC 7946."""
+OBJ = "model/obj"
+"""Media type of Wavefront OBJ."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OutputKind:
+    """One output of the process."""
+
+    output_id: str
+    """Its name in requests, results and paths."""
+    title: str
+    """A few words."""
+    description: str
+    """What is in it, and how to read it."""
+    media_type: str
+    """The one type that it is served as."""
+    filename: str
+    """Name of the file in the folder of outputs, and the last part of the name that a browser saves."""
+    schema: Mapping[str, Any]
+    """JSON schema of the value, for the process description."""
+
+
+def _binary(media_type: str) -> dict[str, Any]:
+    return {"type": "string", "contentEncoding": "binary", "contentMediaType": media_type}
+
+
+_KINDS = (
+    OutputKind(
+        output_id="buildings",
+        title="Buildings as GeoParquet",
+        description="One row a candidate, modelled or not: status and reason, roof type, footprint, heights, volume, "
+        "quality and validity. GeoParquet 1.1 in the CRS of the tiles, all tiles in one file.",
+        media_type=GEOPARQUET,
+        filename="buildings.parquet",
+        schema=_binary(GEOPARQUET),
+    ),
+    OutputKind(
+        output_id="planes",
+        title="Roof planes as GeoParquet",
+        description="One row a roof plane: its face in 3D, slope, aspect, coefficients, area and residuals.",
+        media_type=GEOPARQUET,
+        filename="planes.parquet",
+        schema=_binary(GEOPARQUET),
+    ),
+    OutputKind(
+        output_id="rejected",
+        title="Rejected objects as GeoParquet",
+        description="One row an object that was judged to be no building, with its reason.",
+        media_type=GEOPARQUET,
+        filename="rejected.parquet",
+        schema=_binary(GEOPARQUET),
+    ),
+    OutputKind(
+        output_id="meshes",
+        title="Meshes as OBJ in a zip file",
+        description="The solids as Wavefront OBJ in full coordinates, one file a building (or a tile, if asked for). "
+        "The names in the zip file are those of the column mesh_path.",
+        media_type="application/zip",
+        filename="meshes.zip",
+        schema=_binary("application/zip"),
+    ),
+    OutputKind(
+        output_id="cityjson",
+        title="Buildings as CityJSONSeq",
+        description="CityJSON 2.0 as text lines: one line of metadata, then one feature a building with the record as "
+        "its attributes, a BuildingPart with semantic surfaces a solid.",
+        media_type=CITYJSONSEQ,
+        filename="buildings.city.jsonl",
+        schema={"type": "string", "contentMediaType": CITYJSONSEQ},
+    ),
+    OutputKind(
+        output_id="geojson",
+        title="Footprints as GeoJSON",
+        description="RFC 7946: footprints in WGS 84 with all columns as properties; one without an outline has a null "
+        "geometry. Where the CRS of the tiles is unknown the coordinates are theirs, and `coordRefSys` is null.",
+        media_type=GEOJSON,
+        filename="buildings.geojson",
+        schema={"type": "object", "format": "geojson-feature-collection", "contentMediaType": GEOJSON},
+    ),
+    OutputKind(
+        output_id="report",
+        title="Report of the run",
+        description="Counts by status, reason and roof type, inputs with sha256, settings and hashes, warnings, "
+        "timings, and the digest of the content.",
+        media_type="application/json",
+        filename="report.json",
+        schema={"type": "object", "contentMediaType": "application/json"},
+    ),
+)
+
+OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _KINDS}
+"""The outputs by their ids, in the order in which they are told."""
+
+
+def chosen(wanted: Iterable[str] | None) -> tuple[OutputKind, ...]:
+    """The kinds of some ids, in the table's order; all of them for None.
+
+    Raises
+    ------
+    NoSuchOutputError
+        An id is not in the table.
+
+    Examples
+    --------
+    >>> [kind.output_id for kind in chosen(["report", "buildings"])]
+    ['buildings', 'report']
+    """
+    if wanted is None:
+        return _KINDS
+    names = set(wanted)
+    unknown = sorted(names - set(OUTPUTS))
+    if unknown:
+        raise NoSuchOutputError(f"there is no output {', '.join(unknown)}: use {', '.join(OUTPUTS)}")
+    return tuple(kind for kind in _KINDS if kind.output_id in names)

@@ -1,0 +1,145 @@
+"""One table of a run as one GeoParquet file: the tiles' rows one after the other, few in memory at a time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.errors import RunError
+from pipeline.export.geoparquet import geo_metadata, stored_schema
+
+ROWS_A_GROUP = 5_000
+"""Rows in one row group: a reader with a window skips the groups whose `bbox` is elsewhere."""
+
+
+class MergedTable:
+    """Writes one GeoParquet file from the tiles' files; `tile` becomes an ordinary column.
+
+    Parameters
+    ----------
+    path : Path
+        The file to write.
+    table_name : str
+        buildings, planes or rejected.
+    sources : sequence of Path
+        The tiles' files, whose `geo` metadata are united.
+    projjson : mapping or None
+        The CRS of a table without tiles; None where it is unknown.
+    """
+
+    def __init__(
+        self, path: Path, table_name: str, sources: Sequence[Path], projjson: Mapping[str, Any] | None
+    ) -> None:
+        nothing = geo_metadata(np.empty(0, dtype=object), projjson)
+        geo = united_metadata(_metadata(source) for source in sources) if sources else nothing
+        plain = stored_schema(table_name).append(pa.field("tile", pa.string(), nullable=False))
+        self._schema = plain.with_metadata({"geo": json.dumps(geo, sort_keys=True, separators=(",", ":"))})
+        self._writer = pq.ParquetWriter(path, self._schema, compression="zstd", write_statistics=True)
+        self._waiting: list[pa.Table] = []
+        self._rows = 0
+
+    def add(self, tile: str, table: pa.Table) -> None:
+        """Append the rows of one tile."""
+        named = table.append_column(self._schema.field("tile"), pa.array([tile] * table.num_rows, pa.string()))
+        self._waiting.append(named.select(self._schema.names).cast(self._schema))
+        self._rows += table.num_rows
+        if self._rows >= ROWS_A_GROUP:
+            self._write(whole_groups=True)
+
+    def _write(self, *, whole_groups: bool) -> None:
+        """Write what waits, in whole row groups or all of it."""
+        united = pa.concat_tables(self._waiting) if self._waiting else self._schema.empty_table()
+        count = united.num_rows // ROWS_A_GROUP * ROWS_A_GROUP if whole_groups else united.num_rows
+        if count:
+            self._writer.write_table(united.slice(0, count).combine_chunks(), row_group_size=ROWS_A_GROUP)
+        # a copy: a slice would keep the whole table in memory
+        rest = united.slice(count).combine_chunks()
+        self._waiting, self._rows = ([rest] if rest.num_rows else []), rest.num_rows
+
+    def __enter__(self) -> Self:
+        """Be written to."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write the last rows and the footer."""
+        if kind is None:
+            self._write(whole_groups=False)
+        self._writer.close()
+
+
+def read_tile(path: Path) -> pa.Table:
+    """The rows of one tile's file.
+
+    Raises
+    ------
+    RunError
+        The file is missing or damaged.
+    """
+    try:
+        with pq.ParquetFile(path) as file:
+            return file.read()
+    except (pa.ArrowInvalid, OSError) as error:
+        raise RunError(f"{path} cannot be read as Parquet: {error}") from error
+
+
+def _metadata(path: Path) -> dict[str, Any]:
+    """The `geo` metadata of one file."""
+    try:
+        geo: dict[str, Any] = json.loads(pq.read_metadata(path).metadata[b"geo"])
+    except (pa.ArrowInvalid, OSError, KeyError, TypeError) as error:
+        raise RunError(f"{path} cannot be read as GeoParquet: {error}") from error
+    return geo
+
+
+def united_metadata(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """The `geo` metadata of several files as one: all geometry types, and the bounds of all.
+
+    Parameters
+    ----------
+    parts : iterable of dict
+        As `pipeline.export.geoparquet.geo_metadata` makes them, of one CRS; at least one.
+
+    Raises
+    ------
+    RunError
+        There is none, or the files are of several CRS.
+    """
+    united: dict[str, Any] | None = None
+    types: set[str] = set()
+    bounds: list[list[float]] = []
+    for part in parts:
+        column = part["columns"]["geometry"]
+        if united is not None and column["crs"] != united["columns"]["geometry"]["crs"]:
+            raise RunError("the tiles have more than one CRS: files of two runs lie in one directory")
+        united = united or part
+        types.update(column["geometry_types"])
+        bounds.extend([column["bbox"]] if "bbox" in column else [])
+    if united is None:
+        raise RunError("a merged table needs at least one tile")
+    column = {**united["columns"]["geometry"], "geometry_types": sorted(types)}
+    column.pop("bbox", None)
+    if bounds:
+        column["bbox"] = _united_bounds(bounds)
+    return {**united, "columns": {"geometry": column}}
+
+
+def _united_bounds(bounds: Sequence[Sequence[float]]) -> list[float]:
+    """The bounds of several bounds; flat where one of them is.
+
+    >>> _united_bounds([[0.0, 0.0, 1.0, 2.0, 2.0, 3.0], [-1.0, 1.0, 0.0, 1.0, 5.0, 9.0]])
+    [-1.0, 0.0, 0.0, 2.0, 5.0, 9.0]
+    """
+    flat = any(len(box) == 4 for box in bounds)
+    axes = 2 if flat else 3
+    low = [min(box[axis] for box in bounds) for axis in range(axes)]
+    high = [max(box[len(box) // 2 + axis] for box in bounds) for axis in range(axes)]
+    return [*low, *high]

@@ -1,0 +1,141 @@
+"""One building of a job: its record with its planes, its mesh, its city object."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from service.errors import NoSuchBuildingError
+from service.outputs.building_index import FEATURES_NAME
+from service.outputs.building_pages import opened_index
+from service.outputs.meshes import building_lines
+
+ID_PATTERN = "^[a-z2-7]{24}$"
+"""What a building_id looks like."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StoredBuilding:
+    """Where the parts of one building lie."""
+
+    building_id: str
+    """The building."""
+    tile: str
+    """Its owner tile."""
+    mesh_path: str | None
+    """Its OBJ file, relative to the run directory; None without one."""
+    feature: dict[str, Any]
+    """Its GeoJSON feature."""
+    planes: list[dict[str, Any]]
+    """Its rows of the planes table without geometry."""
+    city_start: int
+    """Of its line in the tile's CityJSONSeq file."""
+    city_size: int
+    """Bytes of the line."""
+
+
+def stored_building(out_dir: Path, building_id: str, *, native: bool = False) -> StoredBuilding:
+    """Look one building up.
+
+    Parameters
+    ----------
+    out_dir : Path
+        The folder of outputs.
+    building_id : str
+        As a client gave it.
+    native : bool
+        Whether the feature's coordinates are to be the tiles' own.
+
+    Raises
+    ------
+    NoSuchBuildingError
+        There is none of this id.
+    NoSuchOutputError
+        The outputs are gone.
+    """
+    row = None
+    if re.fullmatch(ID_PATTERN, building_id):
+        with opened_index(out_dir) as connection:
+            row = connection.execute(
+                "SELECT tile.name, mesh_path, start, size, native, city_start, city_size, planes"
+                " FROM key JOIN building USING (place) JOIN tile ON tile.tile = key.tile WHERE key.building_id = ?",
+                (building_id,),
+            ).fetchone()
+    if row is None:
+        raise NoSuchBuildingError(f"the results of this job hold no building {building_id[:80]!r}")
+    tile, mesh_path, start, size, geometry, city_start, city_size, planes = row
+    with (out_dir / FEATURES_NAME).open("rb") as stream:
+        stream.seek(start)
+        feature: dict[str, Any] = json.loads(stream.read(size))
+    if native:
+        feature["geometry"] = json.loads(geometry)
+    return StoredBuilding(
+        building_id=building_id,
+        tile=tile,
+        mesh_path=mesh_path,
+        feature=feature,
+        planes=json.loads(zlib.decompress(planes)),
+        city_start=city_start,
+        city_size=city_size,
+    )
+
+
+def building_obj(run_dir: Path, building: StoredBuilding) -> Iterator[str]:
+    """The lines of a building's OBJ, also where one file holds a whole tile.
+
+    Raises
+    ------
+    NoSuchBuildingError
+        It has no model, the job was asked for no meshes, or its file is gone.
+    """
+    name = building.building_id
+    if building.mesh_path is None:
+        if building.feature["properties"]["lod"] is None:
+            why = building.feature["properties"]["reason"]
+            raise NoSuchBuildingError(f"building {name} has no model ({why}), so it has no mesh")
+        raise NoSuchBuildingError(f"this job was asked for no meshes: take building {name} as CityJSON")
+    path = run_dir / building.mesh_path
+    if not path.is_file():
+        raise NoSuchBuildingError(f"the mesh of building {name} is no longer in the state folder: submit the job again")
+    return building_lines(path, name)
+
+
+def building_cityjson(run_dir: Path, building: StoredBuilding) -> dict[str, Any]:
+    """A CityJSON document of one building, whole by itself: its objects, vertices, transform and extent.
+
+    Raises
+    ------
+    NoSuchBuildingError
+        Its file is gone.
+    """
+    path = run_dir / "cityjson" / f"tile={building.tile}" / "part-0.city.jsonl"
+    try:
+        with path.open("rb") as stream:
+            document: dict[str, Any] = json.loads(stream.readline())
+            stream.seek(building.city_start)
+            feature = json.loads(stream.read(building.city_size))
+    except FileNotFoundError:
+        raise NoSuchBuildingError(
+            f"the model of building {building.building_id} is no longer in the state folder: submit the job again"
+        ) from None
+    metadata = {**document["metadata"], "title": f"building {building.building_id}"}
+    metadata.pop("geographicalExtent", None)
+    if feature["vertices"]:
+        scale, translate = document["transform"]["scale"], document["transform"]["translate"]
+        corners = [
+            (extreme(vertex[axis] for vertex in feature["vertices"]) * scale[axis] + translate[axis])
+            for extreme in (min, max)
+            for axis in range(3)
+        ]
+        metadata["geographicalExtent"] = [round(corner, 6) for corner in corners]
+    return {
+        **document,
+        "metadata": metadata,
+        "CityObjects": feature["CityObjects"],
+        "vertices": feature["vertices"],
+    }

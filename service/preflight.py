@@ -1,0 +1,362 @@
+"""What a file is, from its header, before anybody works on it. Bombs are refused here.
+
+`examine` does it; `Examiner` has it done by a child process with little memory and little time, because the bytes come
+from strangers and the readers are native code. The child also keeps the readers out of the API's own process. It is
+started by the first file, serves one file after the other, and ends with its parent.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import math
+import os
+import select
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from pipeline.errors import CrsError, EmptyInputError, InputError, UnreadableInputError
+from pipeline.io.formats import recognise_format
+from service.errors import TooLargeError
+from service.vectors import VECTOR_SUFFIXES, examine_vector
+
+PASS_BYTES = 128 << 20
+"""Text and PLY have no bounds in a header: files up to this size are read through, larger ones are only counted."""
+BLOCK_BYTES = 1 << 20
+CHILD_BYTES = 2 << 30
+"""Address space of the child; its libraries alone map some hundred MiB."""
+CHILD_S = 60.0
+"""Seconds for one file, the child's start included."""
+CHILD_FILES = 500
+"""Files after which the child is replaced."""
+REFUSED = "Get the file again, or rewrite it with another tool"
+
+
+def examine(path: Path, *, max_points: int) -> dict[str, Any]:
+    """What the header tells, in this very process.
+
+    Parameters
+    ----------
+    path : Path
+        The file; its name's ending tells whether it holds points or footprints.
+    max_points : int
+        More points are refused before any is decoded.
+
+    Returns
+    -------
+    dict
+        Plain JSON values. `kind` points or footprints, `format`, `usable`, `problems` that `crs` or other inputs of a
+        job may still heal, `warnings`, `crs` (name and EPSG code); of points `pointCount`, `horizontalUnitM`,
+        `verticalUnitM`, `bounds` (x_min, y_min, z_min, x_max, y_max, z_max in the CRS's units), `densityPerM2`,
+        `hasReturns`, `hasClasses`, `acquiredFrom`, `acquiredTo`; of footprints `featureCount`, `layers`. None for what
+        is not known.
+
+    Raises
+    ------
+    InputError
+        Not a format that is read, damaged, or header and size disagree.
+    TooLargeError
+        More points than allowed.
+    """
+    try:
+        if path.suffix.lower() in VECTOR_SUFFIXES:
+            return examine_vector(path)
+        return _examine_points(path, max_points)
+    except OSError as fault:
+        raise UnreadableInputError(
+            str(path), f"cannot be read ({fault.strerror or fault})", "Check the file and its permissions"
+        ) from fault
+    except MemoryError:
+        raise UnreadableInputError(str(path), "its header asks for more memory than any true one", REFUSED) from None
+
+
+def _examine_points(path: Path, max_points: int) -> dict[str, Any]:
+    """Format, count, CRS, bounds of a point cloud."""
+    name = recognise_format(path)
+    _check_count(path, _count_before_reading(path, name), max_points)
+    if name != "las" and path.stat().st_size > PASS_BYTES:
+        return _only_counted(path, name)
+    from pipeline.io.source import READERS, ReadOptions, open_source
+
+    try:
+        known = open_source(path).info
+    except CrsError as fault:
+        facts = READERS[name](path, ReadOptions()).facts
+        _check_facts(path, facts.point_count, facts.bounds, max_points)
+        crs = None if facts.crs is None else {"name": facts.crs.name, "epsg": facts.crs.to_epsg()}
+        return _points(
+            facts.format,
+            facts.point_count,
+            crs=crs,
+            bounds=list(facts.bounds),
+            hasReturns=facts.has_returns,
+            hasClasses=facts.has_classes,
+            warnings=list(facts.warnings),
+            problems=[f"{fault.problem}. {fault.fix}"],
+        )
+    _check_facts(path, known.point_count, known.bounds_m, max_points)
+    reference = known.reference
+    plan, up = reference.horizontal_unit_m, reference.vertical_unit_m
+    units = (plan, plan, up, plan, plan, up)
+    return _points(
+        known.format,
+        known.point_count,
+        crs=None if reference.wkt is None else {"name": reference.name, "epsg": reference.epsg},
+        horizontalUnitM=plan,
+        verticalUnitM=up,
+        bounds=[round(value / unit, 6) for value, unit in zip(known.bounds_m, units, strict=True)],
+        densityPerM2=round(known.density_per_m2, 3) if math.isfinite(known.density_per_m2) else None,
+        hasReturns=known.has_returns,
+        hasClasses=known.has_classes,
+        acquiredFrom=known.acquired_from.isoformat() if known.acquired_from else None,
+        acquiredTo=known.acquired_to.isoformat() if known.acquired_to else None,
+        warnings=list(known.warnings),
+    )
+
+
+def _check_facts(path: Path, count: int, bounds: Iterable[float], max_points: int) -> None:
+    """Refuse too many points, and bounds that are no numbers."""
+    _check_count(path, count, max_points)
+    if not all(map(math.isfinite, bounds)):
+        raise UnreadableInputError(str(path), f"the bounds {tuple(bounds)} are no numbers", REFUSED)
+
+
+def _points(kind: str, count: int, **known: Any) -> dict[str, Any]:
+    """What is told of points; None for what is not known."""
+    names = ("crs", "horizontalUnitM", "verticalUnitM", "bounds", "densityPerM2", "hasReturns", "hasClasses")
+    told: dict[str, Any] = {"kind": "points", "format": kind, "pointCount": count}
+    told |= dict.fromkeys((*names, "acquiredFrom", "acquiredTo"))
+    told |= {"warnings": [], "problems": []} | known
+    return told | {"usable": not told["problems"]}
+
+
+def _only_counted(path: Path, name: str) -> dict[str, Any]:
+    """What is told of text and PLY that are too large to be read through beforehand."""
+    told = f"the file has no header with bounds and more than {PASS_BYTES >> 20} MiB: the job reads it through"
+    return _points(name, _count_before_reading(path, name), warnings=[told])
+
+
+def _check_count(path: Path, count: int, max_points: int) -> None:
+    """Refuse what is too much."""
+    if count > max_points:
+        raise TooLargeError(
+            f"{path.name} has {count} points, this service takes {max_points}: cut it into tiles, or raise "
+            "GABLEWORK_MAX_POINTS"
+        )
+
+
+def promised_points(path: Path) -> int | None:
+    """Points that the header of a LAS, LAZ or PLY file promises; None for text, which has none. Reads no more.
+
+    Raises
+    ------
+    InputError
+        Not a format that is read, or the header is damaged.
+    """
+    name = recognise_format(path)
+    return None if name == "ascii" else _count_before_reading(path, name)
+
+
+def _count_before_reading(path: Path, name: str) -> int:
+    """Points that the file claims, or for text the most that it can have, without parsing any."""
+    if name == "las":
+        from pipeline.io.las_header import read_header_block
+
+        return read_header_block(path).point_count
+    if name == "ply":
+        from pipeline.io.ply import promised_vertices
+
+        return promised_vertices(path)
+    lines = 1
+    with path.open("rb") as stream:
+        while block := stream.read(BLOCK_BYTES):
+            lines += block.count(b"\n")
+    return lines
+
+
+class Examiner:
+    """Has files examined by a child process. Any number of threads may ask; they are served in turn.
+
+    Parameters
+    ----------
+    timeout_s : float
+        Seconds for one file.
+    memory_bytes : int
+        Address space of the child.
+    """
+
+    def __init__(self, *, timeout_s: float = CHILD_S, memory_bytes: int = CHILD_BYTES) -> None:
+        self._timeout_s = timeout_s
+        self._memory_bytes = memory_bytes
+        self._lock = threading.Lock()
+        self._child: subprocess.Popen[bytes] | None = None
+        self._served = 0
+
+    def examine(self, path: Path, *, max_points: int) -> dict[str, Any]:
+        """As the function `examine`; what ends the child or takes too long is an unreadable file.
+
+        Raises
+        ------
+        InputError
+            As `examine`.
+        TooLargeError
+            As `examine`.
+        """
+        with self._lock:
+            answer = self._ask({"path": str(path), "max_points": max_points})
+        if "told" in answer:
+            told: dict[str, Any] = answer["told"]
+            return told
+        kind = _FAULTS.get(answer["kind"])
+        if kind is None:
+            raise TooLargeError(answer["problem"])
+        raise kind(str(path), answer["problem"], answer["fix"])
+
+    def close(self) -> None:
+        """End the child."""
+        with self._lock:
+            self._end()
+
+    def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """One answer. A child that was killed from outside is started again once."""
+        for attempt in range(2):
+            child = self._running()
+            assert child.stdin is not None
+            assert child.stdout is not None
+            deadline_s = time.monotonic() + self._timeout_s
+            try:
+                child.stdin.write(json.dumps(request).encode() + b"\n")
+                child.stdin.flush()
+                line = _line_of(child.stdout, deadline_s)
+            except BrokenPipeError:
+                line = b""
+            except TimeoutError:
+                self._end()
+                return _unreadable(f"its header is not understood within {self._timeout_s:g} s")
+            if line.endswith(b"\n"):
+                self._served += 1
+                answer: dict[str, Any] = json.loads(line)
+                return answer
+            self._end()
+            if attempt:
+                break
+        return _unreadable("reading its header ends the reader")
+
+    def _running(self) -> subprocess.Popen[bytes]:
+        """The child, fresh where there is none or it served enough."""
+        if self._child is not None and (self._child.poll() is not None or self._served >= CHILD_FILES):
+            self._end()
+        if self._child is None:
+            secrets = {name for name in os.environ if name.startswith("GABLEWORK_")}
+            env = {name: value for name, value in os.environ.items() if name not in secrets}
+            env |= {"OPENBLAS_NUM_THREADS": "1", "RAYON_NUM_THREADS": "1", "PROJ_NETWORK": "OFF"}
+            self._child = subprocess.Popen(  # noqa: S603 - our own module, no shell
+                [sys.executable, "-m", "service.preflight", str(self._memory_bytes)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                bufsize=0,
+                env=env,
+            )
+            self._served = 0
+        return self._child
+
+    def _end(self) -> None:
+        """End the child, if there is one."""
+        child, self._child = self._child, None
+        if child is None:
+            return
+        child.kill()
+        child.wait()
+        for pipe in (child.stdin, child.stdout):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
+
+
+_examiner = Examiner()
+atexit.register(_examiner.close)
+
+
+def preflight(path: Path, max_points: int) -> Mapping[str, Any]:
+    """What the header of a file tells, by this process's child; see `examine`.
+
+    Raises
+    ------
+    InputError
+        As `examine`; it names the file, not its folder.
+    TooLargeError
+        More points than allowed.
+    """
+    try:
+        return _examiner.examine(path, max_points=max_points)
+    except InputError as fault:
+        raise type(fault)(path.name, fault.problem, fault.fix) from None
+
+
+_FAULTS: dict[str, type[InputError]] = {
+    fault.__name__: fault for fault in (InputError, UnreadableInputError, EmptyInputError, CrsError)
+}
+
+
+def _unreadable(problem: str) -> dict[str, Any]:
+    """The answer for a file over which the child was lost."""
+    return {"kind": UnreadableInputError.__name__, "problem": problem, "fix": REFUSED}
+
+
+def _line_of(stream: IO[bytes], deadline_s: float) -> bytes:
+    """What the child writes up to the end of the line, or up to its own end.
+
+    Raises
+    ------
+    TimeoutError
+        Not before the deadline.
+    """
+    line = bytearray()
+    while not line.endswith(b"\n"):
+        ready, _, _ = select.select([stream], [], [], max(deadline_s - time.monotonic(), 0.0))
+        if not ready:
+            raise TimeoutError
+        piece = os.read(stream.fileno(), 65_536)
+        if not piece:
+            break
+        line += piece
+    return bytes(line)
+
+
+def _answer(request: Mapping[str, Any]) -> dict[str, Any]:
+    """The child's answer to one request."""
+    path = Path(request["path"])
+    try:
+        return {"told": examine(path, max_points=request["max_points"])}
+    except TooLargeError as fault:
+        return {"kind": TooLargeError.__name__, "problem": str(fault)}
+    except InputError as fault:
+        kind = type(fault).__name__
+        return {
+            "kind": kind if kind in _FAULTS else UnreadableInputError.__name__,
+            "problem": fault.problem,
+            "fix": fault.fix,
+        }
+
+
+def main() -> None:
+    """The child: a request a line in, an answer a line out, until the parent closes the pipe."""
+    import resource
+
+    memory_bytes = int(sys.argv[1])
+    resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    for line in sys.stdin.buffer:
+        sys.stdout.buffer.write(json.dumps(_answer(json.loads(line)), allow_nan=False).encode() + b"\n")
+        sys.stdout.buffer.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,219 @@
+"""Exceptions as problem documents (RFC 9457): the one table from a type to a status, a type URI and a title.
+
+Types of OGC API - Processes keep their own URIs; ours are `urn:gablework:problem:…`; what HTTP itself says
+(405, 406, 415, ...) is `about:blank`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from sqlalchemy import exc as sql
+from starlette.exceptions import HTTPException
+
+from pipeline.errors import InputError, SettingsError
+from service import errors
+from service.jobs import Fault, JobFailure
+
+OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
+"""Where the standard keeps its types."""
+
+OWN = "urn:gablework:problem:"
+"""Where ours are."""
+
+MEDIA_TYPE = "application/problem+json"
+"""Of every problem document."""
+
+RETRY_AFTER_S = 30
+"""Seconds after which a client may come again where nothing better is known."""
+
+_log = logging.getLogger("gablework.service")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Kind:
+    """A kind of problem."""
+
+    status: int
+    """HTTP status."""
+    type_uri: str
+    """Its type."""
+    title: str
+    """The same words for every problem of this kind."""
+    retry: bool = False
+    """Whether `Retry-After` tells when to come again."""
+
+    @property
+    def word(self) -> str:
+        """Last part of the type."""
+        return self.type_uri.removeprefix(OWN).removeprefix(OGC)
+
+
+_AWAY = Kind(status=503, type_uri=f"{OWN}database-away", title="The database does not answer", retry=True)
+
+KINDS: Mapping[type[Exception], Kind] = {
+    errors.NoSuchJobError: Kind(status=404, type_uri=f"{OGC}no-such-job", title="No such job"),
+    errors.NoSuchProcessError: Kind(status=404, type_uri=f"{OGC}no-such-process", title="No such process"),
+    errors.NoSuchUploadError: Kind(status=404, type_uri=f"{OWN}no-such-upload", title="No such upload"),
+    errors.NoSuchBuildingError: Kind(status=404, type_uri=f"{OWN}no-such-building", title="No such building"),
+    errors.NoSuchOutputError: Kind(status=404, type_uri=f"{OWN}no-such-output", title="No such output"),
+    errors.ResultNotReadyError: Kind(status=404, type_uri=f"{OGC}result-not-ready", title="The results are not ready"),
+    errors.RequestError: Kind(status=400, type_uri=f"{OWN}invalid-request", title="The request does not fit"),
+    errors.InputRefusedError: Kind(status=403, type_uri=f"{OWN}input-refused", title="The input is not allowed here"),
+    errors.TooLargeError: Kind(status=413, type_uri=f"{OWN}too-large", title="More than this service takes"),
+    errors.NoSpaceError: Kind(status=507, type_uri=f"{OWN}no-space", title="The disk is full"),
+    errors.UploadInUseError: Kind(status=409, type_uri=f"{OWN}upload-in-use", title="Jobs still need the upload"),
+    errors.StoreError: _AWAY,
+    errors.QueueFullError: Kind(status=429, type_uri=f"{OWN}queue-full", title="Too many jobs wait", retry=True),
+    errors.TooManyRequestsError: Kind(
+        status=429, type_uri=f"{OWN}too-many-requests", title="Too many requests", retry=True
+    ),
+    errors.UnauthorizedError: Kind(status=401, type_uri=f"{OWN}unauthorized", title="A key is needed"),
+    errors.ForbiddenError: Kind(status=403, type_uri=f"{OWN}forbidden", title="The key does not allow this"),
+    InputError: Kind(status=422, type_uri=f"{OWN}unusable-input", title="The input cannot be used"),
+    SettingsError: Kind(status=400, type_uri=f"{OWN}invalid-settings", title="Settings are out of range"),
+    sql.OperationalError: _AWAY,
+    sql.InterfaceError: _AWAY,
+    sql.TimeoutError: _AWAY,
+}
+"""What an exception is told as; a subclass is told as its nearest base."""
+
+INTERNAL = Kind(status=500, type_uri=f"{OWN}internal", title="A fault of the service")
+"""Anything else."""
+
+FOREIGN = Kind(status=403, type_uri=f"{OWN}foreign-origin", title="The request comes from another site")
+"""A page of another site, or a foreign host name, asks a service that needs no keys."""
+
+FAILURES: Mapping[Fault, Kind] = {
+    Fault.INPUT: Kind(status=422, type_uri=f"{OWN}job-failed-input", title="An input could not be used"),
+    Fault.SETTINGS: Kind(status=422, type_uri=f"{OWN}job-failed-settings", title="The settings could not be used"),
+    Fault.REFUSED: Kind(status=422, type_uri=f"{OWN}job-failed-refused", title="An input is not allowed or too large"),
+    Fault.CLUSTER: Kind(status=503, type_uri=f"{OWN}job-failed-cluster", title="The cluster was away or lost"),
+    Fault.LOST: Kind(status=503, type_uri=f"{OWN}job-failed-lost", title="Drivers were lost over the job"),
+    Fault.INTERNAL: Kind(status=500, type_uri=f"{OWN}job-failed-internal", title="A fault of the service"),
+}
+"""What a failed job's results answer, by the cause."""
+
+
+class JobFailedError(errors.ServiceError):
+    """Results were asked of a job that failed."""
+
+    def __init__(self, failure: JobFailure) -> None:
+        self.failure = failure
+        super().__init__(failure.detail)
+
+
+def kind_of(error: Exception) -> Kind:
+    """Which kind of problem an exception is.
+
+    >>> kind_of(errors.NoSuchJobError("x")).word
+    'no-such-job'
+    >>> kind_of(ZeroDivisionError()).status
+    500
+    """
+    if isinstance(error, JobFailedError):
+        return FAILURES[error.failure.fault]
+    return next((KINDS[base] for base in type(error).__mro__ if base in KINDS), INTERNAL)
+
+
+def document(kind: Kind, detail: str, instance: str, faults: Sequence[str] = ()) -> dict[str, Any]:
+    """The members of a problem document; `errors` only where several things can be wrong at once."""
+    found: dict[str, Any] = {
+        "type": kind.type_uri,
+        "title": kind.title,
+        "status": kind.status,
+        "detail": detail,
+        "instance": instance,
+    }
+    if faults:
+        found["errors"] = list(faults)
+    return found
+
+
+def failure_document(failure: JobFailure, instance: str) -> dict[str, Any]:
+    """Why a job failed, as a problem document: the `exception` of its status."""
+    return document(FAILURES[failure.fault], failure.detail, instance)
+
+
+def answer(
+    kind: Kind, detail: str, instance: str, faults: Sequence[str] = (), headers: Mapping[str, str] | None = None
+) -> JSONResponse:
+    """A response with a problem document."""
+    return JSONResponse(
+        document(kind, detail, instance, faults),
+        status_code=kind.status,
+        headers=dict(headers or {}),
+        media_type=MEDIA_TYPE,
+    )
+
+
+def answer_error(error: Exception, instance: str) -> JSONResponse:
+    """The response that an exception of ours, of the pipeline or of the database becomes."""
+    kind = kind_of(error)
+    headers = {}
+    if kind.status == HTTPStatus.UNAUTHORIZED:
+        headers["WWW-Authenticate"] = 'Bearer realm="gablework"'
+    if kind.retry:
+        after = getattr(error, "retry_after_s", RETRY_AFTER_S)
+        headers["Retry-After"] = str(max(1, math.ceil(after)))
+    faults = getattr(error, "faults", ())
+    if kind is _AWAY:
+        # a database's own words can hold its address
+        _log.error("the database does not answer: %s", error)
+        return answer(kind, "The database does not answer; nothing was lost, try again.", instance, (), headers)
+    if kind is INTERNAL:
+        return answer(kind, "The service has logged what happened; please report it.", instance)
+    return answer(kind, str(error) or kind.title, instance, faults, headers)
+
+
+def validation_faults(error: RequestValidationError) -> list[str]:
+    """One sentence a fault that the framework found."""
+    faults = []
+    for fault in error.errors():
+        if fault["type"] == "json_invalid":
+            faults.append(f"the body is no JSON: {fault.get('ctx', {}).get('error', fault['msg'])}")
+            continue
+        place = [str(part) for part in fault["loc"]]
+        where = " ".join([place[0], ".".join(place[1:])]).strip()
+        told = "" if fault["type"] == "missing" else f" is {_short(fault.get('input'))}"
+        faults.append(f"{where}{told}: {fault['msg']}")
+    return faults
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of an application a problem document, the framework's own included."""
+
+    async def on_error(request: Request, error: Exception) -> JSONResponse:
+        return answer_error(error, request.url.path)
+
+    async def on_http_error(request: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, HTTPException)
+        kind = Kind(status=error.status_code, type_uri="about:blank", title=HTTPStatus(error.status_code).phrase)
+        detail = str(error.detail)
+        if error.status_code == HTTPStatus.NOT_FOUND and detail == kind.title:
+            detail = f"There is nothing at {request.url.path}; /openapi.json lists what there is"
+        if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+            detail = f"{request.method} is not possible here"
+        return answer(kind, detail, request.url.path, (), error.headers)
+
+    async def on_validation_error(request: Request, error: Exception) -> JSONResponse:
+        assert isinstance(error, RequestValidationError)
+        return answer_error(errors.RequestError(validation_faults(error)), request.url.path)
+
+    app.add_exception_handler(HTTPException, on_http_error)
+    app.add_exception_handler(RequestValidationError, on_validation_error)
+    for kind in (*KINDS, errors.ServiceError, Exception):
+        app.add_exception_handler(kind, on_error)

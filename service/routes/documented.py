@@ -1,0 +1,245 @@
+"""What the OpenAPI document says about answers: schemas of the documents, and which problems a path can give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from service.problems import MEDIA_TYPE
+
+JOB_ID = "3f2a9c0d5e6b47189a0b1c2d3e4f5a6b"
+"""The job of the examples."""
+
+
+def reference(name: str) -> dict[str, str]:
+    """A schema of the document."""
+    return {"$ref": f"#/components/schemas/{name}"}
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Problem documents as answers of a path, by status."""
+    return {
+        status: {
+            "description": HTTPStatus(status).phrase,
+            "content": {MEDIA_TYPE: {"schema": reference("Problem")}},
+        }
+        for status in statuses
+    }
+
+
+def document(
+    schema: str, description: str, example: Any = None, media_type: str = "application/json", **more: Any
+) -> dict[str, Any]:
+    """An answer with a document."""
+    content: dict[str, Any] = {"schema": reference(schema)}
+    if example is not None:
+        content["example"] = example
+    return {"description": description, "content": {media_type: content}, **more}
+
+
+_TEXT = {"type": "string"}
+_TIME = {"type": "string", "format": "date-time"}
+_LINKS = {"type": "array", "items": reference("Link")}
+
+
+def _object(required: tuple[str, ...], **properties: Any) -> dict[str, Any]:
+    return {"type": "object", "required": list(required), "properties": properties}
+
+
+SCHEMAS: Mapping[str, dict[str, Any]] = {
+    "Link": _object(("href", "rel"), href=_TEXT, rel=_TEXT, type=_TEXT, title=_TEXT),
+    "Problem": _object(
+        ("type", "title", "status", "detail", "instance"),
+        type={**_TEXT, "description": "URI of the kind of problem."},
+        title={**_TEXT, "description": "The same for every problem of this kind."},
+        status={"type": "integer"},
+        detail={**_TEXT, "description": "What happened, with the value and the fix."},
+        instance={**_TEXT, "description": "The path that was asked."},
+        errors={"type": "array", "items": _TEXT, "description": "Every fault, where there can be several."},
+    ),
+    "LandingPage": _object(("title", "links"), title=_TEXT, description=_TEXT, links=_LINKS),
+    "Conformance": _object(("conformsTo",), conformsTo={"type": "array", "items": {"type": "string", "format": "uri"}}),
+    "ProcessSummary": _object(
+        ("id", "version"),
+        id=_TEXT,
+        version=_TEXT,
+        title=_TEXT,
+        description=_TEXT,
+        keywords={"type": "array", "items": _TEXT},
+        jobControlOptions={
+            "type": "array",
+            "items": {"type": "string", "enum": ["sync-execute", "async-execute", "dismiss"]},
+        },
+        outputTransmission={"type": "array", "items": {"type": "string", "enum": ["value", "reference"]}},
+        links=_LINKS,
+    ),
+    "ProcessList": _object(
+        ("processes", "links"), processes={"type": "array", "items": reference("ProcessSummary")}, links=_LINKS
+    ),
+    "Process": {
+        "allOf": [
+            reference("ProcessSummary"),
+            _object(
+                ("inputs", "outputs"),
+                inputs={"type": "object", "additionalProperties": reference("InputDescription")},
+                outputs={"type": "object", "additionalProperties": reference("OutputDescription")},
+            ),
+        ]
+    },
+    "InputDescription": _object(
+        ("schema",),
+        title=_TEXT,
+        description=_TEXT,
+        schema={"type": "object"},
+        minOccurs={"type": "integer"},
+        maxOccurs={"oneOf": [{"type": "integer"}, {"type": "string", "enum": ["unbounded"]}]},
+        valuePassing={"type": "array", "items": {"type": "string", "enum": ["byValue", "byReference"]}},
+    ),
+    "OutputDescription": _object(("schema",), title=_TEXT, description=_TEXT, schema={"type": "object"}),
+    "Execute": _object(
+        (),
+        inputs={
+            "type": "object",
+            "description": "By the names that the process's description lists; each a value, a reference "
+            "`{href}`, a value with a media type `{value, encoding, mediaType}`, or a list of these.",
+        },
+        outputs={
+            "type": "object",
+            "description": "The outputs that are wanted; without it all.",
+            "additionalProperties": {"type": "object"},
+        },
+        response={"type": "string", "enum": ["raw", "document"]},
+    ),
+    "StatusInfo": _object(
+        ("jobID", "id", "type", "processID", "status", "progress", "created", "updated", "links"),
+        jobID=_TEXT,
+        id=_TEXT,
+        type={"type": "string", "enum": ["process"]},
+        processingEntityType={"type": "string", "enum": ["ogc-api-processes"]},
+        processID=_TEXT,
+        status={"type": "string", "enum": ["accepted", "running", "successful", "failed", "dismissed"]},
+        title=_TEXT,
+        message=_TEXT,
+        stage=_TEXT,
+        progress={"type": "integer", "minimum": 0, "maximum": 100},
+        created=_TIME,
+        started=_TIME,
+        finished=_TIME,
+        updated=_TIME,
+        priority={"type": "integer"},
+        attempt={"type": "integer"},
+        summary={"type": "object"},
+        exception=reference("Problem"),
+        request=reference("Execute"),
+        links=_LINKS,
+    ),
+    "JobList": _object(("jobs", "links"), jobs={"type": "array", "items": reference("StatusInfo")}, links=_LINKS),
+    "Event": _object(
+        ("id", "at", "kind", "progress"),
+        id={"type": "integer"},
+        at=_TIME,
+        kind={"type": "string", "enum": ["status", "stage", "progress", "warning", "waiting"]},
+        status={"type": "string", "enum": ["accepted", "running", "successful", "failed", "dismissed"]},
+        stage=_TEXT,
+        done={"type": "integer"},
+        total={"type": "integer"},
+        progress={"type": "integer", "minimum": 0, "maximum": 100},
+        message=_TEXT,
+    ),
+    "EventList": _object(("events", "links"), events={"type": "array", "items": reference("Event")}, links=_LINKS),
+    "JobForm": _object(
+        ("tile",),
+        tile={
+            "type": "array",
+            "items": {"type": "string", "format": "binary"},
+            "minItems": 1,
+            "description": "A point cloud; once or more. A field without a file name holds an href.",
+        },
+        footprints={"type": "string", "format": "binary", "description": "Building outlines; likewise."},
+        crs=_TEXT,
+        verticalUnit=_TEXT,
+        bbox={**_TEXT, "description": "x_min,y_min,x_max,y_max in the tiles' CRS."},
+        method=_TEXT,
+        classes=_TEXT,
+        settings={**_TEXT, "description": "JSON."},
+        meshes=_TEXT,
+        licence=_TEXT,
+        title=_TEXT,
+        priority={"type": "integer"},
+        outputs={**_TEXT, "description": "Ids of the outputs that are wanted, with commas between them."},
+    ),
+    "Preflight": _object(
+        ("kind", "format", "usable", "problems", "warnings"),
+        kind={"type": "string", "enum": ["points", "footprints"]},
+        format={"type": "string", "enum": ["las", "laz", "copc", "ply", "ascii", "geopackage", "geojson"]},
+        usable={"type": "boolean", "description": "Whether a job can use it without being told more."},
+        problems={"type": "array", "items": _TEXT, "description": "What a job can heal, such as degrees by `crs`."},
+        warnings={"type": "array", "items": _TEXT},
+        crs={
+            "type": "object",
+            "nullable": True,
+            "properties": {"name": _TEXT, "epsg": {"type": "integer", "nullable": True}},
+            "description": "Null where the file tells none.",
+        },
+        pointCount={"type": "integer", "description": "Of text that was not read through the number of lines."},
+        horizontalUnitM={"type": "number", "nullable": True},
+        verticalUnitM={"type": "number", "nullable": True},
+        bounds={
+            "type": "array",
+            "nullable": True,
+            "items": {"type": "number"},
+            "description": "x_min, y_min, z_min, x_max, y_max, z_max in the units of the CRS.",
+        },
+        densityPerM2={"type": "number", "nullable": True},
+        hasReturns={"type": "boolean", "nullable": True},
+        hasClasses={"type": "boolean", "nullable": True},
+        acquiredFrom={"type": "string", "nullable": True},
+        acquiredTo={"type": "string", "nullable": True},
+        featureCount={"type": "integer", "nullable": True},
+        layers={"type": "array", "nullable": True, "items": _TEXT},
+    ),
+    "Upload": _object(
+        ("uploadID", "filename", "bytes", "sha256", "created", "expires", "preflight", "links"),
+        uploadID=_TEXT,
+        filename={**_TEXT, "description": "As it was cleaned."},
+        bytes={"type": "integer", "minimum": 1},
+        sha256={**_TEXT, "pattern": "^[0-9a-f]{64}$"},
+        created=_TIME,
+        expires=_TIME,
+        preflight=reference("Preflight"),
+        links=_LINKS,
+    ),
+    "UploadList": _object(("uploads", "links"), uploads={"type": "array", "items": reference("Upload")}, links=_LINKS),
+    "Health": _object(
+        ("status",),
+        status={"type": "string", "enum": ["ok", "unavailable"]},
+        checks={"type": "object", "additionalProperties": _TEXT},
+    ),
+}
+"""Schemas that several paths share, by name."""
+
+STATUS_EXAMPLE = {
+    "jobID": JOB_ID,
+    "id": JOB_ID,
+    "type": "process",
+    "processingEntityType": "ogc-api-processes",
+    "processID": "reconstruct",
+    "status": "running",
+    "message": "12 of 180 candidates",
+    "stage": "reconstruct",
+    "progress": 41,
+    "created": "2026-03-01T09:30:00.000Z",
+    "started": "2026-03-01T09:30:01.000Z",
+    "updated": "2026-03-01T09:30:20.000Z",
+    "links": [{"href": f"http://127.0.0.1:8000/jobs/{JOB_ID}", "rel": "self", "type": "application/json"}],
+}
+
+EXECUTE_EXAMPLE = {
+    "inputs": {
+        "tiles": [{"href": "/uploads/0123456789abcdef0123456789abcdef"}],
+        "crs": "EPSG:28992",
+        "settings": {"candidates": {"min_area_m2": 15.0}},
+    },
+    "outputs": {"buildings": {}, "cityjson": {}},
+}

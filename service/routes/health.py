@@ -1,0 +1,94 @@
+"""Whether the service lives, whether it can work, and its figures."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+
+from fastapi import APIRouter, Request
+from fastapi.responses import JSONResponse, Response
+from prometheus_client import CONTENT_TYPE_LATEST
+
+from service.errors import StoreError
+from service.files import StateFolder
+from service.metrics import Metrics
+from service.routes.bound import Folder, Reader, Store
+from service.routes.documented import document
+from service.store import JobStore
+
+router = APIRouter(tags=["service"])
+
+
+@router.get(
+    "/healthz",
+    summary="Whether the process lives",
+    responses={200: document("Health", "It does.", {"status": "ok"})},
+)
+async def healthz() -> JSONResponse:
+    """Tell that the process answers; nothing else is asked."""
+    return JSONResponse({"status": "ok"})
+
+
+_READY = {"status": "ok", "checks": {"database": "ok", "state": "ok", "driver": "running"}}
+
+
+@router.get(
+    "/readyz",
+    summary="Whether the service can work",
+    responses={
+        200: document("Health", "It can.", _READY),
+        503: document("Health", "It cannot now.", {"status": "unavailable", "checks": {"database": "does not answer"}}),
+    },
+)
+def readyz(request: Request, store: Store, folder: Folder) -> JSONResponse:
+    """Tell whether the database answers and the state folder can be written.
+
+    The driver is told but does not count: without one jobs are still taken, and wait.
+    """
+    checks = {"database": _database(store), "state": _state(folder)}
+    is_ready = all(found == "ok" for found in checks.values())
+    driver = getattr(request.app.state, "driver", None)
+    checks["driver"] = "elsewhere" if driver is None else driver()
+    return JSONResponse(
+        {"status": "ok" if is_ready else "unavailable", "checks": checks},
+        status_code=200 if is_ready else 503,
+        headers={"Cache-Control": "no-store"},
+    )
+
+
+def _database(store: JobStore) -> str:
+    try:
+        store.check()
+    except StoreError:
+        return "does not answer, or is not migrated"
+    return "ok"
+
+
+def _state(folder: StateFolder) -> str:
+    try:
+        handle, name = tempfile.mkstemp(prefix=".ready-", dir=folder.root)
+        os.close(handle)
+        os.unlink(name)  # noqa: PTH108 - mkstemp gives a text
+    except OSError as error:
+        return error.strerror or "cannot be written"
+    return "ok"
+
+
+@router.get(
+    "/metrics",
+    summary="Figures for Prometheus",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "The figures.",
+            "content": {
+                "text/plain": {"schema": {"type": "string"}, "example": 'gablework_jobs{status="running"} 1.0'}
+            },
+        }
+    },
+)
+def metrics(request: Request, caller: Reader) -> Response:
+    """Tell requests, durations and jobs by status, in the text format of Prometheus."""
+    del caller
+    figures: Metrics = request.app.state.metrics
+    return Response(figures.render(), headers={"Content-Type": CONTENT_TYPE_LATEST})

@@ -1,0 +1,186 @@
+"""Results of a job: the document that lists them, and each output as a file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path as FilePath
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.responses import FileResponse, JSONResponse
+from starlette.exceptions import HTTPException
+
+from service.errors import NoSuchOutputError, RequestError
+from service.jobs import Job
+from service.outputs import OUTPUTS, output_file
+from service.routes.bound import Base
+from service.routes.documented import JOB_ID, problems
+from service.routes.finished_jobs import Finished
+from service.routes.negotiation import preferred
+
+router = APIRouter(tags=["results"])
+
+FAILED = (422, 500, 503)
+"""What the results of a failed job answer, by the cause."""
+
+_RANGES = re.compile(r"bytes=\s*(\d{1,18}-\d{0,18}|-\d{1,18})(\s*,\s*(\d{1,18}-\d{0,18}|-\d{1,18}))*\s*", re.IGNORECASE)
+_HEX = "[0-9a-f]"
+
+_EXAMPLE = {
+    output_id: {
+        "href": f"http://127.0.0.1:8000/jobs/{JOB_ID}/results/{output_id}",
+        "rel": "item",
+        "type": OUTPUTS[output_id].media_type,
+        "title": OUTPUTS[output_id].title,
+        "bytes": size,
+        "sha256": "9f" * 32,
+    }
+    for output_id, size in (("buildings", 89_644), ("report", 6_767))
+}
+_REFERENCE = {
+    "type": "object",
+    "required": ["href", "rel", "type", "title", "bytes", "sha256"],
+    "properties": {
+        "href": {"type": "string", "format": "uri"},
+        "rel": {"type": "string"},
+        "type": {"type": "string", "description": "Media type."},
+        "title": {"type": "string"},
+        "bytes": {"type": "integer", "minimum": 0},
+        "sha256": {"type": "string", "pattern": f"^{_HEX}{{64}}$"},
+    },
+}
+
+
+@router.get(
+    "/jobs/{jobID}/results",
+    summary="Results of a job",
+    responses={
+        200: {
+            "description": "The outputs by reference.",
+            "content": {
+                "application/json": {
+                    "schema": {"type": "object", "additionalProperties": _REFERENCE},
+                    "example": _EXAMPLE,
+                }
+            },
+        },
+        **problems(400, 404, *FAILED),
+    },
+)
+def results(
+    finished: Finished,
+    base: Base,
+    outputs: Annotated[
+        list[str] | None, Query(description="Only these, with commas between them or the parameter again.")
+    ] = None,
+) -> JSONResponse:
+    """List what a finished job offers, each with media type, size and sha256."""
+    stored = finished.catalogue.outputs
+    wanted = [word.strip() for value in outputs or () for word in value.split(",") if word.strip()]
+    unknown = [name for name in wanted if name not in OUTPUTS]
+    if unknown:
+        raise RequestError([f"query outputs names {unknown[0][:80]!r}: use {', '.join(OUTPUTS)}"])
+    missing = [name for name in wanted if name not in stored]
+    if missing:
+        raise NoSuchOutputError(f"this job has no output {missing[0]}; it has: {', '.join(stored) or 'none'}")
+    place = f"{base}/jobs/{finished.job.job_id}/results"
+    found = {
+        name: {
+            "href": f"{place}/{name}",
+            "rel": "item",
+            "type": OUTPUTS[name].media_type,
+            "title": OUTPUTS[name].title,
+            "bytes": entry.size_bytes,
+            "sha256": entry.sha256,
+        }
+        for name, entry in stored.items()
+        if not wanted or name in wanted
+    }
+    return JSONResponse(found, headers={"Cache-Control": "private, no-cache"})
+
+
+def _file_answers() -> dict[int | str, dict[str, Any]]:
+    """What the path of a file answers: one media type an output."""
+    content: dict[str, dict[str, Any]] = {}
+    for kind in OUTPUTS.values():
+        value = {"type": "object"} if kind.schema["type"] == "object" else {"type": "string", "format": "binary"}
+        content[kind.media_type] = {"schema": value}
+    headers = {
+        "ETag": {"description": "The sha256.", "schema": {"type": "string"}},
+        "Accept-Ranges": {"description": "Ranges of bytes are served.", "schema": {"type": "string"}},
+        "Content-Disposition": {"description": "A name to save it under.", "schema": {"type": "string"}},
+    }
+    part = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+    return {
+        200: {"description": "The file.", "content": content, "headers": headers},
+        206: {"description": "The range of bytes that was asked for.", "content": {**content, **part}},
+        304: {"description": "The file is the one that the client has."},
+        **problems(400, 404, 406, 416, *FAILED),
+    }
+
+
+@router.head("/jobs/{jobID}/results/{outputID}", include_in_schema=False)
+@router.get(
+    "/jobs/{jobID}/results/{outputID}",
+    summary="One output as a file",
+    response_class=Response,
+    responses=_file_answers(),
+)
+def result(
+    request: Request,
+    finished: Finished,
+    output_id: Annotated[
+        str, Path(alias="outputID", description=f"One of {', '.join(OUTPUTS)}.", examples=["buildings"])
+    ],
+) -> Response:
+    """Send one output; ranges of bytes are served, so that Parquet can be read from afar."""
+    path = output_file(finished.out_dir, output_id)
+    kind, stored = OUTPUTS[output_id], finished.catalogue.outputs[output_id]
+    preferred(request.headers.get("accept"), [kind.media_type])
+    etag = f'"{stored.sha256}"'
+    headers = {"ETag": etag, "Cache-Control": "private, no-cache", "Vary": "Accept"}
+    if _is_known(request.headers.get("if-none-match", ""), etag):
+        return Response(status_code=304, headers=headers)
+    _check_range(request, stored.size_bytes)
+    return FileResponse(path, media_type=kind.media_type, headers=headers, filename=_saved_name(finished.job, path))
+
+
+def _saved_name(job: Job, path: FilePath) -> str:
+    """The name under which a browser saves a file.
+
+    >>> from types import SimpleNamespace
+    >>> _saved_name(SimpleNamespace(title=None, job_id="ab" * 16), FilePath("buildings.parquet"))
+    'gablework-abababab-buildings.parquet'
+    """
+    return f"gablework-{job.job_id[:8]}-{path.name}"
+
+
+def _is_known(if_none_match: str, etag: str) -> bool:
+    """Whether a client has the file already.
+
+    >>> _is_known('W/"a", "b"', '"b"'), _is_known("*", '"b"'), _is_known("", '"b"')
+    (True, True, False)
+    """
+    tags = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]
+    return etag in tags or "*" in tags
+
+
+def _check_range(request: Request, size: int) -> None:
+    """Refuse a range behind the end; one that cannot be understood is ignored, as RFC 9110 (14.2) wants it.
+
+    Raises
+    ------
+    HTTPException
+        416: it starts behind the end.
+    """
+    text = request.headers.get("range")
+    if text is None:
+        return
+    parts = text.partition("=")[2].split(",") if _RANGES.fullmatch(text) else []
+    ends = [part.strip().partition("-")[::2] for part in parts]
+    if not ends or any(first and last and int(last) < int(first) for first, last in ends):
+        request.scope["headers"] = [entry for entry in request.scope["headers"] if entry[0] != b"range"]
+        return
+    if any(int(first) >= size if first else int(last) == 0 for first, last in ends):
+        told = f"the range {text[:80]} lies behind the end: there are {size} bytes"
+        raise HTTPException(416, told, {"Content-Range": f"bytes */{size}"})

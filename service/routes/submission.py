@@ -1,0 +1,94 @@
+"""From a checked draft to a job in the line, or to nothing at all: what was stored for a refused call goes again."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import AsyncIterator, Iterable
+
+import anyio
+from starlette.concurrency import run_in_threadpool
+
+from service.auth import Principal
+from service.drafts import Draft, Inline
+from service.errors import ForbiddenError, UploadInUseError
+from service.fetching import resolve_inputs
+from service.files import StateFolder
+from service.jobs import InputReference, Job
+from service.keys import Scope
+from service.settings import ServiceSettings
+from service.store import JobStore
+from service.uploads import receive, remove_file
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Submission:
+    """What it takes to submit for one caller; remembers the uploads that it made."""
+
+    store: JobStore
+    folder: StateFolder
+    settings: ServiceSettings
+    caller: Principal
+    made: list[str] = dataclasses.field(default_factory=list)
+    """Ids of the uploads of this call."""
+
+    async def keep(self, stream: AsyncIterator[bytes], filename: str) -> InputReference:
+        """Store a file that came with the call."""
+        upload = await receive(
+            stream,
+            filename,
+            store=self.store,
+            folder=self.folder,
+            settings=self.settings,
+            owner=self.caller.key_id,
+        )
+        self.made.append(upload.upload_id)
+        return InputReference(kind="upload", value=upload.upload_id)
+
+    async def submit(self, draft: Draft) -> Job:
+        """Put a job into the line; its row is committed when this returns.
+
+        Raises
+        ------
+        RequestError, InputRefusedError, NoSuchUploadError
+            An input cannot be had.
+        ForbiddenError
+            A priority that this key may not ask for.
+        QueueFullError
+            Too many jobs wait.
+        """
+        if draft.priority > 0 and Scope.ADMIN not in self.caller.scopes:
+            raise ForbiddenError(
+                f"priority is {draft.priority}: this needs the scope {Scope.ADMIN}, use 0 or less with this key"
+            )
+        stored: dict[Inline, InputReference] = {}
+        for inline in draft.inline:
+            stored[inline] = await self.keep(_once(inline.content), inline.filename)
+        return await run_in_threadpool(self._create, draft, stored)
+
+    def _create(self, draft: Draft, stored: dict[Inline, InputReference]) -> Job:
+        request = draft.request(stored)
+        resolve_inputs(request, store=self.store, folder=self.folder, settings=self.settings, owner=self.caller.owner)
+        return self.store.create(
+            request,
+            owner=self.caller.key_id,
+            priority=draft.priority,
+            max_queued=self.settings.max_queued,
+            max_queued_per_key=self.settings.max_queued_per_key,
+        )
+
+    async def undo(self) -> None:
+        """Remove the uploads of this call, also where the client has gone."""
+        with anyio.CancelScope(shield=True):
+            await run_in_threadpool(self._remove, tuple(self.made))
+
+    def _remove(self, upload_ids: Iterable[str]) -> None:
+        for upload_id in upload_ids:
+            # in use: the job was made, and it was the client who did not wait for the answer
+            with contextlib.suppress(UploadInUseError):
+                self.store.remove_upload(upload_id)
+                remove_file(upload_id, self.folder)
+
+
+async def _once(content: bytes) -> AsyncIterator[bytes]:
+    yield content

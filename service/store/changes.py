@@ -1,0 +1,147 @@
+"""The two ways in which a job changes: its status with an event, and events alone. Within a transaction."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from service.errors import LeaseLostError
+from service.jobs import Job, JobEvent, JobStatus
+from service.store.policies import duration_ms
+from service.store.records import is_id, job_of, storable
+from service.store.tables import EVENTS, JOBS
+
+MAX_KEPT = 1000
+"""Events of a job that are kept beside its status events and the latest progress of each stage."""
+_LASTING = ("status", "progress")
+
+
+def lock_job(connection: Connection, job_id: str) -> sa.Row[Any] | None:
+    """A job's row, which nobody else changes until the transaction ends; None where there is no such job."""
+    return _row(connection, job_id, locked=True)
+
+
+def lock_held(connection: Connection, held: Job) -> sa.Row[Any]:
+    """The row of a job that a driver holds, locked.
+
+    Raises
+    ------
+    LeaseLostError
+        The job is over, gone, or held by another driver or for another attempt.
+    """
+    return held_row(connection, held, locked=True)
+
+
+def held_row(connection: Connection, held: Job, *, locked: bool = False) -> sa.Row[Any]:
+    """The row of a job that a driver holds.
+
+    Raises
+    ------
+    LeaseLostError
+        The job is over, gone, or held by another driver or for another attempt.
+    """
+    row = _row(connection, held.job_id, locked=locked)
+    if row is None:
+        raise LeaseLostError(f"job {held.job_id} is gone")
+    if row.status != JobStatus.RUNNING or row.lease_owner != held.lease_owner or row.attempt != held.attempt:
+        by = f", held by {row.lease_owner}" if row.lease_owner else ""
+        raise LeaseLostError(
+            f"job {held.job_id}: {held.lease_owner} held attempt {held.attempt}; "
+            f"the job is {row.status} at attempt {row.attempt}{by}"
+        )
+    return row
+
+
+def _row(connection: Connection, job_id: str, *, locked: bool) -> sa.Row[Any] | None:
+    if not is_id(job_id):
+        return None
+    one = sa.select(JOBS).where(JOBS.c.job_id == job_id)
+    return connection.execute(one.with_for_update() if locked else one).one_or_none()
+
+
+def move(
+    connection: Connection, row: sa.Row[Any], status: JobStatus, *, now: dt.datetime, message: str, **values: Any
+) -> None:
+    """Bring a locked job to a status, and tell it as an event."""
+    message = storable(message)
+    ends: dict[str, Any] = {}
+    if status is not JobStatus.RUNNING:
+        ends = {"lease_owner": None, "lease_until": None}
+    if status.is_over:
+        ends |= {"finished_at": now, "duration_ms": duration_ms(job_of(row), now), "dismiss_requested": False}
+    progress = values.get("progress", row.progress)
+    changed = {"status": status.value, "message": message, "updated_at": now, "last_event": row.last_event + 1}
+    connection.execute(sa.update(JOBS).where(JOBS.c.job_id == row.job_id).values(**changed, **ends, **values))
+    connection.execute(
+        sa.insert(EVENTS).values(
+            job_id=row.job_id,
+            sequence=row.last_event + 1,
+            at=now,
+            kind="status",
+            status=status.value,
+            stage=values.get("stage", row.stage),
+            done=0,
+            total=0,
+            progress=progress,
+            message=message,
+        )
+    )
+
+
+def append(connection: Connection, row: sa.Row[Any], events: Sequence[JobEvent], now: dt.datetime) -> None:
+    """Add events to a locked job: the store gives the numbers and the time; progress never falls.
+
+    Of every stage only the latest progress is kept, and of the other events, but for changes of status, the last
+    `MAX_KEPT`: a job's events stay few however long it runs. Numbers are never given twice.
+    """
+    if not events:
+        return
+    progress, stage, message = row.progress, row.stage, row.message
+    told = []
+    for sequence, event in enumerate(events, start=row.last_event + 1):
+        progress = max(progress, min(event.progress, 100))
+        stage = storable(event.stage, 64) or stage
+        message = storable(event.message) or message
+        told.append(
+            {
+                "job_id": row.job_id,
+                "sequence": sequence,
+                "at": now,
+                "kind": event.kind,
+                "status": None if event.status is None else event.status.value,
+                "stage": storable(event.stage, 64),
+                "done": event.done,
+                "total": event.total,
+                "progress": progress,
+                "message": storable(event.message),
+            }
+        )
+    latest = {item["stage"]: item["sequence"] for item in told if item["kind"] == "progress"}
+    of_job = EVENTS.c.job_id == row.job_id
+    if latest:
+        connection.execute(
+            sa.delete(EVENTS).where(of_job, EVENTS.c.kind == "progress", EVENTS.c.stage.in_(list(latest)))
+        )
+    kept = [item for item in told if item["kind"] != "progress" or latest[item["stage"]] == item["sequence"]]
+    connection.execute(sa.insert(EVENTS), kept)
+    if any(item["kind"] not in _LASTING for item in kept):
+        _forget_oldest(connection, row.job_id)
+    connection.execute(
+        sa.update(JOBS)
+        .where(JOBS.c.job_id == row.job_id)
+        .values(
+            progress=progress, stage=stage, message=message, updated_at=now, last_event=row.last_event + len(events)
+        )
+    )
+
+
+def _forget_oldest(connection: Connection, job_id: str) -> None:
+    others = sa.and_(EVENTS.c.job_id == job_id, EVENTS.c.kind.not_in(_LASTING))
+    newest_first = sa.select(EVENTS.c.sequence).where(others).order_by(EVENTS.c.sequence.desc())
+    forgotten = connection.execute(newest_first.offset(MAX_KEPT).limit(1)).scalar_one_or_none()
+    if forgotten is not None:
+        connection.execute(sa.delete(EVENTS).where(others, EVENTS.c.sequence <= forgotten))

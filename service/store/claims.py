@@ -1,0 +1,130 @@
+"""What drivers do with jobs: claim, renew, record, finish, give back. Within a transaction."""
+
+from __future__ import annotations
+
+import datetime as dt
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from service.jobs import Job, JobFailure, JobStatus
+from service.store.changes import lock_held, move
+from service.store.policies import after_loss, loss
+from service.store.records import job_of, storable
+from service.store.tables import JOBS
+
+_SWEPT_AT_ONCE = 100
+
+
+def work_waits(connection: Connection, now: dt.datetime) -> bool:
+    """Whether a claim may find something: a job to claim, or a lease that has ended."""
+    some = sa.select(JOBS.c.job_id).where(sa.or_(_claimable(now), _expired(now))).limit(1)
+    return connection.execute(some).first() is not None
+
+
+def sweep(connection: Connection, *, now: dt.datetime, max_attempts: int) -> None:
+    """Take back the jobs whose lease has ended: they wait again, or are dismissed or failed."""
+    lost = sa.select(JOBS).where(_expired(now)).order_by(JOBS.c.lease_until).limit(_SWEPT_AT_ONCE)
+    for row in connection.execute(lost.with_for_update(skip_locked=True)).all():
+        give_up(connection, row, now=now, max_attempts=max_attempts)
+
+
+def give_up(connection: Connection, row: sa.Row[Any], *, now: dt.datetime, max_attempts: int) -> None:
+    """Take back one locked job from a driver that was lost."""
+    job = job_of(row)
+    status = after_loss(job, max_attempts)
+    counted = {"lost_attempts": job.lost_attempts + 1}
+    if status is JobStatus.FAILED:
+        failure = loss(job)
+        values = counted | {"fault": failure.fault.value, "fault_detail": failure.detail}
+        move(connection, row, status, now=now, message=failure.detail, **values)
+    elif status is JobStatus.DISMISSED:
+        move(connection, row, status, now=now, message="dismissed; its driver was lost", **counted)
+    else:
+        told = f"attempt {job.attempt} is lost: driver {job.lease_owner} was silent; the job waits for another"
+        move(connection, row, status, now=now, message=told, **counted)
+
+
+def take_first(connection: Connection, driver: str, *, now: dt.datetime, lease_s: float) -> str | None:
+    """Claim the first job in line; its id, or None."""
+    line = sa.select(JOBS).where(_claimable(now)).order_by(JOBS.c.priority.desc(), JOBS.c.created_at, JOBS.c.job_id)
+    row = connection.execute(line.limit(1).with_for_update(skip_locked=True)).one_or_none()
+    if row is None:
+        return None
+    move(
+        connection,
+        row,
+        JobStatus.RUNNING,
+        now=now,
+        message=f"attempt {row.attempt + 1} runs" if row.attempt else "runs",
+        attempt=row.attempt + 1,
+        lease_owner=storable(driver, 255),
+        lease_until=now + dt.timedelta(seconds=lease_s),
+        started_at=row.started_at or now,
+        not_before=None,
+        progress=0,
+        stage="",
+    )
+    return str(row.job_id)
+
+
+def renew(connection: Connection, held: Job, *, until: dt.datetime) -> bool:
+    """Lengthen a lease; True where the job is to be dismissed.
+
+    A lease that has ended, but that nobody took, is as good as new.
+
+    Raises
+    ------
+    LeaseLostError
+        It is not held any more.
+    """
+    row = lock_held(connection, held)
+    connection.execute(sa.update(JOBS).where(JOBS.c.job_id == held.job_id).values(lease_until=until))
+    return bool(row.dismiss_requested)
+
+
+def finish(
+    connection: Connection, held: Job, status: JobStatus, *, now: dt.datetime, message: str, **values: Any
+) -> None:
+    """End a job that is held.
+
+    Raises
+    ------
+    LeaseLostError
+        It is not held any more.
+    """
+    move(connection, lock_held(connection, held), status, now=now, message=message, **values)
+
+
+def failed_values(failure: JobFailure) -> dict[str, Any]:
+    """The columns of a failure."""
+    return {"fault": failure.fault.value, "fault_detail": storable(failure.detail)}
+
+
+def release(
+    connection: Connection, held: Job, *, now: dt.datetime, lost: bool, message: str, not_before: dt.datetime | None
+) -> None:
+    """Give a job back to the line, or end it where it is to be dismissed.
+
+    Raises
+    ------
+    LeaseLostError
+        It is not held any more.
+    """
+    row = lock_held(connection, held)
+    counted = {"lost_attempts": row.lost_attempts + int(lost)}
+    if row.dismiss_requested:
+        move(connection, row, JobStatus.DISMISSED, now=now, message="dismissed", **counted)
+        return
+    told = message or f"driver {held.lease_owner} gave the job back; it waits for another"
+    move(connection, row, JobStatus.ACCEPTED, now=now, message=told, not_before=not_before, **counted)
+
+
+def _claimable(now: dt.datetime) -> sa.ColumnElement[bool]:
+    due = sa.or_(JOBS.c.not_before.is_(None), JOBS.c.not_before <= now)
+    return sa.and_(JOBS.c.status == JobStatus.ACCEPTED.value, due)
+
+
+def _expired(now: dt.datetime) -> sa.ColumnElement[bool]:
+    return sa.and_(JOBS.c.status == JobStatus.RUNNING.value, JOBS.c.lease_until <= now)

@@ -1,0 +1,239 @@
+"""The engine: SQLite's traps, PostgreSQL's time-outs, transactions, the database's clock, and faults in our words."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import sqlite3
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy import event, exc
+from sqlalchemy.engine import URL, Connection, Engine
+
+from service import migrations
+from service.errors import StartUpError, StoreError
+
+_EPOCH = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
+_EPOCH_JULIAN = 2440587.5
+_WRITES = "gablework_writes"
+_POOL_SIZE = 10
+_WAIT_S = 30
+"""Seconds for which a statement waits: for SQLite's write lock, for a connection, for PostgreSQL's answer."""
+_LOCK_MIGRATIONS = 0x6761626C01
+LOCK_SUBMISSIONS = 0x6761626C02
+"""Numbers of PostgreSQL's advisory locks."""
+# PostgreSQL: connection, resources, operator, system, no database, authorisation, idle in transaction, no table
+_PASSING = ("08", "53", "57", "58", "3D", "28", "25P03", "42P01", "SQLITE_NOTADB", "SQLITE_CORRUPT")
+
+
+class Database:
+    """Connections to one database; safe to share between threads.
+
+    Parameters
+    ----------
+    url : str
+        `sqlite:///PATH` or `postgresql+pg8000://…`.
+
+    Raises
+    ------
+    StartUpError
+        The URL cannot be understood, or names a database that is not supported.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._url = _parsed(url)
+        self.is_sqlite = self._url.get_backend_name() == "sqlite"
+        self.engine = _sqlite_engine(self._url) if self.is_sqlite else _postgresql_engine(self._url)
+        # SQLite's own wait is a sleep of growing length: threads of one process queue here, fairly
+        self._one_writer = threading.Lock() if self.is_sqlite else contextlib.nullcontext()
+
+    @property
+    def told_name(self) -> str:
+        """The database in a message that clients may see: no folder, no user, no password."""
+        if self.is_sqlite:
+            return f"the SQLite database {Path(self._url.database or '').name}"
+        return f"the PostgreSQL database {self._url.database or ''} at {self._url.host or 'a local socket'}"
+
+    @contextlib.contextmanager
+    def read(self) -> Iterator[Connection]:
+        """A transaction that only reads.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer.
+        """
+        with self._told_faults(), self.engine.begin() as connection:
+            yield connection
+
+    @contextlib.contextmanager
+    def write(self) -> Iterator[Connection]:
+        """A transaction that may write; committed at its end, rolled back on an exception.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer.
+        """
+        with self._told_faults(), self._one_writer, self.engine.connect() as connection:
+            connection.execution_options(**{_WRITES: True})
+            with connection.begin():
+                yield connection
+
+    def migrate(self) -> None:
+        """Bring the tables to this version; several processes may do so at once.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer, or is of a newer version.
+        """
+        if self.is_sqlite and self._url.database is not None:
+            Path(self._url.database).parent.mkdir(parents=True, exist_ok=True)
+        with self.write() as connection:
+            self.lock(connection, _LOCK_MIGRATIONS)
+            self._check_not_newer(migrations.current(connection))
+            migrations.upgrade(connection)
+
+    def check(self) -> None:
+        """Whether the database answers and has this version's tables.
+
+        Raises
+        ------
+        StoreError
+            It does not, or it has not.
+        """
+        if self.is_sqlite and not Path(self._url.database or "").is_file():
+            raise StoreError(f"{self.told_name} does not exist: start the service once, it makes the database")
+        with self.read() as connection:
+            found = migrations.current(connection)
+        self._check_not_newer(found)
+        if found != migrations.head():
+            raise StoreError(
+                f"{self.told_name} has the tables of revision {found or 'none'}, this version needs "
+                f"{migrations.head()}: start the service or a driver once, they migrate it"
+            )
+
+    def lock(self, connection: Connection, number: int) -> None:
+        """Until the transaction ends nobody else holds this lock; a writer of SQLite is alone anyway."""
+        if not self.is_sqlite:
+            connection.execute(sa.select(sa.func.pg_advisory_xact_lock(number)))
+
+    def now(self, connection: Connection) -> dt.datetime:
+        """The database's clock, in UTC; to the millisecond on SQLite.
+
+        Not the start of the transaction: who waited for a lock gets the time after the wait.
+        """
+        if self.is_sqlite:
+            days = connection.execute(sa.select(sa.func.julianday("now"))).scalar_one()
+            return _EPOCH + dt.timedelta(milliseconds=round((days - _EPOCH_JULIAN) * 86_400_000))
+        told: dt.datetime = connection.execute(sa.select(sa.func.clock_timestamp())).scalar_one()
+        return told.astimezone(dt.UTC)
+
+    def _check_not_newer(self, found: str | None) -> None:
+        if found is not None and found not in migrations.known():
+            raise StoreError(f"{self.told_name} is of a newer version of gablework (revision {found}): update this one")
+
+    @contextlib.contextmanager
+    def _told_faults(self) -> Iterator[None]:
+        """Faults of the database as `StoreError`; faults of ours as they are."""
+        try:
+            yield
+        except (exc.OperationalError, exc.InterfaceError, exc.TimeoutError, OSError) as error:
+            raise StoreError(f"{self.told_name} does not answer: {_cause(error)}") from error
+        except exc.DBAPIError as error:
+            if error.connection_invalidated or _code(error).startswith(_PASSING):
+                raise StoreError(f"{self.told_name} does not answer: {_cause(error)}") from error
+            raise
+
+
+def _parsed(url: str) -> URL:
+    try:
+        parsed = sa.make_url(url)
+    except exc.ArgumentError as error:
+        raise StartUpError(
+            "the database URL cannot be understood: it reads sqlite:////path/to/file.db or "
+            "postgresql+pg8000://user:password@host/database"
+        ) from error
+    backend = parsed.get_backend_name()
+    if backend in {"postgresql", "postgres"}:
+        return parsed.set(drivername="postgresql+pg8000")
+    if backend != "sqlite":
+        raise StartUpError(f"databases of kind {backend!r} are not supported: use sqlite or postgresql")
+    if parsed.database in {None, "", ":memory:"} or "mode=memory" in str(parsed):
+        raise StartUpError("a SQLite database in memory is lost with its process: name a file, sqlite:////path/file.db")
+    return parsed
+
+
+def _sqlite_engine(url: URL) -> Engine:
+    engine = sa.create_engine(
+        url, pool_size=_POOL_SIZE, max_overflow=0, pool_timeout=_WAIT_S, connect_args={"timeout": _WAIT_S}
+    )
+
+    @event.listens_for(engine, "connect")
+    def connected(connection: Any, record: Any) -> None:
+        del record
+        # the driver would begin transactions late, and never for reads: we begin them ourselves
+        connection.isolation_level = None
+        cursor = connection.cursor()
+        cursor.execute(f"PRAGMA busy_timeout = {_WAIT_S * 1000}")
+        cursor.execute("PRAGMA foreign_keys = ON")
+        # a job that was answered with 201 survives a power cut
+        cursor.execute("PRAGMA synchronous = FULL")
+        if cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
+            cursor.execute("PRAGMA journal_mode = WAL")
+        cursor.close()
+
+    @event.listens_for(engine, "begin")
+    def begun(connection: Connection) -> None:
+        # a transaction that reads first and writes later would fail where another wrote in between
+        writes = connection.get_execution_options().get(_WRITES, False)
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+    return engine
+
+
+def _postgresql_engine(url: URL) -> Engine:
+    try:
+        engine = sa.create_engine(
+            url,
+            pool_size=_POOL_SIZE,
+            max_overflow=0,
+            pool_timeout=_WAIT_S,
+            pool_pre_ping=True,
+            pool_recycle=1800,
+            connect_args={"timeout": _WAIT_S, "application_name": "gablework"},
+        )
+    except ImportError as error:
+        raise StartUpError("PostgreSQL needs the driver pg8000: install gablework[postgres]") from error
+
+    @event.listens_for(engine, "connect")
+    def connected(connection: Any, record: Any) -> None:
+        del record
+        cursor = connection.cursor()
+        # a client that vanished must not keep its locks, and a statement ends before the socket's time-out
+        cursor.execute(f"SET idle_in_transaction_session_timeout = '{_WAIT_S}s'")
+        cursor.execute(f"SET statement_timeout = '{_WAIT_S - 5}s'")
+        cursor.close()
+        connection.commit()
+
+    return engine
+
+
+def _code(error: exc.DBAPIError) -> str:
+    """PostgreSQL's SQLSTATE or the name of SQLite's fault; empty where there is none."""
+    if isinstance(error.orig, sqlite3.Error):
+        return getattr(error.orig, "sqlite_errorname", "")
+    told = error.orig.args[0] if error.orig is not None and error.orig.args else None
+    return str(told.get("C", "")) if isinstance(told, dict) else ""
+
+
+def _cause(error: Exception) -> str:
+    """The driver's own words, without the statement and its values."""
+    cause = error.orig if isinstance(error, exc.DBAPIError) and error.orig is not None else error
+    told = cause.args[0] if cause.args else None
+    return str(told.get("M", told)) if isinstance(told, dict) else str(cause)

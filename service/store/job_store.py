@@ -1,0 +1,367 @@
+"""The store: every method is one transaction, committed when it returns."""
+
+from __future__ import annotations
+
+import builtins
+import datetime as dt
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+from service.jobs import Job, JobEvent, JobFailure, JobRequest, JobStatus, Upload
+from service.keys import Key
+from service.store import changes, claims, keys, queries, submissions, uploads
+from service.store.database import LOCK_SUBMISSIONS, Database
+from service.store.queries import JobFilter
+
+
+class JobStore:
+    """Jobs, events, uploads and keys; one a process, safe to share between its threads.
+
+    Every method is a transaction of its own and may raise `StoreError` when the database does not answer.
+    The time is always the database's: machines whose clocks differ agree on leases.
+
+    Parameters
+    ----------
+    url : str
+        SQLAlchemy's URL of a SQLite file or a PostgreSQL database. Nothing is opened yet.
+
+    Raises
+    ------
+    StartUpError
+        The URL cannot be understood, or names a database that is not supported.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._database = Database(url)
+
+    def __enter__(self) -> Self:
+        """For `with`: closes the connections at the end."""
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        """Close."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections; the store opens new ones when it is used again."""
+        self._database.engine.dispose()
+
+    # --- the database
+
+    def migrate(self) -> None:
+        """Make the tables, or bring them to this version; several processes may do so at once.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer, or is of a newer version.
+        """
+        self._database.migrate()
+
+    def check(self) -> None:
+        """Whether the database answers and has this version's tables.
+
+        Raises
+        ------
+        StoreError
+            It does not, or it has not.
+        """
+        self._database.check()
+
+    def now(self) -> dt.datetime:
+        """The database's clock, in UTC."""
+        with self._database.read() as connection:
+            return self._database.now(connection)
+
+    # --- what clients do
+
+    def create(
+        self,
+        request: JobRequest,
+        *,
+        owner: str | None,
+        priority: int = 0,
+        max_queued: int,
+        max_queued_per_key: int,
+    ) -> Job:
+        """Submit a job; its row is committed when this returns.
+
+        Parameters
+        ----------
+        request : JobRequest
+            What is to be done; checked already.
+        owner : str or None
+            The key that submits; None where keys are not used: then only the whole line is limited.
+        priority : int
+            Higher goes first.
+        max_queued, max_queued_per_key : int
+            Most jobs that may wait, of all and of this key; jobs that run do not count.
+
+        Raises
+        ------
+        QueueFullError
+            Too many jobs wait.
+        NoSuchUploadError
+            The request names an upload that is gone.
+        """
+        with self._database.write() as connection:
+            self._database.lock(connection, LOCK_SUBMISSIONS)
+            submissions.check_queue(connection, owner, max_queued=max_queued, max_queued_per_key=max_queued_per_key)
+            now = self._database.now(connection)
+            job_id = submissions.insert(connection, request, owner=owner, priority=priority, now=now)
+            return queries.get(connection, job_id, None)
+
+    def get(self, job_id: str, *, owner: str | None = None) -> Job:
+        """One job; with an owner only its own.
+
+        Raises
+        ------
+        NoSuchJobError
+            It does not exist, or belongs to another key.
+        """
+        with self._database.read() as connection:
+            return queries.get(connection, job_id, owner)
+
+    def list(self, criteria: JobFilter) -> list[Job]:
+        """The jobs that fit, newest first."""
+        with self._database.read() as connection:
+            return queries.listed(connection, criteria, self._database.now(connection))
+
+    def dismiss(self, job_id: str, *, owner: str | None = None) -> Job:
+        """Stop a job: one that waits is dismissed at once, the driver of one that runs is asked to let go.
+
+        A job that is over stays as it is; one that runs, but whose driver is lost, is dismissed at once.
+
+        Raises
+        ------
+        NoSuchJobError
+            It does not exist, or belongs to another key.
+        """
+        with self._database.write() as connection:
+            submissions.dismiss(connection, job_id, owner, self._database.now(connection))
+            return queries.get(connection, job_id, owner)
+
+    def remove(self, job_id: str) -> None:
+        """Forget a job that is over, with its events; its folder is the caller's business.
+
+        Raises
+        ------
+        NoSuchJobError
+            It does not exist.
+        ResultNotReadyError
+            It is not over.
+        """
+        with self._database.write() as connection:
+            submissions.remove(connection, job_id)
+
+    def events(self, job_id: str, after: int = 0, limit: int = 500) -> builtins.list[JobEvent]:
+        """A job's events with a higher number than `after`, in order; none for a job that does not exist."""
+        with self._database.read() as connection:
+            return queries.events(connection, job_id, after, limit)
+
+    def counts(self) -> dict[JobStatus, int]:
+        """Jobs by status; every status is there."""
+        with self._database.read() as connection:
+            return queries.counts(connection)
+
+    def attempts(self, job_ids: Sequence[str]) -> dict[str, tuple[JobStatus, int]]:
+        """Status and number of the latest attempt, of those jobs that exist."""
+        with self._database.read() as connection:
+            return queries.attempts(connection, job_ids)
+
+    # --- what drivers do
+
+    def claim(self, driver: str, *, lease_s: float, max_attempts: int) -> Job | None:
+        """Take the first job in line: highest priority, then oldest.
+
+        Jobs whose lease has ended are put back in line first, or failed when they were lost `max_attempts` times,
+        or dismissed where that was asked for.
+
+        Parameters
+        ----------
+        driver : str
+            Name of the driver, another for each process.
+        lease_s : float
+            Seconds for which the job is held, unless it is renewed.
+        max_attempts : int
+            Losses with which a job is given up.
+
+        Returns
+        -------
+        Job or None
+            The job as it is now held; None where nothing waits.
+        """
+        # most looks find nothing: they take no lock
+        with self._database.read() as connection:
+            if not claims.work_waits(connection, self._database.now(connection)):
+                return None
+        with self._database.write() as connection:
+            now = self._database.now(connection)
+            claims.sweep(connection, now=now, max_attempts=max_attempts)
+            job_id = claims.take_first(connection, driver, now=now, lease_s=lease_s)
+            return None if job_id is None else queries.get(connection, job_id, None)
+
+    def renew(self, job: Job, *, lease_s: float) -> bool:
+        """Hold a job for `lease_s` more seconds from now; True where it is to be dismissed.
+
+        Raises
+        ------
+        LeaseLostError
+            The job is not held any more.
+        """
+        with self._database.write() as connection:
+            until = self._database.now(connection) + dt.timedelta(seconds=lease_s)
+            return claims.renew(connection, job, until=until)
+
+    def still_held(self, job: Job) -> bool:
+        """Whether a job that is held is to be dismissed; only looks, and takes no lock.
+
+        Raises
+        ------
+        LeaseLostError
+            The job is not held any more.
+        """
+        with self._database.read() as connection:
+            return bool(changes.held_row(connection, job).dismiss_requested)
+
+    def record(self, job: Job, events: Sequence[JobEvent]) -> None:
+        """Append events; progress, stage and message of the job follow. The store gives numbers and times.
+
+        Raises
+        ------
+        LeaseLostError
+            The job is not held any more.
+        """
+        with self._database.write() as connection:
+            row = changes.lock_held(connection, job)
+            changes.append(connection, row, events, self._database.now(connection))
+
+    def succeed(self, job: Job, *, message: str, summary: Mapping[str, Any]) -> None:
+        """End a job with success.
+
+        Raises
+        ------
+        LeaseLostError
+            The job is not held any more.
+        """
+        self._finish(job, JobStatus.SUCCESSFUL, message=message, summary=dict(summary), progress=100)
+
+    def fail(self, job: Job, failure: JobFailure) -> None:
+        """End a job with a failure.
+
+        Raises
+        ------
+        LeaseLostError
+            The job is not held any more.
+        """
+        self._finish(job, JobStatus.FAILED, message=failure.detail, **claims.failed_values(failure))
+
+    def dismissed(self, job: Job) -> None:
+        """End a job that was to be dismissed: its driver let go.
+
+        Raises
+        ------
+        LeaseLostError
+            The job is not held any more.
+        """
+        self._finish(job, JobStatus.DISMISSED, message="dismissed")
+
+    def release(self, job: Job, *, lost: bool, message: str = "", retry_after_s: float = 0.0) -> None:
+        """Give a job back to the line; one that is to be dismissed ends instead.
+
+        Parameters
+        ----------
+        job : Job
+            As it was claimed.
+        lost : bool
+            Whether the attempt counts as lost.
+        message : str
+            Why, for the client.
+        retry_after_s : float
+            Seconds for which nobody claims it.
+
+        Raises
+        ------
+        LeaseLostError
+            The job is not held any more.
+        """
+        with self._database.write() as connection:
+            now = self._database.now(connection)
+            later = now + dt.timedelta(seconds=retry_after_s) if retry_after_s > 0.0 else None
+            claims.release(connection, job, now=now, lost=lost, message=message, not_before=later)
+
+    def _finish(self, job: Job, status: JobStatus, *, message: str, **values: Any) -> None:
+        with self._database.write() as connection:
+            now = self._database.now(connection)
+            claims.finish(connection, job, status, now=now, message=message, **values)
+
+    # --- uploads
+
+    def add_upload(self, upload: Upload) -> None:
+        """Store what is known of an upload; its file is in place already."""
+        with self._database.write() as connection:
+            uploads.add(connection, upload)
+
+    def upload(self, upload_id: str, *, owner: str | None = None) -> Upload:
+        """One upload; with an owner only its own.
+
+        Raises
+        ------
+        NoSuchUploadError
+            It does not exist, or belongs to another key.
+        """
+        with self._database.read() as connection:
+            return uploads.get(connection, upload_id, owner)
+
+    def list_uploads(self, *, owner: str | None = None, limit: int, offset: int = 0) -> builtins.list[Upload]:
+        """Uploads, newest first; with an owner only its own."""
+        with self._database.read() as connection:
+            return uploads.listed(connection, owner, limit, offset)
+
+    def remove_upload(self, upload_id: str) -> None:
+        """Forget an upload; the caller removes its file afterwards. One that does not exist is no fault.
+
+        Raises
+        ------
+        UploadInUseError
+            Jobs that wait or run need it.
+        """
+        with self._database.write() as connection:
+            uploads.remove(connection, upload_id)
+
+    def expired_uploads(self, now: dt.datetime) -> builtins.list[Upload]:
+        """Uploads whose time is over and that no waiting or running job needs."""
+        with self._database.read() as connection:
+            return uploads.expired(connection, now)
+
+    def upload_ids(self) -> set[str]:
+        """Ids of all uploads."""
+        with self._database.read() as connection:
+            return uploads.known(connection)
+
+    # --- keys
+
+    def add_key(self, key: Key) -> None:
+        """Store a key."""
+        with self._database.write() as connection:
+            keys.add(connection, key)
+
+    def key_by_digest(self, digest: str) -> Key | None:
+        """The key with this digest, a revoked one too; None where there is none."""
+        with self._database.read() as connection:
+            return keys.by_digest(connection, digest)
+
+    def keys(self) -> builtins.list[Key]:
+        """All keys, revoked ones too, oldest first."""
+        with self._database.read() as connection:
+            return keys.every(connection)
+
+    def revoke_key(self, key_id: str) -> None:
+        """Revoke a key; one that does not exist is no fault."""
+        with self._database.write() as connection:
+            keys.revoke(connection, key_id, self._database.now(connection))
+
+    def has_keys(self) -> bool:
+        """Whether there is a key that is not revoked."""
+        with self._database.read() as connection:
+            return keys.any_valid(connection)

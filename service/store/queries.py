@@ -1,0 +1,133 @@
+"""Reading jobs and events."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import itertools
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from service.errors import NoSuchJobError
+from service.jobs import Job, JobEvent, JobStatus
+from service.store.records import event_of, is_id, job_of, storable
+from service.store.tables import EVENTS, JOBS
+
+_ASKED_AT_ONCE = 500
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class JobFilter:
+    """Which jobs to list; the filters of OGC API - Processes."""
+
+    owner: str | None = None
+    """Only this key's jobs; None for everybody's."""
+    statuses: Collection[JobStatus] = ()
+    """Only these; none given: all."""
+    process_ids: Collection[str] = ()
+    """Only these; none given: all."""
+    created_from: dt.datetime | None = None
+    """Created at this time or later; with a time zone."""
+    created_to: dt.datetime | None = None
+    """Created at this time or earlier; with a time zone."""
+    min_duration_s: float | None = None
+    """Ran for so many seconds or longer; a job that runs counts up to now, one that never ran does not count."""
+    max_duration_s: float | None = None
+    """Ran for so many seconds or shorter; likewise."""
+    limit: int = 100
+    """Most jobs to list."""
+    offset: int = 0
+    """Jobs to pass over."""
+
+
+def no_such_job(job_id: str) -> NoSuchJobError:
+    """The error that names the job."""
+    return NoSuchJobError(f"there is no job {job_id[:64]!r}")
+
+
+def get(connection: Connection, job_id: str, owner: str | None) -> Job:
+    """One job.
+
+    Raises
+    ------
+    NoSuchJobError
+        It does not exist, or belongs to another key.
+    """
+    row = connection.execute(sa.select(JOBS).where(JOBS.c.job_id == job_id)).one_or_none() if is_id(job_id) else None
+    if row is None or (owner is not None and row.owner != owner):
+        raise no_such_job(job_id)
+    return job_of(row)
+
+
+def listed(connection: Connection, criteria: JobFilter, now: dt.datetime) -> list[Job]:
+    """The jobs that fit, newest first."""
+    chosen = sa.select(JOBS).where(*conditions(criteria, now)).order_by(JOBS.c.created_at.desc(), JOBS.c.job_id.desc())
+    return [job_of(row) for row in connection.execute(chosen.limit(criteria.limit).offset(criteria.offset))]
+
+
+def conditions(criteria: JobFilter, now: dt.datetime) -> list[sa.ColumnElement[bool]]:
+    """The filters as SQL; `now` ends the duration of jobs that run."""
+    found: list[sa.ColumnElement[bool]] = []
+    if criteria.owner is not None:
+        found.append(JOBS.c.owner == criteria.owner)
+    if criteria.statuses:
+        found.append(JOBS.c.status.in_([JobStatus(status).value for status in criteria.statuses]))
+    if criteria.process_ids:
+        found.append(JOBS.c.process_id.in_([storable(name) for name in criteria.process_ids]))
+    if criteria.created_from is not None:
+        found.append(JOBS.c.created_at >= criteria.created_from)
+    if criteria.created_to is not None:
+        found.append(JOBS.c.created_at <= criteria.created_to)
+    runs = sa.and_(JOBS.c.finished_at.is_(None), JOBS.c.started_at.is_not(None))
+    if criteria.min_duration_s is not None:
+        started = JOBS.c.started_at <= _before(now, criteria.min_duration_s)
+        found.append(sa.or_(JOBS.c.duration_ms >= _milliseconds(criteria.min_duration_s), sa.and_(runs, started)))
+    if criteria.max_duration_s is not None:
+        started = JOBS.c.started_at >= _before(now, criteria.max_duration_s)
+        found.append(sa.or_(JOBS.c.duration_ms <= _milliseconds(criteria.max_duration_s), sa.and_(runs, started)))
+    return found
+
+
+def events(connection: Connection, job_id: str, after: int, limit: int) -> list[JobEvent]:
+    """A job's events with a higher number than `after`, in order."""
+    if not is_id(job_id):
+        return []
+    later = sa.select(EVENTS).where(EVENTS.c.job_id == job_id, EVENTS.c.sequence > _bounded(after))
+    return [event_of(row) for row in connection.execute(later.order_by(EVENTS.c.sequence).limit(limit))]
+
+
+def counts(connection: Connection) -> dict[JobStatus, int]:
+    """Jobs by status; every status is there."""
+    grouped = sa.select(JOBS.c.status, sa.func.count()).group_by(JOBS.c.status)
+    found: dict[Any, int] = {JobStatus(status): count for status, count in connection.execute(grouped)}
+    return {status: found.get(status, 0) for status in JobStatus}
+
+
+def attempts(connection: Connection, job_ids: Sequence[str]) -> dict[str, tuple[JobStatus, int]]:
+    """Status and number of the latest attempt of those jobs that exist."""
+    found: dict[str, tuple[JobStatus, int]] = {}
+    asked = iter([job_id for job_id in job_ids if is_id(job_id)])
+    while some := list(itertools.islice(asked, _ASKED_AT_ONCE)):
+        known = sa.select(JOBS.c.job_id, JOBS.c.status, JOBS.c.attempt).where(JOBS.c.job_id.in_(some))
+        found |= {row.job_id: (JobStatus(row.status), row.attempt) for row in connection.execute(known)}
+    return found
+
+
+_LONGEST_S = 1e9
+
+
+def _before(now: dt.datetime, seconds: float) -> dt.datetime:
+    """So long ago; anything longer than a lifetime is one."""
+    return now - dt.timedelta(seconds=max(min(seconds, _LONGEST_S), -_LONGEST_S))
+
+
+def _milliseconds(seconds: float) -> int:
+    return round(max(min(seconds, _LONGEST_S), -_LONGEST_S) * 1000)
+
+
+def _bounded(sequence: int) -> int:
+    """Within what a column of integers holds."""
+    return max(0, min(sequence, 2**31 - 1))

@@ -1,0 +1,94 @@
+"""Rows to records and back."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import sqlalchemy as sa
+
+from service.jobs import Fault, Job, JobEvent, JobFailure, JobRequest, JobStatus, Upload
+from service.keys import Key, Scope
+
+_ID = re.compile(r"[0-9a-f]{32}")
+
+
+def is_id(text: str) -> bool:
+    """Whether the text can be the id of a job, an upload or a key."""
+    return _ID.fullmatch(text) is not None
+
+
+def storable(text: str, limit: int | None = None) -> str:
+    """Text that both databases take: no NUL, no lone surrogates, not longer than the column.
+
+    >>> storable("abc", 2)
+    'ab'
+    """
+    clean = text.replace("\0", "\ufffd").encode("utf-8", "replace").decode("utf-8")
+    return clean if limit is None else clean[:limit]
+
+
+def job_of(row: sa.Row[Any]) -> Job:
+    """A row of `jobs`."""
+    return Job(
+        job_id=row.job_id,
+        owner=row.owner,
+        request=JobRequest.from_dict(row.request),
+        status=JobStatus(row.status),
+        priority=row.priority,
+        message=row.message,
+        progress=row.progress,
+        stage=row.stage,
+        created_at=row.created_at,
+        started_at=row.started_at,
+        finished_at=row.finished_at,
+        updated_at=row.updated_at,
+        dismiss_requested=row.dismiss_requested,
+        attempt=row.attempt,
+        lost_attempts=row.lost_attempts,
+        lease_owner=row.lease_owner,
+        lease_until=row.lease_until,
+        failure=None if row.fault is None else JobFailure(fault=Fault(row.fault), detail=row.fault_detail or ""),
+        summary=row.summary,
+    )
+
+
+def event_of(row: sa.Row[Any]) -> JobEvent:
+    """A row of `job_events`."""
+    return JobEvent(
+        sequence=row.sequence,
+        at=row.at,
+        kind=row.kind,
+        status=None if row.status is None else JobStatus(row.status),
+        stage=row.stage,
+        done=row.done,
+        total=row.total,
+        progress=row.progress,
+        message=row.message,
+    )
+
+
+def upload_of(row: sa.Row[Any]) -> Upload:
+    """A row of `uploads`."""
+    return Upload(
+        upload_id=row.upload_id,
+        owner=row.owner,
+        filename=row.filename,
+        size_bytes=row.size_bytes,
+        sha256=row.sha256,
+        created_at=row.created_at,
+        expires_at=row.expires_at,
+        preflight=row.preflight,
+    )
+
+
+def key_of(row: sa.Row[Any]) -> Key:
+    """A row of `keys`."""
+    return Key(
+        key_id=row.key_id,
+        name=row.name,
+        digest=row.digest,
+        scopes=frozenset(Scope(scope) for scope in row.scopes),
+        created_at=row.created_at,
+        revoked_at=row.revoked_at,
+    )

@@ -1,0 +1,129 @@
+"""The tables, as `service.migrations` makes them; a test holds the two against each other."""
+
+from __future__ import annotations
+
+import datetime as dt
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Dialect
+
+METADATA = sa.MetaData()
+
+
+class UtcTime(sa.types.TypeDecorator[dt.datetime]):
+    """A time with a time zone, on SQLite too: there it is stored as UTC and comes back as UTC."""
+
+    impl = sa.DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: dt.datetime | None, dialect: Dialect) -> dt.datetime | None:
+        """To UTC.
+
+        Raises
+        ------
+        ValueError
+            The time has no time zone.
+        """
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError(f"{value} has no time zone")
+        utc = value.astimezone(dt.UTC)
+        return utc.replace(tzinfo=None) if dialect.name == "sqlite" else utc
+
+    def process_result_value(self, value: dt.datetime | None, dialect: Dialect) -> dt.datetime | None:
+        """From what is stored, in UTC."""
+        del dialect
+        if value is None:
+            return None
+        return value.replace(tzinfo=dt.UTC) if value.tzinfo is None else value.astimezone(dt.UTC)
+
+
+JOBS = sa.Table(
+    "jobs",
+    METADATA,
+    sa.Column("job_id", sa.String(32), primary_key=True),
+    sa.Column("owner", sa.String(64)),
+    sa.Column("process_id", sa.String(64), nullable=False),
+    sa.Column("request", sa.JSON, nullable=False),
+    sa.Column("status", sa.String(16), nullable=False),
+    sa.Column("priority", sa.Integer, nullable=False),
+    sa.Column("message", sa.Text, nullable=False),
+    sa.Column("progress", sa.Integer, nullable=False),
+    sa.Column("stage", sa.String(64), nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("started_at", UtcTime),
+    sa.Column("finished_at", UtcTime),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    sa.Column("duration_ms", sa.BigInteger),
+    sa.Column("not_before", UtcTime),
+    sa.Column("dismiss_requested", sa.Boolean, nullable=False),
+    sa.Column("attempt", sa.Integer, nullable=False),
+    sa.Column("lost_attempts", sa.Integer, nullable=False),
+    sa.Column("lease_owner", sa.String(255)),
+    sa.Column("lease_until", UtcTime),
+    sa.Column("fault", sa.String(16)),
+    sa.Column("fault_detail", sa.Text),
+    sa.Column("summary", sa.JSON(none_as_null=True)),
+    sa.Column("last_event", sa.Integer, nullable=False),
+)
+"""One row a job. `duration_ms` is set when a job that was started is over; `last_event` is its events' counter."""
+
+sa.Index("jobs_in_line", JOBS.c.status, JOBS.c.priority.desc(), JOBS.c.created_at, JOBS.c.job_id)
+sa.Index("jobs_by_lease", JOBS.c.status, JOBS.c.lease_until)
+sa.Index("jobs_by_age", JOBS.c.created_at, JOBS.c.job_id)
+sa.Index("jobs_by_owner", JOBS.c.owner, JOBS.c.created_at)
+
+EVENTS = sa.Table(
+    "job_events",
+    METADATA,
+    sa.Column("job_id", sa.String(32), sa.ForeignKey("jobs.job_id", ondelete="CASCADE"), primary_key=True),
+    sa.Column("sequence", sa.Integer, primary_key=True),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("kind", sa.String(16), nullable=False),
+    sa.Column("status", sa.String(16)),
+    sa.Column("stage", sa.String(64), nullable=False),
+    sa.Column("done", sa.BigInteger, nullable=False),
+    sa.Column("total", sa.BigInteger, nullable=False),
+    sa.Column("progress", sa.Integer, nullable=False),
+    sa.Column("message", sa.Text, nullable=False),
+)
+"""What happened to jobs."""
+
+UPLOADS = sa.Table(
+    "uploads",
+    METADATA,
+    sa.Column("upload_id", sa.String(32), primary_key=True),
+    sa.Column("owner", sa.String(64)),
+    sa.Column("filename", sa.String(255), nullable=False),
+    sa.Column("size_bytes", sa.BigInteger, nullable=False),
+    sa.Column("sha256", sa.String(64), nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("expires_at", UtcTime, nullable=False),
+    sa.Column("preflight", sa.JSON, nullable=False),
+)
+"""One row a file that a client sent."""
+
+sa.Index("uploads_by_expiry", UPLOADS.c.expires_at)
+
+JOB_UPLOADS = sa.Table(
+    "job_uploads",
+    METADATA,
+    sa.Column("job_id", sa.String(32), sa.ForeignKey("jobs.job_id", ondelete="CASCADE"), primary_key=True),
+    sa.Column("upload_id", sa.String(32), primary_key=True),
+)
+"""Which job reads which upload; no foreign key to it, since an upload may go when the job is over."""
+
+sa.Index("job_uploads_by_upload", JOB_UPLOADS.c.upload_id)
+
+KEYS = sa.Table(
+    "keys",
+    METADATA,
+    sa.Column("key_id", sa.String(32), primary_key=True),
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("digest", sa.String(64), nullable=False, unique=True),
+    sa.Column("scopes", sa.JSON, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("revoked_at", UtcTime),
+)
+"""One row a key; the key itself is stored nowhere."""

@@ -1,0 +1,270 @@
+"""Runs the API and keeps a driver beside it: a child process, started again when it dies, ended with its parent."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI
+
+from service.app import create_app, start
+from service.errors import StartUpError
+from service.settings import ServiceSettings
+from service.store import JobStore
+
+LEAST_PAUSE_S = 0.5
+"""Seconds before a driver that died is started again, the first time."""
+
+LONGEST_PAUSE_S = 30.0
+"""Seconds before it is started again, when it dies again and again."""
+
+STEADY_S = 60.0
+"""A driver that lived so long is started again at once."""
+
+CLOSING_S = 10
+"""Seconds that requests have to end when the process is to end."""
+
+GRACE_S = 30.0
+"""Seconds that a driver has for its own end, beside those in which it drains."""
+
+_log = logging.getLogger("gablework.serve")
+
+
+def pause_s(deaths: int) -> float:
+    """Seconds before the next start, after so many deaths in a row.
+
+    >>> [pause_s(n) for n in (1, 2, 3, 10)]
+    [0.5, 1.0, 2.0, 30.0]
+    """
+    return min(LONGEST_PAUSE_S, LEAST_PAUSE_S * 2.0 ** min(deaths - 1, 10))
+
+
+def environment_of(settings: ServiceSettings, inherited: Mapping[str, str]) -> dict[str, str]:
+    """The environment in which another process reads the same settings.
+
+    Parameters
+    ----------
+    settings : ServiceSettings
+        What it is to read.
+    inherited : mapping
+        This process's own environment.
+    """
+    prefix = "GABLEWORK_"
+    environment = dict(inherited)
+    for name in ServiceSettings.model_fields:
+        # on this machine they may be written in any case
+        for written in [given for given in environment if given.upper() == f"{prefix}{name}".upper()]:
+            del environment[written]
+        value = getattr(settings, name)
+        if value is not None:
+            environment[f"{prefix}{name}".upper()] = _written(value)
+    return environment
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, tuple):
+        return json.dumps([str(item) for item in value])
+    return str(value.resolve()) if isinstance(value, Path) else str(value)
+
+
+class Supervisor:
+    """Keeps one driver running.
+
+    Parameters
+    ----------
+    command : sequence of str
+        What starts a driver. Its standard input is a pipe that closes when this process ends, however it does.
+    environment : mapping
+        Its environment.
+    """
+
+    def __init__(self, command: list[str], environment: Mapping[str, str]) -> None:
+        self._command = command
+        self._environment = dict(environment)
+        self._child: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._keep, name="supervisor", daemon=True)
+        self.deaths = 0
+        """How often a driver died since the last one that was steady."""
+
+    def start(self) -> None:
+        """Start the driver, and watch it."""
+        self._launch()
+        self._thread.start()
+
+    def status(self) -> str:
+        """running, starting again, or ending."""
+        if self._ending.is_set():
+            return "ending"
+        child = self._child
+        return "running" if child is not None and child.poll() is None else "starting again"
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the driver."""
+        return None if self._child is None else self._child.pid
+
+    def _launch(self) -> None:
+        with self._lock:
+            if not self._ending.is_set():
+                self._child = subprocess.Popen(self._command, env=self._environment, stdin=subprocess.PIPE)  # noqa: S603
+
+    def _keep(self) -> None:
+        while not self._ending.is_set():
+            began = time.monotonic()
+            child = self._child
+            assert child is not None
+            code = child.wait()
+            if self._ending.is_set():
+                return
+            self.deaths = 1 if time.monotonic() - began > STEADY_S else self.deaths + 1
+            wait_s = pause_s(self.deaths)
+            _log.error("the driver ended with code %d; another one starts in %.1f s", code, wait_s)
+            if self._ending.wait(wait_s):
+                return
+            self._launch()
+
+    def ask_to_end(self) -> None:
+        """Tell the driver to end its jobs and itself."""
+        self._ending.set()
+        with self._lock:
+            if self._child is not None and self._child.poll() is None:
+                self._child.terminate()
+
+    def end(self, within_s: float) -> None:
+        """Wait until the driver has ended; after `within_s` seconds it is killed."""
+        self.ask_to_end()
+        child = self._child
+        if child is None:
+            return
+        try:
+            child.wait(within_s)
+        except subprocess.TimeoutExpired:
+            _log.error("the driver did not end within %.0f s and is killed; its jobs go back to the line", within_s)
+            child.kill()
+            child.wait()
+
+    def kill(self) -> None:
+        """End the driver now; its jobs go back to the line when their leases end."""
+        self._ending.set()
+        if self._child is not None:
+            self._child.kill()
+
+
+class _Server(uvicorn.Server):
+    """A server that tells when it listens, and everybody when it is to end."""
+
+    def __init__(
+        self, config: uvicorn.Config, app: FastAPI, *, on_ready: Callable[[], None], on_exit: Callable[[], None]
+    ) -> None:
+        super().__init__(config)
+        self._application = app
+        self._on_ready = on_ready
+        self._on_exit = on_exit
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, then tell."""
+        await super().startup(sockets)
+        if self.started and not self.should_exit:
+            self._on_ready()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """End; streams end of themselves, and the driver starts to drain."""
+        self._application.state.streams.closing = True
+        self._on_exit()
+        super().handle_exit(sig, frame)
+
+
+def listen(settings: ServiceSettings) -> tuple[socket.socket, str]:
+    """The socket of the service's address, and its URL; port 0 takes a free one.
+
+    Raises
+    ------
+    StartUpError
+        The address cannot be had.
+    """
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    try:
+        listening = socket.create_server((settings.host, settings.port), family=family, backlog=2048)
+    except OSError as error:
+        raise StartUpError(
+            f"cannot listen on {settings.host} port {settings.port}: {error.strerror or error}; choose another --port"
+        ) from error
+    host = f"[{settings.host}]" if family is socket.AF_INET6 else settings.host
+    return listening, f"http://{host}:{listening.getsockname()[1]}"
+
+
+def serve(settings: ServiceSettings, on_ready: Callable[[str], None], *, with_driver: bool = True) -> None:
+    """Answer requests until SIGTERM or SIGINT, with a driver beside it.
+
+    Parameters
+    ----------
+    settings : ServiceSettings
+        All settings.
+    on_ready : callable
+        Gets the URL when requests are answered.
+    with_driver : bool
+        Whether to keep a driver; without, one runs elsewhere.
+
+    Raises
+    ------
+    StartUpError
+        The address cannot be had, or needs keys.
+    StoreError
+        The database does not answer.
+    """
+    with JobStore(settings.database) as store:
+        start(settings, store)
+    listening, url = listen(settings)
+    app = create_app(settings)
+    supervisor = None
+    if with_driver:
+        command = [sys.executable, "-m", "service.cli", "driver", "--with-parent"]
+        supervisor = Supervisor(command, environment_of(settings, os.environ))
+        app.state.driver = supervisor.status
+    config = uvicorn.Config(
+        app,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=CLOSING_S,
+    )
+
+    def on_exit() -> None:
+        if supervisor is not None:
+            supervisor.ask_to_end()
+
+    server = _Server(config, app, on_ready=lambda: on_ready(url), on_exit=on_exit)
+    signals: list[int] = []
+
+    def on_signal(number: int, _frame: FrameType | None) -> None:
+        # the server has its own handlers while it runs, and hands on here what they caught
+        signals.append(number)
+        if len(signals) > 1 and supervisor is not None:
+            _log.warning("asked a second time: the driver is killed")
+            supervisor.kill()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        if supervisor is not None:
+            supervisor.start()
+        server.run(sockets=[listening])
+    finally:
+        if supervisor is not None:
+            supervisor.end(settings.drain_s + GRACE_S)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        listening.close()

@@ -1,0 +1,262 @@
+"""Uploads: a client's bytes to a file in the state folder, counted, hashed and examined on the way.
+
+An upload has its name only when it is whole: the bytes go to a folder `.tmp-<id>` beside the others, which is renamed
+when the last one is on the disk. Whatever goes wrong before, the folder is removed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import datetime as dt
+import errno
+import hashlib
+import os
+import shutil
+import threading
+import uuid
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Protocol
+
+from service.errors import NoSpaceError, RequestError, TooLargeError
+from service.filenames import clean_filename
+from service.files import StateFolder
+from service.jobs import Upload
+from service.preflight import preflight
+from service.settings import ServiceSettings
+
+BLOCK_BYTES = 1 << 20
+"""Bytes that are hashed and written at once."""
+WRITERS = 4
+"""Threads that write uploads: few, so that the other requests keep theirs."""
+TEMPORARY = ".tmp-"
+STALE_S = 24 * 3600.0
+"""Seconds after which a temporary folder that nobody writes to was left behind by a process that died."""
+_writers = ThreadPoolExecutor(max_workers=WRITERS, thread_name_prefix="uploads")
+_examining = ThreadPoolExecutor(max_workers=1, thread_name_prefix="preflight")
+
+
+class UploadTable(Protocol):
+    """What is asked of the store."""
+
+    def now(self) -> dt.datetime:
+        """The time, with a time zone."""
+
+    def add_upload(self, upload: Upload) -> None:
+        """Keep the record."""
+
+
+class _Sink:
+    """The file of one upload while it comes in. Its methods run in threads, one after the other."""
+
+    def __init__(self, folder: StateFolder, upload_id: str, filename: str) -> None:
+        self._lock = threading.Lock()
+        self._digest = hashlib.sha256()
+        self._final = folder.upload(upload_id)
+        self._temporary = folder.uploads / f"{TEMPORARY}{upload_id}"
+        self._temporary.mkdir(parents=True)
+        self._over = False
+        self.path = self._temporary / filename
+        self._stream = self.path.open("xb", buffering=0)
+
+    def write(self, block: bytes) -> None:
+        """Hash and write some bytes."""
+        with self._lock:
+            if not self._over:
+                self._digest.update(block)
+                view = memoryview(block)
+                while view:
+                    view = view[self._stream.write(view) :]
+
+    def sync(self) -> str:
+        """Bring all to the disk; the SHA-256."""
+        with self._lock:
+            os.fsync(self._stream.fileno())
+            self._stream.close()
+            return self._digest.hexdigest()
+
+    def keep(self, upload: Upload, store: UploadTable) -> None:
+        """Give the folder its name, then the store its record."""
+        with self._lock:
+            if self._over:
+                return
+            self._temporary.rename(self._final)
+            try:
+                store.add_upload(upload)
+            except BaseException:
+                shutil.rmtree(self._final, ignore_errors=True)
+                raise
+            self._over = True
+
+    def discard(self) -> None:
+        """Leave nothing behind, unless the upload was kept."""
+        with self._lock:
+            if not self._over:
+                self._over = True
+                self._stream.close()
+                shutil.rmtree(self._temporary, ignore_errors=True)
+
+
+async def receive(
+    stream: AsyncIterator[bytes],
+    filename: str,
+    *,
+    store: UploadTable,
+    folder: StateFolder,
+    settings: ServiceSettings,
+    owner: str | None,
+    sha256: str | None = None,
+) -> Upload:
+    """Take an upload: to the disk while it comes, then preflight, then the record.
+
+    Parameters
+    ----------
+    stream : asynchronous iterator of bytes
+        The file's content.
+    filename : str
+        As the client sent it.
+    store : UploadTable
+        Where the record is kept.
+    folder : StateFolder
+        Where the file is kept.
+    settings : ServiceSettings
+        Limits, and how long it is kept.
+    owner : str or None
+        Id of the key; None where keys are not used.
+    sha256 : str, optional
+        Hexadecimal, as the client promises.
+
+    Raises
+    ------
+    RequestError
+        A name that cannot be, or bytes that are not those promised.
+    TooLargeError
+        More bytes or points than allowed.
+    NoSpaceError
+        The disk is full.
+    InputError
+        The file cannot be used.
+    """
+    loop, upload_id, name = asyncio.get_running_loop(), uuid.uuid4().hex, clean_filename(filename)
+    sink = None
+    try:
+        sink = await loop.run_in_executor(_writers, _Sink, folder, upload_id, name)
+        size = 0
+        async for block in _blocks(stream):
+            size += len(block)
+            _check_size(name, size, settings.max_upload_bytes)
+            await loop.run_in_executor(_writers, sink.write, block)
+        found = await loop.run_in_executor(_writers, sink.sync)
+        _check_digest(name, found, sha256)
+        told = await loop.run_in_executor(_examining, preflight, sink.path, settings.max_points)
+        now = await loop.run_in_executor(_writers, store.now)
+        upload = Upload(
+            upload_id=upload_id,
+            owner=owner,
+            filename=name,
+            size_bytes=size,
+            sha256=found,
+            created_at=now,
+            expires_at=now + dt.timedelta(days=settings.upload_days),
+            preflight=told,
+        )
+        await loop.run_in_executor(_writers, sink.keep, upload, store)
+    except BaseException as fault:
+        if sink is not None:
+            discarded = _writers.submit(sink.discard)
+            if isinstance(fault, Exception):
+                await asyncio.wrap_future(discarded)
+        if isinstance(fault, OSError) and fault.errno in {errno.ENOSPC, errno.EDQUOT}:
+            raise NoSpaceError(f"there is no room on the disk for {name}: free some, or try later") from fault
+        raise
+    return upload
+
+
+def _check_size(name: str, size: int, limit: int) -> None:
+    """Refuse what is too much, as soon as it is."""
+    if size > limit:
+        raise TooLargeError(
+            f"{name} has more than {limit} bytes: cut it into tiles, or raise GABLEWORK_MAX_UPLOAD_BYTES"
+        )
+
+
+def _check_digest(name: str, found: str, promised: str | None) -> None:
+    """Refuse bytes that are not those that the client promised."""
+    if promised is not None and promised != found:
+        raise RequestError([f"the SHA-256 of {name} is {found}, not {promised} as promised: send it again"])
+
+
+async def _blocks(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """The same bytes in blocks of at least `BLOCK_BYTES`, the last one excepted."""
+    held: list[bytes] = []
+    size = 0
+    async for piece in stream:
+        held.append(piece)
+        size += len(piece)
+        if size >= BLOCK_BYTES:
+            yield b"".join(held)
+            held, size = [], 0
+    if held:
+        yield b"".join(held)
+
+
+def path_of(upload: Upload, folder: StateFolder) -> Path:
+    """Where an upload's file lies."""
+    return folder.upload(upload.upload_id) / upload.filename
+
+
+def remove_file(upload_id: str, folder: StateFolder) -> None:
+    """Remove an upload's folder; its record is the store's business, and goes first."""
+    shutil.rmtree(folder.upload(upload_id), ignore_errors=True)
+
+
+def remove_leftovers(folder: StateFolder, *, now_s: float, stale_s: float = STALE_S) -> list[Path]:
+    """Remove the temporary folders that a process left behind when it died.
+
+    Parameters
+    ----------
+    folder : StateFolder
+        The state folder.
+    now_s : float
+        Seconds since the epoch.
+    stale_s : float
+        Seconds without a byte after which nobody writes any more.
+
+    Returns
+    -------
+    list of Path
+        What was removed.
+    """
+    removed = []
+    for path in folder.uploads.glob(f"{TEMPORARY}*"):
+        with contextlib.suppress(FileNotFoundError):
+            newest_s = max(entry.stat().st_mtime for entry in (path, *path.iterdir()))
+            if now_s - newest_s > stale_s:
+                shutil.rmtree(path, ignore_errors=True)
+                removed.append(path)
+    return removed
+
+
+def as_document(upload: Upload, base: str) -> dict[str, Any]:
+    """The upload as clients see it.
+
+    Parameters
+    ----------
+    upload : Upload
+        The record.
+    base : str
+        URL of the service, without a slash at its end.
+    """
+    this = f"{base}/uploads/{upload.upload_id}"
+    return {
+        "uploadID": upload.upload_id,
+        "filename": upload.filename,
+        "bytes": upload.size_bytes,
+        "sha256": upload.sha256,
+        "created": upload.created_at.isoformat(),
+        "expires": upload.expires_at.isoformat(),
+        "preflight": dict(upload.preflight),
+        "links": [{"href": this, "rel": "self", "type": "application/json", "title": "this upload"}],
+    }

@@ -1,0 +1,220 @@
+"""Footprints from strangers: what a GeoPackage or GeoJSON is, without the library that will read it.
+
+A GeoPackage is a database, which can hold views that never end and columns that are computed; GeoJSON can be nested
+without measure. Both are refused here. Shapefiles are several files and are taken by path only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from pipeline.errors import EmptyInputError, UnreadableInputError
+from service.errors import TooLargeError
+from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES
+
+VECTOR_SUFFIXES = (*FOOTPRINT_SUFFIXES, ".shp")
+"""Endings of footprints."""
+GEOPACKAGE_LIMIT = 2**30
+"""Bytes; footprints are held in memory as a whole."""
+GEOJSON_LIMIT = 2**28
+"""Bytes."""
+DEPTH_LIMIT = 64
+"""Levels of GeoJSON: a multipolygon in a collection has twelve."""
+STEPS_LIMIT = 50_000_000
+"""Steps of the database engine for one statement, about a second."""
+VALUE_LIMIT = 2**24
+"""Bytes of one value in a GeoPackage that are read here."""
+HEAD_BYTES = 65_536
+BLOCK_BYTES = 1 << 20
+
+FIX = "Give a GeoPackage (.gpkg) or GeoJSON (.geojson, .json) with polygons of buildings in plain tables"
+SQLITE_MAGIC = b"SQLite format 3\0"
+SHAPE_MAGIC = b"\0\0\x27\x0a"
+APPLICATION_IDS = (b"GPKG", b"GP10", b"GP11")
+POLYGONAL = ("POLYGON", "MULTIPOLYGON", "CURVEPOLYGON", "GEOMETRY", "GEOMETRYCOLLECTION", "SURFACE", "MULTISURFACE")
+"""Types of geometry columns that can hold polygons."""
+HARMLESS_MODULES = ("rtree", "fts3", "fts4", "fts5")
+"""Virtual tables that only index."""
+MODULE = re.compile(r"\bUSING\s+[\"'\[`]?(\w+)", re.IGNORECASE)
+CRS_NAME = re.compile(rb'"crs"\s*:.{0,100}?"name"\s*:\s*"((?:urn:ogc:def:crs:|EPSG:)[\w:.]{1,80})"', re.DOTALL)
+MEMBER = re.compile(rb'"type"\s*:\s*"(FeatureCollection|Feature|Polygon|MultiPolygon|GeometryCollection)"')
+
+
+def examine_vector(path: Path) -> dict[str, Any]:
+    """What a file of footprints is; see `service.preflight.examine`.
+
+    Raises
+    ------
+    UnreadableInputError
+        Not the format that its name says, damaged, or built to harm.
+    EmptyInputError
+        No features.
+    TooLargeError
+        More bytes than are held in memory.
+    """
+    suffix = path.suffix.lower()
+    limit = GEOJSON_LIMIT if suffix in GEOJSON_SUFFIXES else GEOPACKAGE_LIMIT
+    size = path.stat().st_size
+    if size > limit:
+        raise TooLargeError(
+            f"{path.name} has {size} bytes, footprints in {suffix} may have {limit}: cut out the area of the points"
+        )
+    with path.open("rb") as stream:
+        head = stream.read(HEAD_BYTES)
+    if suffix == ".shp":
+        if not head.startswith(SHAPE_MAGIC):
+            raise UnreadableInputError(str(path), f"not a Shapefile: it begins with {head[:4]!r}", FIX)
+        return _told("shapefile", None, None, None, [])
+    if suffix == ".gpkg":
+        if not head.startswith(SQLITE_MAGIC) or head[68:72] not in APPLICATION_IDS:
+            raise UnreadableInputError(str(path), f"not a GeoPackage: it begins with {head[:16]!r}", FIX)
+        return _geopackage(path)
+    return _geojson(path, head)
+
+
+def _told(
+    kind: str, count: int | None, layers: list[str] | None, crs: dict[str, Any] | None, problems: list[str]
+) -> dict[str, Any]:
+    return {
+        "kind": "footprints",
+        "format": kind,
+        "featureCount": count,
+        "layers": layers,
+        "crs": crs,
+        "warnings": [],
+        "usable": not problems,
+        "problems": problems,
+    }
+
+
+def _geopackage(path: Path) -> dict[str, Any]:
+    """A GeoPackage, by its own tables of contents, read only and with a limit on the engine's work."""
+    try:
+        with contextlib.closing(_opened(path)) as database:
+            _refuse_programs(path, database)
+            return _contents(path, database)
+    except (sqlite3.Error, ValueError, TypeError, OverflowError) as fault:
+        raise UnreadableInputError(str(path), f"cannot be read as a GeoPackage ({str(fault)[:160]})", FIX) from fault
+
+
+def _opened(path: Path) -> sqlite3.Connection:
+    database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro&immutable=1", uri=True)
+    database.text_factory = lambda raw: raw.decode(errors="replace")
+    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, VALUE_LIMIT)
+    database.execute("PRAGMA trusted_schema = OFF")
+    database.execute("PRAGMA cell_size_check = ON")
+    steps = 0
+
+    def count() -> int:
+        nonlocal steps
+        steps += 100_000
+        return int(steps > STEPS_LIMIT)
+
+    database.set_progress_handler(count, 100_000)
+    return database
+
+
+def _refuse_programs(path: Path, database: sqlite3.Connection) -> None:
+    """Refuse what is no plain table where plain tables belong."""
+    for kind, name, statement in database.execute("SELECT type, name, sql FROM sqlite_master"):
+        module = MODULE.search(str(statement)) if kind == "table" else None
+        is_virtual = str(statement).lstrip().upper().startswith("CREATE VIRTUAL")
+        if is_virtual and (module is None or module[1].lower() not in HARMLESS_MODULES):
+            raise UnreadableInputError(str(path), f"table {str(name)[:60]!r} is a virtual table", FIX)
+        if kind == "view" and str(name).lower().startswith("gpkg_"):
+            raise UnreadableInputError(str(path), f"{str(name)[:60]!r} is a view, not a table", FIX)
+
+
+def _contents(path: Path, database: sqlite3.Connection) -> dict[str, Any]:
+    """Layers with polygons, their features and CRS."""
+    rows = database.execute(
+        "SELECT c.table_name, upper(g.geometry_type_name), s.srs_name, upper(s.organization), "
+        "s.organization_coordsys_id "
+        "FROM gpkg_contents c JOIN gpkg_geometry_columns g ON lower(g.table_name) = lower(c.table_name) "
+        "LEFT JOIN gpkg_spatial_ref_sys s ON s.srs_id = g.srs_id WHERE c.data_type = 'features' LIMIT 1000"
+    ).fetchall()
+    found = [row for row in rows if row[1] in POLYGONAL]
+    if not found:
+        raise EmptyInputError(str(path), f"none of its {len(rows)} layers can hold polygons", FIX)
+    for row in found:
+        _check_table(path, database, str(row[0]))
+    layers = [str(row[0]) for row in found]
+    if len(found) != 1:
+        return _told("geopackage", None, layers, None, [f"{len(found)} layers could be the footprints: give one"])
+    table = layers[0].replace('"', '""')
+    count = int(database.execute(f'SELECT count(*) FROM "{table}"').fetchone()[0])  # noqa: S608 - quoted; SQLite takes no names as parameters
+    if count == 0:
+        raise EmptyInputError(str(path), f"layer {layers[0][:60]!r} has no features", FIX)
+    _, _, name, organization, code = found[0]
+    crs = None if name is None else {"name": str(name)[:200], "epsg": int(code) if organization == "EPSG" else None}
+    return _told("geopackage", count, layers, crs, [])
+
+
+def _check_table(path: Path, database: sqlite3.Connection, name: str) -> None:
+    """Refuse a layer that is a view, or computes a column."""
+    kinds = database.execute("SELECT type FROM sqlite_master WHERE lower(name) = lower(?)", (name,)).fetchall()
+    if [kind for (kind,) in kinds] != ["table"]:
+        raise UnreadableInputError(str(path), f"layer {name[:60]!r} is a view or is not there", FIX)
+    hidden = database.execute("SELECT count(*) FROM pragma_table_xinfo(?) WHERE hidden <> 0", (name,)).fetchone()
+    if hidden[0]:
+        raise UnreadableInputError(str(path), f"layer {name[:60]!r} has computed columns", FIX)
+
+
+def _geojson(path: Path, head: bytes) -> dict[str, Any]:
+    """GeoJSON, by one pass over its brackets."""
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if not text.startswith(b"{"):
+        raise UnreadableInputError(str(path), f"not GeoJSON: it begins with {head[:16]!r}", FIX)
+    member = MEMBER.search(text)
+    if member is None:
+        raise UnreadableInputError(str(path), "no GeoJSON object in its first 64 KiB", FIX)
+    depth, count = 0, 0
+    for levels, features in _levels(path):
+        low, high, last = levels
+        if depth + high > DEPTH_LIMIT:
+            raise UnreadableInputError(str(path), f"nested more than {DEPTH_LIMIT} levels deep", FIX)
+        if depth + low < 0:
+            raise UnreadableInputError(str(path), "more brackets are closed than opened", FIX)
+        depth += last
+        count += features
+    if depth != 0:
+        raise UnreadableInputError(str(path), f"truncated: {depth} brackets are not closed", FIX)
+    if member[1] == b"FeatureCollection" and count == 0:
+        raise EmptyInputError(str(path), "the collection has no features", FIX)
+    named = CRS_NAME.search(text)
+    name = named[1].decode() if named else "WGS 84 (CRS84)"
+    code = re.search(r"EPSG:(?:[\d.]*:)?(\d{4,6})$", name)
+    crs = {"name": name, "epsg": int(code[1]) if code else None}
+    return _told("geojson", max(count, 1), None, crs, [])
+
+
+def _levels(path: Path) -> Iterator[tuple[tuple[int, int, int], int]]:
+    """Of each block of the file: lowest, highest and last level of brackets relative to its start; and its features."""
+    in_text, rest = False, b""
+    with path.open("rb") as stream:
+        while block := rest + stream.read(BLOCK_BYTES - len(rest)):
+            if len(block) == len(rest):
+                rest = b""  # the end: an escape without its character
+                continue
+            # An escape must not be cut in two.
+            slashes = len(block) - len(block.rstrip(b"\\"))
+            rest = block[-1:] if slashes % 2 else b""
+            body = re.sub(rb"\\.", b"__", block[: len(block) - len(rest)], flags=re.DOTALL)
+            raw = np.frombuffer(body, dtype=np.uint8)
+            quotes = np.cumsum(raw == ord('"')) + int(in_text)
+            outside = quotes % 2 == 0
+            if len(quotes):
+                in_text = bool(quotes[-1] % 2)
+            opened = ((raw == ord("{")) | (raw == ord("["))) & outside
+            closed = ((raw == ord("}")) | (raw == ord("]"))) & outside
+            steps = np.cumsum(opened.astype(np.int64) - closed)
+            if len(steps):
+                yield (int(steps.min()), int(steps.max()), int(steps[-1])), body.count(b'"Feature"')

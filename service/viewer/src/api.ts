@@ -1,0 +1,179 @@
+/** The service's REST interface, as far as the page uses it. */
+
+import { counted } from "./numbers";
+
+const KEY = "gablework.key";
+
+/** An error that the service told as application/problem+json, or that the network had. */
+export class Problem extends Error {
+  constructor(
+    readonly status: number,
+    readonly title: string,
+    readonly detail: string,
+    /** What to do about it. */
+    readonly remedy: string,
+  ) {
+    super(detail === "" ? title : `${title}: ${detail}`);
+  }
+}
+
+export interface Link {
+  href: string;
+  rel?: string;
+  type?: string;
+  title?: string;
+}
+
+export type Status = "accepted" | "running" | "successful" | "failed" | "dismissed";
+
+export interface StatusInfo {
+  jobID: string;
+  status: Status;
+  message?: string;
+  progress?: number;
+  created?: string;
+  started?: string;
+  finished?: string;
+  updated?: string;
+  title?: string;
+  stage?: string;
+  links?: Link[];
+  request?: unknown;
+  exception?: { title?: string; detail?: string };
+}
+
+export interface Feature {
+  type: "Feature";
+  id?: string;
+  geometry: { type: string; coordinates: unknown } | null;
+  properties: Record<string, unknown>;
+}
+
+export const isOver = (status: Status): boolean => status !== "accepted" && status !== "running";
+
+/** Where the service is: the folder of the page, so that a path prefix of a proxy does no harm. */
+export function serviceUrl(path: string): string {
+  return new URL(path, new URL(".", document.baseURI)).href;
+}
+
+/** The key of this browser tab; never stored for longer, never part of an address. */
+export function currentKey(): string | null {
+  return sessionStorage.getItem(KEY);
+}
+
+export function keepKey(key: string | null): void {
+  if (key === null || key.trim() === "") sessionStorage.removeItem(KEY);
+  else sessionStorage.setItem(KEY, key.trim());
+}
+
+export function authorization(): Record<string, string> {
+  const key = currentKey();
+  return key === null ? {} : { Authorization: `Bearer ${key}` };
+}
+
+/**
+ * One request; the answer's status is 2xx.
+ *
+ * @throws Problem for every other answer, and where there is none.
+ */
+export async function request(path: string, options: RequestInit = {}): Promise<Response> {
+  let response: Response;
+  try {
+    response = await fetch(serviceUrl(path), {
+      cache: "no-store",
+      ...options,
+      headers: { Accept: "application/json", ...authorization(), ...(options.headers as Record<string, string>) },
+    });
+  } catch (error) {
+    if (error instanceof DOMException && error.name === "AbortError") throw error;
+    throw unreachable();
+  }
+  if (response.ok) return response;
+  throw problemOf(response.status, response.statusText, await response.text(), response.headers.get("Retry-After"));
+}
+
+export async function getJson<T>(path: string, options: RequestInit = {}): Promise<T> {
+  return (await (await request(path, options)).json()) as T;
+}
+
+export function unreachable(): Problem {
+  return new Problem(0, "The service does not answer", "", "Check that it runs and that this machine can reach it, then try again.");
+}
+
+/** A problem from an answer; bodies that are no problem document give what the status line tells. */
+export function problemOf(status: number, reason: string, body: string, retryAfter: string | null): Problem {
+  let document: { title?: unknown; detail?: unknown } = {};
+  try {
+    document = JSON.parse(body) as typeof document;
+  } catch {
+    document = {};
+  }
+  const title = typeof document?.title === "string" ? document.title : reason || `Status ${status}`;
+  const detail = typeof document?.detail === "string" ? document.detail : "";
+  return new Problem(status, title, detail, remedyOf(status, retryAfter));
+}
+
+function remedyOf(status: number, retryAfter: string | null): string {
+  switch (status) {
+    case 401:
+      return "Enter a key that this service knows. Its operator makes one with gablework keys create.";
+    case 403:
+      return "This key may not do that. Ask the service's operator for a key with the scope that is needed.";
+    case 404:
+    case 410:
+      return "It may have been removed. Reload the list of jobs.";
+    case 413:
+      return "Split the tile, or ask the service's operator to raise the limit.";
+    case 429: {
+      const seconds = Number(retryAfter);
+      return seconds > 0 ? `Try again in ${counted(Math.ceil(seconds), "second")}.` : "Wait a little, then try again.";
+    }
+    case 400:
+    case 415:
+    case 422:
+      return "Correct what is named above and send it again.";
+    case 503:
+      return "The service cannot take work at the moment. Try again in a minute.";
+    default:
+      return status >= 500 ? "This is a fault of the service: its operator finds more in its log." : "";
+  }
+}
+
+/** What the service read in a file's header. */
+export type Preflight = Record<string, unknown>;
+
+export interface UploadInfo {
+  /** How the inputs of an execution name it. */
+  href: string;
+  preflight: Preflight;
+}
+
+/**
+ * Sends a file as it is; `onProgress` gets the share that has left this machine, 0 to 1.
+ *
+ * @throws Problem when it is refused, AbortError when it is called off.
+ */
+export function upload(file: File, onProgress: (share: number) => void, signal: AbortSignal): Promise<UploadInfo> {
+  // fetch tells no progress of what it sends
+  return new Promise((resolve, reject) => {
+    const sending = new XMLHttpRequest();
+    sending.open("POST", serviceUrl(`uploads?filename=${encodeURIComponent(file.name)}`));
+    for (const [name, value] of Object.entries(authorization())) sending.setRequestHeader(name, value);
+    sending.setRequestHeader("Content-Type", "application/octet-stream");
+    sending.setRequestHeader("Accept", "application/json");
+    sending.upload.onprogress = (event) => onProgress(event.total > 0 ? event.loaded / event.total : 0);
+    sending.onload = () => {
+      if (sending.status < 200 || sending.status > 299) {
+        const retryAfter = sending.getResponseHeader("Retry-After");
+        reject(problemOf(sending.status, sending.statusText, sending.responseText, retryAfter));
+        return;
+      }
+      const { uploadID, preflight } = JSON.parse(sending.responseText) as { uploadID: string; preflight: Preflight };
+      resolve({ href: serviceUrl(`uploads/${uploadID}`), preflight });
+    };
+    sending.onerror = () => reject(unreachable());
+    sending.onabort = () => reject(new DOMException("called off", "AbortError"));
+    signal.addEventListener("abort", () => sending.abort());
+    sending.send(file);
+  });
+}

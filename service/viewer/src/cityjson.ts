@@ -1,0 +1,118 @@
+/** CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature a building. */
+
+export type Xyz = [number, number, number];
+
+export interface Transform {
+  scale: Xyz;
+  translate: Xyz;
+}
+
+export type SurfaceKind = "roof" | "wall" | "ground";
+
+/** A face of a solid: rings of indices into the building's vertices, the outer ring first. */
+export interface Face {
+  kind: SurfaceKind;
+  rings: number[][];
+}
+
+/** One building in coordinates of its CRS. */
+export interface Building {
+  id: string;
+  /** The record's columns, as far as they are known. */
+  attributes: Record<string, unknown>;
+  /** Easting, northing, elevation one after another. */
+  vertices: Float64Array;
+  /** Empty where no model could be made. */
+  faces: Face[];
+}
+
+export interface Metadata {
+  transform: Transform;
+  /** EPSG code without the authority; null where the CRS is unknown. */
+  epsg: string | null;
+  /** x_min, y_min, z_min, x_max, y_max, z_max; null where nothing was modelled. */
+  extent: number[] | null;
+}
+
+const KINDS: Record<string, SurfaceKind> = { RoofSurface: "roof", GroundSurface: "ground", WallSurface: "wall" };
+
+/**
+ * Reads the sequence line by line; a further line of metadata stands for the features that follow it.
+ *
+ * @throws Error when a line is no JSON, or a feature comes before the first line of metadata.
+ */
+export class SequenceReader {
+  metadata: Metadata | null = null;
+
+  read(line: string): Building | null {
+    const value = JSON.parse(line) as RawLine;
+    if (value.type === "CityJSON") {
+      this.metadata = metadataOf(value);
+      return null;
+    }
+    if (value.type !== "CityJSONFeature") throw new Error(`a line of type ${String(value.type)} in the CityJSONSeq`);
+    if (this.metadata === null) throw new Error("the CityJSONSeq does not begin with its metadata");
+    return featureOf(value, this.metadata.transform);
+  }
+}
+
+interface RawGeometry {
+  type: string;
+  boundaries: unknown;
+  semantics?: { surfaces: { type: string }[]; values: unknown };
+}
+
+interface RawLine {
+  type?: string;
+  id?: string;
+  transform?: Transform;
+  metadata?: { referenceSystem?: string; geographicalExtent?: number[] };
+  CityObjects?: Record<string, { type: string; attributes?: Record<string, unknown>; geometry?: RawGeometry[] }>;
+  vertices?: Xyz[];
+}
+
+function metadataOf(line: RawLine): Metadata {
+  const code = /\/EPSG\/[^/]+\/(\d+)$/.exec(line.metadata?.referenceSystem ?? "");
+  return {
+    transform: line.transform ?? { scale: [1, 1, 1], translate: [0, 0, 0] },
+    epsg: code?.[1] ?? null,
+    extent: line.metadata?.geographicalExtent ?? null,
+  };
+}
+
+function featureOf(line: RawLine, { scale, translate }: Transform): Building {
+  const id = line.id ?? "";
+  const raw = line.vertices ?? [];
+  const vertices = new Float64Array(raw.length * 3);
+  raw.forEach((xyz, i) => {
+    for (let axis = 0; axis < 3; axis++) vertices[3 * i + axis] = xyz[axis] * scale[axis] + translate[axis];
+  });
+  const faces: Face[] = [];
+  for (const object of Object.values(line.CityObjects ?? {})) {
+    for (const geometry of object.geometry ?? []) faces.push(...facesOf(geometry));
+  }
+  return { id, attributes: line.CityObjects?.[id]?.attributes ?? {}, vertices, faces };
+}
+
+type Rings = number[][];
+
+/** The faces of a geometry; solids give those of all their shells. */
+function facesOf(geometry: RawGeometry): Face[] {
+  const surfaces = geometry.semantics?.surfaces ?? [];
+  const values = geometry.semantics?.values;
+  const kindOf = (value: unknown): SurfaceKind =>
+    typeof value === "number" ? (KINDS[surfaces[value]?.type ?? ""] ?? "wall") : "wall";
+  const shell = (boundaries: Rings[], semantic: unknown): Face[] =>
+    boundaries.map((rings, i) => ({ kind: kindOf(Array.isArray(semantic) ? semantic[i] : undefined), rings }));
+  switch (geometry.type) {
+    case "MultiSurface":
+    case "CompositeSurface":
+      return shell(geometry.boundaries as Rings[], values);
+    case "Solid":
+      return (geometry.boundaries as Rings[][]).flatMap((faces, i) =>
+        shell(faces, Array.isArray(values) ? values[i] : undefined),
+      );
+    default:
+      return [];
+  }
+}

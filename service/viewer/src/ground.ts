@@ -1,0 +1,101 @@
+/** A height field on a square lattice. */
+export interface Ground {
+  xMin: number;
+  yMin: number;
+  cellM: number;
+  /** Nodes along x and y. */
+  nx: number;
+  ny: number;
+  /** Heights row by row, south to north. */
+  heights: Float32Array;
+}
+
+interface Level {
+  nx: number;
+  ny: number;
+  sums: Float32Array;
+  weights: Float32Array;
+}
+
+/**
+ * A smooth ground through the floors of the buildings, for the eye only: the run delivers no terrain.
+ *
+ * Known nodes are averaged into ever coarser lattices and unknown ones filled from the next coarser one
+ * ("pull-push", Gortler et al. 1996).
+ *
+ * @param floors x, y and floor height of places that are known, one after another; at least one.
+ * @param box x_min, y_min, x_max, y_max of the lattice.
+ * @param cells About how many cells along the longer side.
+ */
+export function groundThrough(floors: readonly number[], box: readonly number[], cells: number): Ground {
+  const [xMin, yMin, xMax, yMax] = box;
+  const cellM = Math.max(xMax - xMin, yMax - yMin) / cells || 1;
+  const nx = Math.ceil((xMax - xMin) / cellM) + 1;
+  const ny = Math.ceil((yMax - yMin) / cellM) + 1;
+  const finest = level(nx, ny);
+  for (let i = 0; i < floors.length; i += 3) {
+    const column = clamp(Math.round((floors[i] - xMin) / cellM), nx);
+    const row = clamp(Math.round((floors[i + 1] - yMin) / cellM), ny);
+    finest.sums[row * nx + column] += floors[i + 2];
+    finest.weights[row * nx + column] += 1;
+  }
+  const heights = filled(finest);
+  return { xMin, yMin, cellM, nx, ny, heights };
+}
+
+function filled(fine: Level): Float32Array {
+  const heights = new Float32Array(fine.nx * fine.ny);
+  const holes = fine.weights.includes(0);
+  const coarse = holes && fine.nx * fine.ny > 1 ? filled(coarser(fine)) : null;
+  const width = Math.ceil(fine.nx / 2);
+  const depth = Math.ceil(fine.ny / 2);
+  for (let row = 0; row < fine.ny; row++) {
+    for (let column = 0; column < fine.nx; column++) {
+      const at = row * fine.nx + column;
+      const known = Math.min(fine.weights[at], 1);
+      const guess = coarse === null ? 0 : bilinear(coarse, width, depth, (column - 0.5) / 2, (row - 0.5) / 2);
+      const mean = fine.weights[at] > 0 ? fine.sums[at] / fine.weights[at] : 0;
+      heights[at] = known * mean + (1 - known) * guess;
+    }
+  }
+  return heights;
+}
+
+/** Four cells become one; weights saturate at 1, so that many near floors do not outvote a far one. */
+function coarser(fine: Level): Level {
+  const coarse = level(Math.ceil(fine.nx / 2), Math.ceil(fine.ny / 2));
+  for (let row = 0; row < fine.ny; row++) {
+    for (let column = 0; column < fine.nx; column++) {
+      const from = row * fine.nx + column;
+      const to = (row >> 1) * coarse.nx + (column >> 1);
+      if (fine.weights[from] === 0) continue;
+      const weight = Math.min(fine.weights[from], 1);
+      coarse.sums[to] += (weight * fine.sums[from]) / fine.weights[from];
+      coarse.weights[to] += weight;
+    }
+  }
+  return coarse;
+}
+
+function level(nx: number, ny: number): Level {
+  return { nx, ny, sums: new Float32Array(nx * ny), weights: new Float32Array(nx * ny) };
+}
+
+function bilinear(values: Float32Array, nx: number, ny: number, x: number, y: number): number {
+  const [x0, y0] = [clamp(Math.floor(x), nx), clamp(Math.floor(y), ny)];
+  const [x1, y1] = [clamp(Math.floor(x) + 1, nx), clamp(Math.floor(y) + 1, ny)];
+  const [fx, fy] = [x - Math.floor(x), y - Math.floor(y)];
+  const south = values[y0 * nx + x0] * (1 - fx) + values[y0 * nx + x1] * fx;
+  const north = values[y1 * nx + x0] * (1 - fx) + values[y1 * nx + x1] * fx;
+  return south * (1 - fy) + north * fy;
+}
+
+function clamp(value: number, count: number): number {
+  return Math.min(Math.max(value, 0), count - 1);
+}
+
+/** Height of the ground at a place, between its nodes. */
+export function heightAt(ground: Ground, x: number, y: number): number {
+  const { xMin, yMin, cellM, nx, ny, heights } = ground;
+  return bilinear(heights, nx, ny, (x - xMin) / cellM, (y - yMin) / cellM);
+}

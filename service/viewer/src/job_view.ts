@@ -1,0 +1,207 @@
+import { Problem, getJson, isOver, request, type Status, type StatusInfo } from "./api";
+import { el } from "./elements";
+import { follow, type ServerEvent } from "./event_stream";
+import { titleOf } from "./job_list";
+import { announce, asProblem, problemNotice, warningNotice } from "./notices";
+import { count, duration } from "./numbers";
+
+/** What a job's view tells the page. */
+export interface Hooks {
+  /** The job is not what the list shows any more. */
+  onChange: () => void;
+  onProblem: (problem: Problem) => void;
+}
+
+interface JobEvent {
+  kind: string;
+  /** The status that the job came to; only of the kind `status`. */
+  status?: Status;
+  stage: string;
+  done: number;
+  total: number;
+  progress: number;
+  message: string;
+}
+
+/** The stages of a job, in order: name, what happens, and what is counted. */
+const STAGES: [string, string, string][] = [
+  ["inputs", "Make the inputs ready", "files"],
+  ["plan", "Plan the tiles", ""],
+  ["ingest", "Read the points", "files"],
+  ["split", "Find ground and walls", "tiles"],
+  ["join", "Join surfaces over borders", ""],
+  ["reconstruct", "Model the buildings", "buildings"],
+  ["publish", "Write the results", "tiles"],
+  ["outputs", "Assemble the downloads", ""],
+];
+
+/** Show a job: its progress, why it failed, or what came out. What comes back ends the view. */
+export function showJob(place: HTMLElement, jobId: string, buildingId: string | null, hooks: Hooks): () => void {
+  const calledOff = new AbortController();
+  let leaveResults: () => void = () => undefined;
+  const path = `jobs/${encodeURIComponent(jobId)}`;
+
+  const look = async (): Promise<void> => {
+    const job = await getJson<StatusInfo>(path, { signal: calledOff.signal });
+    if (calledOff.signal.aborted) return;
+    document.title = `${titleOf(job)} · gablework`;
+    if (job.status === "successful") {
+      // the 3D library is only loaded where there is something to draw
+      const { showResults } = await import("./results_view");
+      if (calledOff.signal.aborted) return;
+      leaveResults = showResults(place, job, buildingId, hooks);
+    } else if (isOver(job.status)) {
+      place.replaceChildren(ended(job));
+    } else {
+      const progress = new ProgressView(job, () => cancel(path, hooks));
+      place.replaceChildren(progress.element);
+      await progress.follow(path, calledOff.signal);
+      hooks.onChange();
+      await look();
+    }
+  };
+
+  place.replaceChildren(el("p", { class: "loading" }, "Loading…"));
+  const begin = (): void => {
+    look().catch((error: unknown) => {
+      if (calledOff.signal.aborted) return;
+      const problem = asProblem(error);
+      place.replaceChildren(el("div", { class: "card" }, problemNotice(problem, begin)));
+      hooks.onProblem(problem);
+    });
+  };
+  begin();
+  return () => {
+    calledOff.abort();
+    leaveResults();
+  };
+}
+
+async function cancel(path: string, hooks: Hooks): Promise<void> {
+  await request(path, { method: "DELETE" });
+  hooks.onChange();
+}
+
+/** A job that is over without results. */
+function ended(job: StatusInfo): HTMLElement {
+  const failure = job.exception;
+  const notice =
+    job.status === "failed"
+      ? problemNotice(
+          new Problem(0, failure?.title ?? "The job failed", failure?.detail ?? job.message ?? "", "Correct what is named and submit it again."),
+        )
+      : el("p", {}, "This job was cancelled; nothing of it is kept.");
+  return el("div", { class: "card" }, el("h1", {}, titleOf(job)), notice);
+}
+
+class ProgressView {
+  readonly element: HTMLElement;
+  private readonly bar = el("progress", { max: 100, "aria-label": "Progress of the job" });
+  private readonly percent = el("span", { class: "percent" });
+  private readonly message = el("p", { class: "message" });
+  private readonly waiting = el("div");
+  private readonly warnings = el("div");
+  private readonly elapsed = el("span", { class: "elapsed" });
+  private readonly stages = el("ol", { class: "stages" });
+  private readonly told: string[] = [];
+  private readonly rows = new Map<string, { row: HTMLElement; figure: HTMLElement }>();
+  private readonly started: number;
+
+  constructor(job: StatusInfo, cancel: () => Promise<void>) {
+    this.started = Date.parse(job.started ?? job.created ?? new Date().toISOString());
+    for (const [name, words] of STAGES) this.addStage(name, words);
+    const button = el("button", { type: "button", class: "quiet" }, "Cancel the job");
+    button.addEventListener("click", () => {
+      button.disabled = true;
+      button.textContent = "Cancelling…";
+      cancel().catch((error: unknown) => {
+        button.disabled = false;
+        button.textContent = "Cancel the job";
+        this.waiting.replaceChildren(problemNotice(asProblem(error)));
+      });
+    });
+    this.element = el(
+      "section",
+      { class: "card progress", "aria-labelledby": "progress-title" },
+      el("h1", { id: "progress-title" }, titleOf(job)),
+      el("div", { class: "progress-line" }, this.bar, this.percent),
+      el("div", { class: "progress-words" }, this.message, this.elapsed),
+      this.waiting,
+      this.stages,
+      this.warnings,
+      el("div", { class: "actions" }, button),
+    );
+    this.set(job.progress ?? 0, job.message ?? "");
+    if (job.stage !== undefined) this.enter(job.stage);
+  }
+
+  /** Live until the job is over. */
+  async follow(path: string, signal: AbortSignal): Promise<void> {
+    const clock = setInterval(() => this.tick(), 1000);
+    this.tick();
+    try {
+      await follow(
+        `${path}/events`,
+        (event) => this.take(event),
+        (connected) => {
+          if (!connected) this.message.textContent = "The connection was lost; trying again…";
+        },
+        signal,
+      );
+    } finally {
+      clearInterval(clock);
+    }
+  }
+
+  /** Show one event; true when it was the last. */
+  private take({ data }: ServerEvent): boolean {
+    const event = JSON.parse(data) as JobEvent;
+    this.waiting.replaceChildren(...(event.kind === "waiting" ? [warningNotice(event.message)] : []));
+    if (event.kind === "warning") {
+      if (!this.told.includes(event.message)) this.told.push(event.message);
+      this.warnings.replaceChildren(warningNotice(...this.told));
+      return false;
+    }
+    this.set(event.progress, event.message);
+    if (event.stage !== "") this.enter(event.stage, event);
+    return event.status !== undefined && isOver(event.status);
+  }
+
+  private set(progress: number, message: string): void {
+    this.bar.value = progress;
+    this.percent.textContent = `${progress}\u202f%`;
+    if (message !== "") {
+      this.message.textContent = message;
+      announce(message);
+    }
+    document.title = document.title.replace(/^(\d+\u202f% )?/, `${progress}\u202f% `);
+  }
+
+  private enter(stage: string, event?: JobEvent): void {
+    if (!this.rows.has(stage)) this.addStage(stage, stage);
+    let before = true;
+    for (const [name, { row, figure }] of this.rows) {
+      if (name === stage) {
+        before = false;
+        row.className = "stage stage-now";
+        row.setAttribute("aria-current", "step");
+        const noun = STAGES.find(([known]) => known === name)?.[2] ?? "";
+        if (event !== undefined && event.total > 1) figure.textContent = `${count(event.done)} of ${count(event.total)} ${noun}`;
+      } else {
+        row.className = before ? "stage stage-done" : "stage";
+        row.removeAttribute("aria-current");
+      }
+    }
+  }
+
+  private addStage(name: string, words: string): void {
+    const figure = el("span", { class: "stage-figure" });
+    const row = el("li", { class: "stage" }, el("span", { class: "stage-name" }, words), figure);
+    this.rows.set(name, { row, figure });
+    this.stages.append(row);
+  }
+
+  private tick(): void {
+    this.elapsed.textContent = duration((Date.now() - this.started) / 1000);
+  }
+}

@@ -1,0 +1,87 @@
+/** The page: what the address names is shown, the rest follows. */
+
+import { Problem, currentKey, getJson, keepKey } from "./api";
+import { byId, el } from "./elements";
+import { JobList } from "./job_list";
+import { showJob } from "./job_view";
+import { problemNotice } from "./notices";
+import { Submission } from "./submission";
+import { welcome } from "./welcome";
+
+const main = byId("main");
+const jobs = new JobList(byId("jobs"), onProblem);
+new Submission(byId("submission"), (jobId) => {
+  void jobs.refresh();
+  location.hash = `#/jobs/${jobId}`;
+}, onProblem);
+
+let shown = "";
+let leave: () => void = () => undefined;
+
+/** `#/jobs/<job>` and `#/jobs/<job>/buildings/<building>`. */
+function route(): void {
+  const [, jobId = "", buildingId = null] = /^#\/jobs\/([^/]+)(?:\/buildings\/([^/]+))?/.exec(location.hash) ?? [];
+  jobs.mark(jobId);
+  document.body.classList.toggle("has-job", jobId !== "");
+  if (jobId === shown && jobId !== "") return; // only the building changed: the job's view hears of it itself
+  leave();
+  shown = jobId;
+  if (jobId === "") {
+    document.title = "gablework";
+    main.replaceChildren(welcome());
+    leave = () => undefined;
+    return;
+  }
+  leave = showJob(main, decodeURIComponent(jobId), buildingId === null ? null : decodeURIComponent(buildingId), {
+    onChange: () => void jobs.refresh(),
+    onProblem,
+  });
+}
+
+/** A key that is missing or refused is asked for; everything else is shown where it happened. */
+function onProblem(problem: Problem): void {
+  if (problem.status === 401) askForKey(problem);
+}
+
+const dialog = byId<HTMLDialogElement>("key-dialog");
+
+function askForKey(problem: Problem | null): void {
+  if (dialog.open) return;
+  const field = el("input", {
+    id: "key-field",
+    type: "password",
+    autocomplete: "off",
+    spellcheck: "false",
+    "aria-describedby": "key-hint",
+  });
+  field.value = currentKey() ?? "";
+  const form = el(
+    "form",
+    { method: "dialog" },
+    el("h2", { id: "key-title" }, "Key of this service"),
+    problem === null ? null : problemNotice(problem),
+    el("label", { for: "key-field" }, "Bearer key"),
+    field,
+    el("p", { class: "hint", id: "key-hint" }, "Kept in this tab until it is closed; sent as a header, never in an address."),
+    el(
+      "div",
+      { class: "actions" },
+      el("button", { type: "button", class: "quiet", onclick: () => dialog.close() }, "Cancel"),
+      el("button", { type: "submit", class: "primary" }, "Use this key"),
+    ),
+  );
+  form.addEventListener("submit", () => {
+    keepKey(field.value);
+    location.reload();
+  });
+  dialog.replaceChildren(form);
+  dialog.showModal();
+}
+
+byId("key-button").addEventListener("click", () => askForKey(null));
+window.addEventListener("hashchange", route);
+route();
+void jobs.start();
+void getJson("processes/reconstruct").catch((error: unknown) => {
+  if (error instanceof Problem) onProblem(error);
+});

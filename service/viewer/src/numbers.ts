@@ -1,0 +1,48 @@
+/** Numbers for people: thin groups, few digits, units with a narrow space. */
+
+const NARROW = "\u202f";
+
+export function count(value: number): string {
+  return Math.round(value).toString().replace(/\B(?=(\d{3})+$)/g, NARROW);
+}
+
+/** `1 building`, `2 buildings`. */
+export function counted(value: number, noun: string): string {
+  return `${count(value)} ${noun}${value === 1 ? "" : "s"}`;
+}
+
+export function measure(value: unknown, digits: number, unit = ""): string {
+  if (typeof value !== "number" || !Number.isFinite(value)) return "–";
+  const [whole, fraction] = Math.abs(value).toFixed(digits).split(".");
+  const sign = value < 0 && Number(value.toFixed(digits)) !== 0 ? "−" : "";
+  const text = sign + whole.replace(/\B(?=(\d{3})+$)/g, NARROW) + (fraction === undefined ? "" : `.${fraction}`);
+  return unit === "" ? text : `${text}${NARROW}${unit}`;
+}
+
+export function bytes(value: number): string {
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  let power = 0;
+  let rest = value;
+  while (rest >= 1000 && power < units.length - 1) {
+    rest /= 1000;
+    power += 1;
+  }
+  return `${rest.toFixed(power === 0 || rest >= 100 ? 0 : 1)}${NARROW}${units[power]}`;
+}
+
+/** `12 s`, `3 min 20 s`, `2 h 5 min`. */
+export function duration(seconds: number): string {
+  const s = Math.max(0, Math.round(seconds));
+  if (s < 60) return `${s}${NARROW}s`;
+  if (s < 3600) return `${Math.floor(s / 60)}${NARROW}min ${s % 60}${NARROW}s`;
+  return `${Math.floor(s / 3600)}${NARROW}h ${Math.floor((s % 3600) / 60)}${NARROW}min`;
+}
+
+/** `just now`, `5 min ago`, `3 h ago`, else the date. */
+export function ago(then: Date, now: Date): string {
+  const seconds = (now.getTime() - then.getTime()) / 1000;
+  if (seconds < 60) return "just now";
+  if (seconds < 3600) return `${Math.floor(seconds / 60)}${NARROW}min ago`;
+  if (seconds < 86_400) return `${Math.floor(seconds / 3600)}${NARROW}h ago`;
+  return then.toLocaleDateString(undefined, { day: "numeric", month: "short", year: "numeric" });
+}

@@ -1,0 +1,70 @@
+/** What of a batch a ray can meet. */
+export interface Pickable {
+  boxes: Float32Array;
+  positions: Float32Array;
+  starts: Uint32Array;
+}
+
+export interface Hit<T extends Pickable> {
+  batch: T;
+  /** Number of the building within its batch. */
+  index: number;
+  distance: number;
+}
+
+type Vector = readonly [number, number, number];
+
+/**
+ * The first building that a ray meets; null where it meets none.
+ *
+ * Boxes first, then the triangles of the buildings whose box is met (Möller and Trumbore 1997), from either side.
+ */
+export function pick<T extends Pickable>(batches: Iterable<T>, origin: Vector, direction: Vector): Hit<T> | null {
+  let best: Hit<T> | null = null;
+  for (const batch of batches) {
+    for (let index = 0; index + 1 < batch.starts.length; index++) {
+      const entry = boxEntry(batch.boxes, 6 * index, origin, direction);
+      if (entry >= (best?.distance ?? Infinity)) continue;
+      for (let corner = batch.starts[index]; corner < batch.starts[index + 1]; corner += 3) {
+        const distance = triangleDistance(batch.positions, 3 * corner, origin, direction);
+        if (distance < (best?.distance ?? Infinity)) best = { batch, index, distance };
+      }
+    }
+  }
+  return best;
+}
+
+/** Distance at which the ray enters the box, 0 from inside it, infinity where it misses. */
+function boxEntry(boxes: Float32Array, at: number, origin: Vector, direction: Vector): number {
+  let enter = 0;
+  let leave = Infinity;
+  for (let axis = 0; axis < 3; axis++) {
+    const low = boxes[at + axis] - origin[axis];
+    const high = boxes[at + axis + 3] - origin[axis];
+    if (direction[axis] === 0) {
+      if (low > 0 || high < 0) return Infinity;
+      continue;
+    }
+    const [a, b] = [low / direction[axis], high / direction[axis]];
+    enter = Math.max(enter, Math.min(a, b));
+    leave = Math.min(leave, Math.max(a, b));
+  }
+  return enter <= leave ? enter : Infinity;
+}
+
+function triangleDistance(p: Float32Array, at: number, origin: Vector, direction: Vector): number {
+  const [dx, dy, dz] = direction;
+  const [e1x, e1y, e1z] = [p[at + 3] - p[at], p[at + 4] - p[at + 1], p[at + 5] - p[at + 2]];
+  const [e2x, e2y, e2z] = [p[at + 6] - p[at], p[at + 7] - p[at + 1], p[at + 8] - p[at + 2]];
+  const [px, py, pz] = [dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x];
+  const determinant = e1x * px + e1y * py + e1z * pz;
+  if (determinant === 0) return Infinity;
+  const [tx, ty, tz] = [origin[0] - p[at], origin[1] - p[at + 1], origin[2] - p[at + 2]];
+  const u = (tx * px + ty * py + tz * pz) / determinant;
+  if (u < 0 || u > 1) return Infinity;
+  const [qx, qy, qz] = [ty * e1z - tz * e1y, tz * e1x - tx * e1z, tx * e1y - ty * e1x];
+  const v = (dx * qx + dy * qy + dz * qz) / determinant;
+  if (v < 0 || u + v > 1) return Infinity;
+  const distance = (e2x * qx + e2y * qy + e2z * qz) / determinant;
+  return distance > 0 ? distance : Infinity;
+}

@@ -1,0 +1,185 @@
+import { getJson, type Feature, type Problem } from "./api";
+import { downloadLink } from "./downloads";
+import { el, swatch } from "./elements";
+import { asProblem, problemNotice, warningNotice } from "./notices";
+import { count, measure } from "./numbers";
+import { CATEGORIES, categoryOf } from "./roof_types";
+
+type Record_ = Feature["properties"];
+
+interface Row {
+  label: string;
+  column: string;
+  show: (value: unknown) => string;
+}
+
+const metres = (digits: number) => (value: unknown) => measure(value, digits, "m");
+const whole = (value: unknown): string => (typeof value === "number" ? count(value) : "–");
+
+/** The columns of the record that people look at; the file has all of them. */
+function groups(verticalUnit: string): [string, Row[]][] {
+  const elevation = (value: unknown): string => measure(value, 2, verticalUnit);
+  return [
+    [
+      "Height",
+      [
+        { label: "Ridge above floor", column: "height_m", show: metres(2) },
+        { label: "Ground", column: "ground_z", show: elevation },
+        { label: "Eaves", column: "eave_z", show: elevation },
+        { label: "Ridge", column: "ridge_z", show: elevation },
+        { label: "Median of the roof", column: "h_50p", show: elevation },
+      ],
+    ],
+    [
+      "Size",
+      [
+        { label: "Footprint", column: "footprint_area_m2", show: (v) => measure(v, 1, "m²") },
+        { label: "Roof, slanted", column: "roof_area_m2", show: (v) => measure(v, 1, "m²") },
+        { label: "Volume", column: "volume_m3", show: (v) => measure(v, 0, "m³") },
+        { label: "Roof planes", column: "n_planes", show: whole },
+      ],
+    ],
+    [
+      "Fit to the points",
+      [
+        { label: "RMSE", column: "rmse_m", show: metres(3) },
+        { label: "95th percentile", column: "p95_m", show: metres(3) },
+        { label: "Points covered", column: "coverage", show: (v) => (typeof v === "number" ? measure(100 * v, 1, "%") : "–") },
+        { label: "Points", column: "n_points", show: whole },
+        { label: "Density", column: "density_per_m2", show: (v) => measure(v, 1, "per m²") },
+      ],
+    ],
+  ];
+}
+
+const REASONS: Record<string, string> = {
+  too_few_points: "fewer points than a plane needs",
+  no_plane: "no roof plane was found in its points",
+  no_partition: "the roof planes could not be turned into faces",
+  invalid_solid: "the solid broke a rule of validity",
+  too_complex: "it took more work than one building may",
+  no_footprint: "no outline could be made from its points",
+  internal_error: "a fault of the program in this one building",
+  crashed: "its work ended the process; it is kept as a bundle for a replay",
+  timed_out: "its work took too long; it is kept as a bundle for a replay",
+  out_of_memory: "its work took too much memory; it is kept as a bundle for a replay",
+};
+
+/** The reason of a building that is not `ok`, in words. */
+export function reasonWords(reason: string): string {
+  return REASONS[reason] ?? reason.replaceAll("_", " ");
+}
+
+/** Show the record of one building; what comes back stops the loading. */
+export function showRecord(
+  place: HTMLElement,
+  jobPath: string,
+  buildingId: string,
+  verticalUnit: string,
+  onProblem: (problem: Problem) => void,
+): () => void {
+  const calledOff = new AbortController();
+  const path = `${jobPath}/buildings/${encodeURIComponent(buildingId)}`;
+  const load = (): void => {
+    place.replaceChildren(el("p", { class: "loading" }, "Loading…"));
+    getJson<Feature>(path, { signal: calledOff.signal, headers: { Accept: "application/geo+json" } }).then(
+      ({ properties }) => {
+        if (!calledOff.signal.aborted) place.replaceChildren(...record(properties, path, buildingId, verticalUnit));
+      },
+      (error: unknown) => {
+        if (calledOff.signal.aborted) return;
+        const problem = asProblem(error);
+        place.replaceChildren(problemNotice(problem, load));
+        onProblem(problem);
+      },
+    );
+  };
+  load();
+  return () => calledOff.abort();
+}
+
+function record(properties: Record_, path: string, buildingId: string, verticalUnit: string): HTMLElement[] {
+  const { status, reason, reason_detail: detail, lod, valid } = properties;
+  const category = categoryOf(status, properties["roof_type"]);
+  const modelled = status === "ok" || status === "fallback";
+  const heading = el(
+    "div",
+    { class: "record-head" },
+    el("h2", {}, swatch(category), category === "unknown" ? "Other roof" : CATEGORIES[category].label + roofWord(category)),
+    el("code", { class: "record-id", title: buildingId }, buildingId),
+  );
+  const marks = el(
+    "ul",
+    { class: "marks" },
+    typeof lod === "string" ? el("li", { class: "mark-plain" }, `LoD${lod}`) : null,
+    modelled ? el("li", { class: valid === true ? "mark-good" : "mark-bad" }, valid === true ? "valid solid" : "not valid") : null,
+    properties["touches_data_edge"] === true ? el("li", { class: "mark-warn" }, "at the edge of the data") : null,
+  );
+  const why =
+    typeof reason === "string" && reason !== ""
+      ? warningNotice(`${capital(reasonWords(reason))}${typeof detail === "string" && detail !== "" ? `: ${detail}` : "."}`)
+      : null;
+  const codes = Array.isArray(properties["validity_codes"]) ? properties["validity_codes"] : [];
+  const tables = groups(verticalUnit).map(([title, rows]) =>
+    el(
+      "section",
+      {},
+      el("h3", {}, title),
+      el(
+        "dl",
+        {},
+        ...rows.flatMap(({ label, column, show }) => [el("dt", {}, label), el("dd", {}, show(properties[column]))]),
+      ),
+    ),
+  );
+  return [
+    heading,
+    marks,
+    ...(why === null ? [] : [why]),
+    ...(codes.length > 0 ? [el("p", { class: "hint" }, `Codes of the method's own solid: ${codes.join(", ")}`)] : []),
+    ...tables,
+    ...planes(properties["planes"]),
+    ...(modelled ? [takeAway(path, buildingId)] : []),
+  ];
+}
+
+/** Slope and aspect of each roof plane. */
+function planes(value: unknown): HTMLElement[] {
+  if (!Array.isArray(value) || value.length === 0) return [];
+  const rows = (value as Record_[]).map((plane) =>
+    el(
+      "tr",
+      {},
+      el("td", {}, measure(plane["slope_deg"], 1, "°")),
+      el("td", {}, measure(plane["aspect_deg"], 0, "°")),
+      el("td", {}, measure(plane["area_m2"], 1, "m²")),
+      el("td", {}, measure(plane["rmse_m"], 3, "m")),
+    ),
+  );
+  const heads = ["Slope", "Aspect", "Area", "RMSE"].map((name) => el("th", { scope: "col" }, name));
+  return [
+    el(
+      "section",
+      {},
+      el("h3", {}, "Roof planes"),
+      el("table", {}, el("thead", {}, el("tr", {}, ...heads)), el("tbody", {}, ...rows)),
+    ),
+  ];
+}
+
+function takeAway(path: string, buildingId: string): HTMLElement {
+  return el(
+    "div",
+    { class: "record-links" },
+    downloadLink("OBJ", `${path}?f=obj`, `${buildingId}.obj`),
+    downloadLink("CityJSON", `${path}?f=cityjson`, `${buildingId}.city.json`),
+  );
+}
+
+function roofWord(category: string): string {
+  return category === "fallback" || category === "failed" ? "" : " roof";
+}
+
+function capital(text: string): string {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}

@@ -1,0 +1,311 @@
+import { getJson, request, type Feature, type StatusInfo } from "./api";
+import type { Listed } from "./batching";
+import { BuildingList } from "./building_list";
+import { downloadMenu } from "./downloads";
+import { el } from "./elements";
+import { failedFootprints } from "./failed_footprints";
+import type { Hooks } from "./job_view";
+import { titleOf } from "./job_list";
+import { Legend } from "./legend";
+import { loadModels } from "./model_loading";
+import { announce, asProblem, problemNotice, warningNotice } from "./notices";
+import { count, counted, duration } from "./numbers";
+import { showRecord } from "./record";
+import { ModelScene } from "./scene";
+import type { Category } from "./roof_types";
+
+/** What the page reads of the report. */
+interface Report {
+  crs?: { name?: string | null; horizontal_unit_m?: number | null; vertical_unit_m?: number | null };
+  counts?: Record<string, number>;
+  timings_s?: Record<string, number>;
+  warnings?: string[];
+}
+
+/** Show what a job found: the models, the list and the records, the downloads. What comes back ends the view. */
+export function showResults(place: HTMLElement, job: StatusInfo, first: string | null, hooks: Hooks): () => void {
+  const view = new ResultsView(place, job, hooks);
+  view.start(first).catch((error: unknown) => view.fail(error));
+  return () => view.leave();
+}
+
+class ResultsView {
+  private readonly calledOff = new AbortController();
+  private readonly jobPath: string;
+  private readonly canvas = el("canvas", {
+    tabindex: 0,
+    role: "img",
+    "aria-label":
+      "The models in 3D. Arrow keys turn, plus and minus zoom, f shows all, t looks from above. The list beside it leads to every record.",
+  });
+  private readonly note = el("div", { class: "stage-note" });
+  private readonly facts = el("div", { class: "result-facts" }, "\u00a0");
+  private readonly downloads = el("div", { class: "result-actions" });
+  private readonly panel = el("aside", { class: "panel", "aria-label": "Buildings" });
+  private readonly list: BuildingList;
+  private readonly legend: Legend;
+  private readonly counts = new Map<Category, number>();
+  private readonly listed: Listed[] = [];
+  private scene: ModelScene | null = null;
+  private stopRecord: () => void = () => undefined;
+  private report: Report = {};
+  private selected: string | null = null;
+  private origin: readonly [number, number, number] = [0, 0, 0];
+  private fromScene = false;
+
+  constructor(
+    place: HTMLElement,
+    private readonly job: StatusInfo,
+    private readonly hooks: Hooks,
+  ) {
+    this.jobPath = `jobs/${encodeURIComponent(job.jobID)}`;
+    this.list = new BuildingList((id) => this.address(id));
+    this.legend = new Legend((category, visible) => {
+      this.scene?.show(category, visible);
+      this.list.show(category, visible);
+    });
+    const tools = el(
+      "div",
+      { class: "tools", role: "group", "aria-label": "View" },
+      el("button", { type: "button", title: "Show all (f)", onclick: () => this.scene?.fit() }, "Fit"),
+      el("button", { type: "button", title: "From above, north up (t)", onclick: () => this.scene?.top() }, "Top"),
+    );
+    this.panel.replaceChildren(this.list.element);
+    place.replaceChildren(
+      el(
+        "div",
+        { class: "result" },
+        el(
+          "div",
+          { class: "result-head" },
+          el("div", { class: "result-title" }, el("h1", {}, titleOf(job)), this.facts),
+          this.downloads,
+        ),
+        this.legend.element,
+        el("div", { class: "stage3d" }, this.canvas, tools, this.note),
+        this.panel,
+      ),
+    );
+  }
+
+  async start(first: string | null): Promise<void> {
+    window.addEventListener("hashchange", () => this.followAddress(), { signal: this.calledOff.signal });
+    const [report, menu] = await Promise.all([this.loadReport(), downloadMenu(this.jobPath, this.calledOff.signal)]);
+    if (this.calledOff.signal.aborted) return;
+    this.report = report;
+    this.downloads.replaceChildren(menu, this.removal());
+    this.showFacts();
+    try {
+      this.scene = new ModelScene(this.canvas, (id) => this.open(id));
+    } catch {
+      this.note.replaceChildren(
+        warningNotice("This browser cannot draw in 3D (WebGL is missing or switched off). The list, the records and the downloads work all the same."),
+      );
+    }
+    this.note.append(el("p", { class: "loading" }, "Loading the models…"));
+    const { crs } = report;
+    await loadModels(
+      `${this.jobPath}/results/cityjson`,
+      { horizontalUnitM: crs?.horizontal_unit_m ?? 1, verticalUnitM: crs?.vertical_unit_m ?? 1 },
+      (message) => {
+        if (message.kind === "frame") this.origin = message.origin;
+        if (message.kind !== "buildings") return;
+        this.take(message.listed);
+        this.scene?.add(message.batches);
+      },
+      this.calledOff.signal,
+    );
+    await this.finished(first);
+  }
+
+  fail(error: unknown): void {
+    if (this.calledOff.signal.aborted) return;
+    const problem = asProblem(error);
+    this.note.replaceChildren(problemNotice(problem));
+    this.hooks.onProblem(problem);
+  }
+
+  leave(): void {
+    this.calledOff.abort();
+    this.stopRecord();
+    this.scene?.dispose();
+  }
+
+  // --- what is there
+
+  /** The report, or nothing where the job was asked not to make it. */
+  private async loadReport(): Promise<Report> {
+    try {
+      return await getJson<Report>(`${this.jobPath}/results/report`, { signal: this.calledOff.signal });
+    } catch (error) {
+      if (asProblem(error).status === 404) return {};
+      throw error;
+    }
+  }
+
+  private take(listed: Listed[]): void {
+    for (const building of listed) {
+      this.listed.push(building);
+      this.counts.set(building.category, (this.counts.get(building.category) ?? 0) + 1);
+    }
+    this.legend.set(this.counts);
+    this.list.set(this.listed);
+  }
+
+  private async finished(first: string | null): Promise<void> {
+    this.scene?.finish();
+    this.note.querySelector(".loading")?.remove();
+    this.showFacts();
+    if (this.listed.length === 0) {
+      this.note.replaceChildren(this.nothing());
+      announce("No building was found.");
+      return;
+    }
+    announce(`${counted(this.listed.length, "building")} loaded.`);
+    if (this.counts.has("failed")) await this.drawFailed();
+    if (first !== null) this.select(first);
+    this.canvas.dataset["ready"] = "true";
+  }
+
+  /** Footprints of those that have no model: only the records tell where they are. */
+  private async drawFailed(): Promise<void> {
+    const { crs } = this.report;
+    const page = await getJson<{ features: Feature[] }>(`${this.jobPath}/buildings?status=failed&limit=10000&crs=native`, {
+      signal: this.calledOff.signal,
+      headers: { Accept: "application/geo+json" },
+    });
+    const frame = {
+      origin: this.origin,
+      horizontalUnitM: crs?.horizontal_unit_m ?? 1,
+      verticalUnitM: crs?.vertical_unit_m ?? 1,
+    };
+    const { scene } = this;
+    if (scene === null) return;
+    scene.add(failedFootprints(page.features, frame, (x, y) => scene.groundAt(x, y)));
+  }
+
+  private showFacts(): void {
+    const tally = this.report.counts ?? {};
+    const rejected = tally["rejected"];
+    const points = tally["points"];
+    const seconds = this.report.timings_s?.["total"];
+    const warnings = this.report.warnings ?? [];
+    const facts = [
+      this.listed.length > 0 ? counted(this.listed.length, "building") : null,
+      rejected === undefined ? null : `${count(rejected)} other objects left out`,
+      points === undefined ? null : `${count(points)} points`,
+      seconds === undefined ? null : duration(seconds),
+      this.report.crs?.name ?? "CRS unknown",
+    ]
+      .filter((fact) => fact !== null)
+      .join(" · ");
+    const told = el(
+      "details",
+      { class: "menu menu-warnings" },
+      el("summary", {}, counted(warnings.length, "warning")),
+      el("div", { class: "menu-list" }, warningNotice(...warnings)),
+    );
+    this.facts.replaceChildren(facts, warnings.length === 0 ? "" : " · ", warnings.length === 0 ? "" : told);
+  }
+
+  /** An empty result says what to try. */
+  private nothing(): HTMLElement {
+    const rejected = this.report.counts?.["rejected"] ?? 0;
+    return el(
+      "div",
+      { class: "card" },
+      el("h2", {}, "No building was found"),
+      el(
+        "p",
+        {},
+        rejected > 0
+          ? `${counted(rejected, "object")} ${rejected === 1 ? "was" : "were"} looked at and left out: too small, too low, too narrow, or vegetation. Each is in the download “rejected” with its reason and the measured figure.`
+          : "Nothing stood out of the ground.",
+      ),
+      el(
+        "ul",
+        {},
+        el("li", {}, "Is the vertical unit right? Feet read as metres, or the other way round, move every threshold."),
+        el("li", {}, "Is the file classified in a way of its own? Try “Classes: ignore”."),
+        el("li", {}, "Do the points reach roofs and walls? Fewer than about one point per m² is too little."),
+        el("li", {}, "Footprints, where you have them, say where to look."),
+      ),
+      ...(this.report.warnings ?? []).map((warning) => warningNotice(warning)),
+    );
+  }
+
+  // --- the record of one building
+
+  private address(id: string): string {
+    return `#/jobs/${encodeURIComponent(this.job.jobID)}/buildings/${encodeURIComponent(id)}`;
+  }
+
+  /** A click in the scene: the address follows, and the rest follows the address. */
+  private open(id: string | null): void {
+    const hash = id === null ? `#/jobs/${encodeURIComponent(this.job.jobID)}` : this.address(id);
+    if (location.hash === hash) return;
+    this.fromScene = id !== null;
+    location.hash = hash;
+  }
+
+  private followAddress(): void {
+    const [, jobId, id] = /^#\/jobs\/([^/]+)(?:\/buildings\/([^/]+))?/.exec(location.hash) ?? [];
+    if (jobId === undefined || decodeURIComponent(jobId) !== this.job.jobID) return;
+    this.select(id === undefined ? null : decodeURIComponent(id));
+  }
+
+  private select(id: string | null): void {
+    const before = this.selected;
+    const fly = !this.fromScene;
+    this.fromScene = false;
+    this.stopRecord();
+    this.selected = id;
+    this.scene?.select(id, fly);
+    if (id === null) {
+      this.panel.replaceChildren(this.list.element);
+      if (before !== null) this.panel.querySelector<HTMLElement>(`a[href="${CSS.escape(this.address(before))}"]`)?.focus();
+      return;
+    }
+    const body = el("div", { class: "record", "aria-live": "polite" });
+    const step = (by: number) => () => {
+      const next = this.list.beside(id, by);
+      if (next !== null) location.hash = this.address(next);
+    };
+    const back = el("button", { type: "button", class: "quiet", onclick: () => this.open(null) }, "← All buildings");
+    this.panel.replaceChildren(
+      el(
+        "div",
+        { class: "record-bar" },
+        back,
+        el("span", { class: "spacer" }),
+        el("button", { type: "button", class: "quiet", "aria-label": "Previous building", onclick: step(-1) }, "‹"),
+        el("button", { type: "button", class: "quiet", "aria-label": "Next building", onclick: step(1) }, "›"),
+      ),
+      body,
+    );
+    this.panel.scrollTop = 0;
+    if (fly && before === null) back.focus({ preventScroll: true });
+    this.stopRecord = showRecord(body, this.jobPath, id, unitName(this.report.crs?.vertical_unit_m), this.hooks.onProblem);
+  }
+
+  /** Remove the job and its results, after asking. */
+  private removal(): HTMLElement {
+    const button = el("button", { type: "button", class: "quiet" }, "Remove");
+    button.addEventListener("click", () => {
+      if (!confirm(`Remove “${titleOf(this.job)}” and its results from the service?`)) return;
+      request(this.jobPath, { method: "DELETE" }).then(
+        () => {
+          this.hooks.onChange();
+          location.hash = "#/";
+        },
+        (error: unknown) => this.fail(error),
+      );
+    });
+    return button;
+  }
+}
+
+function unitName(metres: number | null | undefined): string {
+  if (metres == null || metres === 1) return "m";
+  return Math.abs(metres - 0.3048) < 1e-5 ? "ft" : "";
+}

@@ -1,0 +1,32 @@
+/**
+ * What a building is drawn as: its roof type, or why it has none.
+ *
+ * Colours are of the palette of Okabe and Ito (2008), told apart with every kind of colour blindness; fallback and
+ * failed are told by hatching and outline too.
+ */
+export const CATEGORIES = {
+  flat: { label: "Flat", colour: "#56b4e9" },
+  pent: { label: "Pent", colour: "#009e73" },
+  gable: { label: "Gable", colour: "#e69f00" },
+  hip: { label: "Hip", colour: "#cc79a7" },
+  combination: { label: "Combination", colour: "#0072b2" },
+  unknown: { label: "Other", colour: "#8d99a6" },
+  fallback: { label: "Fallback block", colour: "#d55e00" },
+  failed: { label: "No model", colour: "#c0392b" },
+} as const;
+
+export type Category = keyof typeof CATEGORIES;
+
+export const CATEGORY_NAMES = Object.keys(CATEGORIES) as Category[];
+
+/** The category of a record. */
+export function categoryOf(status: unknown, roofType: unknown): Category {
+  if (status === "failed" || status === "fallback") return status;
+  return typeof roofType === "string" && roofType in CATEGORIES ? (roofType as Category) : "unknown";
+}
+
+/** The sRGB bytes of `#rrggbb`. */
+export function bytesOf(colour: string): [number, number, number] {
+  const value = Number.parseInt(colour.slice(1), 16);
+  return [(value >> 16) & 255, (value >> 8) & 255, value & 255];
+}

@@ -1,0 +1,556 @@
+/** The 3D view: what is drawn, where it is seen from, what is chosen. It knows no service and no lists. */
+
+import {
+  AmbientLight,
+  Box3,
+  BufferAttribute,
+  BufferGeometry,
+  Color,
+  DirectionalLight,
+  HemisphereLight,
+  LineBasicMaterial,
+  LineSegments,
+  Mesh,
+  MeshLambertMaterial,
+  PCFShadowMap,
+  PerspectiveCamera,
+  Raycaster,
+  Scene,
+  Vector2,
+  Vector3,
+  WebGLRenderer,
+} from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { LineMaterial } from "three/addons/lines/LineMaterial.js";
+import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
+import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
+import type { Batch } from "./batching";
+import { groundThrough, heightAt, type Ground } from "./ground";
+import { hatched } from "./hatching";
+import { pick } from "./picking";
+import type { Category } from "./roof_types";
+
+const FOV_DEG = 32;
+const START = new Vector3(-0.42, -1, 0.72); // seen from the south-south-west, half from above
+const CLICK_PX = 5; // farther is a drag
+const SHADOW_M = 1500; // wider scenes get no shadows: their map would be too coarse to mean anything
+const FLIGHT_MS = 450;
+
+interface Theme {
+  background: string;
+  ground: string;
+  edges: string;
+  accent: string;
+  sky: number;
+  sun: number;
+}
+
+const LIGHT: Theme = { background: "#eef1f4", ground: "#dfe3e0", edges: "#20262c", accent: "#b4441f", sky: 2.1, sun: 2.2 };
+const DARK: Theme = { background: "#14181d", ground: "#262c33", edges: "#05070a", accent: "#ff9a6b", sky: 1.5, sun: 1.9 };
+
+interface Drawn {
+  batch: Batch;
+  mesh: Mesh;
+  edges: LineSegments;
+}
+
+export interface Chosen {
+  id: string;
+}
+
+export class ModelScene {
+  private readonly renderer: WebGLRenderer;
+  private readonly scene = new Scene();
+  private readonly camera = new PerspectiveCamera(FOV_DEG, 1, 1, 10_000);
+  private readonly controls: OrbitControls;
+  private readonly sun = new DirectionalLight("#fff6e8", 2.2);
+  private readonly sky = new HemisphereLight("#f4f8ff", "#a89f92", 2.1);
+  private readonly surface = new MeshLambertMaterial({ vertexColors: true, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
+  private readonly hatching = hatched(this.surface.clone());
+  private readonly line = new LineBasicMaterial({ transparent: true, depthWrite: false });
+  private readonly outline = new LineMaterial({ linewidth: 3.5, depthTest: true });
+  private readonly glow = new MeshLambertMaterial({ vertexColors: true, emissive: "#ffffff", emissiveIntensity: 0.14, polygonOffset: true, polygonOffsetFactor: 0 });
+  private readonly drawn: Drawn[] = [];
+  private readonly hidden = new Set<Category>();
+  private readonly places = new Map<string, { drawn: Drawn; index: number }>();
+  private readonly bounds = new Box3();
+  private readonly watch: ResizeObserver;
+  private readonly dark = matchMedia("(prefers-color-scheme: dark)");
+  private readonly still = matchMedia("(prefers-reduced-motion: reduce)");
+  private groundMesh: Mesh | null = null;
+  private groundHeights: Ground | null = null;
+  private selection: { mesh: Mesh; outline: LineSegments2 } | null = null;
+  private hovered: string | null = null;
+  private down = new Vector2();
+  private pointer: PointerEvent | null = null;
+  private frame = 0;
+  private flight: { from: number; start: [Vector3, Vector3]; end: [Vector3, Vector3] } | null = null;
+  private touched = false;
+
+  /**
+   * @param canvas Fills its parent.
+   * @param onPick Gets the building that was clicked, null for a click beside all.
+   * @throws Error where the browser has no WebGL.
+   */
+  constructor(
+    private readonly canvas: HTMLCanvasElement,
+    private readonly onPick: (id: string | null) => void,
+  ) {
+    this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.shadowMap.enabled = true;
+    this.renderer.shadowMap.type = PCFShadowMap;
+    this.renderer.shadowMap.autoUpdate = false;
+    this.camera.up.set(0, 0, 1);
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.maxPolarAngle = 0.495 * Math.PI;
+    this.controls.zoomToCursor = true;
+    this.controls.enableDamping = !this.still.matches;
+    this.controls.dampingFactor = 0.12;
+    this.controls.screenSpacePanning = false;
+    this.controls.addEventListener("change", () => this.request());
+    this.controls.addEventListener("start", () => {
+      this.touched = true;
+      this.flight = null;
+    });
+    this.scene.add(this.sky, this.sun, this.sun.target, new AmbientLight("#ffffff", 0.25));
+    this.sun.castShadow = true;
+    this.sun.shadow.mapSize.set(4096, 4096);
+    this.paint();
+    this.dark.addEventListener("change", this.paint);
+    canvas.addEventListener("pointerdown", this.pressed);
+    canvas.addEventListener("pointerup", this.released);
+    canvas.addEventListener("pointermove", this.moved);
+    canvas.addEventListener("pointerleave", this.left);
+    canvas.addEventListener("keydown", this.typed);
+    this.watch = new ResizeObserver(() => this.resize());
+    this.watch.observe(canvas.parentElement ?? canvas);
+    this.resize();
+  }
+
+  /** Draw more buildings; until somebody moves the view it keeps showing all of them. */
+  add(batches: readonly Batch[]): void {
+    for (const batch of batches) {
+      const geometry = new BufferGeometry();
+      geometry.setAttribute("position", new BufferAttribute(batch.positions, 3));
+      geometry.setAttribute("normal", new BufferAttribute(batch.normals, 4, true));
+      geometry.setAttribute("color", new BufferAttribute(batch.colours, 4, true));
+      const hatch = batch.category === "fallback" || batch.category === "failed";
+      const mesh = new Mesh(geometry, hatch ? this.hatching : this.surface);
+      mesh.castShadow = batch.category !== "failed";
+      mesh.receiveShadow = true;
+      const lines = new BufferGeometry();
+      lines.setAttribute("position", new BufferAttribute(batch.edges, 3));
+      const edges = new LineSegments(lines, this.line);
+      const drawn = { batch, mesh, edges };
+      mesh.visible = edges.visible = !this.hidden.has(batch.category);
+      this.scene.add(mesh, edges);
+      this.drawn.push(drawn);
+      batch.ids.forEach((id, index) => {
+        this.places.set(id, { drawn, index });
+        this.bounds.union(boxOf(batch, index));
+      });
+    }
+    if (batches.length > 0 && !this.touched) this.fit(false);
+    this.settle();
+  }
+
+  /** All that is there was added: draw the ground beneath it. */
+  finish(): void {
+    if (this.bounds.isEmpty()) return;
+    const floors = this.drawn.flatMap(({ batch }) =>
+      batch.ids.flatMap((_, i) => {
+        const [x0, y0, z, x1, y1] = batch.boxes.subarray(6 * i, 6 * i + 6);
+        return [(x0 + x1) / 2, (y0 + y1) / 2, z];
+      }),
+    );
+    const size = this.bounds.getSize(new Vector3());
+    const margin = 0.35 * Math.max(size.x, size.y, 30);
+    const { min, max } = this.bounds;
+    const box = [min.x - margin, min.y - margin, max.x + margin, max.y + margin];
+    this.groundHeights = groundThrough(floors, box, 160);
+    if (this.groundMesh !== null) this.remove(this.groundMesh);
+    this.groundMesh = groundMesh(this.groundHeights);
+    this.groundMesh.receiveShadow = true;
+    this.scene.add(this.groundMesh);
+    this.paint();
+    this.settle();
+  }
+
+  /** Height of the drawn ground, 0 where there is none. */
+  groundAt(x: number, y: number): number {
+    return this.groundHeights === null ? 0 : heightAt(this.groundHeights, x, y);
+  }
+
+  /** Show or hide the buildings of a category. */
+  show(category: Category, visible: boolean): void {
+    if (visible) this.hidden.delete(category);
+    else this.hidden.add(category);
+    for (const { batch, mesh, edges } of this.drawn) {
+      if (batch.category === category) mesh.visible = edges.visible = visible;
+    }
+    this.settle();
+  }
+
+  /** Whether there is something to see of a building. */
+  has(id: string): boolean {
+    return this.places.has(id);
+  }
+
+  /** Mark a building, or none; `fly` brings it into view. */
+  select(id: string | null, fly: boolean): void {
+    if (this.selection !== null) {
+      this.remove(this.selection.mesh);
+      this.remove(this.selection.outline);
+      this.selection = null;
+    }
+    const place = id === null ? undefined : this.places.get(id);
+    if (place !== undefined) {
+      const { batch } = place.drawn;
+      const [from, to] = [batch.starts[place.index], batch.starts[place.index + 1]];
+      const geometry = new BufferGeometry();
+      geometry.setAttribute("position", new BufferAttribute(batch.positions.slice(3 * from, 3 * to), 3));
+      geometry.setAttribute("normal", new BufferAttribute(batch.normals.slice(4 * from, 4 * to), 4, true));
+      geometry.setAttribute("color", new BufferAttribute(batch.colours.slice(4 * from, 4 * to), 4, true));
+      const mesh = new Mesh(geometry, this.glow);
+      const ends = batch.edges.slice(3 * batch.edgeStarts[place.index], 3 * batch.edgeStarts[place.index + 1]);
+      const outline = new LineSegments2(new LineSegmentsGeometry().setPositions(ends), this.outline);
+      this.selection = { mesh, outline };
+      this.scene.add(mesh, outline);
+      if (fly) this.flyTo([boxOf(batch, place.index)], this.heading(), 3.2);
+    }
+    this.request();
+  }
+
+  /** See everything. */
+  fit(animated = true): void {
+    if (!this.bounds.isEmpty()) this.flyTo(this.boxes(), this.touched ? this.heading() : START.clone(), 1.0, animated);
+  }
+
+  /** See everything from straight above, north up. */
+  top(): void {
+    this.touched = true;
+    if (!this.bounds.isEmpty()) this.flyTo(this.boxes(), new Vector3(0, -0.001, 1), 1.0);
+  }
+
+  /** Nearer (above 1) or farther. */
+  zoom(factor: number): void {
+    this.touched = true;
+    const offset = this.camera.position.clone().sub(this.controls.target).divideScalar(factor);
+    this.camera.position.copy(this.controls.target).add(offset);
+    this.controls.update();
+    this.request();
+  }
+
+  /** Turn around the target, in degrees: to the left, and up. */
+  turn(leftDeg: number, upDeg: number): void {
+    this.touched = true;
+    const offset = this.camera.position.clone().sub(this.controls.target);
+    const length = offset.length();
+    const azimuth = Math.atan2(offset.y, offset.x) - (leftDeg * Math.PI) / 180;
+    const steep = Math.asin(offset.z / length) + (upDeg * Math.PI) / 180;
+    const elevation = Math.min(Math.max(steep, 0.02), Math.PI / 2 - 0.001);
+    offset.set(Math.cos(elevation) * Math.cos(azimuth), Math.cos(elevation) * Math.sin(azimuth), Math.sin(elevation));
+    this.camera.position.copy(this.controls.target).addScaledVector(offset, length);
+    this.controls.update();
+    this.request();
+  }
+
+  /** Give everything back to the browser. */
+  dispose(): void {
+    cancelAnimationFrame(this.frame);
+    this.frame = -1;
+    this.watch.disconnect();
+    this.dark.removeEventListener("change", this.paint);
+    this.controls.dispose();
+    for (const { mesh, edges } of this.drawn) {
+      mesh.geometry.dispose();
+      edges.geometry.dispose();
+    }
+    this.groundMesh?.geometry.dispose();
+    this.renderer.dispose();
+    this.renderer.forceContextLoss();
+  }
+
+  // --- drawing
+
+  /** Draw once, as soon as the browser does: nothing is drawn while nothing changes. */
+  private request(): void {
+    if (this.frame === 0) this.frame = requestAnimationFrame((now) => this.draw(now));
+  }
+
+  /** What casts shadows has changed. */
+  private settle(): void {
+    const size = this.bounds.isEmpty() ? 0 : this.bounds.getSize(new Vector3()).length();
+    this.sun.castShadow = size > 0 && size < SHADOW_M;
+    if (this.sun.castShadow) {
+      const middle = this.bounds.getCenter(new Vector3());
+      const radius = size / 2;
+      this.sun.target.position.copy(middle);
+      this.sun.position.copy(middle).add(new Vector3(-0.75, -0.35, 1.0).normalize().multiplyScalar(2 * radius));
+      const { camera } = this.sun.shadow;
+      camera.left = camera.bottom = -radius;
+      camera.right = camera.top = radius;
+      camera.near = 0.5 * radius;
+      camera.far = 4 * radius;
+      camera.updateProjectionMatrix();
+      this.sun.shadow.normalBias = Math.min(0.4, radius / 1000);
+      this.sun.shadow.bias = -0.0004;
+      this.renderer.shadowMap.needsUpdate = true;
+    } else {
+      this.sun.position.set(-0.75, -0.35, 1.0);
+      this.sun.target.position.set(0, 0, 0);
+    }
+    this.request();
+  }
+
+  private draw(now: number): void {
+    this.frame = 0;
+    if (this.flight !== null) this.fly(now);
+    else this.controls.update();
+    if (this.pointer !== null) this.hover(this.pointer);
+    const distance = this.camera.position.distanceTo(this.controls.target);
+    const radius = this.bounds.isEmpty() ? 100 : this.bounds.getSize(new Vector3()).length() / 2;
+    this.camera.near = Math.max(0.2, distance / 400);
+    this.camera.far = distance + 6 * radius;
+    this.camera.updateProjectionMatrix();
+    // lines of one pixel would cover what is small: they fade before they do
+    const pixelsPerMetre = this.canvas.clientHeight / (2 * distance * Math.tan((FOV_DEG * Math.PI) / 360));
+    this.line.opacity = Math.min(Math.max((pixelsPerMetre - 0.7) / 5, 0), 0.75);
+    this.line.visible = this.line.opacity > 0.02;
+    const began = performance.now();
+    this.renderer.render(this.scene, this.camera);
+    const { render } = this.renderer.info;
+    Object.assign(this.canvas.dataset, {
+      models: this.places.size,
+      triangles: render.triangles,
+      calls: render.calls,
+      frameMs: (performance.now() - began).toFixed(1),
+    });
+    if (this.flight !== null) this.request();
+  }
+
+  private readonly paint = (): void => {
+    const theme = this.dark.matches ? DARK : LIGHT;
+    this.scene.background = new Color(theme.background);
+    this.line.color.set(theme.edges);
+    this.outline.color.set(theme.accent);
+    this.sky.intensity = theme.sky;
+    this.sun.intensity = theme.sun;
+    if (this.groundMesh !== null) (this.groundMesh.material as MeshLambertMaterial).color.set(theme.ground);
+    this.request();
+  };
+
+  private resize(): void {
+    const place = this.canvas.parentElement ?? this.canvas;
+    const [width, height] = [Math.max(place.clientWidth, 1), Math.max(place.clientHeight, 1)];
+    this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    this.camera.updateProjectionMatrix();
+    if (!this.touched) this.fit(false);
+    this.request();
+  }
+
+  private remove(object: Mesh | LineSegments2): void {
+    this.scene.remove(object);
+    object.geometry.dispose();
+  }
+
+  // --- where it is seen from
+
+  /** The boxes of all buildings that are shown; of all where none is. */
+  private boxes(): Box3[] {
+    const shown = this.drawn.filter(({ mesh }) => mesh.visible);
+    return (shown.length > 0 ? shown : this.drawn).flatMap(({ batch }) => batch.ids.map((_, index) => boxOf(batch, index)));
+  }
+
+  /** From the target to the camera. */
+  private heading(): Vector3 {
+    return this.camera.position.clone().sub(this.controls.target);
+  }
+
+  /** See boxes from a direction, `room` times as far as they need. */
+  private flyTo(boxes: readonly Box3[], direction: Vector3, room: number, animated = true): void {
+    const toCamera = direction.normalize();
+    const right = new Vector3().crossVectors(new Vector3(0, 0, 1), toCamera).normalize();
+    const up = new Vector3().crossVectors(toCamera, right);
+    const tanV = Math.tan((FOV_DEG * Math.PI) / 360);
+    const [across, along] = [new Span(right, toCamera, tanV * this.camera.aspect), new Span(up, toCamera, tanV)];
+    const whole = new Box3();
+    for (const box of boxes) {
+      whole.union(box);
+      for (let corner = 0; corner < 8; corner++) {
+        const point = new Vector3(
+          (corner & 1 ? box.max : box.min).x,
+          (corner & 2 ? box.max : box.min).y,
+          (corner & 4 ? box.max : box.min).z,
+        );
+        across.take(point);
+        along.take(point);
+      }
+    }
+    const depth = whole.getCenter(new Vector3()).dot(toCamera);
+    const needed = Math.max(across.distance, along.distance) - depth;
+    const distance = Math.max(1.06 * room * needed, 12);
+    const target = new Vector3()
+      .addScaledVector(right, across.middle)
+      .addScaledVector(up, along.middle)
+      .addScaledVector(toCamera, depth);
+    const position = target.clone().addScaledVector(toCamera, distance);
+    if (!animated || this.still.matches) {
+      this.controls.target.copy(target);
+      this.camera.position.copy(position);
+      this.controls.update();
+    } else {
+      const start: [Vector3, Vector3] = [this.controls.target.clone(), this.camera.position.clone()];
+      this.flight = { from: performance.now(), start, end: [target, position] };
+    }
+    this.request();
+  }
+
+  private fly(now: number): void {
+    if (this.flight === null) return;
+    const { from, start, end } = this.flight;
+    const share = Math.min(Math.max((now - from) / FLIGHT_MS, 0), 1);
+    const eased = share * share * (3 - 2 * share);
+    this.controls.target.lerpVectors(start[0], end[0], eased);
+    this.camera.position.lerpVectors(start[1], end[1], eased);
+    if (share === 1) this.flight = null;
+    this.controls.update();
+  }
+
+  // --- what is pointed at
+
+  private under(event: PointerEvent): string | null {
+    const frame = this.canvas.getBoundingClientRect();
+    const x = (2 * (event.clientX - frame.left)) / frame.width - 1;
+    const y = 1 - (2 * (event.clientY - frame.top)) / frame.height;
+    const { ray } = castRay(new Vector2(x, y), this.camera);
+    const visible = this.drawn.filter(({ mesh }) => mesh.visible).map(({ batch }) => batch);
+    const hit = pick(visible, ray.origin.toArray(), ray.direction.toArray());
+    return hit?.batch.ids[hit.index] ?? null;
+  }
+
+  private hover(event: PointerEvent): void {
+    this.pointer = null;
+    const id = this.under(event);
+    if (id === this.hovered) return;
+    this.hovered = id;
+    this.canvas.classList.toggle("pointing", id !== null);
+  }
+
+  private readonly pressed = (event: PointerEvent): void => void this.down.set(event.clientX, event.clientY);
+
+  private readonly released = (event: PointerEvent): void => {
+    if (event.button !== 0 || this.down.distanceTo(new Vector2(event.clientX, event.clientY)) > CLICK_PX) return;
+    this.onPick(this.under(event));
+  };
+
+  private readonly moved = (event: PointerEvent): void => {
+    if (event.buttons !== 0 || event.pointerType === "touch") return;
+    this.pointer = event;
+    this.request();
+  };
+
+  private readonly left = (): void => {
+    this.pointer = null;
+    this.canvas.classList.remove("pointing");
+  };
+
+  private readonly typed = (event: KeyboardEvent): void => {
+    const action = (
+      {
+        ArrowLeft: () => this.turn(10, 0),
+        ArrowRight: () => this.turn(-10, 0),
+        ArrowUp: () => this.turn(0, 5),
+        ArrowDown: () => this.turn(0, -5),
+        "+": () => this.zoom(1.25),
+        "=": () => this.zoom(1.25),
+        "-": () => this.zoom(0.8),
+        f: () => this.fit(),
+        t: () => this.top(),
+        Escape: () => this.onPick(null),
+      } as Record<string, () => void>
+    )[event.key];
+    if (action === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    action();
+  };
+}
+
+/**
+ * Where a camera must stand on one of its axes, so that all points are within its frame.
+ *
+ * A point p is left of the right border when (p - c)·axis <= tan (c - p)·forward: the border's constraint is linear in
+ * the camera's place c, and the tightest of each side give both its middle and its least distance.
+ */
+class Span {
+  private high = -Infinity;
+  private low = -Infinity;
+
+  constructor(
+    private readonly axis: Vector3,
+    private readonly forward: Vector3,
+    private readonly tan: number,
+  ) {}
+
+  take(point: Vector3): void {
+    const [aside, near] = [point.dot(this.axis), this.tan * point.dot(this.forward)];
+    this.high = Math.max(this.high, near + aside);
+    this.low = Math.max(this.low, near - aside);
+  }
+
+  get middle(): number {
+    return (this.high - this.low) / 2;
+  }
+
+  get distance(): number {
+    return (this.high + this.low) / (2 * this.tan);
+  }
+}
+
+const caster = new Raycaster();
+
+function castRay(at: Vector2, camera: PerspectiveCamera): Raycaster {
+  camera.updateMatrixWorld();
+  caster.setFromCamera(at, camera);
+  return caster;
+}
+
+function boxOf(batch: Batch, index: number): Box3 {
+  const [x0, y0, z0, x1, y1, z1] = batch.boxes.subarray(6 * index, 6 * index + 6);
+  return new Box3(new Vector3(x0, y0, z0), new Vector3(x1, y1, z1));
+}
+
+/** The ground as a mesh that fades out towards its border. */
+function groundMesh(ground: Ground): Mesh {
+  const { nx, ny, cellM } = ground;
+  const positions = new Float32Array(3 * nx * ny);
+  const colours = new Float32Array(4 * nx * ny).fill(1);
+  for (let row = 0; row < ny; row++) {
+    for (let column = 0; column < nx; column++) {
+      const at = row * nx + column;
+      // a little below the floors, so that they do not flicker through
+      positions.set([ground.xMin + column * cellM, ground.yMin + row * cellM, ground.heights[at] - 0.06], 3 * at);
+      const u = (2 * column) / (nx - 1) - 1;
+      const v = (2 * row) / (ny - 1) - 1;
+      const fade = Math.min(Math.max((1 - Math.hypot(u, v)) / 0.35, 0), 1);
+      colours[4 * at + 3] = fade * fade * (3 - 2 * fade);
+    }
+  }
+  const index: number[] = [];
+  for (let row = 0; row + 1 < ny; row++) {
+    for (let column = 0; column + 1 < nx; column++) {
+      const a = row * nx + column;
+      index.push(a, a + 1, a + nx, a + 1, a + nx + 1, a + nx);
+    }
+  }
+  const geometry = new BufferGeometry();
+  geometry.setAttribute("position", new BufferAttribute(positions, 3));
+  geometry.setAttribute("color", new BufferAttribute(colours, 4));
+  geometry.setIndex(index);
+  geometry.computeVertexNormals();
+  const mesh = new Mesh(geometry, new MeshLambertMaterial({ vertexColors: true, transparent: true, depthWrite: false }));
+  mesh.renderOrder = -1;
+  return mesh;
+}

@@ -1,0 +1,321 @@
+import { Problem, getJson, request, upload, type UploadInfo } from "./api";
+import { el, svg } from "./elements";
+import { announce, asProblem, problemNotice, warningNotice } from "./notices";
+import { bytes, count, measure } from "./numbers";
+
+const TILE_ENDINGS = ".las,.laz,.ply,.xyz,.txt,.csv,.asc,.pts";
+const FOOTPRINT_ENDINGS = ".gpkg,.geojson,.json";
+const VERTICAL_UNITS = { "": "as in the file", m: "metres", ft: "feet", "us-ft": "US survey feet" };
+
+interface Sent {
+  file: File;
+  row: HTMLElement;
+  calledOff: AbortController;
+  uploaded: UploadInfo | null;
+  share: number;
+  problem: Problem | null;
+}
+
+interface InputDescription {
+  schema: { enum?: string[]; default?: string };
+}
+
+/** The form: tiles are sent as soon as they are dropped, the job starts on the button. */
+export class Submission {
+  private tiles: Sent[] = [];
+  private footprints: Sent | null = null;
+  private starting = false;
+  private readonly rows = el("ul", { class: "files" });
+  private readonly footprintRow = el("ul", { class: "files" });
+  private readonly note = el("div");
+  private readonly go = el("button", { type: "submit", class: "primary wide" }, "Reconstruct");
+  private readonly crs = el("input", { id: "crs", type: "text", placeholder: "EPSG:28992", autocomplete: "off", spellcheck: "false" });
+  private readonly verticalUnit = choice("vertical-unit", VERTICAL_UNITS);
+  private readonly method = choice("method", {});
+  private readonly classes = choice("classes", {});
+  private readonly title = el("input", { id: "title", type: "text", autocomplete: "off", maxlength: 200 });
+  private readonly options = el("details", { class: "options" });
+
+  constructor(
+    place: HTMLElement,
+    private readonly onSubmitted: (jobId: string) => void,
+    private readonly onProblem: (problem: Problem) => void,
+  ) {
+    const picker = el("input", { type: "file", id: "tiles", multiple: true, accept: TILE_ENDINGS, class: "visually-hidden" });
+    picker.addEventListener("change", () => {
+      this.addTiles([...(picker.files ?? [])]);
+      picker.value = "";
+    });
+    const zone = el(
+      "label",
+      { class: "drop", for: "tiles" },
+      svg("svg", { viewBox: "0 0 24 24", "aria-hidden": "true" }, svg("path", { d: "M12 16V4m-5 5 5-5 5 5M4 16v4h16v-4" })),
+      el("span", { class: "drop-title" }, "Drop tiles here"),
+      el("span", { class: "hint" }, "or choose files: LAS, LAZ, COPC, PLY, xyz"),
+    );
+    this.takeDrops(zone);
+    const footprintPicker = el("input", { type: "file", id: "footprints", accept: FOOTPRINT_ENDINGS });
+    footprintPicker.addEventListener("change", () => {
+      const file = footprintPicker.files?.[0];
+      if (file !== undefined) this.setFootprints(file);
+      footprintPicker.value = "";
+    });
+    this.options.append(
+      el("summary", {}, "Options"),
+      field("CRS", this.crs, "Where the file names none or a wrong one."),
+      field("Vertical unit", this.verticalUnit),
+      field("Method", this.method),
+      field("Classes of the file", this.classes, "Trusted, only compared with what is found, or not looked at."),
+      field("Footprints", footprintPicker, "GeoPackage or GeoJSON: one model a polygon."),
+      this.footprintRow,
+      field("Title", this.title),
+    );
+    const form = el(
+      "form",
+      { novalidate: true },
+      el("h2", { id: "submission-title" }, "New job"),
+      picker,
+      zone,
+      this.rows,
+      this.options,
+      this.note,
+      this.go,
+    );
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      void this.submit();
+    });
+    place.replaceChildren(form);
+    this.draw();
+    void this.describe();
+  }
+
+  /** Fill what can be chosen from the process's own description. */
+  private async describe(): Promise<void> {
+    try {
+      const process = await getJson<{ inputs: Record<string, InputDescription> }>("processes/reconstruct");
+      for (const [select, name] of [[this.method, "method"], [this.classes, "classes"]] as const) {
+        const schema = process.inputs[name]?.schema;
+        select.replaceChildren(
+          ...(schema?.enum ?? []).map((value) => el("option", { value, selected: value === schema?.default }, value)),
+        );
+      }
+    } catch (error) {
+      this.tell(asProblem(error));
+    }
+  }
+
+  /** Files may be dropped anywhere on the page: a miss by some pixels must not leave the page. */
+  private takeDrops(zone: HTMLElement): void {
+    let depth = 0;
+    const over = (on: boolean): void => void zone.classList.toggle("over", on);
+    document.addEventListener("dragenter", (event) => {
+      event.preventDefault();
+      depth += 1;
+      over(true);
+    });
+    document.addEventListener("dragleave", () => {
+      depth -= 1;
+      if (depth <= 0) over(false);
+    });
+    document.addEventListener("dragover", (event) => event.preventDefault());
+    document.addEventListener("drop", (event) => {
+      event.preventDefault();
+      depth = 0;
+      over(false);
+      this.addTiles([...(event.dataTransfer?.files ?? [])]);
+    });
+  }
+
+  private addTiles(files: File[]): void {
+    for (const file of files) {
+      const sent = this.send(file, () => {
+        this.tiles = this.tiles.filter((other) => other !== sent);
+      });
+      this.tiles.push(sent);
+      this.rows.append(sent.row);
+    }
+    this.draw();
+  }
+
+  private setFootprints(file: File): void {
+    this.footprints?.calledOff.abort();
+    const sent = this.send(file, () => {
+      this.footprints = null;
+    });
+    this.footprints = sent;
+    this.footprintRow.replaceChildren(sent.row);
+    this.draw();
+  }
+
+  /** Begin to send a file; its row tells how far it is and what the service makes of it. */
+  private send(file: File, forget: () => void): Sent {
+    const sent: Sent = {
+      file,
+      row: el("li", { class: "file" }),
+      calledOff: new AbortController(),
+      uploaded: null,
+      share: 0,
+      problem: null,
+    };
+    const remove = (): void => {
+      sent.calledOff.abort();
+      forget();
+      sent.row.remove();
+      this.draw();
+    };
+    const draw = (): void => drawRow(sent, remove);
+    draw();
+    upload(
+      file,
+      (share) => {
+        sent.share = share;
+        draw();
+      },
+      sent.calledOff.signal,
+    ).then(
+      (uploaded) => {
+        sent.uploaded = uploaded;
+        const problems = texts(uploaded.preflight["problems"]);
+        if (problems.length > 0) this.options.open = true;
+        announce(`${file.name} is uploaded. ${problems.join(" ")}`);
+        draw();
+        this.draw();
+      },
+      (error: unknown) => {
+        if (sent.calledOff.signal.aborted) return;
+        sent.problem = asProblem(error);
+        this.onProblem(sent.problem);
+        draw();
+        this.draw();
+      },
+    );
+    return sent;
+  }
+
+  private async submit(): Promise<void> {
+    if (this.go.getAttribute("aria-disabled") === "true") return;
+    this.starting = true;
+    this.note.replaceChildren();
+    this.draw();
+    try {
+      const names = this.tiles.map(({ file }) => file.name);
+      const inputs: Record<string, unknown> = {
+        tiles: this.tiles.map(({ uploaded }) => ({ href: uploaded?.href })),
+        title: this.title.value.trim() || (names.length > 1 ? `${names[0]} and ${names.length - 1} more` : names[0]),
+      };
+      const chosen: [string, string][] = [
+        ["crs", this.crs.value.trim()],
+        ["verticalUnit", this.verticalUnit.value],
+        ["method", this.method.value],
+        ["classes", this.classes.value],
+      ];
+      for (const [name, value] of chosen) if (value !== "") inputs[name] = value;
+      if (this.footprints?.uploaded != null) inputs["footprints"] = { href: this.footprints.uploaded.href };
+      const response = await request("processes/reconstruct/execution", {
+        method: "POST",
+        headers: { "Content-Type": "application/json" },
+        body: JSON.stringify({ inputs }),
+      });
+      const { jobID } = (await response.json()) as { jobID: string };
+      this.clear();
+      announce("The job is submitted.");
+      this.onSubmitted(jobID);
+    } catch (error) {
+      this.tell(asProblem(error));
+    } finally {
+      this.starting = false;
+      this.draw();
+    }
+  }
+
+  private clear(): void {
+    this.tiles = [];
+    this.footprints = null;
+    this.title.value = "";
+    this.rows.replaceChildren();
+    this.footprintRow.replaceChildren();
+  }
+
+  private tell(problem: Problem): void {
+    this.note.replaceChildren(problemNotice(problem));
+    this.onProblem(problem);
+  }
+
+  /** The button says what it waits for. */
+  private draw(): void {
+    const files = this.footprints === null ? this.tiles : [...this.tiles, this.footprints];
+    const refused = files.some(({ problem }) => problem !== null);
+    const waiting = files.some(({ uploaded, problem }) => uploaded === null && problem === null);
+    const ready = this.tiles.length > 0 && !refused && !waiting && !this.starting;
+    // not `disabled`: the button keeps its place in the tab order and its name tells why it waits
+    this.go.setAttribute("aria-disabled", String(!ready));
+    this.go.textContent = this.starting
+      ? "Submitting…"
+      : waiting
+        ? "Uploading…"
+        : refused
+          ? "Remove what was refused"
+          : "Reconstruct";
+  }
+}
+
+function drawRow(sent: Sent, remove: () => void): void {
+  const { file, uploaded, problem, row } = sent;
+  const head = el(
+    "div",
+    { class: "file-head" },
+    el("span", { class: "file-name", title: file.name }, file.name),
+    el("span", { class: "file-size" }, bytes(file.size)),
+    el("button", { type: "button", class: "icon", "aria-label": `Remove ${file.name}`, onclick: remove }, "×"),
+  );
+  if (problem !== null) {
+    row.replaceChildren(head, problemNotice(problem));
+  } else if (uploaded === null) {
+    // the same element while it moves: screen readers and transitions keep their place
+    const bar = row.querySelector("progress") ?? el("progress", { max: 1, "aria-label": `Upload of ${file.name}` });
+    bar.value = sent.share;
+    if (!bar.isConnected) row.replaceChildren(head, bar);
+  } else {
+    row.replaceChildren(head, ...preflight(uploaded.preflight));
+  }
+}
+
+/** What the service read in the header. */
+function preflight(told: Record<string, unknown>): HTMLElement[] {
+  const crs = told["crs"] as { name?: string; epsg?: number | null } | null | undefined;
+  const crsText = crs == null ? "no CRS" : crs.epsg == null ? (crs.name ?? "CRS without a code") : `EPSG:${crs.epsg}`;
+  const facts =
+    told["kind"] === "footprints"
+      ? [typeof told["featureCount"] === "number" ? `${count(told["featureCount"])} outlines` : null, crsText]
+      : [
+          typeof told["pointCount"] === "number" ? `${count(told["pointCount"])} points` : null,
+          typeof told["densityPerM2"] === "number" ? measure(told["densityPerM2"], 1, "per m²") : null,
+          crsText,
+        ];
+  const notes = [...texts(told["problems"]), ...texts(told["warnings"])];
+  return [
+    el("p", { class: "facts", title: crs?.name ?? null }, facts.filter((fact) => fact !== null).join(" · ")),
+    ...(notes.length === 0 ? [] : [warningNotice(...notes)]),
+  ];
+}
+
+function texts(value: unknown): string[] {
+  return Array.isArray(value) ? value.filter((entry) => typeof entry === "string") : [];
+}
+
+function choice(id: string, options: Record<string, string>): HTMLSelectElement {
+  return el("select", { id }, ...Object.entries(options).map(([value, label]) => el("option", { value }, label)));
+}
+
+function field(label: string, control: HTMLElement, hint?: string): HTMLElement {
+  const hintId = `${control.id}-hint`;
+  if (hint !== undefined) control.setAttribute("aria-describedby", hintId);
+  return el(
+    "div",
+    { class: "field" },
+    el("label", { for: control.id }, label),
+    control,
+    hint === undefined ? null : el("p", { class: "hint", id: hintId }, hint),
+  );
+}

@@ -1,0 +1,43 @@
+import { expect, test } from "vitest";
+import { SequenceReader } from "../src/cityjson";
+import { GABLE, METADATA } from "./gable";
+
+const read = (...lines: unknown[]) => {
+  const reader = new SequenceReader();
+  const buildings = lines.map((line) => reader.read(JSON.stringify(line)));
+  return { reader, buildings };
+};
+
+test("the metadata gives transform, EPSG code and extent", () => {
+  const { reader } = read(METADATA);
+  expect(reader.metadata?.epsg).toBe("25832");
+  expect(reader.metadata?.transform.translate).toEqual([565000, 5934000, 80]);
+  expect(reader.metadata?.extent).toHaveLength(6);
+});
+
+test("a feature gives its vertices in the CRS, its faces by kind and its record", () => {
+  const building = read(METADATA, GABLE).buildings[1];
+  expect(building?.id).toBe("house");
+  expect([...(building?.vertices.slice(27, 30) ?? [])]).toEqual([565010, 5934003, 95]);
+  expect(building?.faces.map(({ kind }) => kind)).toEqual(["roof", "roof", "wall", "wall", "wall", "wall", "ground"]);
+  expect(building?.attributes["roof_type"]).toBe("gable");
+});
+
+test("a later line of metadata stands for what follows it", () => {
+  const moved = { ...METADATA, transform: { scale: [0.01, 0.01, 0.01], translate: [0, 0, 0] } };
+  const building = read(METADATA, moved, GABLE).buildings[2];
+  expect([...(building?.vertices.slice(27, 30) ?? [])]).toEqual([100, 30, 150]);
+});
+
+test("a building without a model is a feature without faces", () => {
+  const failed = { type: "CityJSONFeature", id: "x", CityObjects: { x: { type: "Building", attributes: { status: "failed" } } }, vertices: [] };
+  const building = read(METADATA, failed).buildings[1];
+  expect(building?.faces).toEqual([]);
+  expect(building?.attributes["status"]).toBe("failed");
+});
+
+test("what is no CityJSONSeq is told", () => {
+  expect(() => read(GABLE)).toThrow("does not begin with its metadata");
+  expect(() => read({ type: "Feature" })).toThrow("type Feature");
+  expect(() => new SequenceReader().read("{")).toThrow(SyntaxError);
+});

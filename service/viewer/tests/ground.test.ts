@@ -1,0 +1,22 @@
+import { expect, test } from "vitest";
+import { groundThrough, heightAt } from "../src/ground";
+
+const BOX = [-10, -10, 110, 60];
+
+test("one floor makes a level ground", () => {
+  const ground = groundThrough([50, 20, 7], BOX, 32);
+  for (const height of ground.heights) expect(height).toBeCloseTo(7, 5);
+});
+
+test("the ground passes through every floor that has a node of its own", () => {
+  const floors = [0, 0, 10, 100, 0, 30, 0, 50, 20, 100, 50, 15];
+  const ground = groundThrough(floors, BOX, 120);
+  for (let i = 0; i < floors.length; i += 3) expect(heightAt(ground, floors[i], floors[i + 1])).toBeCloseTo(floors[i + 2], 4);
+});
+
+test("between and beyond the floors the ground stays between them", () => {
+  const floors = Array.from({ length: 40 }, (_, i) => [(i * 37) % 100, (i * 17) % 50, 5 + (i % 7)]).flat();
+  const { heights } = groundThrough(floors, BOX, 64);
+  expect(Math.min(...heights)).toBeGreaterThanOrEqual(5);
+  expect(Math.max(...heights)).toBeLessThanOrEqual(11);
+});

@@ -1,0 +1,48 @@
+import { expect, test } from "vitest";
+import { Batcher, type Batch } from "../src/batching";
+import { SequenceReader, type Building } from "../src/cityjson";
+import { pick } from "../src/picking";
+import { GABLE, METADATA } from "./gable";
+
+/** Houses side by side, 20 m apart, the first in the middle of the frame. */
+function houses(count: number): Batch[] {
+  const reader = new SequenceReader();
+  reader.read(JSON.stringify(METADATA));
+  const batcher = new Batcher({ origin: [565005, 5934003, 90], horizontalUnitM: 1, verticalUnitM: 1 });
+  for (let i = 0; i < count; i++) {
+    const house = reader.read(JSON.stringify(GABLE)) as Building;
+    house.vertices = house.vertices.map((value, at) => (at % 3 === 0 ? value + 20 * i : value));
+    batcher.add({ ...house, id: `house ${i}` });
+  }
+  return batcher.take();
+}
+
+test("a ray from above meets the roof of the building beneath it", () => {
+  const batches = houses(5);
+  for (let i = 0; i < 5; i++) {
+    const hit = pick(batches, [20 * i, 1, 100], [0, 0, -1]);
+    expect(hit?.batch.ids[hit.index]).toBe(`house ${i}`);
+    expect(hit?.distance).toBeCloseTo(100 - (5 - 2 / 3), 5);
+  }
+});
+
+test("the first of several buildings in a row is met, from either side", () => {
+  const batches = houses(4);
+  const from = (x: number, dx: number) => pick(batches, [x, 0, 1], [dx, 0, 0]);
+  expect(from(-50, 1)?.index).toBe(0);
+  expect(from(200, -1)?.index).toBe(3);
+  expect(from(200, 1)).toBeNull();
+});
+
+test("a ray through the box but beside the gable meets nothing", () => {
+  expect(pick(houses(1), [-50, 2.9, 4.5], [1, 0, 0])).toBeNull();
+  expect(pick(houses(1), [-50, 0, 4.5], [1, 0, 0])).not.toBeNull();
+});
+
+test("a batch knows where each building begins and ends", () => {
+  const [batch] = houses(3);
+  expect(batch.ids).toHaveLength(3);
+  expect(batch.starts[3]).toBe(batch.positions.length / 3);
+  expect(batch.edgeStarts[3]).toBe(batch.edges.length / 3);
+  expect([...batch.boxes.slice(6, 12)]).toEqual([15, -3, 0, 25, 3, 5]);
+});

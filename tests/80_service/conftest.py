@@ -1,0 +1,79 @@
+"""A service in this process, on a state folder of its own."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.app import create_app
+from service.jobs import InputReference, Job, JobRequest
+from service.keys import Scope, new_key
+from service.settings import ServiceSettings
+from service.store import JobStore
+
+OWN_URL = "http://127.0.0.1:8000"
+"""What the tests call the service; a foreign name is refused."""
+
+POINTS = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
+"""A point cloud as text, small and valid."""
+
+
+class LocalService:
+    """A service, its store, and what tests do with them again and again."""
+
+    def __init__(self, client: TestClient, store: JobStore, settings: ServiceSettings) -> None:
+        self.client = client
+        self.store = store
+        self.settings = settings
+
+    def upload(self, **headers: str) -> str:
+        """The id of an upload."""
+        answer = self.client.post("/uploads?filename=points.xyz", content=POINTS, headers=headers)
+        assert answer.status_code == 201, answer.text
+        return str(answer.json()["uploadID"])
+
+    def waiting(self, owner: str | None = None, **request: Any) -> Job:
+        """A job in the line."""
+        asked = JobRequest(tiles=(InputReference(kind="path", value="/srv/tile.laz"),), **request)
+        return self.store.create(asked, owner=owner, max_queued=1000, max_queued_per_key=1000)
+
+    def running(self, owner: str | None = None) -> Job:
+        """A job that a driver holds."""
+        self.waiting(owner)
+        job = self.store.claim("a driver", lease_s=3600.0, max_attempts=3)
+        assert job is not None
+        return job
+
+    def key(self, scope: Scope) -> dict[str, str]:
+        """A new key, as the header that sends it."""
+        key, secret = new_key(f"a key to {scope}", scope, now=self.store.now())
+        self.store.add_key(key)
+        return {"Authorization": f"Bearer {secret}"}
+
+
+Starting = Callable[..., LocalService]
+
+
+@pytest.fixture
+def starting(tmp_path: Path) -> Iterator[Starting]:
+    """Starts services with the settings that are given."""
+    with contextlib.ExitStack() as stack:
+
+        def start(**options: Any) -> LocalService:
+            settings = ServiceSettings(**{"state": tmp_path / "state", **options})
+            store = stack.enter_context(JobStore(settings.database))
+            client = TestClient(create_app(settings, store), OWN_URL, raise_server_exceptions=False)
+            return LocalService(stack.enter_context(client), store, settings)
+
+        yield start
+
+
+@pytest.fixture
+def local_service(starting: Starting) -> LocalService:
+    """A service on loopback, without keys."""
+    return starting()

@@ -1,0 +1,192 @@
+"""Finished runs of several tiles, written by the program's own export, and a service that holds them as jobs."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import dataclasses
+import datetime as dt
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyproj
+from starlette.testclient import TestClient
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "60_export"))
+
+import small_buildings as small
+
+from pipeline.export.records import RecordContext, RejectedObject
+from pipeline.export.tile import write_tile
+from pipeline.model import BuildingResult, Reason
+from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_manifest
+from service.app import create_app
+from service.files import StateFolder
+from service.jobs import InputReference, Job, JobFailure, JobRequest
+from service.outputs import write_outputs
+from service.settings import ServiceSettings
+from service.store import JobStore
+
+TILE_M = 100.0
+SERVER_FOLDER = "/srv/state/uploads/0f0f"
+"""Where the inputs of the runs lay: no answer may tell it."""
+
+Tiles = Mapping[str, Sequence[BuildingResult]]
+
+
+def ident(name: str) -> str:
+    """An id as the program makes them.
+
+    >>> ident("gable")
+    'l3sszh52dfv4652trj3l3k2l'
+    """
+    return base64.b32encode(hashlib.sha256(name.encode()).digest()[:15]).decode().lower()
+
+
+def placed(result: BuildingResult, name: str, east_m: float, north_m: float, up_m: float = 0.0) -> BuildingResult:
+    """A building with an id of its own, moved."""
+    x, y, z = small.ORIGIN
+    return dataclasses.replace(result, building_id=ident(name), origin=(x + east_m, y + north_m, z + up_m))
+
+
+def four_tiles() -> Tiles:
+    """Models, a fallback, a failure without outline, a building of two solids; one tile owns no building."""
+    return {
+        "x850_y4470": [
+            placed(small.gable(), "gable", 0.0, 0.0),
+            placed(small.courtyard(), "courtyard", 20.0, 40.0),
+            placed(small.failed(), "failed", 50.0, 50.0),
+        ],
+        "x851_y4470": [placed(small.two_parts(), "two_parts", 130.0, 20.0, 7.0)],
+        "x850_y4471": [placed(small.pent(), "pent", 10.0, 150.0, -3.0), placed(small.gable(), "far", 80.0, 190.0)],
+        "x851_y4471": [],
+    }
+
+
+def reference(epsg: int | None) -> small.Reference:
+    """A CRS as the exports see it; None for an unknown one."""
+    if epsg is None:
+        return small.Reference()
+    crs = pyproj.CRS.from_epsg(epsg)
+    unit_m = crs.axis_info[0].unit_conversion_factor
+    return small.Reference(epsg=epsg, projjson=crs.to_json_dict(), horizontal_unit_m=unit_m, vertical_unit_m=unit_m)
+
+
+def crs_facts(epsg: int | None) -> dict[str, Any]:
+    """The entry of run.json."""
+    crs = None if epsg is None else pyproj.CRS.from_epsg(epsg)
+    unit_m = reference(epsg).horizontal_unit_m
+    return {
+        "epsg": epsg,
+        "name": None if crs is None else crs.name,
+        "wkt": None if crs is None else crs.to_wkt(),
+        "horizontal_unit_m": unit_m,
+        "vertical_unit_m": unit_m,
+    }
+
+
+def write_run(
+    run_dir: Path,
+    tiles: Tiles | None = None,
+    *,
+    epsg: int | None = 7415,
+    meshes: str = "building",
+    failed_tile: str | None = None,
+    status: RunStatus = RunStatus.FINISHED,
+) -> Path:
+    """A run directory with these buildings a tile, and a rejected object in every tile."""
+    tiles = four_tiles() if tiles is None else tiles
+    context = RecordContext(
+        reference=reference(epsg),
+        settings_hash="0f" * 32,
+        engine_version="0.1.0",
+        acquired_from=dt.datetime(2014, 3, 1, 10, tzinfo=dt.UTC),
+        acquired_to=dt.datetime(2014, 3, 1, 11, tzinfo=dt.UTC),
+    )
+    (run_dir / "state").mkdir(parents=True)
+    for key, buildings in tiles.items():
+        shed = RejectedObject(
+            object_id=ident(f"shed of {key}"),
+            origin=buildings[0].origin if buildings else small.ORIGIN,
+            reason=Reason.TOO_SMALL,
+            reason_detail="4 m2, at least 10",
+            outline=small.Polygon([(50, 0), (52, 0), (52, 2), (50, 2)]),
+            area_m2=4.0,
+            height_m=2.5,
+            n_points=9,
+        )
+        files = write_tile(run_dir, key, buildings, [shed], context, meshes=meshes)
+        state = {"tile": key, "state": "done", "error": "", "files": dict(files.digests)}
+        (run_dir / "state" / f"{key}.json").write_text(json.dumps(state))
+    if failed_tile is not None:
+        state = {"tile": failed_tile, "state": "failed", "error": f"OSError: {run_dir}/scratch/a is gone", "files": {}}
+        (run_dir / "state" / f"{failed_tile}.json").write_text(json.dumps(state))
+    manifest = RunManifest(
+        status=status,
+        engine_version="0.1.0",
+        method="fuzzy-sart",
+        settings={"general": {"method": "fuzzy-sart"}},
+        settings_hash="0f" * 32,
+        started_at=dt.datetime(2026, 3, 1, 9, tzinfo=dt.UTC),
+        finished_at=dt.datetime(2026, 3, 1, 10, tzinfo=dt.UTC),
+        crs=crs_facts(epsg),
+        inputs=(
+            InputFile(path=f"{SERVER_FOLDER}/tile.laz", sha256="ab" * 32, size_bytes=1000, n_points=640),
+            InputFile(path=f"{SERVER_FOLDER}/outlines.gpkg", sha256="cd" * 32, size_bytes=20),
+        ),
+        source_licence="CC0",
+        tiles=tuple(sorted(tiles)),
+        failed_tiles=() if failed_tile is None else (failed_tile,),
+        counts={"points": 640, "candidates": sum(map(len, tiles.values()))},
+        timings_s={"split": 1.5, "total": 3.0},
+        peak_memory_bytes={"node-7:99": 3_000_000, "node-8:1": 5_000_000},
+        warnings=(f"{SERVER_FOLDER}/tile.laz: no GPS time", "something else"),
+        content_sha256="ee" * 32,
+    )
+    write_manifest(run_dir, manifest)
+    return run_dir
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Service:
+    """A service on this process's own state folder."""
+
+    client: TestClient
+    store: JobStore
+    folder: StateFolder
+
+    def running(self, **request: Any) -> Job:
+        """A job that a driver holds."""
+        tiles = (InputReference(kind="path", value=f"{SERVER_FOLDER}/tile.laz"),)
+        owner = request.pop("owner", None)
+        self.store.create(JobRequest(tiles=tiles, **request), owner=owner, max_queued=99, max_queued_per_key=99)
+        job = self.store.claim("a driver", lease_s=3600.0, max_attempts=3)
+        assert job is not None
+        return job
+
+    def finished(self, write: Callable[[Path], object] = write_run, **request: Any) -> str:
+        """The id of a job whose run is there."""
+        job = self.running(**request)
+        run_dir = self.folder.run(job.job_id, job.attempt)
+        write(run_dir)
+        write_outputs(run_dir, self.folder.outputs(job.job_id, job.attempt), job.request.outputs)
+        self.store.succeed(job, message="done", summary={})
+        return job.job_id
+
+    def failed(self, failure: JobFailure) -> str:
+        """The id of a job that failed."""
+        job = self.running()
+        self.store.fail(job, failure)
+        return job.job_id
+
+
+@contextlib.contextmanager
+def service(state: Path) -> Iterator[Service]:
+    """A service without keys."""
+    settings = ServiceSettings(state=state)
+    with JobStore(settings.database) as store, TestClient(create_app(settings, store), "http://127.0.0.1") as client:
+        yield Service(client=client, store=store, folder=StateFolder(state))

@@ -1,0 +1,495 @@
+"""Buildings by REST: pages by window and words against a slow twin, single buildings in three forms."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import geopandas
+import pytest
+import shapely
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from starlette.testclient import TestClient
+
+sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "60_export"))
+
+import cityjson_rules
+import finished_runs as runs
+import small_buildings as small
+
+from pipeline.export.geoparquet import read_table
+from service.outputs import building_pages, write_outputs
+from service.outputs.building_pages import BuildingQuery, building_page, parsed_bbox
+
+GABLE = runs.ident("gable")
+FAILED = runs.ident("failed")
+TWO_PARTS = runs.ident("two_parts")
+
+
+def nine_tiles() -> runs.Tiles:
+    """Twelve buildings in each of nine tiles, some without outline, some roof types."""
+    makers = (small.gable, small.pent, small.courtyard, small.failed)
+    return {
+        f"x{850 + column}_y{4470 + row}": [
+            runs.placed(makers[k % 4](), f"{column} {row} {k}", column * 100.0 + k * 8.0, row * 100.0 + k * 7.0)
+            for k in range(12)
+        ]
+        for column in range(3)
+        for row in range(3)
+    }
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[runs.Service]:
+    with runs.service(tmp_path_factory.mktemp("state")) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def client(service: runs.Service) -> TestClient:
+    return service.client
+
+
+@pytest.fixture(scope="module")
+def job_id(service: runs.Service) -> str:
+    """A job of six buildings in four tiles."""
+    return service.finished()
+
+
+@pytest.fixture(scope="module")
+def many(service: runs.Service) -> str:
+    """A job of 108 buildings in nine tiles."""
+    return service.finished(lambda run_dir: runs.write_run(run_dir, nine_tiles()))
+
+
+@pytest.fixture(scope="module")
+def out_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The outputs of 108 buildings in nine tiles."""
+    folder = tmp_path_factory.mktemp("many")
+    write_outputs(runs.write_run(folder / "run", nine_tiles()), folder / "out")
+    return folder / "out"
+
+
+def page(client: TestClient, job_id: str, **asked: Any) -> dict[str, Any]:
+    """A page of buildings."""
+    names = {name.replace("_crs", "-crs"): value for name, value in asked.items()}
+    answer = client.get(f"/jobs/{job_id}/buildings", params=names)
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["content-type"] == "application/geo+json"
+    found: dict[str, Any] = answer.json()
+    assert found["numberReturned"] == len(found["features"])
+    return found
+
+
+def ids(found: dict[str, Any]) -> list[str]:
+    return [feature["id"] for feature in found["features"]]
+
+
+def refused(client: TestClient, job_id: str, **asked: Any) -> str:
+    """The detail of a request that is refused."""
+    names = {name.replace("_crs", "-crs"): value for name, value in asked.items()}
+    answer = client.get(f"/jobs/{job_id}/buildings", params=names)
+    assert answer.status_code == 400, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    return str(answer.json()["detail"])
+
+
+# --- pages -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_candidate_is_there_also_one_without_outline(client: TestClient, job_id: str) -> None:
+    found = page(client, job_id)
+    names = ["gable", "courtyard", "failed", "two_parts", "pent", "far"]
+    assert ids(found) == sorted(map(runs.ident, names))
+    assert found["numberMatched"] == 6
+    (lost,) = [feature for feature in found["features"] if feature["id"] == FAILED]
+    assert lost["geometry"] is None
+    assert lost["properties"]["reason"] == "too_few_points"
+
+
+def test_the_pages_together_are_the_output_in_the_order_of_ids(client: TestClient, many: str) -> None:
+    whole = {f["id"]: f for f in client.get(f"/jobs/{many}/results/geojson").json()["features"]}
+    url: str | None = f"/jobs/{many}/buildings?limit=25"
+    found, pages = [], 0
+    while url is not None:
+        answer = client.get(url).json()
+        assert answer["numberMatched"] == 108
+        found += answer["features"]
+        pages += 1
+        url = next((link["href"] for link in answer["links"] if link["rel"] == "next"), None)
+    assert pages == 5
+    assert [feature["id"] for feature in found] == sorted(whole)
+    assert all(feature == whole[feature["id"]] for feature in found)
+
+
+def test_links_lead_on_back_and_up_with_the_same_question(client: TestClient, many: str) -> None:
+    asked = {"status": "ok", "limit": 10, "offset": 20, "bbox": "4.3,52,4.4,52.1"}
+    found = page(client, many, **asked)
+    links = {link["rel"]: link["href"] for link in found["links"]}
+    assert set(links) == {"self", "next", "prev", "collection"}
+    assert client.get(links["self"]).json()["features"] == found["features"]
+    assert ids(client.get(links["next"]).json()) == ids(page(client, many, **asked | {"offset": 30}))
+    assert ids(client.get(links["prev"]).json()) == ids(page(client, many, **asked | {"offset": 10}))
+    assert client.get(links["collection"]).json()["jobID"] == many
+
+
+def test_a_page_behind_the_end_is_empty(client: TestClient, job_id: str) -> None:
+    found = page(client, job_id, offset=10**12)
+    assert (found["features"], found["numberMatched"]) == ([], 6)
+    assert "next" not in {link["rel"] for link in found["links"]}
+
+
+def test_native_coordinates_are_those_of_the_table(client: TestClient, service: runs.Service, job_id: str) -> None:
+    answer = client.get(f"/jobs/{job_id}/buildings", params={"crs": "native"})
+    assert answer.headers["content-crs"] == "<http://www.opengis.net/def/crs/EPSG/0/28992>"
+    found = answer.json()
+    assert found["coordRefSys"] == "http://www.opengis.net/def/crs/EPSG/0/28992"
+    table = read_table(str(service.folder.run(job_id, 1)), "buildings").to_pylist()
+    own = {row["building_id"]: row for row in table}
+    for feature in found["features"]:
+        wkb = own[feature["id"]]["geometry"]
+        if wkb is None:
+            assert feature["geometry"] is None
+        else:
+            assert shapely.geometry.shape(feature["geometry"]).equals_exact(shapely.from_wkb(wkb))
+        assert feature["properties"]["roof_type"] == own[feature["id"]]["roof_type"]
+    plain = client.get(f"/jobs/{job_id}/buildings")
+    assert plain.headers["content-crs"] == "<http://www.opengis.net/def/crs/OGC/1.3/CRS84>"
+    assert "coordRefSys" not in plain.json()
+
+
+def test_a_window_in_degrees_and_one_in_metres_find_the_same(client: TestClient, job_id: str) -> None:
+    native = page(client, job_id, bbox="85125,447015,85155,447030", bbox_crs="native")
+    assert ids(native) == [TWO_PARTS]
+    box = shapely.geometry.shape(native["features"][0]["geometry"]).bounds
+    degrees = ",".join(str(v) for v in box)
+    assert ids(page(client, job_id, bbox=degrees)) == [TWO_PARTS]
+    uri = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
+    assert ids(page(client, job_id, bbox=degrees, bbox_crs=uri, crs=uri)) == [TWO_PARTS]
+
+
+def test_the_border_of_a_window_belongs_to_it(client: TestClient, job_id: str) -> None:
+    touching = page(client, job_id, bbox="84990,446990,85000,447000", bbox_crs="native")
+    assert ids(touching) == [GABLE]
+    beside = page(client, job_id, bbox="84990,446990,84999.999,447000", bbox_crs="native")
+    assert ids(beside) == []
+
+
+def test_words_filter_alone_repeated_and_with_commas(client: TestClient, job_id: str) -> None:
+    assert ids(page(client, job_id, status="failed")) == [FAILED]
+    both = sorted([FAILED, runs.ident("courtyard")])
+    assert ids(page(client, job_id, status="failed,fallback")) == both
+    assert ids(page(client, job_id, status=["failed", "fallback"])) == both
+    assert ids(page(client, job_id, reason="invalid_solid")) == [runs.ident("courtyard")]
+    assert ids(page(client, job_id, roof_type="pent", status="ok")) == [runs.ident("pent")]
+    assert ids(page(client, job_id, roof_type="pent", status="failed")) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("bbox", "1,2,3", "give four numbers"),
+        ("bbox", "1,2,3,4,5,6", "give four numbers"),
+        ("bbox", "a,b,c,d", "give four numbers"),
+        ("bbox", "nan,0,1,1", "give four numbers"),
+        ("bbox", "inf,0,1,1", "give four numbers"),
+        ("bbox", "", "give four numbers"),
+        ("bbox", "0,2,1,1", "south 2 lies north"),
+        ("bbox", "170,0,-170,1", "180th meridian is asked for in two halves"),
+        ("bbox-crs", "EPSG:28992", "bbox-crs"),
+        ("crs", "epsg", "crs"),
+        ("limit", "0", "limit"),
+        ("limit", "10001", "limit"),
+        ("offset", "-1", "offset"),
+        ("offset", str(2**64), "offset"),
+        ("status", "fine", "'fine': use one of ok, fallback, failed"),
+        ("roof_type", "onion", "'onion': use one of flat, pent"),
+        ("reason", "bad luck", "'bad luck': use one of"),
+    ],
+)
+def test_what_means_nothing_is_refused_with_the_fix(
+    client: TestClient, job_id: str, name: str, value: str, told: str
+) -> None:
+    assert told in refused(client, job_id, **{name: value})
+
+
+def test_all_wrong_words_are_told_at_once(client: TestClient, job_id: str) -> None:
+    detail = refused(client, job_id, status="fine", roof_type="onion")
+    assert "'fine'" in detail
+    assert "'onion'" in detail
+
+
+def test_a_page_is_only_geojson(client: TestClient, job_id: str) -> None:
+    path = f"/jobs/{job_id}/buildings"
+    for accept in ("application/json", "application/geo+json", "*/*"):
+        assert client.get(path, headers={"Accept": accept}).headers["content-type"] == "application/geo+json"
+    assert client.get(path, headers={"Accept": "text/html"}).status_code == 406
+
+
+def test_a_large_page_comes_in_pieces(out_dir: Path) -> None:
+    found = building_page(out_dir, BuildingQuery(limit=10_000))
+    chunks = list(found.chunks({"links": []}))
+    assert len(chunks) > 1
+    assert max(map(len, chunks)) < 2 * 65_536
+    assert len(json.loads(b"".join(chunks))["features"]) == 108
+
+
+def test_geopandas_reads_a_page(client: TestClient, job_id: str) -> None:
+    frame = geopandas.GeoDataFrame.from_features(page(client, job_id)["features"], crs="OGC:CRS84")
+    assert len(frame) == 6
+    assert frame.geometry.isna().sum() == 1
+
+
+# --- against a slow twin ---------------------------------------------------------------------------------------------
+
+_WORDS = {
+    "statuses": ("ok", "fallback", "failed"),
+    "roof_types": ("gable", "pent", "flat", "none", "hip"),
+    "reasons": ("invalid_solid", "too_few_points", "no_plane"),
+}
+
+
+@st.composite
+def queries(draw: st.DrawFn) -> BuildingQuery:
+    """Questions of every kind, narrow and wide."""
+    bbox = None
+    if draw(st.booleans()):
+        x, y = draw(st.floats(84_900, 85_400)), draw(st.floats(446_900, 447_400))
+        bbox = (x, y, x + draw(st.floats(0, 400)), y + draw(st.floats(0, 400)))
+    words = {
+        name: tuple(draw(st.lists(st.sampled_from(allowed), max_size=2, unique=True)))
+        for name, allowed in _WORDS.items()
+    }
+    limit, offset = draw(st.integers(1, 120)), draw(st.integers(0, 60))
+    return BuildingQuery(bbox=bbox, bbox_native=True, native=True, limit=limit, offset=offset, **words)
+
+
+def twin(features: list[dict[str, Any]], query: BuildingQuery) -> list[str]:
+    """The ids that fit, found by looking at every feature."""
+    found = []
+    for feature in features:
+        record = feature["properties"]
+        if query.bbox is not None:
+            if feature["geometry"] is None:
+                continue
+            if not shapely.box(*shapely.geometry.shape(feature["geometry"]).bounds).intersects(
+                shapely.box(*query.bbox)
+            ):
+                continue
+        if query.statuses and record["status"] not in query.statuses:
+            continue
+        if query.roof_types and record["roof_type"] not in query.roof_types:
+            continue
+        if query.reasons and record["reason"] not in query.reasons:
+            continue
+        found.append(feature["id"])
+    return sorted(found)
+
+
+@pytest.mark.parametrize("narrow_share", [0.0, 0.25, 1.0])
+def test_pages_are_what_a_look_at_every_building_finds(
+    out_dir: Path, narrow_share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(building_pages, "_NARROW_SHARE", narrow_share)
+    every = building_page(out_dir, BuildingQuery(native=True, limit=10_000))
+    features = [json.loads(text) for text in every.features()]
+    assert len(features) == 108
+
+    @settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+    @given(queries())
+    def check(query: BuildingQuery) -> None:
+        expected = twin(features, query)
+        found = building_page(out_dir, query)
+        assert found.matched == len(expected)
+        told = [json.loads(text)["id"] for text in found.features()]
+        assert told == expected[query.offset : query.offset + query.limit]
+
+    check()
+
+
+@given(st.text(alphabet="0123456789.,-+einfa ", max_size=40))
+def test_any_text_is_a_window_or_refused(text: str) -> None:
+    try:
+        west, south, east, north = parsed_bbox(text, native=False)
+    except building_pages.RequestError as error:
+        assert "bbox" in str(error)
+    else:
+        assert west <= east
+        assert south <= north
+
+
+# --- one building ----------------------------------------------------------------------------------------------------
+
+
+def test_a_building_is_told_with_all_columns_and_its_planes(client: TestClient, job_id: str) -> None:
+    answer = client.get(f"/jobs/{job_id}/buildings/{TWO_PARTS}")
+    assert answer.headers["content-type"] == "application/geo+json"
+    found = answer.json()
+    (listed,) = [f for f in page(client, job_id)["features"] if f["id"] == TWO_PARTS]
+    planes = found["properties"].pop("planes")
+    assert found["properties"] == listed["properties"]
+    assert found["geometry"] == listed["geometry"]
+    assert [plane["plane_id"] for plane in planes] == [0, 1, 2, 3]
+    assert {plane["slope_deg"] for plane in planes} == {36.8699}
+    assert {"aspect_deg", "area_m2", "coefficients", "origin_x", "n_points", "rmse_m"} <= set(planes[0])
+    links = {link["type"]: link["href"] for link in found["links"] if link["rel"] == "alternate"}
+    for media_type, href in links.items():
+        assert client.get(href).headers["content-type"] == media_type
+    assert set(links) == {"model/obj", "application/city+json"}
+
+
+def test_the_form_is_chosen_by_f_or_by_the_header(client: TestClient, job_id: str) -> None:
+    path = f"/jobs/{job_id}/buildings/{GABLE}"
+    for form, media_type in (("json", "application/geo+json"), ("obj", "model/obj")):
+        assert client.get(path, params={"f": form}).headers["content-type"] == media_type
+        assert client.get(path, headers={"Accept": media_type}).headers["content-type"] == media_type
+    asked = {"Accept": "application/city+json, model/obj;q=0.5"}
+    assert client.get(path, headers=asked).headers["content-type"] == "application/city+json"
+    assert client.get(path, params={"f": "obj"}, headers=asked).headers["content-type"] == "model/obj"
+    assert client.get(path, headers={"Accept": "image/png"}).status_code == 406
+    assert client.get(path, params={"f": "glb"}).status_code == 400
+
+
+def test_the_mesh_is_the_file_of_the_run(client: TestClient, service: runs.Service, job_id: str) -> None:
+    sent = client.get(f"/jobs/{job_id}/buildings/{TWO_PARTS}", params={"f": "obj"})
+    assert sent.content == (service.folder.run(job_id, 1) / f"meshes/x851_y4470/{TWO_PARTS}.obj").read_bytes()
+
+
+def test_the_mesh_out_of_a_tiles_file_is_the_same(client: TestClient, service: runs.Service, job_id: str) -> None:
+    in_tiles = service.finished(lambda run_dir: runs.write_run(run_dir, meshes="tile"), meshes="tile")
+    for name in ("gable", "courtyard", "two_parts", "pent", "far"):
+        own, cut = (
+            client.get(f"/jobs/{job}/buildings/{runs.ident(name)}", params={"f": "obj"}) for job in (job_id, in_tiles)
+        )
+        assert own.status_code == cut.status_code == 200
+        assert own.content == cut.content
+
+
+def test_a_building_without_model_has_no_mesh_and_says_why(client: TestClient, job_id: str) -> None:
+    answer = client.get(f"/jobs/{job_id}/buildings/{FAILED}", params={"f": "obj"})
+    assert answer.status_code == 404
+    assert "has no model (too_few_points)" in answer.json()["detail"]
+    links = client.get(f"/jobs/{job_id}/buildings/{FAILED}").json()["links"]
+    assert "model/obj" not in {link["type"] for link in links}
+
+
+def test_a_job_without_meshes_says_so(service: runs.Service) -> None:
+    job = service.finished(lambda run_dir: runs.write_run(run_dir, meshes="none"), meshes="none")
+    answer = service.client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": "obj"})
+    assert answer.status_code == 404
+    assert "asked for no meshes" in answer.json()["detail"]
+    assert service.client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": "cityjson"}).status_code == 200
+
+
+def cjio(path: Path, *words: str) -> str:
+    """Run cjio in a process of its own, since it changes Python's json on import."""
+    command = [sys.executable, "-c", "from cjio.cjio import cli; cli()", str(path), *words]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+@pytest.mark.parametrize("name", ["two_parts", "courtyard", "failed"])
+def test_the_city_object_is_a_document_of_its_own(client: TestClient, job_id: str, name: str, tmp_path: Path) -> None:
+    sent = client.get(f"/jobs/{job_id}/buildings/{runs.ident(name)}", params={"f": "cityjson"})
+    assert sent.headers["content-type"] == "application/city+json"
+    document = sent.json()
+    assert (document["type"], document["version"]) == ("CityJSON", "2.0")
+    # the same rules as for a sequence of one line of metadata and one feature
+    header = {**document, "CityObjects": {}, "vertices": []}
+    feature = {"type": "CityJSONFeature", "id": runs.ident(name)}
+    feature |= {part: document[part] for part in ("CityObjects", "vertices")}
+    assert cityjson_rules.faults([header, feature]) == []
+    path = tmp_path / "one.city.json"
+    path.write_bytes(sent.content)
+    assert "Building" in cjio(path, "info")
+    obj = client.get(f"/jobs/{job_id}/buildings/{runs.ident(name)}", params={"f": "obj"})
+    if obj.status_code == 200:
+        corners = [tuple(map(float, xyz)) for xyz in re.findall(r"^v (\S+) (\S+) (\S+)$", obj.text, re.MULTILINE)]
+        scale, shift = document["transform"]["scale"], document["transform"]["translate"]
+        stood = [
+            tuple(round(v * s + t, 3) for v, s, t in zip(xyz, scale, shift, strict=True))
+            for xyz in document["vertices"]
+        ]
+        assert stood == corners
+        low, high = (tuple(pick(axis) for axis in zip(*corners, strict=True)) for pick in (min, max))
+        assert tuple(document["metadata"]["geographicalExtent"]) == pytest.approx((*low, *high))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [runs.ident("nobody"), "x", "A" * 24, "a" * 25, "..", "%2e%2e%2frun.json", "..%2f..%2frun.json", "%00", "' OR 1"],
+)
+def test_any_other_id_is_no_building(client: TestClient, job_id: str, name: str) -> None:
+    for form in ("json", "obj", "cityjson"):
+        answer = client.get(f"/jobs/{job_id}/buildings/{name}", params={"f": form})
+        # a path that leads elsewhere is never a building
+        assert answer.status_code == 404 or "jobID" in answer.json()
+        assert b"engine_version" not in answer.content
+
+
+# --- an unknown CRS --------------------------------------------------------------------------------------------------
+
+
+def test_where_the_crs_is_unknown_there_are_only_the_tiles_own_coordinates(service: runs.Service) -> None:
+    job = service.finished(lambda run_dir: runs.write_run(run_dir, epsg=None))
+    answer = service.client.get(f"/jobs/{job}/buildings", params={"bbox": "84990,446990,85011,447001"})
+    assert "content-crs" not in answer.headers
+    found = answer.json()
+    assert found["coordRefSys"] is None
+    assert ids(found) == [GABLE]
+    assert shapely.geometry.shape(found["features"][0]["geometry"]).bounds == (85_000.0, 447_000.0, 85_010.0, 447_008.0)
+    assert page(service.client, job, crs="native", bbox_crs="native")["numberMatched"] == 6
+    assert "the CRS of the tiles is unknown: use native" in refused(service.client, job, crs="CRS84")
+    assert "the CRS of the tiles is unknown: use native" in refused(service.client, job, bbox_crs="CRS84")
+    one = service.client.get(f"/jobs/{job}/buildings/{GABLE}").json()
+    assert one["coordRefSys"] is None
+    assert service.client.get(f"/jobs/{job}/buildings/{GABLE}", params={"crs": "CRS84"}).status_code == 400
+
+
+# --- the process that answers ----------------------------------------------------------------------------------------
+
+_ANSWER = """
+import json, sys
+from pathlib import Path
+import service.routes.buildings, service.routes.results
+from service.outputs import output_file
+from service.outputs.building_pages import BuildingQuery, building_page
+from service.outputs.single_building import building_cityjson, building_obj, stored_building
+run, out = Path(sys.argv[1]), Path(sys.argv[2])
+output_file(out, "buildings")
+page = building_page(out, BuildingQuery(bbox=(4.0, 51.0, 5.0, 53.0), statuses=("ok",)))
+first = json.loads(next(page.features()))["id"]
+one = stored_building(out, first)
+list(building_obj(run, one)), building_cityjson(run, one)
+print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
+"""
+
+
+def test_answering_loads_no_numerical_library(out_dir: Path) -> None:
+    command = [sys.executable, "-c", _ANSWER, str(out_dir.parent / "run"), str(out_dir)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    loaded = set(json.loads(result.stdout))
+    heavy = {"numba", "scipy", "pandas", "geopandas", "matplotlib", "dask", "distributed", "pyarrow", "pyproj", "laspy"}
+    assert loaded & heavy == set()
+    assert {"fastapi", "sqlite3"} <= loaded
+
+
+def test_the_openapi_document_describes_pages_and_buildings(client: TestClient) -> None:
+    described = client.get("/openapi.json").json()["paths"]
+    listed = described["/jobs/{jobID}/buildings"]["get"]
+    assert {entry["name"] for entry in listed["parameters"]} == {
+        *("jobID", "bbox", "bbox-crs", "crs", "status", "roof_type", "reason", "limit", "offset")
+    }
+    one = described["/jobs/{jobID}/buildings/{buildingID}"]["get"]["responses"]
+    assert set(one["200"]["content"]) == {"application/geo+json", "model/obj", "application/city+json"}
+    for answers in (listed["responses"], one):
+        assert {"200", "400", "401", "403", "404", "406", "422", "429", "500", "503"} <= set(answers)
+    assert listed["responses"]["200"]["content"]["application/geo+json"]["example"]["features"]

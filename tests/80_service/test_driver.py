@@ -1,0 +1,642 @@
+"""The driver with a scripted run in place of the science: what becomes of a job, whatever happens."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Self, TypeVar
+
+import pytest
+
+from pipeline.errors import ClusterError, RunCancelledError, UnreadableInputError
+from pipeline.runtime.events import Event
+from pipeline.runtime.run import RunSummary
+from service.driver import process
+from service.driver.attempt import Tools
+from service.driver.clusters import SharedCluster, answers
+from service.driver.janitor import tidy, tidy_jobs
+from service.driver.process import Driver
+from service.errors import StoreError
+from service.fetching import Fetched
+from service.files import StateFolder
+from service.jobs import Fault, InputReference, Job, JobRequest, JobStatus, Upload
+from service.settings import ServiceSettings
+from service.store import JobStore
+
+Value = TypeVar("Value")
+
+DEADLINE_S = 60.0
+
+
+def until(condition: Callable[[], Value | None], what: str) -> Value:
+    end = time.monotonic() + DEADLINE_S
+    while True:
+        value = condition()
+        if value:
+            return value
+        assert time.monotonic() < end, f"waited in vain for {what}"
+        time.sleep(0.01)
+
+
+class Engine:
+    """A cluster that only counts."""
+
+    started = 0
+    stopped = 0
+
+    def executor(self, priority: int = 0) -> Any:
+        return SimpleNamespace(priority=priority)
+
+    def __enter__(self) -> Self:
+        type(self).started += 1
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        type(self).stopped += 1
+
+
+class Script:
+    """A run that does what the test says; by default it tells some progress and succeeds."""
+
+    def __init__(self) -> None:
+        self.runs = 0
+        self.seen: list[Any] = []
+        self.steps: list[Callable[[Any, Callable[[Event], None], Callable[[], bool]], None]] = []
+        self.go_on = threading.Event()
+
+    def gather(self, request: JobRequest, *, target: Path, **_others: Any) -> tuple[list[Fetched], None]:
+        target.mkdir(parents=True)
+        tiles = []
+        for number, tile in enumerate(request.tiles):
+            path = target / f"tile {number}.laz"
+            path.write_bytes(b"points")
+            tiles.append(Fetched(reference=tile, path=path, points=1, sha256=None))
+        return tiles, None
+
+    def run(self, request: Any, on_event: Callable[[Event], None], executor: Any, cancelled: Any) -> RunSummary:
+        self.runs += 1
+        self.seen.append((request, executor))
+        Path(request.out).mkdir(parents=True)
+        Path(request.out, "run.json").write_text("{}")
+        for done in range(4):
+            on_event(Event(kind="progress", stage="split", done=done, total=3))
+        on_event(Event(kind="warning", stage="split", message=f"{request.inputs[0]}: odd, see {request.out}/run.json"))
+        if len(self.steps) >= self.runs:
+            self.steps[self.runs - 1](request, on_event, cancelled)
+        return RunSummary(
+            run_dir=request.out,
+            digest="d" * 64,
+            statuses={"ok": 2},
+            reasons={},
+            rejected={"tree": 1},
+            roof_types={"gable": 2},
+            counts={"points": 6},
+            timings_s={"total": 0.5},
+            peak_memory_bytes={"host:1": 5},
+            warnings=(f"{request.inputs[0]}: odd",),
+        )
+
+    def write_outputs(
+        self, _run_dir: Path, out_dir: Path, _wanted: Any, on_progress: Callable[[int, int], None]
+    ) -> None:
+        out_dir.mkdir()
+        (out_dir / "outputs.json").write_text("{}")
+        on_progress(1, 1)
+
+    def raises(self, error: Exception) -> None:
+        """The next run raises."""
+
+        def step(request: Any, on_event: Any, cancelled: Any) -> None:
+            raise error
+
+        self.steps.append(step)
+
+    def waits(self, on_event: Event | None = None) -> None:
+        """The next run goes on until the test says so, or until it is called off."""
+
+        def step(request: Any, tell: Callable[[Event], None], cancelled: Callable[[], bool]) -> None:
+            if on_event is not None:
+                tell(on_event)
+            while not self.go_on.wait(0.01):
+                if cancelled():
+                    raise RunCancelledError("the run was called off")
+
+        self.steps.append(step)
+
+
+class Bench:
+    """A store, a state folder, and drivers in threads."""
+
+    def __init__(self, folder: Path) -> None:
+        self.script = Script()
+        self.settings = ServiceSettings(
+            state=folder, poll_s=0.02, lease_s=30.0, driver_jobs=1, drain_s=30.0, max_attempts=3
+        )
+        self.store = JobStore(self.settings.database)
+        self.store.migrate()
+        self.folder = StateFolder(folder.resolve())
+        self._running: list[tuple[Driver, threading.Thread]] = []
+        self.codes: list[int] = []
+
+    def driver(self, *, parent_pipe: int | None = None, **changed: Any) -> Driver:
+        settings = self.settings.model_copy(update=changed)
+        tools = Tools(gather=self.script.gather, run=self.script.run, write_outputs=self.script.write_outputs)
+        cluster = SharedCluster(settings, Engine)
+        driver = Driver(settings, name=f"d{len(self._running)}", parent_pipe=parent_pipe, tools=tools, cluster=cluster)
+        thread = threading.Thread(target=lambda: self.codes.append(driver.run()), daemon=True)
+        self._running.append((driver, thread))
+        thread.start()
+        return driver
+
+    def submit(self, **values: Any) -> Job:
+        request = JobRequest(tiles=(InputReference(kind="path", value="/data/a.laz"),))
+        return self.store.create(request, owner=None, max_queued=100, max_queued_per_key=100, **values)
+
+    def becomes(self, job: Job, *statuses: JobStatus) -> Job:
+        def there() -> Job | None:
+            found = self.store.get(job.job_id)
+            return found if found.status in statuses else None
+
+        return until(there, f"{statuses}, it is {self.store.get(job.job_id)}")
+
+    def over(self, job: Job) -> Job:
+        return self.becomes(job, *(status for status in JobStatus if status.is_over))
+
+    def runs(self, number: int = 1) -> None:
+        until(lambda: self.script.runs >= number, f"run {number}")
+
+    def end(self, *, at_once: bool = True) -> None:
+        for driver, _ in self._running:
+            driver.stop(at_once=at_once)
+        self.join()
+
+    def join(self) -> None:
+        for _, thread in self._running:
+            thread.join(DEADLINE_S)
+            assert not thread.is_alive()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    one = Bench(tmp_path / "state")
+    try:
+        yield one
+    finally:
+        one.script.go_on.set()
+        one.end()
+        one.store.close()
+
+
+# --- the good case
+
+
+def test_a_job_is_run_and_its_results_are_kept(bench: Bench) -> None:
+    job = bench.submit(priority=7)
+    bench.driver()
+    done = bench.over(job)
+    assert (done.status, done.progress, done.attempt) == (JobStatus.SUCCESSFUL, 100, 1)
+    assert done.message == "2 buildings: 2 ok, 0 fallback, 0 failed; 1 object rejected; 1 warning"
+    assert done.summary is not None
+    assert done.summary["digest"] == "d" * 64
+    assert (bench.folder.outputs(job.job_id, 1) / "outputs.json").exists()
+    assert (bench.folder.run(job.job_id, 1) / "run.json").exists()
+    # what was fetched is not needed any more
+    assert not bench.folder.inputs(job.job_id, 1).exists()
+    request, executor = bench.script.seen[0]
+    assert executor.priority == 7
+    assert request.isolation.timeout_s == bench.settings.building_timeout_s
+
+
+def test_events_tell_the_story_without_a_path_and_progress_never_falls(bench: Bench) -> None:
+    job = bench.submit()
+    bench.driver()
+    done = bench.over(job)
+    events = bench.store.events(job.job_id)
+    statuses = [event.status for event in events if event.kind == "status"]
+    assert statuses == [JobStatus.ACCEPTED, JobStatus.RUNNING, JobStatus.SUCCESSFUL]
+    running = [event.progress for event in events[1:]]
+    assert running == sorted(running)
+    assert [event.stage for event in events if event.kind == "stage"] == ["inputs", "plan", "outputs"]
+    warnings = [event.message for event in events if event.kind == "warning"]
+    assert warnings == ["tile 0.laz: odd, see run.json"]
+    for text in [*(event.message for event in events), done.message, str(done.summary)]:
+        assert str(bench.folder.root) not in text
+    assert done.summary is not None
+    assert done.summary["warnings"] == ["tile 0.laz: odd"]
+
+
+def test_the_folders_of_earlier_attempts_go_with_the_success(bench: Bench) -> None:
+    job = bench.submit()
+    held = bench.store.claim("dead", lease_s=60.0, max_attempts=3)
+    assert held is not None
+    bench.folder.run(job.job_id, 1).mkdir(parents=True)
+    bench.store.release(held, lost=False)
+    bench.driver()
+    assert bench.over(job).attempt == 2
+    left = bench.folder.job(job.job_id)
+    until(lambda: [path.name for path in left.iterdir()] == ["attempt-2"], "one attempt")
+
+
+def test_several_jobs_run_at_once_in_one_driver(bench: Bench) -> None:
+    jobs = [bench.submit() for _ in range(3)]
+    for _ in jobs:
+        bench.script.waits()
+    bench.driver(driver_jobs=3)
+    bench.runs(3)
+    assert bench.store.counts()[JobStatus.RUNNING] == 3
+    bench.script.go_on.set()
+    assert {bench.over(job).status for job in jobs} == {JobStatus.SUCCESSFUL}
+
+
+# --- called off
+
+
+def test_a_running_job_that_is_dismissed_stops_and_leaves_no_file(bench: Bench) -> None:
+    job = bench.submit()
+    bench.script.waits()
+    bench.driver()
+    bench.runs()
+    assert bench.folder.attempt(job.job_id, 1).exists()
+    bench.store.dismiss(job.job_id)
+    assert bench.over(job).status is JobStatus.DISMISSED
+    assert not bench.folder.job(job.job_id).exists()
+
+
+def test_a_dismissal_is_seen_while_outputs_are_assembled(bench: Bench) -> None:
+    job = bench.submit()
+    plain = bench.script.write_outputs
+    began = threading.Event()
+
+    def endless(run_dir: Path, out_dir: Path, wanted: Any, on_progress: Callable[[int, int], None]) -> None:
+        plain(run_dir, out_dir, wanted, on_progress)
+        began.set()
+        while True:
+            on_progress(1, 2)
+            time.sleep(0.01)
+
+    bench.script.write_outputs = endless  # type: ignore[method-assign]
+    bench.driver()
+    assert began.wait(DEADLINE_S)
+    bench.store.dismiss(job.job_id)
+    assert bench.over(job).status is JobStatus.DISMISSED
+
+
+def test_a_driver_that_ends_lets_running_jobs_finish_and_claims_no_more(bench: Bench) -> None:
+    first, second = bench.submit(priority=1), bench.submit()
+    bench.script.waits()
+    driver = bench.driver()
+    bench.runs()
+    driver.stop()
+    until(driver._stopping.is_set, "the stop")
+    bench.script.go_on.set()
+    bench.join()
+    assert bench.codes == [0]
+    assert bench.store.get(first.job_id).status is JobStatus.SUCCESSFUL
+    assert bench.store.get(second.job_id).status is JobStatus.ACCEPTED
+    assert bench.script.runs == 1
+
+
+@pytest.mark.parametrize("how", ["out of time", "second signal", "parent gone"])
+def test_a_driver_that_must_end_gives_its_job_back_at_once(bench: Bench, how: str) -> None:
+    job = bench.submit()
+    bench.script.waits()
+    ours, theirs = os.pipe()
+    try:
+        driver = bench.driver(parent_pipe=ours, drain_s=0.0 if how == "out of time" else 1e6)
+        bench.runs()
+        if how == "parent gone":
+            os.close(theirs)
+        else:
+            driver.stop()
+        if how == "second signal":
+            until(driver._stopping.is_set, "the stop")
+            assert bench.store.get(job.job_id).status is JobStatus.RUNNING
+            driver.stop()
+        bench.join()
+    finally:
+        os.close(ours)
+        if how != "parent gone":
+            os.close(theirs)
+    assert bench.codes == [0]
+    waiting = bench.store.get(job.job_id)
+    assert (waiting.status, waiting.attempt, waiting.lost_attempts) == (JobStatus.ACCEPTED, 1, 0)
+    assert not bench.folder.attempt(job.job_id, 1).exists()
+    bench.script.go_on.set()
+    bench.driver()
+    done = bench.over(job)
+    assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 2)
+
+
+def test_a_run_that_does_not_end_when_called_off_does_not_keep_the_job(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "GRACE_S", 0.1)
+    job = bench.submit()
+    bench.script.steps.append(lambda *_given: bench.script.go_on.wait(DEADLINE_S))
+    driver = bench.driver(drain_s=0.0)
+    bench.runs()
+    driver.stop()
+    bench.join()
+    assert bench.codes == [1]
+    assert bench.store.get(job.job_id).status is JobStatus.ACCEPTED
+
+
+# --- faults
+
+
+def test_a_bad_input_fails_the_job_with_the_inputs_name(bench: Bench) -> None:
+    job = bench.submit()
+    path = bench.folder.inputs(job.job_id, 1) / "tile 0.laz"
+    bench.script.raises(UnreadableInputError(str(path), "is truncated", "Send it again"))
+    bench.driver()
+    failed = bench.over(job)
+    assert failed.failure is not None
+    assert failed.failure.fault is Fault.INPUT
+    assert failed.failure.detail == "tile 0.laz: is truncated. Send it again"
+    assert not bench.folder.attempt(job.job_id, 1).exists()
+
+
+def test_a_fault_of_ours_is_logged_with_its_reference_and_not_shown(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    job = bench.submit()
+    bench.script.raises(ZeroDivisionError("secret detail"))
+    bench.driver()
+    failed = bench.over(job)
+    assert failed.failure is not None
+    assert failed.failure.fault is Fault.INTERNAL
+    assert "secret detail" not in failed.failure.detail
+    (record,) = [record for record in caplog.records if record.exc_info]
+    assert record.__dict__["reference"] in failed.failure.detail
+    assert record.__dict__["job"] == job.job_id
+    assert "secret detail" in caplog.text
+
+
+def test_bad_settings_fail_before_the_run(bench: Bench) -> None:
+    request = JobRequest(tiles=(InputReference(kind="path", value="/a"),), settings={"method": "magic"})
+    job = bench.store.create(request, owner=None, max_queued=9, max_queued_per_key=9)
+    bench.driver()
+    failed = bench.over(job)
+    assert failed.failure is not None
+    assert failed.failure.fault is Fault.SETTINGS
+    assert "magic" in failed.failure.detail
+    assert bench.script.runs == 0
+
+
+def test_a_lost_cluster_is_replaced_and_the_job_tried_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "pause_s", lambda _losses: 0.05)
+    monkeypatch.setattr(Engine, "started", 0)
+    job = bench.submit()
+    bench.script.raises(ClusterError("the scheduler tcp://127.0.0.1:5 was lost"))
+    bench.driver()
+    done = bench.over(job)
+    assert (done.status, done.attempt, done.lost_attempts) == (JobStatus.SUCCESSFUL, 2, 1)
+    assert Engine.started == 2
+    told = [event.message for event in bench.store.events(job.job_id) if event.status is JobStatus.ACCEPTED]
+    assert told[1] == "waiting: the scheduler was lost; tried again in 0.05 s"
+
+
+def test_a_cluster_that_is_lost_again_and_again_fails_the_job(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "pause_s", lambda _losses: 0.01)
+    job = bench.submit()
+    for _ in range(3):
+        bench.script.raises(ClusterError("gone"))
+    bench.driver()
+    failed = bench.over(job)
+    assert bench.script.runs == 3
+    assert failed.failure is not None
+    assert failed.failure.fault is Fault.CLUSTER
+    assert "lost 3 times" in failed.failure.detail
+
+
+def test_a_scheduler_that_is_away_is_told_and_waited_for(bench: Bench) -> None:
+    job = bench.submit()
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        bench.driver(scheduler=f"tcp://127.0.0.1:{listener.getsockname()[1]}")
+        waiting = until(
+            lambda: (found := bench.store.get(job.job_id)).message.startswith("waiting") and found, "waiting"
+        )
+        assert waiting.status is JobStatus.RUNNING
+        assert "127.0.0.1" not in waiting.message
+        assert [event.kind for event in bench.store.events(job.job_id)][-1] == "waiting"
+        listener.listen()
+        assert bench.over(job).status is JobStatus.SUCCESSFUL
+    assert bench.script.runs == 1
+
+
+def test_a_job_that_waits_for_a_scheduler_can_be_dismissed(bench: Bench) -> None:
+    job = bench.submit()
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        bench.driver(scheduler=f"tcp://127.0.0.1:{listener.getsockname()[1]}")
+        bench.becomes(job, JobStatus.RUNNING)
+        bench.store.dismiss(job.job_id)
+        assert bench.over(job).status is JobStatus.DISMISSED
+    assert bench.script.runs == 0
+
+
+def test_after_waiting_for_workers_the_message_says_what_happens_again(bench: Bench) -> None:
+    job = bench.submit()
+
+    def step(request: Any, tell: Callable[[Event], None], cancelled: Any) -> None:
+        tell(Event(kind="waiting", stage="split", message="no worker is there"))
+        until(lambda: bench.store.get(job.job_id).message == "no worker is there", "the message")
+        tell(Event(kind="progress", stage="split", done=3, total=3))
+        until(lambda: bench.store.get(job.job_id).message == "surfaces are found in the tiles", "the next message")
+
+    bench.script.steps.append(step)
+    bench.driver()
+    assert bench.over(job).status is JobStatus.SUCCESSFUL
+
+
+@pytest.mark.parametrize(
+    ("address", "expected"), [("nonsense", True), ("tcp://127.0.0.1:99999", True), ("inproc://a/b/1", True)]
+)
+def test_an_address_that_cannot_be_tried_is_left_to_the_run(address: str, expected: bool) -> None:
+    assert answers(address) is expected
+
+
+# --- leases and the database
+
+
+def test_a_job_that_passed_to_another_driver_is_let_go_and_not_finished(bench: Bench) -> None:
+    job = bench.submit()
+    bench.script.waits()
+    bench.driver()
+    bench.runs()
+    with bench.store._database.write() as connection:
+        connection.exec_driver_sql("UPDATE jobs SET lease_until = '2020-01-01 00:00:00.000000'")
+    other = bench.store.claim("other", lease_s=60.0, max_attempts=3)
+    assert other is not None
+    assert other.attempt == 2
+    until(lambda: not bench.folder.attempt(job.job_id, 1).exists(), "the end of the first attempt")
+    assert bench.store.get(job.job_id) == other
+    bench.store.succeed(other, message="done by the other", summary={})
+    bench.end()
+    statuses = [event.status for event in bench.store.events(job.job_id)]
+    assert statuses.count(JobStatus.SUCCESSFUL) == 1
+
+
+class Flaky:
+    """A store whose database is away when the test says so."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.away = threading.Event()
+        self.refused = 0
+        for name in ("claim", "renew", "still_held", "record", "succeed", "release", "fail", "get"):
+            monkeypatch.setattr(JobStore, name, self._guarded(getattr(JobStore, name)))
+
+    def _guarded(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        def asked(store: JobStore, *values: Any, **named: Any) -> Any:
+            if self.away.is_set() and threading.current_thread() is not threading.main_thread():
+                self.refused += 1
+                raise StoreError("the database does not answer")
+            return method(store, *values, **named)
+
+        return asked
+
+
+def test_a_driver_outlives_a_database_that_is_away_for_a_while(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    flaky = Flaky(monkeypatch)
+    job, next_job = bench.submit(priority=1), bench.submit()
+    bench.script.waits()
+    bench.driver()
+    bench.runs()
+    flaky.away.set()
+    until(lambda: flaky.refused > 5, "refusals")
+    # the run comes to its end while nobody can write it down
+    bench.script.go_on.set()
+    until(lambda: bench.folder.outputs(job.job_id, 1).exists(), "outputs")
+    flaky.refused = 0
+    until(lambda: flaky.refused > 2, "refusals of the end")
+    flaky.away.clear()
+    done = bench.over(job)
+    assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 1)
+    assert bench.over(next_job).status is JobStatus.SUCCESSFUL
+    # what was told meanwhile was not lost
+    assert "outputs" in [event.stage for event in bench.store.events(job.job_id)]
+
+
+def test_without_a_heartbeat_for_the_length_of_the_lease_the_work_stops(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flaky = Flaky(monkeypatch)
+    job = bench.submit()
+    bench.script.waits()
+    bench.script.waits()
+    bench.driver(lease_s=1.0)
+    bench.runs()
+    flaky.away.set()
+    until(lambda: not bench.folder.attempt(job.job_id, 1).exists(), "the end of the attempt")
+    flaky.away.clear()
+    bench.runs(2)
+    bench.script.go_on.set()
+    done = bench.over(job)
+    assert (done.status, done.attempt, done.lost_attempts) == (JobStatus.SUCCESSFUL, 2, 1)
+
+
+def test_a_lease_is_renewed_for_as_long_as_the_run_takes(bench: Bench) -> None:
+    job = bench.submit()
+    bench.script.waits()
+    bench.driver(lease_s=1.0)
+    bench.runs()
+    first = bench.store.get(job.job_id).lease_until
+    assert first is not None
+    end = time.monotonic() + DEADLINE_S
+
+    def renewed() -> bool:
+        # another driver looks for work all the while, and never gets this job
+        assert bench.store.claim("other", lease_s=60.0, max_attempts=3) is None
+        assert time.monotonic() < end
+        until_now = bench.store.get(job.job_id).lease_until
+        assert until_now is not None
+        return (until_now - first).total_seconds() > 2.0
+
+    until(renewed, "renewals")
+    bench.script.go_on.set()
+    done = bench.over(job)
+    assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 1)
+
+
+# --- the janitor
+
+
+def test_the_janitor_removes_what_no_job_needs_and_nothing_else(bench: Bench) -> None:
+    folder, store = bench.folder, bench.store
+
+    def attempts(job_id: str, *numbers: int) -> None:
+        for number in numbers:
+            folder.run(job_id, number).mkdir(parents=True)
+
+    def claimed() -> Job:
+        held = store.claim("d", lease_s=60.0, max_attempts=9)
+        assert held is not None
+        return held
+
+    running = bench.submit(priority=9)
+    store.release(claimed(), lost=False)
+    assert claimed().attempt == 2
+    attempts(running.job_id, 1, 2)
+    done = bench.submit(priority=8)
+    store.succeed(claimed(), message="", summary={})
+    attempts(done.job_id, 1)
+    given_back = bench.submit(priority=7)
+    store.release(claimed(), lost=True, retry_after_s=60.0)
+    attempts(given_back.job_id, 1)
+    dismissed = bench.submit()
+    store.dismiss(dismissed.job_id)
+    attempts(dismissed.job_id, 1)
+    attempts("f" * 32, 1)
+    (folder.jobs / "not ours").mkdir()
+    tidy_jobs(store, folder)
+    left = {path.relative_to(folder.jobs).as_posix() for path in folder.jobs.glob("*/*")}
+    assert left == {f"{running.job_id}/attempt-2", f"{done.job_id}/attempt-1"}
+    assert {path.name for path in folder.jobs.iterdir()} == {
+        *(running.job_id, done.job_id, given_back.job_id),
+        "not ours",
+    }
+
+
+def test_the_janitor_keeps_all_results_beside_an_empty_database(bench: Bench) -> None:
+    bench.folder.run("f" * 32, 1).mkdir(parents=True)
+    assert tidy_jobs(bench.store, bench.folder) == []
+    assert bench.folder.run("f" * 32, 1).exists()
+
+
+def test_the_janitor_removes_uploads_whose_time_is_over(bench: Bench) -> None:
+    import datetime as dt
+
+    now = bench.store.now()
+    for name, days in (("a", -1), ("b", 1)):
+        upload = Upload(
+            upload_id=name * 32,
+            owner=None,
+            filename="x.laz",
+            size_bytes=1,
+            sha256="0" * 64,
+            created_at=now,
+            expires_at=now + dt.timedelta(days=days),
+        )
+        bench.store.add_upload(upload)
+        bench.folder.upload(name * 32).mkdir(parents=True)
+    for name, age_s in (("c", 2 * 24 * 3600.0), ("d", 60.0)):
+        folder = bench.folder.upload(name * 32)
+        folder.mkdir()
+        os.utime(folder, (time.time() - age_s,) * 2)
+    removed = tidy(bench.store, bench.folder)
+    assert {path.name for path in removed} == {"a" * 32, "c" * 32}
+    assert {path.name for path in bench.folder.uploads.iterdir()} == {"b" * 32, "d" * 32}
+    assert bench.store.upload_ids() == {"b" * 32}
+
+
+def test_the_janitor_works_without_any_folder(bench: Bench) -> None:
+    with contextlib.suppress(FileNotFoundError):
+        bench.folder.jobs.rmdir()
+    assert tidy(bench.store, bench.folder) == []

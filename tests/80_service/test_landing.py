@@ -1,0 +1,127 @@
+"""The landing page, conformance, health and figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from service.errors import StartUpError
+from service.keys import Scope
+from service.routes import landing
+from service.routes.status import RELATIONS
+
+from pipeline import __version__  # isort: skip
+
+
+def test_the_landing_page_links_to_all_that_the_standard_wants(local_service) -> None:
+    page = local_service.client.get("/").json()
+    relations = {link["rel"]: link["href"] for link in page["links"]}
+    assert {"service-desc", f"{RELATIONS}conformance", f"{RELATIONS}processes", f"{RELATIONS}job-list"} <= set(
+        relations
+    )
+    for href in relations.values():
+        assert local_service.client.get(href).status_code == 200, href
+
+
+def test_browsers_get_html_and_machines_get_json(local_service) -> None:
+    browser = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
+    page = local_service.client.get("/", headers=browser)
+    assert page.headers["content-type"].startswith("text/html")
+    assert "script-src" not in page.headers["content-security-policy"]
+    assert "default-src 'self'" in page.headers["content-security-policy"]
+    for accept in ("*/*", "application/json", ""):
+        assert local_service.client.get("/", headers={"Accept": accept}).json()["title"] == "gablework"
+
+
+def test_the_parameter_f_stands_above_the_header(local_service) -> None:
+    browser = {"Accept": "text/html"}
+    assert local_service.client.get("/?f=json", headers=browser).json()["title"] == "gablework"
+    assert local_service.client.get("/?f=html").headers["content-type"].startswith("text/html")
+    assert local_service.client.get("/?f=xml").status_code == 400
+    assert local_service.client.get("/", headers={"Accept": "image/png"}).status_code == 406
+
+
+def test_without_a_built_page_browsers_are_told_how_to_build_it(starting, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(landing, "VIEWER", tmp_path / "nothing")
+    page = starting().client.get("/?f=html")
+    assert page.status_code == 200
+    assert "npm run build" in page.text
+
+
+def test_a_built_page_and_its_files_are_served(starting, monkeypatch, tmp_path: Path) -> None:
+    built = tmp_path / "dist"
+    (built / "assets").mkdir(parents=True)
+    (built / "index.html").write_text("<!doctype html><title>the page</title>")
+    (built / "assets" / "page.js").write_text("export {}")
+    monkeypatch.setattr(landing, "VIEWER", built)
+    client = starting().client
+    assert "the page" in client.get("/?f=html").text
+    assert client.get("/viewer/assets/page.js").text == "export {}"
+    assert client.get("/viewer/../service.db").status_code == 404
+    assert client.get("/viewer/%2e%2e/service.db").status_code == 404
+    assert client.get("/viewer/assets/nothing.js").headers["content-type"] == "application/problem+json"
+
+
+def test_conformance_names_what_is_met_and_nothing_else(local_service) -> None:
+    classes = {uri.rpartition("/")[2] for uri in local_service.client.get("/conformance").json()["conformsTo"]}
+    assert classes == {"core", "json", "oas30", "ogc-process-description", "job-list", "dismiss"}
+    assert local_service.client.get("/openapi.json").json()["openapi"].startswith("3.0.")
+
+
+def test_the_page_of_the_api_names_every_path_and_loads_nothing_from_elsewhere(local_service) -> None:
+    page = local_service.client.get("/docs").text
+    for path in local_service.client.get("/openapi.json").json()["paths"]:
+        assert path in page
+    assert "<script" not in page
+    assert "https://" not in page
+
+
+def test_a_service_that_works_is_alive_and_ready(local_service) -> None:
+    assert local_service.client.get("/healthz").json() == {"status": "ok"}
+    assert local_service.client.get("/readyz").json()["checks"] == {
+        "database": "ok",
+        "state": "ok",
+        "driver": "elsewhere",
+    }
+
+
+def test_a_service_without_its_state_folder_is_alive_but_not_ready(local_service) -> None:
+    local_service.settings.state.rename(local_service.settings.state.with_name("gone"))
+    answer = local_service.client.get("/readyz")
+    assert answer.status_code == 503
+    assert answer.json()["checks"]["state"] != "ok"
+    assert local_service.client.get("/healthz").status_code == 200
+
+
+def test_figures_count_requests_by_template_and_jobs_by_status(local_service) -> None:
+    local_service.waiting()
+    for number in range(3):
+        local_service.client.get(f"/jobs/{number}")
+    figures = local_service.client.get("/metrics").text
+    assert 'gablework_requests_total{method="GET",path="/jobs/{jobID}",status="404"} 3.0' in figures
+    assert 'gablework_jobs{status="accepted"} 1.0' in figures
+    assert "process_resident_memory_bytes" in figures
+    oldest = next(line for line in figures.splitlines() if line.startswith("gablework_oldest_waiting_job_seconds "))
+    assert 0.0 <= float(oldest.split()[1]) < 600.0
+
+
+def test_figures_need_a_key_where_there_are_keys(local_service) -> None:
+    header = local_service.key(Scope.READ)
+    assert local_service.client.get("/metrics", headers=header).status_code == 200
+    assert local_service.client.get("/metrics").status_code in {200, 401}  # what was known of keys counts for seconds
+
+
+def test_another_address_needs_keys(starting) -> None:
+    with pytest.raises(StartUpError, match="keys create"):
+        starting(host="0.0.0.0")
+    assert starting(host="0.0.0.0", open_without_keys=True).client.get("/jobs").status_code == 200
+
+
+def test_a_public_url_is_what_links_say(starting) -> None:
+    page = starting(public_url="https://models.example.org/gable/").client.get("/").json()
+    assert {link["href"].partition("/gable/")[0] for link in page["links"]} == {"https://models.example.org"}
+
+
+def test_the_document_tells_the_version(local_service) -> None:
+    assert local_service.client.get("/openapi.json").json()["info"]["version"] == __version__

@@ -1,0 +1,68 @@
+"""The store on SQLite."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.errors import StartUpError, StoreError
+from service.store import JobStore
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+pytest.register_assert_rewrite("store_contract")
+
+from store_contract import StoreContract, claim, submit  # noqa: E402
+
+
+class TestOnSqlite(StoreContract):
+    """All of the contract, on a file."""
+
+    @pytest.fixture
+    def url(self, tmp_path: Path) -> str:
+        return f"sqlite:///{tmp_path / 'some % folder' / 'service.db'}"
+
+
+def test_a_killed_writer_leaves_no_lock_and_no_half_a_job(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'a.db'}"
+    with JobStore(url) as store:
+        store.migrate()
+        submit(store)
+        other = sqlite3.connect(tmp_path / "a.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        other.execute("DELETE FROM jobs")
+        # what a process holds goes with it
+        other.close()
+        assert claim(store).attempt == 1
+
+
+def test_readers_do_not_wait_for_a_writer(tmp_path: Path) -> None:
+    with JobStore(f"sqlite:///{tmp_path / 'a.db'}") as store:
+        store.migrate()
+        job = submit(store)
+        other = sqlite3.connect(tmp_path / "a.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        other.execute("DELETE FROM job_events")
+        assert store.get(job.job_id) == job
+        assert len(store.events(job.job_id)) == 1
+        other.close()
+
+
+def test_a_file_that_is_no_database_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a.db").write_bytes(b"no database at all" * 100)
+    with JobStore(f"sqlite:///{tmp_path / 'a.db'}") as store, pytest.raises(StoreError, match=r"a\.db.*not a database"):
+        store.migrate()
+
+
+def test_messages_name_no_folder_of_the_machine(tmp_path: Path) -> None:
+    with JobStore(f"sqlite:///{tmp_path / 'a.db'}") as store, pytest.raises(StoreError) as told:
+        store.check()
+    assert str(tmp_path) not in str(told.value)
+
+
+@pytest.mark.parametrize("url", ["sqlite://", "sqlite:///:memory:", "mysql://a/b", "nonsense", "sqlite:///"])
+def test_a_database_that_cannot_serve_is_refused(url: str) -> None:
+    with pytest.raises(StartUpError):
+        JobStore(url)

@@ -1,0 +1,201 @@
+"""Real drivers with real clusters over real jobs: killed, drained, several at once."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+from processes import Program, Programs, lives, program, wait_for
+
+from service.files import StateFolder
+from service.jobs import InputReference, Job, JobRequest, JobStatus
+from service.settings import ServiceSettings
+from service.store import JobStore
+
+pytestmark = pytest.mark.slow
+
+DEADLINE_S = 300.0
+
+
+@pytest.fixture(scope="module")
+def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A gabled house."""
+    folder = tmp_path_factory.mktemp("gable")
+    command = [str(program("gablework")), "simulate", "gable", "--out", str(folder), "--quiet"]
+    subprocess.run(command, check=True)
+    return next(folder.glob("*.laz"))
+
+
+class Site:
+    """A state folder with its database, and drivers."""
+
+    def __init__(self, folder: Path, tile: Path, programs: Programs, database_url: str | None) -> None:
+        self.tile = tile
+        self._programs = programs
+        self.settings = ServiceSettings(state=folder, database_url=database_url, input_roots=(tile.parent,))
+        self.folder = StateFolder(folder)
+        self.store = JobStore(self.settings.database)
+        self.store.migrate()
+        self.environment = {
+            "GABLEWORK_STATE": str(folder),
+            "GABLEWORK_DATABASE_URL": self.settings.database,
+            "GABLEWORK_INPUT_ROOTS": f'["{tile.parent}"]',
+            "GABLEWORK_WORKERS": "1",
+            "GABLEWORK_DRIVER_JOBS": "1",
+            "GABLEWORK_LEASE_S": "5",
+            "GABLEWORK_POLL_S": "0.1",
+            "OPENBLAS_NUM_THREADS": "1",
+        }
+
+    def driver(self, name: str, **settings: str) -> Program:
+        environment = {**self.environment, **{f"GABLEWORK_{key.upper()}": value for key, value in settings.items()}}
+        return self._programs.start(name, [str(program("gablework")), "driver", "--name", name], env=environment)
+
+    def submit(self) -> Job:
+        request = JobRequest(tiles=(InputReference(kind="path", value=str(self.tile)),))
+        return self.store.create(request, owner=None, max_queued=100, max_queued_per_key=100)
+
+    def statuses(self, job: Job) -> list[JobStatus]:
+        return [event.status for event in self.store.events(job.job_id) if event.status is not None]
+
+    def over(self, job: Job, *drivers: Program) -> Job:
+        def is_over() -> Job | None:
+            assert any(driver.alive for driver in drivers), "no driver is left"
+            found = self.store.get(job.job_id)
+            return found if found.status.is_over else None
+
+        return wait_for(is_over, f"the end of {self.store.get(job.job_id)}", DEADLINE_S)
+
+    def stage(self, job: Job, stage: str, driver: Program) -> Job:
+        def reached() -> Job | None:
+            found = self.store.get(job.job_id)
+            return found if found.stage == stage and found.status is JobStatus.RUNNING else None
+
+        return driver.wait_for(reached, f"stage {stage}", DEADLINE_S)
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def site(request: pytest.FixtureRequest, tmp_path: Path, tile: Path, programs: Programs) -> Iterator[Site]:
+    """A site on SQLite, and one on PostgreSQL."""
+    url = request.getfixturevalue("postgres_url") if request.param == "postgres" else None
+    one = Site(tmp_path / "state", tile, programs, url)
+    yield one
+    one.store.close()
+
+
+def test_a_killed_drivers_job_is_finished_once_by_another(site: Site) -> None:
+    job = site.submit()
+    first = site.driver("first")
+    site.stage(job, "split", first)
+    children = first.children()
+    first.kill(group=False)
+    # its workers do not outlive it
+    wait_for(lambda: not [child for child in children if lives(child)], "the end of the workers")
+    second = site.driver("second")
+    done = site.over(job, second)
+    assert (done.status, done.attempt, done.lost_attempts) == (JobStatus.SUCCESSFUL, 2, 1)
+    expected = ["accepted", "running", "accepted", "running", "successful"]
+    assert site.statuses(job) == expected
+    messages = [event.message for event in site.store.events(job.job_id)]
+    assert any("driver first was silent" in message for message in messages)
+    wait_for(
+        lambda: [path.name for path in site.folder.job(job.job_id).iterdir()] == ["attempt-2"], "one attempt's folder"
+    )
+    assert second.stop() == 0
+
+
+def test_a_driver_that_is_told_to_end_gives_its_job_back_and_another_takes_it_at_once(site: Site) -> None:
+    job = site.submit()
+    first = site.driver("first", drain_s="0", lease_s="600")
+    site.stage(job, "split", first)
+    assert first.stop() == 0
+    waiting = site.store.get(job.job_id)
+    assert (waiting.status, waiting.lost_attempts) == (JobStatus.ACCEPTED, 0)
+    assert not first.children()
+    second = site.driver("second", lease_s="600")
+    done = site.over(job, second)
+    assert (done.status, done.attempt, done.lost_attempts) == (JobStatus.SUCCESSFUL, 2, 0)
+
+
+@pytest.mark.parametrize("site", ["sqlite"], indirect=True)
+def test_a_driver_that_drains_finishes_its_job_first(site: Site) -> None:
+    job, waiting = site.submit(), site.submit()
+    first = site.driver("first")
+    claimed = first.wait_for(
+        lambda: next((j for j in (job, waiting) if site.store.get(j.job_id).status is JobStatus.RUNNING), None),
+        "a claim",
+        DEADLINE_S,
+    )
+    first.process.terminate()
+    assert first.ended(DEADLINE_S) == 0
+    assert site.store.get(claimed.job_id).status is JobStatus.SUCCESSFUL
+    other = waiting if claimed.job_id == job.job_id else job
+    assert site.store.get(other.job_id).status is JobStatus.ACCEPTED
+
+
+@pytest.mark.parametrize("site", ["sqlite"], indirect=True)
+def test_a_dismissed_job_stops_within_seconds_and_its_files_are_gone(site: Site) -> None:
+    job = site.submit()
+    driver = site.driver("one")
+    site.stage(job, "split", driver)
+    began = time.monotonic()
+    assert site.store.dismiss(job.job_id).dismiss_requested
+    assert site.over(job, driver).status is JobStatus.DISMISSED
+    print(f"dismissed after {time.monotonic() - began:.2f} s")
+    assert not site.folder.job(job.job_id).exists()
+    following = site.submit()
+    assert site.over(following, driver).status is JobStatus.SUCCESSFUL
+
+
+@pytest.mark.parametrize("site", ["sqlite"], indirect=True)
+def test_a_driver_ends_when_its_parent_is_gone(site: Site, tmp_path: Path) -> None:
+    job = site.submit()
+    script = tmp_path / "supervised.py"
+    script.write_text(
+        "import sys\n"
+        "from service.driver import run_driver\n"
+        "from service.settings import ServiceSettings\n"
+        "if __name__ == '__main__':\n"
+        "    raise SystemExit(run_driver(ServiceSettings(), name='child', parent_pipe=int(sys.argv[1])))\n"
+    )
+    ours, theirs = os.pipe()
+    command = [sys.executable, str(script), str(ours)]
+    child = subprocess.Popen(
+        command, env={**os.environ, **site.environment, "GABLEWORK_LEASE_S": "600"}, pass_fds=[ours]
+    )
+    try:
+        os.close(ours)
+        wait_for(lambda: site.store.get(job.job_id).stage == "split" or child.poll() is not None, "a run", DEADLINE_S)
+        grandchildren = psutil.Process(child.pid).children(recursive=True)
+        os.close(theirs)
+        assert child.wait(DEADLINE_S) == 0
+    finally:
+        child.kill()
+        child.wait()
+    assert site.store.get(job.job_id).status is JobStatus.ACCEPTED
+    wait_for(lambda: not [one for one in grandchildren if lives(one)], "the end of the workers")
+
+
+def test_two_drivers_share_twenty_jobs_and_each_is_run_to_its_end_once(site: Site) -> None:
+    jobs = [site.submit() for _ in range(20)]
+    drivers = [site.driver(name) for name in ("left", "right")]
+    done = [site.over(job, *drivers) for job in jobs]
+    assert {job.status for job in done} == {JobStatus.SUCCESSFUL}
+    assert {job.attempt for job in done} == {1}
+    digests = {job.summary["digest"] for job in done if job.summary is not None}
+    assert len(digests) == 1
+    for job in jobs:
+        assert site.statuses(job) == ["accepted", "running", "successful"]
+        assert (site.folder.outputs(job.job_id, 1) / "outputs.json").exists()
+    by = Counter(name for driver in drivers for name in [driver.name] * driver.text.count("the job succeeded"))
+    assert sum(by.values()) == 20
+    assert min(by.values()) >= 1
+    assert len(by) == 2
+    assert [driver.stop() for driver in drivers] == [0, 0]

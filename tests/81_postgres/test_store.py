@@ -1,0 +1,61 @@
+"""The store on a real PostgreSQL."""
+
+from __future__ import annotations
+
+import pytest
+from processes import PostgresServer
+from store_contract import StoreContract, claim, submit
+
+from service.errors import StoreError
+from service.store import JobStore
+
+pytestmark = pytest.mark.slow
+
+
+class TestOnPostgres(StoreContract):
+    """All of the contract, on PostgreSQL."""
+
+    @pytest.fixture
+    def url(self, postgres_url: str) -> str:
+        return postgres_url
+
+
+def test_a_server_that_is_away_is_told_without_the_password_and_is_found_again(
+    postgres_server: PostgresServer, postgres_url: str
+) -> None:
+    with JobStore(postgres_url) as store:
+        store.migrate()
+        held = (submit(store), claim(store))[1]
+        postgres_server.stop()
+        try:
+            with pytest.raises(StoreError, match="does not answer") as told:
+                store.renew(held, lease_s=60.0)
+            assert postgres_server.password not in str(told.value)
+        finally:
+            postgres_server.start()
+        # connections of the pool are stale now, and nothing of that shows
+        store.check()
+        assert store.renew(held, lease_s=60.0) is False
+        store.succeed(held, message="done", summary={})
+
+
+def test_a_wrong_password_is_told(postgres_server: PostgresServer, postgres_url: str) -> None:
+    url = postgres_url.replace(postgres_server.password, "wrong")
+    with JobStore(url) as store, pytest.raises(StoreError, match="password authentication failed"):
+        store.migrate()
+
+
+def test_the_plain_name_of_the_dialect_uses_the_driver_that_is_installed(postgres_url: str) -> None:
+    with JobStore(postgres_url.replace("postgresql+pg8000://", "postgresql://")) as store:
+        store.migrate()
+        store.check()
+
+
+def test_a_job_that_another_claims_is_passed_over_and_not_waited_for(postgres_url: str) -> None:
+    with JobStore(postgres_url) as store:
+        store.migrate()
+        first, second = submit(store, priority=1), submit(store)
+        with store._database.write() as connection:
+            connection.exec_driver_sql(f"SELECT 1 FROM jobs WHERE job_id = '{first.job_id}' FOR UPDATE")
+            assert claim(store).job_id == second.job_id
+        assert claim(store).job_id == first.job_id
