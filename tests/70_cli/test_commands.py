@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from pipeline import __version__
 from pipeline.cli import app
 
-COMMANDS = ("reconstruct", "inspect", "simulate", "digest", "evaluate", "warm-up", "demo")
+COMMANDS = ("reconstruct", "inspect", "simulate", "digest", "evaluate", "warm-up", "demo", "replay")
 
 
 def invoke(*words: str) -> tuple[int, str, str]:

@@ -1,0 +1,136 @@
+"""The API against its own OpenAPI document: generated requests, valid and not, and every answer held against it.
+
+CI runs some hundred; `GABLEWORK_OPENAPI_CASES=5000 .venv/bin/python -m pytest -m slow tests/83_openapi -s` runs more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import hypothesis
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase, given
+from schemathesis.generation import GenerationMode
+from schemathesis.specs.openapi.checks import positive_data_acceptance
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "80_service"))
+
+import finished_runs
+
+CASES = int(os.environ.get("GABLEWORK_OPENAPI_CASES", "500"))
+"""Requests to be generated, at least."""
+
+EXCLUDED = [
+    # whether an upload is there or a host is allowed, a schema cannot say: such a request is valid and yet refused
+    positive_data_acceptance,
+]
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[finished_runs.Service]:
+    with finished_runs.service(tmp_path_factory.mktemp("state")) as running:
+        yield running
+
+
+class Ids:
+    """Ids that exist, for every second request: else nearly all answers would be that there is no such thing."""
+
+    def __init__(self, service: finished_runs.Service) -> None:
+        self._service = service
+        self._finished = service.finished()
+        page = service.client.get(f"/jobs/{self._finished}/buildings").json()
+        self._buildings = itertools.cycle([feature["id"] for feature in page["features"]])
+        self._outputs = itertools.cycle(["buildings", "report", "cityjson", "meshes"])
+        self._turn = itertools.count()
+        points = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
+        sent = service.client.post("/uploads?filename=points.xyz", content=points)
+        assert sent.status_code == 201, sent.text
+        self._upload = sent.json()["uploadID"]
+
+    def _waiting(self) -> str:
+        tile = finished_runs.InputReference(kind="path", value="/srv/tile.laz")
+        request = finished_runs.JobRequest(tiles=(tile,))
+        return self._service.store.create(request, owner=None, max_queued=10**6, max_queued_per_key=10**6).job_id
+
+    def put_into(self, case: Any, mode: GenerationMode) -> None:
+        parameters = case.path_parameters or {}
+        if next(self._turn) % 2:
+            return
+        if case.path.endswith("/execution") and mode is GenerationMode.POSITIVE:
+            case.body = {"inputs": {"tiles": [{"href": f"/uploads/{self._upload}"}], "crs": "EPSG:28992"}}
+        if "processID" in parameters:
+            parameters["processID"] = "reconstruct"
+        if "jobID" in parameters:
+            parameters["jobID"] = self._waiting() if case.method == "DELETE" else self._finished
+        if "uploadID" in parameters and case.method == "GET":
+            parameters["uploadID"] = self._upload
+        if "buildingID" in parameters:
+            parameters["buildingID"] = next(self._buildings)
+        if "outputID" in parameters:
+            parameters["outputID"] = next(self._outputs)
+
+
+class Interrogation:
+    """What was asked, what came back, and what was wrong with it."""
+
+    def __init__(self, ids: Ids) -> None:
+        self._ids = ids
+        self.answers = Counter[int]()
+        self.failures: dict[str, str] = {}
+
+    def ask(self, operation: Any, mode: GenerationMode, most: int) -> None:
+        """Generate requests of one operation."""
+        label = f"{operation.method.upper()} {operation.path}"
+
+        @given(case=operation.as_strategy(generation_mode=mode))
+        @hypothesis.settings(
+            max_examples=most,
+            deadline=None,
+            database=None,
+            phases=[Phase.generate],
+            suppress_health_check=list(HealthCheck),
+        )
+        def one(case: Any) -> None:
+            self._ids.put_into(case, mode)
+            response = case.call(base_url="http://127.0.0.1:8000")
+            self.answers[response.status_code] += 1
+            try:
+                case.validate_response(response, excluded_checks=EXCLUDED)
+            except BaseExceptionGroup as group:
+                for fault in group.exceptions:
+                    self.failures.setdefault(f"{label}: {type(fault).__name__} {str(fault)[:160]}", str(group))
+            except AssertionError as fault:
+                self.failures.setdefault(f"{label}: {type(fault).__name__} {str(fault)[:160]}", str(fault))
+
+        one()
+
+
+@pytest.mark.slow
+def test_generated_requests_meet_no_fault_and_every_answer_fits_the_document(service: finished_runs.Service) -> None:
+    schema = schemathesis.openapi.from_asgi("/openapi.json", service.client.app, headers={"host": "127.0.0.1"})
+    operations = [found.ok() for found in schema.get_all_operations()]
+    # an operation that takes nothing has a case or two
+    variable = [operation for operation in operations if len(operation.query) + len(operation.path_parameters)]
+    most = -(-CASES // (2 * len(variable)))
+    asked = Interrogation(Ids(service))
+    for operation in operations:
+        asked.ask(operation, GenerationMode.POSITIVE, most)
+        # where nothing can be wrong, as with an id that is any text, there are no wrong requests
+        with contextlib.suppress(hypothesis.errors.Unsatisfiable):
+            asked.ask(operation, GenerationMode.NEGATIVE, most)
+    for operation in itertools.cycle(variable):
+        if sum(asked.answers.values()) >= CASES:
+            break
+        asked.ask(operation, GenerationMode.POSITIVE, most)
+    answers = sorted(asked.answers.items())
+    print(f"\n{sum(asked.answers.values())} requests over {len(operations)} operations; answers by status: {answers}")
+    assert not asked.failures, "\n\n".join(asked.failures.values())
+    assert {200, 201, 204, 400, 404} <= set(asked.answers), "the requests did not reach the paths"

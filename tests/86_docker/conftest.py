@@ -1,0 +1,36 @@
+"""The files of docker/, read, and the programs that tests start."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).parent))
+
+from container_files import Compose, Image, read_compose, read_image
+from processes import open_folder, postgres_server, programs
+
+__all__ = ["open_folder", "postgres_server", "programs"]
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    """The repository."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def image() -> Image:
+    """docker/Dockerfile."""
+    return read_image(ROOT / "docker" / "Dockerfile")
+
+
+@pytest.fixture(scope="session")
+def compose() -> Compose:
+    """docker/compose.yaml."""
+    return read_compose(ROOT / "docker" / "compose.yaml")
