@@ -3,6 +3,8 @@
 #   make demo      simulate a small suburb, reconstruct it, show what was found
 #   make test      style, types, import directions, tests: everything but the slow tests
 #   make slow      the slow tests: minutes, real processes, real data
+#   make viewer    build the web page (types, unit tests, bundle); brings its own Node
+#   make serve     the service on this machine, web page and all
 #   make lock      resolve the dependencies anew (the locks name versions and hashes, no hosts)
 #   make docs      write docs/reference/ from the code
 #   make format    format the sources
@@ -23,7 +25,7 @@ KERNELS = $(shell cat $(KERNEL_SOURCES) | cksum | tr ' ' '-')
 TEST_ENV = NUMBA_CACHE_DIR="$(CURDIR)/.cache/numba/$(KERNELS)" OPENBLAS_NUM_THREADS=1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check unit slow lock docs format clean
+.PHONY: help demo test check unit slow viewer serve lock docs format clean
 .DELETE_ON_ERROR:
 
 help:
@@ -71,6 +73,13 @@ lock: $(VENV)/.build-stamp
 		--no-emit-find-links --custom-compile-command "make lock" --group viewer \
 		-c requirements-test.lock -o requirements-viewer.lock
 
+# The web page, by the Node that its lock names. The environment of the tests may or may not hold it.
+VIEWER_SOURCES := $(shell find service/viewer -type f -not -path '*/node_modules/*' -not -path '*/dist/*' 2>/dev/null)
+service/viewer/dist/index.html: $(VIEWER_SOURCES) hatch_build.py requirements-viewer.lock $(VENV)/.build-stamp
+	$(UV) pip install --quiet --python $(BIN)/python --require-hashes -r requirements-viewer.lock
+	$(BIN)/python hatch_build.py
+	@touch $@
+
 # --- the two commands ------------------------------------------------------------------------------------------------
 
 demo: $(VENV)/.warm-stamp
@@ -88,8 +97,13 @@ unit: $(VENV)/.test-stamp
 	@mkdir -p .cache/numba && find .cache/numba -mindepth 1 -maxdepth 1 ! -name '$(KERNELS)' -exec rm -rf {} +
 	$(TEST_ENV) $(BIN)/python -m pytest -m "not slow" --durations=15
 
-slow: $(VENV)/.test-stamp
+slow: $(VENV)/.test-stamp viewer
 	$(TEST_ENV) $(BIN)/python -m pytest -m slow --durations=15
+
+viewer: service/viewer/dist/index.html
+
+serve: $(VENV)/.warm-stamp viewer
+	@$(BIN)/gablework serve
 
 docs: $(VENV)/.run-stamp
 	$(BIN)/python docs/generate.py

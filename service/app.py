@@ -66,10 +66,10 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
         title="gablework",
         version=__version__,
         lifespan=lifespan,
-        root_path=settings.root_path,
         docs_url=None,  # both load scripts from elsewhere
         redoc_url=None,
         redirect_slashes=False,
+        generate_unique_id_function=lambda route: route.name,
     )
     app.state.settings = settings
     app.state.store = kept

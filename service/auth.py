@@ -21,7 +21,7 @@ TRUST_S = 2.0
 """Seconds for which an answer of the key table is used again: a revoked key works no longer than this."""
 REMEMBERED = 4096
 """Most keys remembered at once."""
-FIX = "Send the header `Authorization: Bearer gw_…` with a key from `gablework keys create`"
+FIX = "Send the header `Authorization: Bearer gw_…` with a key from `gablework keys create --name NAME`"
 
 
 class KeyTable(Protocol):
@@ -59,7 +59,7 @@ class Principal:
         if scope not in self.scopes:
             raise ForbiddenError(
                 f"this needs the scope {scope}, the key has {', '.join(sorted(self.scopes))}: "
-                f"make one with `gablework keys create --scope {scope}`"
+                f"make one with `gablework keys create --name NAME --scope {scope}`"
             )
 
 

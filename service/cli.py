@@ -34,6 +34,9 @@ Scheduler = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
 ]
 
+_STANDARD_INPUT = 0
+"""File descriptor of the pipe that `serve` holds open for its driver."""
+
 
 @contextlib.contextmanager
 def _service_errors() -> Iterator[None]:
@@ -81,6 +84,9 @@ def _log_to_stderr() -> None:
     import logging
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    # each names an odd request of a client; whoever sends them is not to fill the log
+    for chatty in ("alembic", "python_multipart"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
 
 
 @app.command()
@@ -152,26 +158,9 @@ def drive(
 
         _log_to_stderr()
         settings = _settings(state=state, database_url=database_url, workers=workers, scheduler=scheduler)
-        if with_parent:
-            _end_with_parent()
-        code = run_driver(settings, name=name)
+        code = run_driver(settings, name=name, parent_pipe=_STANDARD_INPUT if with_parent else None)
         if code:
             raise typer.Exit(code)
-
-
-def _end_with_parent() -> None:
-    """Send SIGTERM to this very process when standard input closes: its parent has ended."""
-    import os
-    import signal
-    import sys
-    import threading
-
-    def watch() -> None:
-        while sys.stdin.buffer.read(1):
-            pass
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------

@@ -18,8 +18,9 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from pipeline.errors import CrsError
-from pipeline.io.crs import horizontal_unit_of, parse_crs
+from pipeline.io.crs import horizontal_unit_of
 from service import catalogue
+from service.input_policy import checked_crs
 from service.jobs import InputReference, JobRequest
 
 LONGEST_TEXT = 500
@@ -123,7 +124,7 @@ class Inputs:
         value = self.text(name, LONGEST_CRS)
         if value is not None:
             try:
-                horizontal_unit_of(parse_crs(value, path=name), path=name)
+                horizontal_unit_of(checked_crs(value, path=name), path=name)
             except CrsError as error:
                 self.faults.append(f"{name}: {error.problem}. Give a projected CRS, such as EPSG:28992")
         return value
@@ -289,7 +290,7 @@ def _ending_of(content: bytes) -> str:
 
 def _same_crs(one: str, other: str) -> bool:
     try:
-        return parse_crs(one, path="bbox") == parse_crs(other, path="crs")
+        return checked_crs(one, path="bbox") == checked_crs(other, path="crs")
     except CrsError:
         return False
 

@@ -67,7 +67,8 @@ class Guard:
         if refusal is not None:
             await answer(FOREIGN, refusal, scope["path"])(scope, receive, guarded_send)
             return
-        if (scope["method"], self._path(scope)) in STREAMED:
+        path = scope["path"].removeprefix(scope.get("root_path", ""))
+        if (scope["method"], path) in STREAMED:
             await self.app(scope, receive, guarded_send)
             return
         most = self.settings.max_body_bytes
@@ -77,10 +78,6 @@ class Guard:
             await answer(kind, _too_large(most), scope["path"])(scope, receive, guarded_send)
             return
         await self.app(scope, _counted(receive, most), guarded_send)
-
-    def _path(self, scope: Scope) -> str:
-        path: str = scope["path"]
-        return path.removeprefix(self.settings.root_path.rstrip("/"))
 
     def _foreign(self, method: str, scheme: str, headers: Headers) -> str | None:
         """Why a request is refused as that of another site; None where it is not."""

@@ -1,4 +1,4 @@
-"""Which paths and URLs a job may name. Pure but for looking at the path itself.
+"""Which paths, URLs and CRS a job may name. Pure but for looking at the path itself.
 
 Hosts are listed in the setting `input_hosts`, each as the origin that it stands for:
 
@@ -12,21 +12,69 @@ A listed host is trusted: where its name resolves to, and what it redirects to w
 from __future__ import annotations
 
 import os
+import re
 import stat
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import httpx
 
-from pipeline.errors import UnreadableInputError
+from pipeline.errors import CrsError, UnreadableInputError
+from pipeline.io.crs import parse_crs
 from service.errors import InputRefusedError, StartUpError
 from service.settings import ServiceSettings
+
+if TYPE_CHECKING:
+    import pyproj
 
 PORTS = {"https": 443, "http": 80}
 """Ports of the schemes that are fetched."""
 LONGEST_URL = 4096
 
+CRS_FORMS = (
+    re.compile(r"[A-Za-z_]{2,20}:{1,2}[A-Za-z0-9_.]{1,20}(\+\d{4,6})?"),  # EPSG:28992, EPSG:28992+5709
+    re.compile(r"urn:ogc:def:crs:\w{2,20}:[\d.]{0,20}:\w{1,20}|urn:ogc:def:crs(,crs:\w{2,20}:[\d.]{0,20}:\w{1,20}){2}"),
+    re.compile(
+        r"(PROJ|GEOD|GEOG|COMPOUND|BOUND|DERIVEDPROJ)(CRS|EDCRS)\s*\[.*|(PROJ|GEOG|COMPD_|GEOC)CS\s*\[.*", re.DOTALL
+    ),
+    re.compile(r"https?://www\.opengis\.net/def/crs/\w{2,20}/[\d.]{1,10}/\w{1,20}"),
+    re.compile(r"\{.*\}", re.DOTALL),
+    re.compile(r"\+proj=[A-Za-z0-9_+=.,\s-]*"),
+)
+"""Authority and code, URN, WKT, the OGC's URI, PROJJSON, and PROJ strings without places of files."""
+CRS_FILES = re.compile(r"grids|\+init|PARAMETERFILE", re.IGNORECASE)
+"""What makes PROJ open files that a text names."""
+
 Origin = tuple[str, str, int]
 """Scheme, host in lower case, port."""
+
+
+def checked_crs(text: str, *, path: str) -> pyproj.CRS:
+    """The CRS that a stranger names.
+
+    PROJ takes any text for a name and looks through its whole database for the nearest one, which stops everything
+    else meanwhile; and some texts name files to be opened. Such texts do not get there.
+
+    Parameters
+    ----------
+    text : str
+        Authority and code, URN, WKT, PROJJSON or a PROJ string.
+    path : str
+        The input, for messages.
+
+    Raises
+    ------
+    CrsError
+        Another text, or PROJ does not understand it.
+    """
+    text = text.strip()
+    if not any(form.fullmatch(text) for form in CRS_FORMS) or CRS_FILES.search(text):
+        raise CrsError(
+            path,
+            f"{text[:80]!r} is no code, WKT, PROJJSON or plain PROJ string of a CRS",
+            "Give one such as EPSG:28992",
+        )
+    return parse_crs(text, path=path)
 
 
 def origin_of(entry: str) -> Origin:
@@ -80,7 +128,9 @@ def checked_url(text: str, settings: ServiceSettings) -> httpx.URL:
         url = None
     origin = None if url is None else _origin(url)
     if url is None or origin is None:
-        raise InputRefusedError(f"{text[:80]!r} is no URL that is fetched: give https://host/path")
+        # what stands before an @ or after a ? may be secret
+        told = text.rpartition("@")[2].partition("?")[0]
+        raise InputRefusedError(f"{told[:80]!r} is no URL that is fetched: give https://host/path")
     if url.userinfo:
         raise InputRefusedError(f"{shown(url)} carries a user or password: give a URL without")
     allowed = {origin_of(entry) for entry in settings.input_hosts}

@@ -51,8 +51,11 @@ def document(app: FastAPI) -> dict[str, Any]:
         components.update(SCHEMAS)
         for operation in operations(found):
             _complete(operation)
-        app.openapi_schema = as_version_3_0(found)
-        app.openapi_schema["openapi"] = VERSION
+        app.openapi_schema = {**as_version_3_0(found), "openapi": VERSION}
+        for operation in operations(app.openapi_schema):
+            for parameter in operation.get("parameters", ()):
+                # one that is not sent is not there; no query can say null
+                parameter["schema"].pop("nullable", None)
     return app.openapi_schema
 
 
@@ -112,6 +115,8 @@ def as_version_3_0(value: Any) -> Any:
             found |= {bound: limit, word: True}
     if "const" in found and "type" in found:
         found["enum"] = [found.pop("const")]
+    if found.get("type") == "array":
+        found.setdefault("items", {})
     if found.pop("contentMediaType", None) == "application/octet-stream" and found.get("type") == "string":
         found["format"] = "binary"
     return found

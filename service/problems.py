@@ -130,12 +130,17 @@ def document(kind: Kind, detail: str, instance: str, faults: Sequence[str] = ())
         "type": kind.type_uri,
         "title": kind.title,
         "status": kind.status,
-        "detail": detail,
-        "instance": instance,
+        "detail": _encodable(detail),
+        "instance": _encodable(instance),
     }
     if faults:
-        found["errors"] = list(faults)
+        found["errors"] = [_encodable(fault) for fault in faults]
     return found
+
+
+def _encodable(text: str) -> str:
+    """The text without halves of characters, which JSON can bring in and UTF-8 cannot carry out."""
+    return text.encode("utf-8", "replace").decode("utf-8")
 
 
 def failure_document(failure: JobFailure, instance: str) -> dict[str, Any]:

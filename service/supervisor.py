@@ -33,6 +33,9 @@ LONGEST_PAUSE_S = 30.0
 STEADY_S = 60.0
 """A driver that lived so long is started again at once."""
 
+KEEP_ALIVE_S = 75
+"""Seconds that a connection without requests stays: longer than proxies keep theirs, so that they close it first."""
+
 CLOSING_S = 10
 """Seconds that requests have to end when the process is to end."""
 
@@ -138,11 +141,11 @@ class Supervisor:
             self._launch()
 
     def ask_to_end(self) -> None:
-        """Tell the driver to end its jobs and itself."""
-        self._ending.set()
+        """Tell the driver, once, to end its jobs and itself: a second time it would not finish them."""
         with self._lock:
-            if self._child is not None and self._child.poll() is None:
+            if not self._ending.is_set() and self._child is not None and self._child.poll() is None:
                 self._child.terminate()
+            self._ending.set()
 
     def end(self, within_s: float) -> None:
         """Wait until the driver has ended; after `within_s` seconds it is killed."""
@@ -240,7 +243,9 @@ def serve(settings: ServiceSettings, on_ready: Callable[[str], None], *, with_dr
         log_config=None,
         access_log=False,
         server_header=False,
+        timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=CLOSING_S,
+        root_path=settings.root_path.rstrip("/"),
     )
 
     def on_exit() -> None:

@@ -29,7 +29,7 @@ Value = TypeVar("Value")
 REQUIRED = "GABLEWORK_REQUIRE_PROGRAMS"
 """Environment variable of .ci/run: 1 makes a test fail where it would skip for want of a program."""
 
-LONG_S = 120.0
+LONG_S = 300.0
 """A deadline for what takes seconds on a quiet machine; not a promise of speed."""
 
 _POSTGRES_FOLDERS = "/usr/lib/postgresql/*/bin"

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 from service.errors import LeaseLostError
 from service.jobs import JobEvent
 from service.store import JobStore
 
 LEASE_S = 1.0
-PATIENCE_S = 60.0
+PATIENCE_S = 600.0
 
 
 def work(store: JobStore, name: str, log: int) -> None:
@@ -38,18 +38,15 @@ def work(store: JobStore, name: str, log: int) -> None:
         except LeaseLostError:
             continue
         os.write(log, f"{job.job_id} {job.attempt}\n".encode())
-    raise SystemExit("jobs are left")
+    raise TimeoutError("jobs are left")
 
 
 def main(url: str, name: str, path: str, threads: int) -> None:
     """Work with several threads over one store."""
     log = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-    with JobStore(url) as store:
-        crew = [threading.Thread(target=work, args=(store, f"{name}-{n}", log)) for n in range(threads)]
-        for one in crew:
-            one.start()
-        for one in crew:
-            one.join()
+    with JobStore(url) as store, ThreadPoolExecutor(threads) as crew:
+        for one in [crew.submit(work, store, f"{name}-{number}", log) for number in range(threads)]:
+            one.result()
 
 
 if __name__ == "__main__":

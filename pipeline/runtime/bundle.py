@@ -108,7 +108,7 @@ def write_bundle(folder: str, bundle: Bundle) -> Path:
             archive.writestr("stderr.txt", stderr)
             for name, array in (("points", candidate.points), ("ground", candidate.ground)):
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+                    np.lib.format.write_array(member, np.ascontiguousarray(array), (1, 0), allow_pickle=False)
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
@@ -152,11 +152,18 @@ def _member(archive: zipfile.ZipFile, path: str, name: str, largest_bytes: int) 
 
 
 def _array(content: bytes) -> FloatArray:
-    """Coordinates, shape (n, 3)."""
-    array = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-    if array.dtype != np.float64 or array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"coordinates are {array.dtype} of shape {array.shape}: float64 of shape (n, 3) is wanted")
-    coordinates: FloatArray = array
+    """Coordinates, shape (n, 3); what the header promises is compared with what is there before any memory is taken."""
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    if version != (1, 0):
+        raise ValueError(f"an array of npy version {version}")
+    shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(stream)
+    values = content[stream.tell() :]
+    if dtype != np.float64 or len(shape) != 2 or shape[1] != 3 or fortran_order:
+        raise ValueError(f"coordinates are {dtype} of shape {shape}: float64 of shape (n, 3) is wanted")
+    if len(values) != dtype.itemsize * shape[0] * shape[1]:
+        raise ValueError(f"coordinates of shape {shape} in {len(values)} bytes")
+    coordinates: FloatArray = np.frombuffer(values, np.float64).reshape(shape).copy()
     return coordinates
 
 

@@ -187,17 +187,22 @@ class Cluster:
         import dask
         from distributed import LocalCluster
 
-        quiet = {"distributed.admin.log-format": "%(message)s", "distributed.logging.distributed": "error"}
+        settings = {
+            "distributed.admin.log-format": "%(message)s",
+            "distributed.logging.distributed": "critical",
+            # a suspect is tried alone before it is blamed, so it need not take many workers with it
+            "distributed.scheduler.allowed-failures": 1,
+        }
         try:
             # the configuration is the process's own, not the thread's, and workers copy it as they start
-            with self._starting, dask.config.set(quiet):
+            with self._starting, dask.config.set(settings):
                 self._embedded = LocalCluster(
                     n_workers=self._workers,
                     threads_per_worker=1,
                     processes=True,
                     dashboard_address="127.0.0.1:0",
                     local_directory=self._local_directory,
-                    silence_logs="ERROR",
+                    silence_logs="CRITICAL",
                     preload=[worker_setup.__name__],
                 )
         except (OSError, RuntimeError, TimeoutError) as error:

@@ -54,6 +54,8 @@ class Lookout:
         Gets the number of workers that take tasks, at every look.
     advice : str
         What to do where no worker is there.
+    clock : callable
+        Seconds, monotonic; replaced in tests.
     """
 
     grace_s = 3.0
@@ -65,12 +67,20 @@ class Lookout:
     _every_s = 1.0
     _answer_s = 5.0
 
-    def __init__(self, client: Any, address: str, on_count: Callable[[int], None], advice: str) -> None:
+    def __init__(
+        self,
+        client: Any,
+        address: str,
+        on_count: Callable[[int], None],
+        advice: str,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._client = client
         self._address = address
         self._on_count = on_count
         self._advice = advice
-        self._answered_s = time.monotonic()
+        self._clock = clock
+        self._answered_s = clock()
         self._looked_s = -1e9
         self._bare_since_s: float | None = None
         self._told_s: float | None = None
@@ -101,18 +111,19 @@ class Lookout:
             The scheduler is lost.
         """
         self.check()
-        now = time.monotonic()
+        now = self._clock()
         if now - self._looked_s < self._every_s:
             return
         try:
             running = self._client.sync(self._client.scheduler.ncores_running, callback_timeout=self._answer_s)
         except (OSError, TimeoutError) as error:
             self.check()
-            if time.monotonic() - self._answered_s > self.silence_s:
-                raise self.lost(f"it did not answer for {time.monotonic() - self._answered_s:.0f} s") from error
+            silent_s = self._clock() - self._answered_s
+            if silent_s > self.silence_s:
+                raise self.lost(f"it has not answered for {silent_s:.0f} s") from error
             return
         finally:
-            self._looked_s = time.monotonic()
+            self._looked_s = self._clock()
         self._answered_s = self._looked_s
         self.threads = sum(running.values())
         self._on_count(len(running))

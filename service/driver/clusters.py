@@ -55,6 +55,7 @@ class SharedCluster:
         self._make = make or (lambda: Cluster(workers=settings.workers, scheduler=settings.scheduler))
         self._lock = threading.Lock()
         self._engine: Engine | None = None
+        self._closed = False
 
     def start(self) -> None:
         """Start the workers, unless they are there.
@@ -62,9 +63,11 @@ class SharedCluster:
         Raises
         ------
         ClusterError
-            They do not start.
+            They do not start, or the driver ends.
         """
         with self._lock:
+            if self._closed:
+                raise ClusterError("the driver ends and starts no workers any more")
             if self._engine is None:
                 self._engine = self._make().__enter__()
 
@@ -85,10 +88,15 @@ class SharedCluster:
     def replace(self) -> None:
         """Stop the workers, so that the next run starts new ones; a scheduler elsewhere is left alone."""
         if self._scheduler is None:
-            self.close()
+            self._stop_engine()
 
     def close(self) -> None:
-        """Stop the workers."""
+        """Stop the workers for good."""
+        with self._lock:
+            self._closed = True
+        self._stop_engine()
+
+    def _stop_engine(self) -> None:
         with self._lock:
             engine, self._engine = self._engine, None
         if engine is not None:

@@ -63,6 +63,7 @@ class HeldJob:
         self._lease_s = lease_s
         self._poll_s = min(poll_s, lease_s / 6.0)
         self._renewed_s = claimed_s
+        self._renewed_at_s = time.time()
         self._written_s = claimed_s
         self._lock = threading.Lock()
         self._writing = threading.Lock()
@@ -97,6 +98,11 @@ class HeldJob:
         if not self._stopped.is_set() and time.monotonic() - self._renewed_s >= self._lease_s:
             self.stop(Stop.LOST)
         return self._stopped.is_set()
+
+    @property
+    def overdue(self) -> bool:
+        """Whether the lease should have been renewed long ago by the wall clock, which counts a machine's sleep too."""
+        return not self.cancelled() and time.time() - self._renewed_at_s > self._lease_s / 2.0
 
     def wait(self, seconds: float) -> bool:
         """Wait, but not longer than the attempt may go on; whether it is to end."""
@@ -171,8 +177,10 @@ class HeldJob:
                 if time.monotonic() - self._written_s >= _FLUSH_S:
                     self.write()
             except LeaseLostError as error:
-                LOG.warning("%s", error, extra=self.facts)
                 self.stop(Stop.LOST)
+                # the attempt may just have written its own end
+                if not self._over.wait(_FLUSH_S):
+                    LOG.warning("%s", error, extra=self.facts)
                 return
             except StoreError as error:
                 # the thread goes on: should nobody have taken the job, it can still be given back
@@ -185,7 +193,7 @@ class HeldJob:
         now_s = time.monotonic()
         if now_s - self._renewed_s >= self._lease_s / 3.0 - self._poll_s:
             wanted = self._store.renew(self.job, lease_s=self._lease_s)
-            self._renewed_s = now_s
+            self._renewed_s, self._renewed_at_s = now_s, time.time()
         else:
             wanted = self._store.still_held(self.job)
         if wanted:

@@ -57,8 +57,8 @@ def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
             removed.append(folder.job(job_id))
             continue
         status, attempt = known[job_id]
-        # nobody holds a job that waits; of one that runs or is over only the last attempt counts
-        last = attempt if status is JobStatus.ACCEPTED else attempt - 1
+        # of a job that waits or failed no attempt counts, of one that runs or succeeded only the last one
+        last = attempt if status in {JobStatus.ACCEPTED, JobStatus.FAILED} else attempt - 1
         for path in _entries(folder.job(job_id)):
             number = _ATTEMPT.fullmatch(path.name)
             if number is not None and int(number[1]) <= last:

@@ -41,11 +41,17 @@ class PlainLines(logging.Formatter):
 
 
 def configure(*, as_json: bool) -> None:
-    """Log to standard error, unless the program has set up its logs already."""
-    logger = logging.getLogger("gablework")
-    if logger.handlers or logging.getLogger().handlers:
-        return
+    """Let the driver's own lines go to standard error with their facts, whatever the program does with others."""
+    logger = logging.getLogger("gablework.driver")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines() if as_json else PlainLines())
-    logger.addHandler(handler)
+    logger.handlers = [handler]
+    logger.propagate = False
     logger.setLevel(logging.INFO)
+    quieten()
+
+
+def quieten() -> None:
+    """Only warnings of the libraries; again when Dask was loaded, since it sets its own levels."""
+    for chatty in ("alembic", "distributed"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)

@@ -5,34 +5,30 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-import shutil
 import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import Any
 
-from pipeline.errors import ClusterError, GableworkError, RunCancelledError
-from service.driver.attempt import Tools, Workshop, perform
+from pipeline.errors import ClusterError
+from service.driver.attempt import Tools, Workshop
 from service.driver.clusters import SharedCluster
-from service.driver.faults import failure_of, pause_s, tried_again
+from service.driver.endings import FIRST_PAUSE_S, LONGEST_PAUSE_S, Attempts
 from service.driver.held import LOG, HeldJob, Stop
 from service.driver.janitor import tidy
-from service.driver.logs import configure
-from service.errors import LeaseLostError, ServiceError, StoreError
+from service.driver.logs import configure, quieten
+from service.errors import LeaseLostError, StoreError
 from service.files import StateFolder
 from service.settings import ServiceSettings
 from service.store import JobStore
 
 TIDY_S = 180.0
 """Seconds between two rounds of the janitor."""
-GRACE_S = 45.0
+GRACE_S = 20.0
 """Seconds that a run which was called off gets to end."""
 _TICK_S = 0.1
-_FIRST_PAUSE_S = 0.5
-_LONGEST_PAUSE_S = 15.0
 
 
 class Driver:
@@ -75,9 +71,11 @@ class Driver:
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._at_once = threading.Event()
+        self._attempts = Attempts(self._shop, name=self.name, at_once=self._at_once)
         # counted by the signal handler, which must not take a lock
         self._stops = 0
         self._parent_gone = False
+        self._broken = False
 
     # --- from outside
 
@@ -91,7 +89,8 @@ class Driver:
         Returns
         -------
         int
-            0 when all jobs are done or given back, 1 where a run did not end when it was called off.
+            0 when all jobs are done or given back; 1 where a run did not end when it was called off, or nothing could
+            be started.
         """
         LOG.info("the driver starts", extra=self._facts)
         slots = [
@@ -114,24 +113,30 @@ class Driver:
         self._cluster.close()
         self._store.close()
         LOG.info("the driver has ended", extra=self._facts)
-        return 0 if clean else 1
+        return 0 if clean and not self._broken else 1
 
     # --- start and end
 
     def _start(self, threads: list[threading.Thread]) -> None:
         """Wait for the database, start the workers, then let the slots claim."""
-        if not self._until_done(self._store.migrate, "the database cannot be migrated"):
-            return
         try:
-            self._cluster.start()
-        except ClusterError:
-            LOG.exception("the workers do not start; it is tried again with the first job", extra=self._facts)
+            if not self._until_done(self._store.migrate, "the database cannot be migrated"):
+                return
+            try:
+                self._cluster.start()
+            except ClusterError as error:
+                LOG.warning("no workers yet, tried again with the first job: %s", error, extra=self._facts)
+        except Exception:  # noqa: BLE001 - without this thread the driver would look alive and claim nothing
+            LOG.exception("the driver cannot start", extra=self._facts)
+            self._broken = True
+            return
+        quieten()
         for thread in threads:
             if not self._stopping.is_set():
                 thread.start()
 
     def _wait_for_stop(self) -> None:
-        while self._stops == 0 and not self._parent_gone:
+        while self._stops == 0 and not self._parent_gone and not self._broken:
             time.sleep(_TICK_S)
 
     def _drain(self) -> bool:
@@ -180,7 +185,7 @@ class Driver:
 
     def _slot(self) -> None:
         """Claim and work, one job after the other."""
-        pause = _FIRST_PAUSE_S
+        pause = FIRST_PAUSE_S
         while True:
             with self._lock:
                 # under the lock, so that who ends the driver sees every claim
@@ -189,11 +194,14 @@ class Driver:
                 self._busy += 1
             try:
                 worked = self._claim_and_work()
-                pause = _FIRST_PAUSE_S
+                pause = FIRST_PAUSE_S
                 wait_s = 0.0 if worked else self._settings.poll_s
             except StoreError as error:
                 LOG.warning("no job can be claimed, again in %g s: %s", pause, error, extra=self._facts)
-                wait_s, pause = pause, min(_LONGEST_PAUSE_S, 2.0 * pause)
+                wait_s, pause = pause, min(LONGEST_PAUSE_S, 2.0 * pause)
+            except Exception:  # noqa: BLE001 - a slot that ended would leave a driver that looks alive and claims nothing
+                LOG.exception("an unexpected fault, again in %g s", pause, extra=self._facts)
+                wait_s, pause = pause, min(LONGEST_PAUSE_S, 2.0 * pause)
             finally:
                 with self._lock:
                     self._busy -= 1
@@ -207,6 +215,9 @@ class Driver:
         StoreError
             The database does not answer.
         """
+        if any(held.overdue for held in self._all_held()):
+            # this machine slept: our own leases come first, or we would take our own jobs for lost
+            return False
         settings, claimed_s = self._settings, time.monotonic()
         job = self._store.claim(self.name, lease_s=settings.lease_s, max_attempts=settings.max_attempts)
         if job is None:
@@ -218,90 +229,11 @@ class Driver:
             # claimed while the driver began to end: nobody told this job
             if self._at_once.is_set():
                 held.stop(Stop.RELEASED)
-            self._work(held)
+            self._attempts.work(held)
         finally:
             with self._lock:
                 del self._held[job.job_id]
         return True
-
-    def _work(self, held: HeldJob) -> None:
-        """One attempt, and what comes of it."""
-        LOG.info("the job runs", extra=held.facts)
-        with held:
-            try:
-                if held.cancelled():
-                    raise RunCancelledError("the job was called off")  # noqa: TRY301
-                message, summary = perform(held, self._shop)
-            except BaseException as error:  # noqa: BLE001 - whatever ends an attempt must become the job's end
-                self._ended(held, error)
-                return
-            done = self._settle(held, lambda: self._store.succeed(held.job, message=message, summary=summary))
-        if done:
-            LOG.info("the job succeeded: %s", message, extra=held.facts)
-            self._forget(held, before=True)
-        else:
-            self._forget(held)
-
-    def _ended(self, held: HeldJob, error: BaseException) -> None:
-        """An attempt that did not come to its end: dismissed, given back, tried again or failed."""
-        job, reason = held.job, held.stopped_for
-        if reason is not None:
-            level = "called off" if isinstance(error, RunCancelledError) else f"ended with {type(error).__name__}"
-            LOG.info("the attempt was %s: %s", level, reason.name.lower(), extra=held.facts)
-        if reason is Stop.DISMISSED:
-            self._forget(held, whole=True)
-            self._settle(held, lambda: self._store.dismissed(job))
-            return
-        if reason is not None:
-            self._forget(held)
-            told = f"driver {self.name} ended; the job waits for another" if reason is Stop.RELEASED else ""
-            self._settle(held, lambda: self._store.release(job, lost=reason is Stop.LOST, message=told))
-            return
-        reference = secrets.token_hex(4)
-        facts: dict[str, Any] = {**held.facts, "reference": reference}
-        expected = isinstance(error, GableworkError | ServiceError)
-        LOG.warning("the attempt failed: %s", error, extra=facts, exc_info=None if expected else error)
-        if isinstance(error, ClusterError):
-            self._cluster.replace()
-        self._forget(held)
-        if tried_again(error, job, self._settings.max_attempts):
-            pause = pause_s(job.lost_attempts)
-            told = f"waiting: {held.scrub(str(error))}; tried again in {pause:g} s"
-            lost = isinstance(error, ClusterError)
-            self._settle(held, lambda: self._store.release(job, lost=lost, message=told, retry_after_s=pause))
-            return
-        failure = failure_of(error, scrub=held.scrub, reference=reference, attempts=job.lost_attempts + 1)
-        self._settle(held, lambda: self._store.fail(job, failure))
-
-    def _settle(self, held: HeldJob, write: Callable[[], None]) -> bool:
-        """Write the end of an attempt, however long the database is away; False where the lease is lost."""
-        pause = _FIRST_PAUSE_S
-        while True:
-            try:
-                with contextlib.suppress(LeaseLostError):
-                    held.write()
-                write()
-            except LeaseLostError as error:
-                LOG.warning("the attempt does not count: %s", error, extra=held.facts)
-                return False
-            except StoreError as error:
-                LOG.warning("the end of the attempt cannot be written yet: %s", error, extra=held.facts)
-                if self._at_once.wait(pause):
-                    return False
-                pause = min(_LONGEST_PAUSE_S, 2.0 * pause)
-            else:
-                return True
-
-    def _forget(self, held: HeldJob, *, whole: bool = False, before: bool = False) -> None:
-        """Remove this attempt's folder, the whole job's, or those of the attempts before this one."""
-        job, folder = held.job, self._shop.folder
-        if whole:
-            shutil.rmtree(folder.job(job.job_id), ignore_errors=True)
-        elif before:
-            for number in range(1, job.attempt):
-                shutil.rmtree(folder.attempt(job.job_id, number), ignore_errors=True)
-        else:
-            shutil.rmtree(folder.attempt(job.job_id, job.attempt), ignore_errors=True)
 
     # --- the janitor
 
@@ -319,14 +251,14 @@ class Driver:
 
     def _until_done(self, action: Callable[[], None], complaint: str) -> bool:
         """Try again until the database is there; False where the driver is to end."""
-        pause = _FIRST_PAUSE_S
+        pause = FIRST_PAUSE_S
         while not self._stopping.is_set():
             try:
                 action()
             except StoreError as error:
                 LOG.warning("%s, again in %g s: %s", complaint, pause, error, extra=self._facts)
                 self._stopping.wait(pause)
-                pause = min(_LONGEST_PAUSE_S, 2.0 * pause)
+                pause = min(LONGEST_PAUSE_S, 2.0 * pause)
             else:
                 return True
         return False

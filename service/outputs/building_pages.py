@@ -16,13 +16,17 @@ from service.errors import NoSuchOutputError, RequestError
 from service.outputs.building_index import FEATURES_NAME, NAME, Box
 from service.outputs.catalogue import ResultsCrs
 
+GONE = "the buildings of this job are no longer in the state folder: submit it again"
+"""What is told where the files were removed."""
 MAX_LIMIT = 10_000
 """Most buildings of one page."""
 MAX_OFFSET = 10**12
 """Most buildings before a page."""
 _CHUNK_BYTES = 1 << 16
-_NARROW_SHARE = 0.25
-"""Windows that meet tiles with fewer buildings than this share are looked up tile by tile."""
+_CACHE_KIB = 512
+_NARROW_SHARE = 0.05
+"""Windows whose tiles hold a smaller share of all buildings are looked up tile by tile, where a row costs ten times
+more."""
 
 
 class CoordinateChoice(StrEnum):
@@ -63,7 +67,7 @@ class BuildingQuery:
     """Buildings before it, in the order of their ids."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class FeaturePart:
     """Where a building's feature lies, and what takes the place of its geometry."""
 
@@ -181,10 +185,17 @@ def opened_index(out_dir: Path) -> Iterator[sqlite3.Connection]:
     """
     path = (out_dir / NAME).resolve()
     if not path.is_file():
-        raise NoSuchOutputError("the buildings of this job are no longer in the state folder: submit it again")
+        raise NoSuchOutputError(GONE)
     connection = sqlite3.connect(f"{path.as_uri()}?mode=ro&immutable=1", uri=True)
     try:
+        # many requests at once are as large as their caches; the system keeps the file's pages anyway
+        connection.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
         yield connection
+    except sqlite3.OperationalError:
+        # the job may be removed while it is read
+        if not path.is_file():
+            raise NoSuchOutputError(GONE) from None
+        raise
     finally:
         connection.close()
 

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from service.errors import NoSuchBuildingError
+from service.errors import NoSuchBuildingError, NoSuchOutputError
 from service.outputs.building_index import FEATURES_NAME
-from service.outputs.building_pages import opened_index
+from service.outputs.building_pages import GONE, opened_index
 from service.outputs.meshes import building_lines
 
 ID_PATTERN = "^[a-z2-7]{24}$"
@@ -69,9 +69,12 @@ def stored_building(out_dir: Path, building_id: str, *, native: bool = False) ->
     if row is None:
         raise NoSuchBuildingError(f"the results of this job hold no building {building_id[:80]!r}")
     tile, mesh_path, start, size, geometry, city_start, city_size, planes = row
-    with (out_dir / FEATURES_NAME).open("rb") as stream:
-        stream.seek(start)
-        feature: dict[str, Any] = json.loads(stream.read(size))
+    try:
+        with (out_dir / FEATURES_NAME).open("rb") as stream:
+            stream.seek(start)
+            feature: dict[str, Any] = json.loads(stream.read(size))
+    except FileNotFoundError:
+        raise NoSuchOutputError(GONE) from None
     if native:
         feature["geometry"] = json.loads(geometry)
     return StoredBuilding(

@@ -148,6 +148,16 @@ SCHEMAS: Mapping[str, dict[str, Any]] = {
         message=_TEXT,
     ),
     "EventList": _object(("events", "links"), events={"type": "array", "items": reference("Event")}, links=_LINKS),
+    "ServerSentEvent": {
+        **_object(
+            (),
+            event={**_TEXT, "description": "The event's kind."},
+            data={**_TEXT, "description": "The event, as JSON."},
+            id={**_TEXT, "description": "The event's id, for Last-Event-ID."},
+            retry={"type": "integer", "minimum": 0, "description": "Milliseconds until a client comes again."},
+        ),
+        "description": "One event of the stream.",
+    },
     "JobForm": _object(
         ("tile",),
         tile={

@@ -16,7 +16,7 @@ from starlette.types import Receive, Scope, Send
 from service.errors import NoSuchJobError, TooManyRequestsError
 from service.jobs import JobEvent
 from service.routes.bound import Base, Reader, Settings_, Store
-from service.routes.documented import document, problems
+from service.routes.documented import document, problems, reference
 from service.routes.jobs import JobId
 from service.routes.negotiation import preferred
 from service.routes.status import event_data, link
@@ -65,7 +65,7 @@ _EXAMPLE = {
             "description": "The events: a list, or a stream where `text/event-stream` is asked for.",
             "content": {
                 **document("EventList", "", _EXAMPLE)["content"],
-                "text/event-stream": {"schema": {"type": "string"}},
+                "text/event-stream": {"schema": reference("ServerSentEvent")},
             },
         },
         204: {"description": "The job is over and all its events are known: do not come again."},

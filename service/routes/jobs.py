@@ -156,7 +156,10 @@ _STATUSES = [status.value for status in JobStatus]
 @router.get(
     "/jobs",
     summary="List jobs",
-    responses={200: document("JobList", "The jobs, newest first."), **problems(400)},
+    responses={
+        200: document("JobList", "The jobs, newest first.", {"jobs": [STATUS_EXAMPLE], "links": []}),
+        **problems(400),
+    },
 )
 def jobs(
     base: Base,

@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 
 from service.routes.bound import Base, visitor
-from service.routes.documented import problems
+from service.routes.documented import document, problems
 from service.routes.negotiation import preferred
 from service.routes.status import RELATIONS, link
 
@@ -108,7 +108,7 @@ UNBUILT = """<!doctype html>
     "/conformance",
     summary="Conformance classes",
     responses={
-        200: {"content": {"application/json": {"schema": {"$ref": "#/components/schemas/Conformance"}}}},
+        200: document("Conformance", "The classes.", {"conformsTo": list(CONFORMANCE)}),
     },
 )
 def conformance() -> JSONResponse:
@@ -122,21 +122,21 @@ def docs(request: Request) -> HTMLResponse:
     return HTMLResponse(_docs(request.app.openapi()))
 
 
-def _docs(document: Mapping[str, Any]) -> str:
+def _docs(api: Mapping[str, Any]) -> str:
     """The operations of an OpenAPI document as a page."""
-    chapters: dict[str, list[str]] = {tag["name"]: [] for tag in document["tags"]}
-    for path, operations in document["paths"].items():
+    chapters: dict[str, list[str]] = {tag["name"]: [] for tag in api["tags"]}
+    for path, operations in api["paths"].items():
         for method, operation in operations.items():
             answers = ", ".join(operation["responses"])
             chapters[operation["tags"][0]].append(
                 f"<h3><code>{method.upper()} {escape(path)}</code> {escape(operation['summary'])}</h3>"
                 f"<p>{escape(operation.get('description', ''))}</p>{_parameters(operation)}<p>Answers: {answers}</p>"
             )
-    titles = {tag["name"]: tag["description"] for tag in document["tags"]}
+    titles = {tag["name"]: tag["description"] for tag in api["tags"]}
     body = "".join(
         f"<h2>{escape(name)}</h2><p>{escape(titles[name])}</p>{''.join(told)}" for name, told in chapters.items()
     )
-    info = document["info"]
+    info = api["info"]
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1"><title>gablework API</title></head>'

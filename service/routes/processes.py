@@ -18,12 +18,21 @@ from service.routes.submission import Submission
 
 router = APIRouter(tags=["processes"])
 
+_SUMMARY = {
+    "id": "reconstruct",
+    "version": "0.1.0",
+    "title": "Reconstruct buildings",
+    "jobControlOptions": ["async-execute", "dismiss"],
+    "outputTransmission": ["reference"],
+    "links": [{"href": "http://127.0.0.1:8000/processes/reconstruct", "rel": "self", "type": "application/json"}],
+}
+
 
 @router.get(
     "/processes",
     summary="List the processes",
     dependencies=[Depends(visitor)],
-    responses={200: document("ProcessList", "The processes.")},
+    responses={200: document("ProcessList", "The processes.", {"processes": [_SUMMARY], "links": []})},
 )
 def processes(
     base: Base,
@@ -44,7 +53,18 @@ def processes(
     "/processes/{processID}",
     summary="Describe a process",
     dependencies=[Depends(visitor)],
-    responses={200: document("Process", "Its inputs and outputs."), **problems(404)},
+    responses={
+        200: document(
+            "Process",
+            "Its inputs and outputs.",
+            {
+                **_SUMMARY,
+                "inputs": {"crs": {"title": "CRS", "schema": {"type": "string"}, "minOccurs": 0, "maxOccurs": 1}},
+                "outputs": {"report": {"title": "Report", "schema": {"type": "object"}}},
+            },
+        ),
+        **problems(404),
+    },
 )
 def process(processID: str, base: Base, settings: Settings_) -> JSONResponse:  # noqa: N803 - the standard's word
     """Describe a process: its inputs with their schemas, its outputs with their media types."""

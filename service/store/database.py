@@ -93,7 +93,8 @@ class Database:
             The database does not answer, or is of a newer version.
         """
         if self.is_sqlite and self._url.database is not None:
-            Path(self._url.database).parent.mkdir(parents=True, exist_ok=True)
+            with self._told_faults():
+                Path(self._url.database).parent.mkdir(parents=True, exist_ok=True)
         with self.write() as connection:
             self.lock(connection, _LOCK_MIGRATIONS)
             self._check_not_newer(migrations.current(connection))

@@ -20,8 +20,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from faults.asked import environment
 
+import pipeline.reconstruct
 from pipeline.errors import RunCancelledError, RunError, SettingsError
-from pipeline.model import Reason
+from pipeline.model import Candidate, Reason
 from pipeline.runtime import children
 from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
 from pipeline.runtime.messages import Frames, frame
@@ -247,7 +248,7 @@ def test_a_prestarted_child_is_the_one_that_works(orders: Callable[[str], str]) 
 
 def test_children_that_cannot_start_are_an_error_that_tells_what_they_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(children, "_LOADS", ("no_such_module:load",))
-    with pytest.raises(RunError, match=r"3 times in a row.*No module named 'no_such_module'"):
+    with pytest.raises(RunError, match=r"(?s)3 times in a row.*No module named 'no_such_module'"):
         outcomes(len, ["abc"])
 
 
@@ -304,9 +305,9 @@ time.sleep(1000)
 def test_a_child_is_gone_when_its_worker_is_killed(
     orders: Callable[[str], str], tmp_path: Path, order: str, sign: signal.Signals
 ) -> None:
-    told = f"open('{tmp_path}/reached', 'w').close(); {order}"
+    told = f"open('{tmp_path}/reached', 'w').close()\n{order}"
     with subprocess.Popen([sys.executable, "-c", WORKER, str(tmp_path), told], stderr=subprocess.DEVNULL) as worker:
-        wait_for((tmp_path / "reached").exists, "the item")
+        wait_for(lambda: (tmp_path / "reached").exists() or worker.poll() is not None, "the item")
         (child,) = child_processes(worker.pid)
         worker.send_signal(sign)
     wait_for(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE, "the end of the child")
@@ -331,17 +332,26 @@ def test_isolation_changes_no_content(suburb: Path, reconstruct: Any) -> None:
     assert not (Path(isolated.run_dir) / "quarantine").exists()
 
 
-def test_a_building_of_ours_at_fault_is_kept_with_and_without_a_child(
-    suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("isolate", [True, False])
+def test_a_building_that_meets_a_fault_of_ours_is_kept_with_and_without_a_child(
+    suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch, isolate: bool
 ) -> None:
     victim = min(rows(reconstruct(suburb).run_dir))
     for name, value in environment(**{"raise": [victim]}).items():
         monkeypatch.setenv(name, value)
-    isolated = reconstruct(suburb, isolate=True)
-    row = rows(isolated.run_dir)[victim]
+    real = pipeline.reconstruct._reconstruct
+
+    def faulty(candidate: Candidate, *rest: Any) -> Any:
+        if candidate.building_id == victim:
+            raise ZeroDivisionError("on purpose")
+        return real(candidate, *rest)
+
+    monkeypatch.setattr(pipeline.reconstruct, "_reconstruct", faulty)
+    summary = reconstruct(suburb, isolate=isolate)
+    row = rows(summary.run_dir)[victim]
     assert (row["status"], row["reason"]) == ("failed", "internal_error")
     assert "on purpose" in row["reason_detail"]
-    assert [path.name for path in Path(isolated.run_dir, "quarantine").iterdir()] == [f"{victim}.bundle"]
+    assert [path.name for path in Path(summary.run_dir, "quarantine").iterdir()] == [f"{victim}.bundle"]
 
 
 @pytest.mark.slow

@@ -67,7 +67,8 @@ def starting(tmp_path: Path) -> Iterator[Starting]:
         def start(**options: Any) -> LocalService:
             settings = ServiceSettings(**{"state": tmp_path / "state", **options})
             store = stack.enter_context(JobStore(settings.database))
-            client = TestClient(create_app(settings, store), OWN_URL, raise_server_exceptions=False)
+            app = create_app(settings, store)
+            client = TestClient(app, OWN_URL, raise_server_exceptions=False, root_path=settings.root_path)
             return LocalService(stack.enter_context(client), store, settings)
 
         yield start

@@ -17,7 +17,7 @@ import pytest
 from pipeline.errors import ClusterError, RunCancelledError, UnreadableInputError
 from pipeline.runtime.events import Event
 from pipeline.runtime.run import RunSummary
-from service.driver import process
+from service.driver import endings, process
 from service.driver.attempt import Tools
 from service.driver.clusters import SharedCluster, answers
 from service.driver.janitor import tidy, tidy_jobs
@@ -25,7 +25,7 @@ from service.driver.process import Driver
 from service.errors import StoreError
 from service.fetching import Fetched
 from service.files import StateFolder
-from service.jobs import Fault, InputReference, Job, JobRequest, JobStatus, Upload
+from service.jobs import Fault, InputReference, Job, JobFailure, JobRequest, JobStatus, Upload
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -390,7 +390,7 @@ def test_bad_settings_fail_before_the_run(bench: Bench) -> None:
 
 
 def test_a_lost_cluster_is_replaced_and_the_job_tried_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(process, "pause_s", lambda _losses: 0.05)
+    monkeypatch.setattr(endings, "pause_s", lambda _losses: 0.05)
     monkeypatch.setattr(Engine, "started", 0)
     job = bench.submit()
     bench.script.raises(ClusterError("the scheduler tcp://127.0.0.1:5 was lost"))
@@ -403,7 +403,7 @@ def test_a_lost_cluster_is_replaced_and_the_job_tried_again(bench: Bench, monkey
 
 
 def test_a_cluster_that_is_lost_again_and_again_fails_the_job(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(process, "pause_s", lambda _losses: 0.01)
+    monkeypatch.setattr(endings, "pause_s", lambda _losses: 0.01)
     job = bench.submit()
     for _ in range(3):
         bench.script.raises(ClusterError("gone"))
@@ -524,6 +524,116 @@ def test_a_driver_outlives_a_database_that_is_away_for_a_while(bench: Bench, mon
     assert "outputs" in [event.stage for event in bench.store.events(job.job_id)]
 
 
+def test_a_success_whose_answer_was_lost_on_the_way_keeps_its_results(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, answers_lost = JobStore.succeed, []
+
+    def cut(store: JobStore, *values: Any, **named: Any) -> None:
+        plain(store, *values, **named)
+        if not answers_lost:
+            answers_lost.append(True)
+            raise StoreError("the connection broke after the commit")
+
+    monkeypatch.setattr(JobStore, "succeed", cut)
+    job = bench.submit()
+    driver = bench.driver()
+    assert bench.over(job).status is JobStatus.SUCCESSFUL
+    driver.stop()
+    bench.join()
+    assert answers_lost
+    assert (bench.folder.outputs(job.job_id, 1) / "outputs.json").exists()
+
+
+def test_a_driver_that_slept_renews_its_own_lease_before_it_looks_for_work(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = bench.submit()
+    bench.script.waits()
+    bench.driver(driver_jobs=2)
+    bench.runs()
+    claims = []
+    plain_claim, plain_renew = JobStore.claim, JobStore.renew
+    renewals = threading.Event()
+
+    def claim(store: JobStore, *values: Any, **named: Any) -> Job | None:
+        claims.append(renewals.is_set())
+        return plain_claim(store, *values, **named)
+
+    def renew(store: JobStore, *values: Any, **named: Any) -> bool:
+        renewals.set()
+        return plain_renew(store, *values, **named)
+
+    (driver, _) = bench._running[0]
+    (held,) = driver._all_held()
+    # as after an hour of sleep: the wall clock and the database's went on, the lease has ended
+    monkeypatch.setattr(held, "_renewed_at_s", time.time() - 3600.0)
+    until(lambda: driver._busy == 1, "the end of a claim that was under way")
+    with bench.store._database.write() as connection:
+        connection.exec_driver_sql("UPDATE jobs SET lease_until = '2020-01-01 00:00:00.000000'")
+    monkeypatch.setattr(JobStore, "claim", claim)
+    monkeypatch.setattr(JobStore, "renew", renew)
+    monkeypatch.setattr(held, "_renewed_s", held._renewed_s - 15.0)
+    until(lambda: claims, "a claim")
+    assert claims[0], "a claim came before the renewal"
+    bench.script.go_on.set()
+    done = bench.over(job)
+    assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 1)
+
+
+def test_a_driver_that_cannot_start_ends_and_says_so(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(store: JobStore) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(JobStore, "migrate", broken)
+    bench.driver()
+    bench.join()
+    assert bench.codes == [1]
+
+
+def test_a_driver_waits_for_its_database_and_can_be_stopped_while_it_does(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = threading.Event()
+
+    def away(store: JobStore) -> None:
+        asked.set()
+        raise StoreError("the database does not answer")
+
+    monkeypatch.setattr(JobStore, "migrate", away)
+    driver = bench.driver()
+    assert asked.wait(DEADLINE_S)
+    driver.stop()
+    bench.join()
+    assert bench.codes == [0]
+
+
+def test_workers_are_not_started_again_once_the_driver_has_ended(bench: Bench) -> None:
+    cluster = SharedCluster(bench.settings, Engine)
+    cluster.start()
+    cluster.replace()
+    cluster.start()
+    cluster.close()
+    with pytest.raises(ClusterError, match="ends"):
+        cluster.executor(0)
+
+
+def test_a_slot_outlives_a_fault_that_nobody_thought_of(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, faults = JobStore.claim, []
+
+    def broken(store: JobStore, *values: Any, **named: Any) -> Job | None:
+        if not faults:
+            faults.append(True)
+            raise TypeError("a request of another version")
+        return plain(store, *values, **named)
+
+    monkeypatch.setattr(JobStore, "claim", broken)
+    job = bench.submit()
+    bench.driver()
+    assert bench.over(job).status is JobStatus.SUCCESSFUL
+    assert faults
+
+
 def test_without_a_heartbeat_for_the_length_of_the_lease_the_work_stops(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -587,6 +697,9 @@ def test_the_janitor_removes_what_no_job_needs_and_nothing_else(bench: Bench) ->
     done = bench.submit(priority=8)
     store.succeed(claimed(), message="", summary={})
     attempts(done.job_id, 1)
+    failed = bench.submit(priority=8)
+    store.fail(claimed(), JobFailure(fault=Fault.LOST, detail="lost"))
+    attempts(failed.job_id, 1)
     given_back = bench.submit(priority=7)
     store.release(claimed(), lost=True, retry_after_s=60.0)
     attempts(given_back.job_id, 1)
@@ -599,7 +712,7 @@ def test_the_janitor_removes_what_no_job_needs_and_nothing_else(bench: Bench) ->
     left = {path.relative_to(folder.jobs).as_posix() for path in folder.jobs.glob("*/*")}
     assert left == {f"{running.job_id}/attempt-2", f"{done.job_id}/attempt-1"}
     assert {path.name for path in folder.jobs.iterdir()} == {
-        *(running.job_id, done.job_id, given_back.job_id),
+        *(running.job_id, done.job_id, given_back.job_id, failed.job_id),
         "not ours",
     }
 

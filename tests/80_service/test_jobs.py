@@ -7,12 +7,15 @@ import datetime as dt
 import errno
 import json
 import logging
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import service.jobs
 from pipeline.errors import (
     ClusterError,
     CrsError,
@@ -34,6 +37,8 @@ from service.errors import (
     TooLargeError,
 )
 from service.jobs import Fault, InputReference, Job, JobRequest, JobStatus
+from service.settings import ServiceSettings
+from service.store.changes import MAX_KEPT
 from service.store.policies import after_loss, duration_ms, lease_expired, loss
 
 NOON = dt.datetime(2026, 5, 1, 12, tzinfo=dt.UTC)
@@ -246,3 +251,34 @@ def test_lines_of_the_log_name_the_job_and_the_attempt() -> None:
     told = json.loads(JsonLines().format(record))
     assert (told["message"], told["job"], told["attempt"], told["level"]) == ("runs 3", "ab", 2, "info")
     assert PlainLines().format(record).endswith("runs 3 [job ab, attempt 2]")
+
+
+# --- the page about jobs
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "how_to" / "jobs.md"
+
+
+def test_the_page_draws_the_transitions_as_the_code_does() -> None:
+    (drawn,) = re.findall(r"```\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert service.jobs.__doc__ is not None
+    assert drawn in service.jobs.__doc__
+
+
+def test_the_page_names_settings_that_exist_with_their_defaults() -> None:
+    text = PAGE.read_text()
+    fields = ServiceSettings.model_fields
+    for name in re.findall(r"GABLEWORK_([A-Z_]+)", text):
+        assert name.lower() in fields
+    told = dict(re.findall(r"`GABLEWORK_([A-Z_]+)` \((\d+)", text))
+    assert set(told) == {"LEASE_S", "MAX_ATTEMPTS", "DRIVER_JOBS", "DRAIN_S"}
+    for name, value in told.items():
+        assert fields[name.lower()].default == float(value)
+
+
+def test_the_page_tells_the_shares_of_the_stages_and_every_cause() -> None:
+    text = " ".join(PAGE.read_text().split())
+    assert ", ".join(f"{stage} {weight}" for stage, weight in WEIGHTS.items()) in text
+    assert {fault for fault in Fault if f"`{fault}`" in text} == set(Fault)
+    assert f"the last {MAX_KEPT} warnings" in text
+    for status in JobStatus:
+        assert f"| {status} |" in text

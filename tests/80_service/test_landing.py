@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from pipeline import __version__
 from service.errors import StartUpError
 from service.keys import Scope
 from service.routes import landing
 from service.routes.status import RELATIONS
-
-from pipeline import __version__  # isort: skip
 
 
 def test_the_landing_page_links_to_all_that_the_standard_wants(local_service) -> None:
@@ -28,7 +27,6 @@ def test_browsers_get_html_and_machines_get_json(local_service) -> None:
     browser = {"Accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
     page = local_service.client.get("/", headers=browser)
     assert page.headers["content-type"].startswith("text/html")
-    assert "script-src" not in page.headers["content-security-policy"]
     assert "default-src 'self'" in page.headers["content-security-policy"]
     for accept in ("*/*", "application/json", ""):
         assert local_service.client.get("/", headers={"Accept": accept}).json()["title"] == "gablework"
@@ -109,7 +107,7 @@ def test_figures_count_requests_by_template_and_jobs_by_status(local_service) ->
 def test_figures_need_a_key_where_there_are_keys(local_service) -> None:
     header = local_service.key(Scope.READ)
     assert local_service.client.get("/metrics", headers=header).status_code == 200
-    assert local_service.client.get("/metrics").status_code in {200, 401}  # what was known of keys counts for seconds
+    assert local_service.client.get("/metrics").status_code == 401
 
 
 def test_another_address_needs_keys(starting) -> None:

@@ -341,6 +341,18 @@ def test_elevations_in_feet_do_not_move_footprints(tmp_path: Path) -> None:
         assert back.transform(*shapes[name].centroid.coords[0]) == pytest.approx(geometry.centroid.coords[0], abs=0.01)
 
 
+def test_a_footprint_without_a_place_on_earth_is_a_feature_without_geometry(tmp_path: Path) -> None:
+    lost = runs.placed(small.gable(), "lost", 1e9, 0.0)
+    found = runs.placed(small.gable(), "found", 500_000.0, 5_000_000.0)
+    write_outputs(runs.write_run(tmp_path / "run", {"x1_y1": [lost, found]}, epsg=25832), tmp_path / "out")
+    features = json.loads(output_file(tmp_path / "out", "geojson").read_text())["features"]
+    assert {feature["id"]: feature["geometry"] is None for feature in features} == {
+        runs.ident("lost"): True,
+        runs.ident("found"): False,
+    }
+    assert json.loads(output_file(tmp_path / "out", "report").read_text())["buildings"]["without_footprint"] == 1
+
+
 def test_an_unknown_crs_is_told_and_the_coordinates_stay_the_tiles_own(tmp_path: Path) -> None:
     write_outputs(runs.write_run(tmp_path / "run", epsg=None), tmp_path / "out")
     found = json.loads(output_file(tmp_path / "out", "geojson").read_text())

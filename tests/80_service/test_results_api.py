@@ -257,6 +257,16 @@ def test_results_whose_files_are_gone_are_told_so(service: runs.Service) -> None
         assert "no longer in the state folder" in problem(service.client.get(path), 404, "no-such-output")
 
 
+def test_a_building_whose_job_is_being_removed_is_told_so(service: runs.Service) -> None:
+    job_id = service.finished()
+    (service.folder.outputs(job_id, 1) / "buildings.geojson").unlink()
+    answer = service.client.get(f"/jobs/{job_id}/buildings/{runs.ident('gable')}")
+    assert "no longer in the state folder" in problem(answer, 404, "no-such-output")
+    (service.folder.outputs(job_id, 1) / "index.sqlite").unlink()
+    answer = service.client.get(f"/jobs/{job_id}/buildings")
+    assert "no longer in the state folder" in problem(answer, 404, "no-such-output")
+
+
 def test_results_of_another_key_are_no_results(tmp_path: Path) -> None:
     with runs.service(tmp_path) as service:
         tokens = {}
@@ -287,3 +297,10 @@ def test_the_openapi_document_declares_every_answer_with_its_type(client: TestCl
     assert all(set(file[status]["content"]) == {"application/problem+json"} for status in ("404", "406", "416"))
     listed = described["/jobs/{jobID}/results"]["get"]["responses"]["200"]["content"]["application/json"]
     assert json.dumps(listed["example"])
+
+
+def test_the_page_on_results_tells_every_output_with_its_type_and_file() -> None:
+    page = Path(__file__).resolve().parents[2] / "docs/how_to/results_by_rest.md"
+    rows = [line.split("|")[1:4] for line in page.read_text().splitlines() if line.startswith("| `")]
+    told = [tuple(cell.strip().strip("`") for cell in row) for row in rows]
+    assert told[: len(OUTPUTS)] == [(kind.output_id, kind.media_type, kind.filename) for kind in OUTPUTS.values()]

@@ -66,3 +66,9 @@ def test_messages_name_no_folder_of_the_machine(tmp_path: Path) -> None:
 def test_a_database_that_cannot_serve_is_refused(url: str) -> None:
     with pytest.raises(StartUpError):
         JobStore(url)
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with JobStore(f"sqlite:///{tmp_path / 'file' / 'a.db'}") as store, pytest.raises(StoreError, match=r"a\.db"):
+        store.migrate()

@@ -514,6 +514,13 @@ def test_a_path_with_dots_is_sent_as_it_is_and_finds_nothing(url: str) -> None:
         assert b"ServiceSettings" not in answer
 
 
+def test_half_a_character_in_a_request_is_refused_and_told(client: httpx.Client) -> None:
+    body = b'{"inputs": {"tiles": [], "settings": {"\\ud800": 1}, "\\udfff": "\\ud800"}}'
+    answer = client.post("/processes/reconstruct/execution", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code == 400
+    assert "?" in problem(answer)
+
+
 def test_keys_see_their_own_uploads_and_an_admin_all(tmp_path: Path) -> None:
     settings = settings_in(tmp_path)
     scopes = {"one": Scope.SUBMIT, "two": Scope.SUBMIT, "reader": Scope.READ, "admin": Scope.ADMIN}

@@ -111,6 +111,7 @@ def test_a_killed_drivers_job_is_finished_once_by_another(site: Site) -> None:
     assert second.stop() == 0
 
 
+@pytest.mark.parametrize("site", ["sqlite"], indirect=True)
 def test_a_driver_that_is_told_to_end_gives_its_job_back_and_another_takes_it_at_once(site: Site) -> None:
     job = site.submit()
     first = site.driver("first", drain_s="0", lease_s="600")
@@ -118,7 +119,7 @@ def test_a_driver_that_is_told_to_end_gives_its_job_back_and_another_takes_it_at
     assert first.stop() == 0
     waiting = site.store.get(job.job_id)
     assert (waiting.status, waiting.lost_attempts) == (JobStatus.ACCEPTED, 0)
-    assert not first.children()
+    wait_for(lambda: not first.children(), "the end of the workers")
     second = site.driver("second", lease_s="600")
     done = site.over(job, second)
     assert (done.status, done.attempt, done.lost_attempts) == (JobStatus.SUCCESSFUL, 2, 0)
@@ -183,6 +184,7 @@ def test_a_driver_ends_when_its_parent_is_gone(site: Site, tmp_path: Path) -> No
     wait_for(lambda: not [one for one in grandchildren if lives(one)], "the end of the workers")
 
 
+@pytest.mark.parametrize("site", ["postgres"], indirect=True)
 def test_two_drivers_share_twenty_jobs_and_each_is_run_to_its_end_once(site: Site) -> None:
     jobs = [site.submit() for _ in range(20)]
     drivers = [site.driver(name) for name in ("left", "right")]

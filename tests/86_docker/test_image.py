@@ -173,11 +173,13 @@ def test_a_role_has_as_long_to_stop_as_it_may_take(compose: Compose) -> None:
         assert float(services[role]["stop_grace_period"].removesuffix("s")) > drain_s
 
 
-def test_a_building_may_not_take_all_of_a_workers_memory(compose: Compose) -> None:
+def test_a_worker_and_its_building_fit_into_the_container(compose: Compose) -> None:
     services = compose["services"]
     limit = services["worker"]["deploy"]["resources"]["limits"]["memory"]
-    building = float(services["driver"]["environment"]["GABLEWORK_BUILDING_MEMORY_BYTES"])
-    assert float(limit.removesuffix("g")) * 2**30 - building >= 2**30
+    command = services["worker"]["command"]
+    worker = command[command.index("--memory-limit") + 1]
+    building = int(services["driver"]["environment"]["GABLEWORK_BUILDING_MEMORY_BYTES"])
+    assert int(worker.removesuffix("GiB")) * 2**30 + building <= int(limit.removesuffix("g")) * 2**30
 
 
 def test_build_and_run_agree_on_where_and_for_what_kernels_are_compiled(image: Image) -> None:

@@ -1,6 +1,7 @@
-"""What the image starts, taken from its own files, run as plain processes on the loopback by a user without rights.
+"""What the image starts, taken from its own files, run as plain processes on the loopback, without any rights.
 
-Only names that a container alone has are replaced: folders, host names and ports.
+Only names that a container alone has are replaced: folders, host names and ports. The processes run as the image's
+user; where that one cannot enter the folders of this environment they run as this user, without capabilities.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Any
 import httpx
 import pytest
 from container_files import Compose, Image
-from processes import LONG_S, PostgresServer, Program, Programs, free_port, missing, wait_for
+from processes import LONG_S, PostgresServer, Program, Programs, free_port, missing, program, wait_for
 
 from pipeline.synthetic.dataset import simulate
 
@@ -34,8 +35,13 @@ class Host:
     """Stands in for the container engine: a user, and what the container's names are on this machine."""
 
     user: int | None
+    """Whom processes run as; None for this user."""
+    before: tuple[str, ...]
+    """What takes rights away from a command that follows it."""
     folder: Path
+    """Below it is all that is written."""
     names: Mapping[str, str]
+    """Of the container, and what they are here."""
 
     def here(self, text: str) -> str:
         """A word of the container's, on this machine."""
@@ -60,7 +66,7 @@ class Host:
     def run(self, command: Sequence[str], env: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
         """Run a command to its end."""
         return subprocess.run(
-            command,
+            [*self.before, *command],
             env=env,
             cwd=self.folder,
             user=self.user,
@@ -71,6 +77,14 @@ class Host:
             timeout=600,
             check=False,
         )
+
+
+def able(host: Host) -> bool:
+    """Whether gablework can be run."""
+    try:
+        return host.run([sys.executable, "-c", "import pipeline"], {}).returncode == 0
+    except PermissionError:
+        return False
 
 
 @pytest.fixture(scope="module")
@@ -91,9 +105,12 @@ def host(image: Image, open_folder: Path, root: Path, postgres_server: PostgresS
         "8786": str(free_port()),
         "8000": str(free_port()),
     }
-    some = Host(user, open_folder, names)
-    if some.run([sys.executable, "-c", "import pipeline"], {}).returncode != 0:
-        missing(f"the user {user} cannot read this checkout and its environment")
+    some = Host(user, (), open_folder, names)
+    if user is not None and not able(some):
+        no_rights = ("setpriv", "--bounding-set=-all", "--inh-caps=-all", "--no-new-privs", "--")
+        some = Host(None, (str(program("setpriv")), *no_rights[1:]), open_folder, names)
+        if not able(some):
+            missing("this environment cannot be used without the rights of root")
     (open_folder / "postgres_password").write_text(f"{postgres_server.password}\n")
     (open_folder / "postgres_password").chmod(0o444)
     some.own_folder("state")
@@ -142,6 +159,7 @@ class Composed:
         home = self.host.own_folder(name)
         command = start_words(self.host, self.image, self.compose["services"][service]["command"])
         env = {**self.environment(service, home), **more}
+        command = [*self.host.before, *command]
         return self.programs.start(name, command, env=env, cwd=self.host.folder, user=self.host.user, inherit=False)
 
     def run(self, service: str, arguments: list[str]) -> subprocess.CompletedProcess[str]:

@@ -63,7 +63,7 @@ export class BuildingList {
 
   private row({ id, category, reason, heightM, areaM2 }: Listed): HTMLElement {
     const figures = [
-      heightM === null ? null : measure(heightM, 1, "m high"),
+      heightM === null ? null : measure(heightM, 1, "m"),
       areaM2 === null ? null : measure(areaM2, 0, "m²"),
     ].filter((figure) => figure !== null);
     return el(
@@ -71,7 +71,7 @@ export class BuildingList {
       { class: "building", href: this.address(id) },
       swatch(category),
       el("span", { class: "building-type" }, CATEGORIES[category].label),
-      el("span", { class: "building-figures" }, figures.join(" · ")),
+      el("span", { class: "building-figures", title: "Height and footprint" }, figures.join(" · ")),
       reason === null ? null : el("span", { class: "building-reason" }, reasonWords(reason)),
     );
   }

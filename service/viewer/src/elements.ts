@@ -1,3 +1,5 @@
+import { CATEGORIES, type Category } from "./roof_types";
+
 type Child = Node | string | number | null | undefined | false;
 type Properties = Record<string, string | number | boolean | ((event: never) => void) | null | undefined>;
 
@@ -32,9 +34,13 @@ export function byId<T extends HTMLElement = HTMLElement>(id: string): T {
   return element as T;
 }
 
-/** A small square in a category's colour; the classes are in style.css, since the page allows no inline styles. */
-export function swatch(category: string): HTMLElement {
-  return el("span", { class: `swatch swatch-${category}`, "aria-hidden": "true" });
+/** A small square in a category's colour, hatched where the models are. */
+export function swatch(category: Category): HTMLElement {
+  const hatch = category === "fallback" || category === "failed" ? " swatch-hatched" : "";
+  const square = el("span", { class: `swatch${hatch}`, "aria-hidden": "true" });
+  // by the object model: the page's policy allows no style attributes
+  square.style.backgroundColor = CATEGORIES[category].colour;
+  return square;
 }
 
 function setProperties(element: Element, properties: Properties): void {

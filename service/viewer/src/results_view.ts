@@ -158,6 +158,7 @@ class ResultsView {
     this.showFacts();
     if (this.listed.length === 0) {
       this.note.replaceChildren(this.nothing());
+      this.note.closest(".result")?.classList.add("result-empty");
       announce("No building was found.");
       return;
     }
@@ -230,7 +231,6 @@ class ResultsView {
         el("li", {}, "Do the points reach roofs and walls? Fewer than about one point per m² is too little."),
         el("li", {}, "Footprints, where you have them, say where to look."),
       ),
-      ...(this.report.warnings ?? []).map((warning) => warningNotice(warning)),
     );
   }
 
@@ -284,6 +284,7 @@ class ResultsView {
       body,
     );
     this.panel.scrollTop = 0;
+    if (!fly) this.panel.scrollIntoView({ block: "nearest" }); // on narrow screens it is below the models
     if (fly && before === null) back.focus({ preventScroll: true });
     this.stopRecord = showRecord(body, this.jobPath, id, unitName(this.report.crs?.vertical_unit_m), this.hooks.onProblem);
   }

@@ -1,0 +1,178 @@
+"""Many uploads at once beside many pollers, against a `gablework serve` of its own.
+
+    python benchmarks/service_load.py [--tile FILE] [--uploads 50] [--pollers 200] [--with-driver]
+
+Sends the tile as so many jobs at once while pollers ask for the status of what was submitted. Checks that no job and
+no upload is lost or doubled and that every stored file has the SHA-256 of the tile; tells the peak memory of the API
+process (the kernel's own high-water mark) and the duration of the status calls. Fails above the limits of the design.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import hashlib
+import json
+import os
+import re
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+TILE = Path(__file__).resolve().parents[2] / "shared" / "data" / "ahn3" / "delft_east.laz"
+MOST_API_MIB = 250.0
+"""Limit of the API process."""
+PAUSE_S = 1.0
+"""Seconds that a poller waits between two calls."""
+REST_S = 5.0
+"""Seconds that the pollers go on when the last upload is through."""
+
+
+@contextlib.contextmanager
+def serving(state: Path, *options: str) -> Iterator[tuple[str, int]]:
+    """URL and process id of a service."""
+    # all clients share an address here: the limit of one client's requests is not what is measured
+    environment = os.environ | {"GABLEWORK_RATE_LIMIT": "1000000/minute", "GABLEWORK_DRAIN_S": "0"}
+    command = [sys.executable, "-m", "service.cli", "serve", "--json", "--port", "0", "--state", str(state), *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stdout is not None
+        told = ""
+        while not told.rstrip().endswith("}"):
+            line = process.stdout.readline()
+            if not line:
+                raise SystemExit(f"serve ended with {process.wait()}")
+            told += line
+        try:
+            yield json.loads(told)["url"], process.pid
+        finally:
+            process.send_signal(signal.SIGTERM)
+
+
+def peak_mib(pid: int) -> tuple[float, float]:
+    """Resident memory of a process in MiB: now, and at its highest."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    now, peak = (int(re.search(rf"{name}:\s+(\d+) kB", status)[1]) / 1024 for name in ("VmRSS", "VmHWM"))  # type: ignore[index]
+    return now, peak
+
+
+class Load:
+    """The clients."""
+
+    def __init__(self, url: str, tile: Path) -> None:
+        limits = httpx.Limits(max_connections=None, max_keepalive_connections=None)
+        self._client = httpx.AsyncClient(base_url=url, timeout=600.0, limits=limits)
+        self._tile = tile
+        self.jobs: list[str] = []
+        self.calls_s: list[float] = []
+        self.uploads_s: list[float] = []
+        self.faults: list[str] = []
+        self._over = asyncio.Event()
+
+    async def submit(self) -> None:
+        """Send the tile as a job."""
+        began = time.perf_counter()
+        with self._tile.open("rb") as stream:
+            answer = await self._client.post(
+                "/jobs", files={"tile": (self._tile.name, stream)}, data={"crs": "EPSG:28992"}
+            )
+        self.uploads_s.append(time.perf_counter() - began)
+        if answer.status_code == 201:
+            self.jobs.append(answer.json()["jobID"])
+        else:
+            self.faults.append(f"upload: {answer.status_code} {answer.text[:200]}")
+
+    async def poll(self, number: int) -> None:
+        """Ask for a job's status, or for the list while there is none, until all is over."""
+        await asyncio.sleep(PAUSE_S * (number % 20) / 20.0)
+        while not self._over.is_set():
+            path = f"/jobs/{self.jobs[number % len(self.jobs)]}" if self.jobs else "/jobs?limit=10"
+            began = time.perf_counter()
+            try:
+                answer = await self._client.get(path)
+            except httpx.TransportError as error:
+                self.faults.append(f"poll: {type(error).__name__} {error}")
+                continue
+            self.calls_s.append(time.perf_counter() - began)
+            if answer.status_code != 200:
+                self.faults.append(f"poll: {answer.status_code} {answer.text[:200]}")
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._over.wait(), PAUSE_S)
+
+    async def run(self, uploads: int, pollers: int) -> None:
+        """All at once; the pollers start first and end last."""
+        async with self._client:
+            polling = [asyncio.create_task(self.poll(number)) for number in range(pollers)]
+            await asyncio.sleep(PAUSE_S)
+            await asyncio.gather(*(self.submit() for _ in range(uploads)))
+            await asyncio.sleep(REST_S)
+            self._over.set()
+            await asyncio.gather(*polling)
+
+
+def stored_faults(url: str, state: Path, jobs: list[str], sha256: str) -> list[str]:
+    """What is lost or doubled."""
+    faults = []
+    listed = [job["jobID"] for job in httpx.get(f"{url}/jobs?limit=1000", timeout=60.0).json()["jobs"]]
+    if len(set(jobs)) != len(jobs) or sorted(listed) != sorted(jobs):
+        faults.append(f"{len(jobs)} jobs were answered, {len(set(jobs))} different; {len(listed)} are listed")
+    files = [path for path in (state / "uploads").rglob("*") if path.is_file()]
+    digests = {hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    if len(files) != len(jobs) or digests != {sha256}:
+        faults.append(f"{len(files)} files for {len(jobs)} jobs, {len(digests)} different contents")
+    tiles = [
+        tile["href"]
+        for job in jobs
+        for tile in httpx.get(f"{url}/jobs/{job}", timeout=60.0).json()["request"]["inputs"]["tiles"]
+    ]
+    told = {httpx.get(tile, timeout=60.0).json()["sha256"] for tile in tiles}
+    if len(set(tiles)) != len(jobs) or told != {sha256}:
+        faults.append(f"{len(set(tiles))} uploads for {len(jobs)} jobs, told with the hashes {sorted(told)}")
+    return faults
+
+
+def main() -> int:
+    """Load a service; 1 where something is lost, doubled or too large."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tile", type=Path, default=TILE)
+    parser.add_argument("--uploads", type=int, default=50)
+    parser.add_argument("--pollers", type=int, default=200)
+    parser.add_argument("--with-driver", action="store_true", help="let a driver work on the jobs meanwhile")
+    options = parser.parse_args()
+    sha256 = hashlib.sha256(options.tile.read_bytes()).hexdigest()
+    with tempfile.TemporaryDirectory(prefix="gablework-load-") as folder:
+        state = Path(folder) / "state"
+        with serving(state, *([] if options.with_driver else ["--no-driver"])) as (url, pid):
+            at_rest, _ = peak_mib(pid)
+            load = Load(url, options.tile)
+            began = time.perf_counter()
+            asyncio.run(load.run(options.uploads, options.pollers))
+            seconds = time.perf_counter() - began
+            after, peak = peak_mib(pid)
+            faults = [*load.faults, *stored_faults(url, state, load.jobs, sha256)]
+    if peak > MOST_API_MIB:
+        faults.append(f"the API process took {peak:.0f} MiB, {MOST_API_MIB:.0f} are allowed")
+    cuts = statistics.quantiles(load.calls_s, n=100)
+    figures: dict[str, Any] = {
+        "uploads": f"{len(load.jobs)} of {options.uploads}, {options.tile.stat().st_size} bytes each",
+        "slowest upload": f"{max(load.uploads_s):.1f} s",
+        "status calls": f"{len(load.calls_s)} of {options.pollers} pollers in {seconds:.0f} s",
+        "status p50 / p95 / max": f"{cuts[49] * 1e3:.0f} / {cuts[94] * 1e3:.0f} / {max(load.calls_s) * 1e3:.0f} ms",
+        "API at rest / after / peak": f"{at_rest:.0f} / {after:.0f} / {peak:.0f} MiB",
+        "lost or doubled": "; ".join(faults) or "nothing",
+    }
+    for name, value in figures.items():
+        print(f"{name:28} {value}")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,135 @@
+"""What comes of an attempt: success, failure, another try, dismissal; written however long the database is away."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import shutil
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from pipeline.errors import ClusterError, GableworkError, RunCancelledError
+from service.driver.attempt import Workshop, perform
+from service.driver.faults import failure_of, pause_s, tried_again
+from service.driver.held import LOG, HeldJob, Stop
+from service.errors import LeaseLostError, ServiceError, StoreError
+from service.jobs import JobStatus
+
+FIRST_PAUSE_S = 0.5
+LONGEST_PAUSE_S = 15.0
+"""Seconds between two tries to reach a database that is away: doubled from the one to the other."""
+
+
+class Attempts:
+    """Brings attempts to their end.
+
+    Parameters
+    ----------
+    shop : Workshop
+        Store, folder, cluster.
+    name : str
+        The driver's, for messages.
+    at_once : threading.Event
+        Set when the driver is to end without waiting for the database any longer.
+    """
+
+    def __init__(self, shop: Workshop, *, name: str, at_once: threading.Event) -> None:
+        self._shop = shop
+        self._name = name
+        self._at_once = at_once
+
+    def work(self, held: HeldJob) -> None:
+        """One attempt, and what comes of it."""
+        LOG.info("the job runs", extra=held.facts)
+        with held:
+            try:
+                if held.cancelled():
+                    raise RunCancelledError("the job was called off")  # noqa: TRY301
+                message, summary = perform(held, self._shop)
+            except BaseException as error:  # noqa: BLE001 - whatever ends an attempt must become the job's end
+                self._ended(held, error)
+                return
+            done = self._settle(
+                held,
+                lambda: self._shop.store.succeed(held.job, message=message, summary=summary),
+                JobStatus.SUCCESSFUL,
+            )
+        if done:
+            LOG.info("the job succeeded: %s", message, extra=held.facts)
+            self._forget(held, before=True)
+        else:
+            self._forget(held)
+
+    def _ended(self, held: HeldJob, error: BaseException) -> None:
+        """An attempt that did not come to its end: dismissed, given back, tried again or failed."""
+        job, reason = held.job, held.stopped_for
+        if reason is not None:
+            level = "called off" if isinstance(error, RunCancelledError) else f"ended with {type(error).__name__}"
+            LOG.info("the attempt was %s: %s", level, reason.name.lower(), extra=held.facts)
+        if reason is Stop.DISMISSED:
+            self._forget(held, whole=True)
+            self._settle(held, lambda: self._shop.store.dismissed(job), JobStatus.DISMISSED)
+            return
+        if reason is not None:
+            self._forget(held)
+            told = f"driver {self._name} ended; the job waits for another" if reason is Stop.RELEASED else ""
+            lost = reason is Stop.LOST
+            self._settle(held, lambda: self._shop.store.release(job, lost=lost, message=told), JobStatus.ACCEPTED)
+            return
+        reference = secrets.token_hex(4)
+        facts: dict[str, Any] = {**held.facts, "reference": reference}
+        expected = isinstance(error, GableworkError | ServiceError)
+        LOG.warning("the attempt failed: %s", error, extra=facts, exc_info=None if expected else error)
+        if isinstance(error, ClusterError):
+            self._shop.cluster.replace()
+        self._forget(held)
+        if tried_again(error, job, self._shop.settings.max_attempts):
+            pause = pause_s(job.lost_attempts)
+            told = f"waiting: {held.scrub(str(error))}; tried again in {pause:g} s"
+            lost = isinstance(error, ClusterError)
+            self._settle(
+                held,
+                lambda: self._shop.store.release(job, lost=lost, message=told, retry_after_s=pause),
+                JobStatus.ACCEPTED,
+            )
+            return
+        failure = failure_of(error, scrub=held.scrub, reference=reference, attempts=job.lost_attempts + 1)
+        self._settle(held, lambda: self._shop.store.fail(job, failure), JobStatus.FAILED)
+
+    def _settle(self, held: HeldJob, write: Callable[[], None], status: JobStatus) -> bool:
+        """Write the end of an attempt, however long the database is away; False where the lease is lost.
+
+        A commit whose answer was lost on the way did happen: then the job has the status, at this very attempt.
+        """
+        pause = FIRST_PAUSE_S
+        while True:
+            try:
+                try:
+                    with contextlib.suppress(LeaseLostError):
+                        held.write()
+                    write()
+                except LeaseLostError as error:
+                    known = self._shop.store.attempts([held.job.job_id])
+                    if known.get(held.job.job_id) == (status, held.job.attempt):
+                        return True
+                    LOG.warning("the attempt does not count: %s", error, extra=held.facts)
+                    return False
+            except StoreError as error:
+                LOG.warning("the end of the attempt cannot be written yet: %s", error, extra=held.facts)
+                if self._at_once.wait(pause):
+                    return False
+                pause = min(LONGEST_PAUSE_S, 2.0 * pause)
+            else:
+                return True
+
+    def _forget(self, held: HeldJob, *, whole: bool = False, before: bool = False) -> None:
+        """Remove this attempt's folder, the whole job's, or those of the attempts before this one."""
+        job, folder = held.job, self._shop.folder
+        if whole:
+            shutil.rmtree(folder.job(job.job_id), ignore_errors=True)
+        elif before:
+            for number in range(1, job.attempt):
+                shutil.rmtree(folder.attempt(job.job_id, number), ignore_errors=True)
+        else:
+            shutil.rmtree(folder.attempt(job.job_id, job.attempt), ignore_errors=True)

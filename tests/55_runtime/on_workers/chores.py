@@ -1,0 +1,50 @@
+"""Tasks for workers under test; on their path, because tests themselves are not importable there."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+DEADLINE_S = 120.0
+
+
+def double(number: int) -> int:
+    """Twice the number."""
+    return 2 * number
+
+
+def die_the_first_time(task: tuple[str, int]) -> int:
+    """Kill the process when the task runs for the first time; leave a mark at every run."""
+    folder, number = task
+    runs = len(list(Path(folder).glob(f"{number}.*")))
+    Path(folder, f"{number}.{runs}").touch()
+    if runs == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def die_if_five(number: int) -> int:
+    """Kill the process for one number."""
+    if number == 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def wait_for_mark(task: tuple[str, str]) -> str:
+    """Say who runs, by a file that counts up, then wait for the file `go`."""
+    folder, name = task
+    order = len(list(Path(folder).glob("started-*")))
+    Path(folder, f"started-{order:03d}-{name}").touch()
+    end = time.monotonic() + DEADLINE_S
+    while not Path(folder, "go").exists():
+        if time.monotonic() > end:
+            raise TimeoutError(f"nobody let {name} go")
+        time.sleep(0.02)
+    return name
+
+
+def fail(message: str) -> None:
+    """Raise what no task of a run raises."""
+    raise ZeroDivisionError(message)

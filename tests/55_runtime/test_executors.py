@@ -1,0 +1,300 @@
+"""Executors: every task gives its result, whatever happens to the workers, and what cannot go on says so."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import ClusterError, RunCancelledError, RunError, VersionMismatchError
+from pipeline.runtime.events import Event, Watch
+from pipeline.runtime.executors import Cluster, Measured, SerialExecutor, executor_for
+from pipeline.runtime.flight import Lookout
+from pipeline.runtime.measured import measure_packed, packed
+from pipeline.runtime.versions import ENGINE, differences, fingerprint, versions_here, versions_of
+
+sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
+
+import chores
+
+LONG_S = 120.0
+
+
+def wait_for(condition: Any, what: str) -> None:
+    end = time.monotonic() + LONG_S
+    while not condition():
+        assert time.monotonic() < end, f"waited in vain for {what}"
+        time.sleep(0.02)
+
+
+def collect(running: Iterable[Measured[int]], results: list[int]) -> None:
+    """Keep what comes, though the map may end with an error."""
+    for measured in running:
+        results.append(measured.result)  # noqa: PERF401 - extend would keep nothing then
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """Two workers for all tests of this file."""
+    with Cluster(workers=2) as both:
+        yield both
+
+
+# --- what comes back -------------------------------------------------------------------------------------------------
+
+
+def test_every_task_gives_its_result(cluster: Cluster) -> None:
+    with cluster.executor() as executor:
+        executor.prepare("double", Watch())
+        results = [measured.result for measured in executor.map("double", chores.double, range(50), Watch())]
+    assert sorted(results) == [2 * n for n in range(50)]
+
+
+def test_several_runs_share_one_cluster_at_once(cluster: Cluster) -> None:
+    def go(first: int) -> list[int]:
+        with cluster.executor() as executor:
+            tasks = range(first, first + 20)
+            return sorted(measured.result for measured in executor.map("double", chores.double, tasks, Watch()))
+
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(go, (0, 100, 200, 300)))
+    assert found == [[2 * n for n in range(first, first + 20)] for first in (0, 100, 200, 300)]
+
+
+def test_a_fault_of_a_task_is_raised_as_it_is(cluster: Cluster) -> None:
+    with cluster.executor() as executor, pytest.raises(ZeroDivisionError, match="on purpose"):
+        list(executor.map("fail", chores.fail, ["on purpose"], Watch()))
+
+
+def test_a_task_whose_worker_dies_runs_again_elsewhere(cluster: Cluster, tmp_path: Path) -> None:
+    tasks = [(str(tmp_path), number) for number in range(3)]
+    with cluster.executor() as executor:
+        results = [measured.result for measured in executor.map("die", chores.die_the_first_time, tasks, Watch())]
+    assert sorted(results) == [0, 1, 2]
+    for number in range(3):
+        assert len(list(tmp_path.glob(f"{number}.*"))) >= 2
+
+
+@pytest.mark.slow
+def test_only_the_task_that_kills_its_workers_again_and_again_is_blamed(cluster: Cluster) -> None:
+    results: list[int] = []
+    with cluster.executor() as executor, pytest.raises(RunError, match=r"stage die: .* when it ran alone: 5\. "):
+        collect(executor.map("die", chores.die_if_five, range(12), Watch()), results)
+    # those that shared its window, and were under suspicion, are through before it is tried alone
+    assert {0, 1, 2, 3, 4} <= set(results)
+    assert 5 not in results
+    with cluster.executor() as executor:
+        left = [measured.result for measured in executor.map("double", chores.double, range(8), Watch())]
+    assert sorted(left) == [2 * n for n in range(8)]
+
+
+def test_higher_priorities_go_first(tmp_path: Path) -> None:
+    def go(cluster: Cluster, name: str, priority: int) -> None:
+        with cluster.executor(priority) as executor:
+            tasks = [(str(tmp_path), f"{name}{k}") for k in range(2)]
+            results = [measured.result for measured in executor.map(name, chores.wait_for_mark, tasks, Watch())]
+        assert sorted(results) == [f"{name}0", f"{name}1"]
+
+    def started() -> list[str]:
+        return [path.name.split("-")[2] for path in sorted(tmp_path.glob("started-*"))]
+
+    def known(cluster: Cluster) -> int:
+        return len(cluster._embedded.scheduler.tasks)
+
+    with Cluster(workers=1) as cluster, ThreadPoolExecutor(3) as threads:
+        ways = []
+        for count, (name, priority) in enumerate((("first", 0), ("low", 0), ("high", 5)), start=1):
+            ways.append(threads.submit(go, cluster, name, priority))
+            wait_for(lambda count=count: known(cluster) == 2 * count, f"the tasks of {name}")
+            wait_for(started, "a task that runs")
+        Path(tmp_path, "go").touch()
+        for way in ways:
+            way.result(LONG_S)
+    order = started()
+    assert order[0].startswith("first")
+    high, low = (max(order.index(f"{name}{k}") for k in range(2)) for name in ("high", "low"))
+    assert high < min(order.index("low0"), order.index("low1")) <= low
+
+
+# --- called off ------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_that_is_called_off_tells_its_tasks_and_waits_for_them(cluster: Cluster, tmp_path: Path) -> None:
+    off = threading.Event()
+    watch = Watch(cancelled=off.is_set, stop=Path(tmp_path, "go").touch)
+    tasks = [(str(tmp_path), f"task{k}") for k in range(30)]
+    with cluster.executor() as executor:
+        running = executor.map("wait", chores.wait_for_mark, tasks, watch)
+        with ThreadPoolExecutor(1) as thread:
+            way = thread.submit(list, running)
+            wait_for(lambda: list(tmp_path.glob("started-*")), "a task that runs")
+            off.set()
+            with pytest.raises(RunCancelledError, match="called off"):
+                way.result(LONG_S)
+    begun = len(list(tmp_path.glob("started-*")))
+    assert begun < len(tasks)
+    with cluster.executor() as executor:
+        assert [m.result for m in executor.map("double", chores.double, [4], Watch())] == [8]
+    assert len(list(tmp_path.glob("started-*"))) == begun, "a task of the run that was called off began later"
+
+
+def test_tasks_of_a_map_that_is_closed_do_not_begin(cluster: Cluster, tmp_path: Path) -> None:
+    stopped = threading.Event()
+
+    def stop() -> None:
+        stopped.set()
+        Path(tmp_path, "go").touch()
+
+    with cluster.executor() as executor:
+        tasks = [(str(tmp_path), f"task{k}") for k in range(30)]
+        Path(tmp_path, "go").touch()
+        running = executor.map("wait", chores.wait_for_mark, tasks, Watch(stop=stop))
+        next(running)
+        running.close()
+    assert stopped.is_set()
+    assert len(list(tmp_path.glob("started-*"))) < len(tasks)
+
+
+def test_serial_tasks_are_called_off_between_two() -> None:
+    found: list[int] = []
+    watch = Watch(cancelled=lambda: len(found) == 2)
+    with pytest.raises(RunCancelledError):
+        collect(SerialExecutor().map("double", chores.double, [1, 2, 3], watch), found)
+    assert found == [2, 4]
+
+
+# --- scheduler and workers that are not there ------------------------------------------------------------------------
+
+
+class FakeScheduler:
+    """What a lookout asks: how many threads there are, or nothing where it does not answer."""
+
+    def __init__(self) -> None:
+        self.threads: dict[str, int] | None = {}
+        self.status = "running"
+        self.scheduler = self
+
+    def ncores_running(self) -> None:
+        """The name of what is asked."""
+
+    def sync(self, ask: Any, callback_timeout: float) -> dict[str, int]:
+        """Answer, or be silent."""
+        assert ask == self.ncores_running
+        assert callback_timeout > 0
+        if self.threads is None:
+            raise TimeoutError
+        return self.threads
+
+
+class Lookouts:
+    """A lookout over a fake scheduler, with a clock of its own."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.client = FakeScheduler()
+        self.events: list[Event] = []
+        self.counts: list[int] = []
+        self.lookout = Lookout(self.client, "tcp://s:8786", self.counts.append, "Start one", clock=lambda: self.now_s)
+
+    def pass_time(self, seconds: float) -> None:
+        """Look once a second for a while."""
+        for _ in range(round(seconds)):
+            self.now_s += 1.0
+            self.lookout.look("split", Watch(listener=self.events.append))
+
+
+def test_waiting_for_workers_is_told_with_the_time_and_the_fix_and_so_is_their_return() -> None:
+    world = Lookouts()
+    world.pass_time(70)
+    assert [event.kind for event in world.events] == ["waiting"] * 3
+    assert world.events[0].message.startswith("no worker has been there for 3 s")
+    assert world.events[0].message.endswith("Start one")
+    assert "for 63 s" in world.events[2].message
+    world.client.threads = {"tcp://w:1": 2}
+    world.pass_time(5)
+    assert [event.kind for event in world.events[3:]] == ["run"]
+    assert "workers are there after 70 s" in world.events[3].message
+    assert world.lookout.threads == 2
+    assert world.counts == [0] * 70 + [1] * 5
+
+
+def test_a_worker_that_is_restarted_at_once_is_not_worth_a_word() -> None:
+    world = Lookouts()
+    for _ in range(5):
+        world.client.threads = {}
+        world.pass_time(2)
+        world.client.threads = {"tcp://w:1": 1}
+        world.pass_time(2)
+    assert world.events == []
+
+
+def test_a_scheduler_that_is_silent_is_lost_after_a_while_and_not_before() -> None:
+    world = Lookouts()
+    world.client.threads = {"tcp://w:1": 1}
+    world.pass_time(3)
+    world.client.threads = None
+    world.pass_time(59)
+    with pytest.raises(ClusterError, match=r"scheduler tcp://s:8786 was lost: it has not answered for 6\d s"):
+        world.pass_time(3)
+
+
+def test_a_broken_connection_to_the_scheduler_is_told_at_once() -> None:
+    world = Lookouts()
+    world.client.status = "connecting"
+    with pytest.raises(ClusterError, match="connection to it broke"):
+        world.pass_time(1)
+
+
+def test_a_scheduler_that_is_not_there_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.runtime.executors.CONNECT_S", 1.0)
+    executor = executor_for(workers=2, scheduler="tcp://127.0.0.1:9", local_directory="")
+    with pytest.raises(ClusterError, match=r"tcp://127.0.0.1:9 does not answer.*Check the address"), executor:
+        pytest.fail("it connected")
+
+
+def test_an_executor_that_was_not_entered_says_so() -> None:
+    executor = Cluster(scheduler="tcp://127.0.0.1:9").executor()
+    with pytest.raises(ClusterError, match="not connected"):
+        list(executor.map("double", chores.double, [1], Watch()))
+    with pytest.raises(ClusterError, match="not running"):
+        Cluster().executor().__enter__()
+
+
+def test_a_lost_scheduler_ends_the_run_at_once(tmp_path: Path) -> None:
+    with Cluster(workers=1) as cluster, cluster.executor() as executor, ThreadPoolExecutor(1) as thread:
+        tasks = [(str(tmp_path), f"task{k}") for k in range(4)]
+        way = thread.submit(list, executor.map("wait", chores.wait_for_mark, tasks, Watch()))
+        wait_for(lambda: list(tmp_path.glob("started-*")), "a task that runs")
+        embedded = cluster._embedded
+        embedded.sync(embedded.scheduler.close)
+        Path(tmp_path, "go").touch()
+        with pytest.raises(ClusterError, match="was lost"):
+            way.result(LONG_S)
+
+
+# --- versions --------------------------------------------------------------------------------------------------------
+
+
+def test_a_task_of_another_version_is_refused_before_it_is_unpacked() -> None:
+    other = fingerprint().replace(f"{ENGINE}=", f"{ENGINE}=9.")
+    with pytest.raises(VersionMismatchError, match=rf"worker \S+: {ENGINE} \S+ where the client has 9\."):
+        measure_packed(other, b"no pickle at all")
+    assert measure_packed(fingerprint(), packed(chores.double, 4)).result == 8
+
+
+def test_a_fingerprint_tells_every_version() -> None:
+    assert versions_of(fingerprint()) == dict(versions_here())
+    assert {"python", "numpy", "numba", "distributed", "pyarrow", "shapely", ENGINE} <= set(versions_here())
+    assert "none" not in versions_here().values()
+
+
+def test_all_that_differs_is_told() -> None:
+    ours = {"numpy": "2.1", "numba": "0.63", "scipy": "1.16"}
+    told = differences(ours, {"numpy": "2.0", "scipy": "1.16", "pandas": "3"})
+    assert told == ["numpy 2.0 where the client has 2.1", "no numba where the client has 0.63"]

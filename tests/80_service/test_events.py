@@ -1,0 +1,137 @@
+"""Events of a job, as a stream that can be taken up again and as a list."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+
+from service.jobs import JobEvent, JobStatus
+from service.routes import events as events_routes
+
+STREAM = {"Accept": "text/event-stream"}
+
+
+def event(kind: str, **values: object) -> JobEvent:
+    import datetime as dt
+
+    return JobEvent(sequence=0, at=dt.datetime.now(tz=dt.UTC), kind=kind, **values)
+
+
+def parsed(text: str) -> Iterator[dict]:
+    """Events of a stream: comments and the time to come again are no events."""
+    for block in text.split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith((":", "retry")))
+        if "data" in fields:
+            told = json.loads(fields["data"])
+            assert fields["event"] == told["kind"]
+            assert fields["id"] == str(told["id"])
+            yield told
+
+
+def finished(service) -> str:
+    job = service.running()
+    service.store.record(job, [event("stage", stage="split", progress=10), event("warning", message="two\nlines")])
+    service.store.succeed(job, message="done", summary={})
+    return job.job_id
+
+
+def test_the_stream_of_a_finished_job_tells_all_and_ends(local_service) -> None:
+    job_id = finished(local_service)
+    answer = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM)
+    assert answer.headers["content-type"].startswith("text/event-stream")
+    assert answer.text.startswith("retry: ")
+    told = list(parsed(answer.text))
+    assert [entry["kind"] for entry in told] == ["status", "status", "stage", "warning", "status"]
+    assert [entry.get("status") for entry in told] == ["accepted", "running", None, None, "successful"]
+    assert told[3]["message"] == "two\nlines"
+    assert [entry["id"] for entry in told] == sorted({entry["id"] for entry in told})
+
+
+def test_a_broken_stream_goes_on_where_it_broke(local_service) -> None:
+    job_id = finished(local_service)
+    whole = list(parsed(local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM).text))
+    rest = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM | {"Last-Event-ID": str(whole[1]["id"])})
+    assert list(parsed(rest.text)) == whole[2:]
+
+
+def test_who_knows_all_of_a_job_that_is_over_is_told_not_to_come_again(local_service) -> None:
+    job_id = finished(local_service)
+    answer = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM | {"Last-Event-ID": "999"})
+    assert answer.status_code == 204
+
+
+def test_an_odd_last_event_id_counts_for_nothing(local_service) -> None:
+    job_id = finished(local_service)
+    for odd in ("x", "-1", "1e3", ""):
+        answer = local_service.client.get(f"/jobs/{job_id}/events", headers=STREAM | {"Last-Event-ID": odd})
+        assert len(list(parsed(answer.text))) == 5
+
+
+def test_a_stream_follows_a_job_that_runs_until_it_is_over(starting) -> None:
+    service = starting(poll_s=0.01)
+    job = service.running()
+
+    def drive() -> None:
+        for number in range(20):
+            service.store.record(job, [event("warning", message=f"number {number}", progress=number)])
+        service.store.succeed(job, message="done", summary={})
+
+    driver = threading.Thread(target=drive)
+    driver.start()
+    told = list(parsed(service.client.get(f"/jobs/{job.job_id}/events", headers=STREAM).text))
+    driver.join(60.0)
+    assert [entry["message"] for entry in told if entry["kind"] == "warning"] == [f"number {n}" for n in range(20)]
+    assert told[-1]["status"] == JobStatus.SUCCESSFUL
+
+
+def test_a_stream_without_events_shows_that_it_lives_and_ends_when_the_job_is_gone(starting, monkeypatch) -> None:
+    monkeypatch.setattr(events_routes, "KEEP_ALIVE_S", 0.0)
+    service = starting(poll_s=0.01)
+    job = service.running()
+    service.store.dismiss(job.job_id)
+    asked = threading.Event()
+    original = service.store.get
+
+    def get(job_id: str, **options: object):
+        if asked.is_set() and original(job_id).status is JobStatus.RUNNING:
+            service.store.dismissed(job)
+            service.store.remove(job_id)
+        asked.set()
+        return original(job_id, **options)
+
+    monkeypatch.setattr(service.store, "get", get)
+    answer = service.client.get(f"/jobs/{job.job_id}/events", headers=STREAM)
+    assert [entry.get("status") for entry in parsed(answer.text)] == ["accepted", "running"]
+
+
+def test_pollers_get_a_list_and_where_to_go_on(local_service) -> None:
+    job_id = finished(local_service)
+    page = local_service.client.get(f"/jobs/{job_id}/events?limit=2").json()
+    assert [entry["status"] for entry in page["events"]] == ["accepted", "running"]
+    following = next(link["href"] for link in page["links"] if link["rel"] == "next")
+    assert [entry["kind"] for entry in local_service.client.get(following).json()["events"]] == ["stage", "warning"]
+    assert local_service.client.get(f"/jobs/{job_id}/events?after=999").json()["events"] == []
+
+
+def test_more_streams_than_allowed_are_refused_and_counted_down_again(starting) -> None:
+    service = starting(max_event_streams=1)
+    job_id = finished(service)
+    streams = service.client.app.state.streams
+    streams.open(1)
+    refused = service.client.get(f"/jobs/{job_id}/events", headers=STREAM)
+    assert refused.status_code == 429
+    assert int(refused.headers["retry-after"]) >= 1
+    streams.close()
+    for _ in range(3):
+        assert service.client.get(f"/jobs/{job_id}/events", headers=STREAM).status_code == 200
+    assert streams.count == 0
+
+
+def test_a_process_that_ends_ends_its_streams(starting) -> None:
+    service = starting(poll_s=0.01)
+    job = service.running()
+    service.client.app.state.streams.closing = True
+    answer = service.client.get(f"/jobs/{job.job_id}/events", headers=STREAM)
+    assert answer.status_code == 200
+    assert list(parsed(answer.text)) == []

@@ -1,0 +1,298 @@
+"""The processes: descriptions that hold for the code, and requests of which every fault is told."""
+
+from __future__ import annotations
+
+import base64
+import json
+
+import jsonschema
+import pytest
+
+from pipeline.methods import METHODS
+from pipeline.settings import RunSettings
+from service import catalogue
+from service.drafts import Inputs, reference_of
+from service.jobs import InputReference
+from service.keys import Scope
+from service.outputs import OUTPUTS
+
+POINTS = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
+
+
+def execute(service, inputs: object, **body: object):
+    return service.client.post("/processes/reconstruct/execution", json={"inputs": inputs, **body})
+
+
+def faults_of(answer) -> str:
+    assert answer.status_code == 400, answer.text
+    return "\n".join(answer.json()["errors"])
+
+
+def test_the_catalogue_of_settings_is_that_of_the_code() -> None:
+    assert catalogue.PATH.read_text(encoding="utf-8") == catalogue.render(), "run `python -m service.catalogue`"
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"method": "none-such"},
+        {"halo_m": -1.0, "classes": "believe"},
+        {"roof": {"no_such": 1}, "candidates": {"min_area_m2": "wide"}},
+        {"no-such-table": {}},
+        {"candidates": {"min_area_m2": 15}, "method": "fuzzy-sart"},
+    ],
+)
+def test_the_service_finds_the_faults_of_settings_that_a_run_finds(settings: dict) -> None:
+    from pipeline.errors import SettingsError
+
+    try:
+        RunSettings.from_mapping(settings)
+        wanted: set[str] = set()
+    except SettingsError as error:
+        wanted = set(error.faults)
+    assert set(catalogue.load().faults(settings)) == wanted
+
+
+def test_what_only_json_can_say_is_a_fault_too() -> None:
+    found = catalogue.load().faults({"halo_m": None, "roof": {"step_offset_spacings": 10**400}, "lattice_x_m": [1]})
+    assert len(found) == 3
+    assert any("401 digits" in fault for fault in found)
+
+
+def test_the_schema_of_settings_is_a_json_schema_whose_defaults_fit_it() -> None:
+    schema = catalogue.load().schema()
+    jsonschema.Draft202012Validator.check_schema(schema)
+    defaults = {
+        name: {field: value["default"] for field, value in found["properties"].items()}
+        if found["type"] == "object"
+        else found["default"]
+        for name, found in schema["properties"].items()
+    }
+    jsonschema.validate(defaults, schema)
+    assert catalogue.load().faults(defaults) == []
+
+
+def test_the_description_names_methods_and_outputs_of_the_code(local_service) -> None:
+    described = local_service.client.get("/processes/reconstruct").json()
+    assert described["inputs"]["method"]["schema"]["enum"] == list(METHODS)
+    assert set(described["outputs"]) == set(OUTPUTS)
+    assert described["jobControlOptions"] == ["async-execute", "dismiss"]
+    for described_input in described["inputs"].values():
+        jsonschema.Draft202012Validator.check_schema(described_input["schema"])
+    assert described["inputs"]["tiles"]["minOccurs"] == 1
+
+
+def test_the_list_of_processes_has_pages(local_service) -> None:
+    page = local_service.client.get("/processes?limit=1").json()
+    assert [process["id"] for process in page["processes"]] == ["reconstruct"]
+    assert {link["rel"] for link in page["links"]} == {"self"}
+    assert local_service.client.get("/processes?limit=0").status_code == 400
+
+
+def test_an_unknown_process_is_told_with_those_that_there_are(local_service) -> None:
+    for answer in (
+        local_service.client.get("/processes/paint"),
+        local_service.client.post("/processes/paint/execution", json={"inputs": {}}),
+    ):
+        assert answer.status_code == 404
+        assert answer.json()["type"].endswith("/no-such-process")
+        assert "reconstruct" in answer.json()["detail"]
+
+
+def test_a_job_of_an_upload_waits_as_soon_as_the_answer_is_there(local_service) -> None:
+    upload = local_service.upload()
+    inputs = {
+        "tiles": [{"href": f"/uploads/{upload}"}],
+        "crs": "EPSG:28992",
+        "method": "fuzzy-sart",
+        "settings": {"candidates": {"min_area_m2": 15}},
+        "bbox": {"bbox": [0, 0, 10, 10], "crs": "http://www.opengis.net/def/crs/EPSG/0/28992"},
+        "title": "Straße 1",
+    }
+    answer = local_service.client.post(
+        "/processes/reconstruct/execution",
+        json={"inputs": inputs, "outputs": {"report": {}, "buildings": {}}},
+        headers={"Prefer": "respond-async, wait=10"},
+    )
+    assert answer.status_code == 201
+    assert answer.headers["preference-applied"] == "respond-async"
+    told = answer.json()
+    assert answer.headers["location"].endswith(f"/jobs/{told['jobID']}")
+    assert (told["status"], told["type"], told["processID"]) == ("accepted", "process", "reconstruct")
+    job = local_service.store.get(told["jobID"])
+    assert job.request.tiles == (InputReference(kind="upload", value=upload),)
+    assert job.request.settings == {"candidates": {"min_area_m2": 15}, "method": "fuzzy-sart"}
+    assert job.request.bbox == (0.0, 0.0, 10.0, 10.0)
+    assert job.request.outputs == ("buildings", "report")
+    assert told["request"]["inputs"]["title"] == "Straße 1"
+
+
+def test_the_request_that_a_job_tells_can_be_sent_again(local_service) -> None:
+    first = execute(
+        local_service, {"tiles": {"href": f"/uploads/{local_service.upload()}"}, "crs": "EPSG:28992"}
+    ).json()
+    second = local_service.client.post("/processes/reconstruct/execution", json=first["request"]).json()
+    one, other = (local_service.store.get(told["jobID"]).request for told in (first, second))
+    assert one == other
+
+
+def test_without_a_preference_none_is_applied(local_service) -> None:
+    answer = execute(local_service, {"tiles": {"href": f"/uploads/{local_service.upload()}"}, "crs": "EPSG:28992"})
+    assert answer.status_code == 201
+    assert "preference-applied" not in answer.headers
+
+
+def test_a_tile_by_value_becomes_an_upload(local_service) -> None:
+    value = {"value": base64.b64encode(POINTS).decode(), "encoding": "base64", "mediaType": "text/plain"}
+    answer = execute(local_service, {"tiles": [value], "crs": "EPSG:28992"})
+    assert answer.status_code == 201, answer.text
+    reference = local_service.store.get(answer.json()["jobID"]).request.tiles[0]
+    kept = local_service.store.upload(reference.value)
+    assert (kept.filename, kept.size_bytes) == ("tiles.xyz", len(POINTS))
+
+
+def test_footprints_by_value_are_geojson(local_service) -> None:
+    square = {"type": "Polygon", "coordinates": [[[1, 1], [9, 1], [9, 9], [1, 9], [1, 1]]]}
+    outlines = {"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry": square}]}
+    tile = {"href": f"/uploads/{local_service.upload()}"}
+    for footprints in (outlines, {"value": outlines, "mediaType": "application/geo+json"}):
+        answer = execute(local_service, {"tiles": tile, "crs": "EPSG:28992", "footprints": footprints})
+        assert answer.status_code == 201, answer.text
+        reference = local_service.store.get(answer.json()["jobID"]).request.footprints
+        path = local_service.settings.state / "uploads" / reference.value / "footprints.geojson"
+        assert json.loads(path.read_text()) == outlines
+
+
+def test_all_faults_of_a_request_are_told_at_once(local_service) -> None:
+    answer = execute(
+        local_service,
+        {
+            "tiles": [{"href": "relative.laz"}, {"value": "%%%"}],
+            "crs": "EPSG:4326",
+            "verticalUnit": "ell",
+            "bbox": [0, 0, -1, 1],
+            "method": "guess",
+            "settings": {"roof": {"no_such": 1}},
+            "meshes": "all",
+            "title": "a\u0000b",
+            "priority": 99,
+            "colour": "red",
+        },
+        outputs={"pictures": {}},
+    )
+    told = faults_of(answer)
+    for words in (
+        "tiles[0].href",
+        "tiles[1]",
+        "geographic",
+        "verticalUnit",
+        "bbox",
+        "method",
+        "[roof] no_such",
+        "meshes",
+        "title",
+        "priority",
+        "colour",
+        "pictures",
+    ):
+        assert words in told
+    assert local_service.client.get("/jobs").json()["jobs"] == []
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({}, "tiles is missing"),
+        ({"inputs": []}, "inputs is"),
+        ({"inputs": {}, "outputs": ["buildings"]}, "outputs is"),
+        ({"inputs": {}, "mode": "sync"}, "mode is"),
+        ({"inputs": {}, "response": "raw!"}, "response is"),
+        ({"inputs": {}, "subscriber": {"successUri": "http://example.org"}}, "subscriber"),
+        ({"inputs": {"tiles": None}}, "tiles is missing"),
+        ({"inputs": {"tiles": 7}}, "tiles is 7"),
+    ],
+)
+def test_a_request_that_is_none_is_refused(local_service, body: dict, words: str) -> None:
+    assert words in faults_of(local_service.client.post("/processes/reconstruct/execution", json=body))
+
+
+def test_a_body_that_is_no_json_is_refused_with_the_reason(local_service) -> None:
+    json_type = {"Content-Type": "application/json"}
+    for content in (b"{", b"[1]", b"\xff", b"9" * 10_000):
+        answer = local_service.client.post("/processes/reconstruct/execution", content=content, headers=json_type)
+        assert answer.status_code == 400, content[:20]
+        assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_method_and_settings_may_not_contradict_each_other(local_service) -> None:
+    tile = {"href": f"/uploads/{local_service.upload()}"}
+    answer = execute(local_service, {"tiles": tile, "classes": "trust", "settings": {"classes": "audit"}})
+    assert "classes is trust" in faults_of(answer)
+
+
+def test_a_rectangle_in_another_crs_is_refused(local_service) -> None:
+    tile = {"href": f"/uploads/{local_service.upload()}"}
+    box = {"bbox": [4.0, 52.0, 4.1, 52.1]}
+    for more in ({}, {"crs": "http://www.opengis.net/def/crs/OGC/1.3/CRS84"}):
+        assert "bbox" in faults_of(execute(local_service, {"tiles": tile, "crs": "EPSG:28992", "bbox": box | more}))
+
+
+def test_an_upload_that_is_not_there_is_told(local_service) -> None:
+    answer = execute(local_service, {"tiles": {"href": f"/uploads/{'0' * 32}"}, "crs": "EPSG:28992"})
+    assert answer.status_code in {400, 404}
+    assert "0" * 32 in answer.json()["detail"]
+
+
+def test_nothing_is_kept_of_a_request_that_is_refused(local_service) -> None:
+    good = {"value": base64.b64encode(POINTS).decode(), "mediaType": "text/plain"}
+    bad = {"value": base64.b64encode(b"LASF" + bytes(40)).decode()}
+    answer = execute(local_service, {"tiles": [good, bad], "crs": "EPSG:28992"})
+    assert answer.status_code == 422, answer.text
+    assert list((local_service.settings.state / "uploads").iterdir()) == []
+
+
+def test_a_high_priority_needs_the_scope_admin(local_service) -> None:
+    submitter, admin = local_service.key(Scope.SUBMIT), local_service.key(Scope.ADMIN)
+
+    def send(header: dict[str, str], priority: int) -> int:
+        tile = {"href": f"/uploads/{local_service.upload(**header)}"}
+        body = {"inputs": {"tiles": tile, "crs": "EPSG:28992", "priority": priority}}
+        return local_service.client.post("/processes/reconstruct/execution", json=body, headers=header).status_code
+
+    assert send(submitter, 1) == 403
+    assert send(submitter, -1) == 201
+    assert send(admin, 1) == 201
+
+
+def test_a_full_line_is_told_with_when_to_come_again(starting) -> None:
+    service = starting(max_queued=2)
+    tile = {"href": f"/uploads/{service.upload()}"}
+    answers = [execute(service, {"tiles": tile, "crs": "EPSG:28992"}) for _ in range(3)]
+    assert [answer.status_code for answer in answers] == [201, 201, 429]
+    assert int(answers[2].headers["retry-after"]) > 0
+
+
+@pytest.mark.parametrize(
+    ("href", "kind", "value"),
+    [
+        (f"/uploads/{'a' * 32}", "upload", "a" * 32),
+        (f"https://example.org/prefix/uploads/{'a' * 32}", "upload", "a" * 32),
+        ("https://example.org/tile.laz", "url", "https://example.org/tile.laz"),
+        ("file:///data/a%20b.laz", "path", "/data/a b.laz"),
+        ("/data/tile.laz", "path", "/data/tile.laz"),
+    ],
+)
+def test_an_href_is_an_upload_a_url_or_a_path(href: str, kind: str, value: str) -> None:
+    assert reference_of(href) == InputReference(kind=kind, value=value)
+
+
+@pytest.mark.parametrize(
+    "href", ["tile.laz", "../tile.laz", "ftp://example.org/a", "file://host/a", "s3://b/k", "https://"]
+)
+def test_any_other_href_is_none(href: str) -> None:
+    assert reference_of(href) is None
+
+
+def test_values_may_be_wrapped_as_the_standard_allows() -> None:
+    inputs = Inputs({"title": [{"value": "a title"}], "meshes": ["none"]})
+    assert (inputs.text("title"), inputs.word("meshes", ("none",)), inputs.faults) == ("a title", "none", [])

@@ -1,0 +1,310 @@
+"""`gablework serve`, `driver` and `keys` as processes: starting, refusing, restarting the driver, ending."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+import pytest
+
+from service.settings import ServiceSettings
+from service.supervisor import Supervisor, environment_of, listen, pause_s
+
+DEADLINE_S = 180.0
+"""For what takes seconds on a quiet machine; not a promise of speed."""
+
+
+def until(condition: Callable[[], Any], what: str) -> Any:
+    """What the condition gives, once it is true."""
+    give_up_s = time.monotonic() + DEADLINE_S
+    while time.monotonic() < give_up_s:
+        if found := condition():
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"not within {DEADLINE_S:.0f} s: {what}")
+
+
+def gablework(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "service.cli", *words]
+    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=DEADLINE_S, **options)
+
+
+class Served:
+    """A service that runs as a process."""
+
+    def __init__(self, state: Path, *options: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "service.cli", "serve", "--json", "--port", "0", "--state", str(state), *options],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        told = ""
+        while not told.rstrip().endswith("}"):
+            line = self.process.stdout.readline()
+            assert line, f"serve ended with {self.process.wait()}"
+            told += line
+        self.url = json.loads(told)["url"]
+
+    def driver(self) -> psutil.Process:
+        """The driver's process."""
+
+        def find() -> psutil.Process | None:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                children = psutil.Process(self.process.pid).children()
+                return next((child for child in children if "driver" in child.cmdline()), None)
+            return None
+
+        found = until(find, "a driver beside the service")
+        assert isinstance(found, psutil.Process)
+        return found
+
+    def end(self) -> None:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            family = psutil.Process(self.process.pid).children(recursive=True)
+            self.process.kill()
+            for member in family:
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    member.kill()
+        self.process.wait()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Callable[..., Served]]:
+    with contextlib.ExitStack() as stack:
+
+        def start(*options: str) -> Served:
+            running = Served(tmp_path / "state", *options)
+            stack.callback(running.end)
+            return running
+
+        yield start
+
+
+# --- without a process
+
+
+def test_help_imports_nothing_of_the_service() -> None:
+    heavy = "('fastapi', 'sqlalchemy', 'numba', 'numpy')"
+    code = f"import sys; import service.cli; print([m for m in {heavy} if m in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_the_api_process_loads_nothing_of_the_science() -> None:
+    heavy = "('numba', 'scipy', 'pandas', 'matplotlib', 'dask', 'distributed', 'pyarrow', 'laspy', 'pyogrio')"
+    code = f"import sys; import service.supervisor; print([m for m in {heavy} if m in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_the_next_start_waits_longer_after_every_death_but_not_for_ever() -> None:
+    pauses = [pause_s(deaths) for deaths in range(1, 40)]
+    assert pauses == sorted(pauses)
+    assert (pauses[0], pauses[-1]) == (0.5, 30.0)
+
+
+def test_another_process_reads_the_same_settings_from_its_environment(tmp_path: Path, monkeypatch) -> None:
+    settings = ServiceSettings(
+        state=tmp_path,
+        input_roots=(tmp_path, Path("/data")),
+        input_hosts=("a.example",),
+        max_points=5,
+        rate_limit="9/second",
+    )
+    environment = environment_of(
+        settings, {"gablework_workers": "77", "GABLEWORK_SCHEDULER": "tcp://old:1", "HOME": "/"}
+    )
+    assert environment["HOME"] == "/"
+    for name in list(os.environ):
+        if name.upper().startswith("GABLEWORK_"):
+            monkeypatch.delenv(name)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert ServiceSettings() == settings
+
+
+def test_port_0_takes_a_free_port_and_a_taken_one_is_told(tmp_path: Path) -> None:
+    from service.errors import StartUpError
+
+    first, url = listen(ServiceSettings(state=tmp_path, port=0))
+    with first:
+        port = first.getsockname()[1]
+        assert url == f"http://127.0.0.1:{port}"
+        with pytest.raises(StartUpError, match=f"port {port}"):
+            listen(ServiceSettings(state=tmp_path, port=port))
+
+
+def test_a_supervised_process_is_started_again_and_ends_with_its_supervisor() -> None:
+    # ends by itself when its standard input closes
+    supervisor = Supervisor([sys.executable, "-c", "import sys; sys.stdin.read()"], os.environ)
+    supervisor.start()
+    first = supervisor.pid
+    assert first is not None
+    os.kill(first, signal.SIGKILL)
+    until(lambda: supervisor.pid != first and supervisor.status() == "running", "another process")
+    assert supervisor.deaths == 1
+    last = supervisor.pid
+    supervisor.end(DEADLINE_S)
+    assert supervisor.status() == "ending"
+    assert last is not None
+    assert not psutil.pid_exists(last)
+
+
+def test_a_supervised_process_that_does_not_end_is_killed(tmp_path: Path) -> None:
+    up = tmp_path / "up"
+    stubborn = (
+        "import pathlib, signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
+        f"pathlib.Path({str(up)!r}).touch(); time.sleep(900)"
+    )
+    supervisor = Supervisor([sys.executable, "-c", stubborn], os.environ)
+    supervisor.start()
+    until(up.exists, "the process ignores SIGTERM")
+    supervisor.end(0.2)
+    assert supervisor.pid is not None
+    assert not psutil.pid_exists(supervisor.pid)
+
+
+def test_a_supervised_process_is_asked_to_end_once_however_often_that_is_wanted(tmp_path: Path) -> None:
+    up, asked = tmp_path / "up", tmp_path / "asked"
+    counting = (
+        "import pathlib, signal\n"
+        "signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])\n"
+        f"pathlib.Path({str(up)!r}).touch()\n"
+        "signal.sigwait([signal.SIGTERM])\n"
+        f"pathlib.Path({str(asked)!r}).write_text('once')\n"
+        "if signal.sigtimedwait([signal.SIGTERM], 0.5):\n"
+        f"    pathlib.Path({str(asked)!r}).write_text('twice')\n"
+    )
+    supervisor = Supervisor([sys.executable, "-c", counting], os.environ)
+    supervisor.start()
+    until(up.exists, "the process waits for SIGTERM")
+    supervisor.ask_to_end()
+    until(asked.exists, "the process is asked to end")
+    supervisor.end(DEADLINE_S)
+    assert asked.read_text() == "once"
+
+
+# --- keys
+
+
+def test_keys_are_made_listed_and_revoked(tmp_path: Path) -> None:
+    state = ("--state", str(tmp_path / "state"))
+    made = json.loads(gablework("keys", "create", "--name", "a city", "--scope", "read", *state, "--json").stdout)
+    assert made["key"].startswith("gw_")
+    assert made["scopes"] == ["read"]
+    listed = gablework("keys", "list", *state, "--json").stdout
+    assert made["key"] not in listed
+    assert [key["id"] for key in json.loads(listed)["keys"]] == [made["id"]]
+    assert gablework("keys", "revoke", made["id"], *state).returncode == 0
+    assert json.loads(gablework("keys", "list", *state, "--json").stdout)["keys"][0]["revoked"] is not None
+    unknown = gablework("keys", "revoke", "0" * 32, *state)
+    assert unknown.returncode == 2
+    assert "0" * 32 in unknown.stderr
+
+
+def test_a_scope_that_is_none_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
+    found = gablework("keys", "create", "--name", "x", "--scope", "root", "--state", str(tmp_path))
+    assert found.returncode == 2
+    assert "read, submit, admin" in found.stderr
+
+
+def test_serve_refuses_other_addresses_without_keys(tmp_path: Path) -> None:
+    found = gablework("serve", "--host", "0.0.0.0", "--port", "0", "--state", str(tmp_path / "state"))
+    assert found.returncode == 2
+    assert "keys create" in found.stderr
+    assert "Traceback" not in found.stderr
+
+
+def test_settings_that_cannot_be_are_told_together(tmp_path: Path) -> None:
+    environment = os.environ | {"GABLEWORK_MAX_POINTS": "-1", "GABLEWORK_LEASE_S": "soon"}
+    found = gablework("serve", "--state", str(tmp_path), env=environment)
+    assert found.returncode == 2
+    assert "max_points" in found.stderr
+    assert "lease_s" in found.stderr
+
+
+# --- as processes
+
+
+@pytest.mark.slow
+def test_serve_answers_and_ends_with_its_driver_on_sigterm(served) -> None:
+    running = served()
+    driver = running.driver()
+    assert httpx.get(f"{running.url}/readyz").json()["checks"]["driver"] == "running"
+    running.process.send_signal(signal.SIGTERM)
+    assert running.process.wait(DEADLINE_S) == 0
+    assert not driver.is_running()
+
+
+@pytest.mark.slow
+def test_a_driver_that_dies_is_started_again(served) -> None:
+    running = served()
+    first = running.driver()
+    first.kill()
+    second = until(lambda: (found := running.driver()).pid != first.pid and found, "another driver")
+    assert second.is_running()
+    assert httpx.get(f"{running.url}/healthz").status_code == 200
+
+
+@pytest.mark.slow
+def test_a_driver_ends_when_the_service_is_killed(served) -> None:
+    running = served()
+    driver = running.driver()
+    running.process.kill()
+    until(lambda: not driver.is_running() or driver.status() == psutil.STATUS_ZOMBIE, "the driver's end")
+
+
+@pytest.mark.slow
+def test_an_event_stream_does_not_hold_up_the_end(served, tmp_path: Path) -> None:
+    running = served("--no-driver")
+    points = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
+    made = httpx.post(f"{running.url}/jobs", files={"tile": ("a.xyz", points)}, data={"crs": "EPSG:28992"}).json()
+    with httpx.stream("GET", f"{running.url}/jobs/{made['jobID']}/events?f=sse", timeout=DEADLINE_S) as stream:
+        lines = stream.iter_lines()
+        assert any(line.startswith("data:") for line in lines)
+        running.process.send_signal(signal.SIGTERM)
+        assert list(lines) is not None  # the stream ends of itself
+    assert running.process.wait(DEADLINE_S) == 0
+
+
+@pytest.mark.slow
+def test_nothing_is_kept_of_an_upload_whose_client_goes(served, tmp_path: Path) -> None:
+    import socket
+    from urllib.parse import urlsplit
+
+    running = served("--no-driver")
+    uploads = tmp_path / "state" / "uploads"
+    with socket.create_connection((urlsplit(running.url).hostname, urlsplit(running.url).port)) as link:
+        head = b'--x\r\nContent-Disposition: form-data; name="tile"; filename="a.xyz"\r\n\r\n'
+        link.sendall(
+            b"POST /jobs HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99999999\r\n"
+            b"Content-Type: multipart/form-data; boundary=x\r\n\r\n" + head + b"1 2 3\n" * 400_000
+        )
+        until(lambda: any(uploads.iterdir()), "the beginning of an upload")
+    until(lambda: not any(uploads.iterdir()), "the end of the unfinished upload")
+    assert httpx.get(f"{running.url}/jobs").json()["jobs"] == []
+
+
+@pytest.mark.slow
+def test_a_path_prefix_is_in_every_link(served, monkeypatch) -> None:
+    monkeypatch.setenv("GABLEWORK_ROOT_PATH", "/gable")
+    running = served("--no-driver")
+    page = httpx.get(f"{running.url}/").json()
+    assert all("/gable/" in link["href"] for link in page["links"])
+    # what a proxy does: it takes the prefix away
+    for link in page["links"]:
+        answer = httpx.get(f"{running.url}{link['href'].partition('/gable')[2]}")
+        assert answer.status_code == 200, link

