@@ -64,6 +64,12 @@ def peak_mib(pid: int) -> tuple[float, float]:
     return now, peak
 
 
+def cpu_s(pid: int) -> float:
+    """Processor seconds that a process took so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 class Load:
     """The clients."""
 
@@ -153,20 +159,23 @@ def main() -> int:
         with serving(state, *([] if options.with_driver else ["--no-driver"])) as (url, pid):
             at_rest, _ = peak_mib(pid)
             load = Load(url, options.tile)
-            began = time.perf_counter()
+            others = os.getloadavg()[0]
+            began, cpu_before_s = time.perf_counter(), cpu_s(pid)
             asyncio.run(load.run(options.uploads, options.pollers))
-            seconds = time.perf_counter() - began
+            seconds, api_cpu_s = time.perf_counter() - began, cpu_s(pid) - cpu_before_s
             after, peak = peak_mib(pid)
             faults = [*load.faults, *stored_faults(url, state, load.jobs, sha256)]
     if peak > MOST_API_MIB:
         faults.append(f"the API process took {peak:.0f} MiB, {MOST_API_MIB:.0f} are allowed")
     cuts = statistics.quantiles(load.calls_s, n=100)
     figures: dict[str, Any] = {
+        "machine": f"{os.cpu_count()} cores, {others:.1f} busy processes before",
         "uploads": f"{len(load.jobs)} of {options.uploads}, {options.tile.stat().st_size} bytes each",
         "slowest upload": f"{max(load.uploads_s):.1f} s",
         "status calls": f"{len(load.calls_s)} of {options.pollers} pollers in {seconds:.0f} s",
         "status p50 / p95 / max": f"{cuts[49] * 1e3:.0f} / {cuts[94] * 1e3:.0f} / {max(load.calls_s) * 1e3:.0f} ms",
         "API at rest / after / peak": f"{at_rest:.0f} / {after:.0f} / {peak:.0f} MiB",
+        "API processor time": f"{api_cpu_s:.1f} s, {100.0 * api_cpu_s / seconds:.0f} % of a core",
         "lost or doubled": "; ".join(faults) or "nothing",
     }
     for name, value in figures.items():

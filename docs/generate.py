@@ -1,4 +1,4 @@
-"""Writes the pages of docs/reference/ that the code itself can tell: settings, command line, exit codes.
+"""Writes the pages of docs/reference/ that the code itself can tell, and the service's catalogue of settings.
 
 `make docs` runs it; tests/00_house/test_docs.py fails where a page says other than the code.
 """
@@ -18,6 +18,7 @@ from pipeline.methods import METHODS
 from pipeline.parameters import Parameters
 from pipeline.quality import validity as checker
 from pipeline.settings import SECTIONS, GeneralSettings
+from service import catalogue
 from service.cli import app
 
 REFERENCE = Path(__file__).resolve().parent / "reference"
@@ -173,11 +174,98 @@ def validity() -> str:
     return "\n".join(lines) + "\n"
 
 
+def paths() -> list[list[object]]:
+    """Rows of the table of paths."""
+    from service.app import create_app
+    from service.settings import ServiceSettings
+
+    rows: list[list[object]] = []
+    for path, item in create_app(ServiceSettings()).openapi()["paths"].items():
+        for method, operation in item.items():
+            needs_key = "yes" if "security" in operation else "no"
+            answers = ", ".join(operation["responses"])
+            rows.append([f"`{method.upper()} {path}`", operation["summary"], needs_key, answers])
+    return rows
+
+
+def service_settings() -> list[list[object]]:
+    """Rows of the table of the service's settings."""
+    from service.settings import ServiceSettings
+
+    rows: list[list[object]] = []
+    for name, field in ServiceSettings.model_fields.items():
+        default = (
+            "the user's data folder" if name == "state" else "" if field.default in (None, (), "") else field.default
+        )
+        rows.append([f"`GABLEWORK_{name.upper()}`", default, field.description])
+    return rows
+
+
+def service() -> str:
+    """The page of the service: paths, problems, keys, settings."""
+    from service.keys import Scope
+    from service.problems import FAILURES, FOREIGN, INTERNAL, KINDS
+    from service.routes.landing import CONFORMANCE
+
+    kinds = {(kind.status, kind.type_uri, kind.title) for kind in (*KINDS.values(), FOREIGN, INTERNAL)}
+    problems: list[list[object]] = [[status, f"`{uri}`", title] for status, uri, title in sorted(kinds)]
+    failures: list[list[object]] = [
+        [f"`{fault}`", kind.title, kind.status, f"`{kind.type_uri}`"] for fault, kind in FAILURES.items()
+    ]
+    scopes: list[list[object]] = [[f"`{scope}`", ", ".join(sorted(scope.included))] for scope in Scope]
+    lines = [
+        NOTE,
+        "# The service",
+        "",
+        "It speaks OGC API - Processes 1.0. `/openapi.json` (OpenAPI 3.0) has every parameter and answer, `/docs` the",
+        "same for people. How to run it: [serve](../how_to/serve.md).",
+        "",
+        "## Paths",
+        "",
+        "*Key* tells whether a key is needed where the service has keys.",
+        "",
+        *table(["path", "what it does", "key", "answers"], paths()),
+        "",
+        "## Conformance",
+        "",
+        *(f"- `{uri}`" for uri in CONFORMANCE),
+        "",
+        "## Problems",
+        "",
+        "Every error is a problem document (`application/problem+json`, RFC 9457) with `type`, `title`, `status`,",
+        "`detail` and `instance`, and with `errors`, one sentence a fault, where there can be several. What HTTP says",
+        "(405, 406, 415, 416, an unknown path) has the type `about:blank`. `Retry-After` comes with 429 and 503.",
+        "",
+        *table(["status", "type", "title"], problems),
+        "",
+        "## Results of a failed job",
+        "",
+        "`/jobs/{jobID}/results` of a job that failed answers with the status that fits the cause; the same document",
+        "is the `exception` of the job's status.",
+        "",
+        *table(["cause", "title", "status", "type"], failures),
+        "",
+        "## Keys",
+        "",
+        "`gablework keys create` makes one; it is sent as `Authorization: Bearer gw_...`.",
+        "",
+        *table(["scope", "holds"], scopes),
+        "",
+        "## Settings",
+        "",
+        "Environment variables; options of `gablework serve` and `gablework driver` stand above them. Lists are JSON.",
+        "",
+        *table(["variable", "default", "meaning"], service_settings()),
+    ]
+    return "\n".join(lines) + "\n"
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
     "command_line.md": command_line,
     "exit_codes.md": exit_codes,
     "validity.md": validity,
+    "service.md": service,
 }
 """The generated pages by file name."""
 
@@ -187,6 +275,8 @@ def main() -> None:
     for name, render in PAGES.items():
         (REFERENCE / name).write_text(render(), encoding="utf-8")
         print(f"wrote docs/reference/{name}")
+    catalogue.PATH.write_text(catalogue.render(), encoding="utf-8")
+    print(f"wrote service/{catalogue.PATH.name}")
 
 
 if __name__ == "__main__":

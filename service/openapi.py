@@ -92,7 +92,7 @@ def as_version_3_0(value: Any) -> Any:
     >>> as_version_3_0({"anyOf": [{"type": "string"}, {"type": "null"}], "title": "F"})
     {'title': 'F', 'type': 'string', 'nullable': True}
     >>> as_version_3_0({"type": "number", "exclusiveMinimum": 0})
-    {'type': 'number', 'minimum': 0, 'exclusiveMinimum': True}
+    {'type': 'number', 'exclusiveMinimum': True, 'minimum': 0}
     """
     if isinstance(value, list):
         return [as_version_3_0(item) for item in value]

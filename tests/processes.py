@@ -66,7 +66,9 @@ def free_port() -> int:
         return port
 
 
-def wait_for(condition: Callable[[], Value | None], what: str, deadline_s: float = LONG_S) -> Value:
+def wait_for(
+    condition: Callable[[], Value | None], what: str, deadline_s: float = LONG_S, *, interval_s: float = 0.02
+) -> Value:
     """What the condition returns once it is true; a failure that names what was waited for after the deadline."""
     end = time.monotonic() + deadline_s
     while True:
@@ -75,7 +77,7 @@ def wait_for(condition: Callable[[], Value | None], what: str, deadline_s: float
             return value
         if time.monotonic() > end:
             pytest.fail(f"waited {deadline_s:g} s in vain for {what}")
-        time.sleep(0.02)
+        time.sleep(interval_s)
 
 
 def listens(port: int, host: str = "127.0.0.1") -> bool:

@@ -35,6 +35,7 @@ CONNECT_S = 20.0
 """A scheduler that does not answer within so long is not there."""
 _ANSWER_S = 30.0
 _MEND_S = 5.0
+_CLOSE_S = 30.0
 
 
 class Executor(Protocol):
@@ -215,7 +216,9 @@ class Cluster:
         """End the embedded workers."""
         if self._embedded is not None:
             embedded, self._embedded = self._embedded, None
-            embedded.close()
+            # what does not end in time ends with this process
+            with contextlib.suppress(TimeoutError):
+                embedded.close(timeout=_CLOSE_S)
 
 
 class DaskExecutor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import pickle
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -74,8 +75,6 @@ class StoredResult:
 
     result: BuildingResult
     facts: CandidateFacts
-    seconds: float = 0.0
-    """Wall clock that it took."""
 
 
 def batches(sites: Sequence[CandidateSite]) -> list[tuple[CandidateSite, ...]]:
@@ -114,21 +113,38 @@ def model_batch(task: BatchTask) -> tuple[Modelled, ...]:
     """
     models = _here(task) if task.isolation is None else _in_child(task, task.isolation)
     try:
-        stored = dict(models)
+        packed = dict(models)
     except OSError:
         task.scratch.check_cancelled()  # a run that is over has no scratch any more
         raise
-    by_tile: dict[Tile, list[StoredResult]] = {}
+    by_tile: dict[Tile, list[bytes]] = {}
     for index, site in enumerate(task.sites):
-        by_tile.setdefault(site.owner, []).append(stored[index])
-    for tile, results in by_tile.items():
-        task.scratch.put_object(f"results/{tile.key}/{task.number}.pickle", results)
-    return tuple(_told(site, stored[index]) for index, site in enumerate(task.sites))
+        by_tile.setdefault(site.owner, []).append(packed[index].stored)
+    for tile, pickles in by_tile.items():
+        task.scratch.put_object(_results_name(tile, task.number), pickles)
+    return tuple(packed[index].told for index in range(len(task.sites)))
 
 
-def _told(site: CandidateSite, stored: StoredResult) -> Modelled:
-    result = stored.result
-    return Modelled(
+def stored_results(scratch: Scratch, tile: Tile, number: int) -> list[StoredResult]:
+    """What a batch modelled of a tile. Of this run's own scratch only: pickles run code."""
+    return [pickle.loads(stored) for stored in scratch.get_object(_results_name(tile, number))]  # noqa: S301
+
+
+def _results_name(tile: Tile, number: int) -> str:
+    return f"results/{tile.key}/{number}.pickle"
+
+
+@dataclasses.dataclass(frozen=True)
+class Packed:
+    """A model on its way to scratch: pickled once, where it was made, and never opened on the way."""
+
+    told: Modelled
+    stored: bytes
+    """A pickled `StoredResult`."""
+
+
+def _packed(site: CandidateSite, result: BuildingResult, facts: CandidateFacts, seconds: float) -> Packed:
+    told = Modelled(
         building_id=result.building_id,
         owner=site.owner,
         status=result.status.value,
@@ -136,27 +152,26 @@ def _told(site: CandidateSite, stored: StoredResult) -> Modelled:
         roof_type=result.roof_type.value,
         faces=len(result.faces),
         points=result.n_points,
-        seconds=stored.seconds,
+        seconds=seconds,
     )
+    stored = StoredResult(result=result, facts=facts)
+    return Packed(told=told, stored=pickle.dumps(stored, protocol=pickle.HIGHEST_PROTOCOL))
 
 
-def _here(task: BatchTask) -> Iterator[tuple[int, StoredResult]]:
+def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:
     """Models made in this process: one that runs out of memory has a record, one that crashes takes all along."""
     for index, site in enumerate(task.sites):
         task.scratch.check_cancelled()
         try:
-            yield index, model_site(task, site)
+            packed = model_site(task, site)
         except MemoryError as error:
             detail = f"memory ran out: {error}".removesuffix(": ")
-            yield (
-                index,
-                StoredResult(
-                    result=failed_site(site, task.method, Reason.OUT_OF_MEMORY, detail), facts=CandidateFacts()
-                ),
-            )
+            result = failed_site(site, task.method, Reason.OUT_OF_MEMORY, detail)
+            packed = _packed(site, result, CandidateFacts(), 0.0)
+        yield index, packed
 
 
-def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, StoredResult]]:
+def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, Packed]]:
     """Models made in a supervised child process: each building can cost only itself."""
     common = dataclasses.replace(task, sites=())
     cancelled = functools.partial(_cancelled, task)
@@ -171,7 +186,7 @@ def _cancelled(task: BatchTask) -> bool:
     return task.scratch.cancelled
 
 
-def model_site(task: BatchTask, site: CandidateSite) -> StoredResult:
+def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     """One candidate's model; a fault of its own becomes its record.
 
     Raises
@@ -195,25 +210,23 @@ def model_site(task: BatchTask, site: CandidateSite) -> StoredResult:
     if result.reason is Reason.INTERNAL_ERROR:
         incident = Incident(reason=result.reason.value, detail=result.reason_detail, seconds=seconds)
         result = _kept(task, candidate, result, incident)
-    return StoredResult(result=result, facts=facts, seconds=seconds)
+    return _packed(site, result, facts, seconds)
 
 
 def _lost(
     task: BatchTask, site: CandidateSite, loss: Loss, limits: IsolationLimits, cancelled: Callable[[], bool]
-) -> StoredResult:
+) -> Packed:
     """The record and the bundle of a building that cost its process; made in a child, too."""
     patient = dataclasses.replace(limits, timeout_s=max(limits.timeout_s, _BUNDLE_TIMEOUT_S))
     describe = functools.partial(lost_site, task, loss)
     ((_, described),) = supervise(describe, [site], patient, cancelled, second_chance=False)
-    if isinstance(described, StoredResult):
+    if not isinstance(described, Loss):
         return described
     detail = f"{loss.detail}; {_NO_BUNDLE}: {described.detail}"
-    return StoredResult(
-        result=failed_site(site, task.method, loss.reason, detail), facts=CandidateFacts(), seconds=loss.seconds
-    )
+    return _packed(site, failed_site(site, task.method, loss.reason, detail), CandidateFacts(), loss.seconds)
 
 
-def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> StoredResult:
+def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
     """The record of a building that cost its process, and its bundle in the quarantine.
 
     Raises
@@ -230,7 +243,7 @@ def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> StoredResult:
         memory_bytes=loss.memory_bytes,
         stderr=loss.stderr,
     )
-    return StoredResult(result=_kept(task, candidate, result, incident), facts=facts, seconds=loss.seconds)
+    return _packed(site, _kept(task, candidate, result, incident), facts, loss.seconds)
 
 
 def _kept(task: BatchTask, candidate: Candidate | None, result: BuildingResult, incident: Incident) -> BuildingResult:

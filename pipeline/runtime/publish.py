@@ -13,7 +13,7 @@ from pipeline.export.records import RecordContext, RejectedObject
 from pipeline.export.tile import Put, TileFiles, write_tile
 from pipeline.io import LocalStorage
 from pipeline.runtime.join import RejectedSite
-from pipeline.runtime.modelling import StoredResult
+from pipeline.runtime.modelling import StoredResult, stored_results
 from pipeline.runtime.scratch import Scratch
 from pipeline.tiling import MM, Tile
 
@@ -102,7 +102,7 @@ def _write(task: PublishTask, put: Put) -> TileFiles:
     """Write the files of a tile that owns something."""
     stored: list[StoredResult] = []
     for number in task.batches:
-        stored.extend(task.scratch.get_object(f"results/{task.tile.key}/{number}.pickle"))
+        stored.extend(stored_results(task.scratch, task.tile, number))
     context = dataclasses.replace(task.context, facts={entry.result.building_id: entry.facts for entry in stored})
     return write_tile(
         task.run_dir,

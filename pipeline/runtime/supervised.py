@@ -78,6 +78,7 @@ class SupervisedChild:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._stdin, self._stdout = self._process.stdin, self._process.stdout
+        self._watched = psutil.Process(self._process.pid)
         self._poll = select.poll()
         self._poll.register(self._stdout, select.POLLIN)
         self._frames = Frames()
@@ -95,7 +96,7 @@ class SupervisedChild:
     def memory_bytes(self) -> int:
         """Its private memory: resident, without what it shares with files; 0 once it is gone."""
         try:
-            info = psutil.Process(self._process.pid).memory_info()
+            info = self._watched.memory_info()
         except psutil.Error:
             return 0
         return int(info.rss) - int(getattr(info, "shared", 0))

@@ -49,7 +49,11 @@ def test_the_sources_keep_all_contracts(copied_house: Path) -> None:
             "import pipeline.segmentation.plane_refinement",
             "Steps of a segmentation do not import one another",
         ),
-        ("pipeline/runtime/plan.py", "from dask.distributed import Client", "Only the engine's own modules import Dask"),
+        (
+            "pipeline/runtime/plan.py",
+            "from dask.distributed import Client",
+            "Only the engine's own modules import Dask",
+        ),
         ("pipeline/newcomer.py", "", "Layers of the pipeline"),
         ("service/newcomer.py", "", "Layers of the service"),
     ],

@@ -266,18 +266,6 @@ def test_an_executor_that_was_not_entered_says_so() -> None:
         Cluster().executor().__enter__()
 
 
-def test_a_lost_scheduler_ends_the_run_at_once(tmp_path: Path) -> None:
-    with Cluster(workers=1) as cluster, cluster.executor() as executor, ThreadPoolExecutor(1) as thread:
-        tasks = [(str(tmp_path), f"task{k}") for k in range(4)]
-        way = thread.submit(list, executor.map("wait", chores.wait_for_mark, tasks, Watch()))
-        wait_for(lambda: list(tmp_path.glob("started-*")), "a task that runs")
-        embedded = cluster._embedded
-        embedded.sync(embedded.scheduler.close)
-        Path(tmp_path, "go").touch()
-        with pytest.raises(ClusterError, match="was lost"):
-            way.result(LONG_S)
-
-
 # --- versions --------------------------------------------------------------------------------------------------------
 
 

@@ -331,6 +331,14 @@ def test_a_known_point_lies_where_the_survey_says(tmp_path: Path) -> None:
     assert told.uri == "http://www.opengis.net/def/crs/EPSG/0/28992"
 
 
+def test_a_crs_that_names_northing_first_is_read_easting_first(tmp_path: Path) -> None:
+    # the centre of the European equal-area projection is 52 N, 10 E at easting 4321000, northing 3210000
+    centre = runs.placed(small.pent(), "centre", 4_321_000.0 - small.ORIGIN[0], 3_210_000.0 - small.ORIGIN[1])
+    write_outputs(runs.write_run(tmp_path / "run", {"x1_y1": [centre]}, epsg=3035), tmp_path / "out")
+    (feature,) = json.loads(output_file(tmp_path / "out", "geojson").read_text())["features"]
+    assert shapely.geometry.shape(feature["geometry"]).bounds[:2] == pytest.approx((10.0, 52.0), abs=1e-5)
+
+
 def test_elevations_in_feet_do_not_move_footprints(tmp_path: Path) -> None:
     write_outputs(runs.write_run(tmp_path / "run", epsg=2225), tmp_path / "out")
     own = geopandas.read_parquet(tmp_path / "out/buildings.parquet").dropna(subset="geometry")

@@ -49,7 +49,7 @@ class Site:
             "GABLEWORK_INPUT_ROOTS": f'["{tile.parent}"]',
             "GABLEWORK_WORKERS": "1",
             "GABLEWORK_DRIVER_JOBS": "1",
-            "GABLEWORK_LEASE_S": "5",
+            "GABLEWORK_LEASE_S": "10",
             "GABLEWORK_POLL_S": "0.1",
             "OPENBLAS_NUM_THREADS": "1",
         }
@@ -187,7 +187,7 @@ def test_a_driver_ends_when_its_parent_is_gone(site: Site, tmp_path: Path) -> No
 @pytest.mark.parametrize("site", ["postgres"], indirect=True)
 def test_two_drivers_share_twenty_jobs_and_each_is_run_to_its_end_once(site: Site) -> None:
     jobs = [site.submit() for _ in range(20)]
-    drivers = [site.driver(name) for name in ("left", "right")]
+    drivers = [site.driver(name, lease_s="60") for name in ("left", "right")]
     done = [site.over(job, *drivers) for job in jobs]
     assert {job.status for job in done} == {JobStatus.SUCCESSFUL}
     assert {job.attempt for job in done} == {1}

@@ -137,6 +137,10 @@ class Deployment:
         self.running: dict[str, Program] = {}
         self.gone: set[str] = set()
         """What the supervisor does not start again."""
+        self.replaced: list[Program] = []
+        """Programs that live beside those that took their names."""
+        self.submitted: set[str] = set()
+        """The ids of all jobs."""
 
     @property
     def scheduler_address(self) -> str:
@@ -199,7 +203,7 @@ class Deployment:
             except OSError:
                 return False
 
-        wait_for(complete, f"{len(self.workers)} workers")
+        wait_for(complete, f"{len(self.workers)} workers", interval_s=0.5)
 
     def worker_of(self, pid: int) -> str:
         """The name of the worker to which a process belongs."""
@@ -242,6 +246,7 @@ class Deployment:
             )
         assert answer.status_code == 201, answer.text
         job_id: str = answer.json()["jobID"]
+        self.submitted.add(job_id)
         return job_id
 
     def status(self, job_id: str) -> str | None:

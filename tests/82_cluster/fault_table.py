@@ -66,8 +66,7 @@ def freeze_driver(service: Deployment, moment: Moment) -> None:
     service.start("driver")
     wait_for(lambda: service.job(moment.job_id).attempt == 2, "the claim of another driver")
     silent.process.send_signal(signal.SIGCONT)
-    service.running["driver-before"] = silent
-    service.gone.add("driver-before")
+    service.replaced.append(silent)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -74,7 +74,7 @@ class Host:
             extra_groups=None if self.user is None else [],
             capture_output=True,
             text=True,
-            timeout=600,
+            timeout=1800,
             check=False,
         )
 

@@ -25,13 +25,17 @@ import { LineMaterial } from "three/addons/lines/LineMaterial.js";
 import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
 import type { Batch } from "./batching";
+import { framing } from "./framing";
 import { groundThrough, heightAt, type Ground } from "./ground";
+import { groundMesh } from "./ground_mesh";
 import { hatched } from "./hatching";
 import { pick } from "./picking";
 import type { Category } from "./roof_types";
 
 const FOV_DEG = 32;
 const START = new Vector3(-0.42, -1, 0.72); // seen from the south-south-west, half from above
+const TAN_HALF_FOV = Math.tan((FOV_DEG * Math.PI) / 360);
+const NEAREST_M = 12;
 const CLICK_PX = 5; // farther is a drag
 const SHADOW_M = 1500; // wider scenes get no shadows: their map would be too coarse to mean anything
 const FLIGHT_MS = 450;
@@ -52,10 +56,6 @@ interface Drawn {
   batch: Batch;
   mesh: Mesh;
   edges: LineSegments;
-}
-
-export interface Chosen {
-  id: string;
 }
 
 export class ModelScene {
@@ -315,7 +315,7 @@ export class ModelScene {
     this.camera.far = distance + 6 * radius;
     this.camera.updateProjectionMatrix();
     // lines of one pixel would cover what is small: they fade before they do
-    const pixelsPerMetre = this.canvas.clientHeight / (2 * distance * Math.tan((FOV_DEG * Math.PI) / 360));
+    const pixelsPerMetre = this.canvas.clientHeight / (2 * distance * TAN_HALF_FOV);
     this.line.opacity = Math.min(Math.max((pixelsPerMetre - 0.7) / 5, 0), 0.75);
     this.line.visible = this.line.opacity > 0.02;
     const began = performance.now();
@@ -371,32 +371,8 @@ export class ModelScene {
 
   /** See boxes from a direction, `room` times as far as they need. */
   private flyTo(boxes: readonly Box3[], direction: Vector3, room: number, animated = true): void {
-    const toCamera = direction.normalize();
-    const right = new Vector3().crossVectors(new Vector3(0, 0, 1), toCamera).normalize();
-    const up = new Vector3().crossVectors(toCamera, right);
-    const tanV = Math.tan((FOV_DEG * Math.PI) / 360);
-    const [across, along] = [new Span(right, toCamera, tanV * this.camera.aspect), new Span(up, toCamera, tanV)];
-    const whole = new Box3();
-    for (const box of boxes) {
-      whole.union(box);
-      for (let corner = 0; corner < 8; corner++) {
-        const point = new Vector3(
-          (corner & 1 ? box.max : box.min).x,
-          (corner & 2 ? box.max : box.min).y,
-          (corner & 4 ? box.max : box.min).z,
-        );
-        across.take(point);
-        along.take(point);
-      }
-    }
-    const depth = whole.getCenter(new Vector3()).dot(toCamera);
-    const needed = Math.max(across.distance, along.distance) - depth;
-    const distance = Math.max(1.06 * room * needed, 12);
-    const target = new Vector3()
-      .addScaledVector(right, across.middle)
-      .addScaledVector(up, along.middle)
-      .addScaledVector(toCamera, depth);
-    const position = target.clone().addScaledVector(toCamera, distance);
+    const { target, distance } = framing(boxes, direction.normalize(), TAN_HALF_FOV, this.camera.aspect);
+    const position = target.clone().addScaledVector(direction, Math.max(1.06 * room * distance, NEAREST_M));
     if (!animated || this.still.matches) {
       this.controls.target.copy(target);
       this.camera.position.copy(position);
@@ -478,37 +454,6 @@ export class ModelScene {
   };
 }
 
-/**
- * Where a camera must stand on one of its axes, so that all points are within its frame.
- *
- * A point p is left of the right border when (p - c)·axis <= tan (c - p)·forward: the border's constraint is linear in
- * the camera's place c, and the tightest of each side give both its middle and its least distance.
- */
-class Span {
-  private high = -Infinity;
-  private low = -Infinity;
-
-  constructor(
-    private readonly axis: Vector3,
-    private readonly forward: Vector3,
-    private readonly tan: number,
-  ) {}
-
-  take(point: Vector3): void {
-    const [aside, near] = [point.dot(this.axis), this.tan * point.dot(this.forward)];
-    this.high = Math.max(this.high, near + aside);
-    this.low = Math.max(this.low, near - aside);
-  }
-
-  get middle(): number {
-    return (this.high - this.low) / 2;
-  }
-
-  get distance(): number {
-    return (this.high + this.low) / (2 * this.tan);
-  }
-}
-
 const caster = new Raycaster();
 
 function castRay(at: Vector2, camera: PerspectiveCamera): Raycaster {
@@ -520,37 +465,4 @@ function castRay(at: Vector2, camera: PerspectiveCamera): Raycaster {
 function boxOf(batch: Batch, index: number): Box3 {
   const [x0, y0, z0, x1, y1, z1] = batch.boxes.subarray(6 * index, 6 * index + 6);
   return new Box3(new Vector3(x0, y0, z0), new Vector3(x1, y1, z1));
-}
-
-/** The ground as a mesh that fades out towards its border. */
-function groundMesh(ground: Ground): Mesh {
-  const { nx, ny, cellM } = ground;
-  const positions = new Float32Array(3 * nx * ny);
-  const colours = new Float32Array(4 * nx * ny).fill(1);
-  for (let row = 0; row < ny; row++) {
-    for (let column = 0; column < nx; column++) {
-      const at = row * nx + column;
-      // a little below the floors, so that they do not flicker through
-      positions.set([ground.xMin + column * cellM, ground.yMin + row * cellM, ground.heights[at] - 0.06], 3 * at);
-      const u = (2 * column) / (nx - 1) - 1;
-      const v = (2 * row) / (ny - 1) - 1;
-      const fade = Math.min(Math.max((1 - Math.hypot(u, v)) / 0.35, 0), 1);
-      colours[4 * at + 3] = fade * fade * (3 - 2 * fade);
-    }
-  }
-  const index: number[] = [];
-  for (let row = 0; row + 1 < ny; row++) {
-    for (let column = 0; column + 1 < nx; column++) {
-      const a = row * nx + column;
-      index.push(a, a + 1, a + nx, a + 1, a + nx + 1, a + nx);
-    }
-  }
-  const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new BufferAttribute(positions, 3));
-  geometry.setAttribute("color", new BufferAttribute(colours, 4));
-  geometry.setIndex(index);
-  geometry.computeVertexNormals();
-  const mesh = new Mesh(geometry, new MeshLambertMaterial({ vertexColors: true, transparent: true, depthWrite: false }));
-  mesh.renderOrder = -1;
-  return mesh;
 }
