@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import AsyncIterator
 
+import anyio
 from fastapi import APIRouter, FastAPI
 from fastapi.staticfiles import StaticFiles
 from starlette.concurrency import run_in_threadpool
@@ -17,6 +18,7 @@ from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
 from service.routes import buildings, events, health, jobs, landing, processes, results, uploads
 from service.routes.events import Streams
+from service.routes.submission import WRITERS
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -76,6 +78,7 @@ def create_app(settings: ServiceSettings, store: JobStore | None = None) -> Fast
     app.state.folder = StateFolder(settings.state)
     app.state.limiter = RateLimiter(settings)
     app.state.streams = streams
+    app.state.submitting = anyio.CapacityLimiter(WRITERS)
     app.state.metrics = metrics
     problems.install(app)
     for router in ROUTERS:

@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Callable
 from typing import Literal
 
+from pipeline.errors import RunCancelledError
+
 EventKind = Literal["run", "stage", "progress", "warning", "waiting", "finished"]
 
 
@@ -52,3 +54,14 @@ class Watch:
     """Tells the tasks in flight to end, because nobody waits for them any more."""
     listener: Listener = ignore
     """Gets events that no result tells: workers are missing, workers are back."""
+
+    def check_cancelled(self) -> None:
+        """End a run that was called off.
+
+        Raises
+        ------
+        RunCancelledError
+            It was called off.
+        """
+        if self.cancelled():
+            raise RunCancelledError("the run was called off")

@@ -11,13 +11,14 @@ import threading
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
-from pipeline.errors import ClusterError, RunCancelledError, VersionMismatchError
+from pipeline.errors import ClusterError, VersionMismatchError
 from pipeline.runtime import worker_setup
 from pipeline.runtime.events import Watch
 from pipeline.runtime.flight import SETTLE_INTERRUPTED_S, SETTLE_S, TICK_S, Flight, Lookout
 from pipeline.runtime.measured import Measured, Result, Task, measure, mismatch_told, peak_of_process
+from pipeline.runtime.serial import Executor, SerialExecutor
 from pipeline.runtime.versions import ENGINE, TALKING, WORKING, differences
 
 __all__ = [
@@ -36,67 +37,6 @@ CONNECT_S = 20.0
 _ANSWER_S = 30.0
 _MEND_S = 5.0
 _CLOSE_S = 30.0
-
-
-class Executor(Protocol):
-    """What a run needs of an engine. One executor serves one run at a time."""
-
-    def prepare(self, stage: str, watch: Watch) -> None:
-        """Wait until tasks can run, and see that all processes run the same versions."""
-
-    def map(
-        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
-    ) -> Generator[Measured[Result], None, None]:
-        """Results of all tasks, in the order in which they finish."""
-
-    @property
-    def memory_limit_bytes(self) -> int | None:
-        """Memory of one worker; None where there is no limit."""
-
-    def __enter__(self) -> Self:
-        """Start."""
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop."""
-
-
-class SerialExecutor:
-    """One task after the other, in this process."""
-
-    def prepare(self, stage: str, watch: Watch) -> None:
-        """Nothing to wait for."""
-
-    def map(
-        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
-    ) -> Generator[Measured[Result], None, None]:
-        """Results in the order of the tasks.
-
-        Raises
-        ------
-        RunCancelledError
-            The watch called the run off.
-        """
-        del stage
-        for task in tasks:
-            if watch.cancelled():
-                raise RunCancelledError("the run was called off")
-            yield measure(function, task)
-
-    @property
-    def memory_limit_bytes(self) -> int | None:
-        """No limit of its own."""
-        return None
-
-    def __enter__(self) -> Self:
-        """Nothing to start."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nothing to stop."""
 
 
 class Cluster:
@@ -276,8 +216,15 @@ class DaskExecutor:
 
     @property
     def memory_limit_bytes(self) -> int | None:
-        """The smallest worker's limit; None where none has one, or where no worker is there."""
-        limits = [w["memory_limit"] for w in self._client.scheduler_info(n_workers=-1)["workers"].values()]
+        """The smallest worker's limit; None where none has one, or where no worker is there.
+
+        Raises
+        ------
+        ClusterError
+            The scheduler is lost.
+        """
+        found = self._ask(self._client.scheduler.identity, n_workers=-1)
+        limits = [worker["memory_limit"] for worker in found["workers"].values()]
         return min((limit for limit in limits if limit), default=None)
 
     def prepare(self, stage: str, watch: Watch) -> None:
@@ -294,13 +241,12 @@ class DaskExecutor:
         """
         lookout = self._started()
         while not lookout.threads:
-            if watch.cancelled():
-                raise RunCancelledError("the run was called off")
+            watch.check_cancelled()
             lookout.look(stage, watch)
             if not lookout.threads:
                 time.sleep(TICK_S)
         if not self._cluster.embedded:
-            self._check_versions(lookout)
+            self._check_versions()
 
     def map(
         self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
@@ -336,7 +282,20 @@ class DaskExecutor:
             raise ClusterError("the executor is not connected: use it as a context manager")
         return self._lookout
 
-    def _check_versions(self, lookout: Lookout) -> None:
+    def _ask(self, what: Callable[..., Any], **options: Any) -> Any:
+        """An answer of the scheduler.
+
+        Raises
+        ------
+        ClusterError
+            There is none.
+        """
+        try:
+            return self._client.sync(what, callback_timeout=_ANSWER_S, **options)
+        except (OSError, TimeoutError) as error:
+            raise self._started().lost(f"it did not answer ({type(error).__name__}: {error})") from error
+
+    def _check_versions(self) -> None:
         """Compare this process with the scheduler and all workers.
 
         Raises
@@ -352,15 +311,8 @@ class DaskExecutor:
         ours = _plain(get_versions(packages))
         talking = {name: ours[name] for name in ("python", ENGINE, *TALKING) if name in ours}
         message = {"op": "versions", "packages": packages}
-        try:
-            scheduler = self._client.sync(
-                self._client.scheduler.versions, packages=[ENGINE], callback_timeout=_ANSWER_S
-            )
-            workers = self._client.sync(
-                self._client.scheduler.broadcast, msg=message, on_error="ignore", callback_timeout=_ANSWER_S
-            )
-        except (OSError, TimeoutError) as error:
-            raise lookout.lost(f"it did not tell the versions of its processes ({error})") from error
+        scheduler = self._ask(self._client.scheduler.versions, packages=[ENGINE])
+        workers = self._ask(self._client.scheduler.broadcast, msg=message, on_error="ignore")
         told = {f"scheduler {self._cluster.address}": differences(talking, _plain(scheduler))}
         for address, theirs in sorted(workers.items()):
             told[f"worker {address}"] = differences(ours, _plain(theirs))

@@ -22,7 +22,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, Generic
 
-from pipeline.errors import ClusterError, RunCancelledError, RunError
+from pipeline.errors import ClusterError, GableworkError, RunCancelledError, RunError
 from pipeline.runtime.events import Event, Watch
 from pipeline.runtime.measured import Measured, Result, Task, measure_packed, packed
 from pipeline.runtime.versions import fingerprint
@@ -39,6 +39,10 @@ _RESULT_S = 5.0
 _ENDED = frozenset({"finished", "error", "cancelled"})
 """A future that is pending is still to come, and one that is lost is made again."""
 _SUSPECTS = "gablework-suspects"
+_NOT_SHARED = (
+    "a worker does not see the run's scratch folder: "
+    "the run directory must be on a file system that all workers share, under the same name"
+)
 
 
 class Lookout:
@@ -183,8 +187,7 @@ class Flight(Generic[Task, Result]):
         """
         try:
             while self._waiting or self._suspects or self._flying:
-                if self.watch.cancelled():
-                    raise RunCancelledError("the run was called off")
+                self.watch.check_cancelled()
                 self.lookout.look(self.stage, self.watch)
                 self._submit()
                 self._wake.wait(TICK_S)
@@ -193,6 +196,13 @@ class Flight(Generic[Task, Result]):
                     yield from self._landed(future)
         except KeyboardInterrupt:
             self.settle_s = min(self.settle_s, SETTLE_INTERRUPTED_S)
+            raise
+        except GableworkError:
+            raise
+        except Exception as error:
+            # what a client says that has just lost its scheduler comes in many kinds
+            if self.client.status != "running":
+                raise self.lookout.lost(f"{type(error).__name__}: {error}") from error
             raise
         finally:
             self._settle()
@@ -246,6 +256,8 @@ class Flight(Generic[Task, Result]):
         number = self._flying[future]
         if future.status == "error":
             error = future.exception(timeout=_RESULT_S)
+            if isinstance(error, RunCancelledError) and not self.watch.cancelled():
+                raise RunError(_NOT_SHARED) from error
             if not isinstance(error, KilledWorker):
                 raise error
             if self._alone is not None:

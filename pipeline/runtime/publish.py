@@ -31,6 +31,8 @@ class PublishTask:
     """Objects of this tile that are no buildings."""
     context: RecordContext
     meshes: str
+    empty_tables: bool = False
+    """Whether to write tables without rows, where nothing at all was found: every run has tables."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,7 +84,7 @@ def publish(task: PublishTask) -> Published:
     files: TileFiles | None = None
     error = ""
     try:
-        if task.batches or task.rejected:
+        if task.batches or task.rejected or task.empty_tables:
             files = _write(task, put)
     except RunCancelledError:
         raise

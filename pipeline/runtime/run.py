@@ -278,11 +278,14 @@ def _calling_off(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Ca
     over, off = threading.Event(), threading.Event()
 
     def ask() -> None:
-        while not over.wait(TICK_S):
-            if cancelled():
+        try:
+            while not over.wait(TICK_S) and not cancelled():
+                pass
+        finally:
+            # a run whose end nobody could tell any more ends, too
+            if not over.is_set():
                 off.set()
                 scratch.cancel()
-                return
 
     asking = threading.Thread(target=ask, name="gablework-cancelled", daemon=True)
     asking.start()

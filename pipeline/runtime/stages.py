@@ -319,6 +319,7 @@ class Stages:
                 rejected=tuple(rejected.get(tile, ())),
                 context=context,
                 meshes=self.meshes,
+                empty_tables=not numbers and not rejected and tile == owners[0],
             )
             for tile in owners
         ]

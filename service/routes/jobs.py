@@ -79,7 +79,9 @@ async def submit(
 
     If anything is refused, nothing of the call is kept.
     """
-    submission = Submission(store=store, folder=folder, settings=settings, caller=caller)
+    submission = Submission(
+        store=store, folder=folder, settings=settings, caller=caller, threads=request.app.state.submitting
+    )
     try:
         inputs, outputs = await _read(request, submission, settings)
         draft = process_named("reconstruct").draft(inputs, outputs, settings)

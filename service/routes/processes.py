@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Body, Depends, Header, Query
+from fastapi import APIRouter, Body, Depends, Header, Query, Request
 from fastapi.responses import JSONResponse
 
 from service.drafts import shortened
@@ -97,6 +97,7 @@ def process(processID: str, base: Base, settings: Settings_) -> JSONResponse:  #
     },
 )
 async def execute(
+    request: Request,
     processID: str,  # noqa: N803 - the standard's word
     body: Annotated[dict[str, Any], Body()],
     base: Base,
@@ -110,7 +111,9 @@ async def execute(
     chosen = process_named(processID)
     inputs, outputs = _split(body)
     draft = chosen.draft(inputs, outputs, settings)
-    submission = Submission(store=store, folder=folder, settings=settings, caller=caller)
+    submission = Submission(
+        store=store, folder=folder, settings=settings, caller=caller, threads=request.app.state.submitting
+    )
     try:
         job = await submission.submit(draft)
     except BaseException:

@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import AsyncIterator, Iterable
 
 import anyio
-from starlette.concurrency import run_in_threadpool
+import anyio.to_thread
 
 from service.auth import Principal
 from service.drafts import Draft, Inline
@@ -20,6 +20,9 @@ from service.settings import ServiceSettings
 from service.store import JobStore
 from service.uploads import receive, remove_file
 
+WRITERS = 3
+"""Threads that write jobs: few, for writers wait for one another, and those who only look are not to wait for them."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Submission:
@@ -29,6 +32,8 @@ class Submission:
     folder: StateFolder
     settings: ServiceSettings
     caller: Principal
+    threads: anyio.CapacityLimiter
+    """How many calls may write jobs at once."""
     made: list[str] = dataclasses.field(default_factory=list)
     """Ids of the uploads of this call."""
 
@@ -64,7 +69,7 @@ class Submission:
         stored: dict[Inline, InputReference] = {}
         for inline in draft.inline:
             stored[inline] = await self.keep(_once(inline.content), inline.filename)
-        return await run_in_threadpool(self._create, draft, stored)
+        return await anyio.to_thread.run_sync(self._create, draft, stored, limiter=self.threads)
 
     def _create(self, draft: Draft, stored: dict[Inline, InputReference]) -> Job:
         request = draft.request(stored)
@@ -80,7 +85,7 @@ class Submission:
     async def undo(self) -> None:
         """Remove the uploads of this call, also where the client has gone."""
         with anyio.CancelScope(shield=True):
-            await run_in_threadpool(self._remove, tuple(self.made))
+            await anyio.to_thread.run_sync(self._remove, tuple(self.made), limiter=self.threads)
 
     def _remove(self, upload_ids: Iterable[str]) -> None:
         for upload_id in upload_ids:

@@ -15,6 +15,7 @@ import shapely
 import pipeline.reconstruct
 import pipeline.runtime.publish
 from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, RunError
+from pipeline.runtime.digest import run_digest
 from pipeline.runtime.events import Event
 from pipeline.runtime.run import RunRequest, run
 from pipeline.settings import RunSettings
@@ -238,3 +239,18 @@ def test_a_tile_that_cannot_be_written_costs_only_itself(
 def test_an_object_store_is_refused_at_once(suburb: Path, reconstruct: Any) -> None:
     with pytest.raises(RunError, match=r"s3://bucket/run is no local path"):
         reconstruct(suburb, out="s3://bucket/run")
+
+
+def test_a_meadow_has_no_building_and_ends_well(tmp_path: Path, reconstruct: Any) -> None:
+    rng = np.random.default_rng(1)
+    las = laspy.create(point_format=6, file_version="1.4")
+    las.header.scales, las.header.offsets = [0.001] * 3, [200_000.0, 500_000.0, 0.0]
+    las.x, las.y = 200_000.0 + rng.uniform(0.0, 60.0, 8000), 500_000.0 + rng.uniform(0.0, 60.0, 8000)
+    las.z = rng.normal(0.0, 0.02, 8000)
+    las.return_number = las.number_of_returns = np.ones(8000, np.uint8)
+    las.write(tmp_path / "meadow.las")
+    whole = reconstruct(tmp_path / "meadow.las", crs="EPSG:28992")
+    tiled = reconstruct(tmp_path / "meadow.las", crs="EPSG:28992", settings={"tile_size_m": 25.0})
+    assert whole.counts["candidates"] == whole.counts["rejected"] == 0
+    assert tiled.counts["tiles"] > 1
+    assert tiled.digest == whole.digest == run_digest(whole.run_dir)

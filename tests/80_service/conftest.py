@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from driver_bench import bench  # noqa: F401 - a fixture
 from starlette.testclient import TestClient
 
 from service.app import create_app

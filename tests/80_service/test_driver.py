@@ -2,196 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Self, TypeVar
+from typing import Any
 
 import pytest
+from driver_bench import DEADLINE_S, Bench, Engine, until
 
-from pipeline.errors import ClusterError, RunCancelledError, UnreadableInputError
+from pipeline.errors import ClusterError, UnreadableInputError
 from pipeline.runtime.events import Event
-from pipeline.runtime.run import RunSummary
 from service.driver import endings, process
-from service.driver.attempt import Tools
 from service.driver.clusters import SharedCluster, answers
-from service.driver.janitor import tidy, tidy_jobs
-from service.driver.process import Driver
 from service.errors import StoreError
-from service.fetching import Fetched
-from service.files import StateFolder
-from service.jobs import Fault, InputReference, Job, JobFailure, JobRequest, JobStatus, Upload
-from service.settings import ServiceSettings
+from service.jobs import Fault, InputReference, Job, JobRequest, JobStatus
 from service.store import JobStore
-
-Value = TypeVar("Value")
-
-DEADLINE_S = 60.0
-
-
-def until(condition: Callable[[], Value | None], what: str) -> Value:
-    end = time.monotonic() + DEADLINE_S
-    while True:
-        value = condition()
-        if value:
-            return value
-        assert time.monotonic() < end, f"waited in vain for {what}"
-        time.sleep(0.01)
-
-
-class Engine:
-    """A cluster that only counts."""
-
-    started = 0
-    stopped = 0
-
-    def executor(self, priority: int = 0) -> Any:
-        return SimpleNamespace(priority=priority)
-
-    def __enter__(self) -> Self:
-        type(self).started += 1
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        type(self).stopped += 1
-
-
-class Script:
-    """A run that does what the test says; by default it tells some progress and succeeds."""
-
-    def __init__(self) -> None:
-        self.runs = 0
-        self.seen: list[Any] = []
-        self.steps: list[Callable[[Any, Callable[[Event], None], Callable[[], bool]], None]] = []
-        self.go_on = threading.Event()
-
-    def gather(self, request: JobRequest, *, target: Path, **_others: Any) -> tuple[list[Fetched], None]:
-        target.mkdir(parents=True)
-        tiles = []
-        for number, tile in enumerate(request.tiles):
-            path = target / f"tile {number}.laz"
-            path.write_bytes(b"points")
-            tiles.append(Fetched(reference=tile, path=path, points=1, sha256=None))
-        return tiles, None
-
-    def run(self, request: Any, on_event: Callable[[Event], None], executor: Any, cancelled: Any) -> RunSummary:
-        self.runs += 1
-        self.seen.append((request, executor))
-        Path(request.out).mkdir(parents=True)
-        Path(request.out, "run.json").write_text("{}")
-        for done in range(4):
-            on_event(Event(kind="progress", stage="split", done=done, total=3))
-        on_event(Event(kind="warning", stage="split", message=f"{request.inputs[0]}: odd, see {request.out}/run.json"))
-        if len(self.steps) >= self.runs:
-            self.steps[self.runs - 1](request, on_event, cancelled)
-        return RunSummary(
-            run_dir=request.out,
-            digest="d" * 64,
-            statuses={"ok": 2},
-            reasons={},
-            rejected={"tree": 1},
-            roof_types={"gable": 2},
-            counts={"points": 6},
-            timings_s={"total": 0.5},
-            peak_memory_bytes={"host:1": 5},
-            warnings=(f"{request.inputs[0]}: odd",),
-        )
-
-    def write_outputs(
-        self, _run_dir: Path, out_dir: Path, _wanted: Any, on_progress: Callable[[int, int], None]
-    ) -> None:
-        out_dir.mkdir()
-        (out_dir / "outputs.json").write_text("{}")
-        on_progress(1, 1)
-
-    def raises(self, error: Exception) -> None:
-        """The next run raises."""
-
-        def step(request: Any, on_event: Any, cancelled: Any) -> None:
-            raise error
-
-        self.steps.append(step)
-
-    def waits(self, on_event: Event | None = None) -> None:
-        """The next run goes on until the test says so, or until it is called off."""
-
-        def step(request: Any, tell: Callable[[Event], None], cancelled: Callable[[], bool]) -> None:
-            if on_event is not None:
-                tell(on_event)
-            while not self.go_on.wait(0.01):
-                if cancelled():
-                    raise RunCancelledError("the run was called off")
-
-        self.steps.append(step)
-
-
-class Bench:
-    """A store, a state folder, and drivers in threads."""
-
-    def __init__(self, folder: Path) -> None:
-        self.script = Script()
-        self.settings = ServiceSettings(
-            state=folder, poll_s=0.02, lease_s=30.0, driver_jobs=1, drain_s=30.0, max_attempts=3
-        )
-        self.store = JobStore(self.settings.database)
-        self.store.migrate()
-        self.folder = StateFolder(folder.resolve())
-        self._running: list[tuple[Driver, threading.Thread]] = []
-        self.codes: list[int] = []
-
-    def driver(self, *, parent_pipe: int | None = None, **changed: Any) -> Driver:
-        settings = self.settings.model_copy(update=changed)
-        tools = Tools(gather=self.script.gather, run=self.script.run, write_outputs=self.script.write_outputs)
-        cluster = SharedCluster(settings, Engine)
-        driver = Driver(settings, name=f"d{len(self._running)}", parent_pipe=parent_pipe, tools=tools, cluster=cluster)
-        thread = threading.Thread(target=lambda: self.codes.append(driver.run()), daemon=True)
-        self._running.append((driver, thread))
-        thread.start()
-        return driver
-
-    def submit(self, **values: Any) -> Job:
-        request = JobRequest(tiles=(InputReference(kind="path", value="/data/a.laz"),))
-        return self.store.create(request, owner=None, max_queued=100, max_queued_per_key=100, **values)
-
-    def becomes(self, job: Job, *statuses: JobStatus) -> Job:
-        def there() -> Job | None:
-            found = self.store.get(job.job_id)
-            return found if found.status in statuses else None
-
-        return until(there, f"{statuses}, it is {self.store.get(job.job_id)}")
-
-    def over(self, job: Job) -> Job:
-        return self.becomes(job, *(status for status in JobStatus if status.is_over))
-
-    def runs(self, number: int = 1) -> None:
-        until(lambda: self.script.runs >= number, f"run {number}")
-
-    def end(self, *, at_once: bool = True) -> None:
-        for driver, _ in self._running:
-            driver.stop(at_once=at_once)
-        self.join()
-
-    def join(self) -> None:
-        for _, thread in self._running:
-            thread.join(DEADLINE_S)
-            assert not thread.is_alive()
-
-
-@pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    one = Bench(tmp_path / "state")
-    try:
-        yield one
-    finally:
-        one.script.go_on.set()
-        one.end()
-        one.store.close()
-
 
 # --- the good case
 
@@ -673,83 +501,3 @@ def test_a_lease_is_renewed_for_as_long_as_the_run_takes(bench: Bench) -> None:
     bench.script.go_on.set()
     done = bench.over(job)
     assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 1)
-
-
-# --- the janitor
-
-
-def test_the_janitor_removes_what_no_job_needs_and_nothing_else(bench: Bench) -> None:
-    folder, store = bench.folder, bench.store
-
-    def attempts(job_id: str, *numbers: int) -> None:
-        for number in numbers:
-            folder.run(job_id, number).mkdir(parents=True)
-
-    def claimed() -> Job:
-        held = store.claim("d", lease_s=60.0, max_attempts=9)
-        assert held is not None
-        return held
-
-    running = bench.submit(priority=9)
-    store.release(claimed(), lost=False)
-    assert claimed().attempt == 2
-    attempts(running.job_id, 1, 2)
-    done = bench.submit(priority=8)
-    store.succeed(claimed(), message="", summary={})
-    attempts(done.job_id, 1)
-    failed = bench.submit(priority=8)
-    store.fail(claimed(), JobFailure(fault=Fault.LOST, detail="lost"))
-    attempts(failed.job_id, 1)
-    given_back = bench.submit(priority=7)
-    store.release(claimed(), lost=True, retry_after_s=60.0)
-    attempts(given_back.job_id, 1)
-    dismissed = bench.submit()
-    store.dismiss(dismissed.job_id)
-    attempts(dismissed.job_id, 1)
-    attempts("f" * 32, 1)
-    (folder.jobs / "not ours").mkdir()
-    tidy_jobs(store, folder)
-    left = {path.relative_to(folder.jobs).as_posix() for path in folder.jobs.glob("*/*")}
-    assert left == {f"{running.job_id}/attempt-2", f"{done.job_id}/attempt-1"}
-    assert {path.name for path in folder.jobs.iterdir()} == {
-        *(running.job_id, done.job_id, given_back.job_id, failed.job_id),
-        "not ours",
-    }
-
-
-def test_the_janitor_keeps_all_results_beside_an_empty_database(bench: Bench) -> None:
-    bench.folder.run("f" * 32, 1).mkdir(parents=True)
-    assert tidy_jobs(bench.store, bench.folder) == []
-    assert bench.folder.run("f" * 32, 1).exists()
-
-
-def test_the_janitor_removes_uploads_whose_time_is_over(bench: Bench) -> None:
-    import datetime as dt
-
-    now = bench.store.now()
-    for name, days in (("a", -1), ("b", 1)):
-        upload = Upload(
-            upload_id=name * 32,
-            owner=None,
-            filename="x.laz",
-            size_bytes=1,
-            sha256="0" * 64,
-            created_at=now,
-            expires_at=now + dt.timedelta(days=days),
-        )
-        bench.store.add_upload(upload)
-        bench.folder.upload(name * 32).mkdir(parents=True)
-    for name, age_s in (("c", 2 * 24 * 3600.0), ("d", 60.0)):
-        folder = bench.folder.upload(name * 32)
-        folder.mkdir()
-        os.utime(folder, (time.time() - age_s,) * 2)
-    removed = tidy(bench.store, bench.folder)
-    assert {path.name for path in removed} == {"a" * 32, "c" * 32}
-    assert {path.name for path in bench.folder.uploads.iterdir()} == {"b" * 32, "d" * 32}
-    assert bench.store.upload_ids() == {"b" * 32}
-
-
-def test_the_janitor_works_without_any_folder(bench: Bench) -> None:
-    with contextlib.suppress(FileNotFoundError):
-        bench.folder.jobs.rmdir()
-    assert tidy(bench.store, bench.folder) == []

@@ -151,7 +151,7 @@ def test_the_stages_make_up_the_whole_job() -> None:
     ("message", "expected"),
     [
         ("/var/lib/gablework/jobs/ab/run is not empty", "run is not empty"),
-        ("[Errno 13] Permission denied: '/root/x/y.npy'", "[Errno 13] Permission denied: 'y.npy'"),
+        ("[Errno 13] Permission denied: '/srv/x/y.npy'", "[Errno 13] Permission denied: 'y.npy'"),
         ("3 m/s and 4 points/m2, eave/ridge", "3 m/s and 4 points/m2, eave/ridge"),
         ("see https://example.org/a/b/c for it", "see https://example.org/a/b/c for it"),
         ("the scheduler tcp://10.0.0.1:8786 was lost", "the scheduler was lost"),

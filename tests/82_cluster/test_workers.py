@@ -10,7 +10,6 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
@@ -65,6 +64,7 @@ class Bench:
         self.port = free_port()
         self.events: list[Event] = []
         self.threads = ThreadPoolExecutor(4)
+        self.over = threading.Event()
         self.scheduler = self.start_scheduler()
 
     @property
@@ -90,17 +90,21 @@ class Bench:
         command = [str(program("gablework")), "worker", "--scheduler", self.address, "--name", name]
         return self.programs.start(name, [*command, *options], env={"PYTHONPATH": str(CHORES)})
 
-    def run(self, out: str, **options: Any) -> RunSummary:
-        """Reconstruct the tile on the workers."""
+    def run(self, out: str, cancelled: Callable[[], bool] | None = None) -> RunSummary:
+        """Reconstruct the tile on the workers; called off where the test is over before."""
         settings = RunSettings.from_mapping({"tile_size_m": 40.0})
         request = RunRequest(
             inputs=(str(self.tile),), out=str(self.folder / out), settings=settings, scheduler=self.address
         )
-        return run(request, self.events.append, **options)
+        return run(request, self.listen, cancelled=cancelled or self.over.is_set)
 
-    def begin(self, out: str, **options: Any) -> Future[RunSummary]:
+    def listen(self, event: Event) -> None:
+        """Keep what a run tells."""
+        self.events.append(event)
+
+    def begin(self, out: str) -> Future[RunSummary]:
         """Reconstruct in another thread."""
-        return self.threads.submit(self.run, out, **options)
+        return self.threads.submit(self.run, out)
 
     def pausing(self, stage: str) -> tuple[Path, dict[str, str]]:
         """A folder, and the environment of workers that stop before the tasks of a stage until it holds `go`."""
@@ -129,8 +133,11 @@ def digest(tile: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 def bench(programs: Programs, tmp_path: Path, tile: Path) -> Iterator[Bench]:
     """A scheduler without workers."""
     one = Bench(programs, tmp_path, tile)
-    with one.threads:
+    try:
         yield one
+    finally:
+        one.over.set()
+        one.threads.shutdown()
 
 
 def reached(folder: Path) -> Callable[[], int | None]:
@@ -157,7 +164,7 @@ def test_a_worker_killed_in_any_stage_changes_nothing(stage: str, bench: Bench, 
     running = bench.begin("run")
     victim = owner(wait_for(reached(folder), f"a task of {stage}"), workers)
     victim.kill()
-    assert not victim.children()
+    wait_for(lambda: not victim.children(), "the end of its processes")
     (folder / "go").touch()
     summary = running.result(END_S)
     assert summary.digest == digest
@@ -206,17 +213,13 @@ def test_a_scheduler_killed_under_a_run_ends_it_with_a_clear_error(bench: Bench)
 
 def test_a_run_that_is_called_off_leaves_a_cluster_that_serves_the_next(bench: Bench, digest: str) -> None:
     bench.start_worker("one")
-    off = threading.Event()
 
-    def on_event(event: Event) -> None:
-        if event.kind == "progress" and event.stage == "split":
-            off.set()
+    def split_began() -> bool:
+        return any(event.kind == "progress" and event.stage == "split" for event in bench.events)
 
-    bench.events = type("", (), {"append": staticmethod(on_event)})()  # type: ignore[assignment]
     with pytest.raises(RunCancelledError):
-        bench.run("off", cancelled=off.is_set)
+        bench.run("off", cancelled=split_began)
     assert read_manifest(bench.folder / "off").status is RunStatus.CANCELLED
-    bench.events = []
     assert bench.run("next").digest == digest
 
 
@@ -276,8 +279,9 @@ def test_a_worker_that_is_told_to_end_finishes_what_runs_and_nothing_runs_twice(
     marks.mkdir()
     tasks = [(str(marks), f"task{k}") for k in range(12)]
     with Cluster(scheduler=bench.address) as cluster, cluster.executor() as executor:
-        executor.prepare("wait", Watch())
-        running = bench.threads.submit(lambda: list(executor.map("wait", chores.wait_for_mark, tasks, Watch())))
+        watch = Watch(cancelled=bench.over.is_set)
+        executor.prepare("wait", watch)
+        running = bench.threads.submit(lambda: list(executor.map("wait", chores.wait_for_mark, tasks, watch)))
         wait_for(lambda: len(list(marks.glob("started-*"))) == 2, "a task on each worker")
         leaving = workers[0]
         leaving.process.send_signal(signal.SIGTERM)
@@ -300,7 +304,8 @@ def test_the_last_worker_hands_its_result_over_before_it_leaves(bench: Bench) ->
     marks.mkdir()
     with Cluster(scheduler=bench.address) as cluster, cluster.executor() as executor:
         tasks = [(str(marks), "only")]
-        running = bench.threads.submit(lambda: list(executor.map("wait", chores.wait_for_mark, tasks, Watch())))
+        watch = Watch(cancelled=bench.over.is_set)
+        running = bench.threads.submit(lambda: list(executor.map("wait", chores.wait_for_mark, tasks, watch)))
         wait_for(lambda: list(marks.glob("started-*")), "the task")
         worker.process.send_signal(signal.SIGTERM)
         worker.wait_for_text("no new tasks")
@@ -315,9 +320,8 @@ def test_a_second_signal_ends_a_worker_at_once(bench: Bench) -> None:
     worker.wait_for_text("is at the scheduler")
     marks = bench.folder / "marks"
     marks.mkdir()
-    off = threading.Event()
     with Cluster(scheduler=bench.address) as cluster, cluster.executor() as executor:
-        watch = Watch(cancelled=off.is_set)
+        watch = Watch(cancelled=bench.over.is_set)
         tasks = [(str(marks), "endless")]
         running = bench.threads.submit(lambda: list(executor.map("wait", chores.wait_for_mark, tasks, watch)))
         wait_for(lambda: list(marks.glob("started-*")), "the task")
@@ -326,7 +330,7 @@ def test_a_second_signal_ends_a_worker_at_once(bench: Bench) -> None:
         worker.process.send_signal(signal.SIGTERM)
         assert worker.ended() == 0
         assert "ended at once" in worker.text
-        off.set()
+        bench.over.set()
         with pytest.raises(RunCancelledError):
             running.result(END_S)
 

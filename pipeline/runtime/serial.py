@@ -1,0 +1,70 @@
+"""What a run needs of an engine, and the simplest one: one task after the other, in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from types import TracebackType
+from typing import Protocol, Self
+
+from pipeline.runtime.events import Watch
+from pipeline.runtime.measured import Measured, Result, Task, measure
+
+
+class Executor(Protocol):
+    """What a run needs of an engine. One executor serves one run at a time."""
+
+    def prepare(self, stage: str, watch: Watch) -> None:
+        """Wait until tasks can run, and see that all processes run the same versions."""
+
+    def map(
+        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
+    ) -> Generator[Measured[Result], None, None]:
+        """Results of all tasks, in the order in which they finish."""
+
+    @property
+    def memory_limit_bytes(self) -> int | None:
+        """Memory of one worker; None where there is no limit."""
+
+    def __enter__(self) -> Self:
+        """Start."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop."""
+
+
+class SerialExecutor:
+    """One task after the other, in this process."""
+
+    def prepare(self, stage: str, watch: Watch) -> None:
+        """Nothing to wait for."""
+
+    def map(
+        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
+    ) -> Generator[Measured[Result], None, None]:
+        """Results in the order of the tasks.
+
+        Raises
+        ------
+        RunCancelledError
+            The watch called the run off.
+        """
+        del stage
+        for task in tasks:
+            watch.check_cancelled()
+            yield measure(function, task)
+
+    @property
+    def memory_limit_bytes(self) -> int | None:
+        """No limit of its own."""
+        return None
+
+    def __enter__(self) -> Self:
+        """Nothing to start."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing to stop."""

@@ -1,0 +1,89 @@
+"""The janitor removes what no job needs, and nothing else."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+
+from driver_bench import Bench
+
+from service.driver.janitor import tidy, tidy_jobs
+from service.jobs import Fault, Job, JobFailure, Upload
+
+
+def test_the_janitor_removes_what_no_job_needs_and_nothing_else(bench: Bench) -> None:
+    folder, store = bench.folder, bench.store
+
+    def attempts(job_id: str, *numbers: int) -> None:
+        for number in numbers:
+            folder.run(job_id, number).mkdir(parents=True)
+
+    def claimed() -> Job:
+        held = store.claim("d", lease_s=60.0, max_attempts=9)
+        assert held is not None
+        return held
+
+    running = bench.submit(priority=9)
+    store.release(claimed(), lost=False)
+    assert claimed().attempt == 2
+    attempts(running.job_id, 1, 2)
+    done = bench.submit(priority=8)
+    store.succeed(claimed(), message="", summary={})
+    attempts(done.job_id, 1)
+    failed = bench.submit(priority=8)
+    store.fail(claimed(), JobFailure(fault=Fault.LOST, detail="lost"))
+    attempts(failed.job_id, 1)
+    given_back = bench.submit(priority=7)
+    store.release(claimed(), lost=True, retry_after_s=60.0)
+    attempts(given_back.job_id, 1)
+    dismissed = bench.submit()
+    store.dismiss(dismissed.job_id)
+    attempts(dismissed.job_id, 1)
+    attempts("f" * 32, 1)
+    (folder.jobs / "not ours").mkdir()
+    tidy_jobs(store, folder)
+    left = {path.relative_to(folder.jobs).as_posix() for path in folder.jobs.glob("*/*")}
+    assert left == {f"{running.job_id}/attempt-2", f"{done.job_id}/attempt-1"}
+    assert {path.name for path in folder.jobs.iterdir()} == {
+        *(running.job_id, done.job_id, given_back.job_id, failed.job_id),
+        "not ours",
+    }
+
+
+def test_the_janitor_keeps_all_results_beside_an_empty_database(bench: Bench) -> None:
+    bench.folder.run("f" * 32, 1).mkdir(parents=True)
+    assert tidy_jobs(bench.store, bench.folder) == []
+    assert bench.folder.run("f" * 32, 1).exists()
+
+
+def test_the_janitor_removes_uploads_whose_time_is_over(bench: Bench) -> None:
+    import datetime as dt
+
+    now = bench.store.now()
+    for name, days in (("a", -1), ("b", 1)):
+        upload = Upload(
+            upload_id=name * 32,
+            owner=None,
+            filename="x.laz",
+            size_bytes=1,
+            sha256="0" * 64,
+            created_at=now,
+            expires_at=now + dt.timedelta(days=days),
+        )
+        bench.store.add_upload(upload)
+        bench.folder.upload(name * 32).mkdir(parents=True)
+    for name, age_s in (("c", 2 * 24 * 3600.0), ("d", 60.0)):
+        folder = bench.folder.upload(name * 32)
+        folder.mkdir()
+        os.utime(folder, (time.time() - age_s,) * 2)
+    removed = tidy(bench.store, bench.folder)
+    assert {path.name for path in removed} == {"a" * 32, "c" * 32}
+    assert {path.name for path in bench.folder.uploads.iterdir()} == {"b" * 32, "d" * 32}
+    assert bench.store.upload_ids() == {"b" * 32}
+
+
+def test_the_janitor_works_without_any_folder(bench: Bench) -> None:
+    with contextlib.suppress(FileNotFoundError):
+        bench.folder.jobs.rmdir()
+    assert tidy(bench.store, bench.folder) == []

@@ -1,0 +1,187 @@
+"""A driver with a scripted run in place of the science, for tests of what becomes of jobs."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Self, TypeVar
+
+import pytest
+
+from pipeline.errors import RunCancelledError
+from pipeline.runtime.events import Event
+from pipeline.runtime.run import RunSummary
+from service.driver.attempt import Tools
+from service.driver.clusters import SharedCluster
+from service.driver.process import Driver
+from service.fetching import Fetched
+from service.files import StateFolder
+from service.jobs import InputReference, Job, JobRequest, JobStatus
+from service.settings import ServiceSettings
+from service.store import JobStore
+
+Value = TypeVar("Value")
+
+DEADLINE_S = 60.0
+
+
+def until(condition: Callable[[], Value | None], what: str) -> Value:
+    end = time.monotonic() + DEADLINE_S
+    while True:
+        value = condition()
+        if value:
+            return value
+        assert time.monotonic() < end, f"waited in vain for {what}"
+        time.sleep(0.01)
+
+
+class Engine:
+    """A cluster that only counts."""
+
+    started = 0
+    stopped = 0
+
+    def executor(self, priority: int = 0) -> Any:
+        return SimpleNamespace(priority=priority)
+
+    def __enter__(self) -> Self:
+        type(self).started += 1
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        type(self).stopped += 1
+
+
+class Script:
+    """A run that does what the test says; by default it tells some progress and succeeds."""
+
+    def __init__(self) -> None:
+        self.runs = 0
+        self.seen: list[Any] = []
+        self.steps: list[Callable[[Any, Callable[[Event], None], Callable[[], bool]], None]] = []
+        self.go_on = threading.Event()
+
+    def gather(self, request: JobRequest, *, target: Path, **_others: Any) -> tuple[list[Fetched], None]:
+        target.mkdir(parents=True)
+        tiles = []
+        for number, tile in enumerate(request.tiles):
+            path = target / f"tile {number}.laz"
+            path.write_bytes(b"points")
+            tiles.append(Fetched(reference=tile, path=path, points=1, sha256=None))
+        return tiles, None
+
+    def run(self, request: Any, on_event: Callable[[Event], None], executor: Any, cancelled: Any) -> RunSummary:
+        self.runs += 1
+        self.seen.append((request, executor))
+        Path(request.out).mkdir(parents=True)
+        Path(request.out, "run.json").write_text("{}")
+        for done in range(4):
+            on_event(Event(kind="progress", stage="split", done=done, total=3))
+        on_event(Event(kind="warning", stage="split", message=f"{request.inputs[0]}: odd, see {request.out}/run.json"))
+        if len(self.steps) >= self.runs:
+            self.steps[self.runs - 1](request, on_event, cancelled)
+        return RunSummary(
+            run_dir=request.out,
+            digest="d" * 64,
+            statuses={"ok": 2},
+            reasons={},
+            rejected={"tree": 1},
+            roof_types={"gable": 2},
+            counts={"points": 6},
+            timings_s={"total": 0.5},
+            peak_memory_bytes={"host:1": 5},
+            warnings=(f"{request.inputs[0]}: odd",),
+        )
+
+    def write_outputs(
+        self, _run_dir: Path, out_dir: Path, _wanted: Any, on_progress: Callable[[int, int], None]
+    ) -> None:
+        out_dir.mkdir()
+        (out_dir / "outputs.json").write_text("{}")
+        on_progress(1, 1)
+
+    def raises(self, error: Exception) -> None:
+        """The next run raises."""
+
+        def step(request: Any, on_event: Any, cancelled: Any) -> None:
+            raise error
+
+        self.steps.append(step)
+
+    def waits(self, on_event: Event | None = None) -> None:
+        """The next run goes on until the test says so, or until it is called off."""
+
+        def step(request: Any, tell: Callable[[Event], None], cancelled: Callable[[], bool]) -> None:
+            if on_event is not None:
+                tell(on_event)
+            while not self.go_on.wait(0.01):
+                if cancelled():
+                    raise RunCancelledError("the run was called off")
+
+        self.steps.append(step)
+
+
+class Bench:
+    """A store, a state folder, and drivers in threads."""
+
+    def __init__(self, folder: Path) -> None:
+        self.script = Script()
+        self.settings = ServiceSettings(
+            state=folder, poll_s=0.02, lease_s=30.0, driver_jobs=1, drain_s=30.0, max_attempts=3
+        )
+        self.store = JobStore(self.settings.database)
+        self.store.migrate()
+        self.folder = StateFolder(folder.resolve())
+        self._running: list[tuple[Driver, threading.Thread]] = []
+        self.codes: list[int] = []
+
+    def driver(self, *, parent_pipe: int | None = None, **changed: Any) -> Driver:
+        settings = self.settings.model_copy(update=changed)
+        tools = Tools(gather=self.script.gather, run=self.script.run, write_outputs=self.script.write_outputs)
+        cluster = SharedCluster(settings, Engine)
+        driver = Driver(settings, name=f"d{len(self._running)}", parent_pipe=parent_pipe, tools=tools, cluster=cluster)
+        thread = threading.Thread(target=lambda: self.codes.append(driver.run()), daemon=True)
+        self._running.append((driver, thread))
+        thread.start()
+        return driver
+
+    def submit(self, **values: Any) -> Job:
+        request = JobRequest(tiles=(InputReference(kind="path", value="/data/a.laz"),))
+        return self.store.create(request, owner=None, max_queued=100, max_queued_per_key=100, **values)
+
+    def becomes(self, job: Job, *statuses: JobStatus) -> Job:
+        def there() -> Job | None:
+            found = self.store.get(job.job_id)
+            return found if found.status in statuses else None
+
+        return until(there, f"{statuses}, it is {self.store.get(job.job_id)}")
+
+    def over(self, job: Job) -> Job:
+        return self.becomes(job, *(status for status in JobStatus if status.is_over))
+
+    def runs(self, number: int = 1) -> None:
+        until(lambda: self.script.runs >= number, f"run {number}")
+
+    def end(self, *, at_once: bool = True) -> None:
+        for driver, _ in self._running:
+            driver.stop(at_once=at_once)
+        self.join()
+
+    def join(self) -> None:
+        for _, thread in self._running:
+            thread.join(DEADLINE_S)
+            assert not thread.is_alive()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    one = Bench(tmp_path / "state")
+    try:
+        yield one
+    finally:
+        one.script.go_on.set()
+        one.end()
+        one.store.close()
