@@ -37,9 +37,11 @@ END_S = 300.0
 OTHER_VERSION = """
 import importlib.metadata
 import distributed.versions
-real = importlib.metadata.version
-importlib.metadata.version = lambda name: "9.9" if name == "shapely" else real(name)
-distributed.versions.version = importlib.metadata.version
+
+def version(name, real=importlib.metadata.version):
+    return "9.9" if name == "shapely" else real(name)
+
+importlib.metadata.version = distributed.versions.version = version
 distributed.versions._version_cached.cache_clear()
 """
 
@@ -188,12 +190,15 @@ def test_a_run_without_workers_waits_tells_it_and_goes_on_when_one_comes(bench: 
     running = bench.begin("run")
     wait_for(reached(folder), "a task of split")
     only.kill()
-    waiting = wait_for(lambda: next((e for e in bench.events if e.kind == "waiting"), None), "the word that it waits")
-    assert waiting.stage == "split"
+
+    def told() -> list[Event]:
+        return [event for event in bench.events if (event.kind, event.stage) == ("waiting", "split")]
+
+    waiting = wait_for(told, "the word that it waits")[0]
     assert f"gablework worker --scheduler {bench.address}" in waiting.message
     bench.start_worker("two")
     assert running.result(END_S).digest == digest
-    assert any(e.kind == "run" and "workers are there after" in e.message for e in bench.events)
+    assert any((e.kind, e.stage) == ("run", "split") and "workers are there after" in e.message for e in bench.events)
 
 
 def test_a_scheduler_killed_under_a_run_ends_it_with_a_clear_error(bench: Bench) -> None:
