@@ -27,7 +27,7 @@ from service.jobs import Upload
 from service.preflight import preflight
 from service.settings import ServiceSettings
 
-BLOCK_BYTES = 1 << 20
+BLOCK_BYTES = 1 << 18
 """Bytes that are hashed and written at once."""
 WRITERS = 4
 """Threads that write uploads: few, so that the other requests keep theirs."""

@@ -12,6 +12,7 @@ import struct
 import sys
 import tracemalloc
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import laspy
@@ -24,7 +25,7 @@ from pipeline.errors import EmptyInputError, InputError, UnreadableInputError
 from pipeline.io import SpatialReference, read_footprints
 from service import vectors
 from service.errors import LimitError, TooLargeError
-from service.preflight import CHILD_BYTES, CHILD_S, Examiner, examine
+from service.preflight import CHILD_S, Examiner, examine
 from service.vectors import DEPTH_LIMIT, _levels
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -450,12 +451,23 @@ def test_a_file_over_which_the_child_hangs_is_refused_and_the_next_is_served(
 
 
 def test_a_file_over_which_the_child_dies_is_refused_and_the_next_is_served(tmp_path: Path, examiner: Examiner) -> None:
-    good = written(tmp_path, "a.laz", las_bytes(100))
-    # Too little memory to load the readers: the child ends without an answer.
-    examiner._memory_bytes = 30 << 20
-    with pytest.raises(UnreadableInputError, match="ends the reader"):
-        examiner.examine(good, max_points=MOST)
-    examiner._memory_bytes = CHILD_BYTES
+    good, pipe = written(tmp_path, "a.laz", las_bytes(100)), tmp_path / "b.laz"
+    os.mkfifo(pipe)
+
+    def kill_the_readers() -> None:
+        # opening a pipe to write into it waits until the child has opened it to read: then the child is at work
+        for _ in range(2):  # it is tried twice
+            with pipe.open("wb"):
+                child = examiner._child
+                assert child is not None
+                child.kill()
+                child.wait()
+
+    with ThreadPoolExecutor(1) as pool:
+        killed = pool.submit(kill_the_readers)
+        with pytest.raises(UnreadableInputError, match="ends the reader"):
+            examiner.examine(pipe, max_points=MOST)
+        killed.result()
     assert examiner.examine(good, max_points=MOST)["pointCount"] == 100
 
 

@@ -267,6 +267,16 @@ class Deployment:
         """What happened to a job."""
         return self._store.events(job_id, limit=10_000)
 
+    def held(self, job_id: str, stage: str) -> int:
+        """Wait until a job is held in a stage; the id of a process that waits there."""
+
+        def reached() -> int | None:
+            job = self.job(job_id)
+            assert not job.status.is_over, f"the job ended before {stage}: {job.status}, {job.message}"
+            return self.gates.reached(stage)
+
+        return wait_for(reached, f"the stage {stage}")
+
     def ended(self, job_id: str) -> Ended:
         """Wait until a job is over, and bring back what dies meanwhile."""
 

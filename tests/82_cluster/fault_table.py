@@ -129,7 +129,7 @@ def strike(service: Deployment, fault: Fault, stage: str, tile: Path, settings: 
     else:
         service.gates.close(stage)
         job_id = service.submit(tile, settings, f"{fault.name}: {stage}")
-        pid = wait_for(lambda: service.gates.reached(stage), f"the stage {stage}")
+        pid = service.held(job_id, stage)
         fault.strike(service, Moment(job_id, pid))
         service.gates.open()
     return service.ended(job_id)

@@ -15,12 +15,12 @@ def double(number: int) -> int:
     return 2 * number
 
 
-def die_the_first_time(task: tuple[str, int]) -> int:
-    """Kill the process when the task runs for the first time; leave a mark at every run."""
-    folder, number = task
+def die_at_first(task: tuple[str, int, int]) -> int:
+    """Kill the process when the task runs for the first so many times; leave a mark at every run."""
+    folder, number, deaths = task
     runs = len(list(Path(folder).glob(f"{number}.*")))
     Path(folder, f"{number}.{runs}").touch()
-    if runs == 0:
+    if runs < deaths:
         os.kill(os.getpid(), signal.SIGKILL)
     return number
 
