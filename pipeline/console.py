@@ -145,6 +145,8 @@ class Console:
             self._log(event)
 
     def _advance_bar(self, event: Event) -> None:
+        if event.kind == "waiting":
+            self.warn(event.message)
         if event.kind not in {"stage", "progress"}:
             return
         if self._bars is None:

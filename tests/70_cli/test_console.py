@@ -144,6 +144,15 @@ def test_a_terminal_gets_bars(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "no vertical unit" in text
 
 
+def test_a_terminal_is_told_that_a_run_waits_for_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    with Console() as console:
+        console.on_event(Event(kind="stage", stage="split", total=4))
+        console.on_event(Event(kind="waiting", stage="split", message="no worker has been there for 3 s"))
+    assert "no worker has been there for 3 s" in terminal.getvalue()
+
+
 def test_tables_are_silent_for_machines(capsys: pytest.CaptureFixture[str]) -> None:
     console = Console(as_json=True)
     console.table("Roofs", ["type", "count"], [["gable", 1]])
