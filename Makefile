@@ -95,7 +95,7 @@ check: $(VENV)/.test-stamp
 
 unit: $(VENV)/.test-stamp
 	@mkdir -p .cache/numba && find .cache/numba -mindepth 1 -maxdepth 1 ! -name '$(KERNELS)' -exec rm -rf {} +
-	$(TEST_ENV) $(BIN)/python -m pytest -m "not slow" --durations=15
+	$(TEST_ENV) $(BIN)/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile --durations=15
 
 slow: $(VENV)/.test-stamp viewer
 	$(TEST_ENV) $(BIN)/python -m pytest -m slow --durations=15
