@@ -20,6 +20,7 @@ from urllib.parse import unquote, urlsplit
 from pipeline.errors import CrsError
 from pipeline.io.crs import horizontal_unit_of
 from service import catalogue
+from service.errors import RequestError
 from service.input_policy import checked_crs
 from service.jobs import InputReference, JobRequest
 
@@ -187,7 +188,7 @@ class Inputs:
         media_type = None
         if isinstance(value, Mapping):
             media_type = value.get("mediaType")
-            if media_type is not None and media_type not in ENDINGS:
+            if media_type is not None and not (isinstance(media_type, str) and media_type in ENDINGS):
                 self._fault(f"{name}.mediaType", media_type, f"use one of {', '.join(ENDINGS)}")
                 return None
             if value.get("encoding", "base64") != "base64":
@@ -296,7 +297,17 @@ def _same_crs(one: str, other: str) -> bool:
 
 
 def _json(value: Any) -> bytes:
-    return json.dumps(value, ensure_ascii=False).encode("utf-8", "replace")
+    """A part of a request as JSON again.
+
+    Raises
+    ------
+    RequestError
+        It could just be read, but is nested too deeply to be written.
+    """
+    try:
+        return json.dumps(value, ensure_ascii=False).encode("utf-8", "replace")
+    except RecursionError:
+        raise RequestError(["the request is nested hundreds of levels deep: nothing that is read here is"]) from None
 
 
 def shortened(value: Any) -> str:

@@ -209,7 +209,12 @@ class Examiner:
             As `examine`.
         """
         with self._lock:
-            answer = self._ask({"path": str(path), "max_points": max_points})
+            try:
+                answer = self._ask({"path": str(path), "max_points": max_points})
+            except BaseException:
+                # an answer that is still to come would be taken for that of the next file
+                self._end()
+                raise
         if "told" in answer:
             told: dict[str, Any] = answer["told"]
             return told
@@ -319,9 +324,11 @@ def _line_of(stream: IO[bytes], deadline_s: float) -> bytes:
         Not before the deadline.
     """
     line = bytearray()
+    # not select: it takes no file descriptor above 1023, and a service has many connections
+    poll = select.poll()
+    poll.register(stream, select.POLLIN)
     while not line.endswith(b"\n"):
-        ready, _, _ = select.select([stream], [], [], max(deadline_s - time.monotonic(), 0.0))
-        if not ready:
+        if not poll.poll(max(deadline_s - time.monotonic(), 0.0) * 1e3):
             raise TimeoutError
         piece = os.read(stream.fileno(), 65_536)
         if not piece:

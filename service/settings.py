@@ -54,7 +54,7 @@ class ServiceSettings(BaseSettings):
     max_points: int = Field(default=500_000_000, gt=0, description="Most points of all inputs of one job.")
     max_inputs: int = Field(default=1000, gt=0, description="Most input files of one job.")
     upload_days: float = Field(
-        default=7.0, gt=0.0, description="Days after which an upload that no job needs is removed."
+        default=7.0, gt=0.0, le=36_500.0, description="Days after which an upload that no job needs is removed."
     )
 
     # limits
@@ -70,11 +70,17 @@ class ServiceSettings(BaseSettings):
     workers: int = Field(default=2, ge=1, description="Processes of the embedded cluster.")
     driver_jobs: int = Field(default=2, ge=1, description="Jobs that one driver runs at once.")
     lease_s: float = Field(
-        default=30.0, gt=0.5, description="Seconds after which a silent driver's job passes to another."
+        default=30.0,
+        gt=0.5,
+        allow_inf_nan=False,
+        description="Seconds after which a silent driver's job passes to another.",
     )
     max_attempts: int = Field(default=3, ge=1, description="Drivers that may die over a job before it is failed.")
     poll_s: float = Field(
-        default=0.5, gt=0.0, description="Seconds between a driver's looks for work and for dismissals."
+        default=0.5,
+        gt=0.0,
+        allow_inf_nan=False,
+        description="Seconds between a driver's looks for work and for dismissals.",
     )
     drain_s: float = Field(
         default=600.0,
@@ -83,10 +89,10 @@ class ServiceSettings(BaseSettings):
     )
     log_json: bool = Field(default=False, description="Log one JSON object a line in place of plain lines.")
     building_timeout_s: float = Field(
-        default=600.0, gt=0.0, description="Seconds after which a building's work is stopped."
+        default=600.0, gt=0.0, allow_inf_nan=False, description="Seconds after which a building's work is stopped."
     )
     building_memory_bytes: int = Field(
-        default=4 * _GIB, gt=0, description="Resident memory at which a building's work is stopped."
+        default=4 * _GIB, ge=_GIB // 2, description="Resident memory at which a building's work is stopped."
     )
 
     @property

@@ -258,6 +258,7 @@ def serve(settings: ServiceSettings, on_ready: Callable[[str], None], *, with_dr
     def on_signal(number: int, _frame: FrameType | None) -> None:
         # the server has its own handlers while it runs, and hands on here what they caught
         signals.append(number)
+        server.should_exit = True
         if len(signals) > 1 and supervisor is not None:
             _log.warning("asked a second time: the driver is killed")
             supervisor.kill()

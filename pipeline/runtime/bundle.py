@@ -12,6 +12,7 @@ import json
 import math
 import platform
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -136,9 +137,9 @@ def read_bundle(path: str) -> Bundle:
         return _bundle(document, points, ground, stderr)
     except OSError as error:
         raise UnreadableInputError(path, f"it cannot be read: {error.strerror or error}", _FIX) from error
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise UnreadableInputError(path, f"it is no bundle, or broken: {error}", _FIX) from error
-    except (KeyError, ValueError, TypeError, AttributeError, shapely.errors.ShapelyError) as error:
+    except (KeyError, ValueError, TypeError, AttributeError, OverflowError, shapely.errors.ShapelyError) as error:
         raise UnreadableInputError(path, f"its content is odd: {type(error).__name__}: {error}", _FIX) from error
 
 

@@ -58,7 +58,7 @@ class Attempts:
         if done:
             LOG.info("the job succeeded: %s", message, extra=held.facts)
             self._forget(held, before=True)
-        else:
+        elif done is False:
             self._forget(held)
 
     def _ended(self, held: HeldJob, error: BaseException) -> None:
@@ -97,10 +97,11 @@ class Attempts:
         failure = failure_of(error, scrub=held.scrub, reference=reference, attempts=job.lost_attempts + 1)
         self._settle(held, lambda: self._shop.store.fail(job, failure), JobStatus.FAILED)
 
-    def _settle(self, held: HeldJob, write: Callable[[], None], status: JobStatus) -> bool:
+    def _settle(self, held: HeldJob, write: Callable[[], None], status: JobStatus) -> bool | None:
         """Write the end of an attempt, however long the database is away; False where the lease is lost.
 
-        A commit whose answer was lost on the way did happen: then the job has the status, at this very attempt.
+        A commit whose answer was lost on the way did happen: then the job has the status, at this very attempt. None
+        where the driver must end before it is known: then a janitor decides over the files, when the database is back.
         """
         pause = FIRST_PAUSE_S
         while True:
@@ -118,7 +119,7 @@ class Attempts:
             except StoreError as error:
                 LOG.warning("the end of the attempt cannot be written yet: %s", error, extra=held.facts)
                 if self._at_once.wait(pause):
-                    return False
+                    return None
                 pause = min(LONGEST_PAUSE_S, 2.0 * pause)
             else:
                 return True

@@ -83,6 +83,15 @@ class Driver:
         """End: no new jobs; those that run get `drain_s`, or nothing where it is to end at once."""
         self._stops += 2 if at_once else 1
 
+    def signalled(self) -> None:
+        """A signal says to end: the second one at once, but where there is a parent only the first counts.
+
+        A terminal and a service manager send theirs to all processes of a service, and the parent hands it on besides.
+        It is also the parent that ends a driver at once.
+        """
+        if self._parent_pipe is None or self._stops == 0:
+            self.stop()
+
     def run(self) -> int:
         """Work until told to stop.
 
@@ -269,7 +278,7 @@ class Driver:
 
 
 def run_driver(settings: ServiceSettings, *, name: str | None = None, parent_pipe: int | None = None) -> int:
-    """Claim jobs and run them until SIGTERM or SIGINT; a second signal ends it at once. Blocks.
+    """Claim jobs and run them until SIGTERM or SIGINT; a second signal ends it at once, unless it has a parent. Blocks.
 
     Parameters
     ----------
@@ -302,7 +311,7 @@ def _signals(driver: Driver) -> Iterator[None]:
 
     def stop(number: int, frame: FrameType | None) -> None:
         del number, frame
-        driver.stop()
+        driver.signalled()
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
     try:

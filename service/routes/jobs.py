@@ -41,6 +41,10 @@ OTHER_PARTS = 50
 
 JobId = Annotated[str, Path(alias="jobID", description="As the job's statusInfo tells it.", examples=[JOB_ID])]
 
+_MILLISECOND = dt.timedelta(microseconds=999)
+"""The rest of the millisecond that a told time stands for."""
+_LAST = dt.datetime.max.replace(tzinfo=dt.UTC)
+
 _log = logging.getLogger("gablework.service")
 
 
@@ -243,7 +247,8 @@ def _interval(text: str | None, faults: list[str]) -> tuple[dt.datetime | None, 
     parts = text.split("/")
     first = _instant(parts[0], faults, is_open=len(parts) == 2)
     if len(parts) == 1:
-        return first, None if first is None else first + dt.timedelta(microseconds=999)
+        # nothing comes after the last instant that there is
+        return first, None if first is None or first > _LAST - _MILLISECOND else first + _MILLISECOND
     if len(parts) > 2:
         faults.append(f"datetime is {shortened(text)}: use one time, or two with a slash between them")
         return None, None

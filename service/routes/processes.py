@@ -139,9 +139,9 @@ def _split(body: Mapping[str, Any]) -> tuple[dict[str, Any], list[str] | None]:
         faults.append(f"inputs is {shortened(inputs)}: use an object")
     if outputs is not None and not (isinstance(outputs, dict) and all(isinstance(o, dict) for o in outputs.values())):
         faults.append(f"outputs is {shortened(outputs)}: use an object of objects, by the outputs' ids")
-    if body.get("mode", "async") not in {"async", "auto"}:
+    if body.get("mode", "async") not in ("async", "auto"):
         faults.append(f"mode is {shortened(body['mode'])}: jobs run asynchronously, use async or leave it out")
-    if body.get("response", "document") not in {"document", "raw"}:
+    if body.get("response", "document") not in ("document", "raw"):
         faults.append(f"response is {shortened(body['response'])}: use document or raw")
     if body.get("subscriber") is not None:
         faults.append("subscriber is given: this service does not call back, follow the job's events")

@@ -69,7 +69,7 @@ def status_info(job: Job, base: str, *, with_request: bool = True) -> dict[str, 
         "attempt": job.attempt or None,
         "summary": None if job.summary is None else dict(job.summary),
         "exception": None if job.failure is None else failure_document(job.failure, f"/jobs/{job.job_id}"),
-        "request": execute_request(job.request, base) if with_request else None,
+        "request": execute_request(job.request, base, job.priority) if with_request else None,
         "links": links,
     }
     return {name: value for name, value in info.items() if value is not None}
@@ -88,7 +88,7 @@ def _words(job: Job) -> str:
     }[job.status]
 
 
-def execute_request(request: JobRequest, base: str) -> dict[str, Any]:
+def execute_request(request: JobRequest, base: str, priority: int) -> dict[str, Any]:
     """The request that would submit the same job again."""
 
     def reference(source: InputReference) -> dict[str, str]:
@@ -106,6 +106,7 @@ def execute_request(request: JobRequest, base: str) -> dict[str, Any]:
         "meshes": request.meshes,
         "licence": request.licence,
         "title": request.title,
+        "priority": priority or None,
     }
     found: dict[str, Any] = {"inputs": {name: value for name, value in inputs.items() if value is not None}}
     if request.outputs is not None:

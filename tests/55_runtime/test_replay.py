@@ -193,9 +193,18 @@ def test_what_is_no_bundle_is_exit_code_3_and_named(path: Path, tmp_path: Path) 
     whole = path.read_bytes()
     (tmp_path / "text.bundle").write_text("hello")
     (tmp_path / "cut.bundle").write_bytes(whole[: len(whole) // 2])
+    middle = whole.index(b"bundle.json") + 40
+    (tmp_path / "damaged.bundle").write_bytes(whole[:middle] + b"\xff" * 40 + whole[middle + 40 :])
     (tmp_path / "folder.bundle").mkdir()
     rewritten(path, points_npy=b"")
-    for name in ("text.bundle", "cut.bundle", "folder.bundle", "absent.bundle", "quarantine/other.bundle"):
+    for name in (
+        "text.bundle",
+        "cut.bundle",
+        "damaged.bundle",
+        "folder.bundle",
+        "absent.bundle",
+        "quarantine/other.bundle",
+    ):
         code, _, said = invoke("replay", str(tmp_path / name))
         assert code == 3, said
         assert name in said

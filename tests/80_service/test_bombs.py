@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
 import json
 import os
 import re
+import resource
 import sqlite3
 import struct
 import sys
@@ -469,6 +471,35 @@ def test_a_file_over_which_the_child_dies_is_refused_and_the_next_is_served(tmp_
             examiner.examine(pipe, max_points=MOST)
         killed.result()
     assert examiner.examine(good, max_points=MOST)["pointCount"] == 100
+
+
+def test_an_answer_that_cannot_be_read_is_not_taken_for_that_of_the_next_file(
+    tmp_path: Path, examiner: Examiner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = written(tmp_path, "a.laz", las_bytes(100)), written(tmp_path, "b.laz", las_bytes(55))
+    with monkeypatch.context() as broken:
+        broken.setattr("service.preflight._line_of", lambda *_: b"no JSON\n")
+        with pytest.raises(ValueError, match="Expecting value"):
+            examiner.examine(first, max_points=MOST)
+    assert examiner.examine(second, max_points=MOST)["pointCount"] == 55
+
+
+def test_the_child_answers_also_where_a_thousand_files_and_connections_are_open(
+    tmp_path: Path, examiner: Examiner
+) -> None:
+    good = written(tmp_path, "a.laz", las_bytes(100))
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = 2000
+    if hard != resource.RLIM_INFINITY and hard < wanted:
+        pytest.skip(f"this machine allows {hard} open files")
+    with contextlib.ExitStack() as stack:
+        if soft != resource.RLIM_INFINITY and soft < wanted:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+            stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        for _ in range(1100):
+            stack.callback(os.close, os.open(os.devnull, os.O_RDONLY))
+        assert examiner.examine(good, max_points=MOST)["pointCount"] == 100
+        examiner.close()
 
 
 def test_a_child_that_was_killed_is_started_again_without_a_word(tmp_path: Path, examiner: Examiner) -> None:

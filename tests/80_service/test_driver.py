@@ -130,6 +130,25 @@ def test_a_driver_that_ends_lets_running_jobs_finish_and_claims_no_more(bench: B
     assert bench.script.runs == 1
 
 
+def test_a_second_signal_does_not_hurry_a_driver_whose_parent_decides(bench: Bench) -> None:
+    # Ctrl-C goes to both, and the parent asks besides
+    job = bench.submit()
+    bench.script.waits()
+    read_end, write_end = os.pipe()
+    try:
+        driver = bench.driver(parent_pipe=read_end)
+        bench.runs()
+        for _ in range(2):
+            driver.signalled()
+        assert not driver._at_once.wait(0.5)
+        bench.script.go_on.set()
+        bench.join()
+    finally:
+        os.close(write_end)
+        os.close(read_end)
+    assert bench.store.get(job.job_id).status is JobStatus.SUCCESSFUL
+
+
 @pytest.mark.parametrize("how", ["out of time", "second signal", "parent gone"])
 def test_a_driver_that_must_end_gives_its_job_back_at_once(bench: Bench, how: str) -> None:
     job = bench.submit()
@@ -370,6 +389,27 @@ def test_a_success_whose_answer_was_lost_on_the_way_keeps_its_results(
     driver.stop()
     bench.join()
     assert answers_lost
+    assert (bench.folder.outputs(job.job_id, 1) / "outputs.json").exists()
+
+
+def test_a_success_that_a_driver_never_learns_of_keeps_its_results(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, flaky = JobStore.succeed, Flaky(monkeypatch)
+
+    def cut(store: JobStore, *values: Any, **named: Any) -> None:
+        if not flaky.away.is_set():
+            plain(store, *values, **named)
+            flaky.away.set()
+        raise StoreError("the connection broke after the commit, and there is no other")
+
+    monkeypatch.setattr(JobStore, "succeed", cut)
+    job = bench.submit()
+    driver = bench.driver()
+    until(flaky.away.is_set, "the commit")
+    driver.stop(at_once=True)
+    bench.join()
+    assert bench.store.get(job.job_id).status is JobStatus.SUCCESSFUL
     assert (bench.folder.outputs(job.job_id, 1) / "outputs.json").exists()
 
 

@@ -206,7 +206,8 @@ def test_jobs_are_filtered_by_when_they_were_created(local_service) -> None:
     assert listed(local_service, f"?datetime={told}") == [job.job_id]
     for interval in (f"{told}/..", "../2100-01-01T00:00:00Z", "2000-01-01/2100-01-01", f"{told}/"):
         assert listed(local_service, f"?datetime={interval}") == [job.job_id], interval
-    for interval in ("../2000-01-01T00:00:00Z", "2100-01-01T00:00:00+02:00/..", "2000-01-01T00:00:00Z"):
+    last = "9999-12-31T23:59:59.999999Z"
+    for interval in ("../2000-01-01T00:00:00Z", "2100-01-01T00:00:00+02:00/..", "2000-01-01T00:00:00Z", last):
         assert listed(local_service, f"?datetime={interval}") == [], interval
 
 

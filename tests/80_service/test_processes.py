@@ -129,11 +129,12 @@ def test_a_job_of_an_upload_waits_as_soon_as_the_answer_is_there(local_service) 
 
 def test_the_request_that_a_job_tells_can_be_sent_again(local_service) -> None:
     first = execute(
-        local_service, {"tiles": {"href": f"/uploads/{local_service.upload()}"}, "crs": "EPSG:28992"}
+        local_service, {"tiles": {"href": f"/uploads/{local_service.upload()}"}, "crs": "EPSG:28992", "priority": -3}
     ).json()
     second = local_service.client.post("/processes/reconstruct/execution", json=first["request"]).json()
-    one, other = (local_service.store.get(told["jobID"]).request for told in (first, second))
-    assert one == other
+    one, other = (local_service.store.get(told["jobID"]) for told in (first, second))
+    assert (one.request, one.priority) == (other.request, other.priority)
+    assert one.priority == -3
 
 
 def test_without_a_preference_none_is_applied(local_service) -> None:
@@ -210,10 +211,25 @@ def test_all_faults_of_a_request_are_told_at_once(local_service) -> None:
         ({"inputs": {}, "subscriber": {"successUri": "http://example.org"}}, "subscriber"),
         ({"inputs": {"tiles": None}}, "tiles is missing"),
         ({"inputs": {"tiles": 7}}, "tiles is 7"),
+        ({"inputs": {}, "mode": []}, "mode is []"),
+        ({"inputs": {}, "response": {}}, "response is {}"),
+        ({"inputs": {"tiles": {"value": "eA==", "mediaType": []}}}, "tiles.mediaType is []"),
     ],
 )
 def test_a_request_that_is_none_is_refused(local_service, body: dict, words: str) -> None:
     assert words in faults_of(local_service.client.post("/processes/reconstruct/execution", json=body))
+
+
+def test_a_body_nested_as_deeply_as_can_just_be_read_is_refused(local_service) -> None:
+    json_type = {"Content-Type": "application/json"}
+    for depth in range(700, 1020, 8):
+        for opened, closed in (("[", "]"), ('{"a":', "}")):
+            nested = opened * depth + "1" + closed * depth
+            for body in (f'{{"inputs": {{"tiles": {nested}}}}}', f'{{"inputs": {{}}, "mode": {nested}}}'):
+                answer = local_service.client.post(
+                    "/processes/reconstruct/execution", content=body.encode(), headers=json_type
+                )
+                assert answer.status_code == 400, depth
 
 
 def test_a_body_that_is_no_json_is_refused_with_the_reason(local_service) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -16,7 +17,9 @@ from typing import Any
 import httpx
 import psutil
 import pytest
+from pydantic import ValidationError
 
+from pipeline.runtime.isolation import LEAST_MEMORY_BYTES
 from service.settings import ServiceSettings
 from service.supervisor import Supervisor, environment_of, listen, pause_s
 
@@ -234,6 +237,36 @@ def test_settings_that_cannot_be_are_told_together(tmp_path: Path) -> None:
     assert found.returncode == 2
     assert "max_points" in found.stderr
     assert "lease_s" in found.stderr
+
+
+def test_a_signal_before_the_server_listens_to_any_is_not_lost(tmp_path: Path) -> None:
+    early = (
+        "import os, pathlib, signal, sys\n"
+        "from service import supervisor\n"
+        "from service.settings import ServiceSettings\n"
+        "plain = supervisor._Server.run\n"
+        "def run(server, **options):\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    plain(server, **options)\n"
+        "supervisor._Server.run = run\n"
+        "supervisor.serve(ServiceSettings(state=pathlib.Path(sys.argv[1]), port=0), print, with_driver=False)\n"
+    )
+    command = [sys.executable, "-c", early, str(tmp_path / "state")]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=DEADLINE_S)
+    assert (ended.returncode, ended.stdout) == (0, ""), ended.stderr
+
+
+def test_limits_that_no_run_takes_are_refused_at_the_start_and_not_by_every_job() -> None:
+    assert ServiceSettings(building_memory_bytes=LEAST_MEMORY_BYTES).building_memory_bytes == LEAST_MEMORY_BYTES
+    with pytest.raises(ValidationError) as caught:
+        ServiceSettings(
+            building_memory_bytes=LEAST_MEMORY_BYTES - 1,
+            building_timeout_s=math.inf,
+            lease_s=math.inf,
+            poll_s=math.inf,
+            upload_days=math.inf,
+        )
+    assert caught.value.error_count() == 5
 
 
 # --- as processes

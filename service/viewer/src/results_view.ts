@@ -191,12 +191,13 @@ class ResultsView {
     const points = tally["points"];
     const seconds = this.report.timings_s?.["total"];
     const warnings = this.report.warnings ?? [];
+    const crsName = this.report.crs?.name ?? "unknown";
     const facts = [
       this.listed.length > 0 ? counted(this.listed.length, "building") : null,
       rejected === undefined ? null : `${count(rejected)} other objects left out`,
       points === undefined ? null : `${count(points)} points`,
       seconds === undefined ? null : duration(seconds),
-      this.report.crs?.name ?? "CRS unknown",
+      crsName === "unknown" ? "CRS unknown" : crsName,
     ]
       .filter((fact) => fact !== null)
       .join(" · ");
