@@ -103,6 +103,7 @@ def start(settings: ServiceSettings, store: JobStore) -> None:
     """
     folder = StateFolder(settings.state)
     for path in (folder.root, folder.uploads, folder.jobs):
-        path.mkdir(parents=True, exist_ok=True)
+        # others on this machine have no business with tiles, results and digests of keys
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
     store.migrate()
     settings.check_address(has_keys=store.has_keys())

@@ -97,7 +97,8 @@ class Supervisor:
         self._command = command
         self._environment = dict(environment)
         self._child: subprocess.Popen[bytes] | None = None
-        self._lock = threading.Lock()
+        # a signal's handler may take it where this thread holds it already
+        self._lock = threading.RLock()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._keep, name="supervisor", daemon=True)
         self.deaths = 0
@@ -162,9 +163,10 @@ class Supervisor:
 
     def kill(self) -> None:
         """End the driver now; its jobs go back to the line when their leases end."""
-        self._ending.set()
-        if self._child is not None:
-            self._child.kill()
+        with self._lock:
+            self._ending.set()
+            if self._child is not None:
+                self._child.kill()
 
 
 class _Server(uvicorn.Server):

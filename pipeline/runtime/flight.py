@@ -255,7 +255,12 @@ class Flight(Generic[Task, Result]):
             raise self.lookout.lost("it no longer knows the tasks of this run")
         number = self._flying[future]
         if future.status == "error":
-            error = future.exception(timeout=_RESULT_S)
+            try:
+                error = future.exception(timeout=_RESULT_S)
+            except TimeoutError:
+                # a busy cluster: it is looked at again
+                self.lookout.check()
+                return
             if isinstance(error, RunCancelledError) and not self.watch.cancelled():
                 raise RunError(_NOT_SHARED) from error
             if not isinstance(error, KilledWorker):

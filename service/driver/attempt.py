@@ -124,7 +124,8 @@ def perform(held: HeldJob, shop: Workshop) -> tuple[str, dict[str, Any]]:
     request = run_request(job.request, tiles, outlines, folder.run(job.job_id, job.attempt), shop.settings)
     shop.cluster.wait_until_there(held)
     held.tell(Event(kind="stage", stage="plan"))
-    summary = shop.tools.run(request, held.tell, shop.cluster.executor(job.priority), held.cancelled)
+    held.engine = shop.cluster.engine()
+    summary = shop.tools.run(request, held.tell, held.engine.executor(job.priority), held.cancelled)
     _check(held)
     held.tell(Event(kind="stage", stage="outputs"))
 

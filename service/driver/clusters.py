@@ -7,14 +7,12 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
-from typing import Protocol, Self
 from urllib.parse import urlsplit
 
 from pipeline.errors import ClusterError, RunCancelledError
 from pipeline.runtime.events import Event
-from pipeline.runtime.executors import Cluster, Executor
-from service.driver.held import LOG, HeldJob
+from pipeline.runtime.executors import Cluster
+from service.driver.held import LOG, Engine, HeldJob
 from service.settings import ServiceSettings
 
 _CONNECT_S = 2.0
@@ -22,21 +20,6 @@ _AGAIN_S = 1.0
 """A scheduler that does not answer is tried again after so long."""
 _TELL_S = 30.0
 """That the job waits is told again after so long."""
-
-
-class Engine(Protocol):
-    """`pipeline.runtime.executors.Cluster`."""
-
-    def executor(self, priority: int = 0) -> Executor:
-        """An executor for one run."""
-
-    def __enter__(self) -> Self:
-        """Start."""
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop."""
 
 
 class SharedCluster:
@@ -57,8 +40,8 @@ class SharedCluster:
         self._engine: Engine | None = None
         self._closed = False
 
-    def start(self) -> None:
-        """Start the workers, unless they are there.
+    def engine(self) -> Engine:
+        """The workers that are there; starts them unless they are.
 
         Raises
         ------
@@ -70,34 +53,25 @@ class SharedCluster:
                 raise ClusterError("the driver ends and starts no workers any more")
             if self._engine is None:
                 self._engine = self._make().__enter__()
+            return self._engine
 
-    def executor(self, priority: int) -> Executor:
-        """An executor for one run; starts the workers unless they are there.
+    def replace(self, broken: Engine) -> None:
+        """Stop workers that broke, so that the next run starts new ones; a scheduler elsewhere is left alone.
 
-        Raises
-        ------
-        ClusterError
-            They do not start.
+        Another job may have done so before, and may be at work on the new ones by now: these are left alone, too.
         """
-        self.start()
+        if self._scheduler is not None:
+            return
         with self._lock:
-            if self._engine is None:
-                raise ClusterError("the driver's workers have been stopped")
-            return self._engine.executor(priority)
-
-    def replace(self) -> None:
-        """Stop the workers, so that the next run starts new ones; a scheduler elsewhere is left alone."""
-        if self._scheduler is None:
-            self._stop_engine()
+            if self._engine is not broken:
+                return
+            self._engine = None
+        broken.__exit__(None, None, None)
 
     def close(self) -> None:
         """Stop the workers for good."""
         with self._lock:
             self._closed = True
-        self._stop_engine()
-
-    def _stop_engine(self) -> None:
-        with self._lock:
             engine, self._engine = self._engine, None
         if engine is not None:
             engine.__exit__(None, None, None)

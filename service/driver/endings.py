@@ -81,8 +81,8 @@ class Attempts:
         facts: dict[str, Any] = {**held.facts, "reference": reference}
         expected = isinstance(error, GableworkError | ServiceError)
         LOG.warning("the attempt failed: %s", error, extra=facts, exc_info=None if expected else error)
-        if isinstance(error, ClusterError):
-            self._shop.cluster.replace()
+        if isinstance(error, ClusterError) and held.engine is not None:
+            self._shop.cluster.replace(held.engine)
         self._forget(held)
         if tried_again(error, job, self._shop.settings.max_attempts):
             pause = pause_s(job.lost_attempts)

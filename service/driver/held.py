@@ -7,9 +7,10 @@ import threading
 import time
 from enum import IntEnum
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 from pipeline.runtime.events import Event
+from pipeline.runtime.executors import Executor
 from service.driver.progress import WORDS, percent
 from service.driver.wording import Scrubber
 from service.errors import LeaseLostError, StoreError
@@ -22,6 +23,21 @@ _FLUSH_S = 0.5
 """Progress is written at most so often."""
 _MOST_PENDING = 500
 """Events that wait while the database is away; the oldest go first."""
+
+
+class Engine(Protocol):
+    """`pipeline.runtime.executors.Cluster`."""
+
+    def executor(self, priority: int = 0) -> Executor:
+        """An executor for one run."""
+
+    def __enter__(self) -> Self:
+        """Start."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop."""
 
 
 class Stop(IntEnum):
@@ -75,6 +91,8 @@ class HeldJob:
         self._waited = False
         self._pulse = threading.Thread(target=self._keep, name=f"lease-{job.job_id[:8]}", daemon=True)
         self.scrub = Scrubber()
+        self.engine: Engine | None = None
+        """The workers on which the attempt runs; None until it does."""
 
     def __enter__(self) -> Self:
         """Start the thread."""

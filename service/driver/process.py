@@ -132,7 +132,7 @@ class Driver:
             if not self._until_done(self._store.migrate, "the database cannot be migrated"):
                 return
             try:
-                self._cluster.start()
+                self._cluster.engine()
             except ClusterError as error:
                 LOG.warning("no workers yet, tried again with the first job: %s", error, extra=self._facts)
         except Exception:  # noqa: BLE001 - without this thread the driver would look alive and claim nothing

@@ -186,7 +186,7 @@ def jobs(
     max_duration: Annotated[
         float | None, Query(alias="maxDuration", ge=0.0, le=1e9, allow_inf_nan=False, description="Seconds.")
     ] = None,
-    limit: Annotated[int, Query(ge=1, le=1000, description="Most jobs to list.")] = 100,
+    limit: Annotated[int, Query(ge=1, le=10_000, description="Most jobs to list.")] = 100,
     offset: Annotated[int, Query(ge=0, le=2**31 - 1, description="Jobs to pass over.")] = 0,
 ) -> JSONResponse:
     """List the jobs that this key may see."""

@@ -478,12 +478,22 @@ def test_a_driver_waits_for_its_database_and_can_be_stopped_while_it_does(
 
 def test_workers_are_not_started_again_once_the_driver_has_ended(bench: Bench) -> None:
     cluster = SharedCluster(bench.settings, Engine)
-    cluster.start()
-    cluster.replace()
-    cluster.start()
+    cluster.replace(cluster.engine())
+    cluster.engine()
     cluster.close()
     with pytest.raises(ClusterError, match="ends"):
-        cluster.executor(0)
+        cluster.engine()
+
+
+def test_a_job_whose_workers_broke_leaves_the_new_ones_of_another_job_alone(bench: Bench) -> None:
+    cluster = SharedCluster(bench.settings, Engine)
+    broken = cluster.engine()
+    cluster.replace(broken)
+    new = cluster.engine()
+    stopped = Engine.stopped
+    cluster.replace(broken)
+    assert cluster.engine() is new is not broken
+    assert Engine.stopped == stopped
 
 
 def test_a_slot_outlives_a_fault_that_nobody_thought_of(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -222,7 +222,7 @@ def test_jobs_are_filtered_by_how_long_they_ran(local_service) -> None:
     "query",
     [
         "limit=0",
-        "limit=1001",
+        "limit=10001",
         "limit=x",
         "offset=-1",
         "status=done",
