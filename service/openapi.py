@@ -49,28 +49,32 @@ def document(app: FastAPI) -> dict[str, Any]:
         for name in ("HTTPValidationError", "ValidationError"):
             components.pop(name, None)
         components.update(SCHEMAS)
-        for operation in operations(found):
-            _complete(operation)
+        for path, operation in operations(found):
+            _complete(path, operation)
         app.openapi_schema = {**as_version_3_0(found), "openapi": VERSION}
-        for operation in operations(app.openapi_schema):
+        for _, operation in operations(app.openapi_schema):
             for parameter in operation.get("parameters", ()):
                 # one that is not sent is not there; no query can say null
                 parameter["schema"].pop("nullable", None)
     return app.openapi_schema
 
 
-def operations(found: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """All operations of a document."""
-    for path in found["paths"].values():
-        yield from (path[method] for method in _METHODS if method in path)
+def operations(found: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """All operations of a document, with their paths."""
+    for path, item in found["paths"].items():
+        yield from ((path, item[method]) for method in _METHODS if method in item)
 
 
-def _complete(operation: dict[str, Any]) -> None:
+_UNCOUNTED = ("/healthz", "/readyz")
+"""Paths that whoever watches the service may ask as often as it likes."""
+
+
+def _complete(path: str, operation: dict[str, Any]) -> None:
     """Add the problems that the application gives wherever they can come up."""
     responses = operation["responses"]
     if "HTTPValidationError" in str(responses.get("422")):
         del responses["422"]
-    general = [429, 503]
+    general = [503] if path in _UNCOUNTED else [429, 503]
     if operation.get("parameters") or "requestBody" in operation:
         general.append(400)
     if "requestBody" in operation:
