@@ -45,6 +45,11 @@ def wait_for_mark(task: tuple[str, str]) -> str:
     return name
 
 
+def tasks_held(dask_worker: object) -> int:
+    """How many tasks a worker has, whether they run or wait."""
+    return len(dask_worker.state.tasks)  # type: ignore[attr-defined]
+
+
 def fail(message: str) -> None:
     """Raise what no task of a run raises."""
     raise ZeroDivisionError(message)
