@@ -1,1 +1,1 @@
-"""The console script and, later, the REST service; imports pipeline, never the other way round."""
+"""The REST service, its job driver and the console script; imports pipeline, never the other way round."""

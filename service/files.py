@@ -9,6 +9,15 @@ from pathlib import Path
 _ID = re.compile(r"[0-9a-f]{32}")
 
 
+def is_id(text: str) -> bool:
+    """Whether the text can be the id of a job or an upload.
+
+    >>> is_id("0123456789abcdef" * 2), is_id("../" + "a" * 29)
+    (True, False)
+    """
+    return _ID.fullmatch(text) is not None
+
+
 def _checked(identifier: str) -> str:
     """An id that we made; anything else is a fault of the caller, never a path.
 
@@ -17,7 +26,7 @@ def _checked(identifier: str) -> str:
     ValueError
         It is no id.
     """
-    if _ID.fullmatch(identifier) is None:
+    if not is_id(identifier):
         raise ValueError(f"{identifier!r} is no id of this service")
     return identifier
 

@@ -34,12 +34,6 @@ class _Children:
         self._all: set[SupervisedChild] = set()
         self._closed = False
 
-    def prestart(self) -> None:
-        """Start a child if there is none, and do not wait for it."""
-        with self._lock:
-            if not self._all and not self._closed:
-                self._idle.append(self._started())
-
     @contextlib.contextmanager
     def lent(self, cancelled: Callable[[], bool], *, fresh: bool) -> Iterator[SupervisedChild]:
         """A ready child, `fresh` where it must not have done anything yet; ended where its work broke off.
@@ -141,14 +135,6 @@ def lent_child(cancelled: Callable[[], bool], *, fresh: bool) -> contextlib.Abst
         No child can be started.
     """
     return _children.lent(cancelled, fresh=fresh)
-
-
-def prestart() -> None:
-    """Start this process's child in the background, so that it is there when the first building comes.
-
-    For tasks of earlier stages: starting takes two seconds. Does nothing where there is one.
-    """
-    _children.prestart()
 
 
 def kill_children() -> None:

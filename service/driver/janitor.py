@@ -9,14 +9,13 @@ import time
 from pathlib import Path
 
 from service.errors import UploadInUseError
-from service.files import StateFolder
+from service.files import StateFolder, is_id
 from service.jobs import JobStatus
 from service.store import JobStore
 from service.uploads import STALE_S, remove_file, remove_leftovers
 
 LOG = logging.getLogger("gablework.driver")
 
-_ID = re.compile(r"[0-9a-f]{32}")
 _ATTEMPT = re.compile(r"attempt-([0-9]+)")
 
 
@@ -46,7 +45,7 @@ def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
     Folders are listed before the database is asked, and a job is in the database before it has a folder: one that
     the database does not know is of a job that was removed.
     """
-    found = sorted(path.name for path in _entries(folder.jobs) if _ID.fullmatch(path.name))
+    found = sorted(path.name for path in _entries(folder.jobs) if is_id(path.name))
     known = store.attempts(found)
     if found and not known and sum(store.counts().values()) == 0:
         LOG.warning("the database has no jobs, but %s has: they are kept, in case it is the wrong one", folder.jobs)
@@ -80,7 +79,7 @@ def tidy_uploads(store: JobStore, folder: StateFolder) -> list[Path]:
         remove_file(upload.upload_id, folder)
         removed.append(folder.upload(upload.upload_id))
     now_s = time.time()
-    stale = [p for p in _entries(folder.uploads) if _ID.fullmatch(p.name) and _is_stale(p, now_s)]
+    stale = [p for p in _entries(folder.uploads) if is_id(p.name) and _is_stale(p, now_s)]
     known = store.upload_ids() if stale else set()
     for path in stale:
         if path.name not in known:

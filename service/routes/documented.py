@@ -253,3 +253,11 @@ EXECUTE_EXAMPLE = {
     },
     "outputs": {"buildings": {}, "cityjson": {}},
 }
+
+JOB_MADE = document(
+    "StatusInfo",
+    "The job waits for a driver.",
+    STATUS_EXAMPLE | {"status": "accepted", "progress": 0, "message": "waits for a driver"},
+    headers={"Location": {"description": "The job.", "schema": {"type": "string"}}},
+)
+"""What both ways to submit a job answer."""

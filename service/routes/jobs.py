@@ -22,7 +22,7 @@ from service.jobs import Job, JobStatus
 from service.multipart import Form, Part
 from service.processes import process_named
 from service.routes.bound import Base, Folder, Reader, Settings_, Store, Submitter
-from service.routes.documented import JOB_ID, STATUS_EXAMPLE, document, problems, reference
+from service.routes.documented import JOB_ID, JOB_MADE, STATUS_EXAMPLE, document, problems, reference
 from service.routes.status import link, status_info
 from service.routes.submission import Submission
 from service.settings import ServiceSettings
@@ -56,12 +56,7 @@ _log = logging.getLogger("gablework.service")
     summary="Send tiles and start a job",
     status_code=201,
     responses={
-        201: document(
-            "StatusInfo",
-            "The job waits for a driver.",
-            STATUS_EXAMPLE | {"status": "accepted", "progress": 0, "message": "waits for a driver"},
-            headers={"Location": {"description": "The job.", "schema": {"type": "string"}}},
-        ),
+        201: JOB_MADE,
         **problems(400, 404, 413, 422, 507),
     },
     openapi_extra={
@@ -83,16 +78,12 @@ async def submit(
 
     If anything is refused, nothing of the call is kept.
     """
-    submission = Submission(
+    async with Submission(
         store=store, folder=folder, settings=settings, caller=caller, threads=request.app.state.submitting
-    )
-    try:
+    ) as submission:
         inputs, outputs = await _read(request, submission, settings)
         draft = process_named("reconstruct").draft(inputs, outputs, settings)
         job = await submission.submit(draft)
-    except BaseException:
-        await submission.undo()
-        raise
     return JSONResponse(status_info(job, base), status_code=201, headers={"Location": f"{base}/jobs/{job.job_id}"})
 
 

@@ -12,7 +12,7 @@ from service.drafts import shortened
 from service.errors import RequestError
 from service.processes import PROCESSES, process_named
 from service.routes.bound import Base, Folder, Settings_, Store, Submitter, visitor
-from service.routes.documented import EXECUTE_EXAMPLE, STATUS_EXAMPLE, document, problems
+from service.routes.documented import EXECUTE_EXAMPLE, JOB_MADE, document, problems
 from service.routes.status import link, status_info
 from service.routes.submission import Submission
 
@@ -76,12 +76,7 @@ def process(processID: str, base: Base, settings: Settings_) -> JSONResponse:  #
     summary="Start a job",
     status_code=201,
     responses={
-        201: document(
-            "StatusInfo",
-            "The job waits for a driver.",
-            STATUS_EXAMPLE | {"status": "accepted", "progress": 0, "message": "waits for a driver"},
-            headers={"Location": {"description": "The job.", "schema": {"type": "string"}}},
-        ),
+        201: JOB_MADE,
         **problems(400, 404, 422),
     },
     openapi_extra={
@@ -111,14 +106,10 @@ async def execute(
     chosen = process_named(processID)
     inputs, outputs = _split(body)
     draft = chosen.draft(inputs, outputs, settings)
-    submission = Submission(
+    async with Submission(
         store=store, folder=folder, settings=settings, caller=caller, threads=request.app.state.submitting
-    )
-    try:
+    ) as submission:
         job = await submission.submit(draft)
-    except BaseException:
-        await submission.undo()
-        raise
     headers = {"Location": f"{base}/jobs/{job.job_id}"}
     if prefer is not None and "respond-async" in prefer.lower():
         headers["Preference-Applied"] = "respond-async"

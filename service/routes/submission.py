@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import AsyncIterator, Iterable
+from types import TracebackType
+from typing import Self
 
 import anyio
 import anyio.to_thread
@@ -26,7 +28,7 @@ WRITERS = 3
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Submission:
-    """What it takes to submit for one caller; remembers the uploads that it made."""
+    """What it takes to submit for one caller; a context manager that takes back its uploads when a call breaks off."""
 
     store: JobStore
     folder: StateFolder
@@ -82,8 +84,16 @@ class Submission:
             max_queued_per_key=self.settings.max_queued_per_key,
         )
 
-    async def undo(self) -> None:
-        """Remove the uploads of this call, also where the client has gone."""
+    async def __aenter__(self) -> Self:
+        """Nothing is stored yet."""
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove the uploads of a call that broke off, also where the client has gone."""
+        if kind is None:
+            return
         with anyio.CancelScope(shield=True):
             await anyio.to_thread.run_sync(self._remove, tuple(self.made), limiter=self.threads)
 

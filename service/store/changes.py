@@ -10,9 +10,10 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from service.errors import LeaseLostError
+from service.files import is_id
 from service.jobs import Job, JobEvent, JobStatus
 from service.store.policies import duration_ms
-from service.store.records import is_id, job_of, storable
+from service.store.records import job_of, storable
 from service.store.tables import EVENTS, JOBS
 
 MAX_KEPT = 1000

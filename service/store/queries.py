@@ -12,8 +12,9 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from service.errors import NoSuchJobError
+from service.files import is_id
 from service.jobs import Job, JobEvent, JobStatus
-from service.store.records import event_of, is_id, job_of, storable
+from service.store.records import event_of, job_of, storable
 from service.store.tables import EVENTS, JOBS
 
 _ASKED_AT_ONCE = 500

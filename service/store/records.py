@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import sqlalchemy as sa
 
 from service.jobs import Fault, Job, JobEvent, JobFailure, JobRequest, JobStatus, Upload
 from service.keys import Key, Scope
-
-_ID = re.compile(r"[0-9a-f]{32}")
-
-
-def is_id(text: str) -> bool:
-    """Whether the text can be the id of a job, an upload or a key."""
-    return _ID.fullmatch(text) is not None
 
 
 def storable(text: str, limit: int | None = None) -> str:

@@ -8,8 +8,9 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from service.errors import NoSuchUploadError, UploadInUseError
+from service.files import is_id
 from service.jobs import JobStatus, Upload
-from service.store.records import is_id, storable, upload_of
+from service.store.records import storable, upload_of
 from service.store.tables import JOB_UPLOADS, JOBS, UPLOADS
 
 _NOT_OVER = [status.value for status in JobStatus if not status.is_over]

@@ -238,14 +238,6 @@ def test_threads_have_children_of_their_own(orders: Callable[[str], str], tmp_pa
     assert len(child_processes()) == 2
 
 
-def test_a_prestarted_child_is_the_one_that_works(orders: Callable[[str], str]) -> None:
-    children.prestart()
-    children.prestart()
-    (child,) = child_processes()
-    assert outcomes(orders, ["1"]) == ["1"]
-    assert child_processes() == [child]
-
-
 def test_children_that_cannot_start_are_an_error_that_tells_what_they_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(children, "_LOADS", ("no_such_module:load",))
     with pytest.raises(RunError, match=r"(?s)3 times in a row.*No module named 'no_such_module'"):
