@@ -11,7 +11,7 @@ import typer
 from pipeline.console import Console, ExitCode
 
 if TYPE_CHECKING:
-    from pipeline.report.truth_score import TruthScore
+    from pipeline.evaluation.evaluate import Evaluation
     from pipeline.runtime.run import RunSummary
     from pipeline.settings import RunSettings
 
@@ -211,30 +211,48 @@ def digest(
 
 @app.command()
 def simulate(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="suburb, town, cube or one of the roof shapes.")],
-    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: a LAZ tile and the truth beside it.")],
+    suite: Annotated[
+        str,
+        typer.Argument(metavar="SUITE", help="suburb, town, cube, hofmann310, sweep, city or one of the roof shapes."),
+    ],
+    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: LAZ tiles and the truth beside them.")],
     seed: Annotated[
         int | None, typer.Option(metavar="N", help="Of layout and scanner; default the suite's own.")
     ] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(metavar="dev|test", help="In place of --seed: methods are tuned on dev and reported on test."),
+    ] = None,
+    draw: Annotated[int, typer.Option(metavar="N", help="Which scene of the split, counted from 0.")] = 0,
     size: Annotated[
         tuple[float, float] | None,
         typer.Option(metavar="EAST NORTH", help="Extent in metres; default the suite's own."),
     ] = None,
-    density: Annotated[float | None, typer.Option(metavar="D", help="Pulses a square metre.")] = None,
-    noise: Annotated[float | None, typer.Option(metavar="M", help="Range noise in metres.")] = None,
+    density: Annotated[
+        float | None, typer.Option(metavar="D", help="Pulses a square metre; of sweep, which cells.")
+    ] = None,
+    noise: Annotated[
+        float | None, typer.Option(metavar="M", help="Range noise in metres; of sweep, which cells.")
+    ] = None,
     with_classes: Annotated[bool, typer.Option("--with-classes", help="Write the true classes into the tile.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate a scene as a LAZ tile, with the exact truth beside it."""
+    """Simulate a scene as LAZ tiles, with the exact truth beside them."""
     with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.errors import SettingsError
         from pipeline.runtime.events import Event
         from pipeline.synthetic.dataset import simulate as simulate_scene
+        from pipeline.synthetic.seeds import seed_of
 
+        if split is None and draw != 0:
+            raise SettingsError([f"draw is {draw} of no split: give --split dev or --split test with it"])
+        if split is not None and seed is not None:
+            raise SettingsError([f"both --seed {seed} and --split {split} are given: use one of them"])
         paths = simulate_scene(
             suite,
             out,
-            seed,
+            seed if split is None else seed_of(split, draw),
             size_m=size,
             density_per_m2=density,
             noise_m=noise,
@@ -266,42 +284,99 @@ def warm_up(as_json: AsJson = False, quiet: Quiet = False) -> None:
 
 @app.command()
 def evaluate(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="A run directory.")],
+    models: Annotated[
+        str, typer.Argument(metavar="MODELS", help="A run directory; CityJSON, CityJSONSeq or OBJ of any program.")
+    ],
     truth: Annotated[
-        str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: score the models against it.")
+        str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: measure the models against it.")
+    ] = None,
+    points: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TILE", help="A classified tile to measure against; several by several --points."),
+    ] = None,
+    footprints: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Building outlines that go with the points.")
+    ] = None,
+    ground: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE", help="The same points as some program classified them: judge its ground."),
+    ] = None,
+    crs: Crs = None,
+    vertical_unit: VerticalUnit = None,
+    blocks: Annotated[
+        bool | None,
+        typer.Option(
+            "--blocks/--no-blocks", help="Join true buildings that touch; default: for runs without footprints."
+        ),
+    ] = None,
+    out: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Write the report here: a page, Markdown, Parquet tables.")
     ] = None,
     picture: Annotated[str | None, typer.Option(metavar="FILE", help="Draw the run to this PNG file.")] = None,
     as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Tell what a finished run found, as tables and as a picture."""
-    with Console(as_json=as_json) as console:
-        from pipeline.report.table import run_statistics, statistics_tables
+    """Measure models: against simulated truth, against classified points, or by themselves."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.evaluation.files import EvaluationRequest, evaluate_files
+        from pipeline.runtime.events import Event
 
-        statistics = run_statistics(run)
-        document: dict[str, Any] = {"run": run, "statistics": statistics}
-        for table in statistics_tables(statistics):
-            console.show(table)
-        if truth is not None:
-            from pipeline.report.roof_models import read_roof_models
-            from pipeline.report.truth_score import score_against_truth
+        request = EvaluationRequest(
+            models=models,
+            truth=truth,
+            points=tuple(points or ()),
+            footprints=footprints,
+            ground=tuple(ground or ()),
+            crs=crs,
+            vertical_unit=vertical_unit,
+            blocks=blocks,
+        )
 
-            score = score_against_truth(read_roof_models(run), read_roof_models(truth))
-            show_score(console, score)
-            document["score"] = dict(score.table())
+        def on_step(name: str) -> None:
+            console.on_event(Event(kind="stage", stage=name))
+
+        evaluation = evaluate_files(request, on_step)
+        document = show_evaluation(console, evaluation)
+        if out is not None:
+            from pipeline.evaluation.writing import write_tables
+            from pipeline.report.evaluation_page import write_page
+
+            on_step("page")
+            written = [*write_tables(evaluation, out), write_page(evaluation, out)]
+            console.say(f"the report is {written[-1]}")
+            document["written"] = [str(path) for path in written]
         if picture is not None:
             from pipeline.report.render import render_run
 
-            render_run(run, picture, truth=truth)
+            render_run(models, picture, truth=truth)
             console.say(f"the picture is {picture}")
             document["picture"] = picture
         console.document(document)
 
 
-def show_score(console: Console, score: TruthScore) -> None:
-    """Models against the truth, as tables."""
-    console.table("Against the truth", ["figure", "value"], score.table())
-    confused = [(str(true), str(model), n) for (true, model), n in score.confusion().items()]
-    console.table("Roof types against the truth", ["truth", "model", "buildings"], confused)
+def show_evaluation(console: Console, evaluation: Evaluation) -> dict[str, Any]:
+    """An evaluation as tables; returns it as plain JSON values."""
+    from pipeline.evaluation.chapters import chapters
+    from pipeline.evaluation.writing import all_notes, measures_table
+
+    document: dict[str, Any] = {"models": evaluation.models.path, "notes": list(all_notes(evaluation))}
+    if evaluation.models.kind == "run":
+        from pipeline.report.table import run_statistics, statistics_tables
+
+        document["statistics"] = run_statistics(evaluation.models.path)
+        for table in statistics_tables(document["statistics"]):
+            console.show(table)
+    for chapter in chapters(evaluation):
+        rows = [
+            (line.label, line.value, line.interval, line.n) for line in chapter.lines if line.measure.subset == "all"
+        ]
+        console.table(chapter.title, ["measure", "value", "95 % interval", "n"], rows)
+        for counts in chapter.tables:
+            console.table(counts.title, list(counts.header), list(counts.rows))
+    for note in all_notes(evaluation):
+        console.say(note)
+    document["measures"] = measures_table(evaluation).to_pylist()
+    return document
 
 
 @app.command()
@@ -355,16 +430,22 @@ def demo(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate a small suburb, reconstruct it, score it against the truth, draw it."""
+    """Simulate a small suburb, reconstruct it, measure it against the truth, draw it."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.demo import demonstrate
+        from pipeline.evaluation.chapters import chapters
+        from pipeline.evaluation.writing import measures_table
+        from pipeline.report.evaluation_page import headline
 
         made = demonstrate(out, console.on_event, workers=workers, overwrite=overwrite, size_m=size, seed=seed)
         show_summary(console, made.summary)
-        show_score(console, made.score)
+        decisive = headline(chapters(made.evaluation))
+        rows = [(line.label, line.value, line.interval, line.n) for _, line in decisive]
+        console.table("Against the truth", ["measure", "value", "95 % interval", "n"], rows)
         console.say("Where to look:")
         places = [
             ("picture", made.picture),
+            ("report", made.page),
             ("run directory", made.summary.run_dir),
             ("meshes (OBJ)", f"{made.summary.run_dir}/meshes"),
             ("tables (GeoParquet)", f"{made.summary.run_dir}/buildings"),
@@ -372,9 +453,8 @@ def demo(
             ("the truth", made.scene.truth),
         ]
         console.table("", ["what", "where"], places)
-        console.document(
-            dataclasses.asdict(made.summary) | {"score": dict(made.score.table()), "picture": str(made.picture)}
-        )
+        told = {"measures": measures_table(made.evaluation).to_pylist(), "picture": str(made.picture)}
+        console.document(dataclasses.asdict(made.summary) | told)
 
 
 @app.command()

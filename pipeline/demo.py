@@ -1,13 +1,15 @@
-"""The demo: a simulated suburb with exact truth, reconstructed, scored against the truth, drawn."""
+"""The demo: a simulated suburb with exact truth, reconstructed, measured against the truth, drawn."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
 
+from pipeline.evaluation.evaluate import Evaluation
+from pipeline.evaluation.files import EvaluationRequest, evaluate_files
+from pipeline.evaluation.writing import write_tables
+from pipeline.report.evaluation_page import write_page
 from pipeline.report.render import render_run
-from pipeline.report.roof_models import read_roof_models
-from pipeline.report.truth_score import TruthScore, score_against_truth
 from pipeline.runtime.events import Event, Listener
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.synthetic.dataset import ScenePaths, simulate
@@ -24,8 +26,10 @@ class Demo:
     """The simulated tile and its truth."""
     summary: RunSummary
     """The run on it."""
-    score: TruthScore
+    evaluation: Evaluation
     """The run's models against the truth."""
+    page: Path
+    """The report of the evaluation, for people."""
     picture: Path
     """The run, drawn."""
 
@@ -39,12 +43,12 @@ def demonstrate(
     size_m: tuple[float, float] | None,
     seed: int | None,
 ) -> Demo:
-    """Simulate, reconstruct, score, draw.
+    """Simulate, reconstruct, measure, draw.
 
     Parameters
     ----------
     out : str or Path
-        Folder of everything: `scene/`, `run/` and `demo.png`.
+        Folder of everything: `scene/`, `run/`, `report/` and `demo.png`.
     on_event : callable
         Gets the events of all steps.
     workers : int
@@ -71,11 +75,13 @@ def demonstrate(
     )
     request = RunRequest(inputs=(str(scene.laz),), out=str(folder / "run"), workers=workers, overwrite=overwrite)
     summary = run(request, on_event)
-    on_event(Event(kind="stage", stage="score", total=1))
-    score = score_against_truth(read_roof_models(summary.run_dir), read_roof_models(scene.truth))
-    on_event(Event(kind="progress", stage="score", done=1, total=1))
+    on_event(Event(kind="stage", stage="measure", total=1))
+    evaluation = evaluate_files(EvaluationRequest(models=summary.run_dir, truth=str(scene.truth)))
+    write_tables(evaluation, folder / "report")
+    page = write_page(evaluation, folder / "report")
+    on_event(Event(kind="progress", stage="measure", done=1, total=1))
     on_event(Event(kind="stage", stage="draw", total=1))
     picture = folder / "demo.png"
     render_run(summary.run_dir, picture, truth=scene.truth)
     on_event(Event(kind="progress", stage="draw", done=1, total=1))
-    return Demo(scene=scene, summary=summary, score=score, picture=picture)
+    return Demo(scene=scene, summary=summary, evaluation=evaluation, page=page, picture=picture)

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from numba import njit
+from shapely import MultiPolygon, Polygon
 
-from pipeline.model import FloatArray, IntArray, Plane, RoofFace
+from pipeline.model import FloatArray, IntArray, LabelArray, Plane, RoofFace
 
 _MAX_CELLS = 1_000_000
 
@@ -34,11 +35,53 @@ class ResidualSummary:
 
 
 @njit(cache=True, nogil=True)
+def _is_inside(x: float, y: float, edges: FloatArray, first: int, last: int) -> bool:
+    """Whether an odd number of edges is crossed to the right of a place."""
+    inside = False
+    for e in range(first, last):
+        y0 = edges[e, 1]
+        y1 = edges[e, 3]
+        if (y0 > y) == (y1 > y):
+            continue
+        x0 = edges[e, 0]
+        x1 = edges[e, 2]
+        # always from the lower end, so that both faces of an edge judge alike
+        if y0 > y1:
+            x0, x1 = x1, x0
+            y0, y1 = y1, y0
+        if (x1 - x0) * (y - y0) - (x - x0) * (y1 - y0) > 0.0:
+            inside = not inside
+    return inside
+
+
+@njit(cache=True, nogil=True)
+def _is_near(x: float, y: float, edges: FloatArray, first: int, last: int, limit: float) -> bool:
+    """Whether an edge passes within a distance of a place."""
+    for e in range(first, last):
+        x0 = edges[e, 0]
+        y0 = edges[e, 1]
+        dx = edges[e, 2] - x0
+        dy = edges[e, 3] - y0
+        length = dx * dx + dy * dy
+        along = 0.0
+        if length > 0.0:
+            along = min(1.0, max(0.0, ((x - x0) * dx + (y - y0) * dy) / length))
+        dx = x - x0 - along * dx
+        dy = y - y0 - along * dy
+        if dx * dx + dy * dy <= limit * limit:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
 def _top_surface(
     px: FloatArray,
     py: FloatArray,
+    origin_x: float,
+    origin_y: float,
     edges: FloatArray,
     edge_starts: IntArray,
+    boxes: FloatArray,
     coefficients: FloatArray,
     cell_starts: IntArray,
     cell_faces: IntArray,
@@ -47,39 +90,38 @@ def _top_surface(
     cell: float,
     columns: int,
     rows: int,
-) -> FloatArray:
-    """Highest face over every point, nan where there is none: crossings to the right, of the faces in the cell."""
+    tolerance: float,
+) -> tuple[FloatArray, LabelArray]:
+    """Highest face over every point and its number, nan and -1 where there is none."""
     n = len(px)
     top = np.full(n, np.nan)
+    number = np.full(n, -1, np.int32)
     for i in range(n):
-        x = px[i]
-        y = py[i]
+        x = px[i] - origin_x
+        y = py[i] - origin_y
         column = math.floor((x - low_x) / cell)
         row = math.floor((y - low_y) / cell)
         if column < 0 or row < 0 or column >= columns or row >= rows:
             continue
         k = row * columns + column
-        for s in range(cell_starts[k], cell_starts[k + 1]):
-            face = cell_faces[s]
-            inside = False
-            for e in range(edge_starts[face], edge_starts[face + 1]):
-                y0 = edges[e, 1]
-                y1 = edges[e, 3]
-                if (y0 > y) == (y1 > y):
+        for turn in range(2):
+            for s in range(cell_starts[k], cell_starts[k + 1]):
+                face = cell_faces[s]
+                if x < boxes[face, 0] or y < boxes[face, 1] or x > boxes[face, 2] or y > boxes[face, 3]:
                     continue
-                x0 = edges[e, 0]
-                x1 = edges[e, 2]
-                # always from the lower end, so that both faces of an edge judge alike
-                if y0 > y1:
-                    x0, x1 = x1, x0
-                    y0, y1 = y1, y0
-                if (x1 - x0) * (y - y0) - (x - x0) * (y1 - y0) > 0.0:
-                    inside = not inside
-            if inside:
-                z = coefficients[face, 0] * x + coefficients[face, 1] * y + coefficients[face, 2]
-                if not top[i] >= z:
-                    top[i] = z
-    return top
+                first, last = edge_starts[face], edge_starts[face + 1]
+                if turn == 0:
+                    hit = _is_inside(x, y, edges, first, last)
+                else:
+                    hit = _is_near(x, y, edges, first, last, tolerance)
+                if hit:
+                    z = coefficients[face, 0] * x + coefficients[face, 1] * y + coefficients[face, 2]
+                    if not top[i] >= z:
+                        top[i] = z
+                        number[i] = face
+            if number[i] >= 0 or tolerance <= 0.0:
+                break
+    return top, number
 
 
 @njit(cache=True, nogil=True)
@@ -110,6 +152,130 @@ def _faces_of_cells(
     return starts, faces
 
 
+class TopSurface:
+    """The highest of many planar faces: built once, asked for any number of places.
+
+    Coordinates are taken relative to a corner in whole metres, which is exact: nothing is lost at 1e6 m. A place on
+    the border of two faces belongs to exactly one of them; of faces of one height the first counts.
+
+    Parameters
+    ----------
+    polygons : sequence of shapely Polygon or MultiPolygon
+        Plan shapes, metres; elevations in them are not looked at.
+    coefficients : (n, 3) float64
+        z = a (x - origin_x) + b (y - origin_y) + c + origin_z of each.
+    origins : (n, 3) float64, optional
+        The places that the planes are given about; (0, 0, 0) by default.
+    tolerance_m : float
+        A place that no face covers takes the highest face whose border is this near: with coordinates rounded to
+        1 mm, two faces that meet leave gaps.
+    corner : tuple of float, optional
+        Place of the local frame; whole metres at the lower left of all faces by default.
+    """
+
+    def __init__(
+        self,
+        polygons: Sequence[Polygon | MultiPolygon],
+        coefficients: FloatArray,
+        origins: FloatArray | None = None,
+        *,
+        tolerance_m: float = 0.0,
+        corner: tuple[float, float] | None = None,
+    ) -> None:
+        n = len(polygons)
+        self._empty = all(polygon.is_empty for polygon in polygons)
+        self._tolerance = tolerance_m
+        if self._empty:
+            return
+        parts, owner = shapely.get_parts(np.asarray(polygons, dtype=object), return_index=True)
+        rings, part = shapely.get_rings(parts, return_index=True)
+        xy, ring = shapely.get_coordinates(rings, return_index=True)
+        self._corner = (float(np.floor(xy[:, 0].min())), float(np.floor(xy[:, 1].min()))) if corner is None else corner
+        xy = xy - np.array(self._corner)
+        joined = ring[:-1] == ring[1:]
+        self._edges = np.ascontiguousarray(np.hstack((xy[:-1][joined], xy[1:][joined])))
+        face = owner[part[ring[:-1][joined]]]
+        self._edge_starts = np.searchsorted(face, np.arange(n + 1)).astype(np.int64)
+        of_face = owner[part[ring]]
+        starts = np.searchsorted(of_face, np.arange(n))
+        filled = np.append(starts[1:], len(of_face)) > starts
+        boxes = np.tile(np.array([np.inf, np.inf, -np.inf, -np.inf]), (n, 1))
+        boxes[filled, :2] = np.minimum.reduceat(xy, starts[filled])
+        boxes[filled, 2:] = np.maximum.reduceat(xy, starts[filled])
+        boxes += np.array([-tolerance_m, -tolerance_m, tolerance_m, tolerance_m])
+        self._boxes = boxes
+        planes = np.array(coefficients, dtype=np.float64).reshape(n, 3)
+        if origins is not None:
+            shift = np.asarray(origins, dtype=np.float64)
+            planes[:, 2] += (
+                shift[:, 2]
+                + planes[:, 0] * (self._corner[0] - shift[:, 0])
+                + planes[:, 1] * (self._corner[1] - shift[:, 1])
+            )
+        elif self._corner != (0.0, 0.0):
+            planes[:, 2] += planes[:, 0] * self._corner[0] + planes[:, 1] * self._corner[1]
+        self._planes = planes
+        self._low = float(boxes[filled, 0].min()), float(boxes[filled, 1].min())
+        width, depth = float(boxes[filled, 2].max()) - self._low[0], float(boxes[filled, 3].max()) - self._low[1]
+        cell = max(0.5, math.sqrt(width * depth / (4 * n)))
+        while (width / cell + 1) * (depth / cell + 1) > max(_MAX_CELLS, 8 * n):
+            cell *= 2.0
+        self._cell = cell
+        self._shape = math.floor(width / cell) + 1, math.floor(depth / cell) + 1
+        self._cell_starts, cell_faces = _faces_of_cells(boxes[filled], *self._low, cell, *self._shape)
+        self._cell_faces = np.flatnonzero(filled)[cell_faces]
+
+    def at(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, LabelArray]:
+        """Elevation of the highest face at places, and its number.
+
+        Parameters
+        ----------
+        x, y : (n,) float64
+            Easting, northing, metres; finite.
+
+        Returns
+        -------
+        elevation : (n,) float64
+            Metres; nan where no face is.
+        face : (n,) int32
+            Index into the polygons; -1 where no face is.
+        """
+        if self._empty or len(x) == 0:
+            return np.full(len(x), np.nan), np.full(len(x), -1, np.int32)
+        top, number = _top_surface(
+            np.ascontiguousarray(x, dtype=np.float64),
+            np.ascontiguousarray(y, dtype=np.float64),
+            *self._corner,
+            self._edges,
+            self._edge_starts,
+            self._boxes,
+            self._planes,
+            self._cell_starts,
+            self._cell_faces,
+            *self._low,
+            self._cell,
+            *self._shape,
+            self._tolerance,
+        )
+        return top, number
+
+    def elevation(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Elevation of the highest face at places, (n,) float64; nan where there is none."""
+        return self.at(x, y)[0]
+
+    def face(self, x: FloatArray, y: FloatArray) -> LabelArray:
+        """Number of the highest face at places, (n,) int32; -1 where there is none."""
+        return self.at(x, y)[1]
+
+
+def plan_index(polygons: Sequence[Polygon | MultiPolygon]) -> TopSurface:
+    """Which of many polygons holds a place: `face` of the result; the first where several do.
+
+    Borders are judged as those of roof faces are.
+    """
+    return TopSurface(polygons, np.zeros((len(polygons), 3)))
+
+
 def top_surface(points: FloatArray, faces: Sequence[RoofFace], planes: Sequence[Plane]) -> FloatArray:
     """Elevation of the model's highest roof face over or under every point.
 
@@ -127,43 +293,9 @@ def top_surface(points: FloatArray, faces: Sequence[RoofFace], planes: Sequence[
     (n,) float64
         Metres; nan where no face covers the point.
     """
-    if len(faces) == 0 or len(points) == 0:
-        return np.full(len(points), np.nan)
-    blocks, starts = [], [0]
-    for face in faces:
-        for ring in (face.polygon.exterior, *face.polygon.interiors):
-            xy = shapely.get_coordinates(ring)
-            blocks.append(np.hstack((xy[:-1], xy[1:])))
-        starts.append(starts[-1] + _n_edges(face))
-    edges = np.concatenate(blocks)
-    boxes = np.array([face.polygon.bounds for face in faces])
-    low_x, low_y = float(boxes[:, 0].min()), float(boxes[:, 1].min())
-    width, depth = float(boxes[:, 2].max()) - low_x, float(boxes[:, 3].max()) - low_y
-    cell = max(0.5, math.sqrt(width * depth / (4 * len(faces))))
-    while (width / cell + 1) * (depth / cell + 1) > _MAX_CELLS:
-        cell *= 2.0
-    columns, rows = math.floor(width / cell) + 1, math.floor(depth / cell) + 1
-    cell_starts, cell_faces = _faces_of_cells(boxes, low_x, low_y, cell, columns, rows)
-    coefficients = np.array([planes[face.plane].coefficients for face in faces])
-    top: FloatArray = _top_surface(
-        np.ascontiguousarray(points[:, 0]),
-        np.ascontiguousarray(points[:, 1]),
-        edges,
-        np.array(starts, np.int64),
-        coefficients,
-        cell_starts,
-        cell_faces,
-        low_x,
-        low_y,
-        cell,
-        columns,
-        rows,
-    )
-    return top
-
-
-def _n_edges(face: RoofFace) -> int:
-    return int(shapely.get_num_coordinates(face.polygon)) - 1 - len(face.polygon.interiors)
+    coefficients = np.array([planes[face.plane].coefficients for face in faces]).reshape(-1, 3)
+    surface = TopSurface([face.polygon for face in faces], coefficients, corner=(0.0, 0.0))
+    return surface.elevation(points[:, 0], points[:, 1])
 
 
 def vertical_residuals(points: FloatArray, faces: Sequence[RoofFace], planes: Sequence[Plane]) -> FloatArray:

@@ -16,68 +16,16 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.model import BoolArray, ByteArray, FloatArray, LabelArray, PointCloud
-from pipeline.parameters import Parameters, parameter
 from pipeline.synthetic.beam import COLUMNS, MAX_RETURNS, FlightLine, scan_lines
 from pipeline.synthetic.scene import Scene
 from pipeline.synthetic.scene_arrays import SceneArrays, scene_arrays
+from pipeline.synthetic.strips import ScannerSettings, flight_lines, lines_over, reach_m
+from pipeline.synthetic.survey_faults import fault_rows, move_faulty
 
-_FIRST_GPS_TIME_S = 427_536_018.0
-"""Start of the first strip: 1 April 2025, 10:00 UTC, as adjusted standard GPS time."""
-_TURN_S = 120.0
-"""From the end of a strip to the start of the next."""
+__all__ = ["ScanBlock", "ScannerSettings", "joined", "reach_m", "scan", "scan_all", "strip_count"]
+
 _PULSES_A_BLOCK = 131_072
 """Work unit of a thread: it holds at most this many pulses in memory."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ScannerSettings(Parameters):
-    """The survey: instrument, flight and noise."""
-
-    pulse_density_per_m2: float = parameter(
-        8.0, "Pulses a square metre of one strip.", unit="1/m2", minimum=0.01, maximum=500.0
-    )
-    range_noise_m: float = parameter(0.03, "Standard deviation along the beam.", unit="m", minimum=0.0, maximum=2.0)
-    altitude_m: float = parameter(600.0, "Flying height over the terrain's base.", unit="m", minimum=50.0)
-    strip_spacing_m: float = parameter(120.0, "Distance of neighbouring flight lines.", unit="m", minimum=5.0)
-    strip_overlap: float = parameter(
-        0.15, "Share by which the swath is wider than the spacing.", minimum=0.0, maximum=2.0
-    )
-    flight_azimuth_deg: float = parameter(
-        0.0, "Direction of the strips, clockwise from north.", unit="deg", minimum=0.0, maximum=360.0
-    )
-    jitter: float = parameter(
-        0.5,
-        "Random shift of each pulse along and across the line, as a share of the spacing.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    beam_radius_m: float = parameter(0.12, "Radius of the beam's footprint.", unit="m", minimum=0.0, maximum=2.0)
-    range_resolution_m: float = parameter(
-        1.2, "Echoes of one beam that are closer than this melt into one return.", unit="m", minimum=0.0, maximum=10.0
-    )
-    drop_out: float = parameter(0.005, "Share of pulses that never come back.", minimum=0.0, maximum=1.0)
-    strip_shift_m: float = parameter(
-        0.0, "Standard deviation of a strip's own horizontal shift, each axis.", unit="m", minimum=0.0, maximum=5.0
-    )
-    strip_lift_m: float = parameter(
-        0.0, "Standard deviation of a strip's own vertical shift.", unit="m", minimum=0.0, maximum=5.0
-    )
-    speed_m_s: float = parameter(60.0, "Speed of the aircraft.", unit="m/s", minimum=1.0, maximum=500.0)
-
-    @property
-    def half_swath_m(self) -> float:
-        """Half the width of a strip on the ground."""
-        return self.strip_spacing_m * (1.0 + self.strip_overlap) / 2.0
-
-    @property
-    def max_lean(self) -> float:
-        """Tangent of the largest scan angle."""
-        return self.half_swath_m / self.altitude_m
-
-    @property
-    def pulse_spacing_m(self) -> float:
-        """Distance of scan lines, and of pulses in a line."""
-        return 1.0 / math.sqrt(self.pulse_density_per_m2)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -117,14 +65,18 @@ class _Job:
 
 
 def strip_count(scene: Scene, settings: ScannerSettings) -> int:
-    """Number of strips that cover the scene."""
-    return len(_flight_lines(scene, settings, 0))
+    """Number of strips that cover the scene, or the survey that it is a tile of."""
+    return len(flight_lines(scene, settings, 0))
 
 
 def scan(
     scene: Scene, settings: ScannerSettings, seed: int, *, chunk_points: int = 1_000_000, threads: int = 2
 ) -> Iterator[ScanBlock]:
     """Scan a scene, chunk by chunk, in the order of time.
+
+    A scene with a `survey_extent` is one tile of a survey: the strips are laid over the whole, and exactly those pulses
+    are fired that aim into the tile, so that the tiles together give the returns of the whole. For that each tile holds
+    all objects and survey faults within `reach_m` of its extent, in one order everywhere.
 
     Parameters
     ----------
@@ -143,8 +95,14 @@ def scan(
     ------
     ScanBlock
         A chunk of returns. A scene without any return yields nothing.
+
+    Raises
+    ------
+    SettingsError
+        If the terrain is so steep that beams graze it.
     """
-    arrays = scene_arrays(scene, settings.max_lean, settings.beam_radius_m + settings.pulse_spacing_m)
+    margin_m = settings.beam_radius_m + settings.pulse_spacing_m
+    arrays = scene_arrays(scene, settings.max_lean, margin_m, settings.beam_radius_m)
     pending: list[ScanBlock] = []
     for block in _in_order(_jobs(scene, settings, seed, chunk_points), arrays, scene, settings, seed, threads):
         if len(block):
@@ -182,50 +140,14 @@ def joined(blocks: list[ScanBlock]) -> ScanBlock:
     return ScanBlock(points=points, **{name: np.concatenate([getattr(b, name) for b in blocks]) for name in others})
 
 
-def _flight_lines(scene: Scene, settings: ScannerSettings, seed: int) -> list[FlightLine]:
-    """The strips, every second one flown backwards."""
-    azimuth = math.radians(settings.flight_azimuth_deg)
-    along = np.array([math.sin(azimuth), math.cos(azimuth)])
-    across = np.array([along[1], -along[0]])
-    x0, y0, x1, y1 = scene.extent
-    corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
-    low, high = (corners @ across).min(), (corners @ across).max()
-    start, end = (corners @ along).min() - settings.pulse_spacing_m, (corners @ along).max() + settings.pulse_spacing_m
-    count = max(1, math.ceil((high - low) / settings.strip_spacing_m))
-    first = (low + high) / 2 - (count - 1) / 2 * settings.strip_spacing_m
-    random = np.random.default_rng([seed, 0x57])
-    time, lines = _FIRST_GPS_TIME_S, []
-    for k in range(count):
-        sign = 1.0 if k % 2 == 0 else -1.0
-        shift = random.normal(0.0, 1.0, 3) * (settings.strip_shift_m, settings.strip_shift_m, settings.strip_lift_m)
-        middle = across * (first + k * settings.strip_spacing_m)
-        begin = middle + along * (start if sign > 0 else end)
-        lines.append(
-            FlightLine(
-                number=k,
-                x=float(begin[0]),
-                y=float(begin[1]),
-                along_x=float(sign * along[0]),
-                along_y=float(sign * along[1]),
-                length=float(end - start),
-                time=time,
-                shift_x=float(shift[0]),
-                shift_y=float(shift[1]),
-                shift_z=float(shift[2]),
-            )
-        )
-        time += (end - start) / settings.speed_m_s + _TURN_S
-    return lines
-
-
 def _jobs(scene: Scene, settings: ScannerSettings, seed: int, chunk_points: int) -> Iterator[_Job]:
     spacing = settings.pulse_spacing_m
     per_line = math.ceil(2 * settings.half_swath_m / spacing)
     step = max(1, min(_PULSES_A_BLOCK, chunk_points) // per_line)
-    for line in _flight_lines(scene, settings, seed):
-        count = math.ceil(line.length / spacing)
-        for first in range(0, count, step):
-            yield _Job(line=line, first=first, stop=min(first + step, count))
+    for line in flight_lines(scene, settings, seed):
+        needed = lines_over(line, scene, settings)
+        for first in needed[::step]:
+            yield _Job(line=line, first=first, stop=min(first + step, needed.stop))
 
 
 def _in_order(
@@ -264,12 +186,18 @@ def _block(job: _Job, arrays: SceneArrays, scene: Scene, settings: ScannerSettin
             settings.range_resolution_m,
             settings.drop_out,
             settings.speed_m_s,
+            settings.wrong_row_share,
+            settings.wrong_row_lift_m,
         ]
     )
     count = scan_lines(
         arrays, job.line, survey, np.array(scene.extent), seed, job.first, job.stop, per_line, floats, integers
     )
-    return _as_block(floats[:count], integers[:count], scene, job.line.number)
+    floats, integers = floats[:count], integers[:count]
+    faults = fault_rows(scene.survey_faults, floats)
+    if len(faults):
+        move_faulty(floats, np.ascontiguousarray(integers[:, 7]), faults, seed, job.line.number)
+    return _as_block(floats, integers, scene, job.line.number)
 
 
 def _as_block(floats: FloatArray, integers: LabelArray, scene: Scene, strip: int) -> ScanBlock:

@@ -12,10 +12,12 @@ from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.synthetic.first_hit import (
     BOX,
     GROUND,
+    ROOF,
     TREE,
     cell_of,
     first_hit,
     is_clear,
+    is_wet,
     mixed_bits,
     terrain_hit,
     uniform_of,
@@ -26,14 +28,17 @@ LINES_A_BEAM = 7
 """One in the middle, six around it; a beam that meets no edge and no crown needs only the one in the middle."""
 MAX_RETURNS = LINES_A_BEAM
 """No more returns than lines."""
-COLUMNS = 7
-"""Integer columns: return number, return count, class, intensity, building, face, mixed."""
+COLUMNS = 8
+"""Integer columns: return number, return count, class, intensity, building, face, mixed, scan line."""
 
 _CLEAR_RADII = 1.5
 """A sloping face is met a little farther out than a level one."""
 _DRAWS_BEFORE_CROWNS = 4 + 2 * MAX_RETURNS
 _DRAWS_A_LINE = 4096
 """More than entries in any cell, so that no two lines of a beam share a chance."""
+_WRONG_ROW = 0x3C6EF372FE94F82B
+"""Tells the random state of a scan line's fault from those of its pulses."""
+_ROUNDING_M = 1e-6
 
 
 class FlightLine(NamedTuple):
@@ -69,12 +74,48 @@ def _normal_of(state: np.uint64, draw: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _pulse_state(seed: int, strip: int, line: int, pulse: int) -> np.uint64:
-    """The random state of one pulse."""
+def line_state(seed: int, strip: int, line: int) -> np.uint64:
+    """The random state of one scan line."""
     state = mixed_bits(np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15))
     state = mixed_bits(state ^ mixed_bits(np.uint64(strip) + np.uint64(0xD1B54A32D192ED03)))
-    state = mixed_bits(state ^ mixed_bits(np.uint64(line) + np.uint64(0x8CB92BA72F3D8DD7)))
-    return mixed_bits(state ^ mixed_bits(np.uint64(pulse) + np.uint64(0xABC98388FB8FAC03)))
+    return mixed_bits(state ^ mixed_bits(np.uint64(line) + np.uint64(0x8CB92BA72F3D8DD7)))
+
+
+@njit(cache=True, nogil=True)
+def _pulse_state(line: np.uint64, pulse: int) -> np.uint64:
+    """The random state of one pulse, from that of its line."""
+    return mixed_bits(line ^ mixed_bits(np.uint64(pulse) + np.uint64(0xABC98388FB8FAC03)))
+
+
+@njit(cache=True, nogil=True)
+def row_chance(line: np.uint64, draw: int) -> float:
+    """A number in (0, 1) that decides a fault of a whole scan line, from the line's state."""
+    return uniform_of(line ^ np.uint64(_WRONG_ROW), draw)
+
+
+@njit(cache=True, nogil=True)
+def _places_in_extent(
+    flight: FlightLine, extent: FloatArray, half_swath: float, spacing: float, line: int, pulses_a_line: int
+) -> tuple[int, int]:
+    """The range of places across a scan line outside of which no pulse aims into the extent."""
+    low, high = -half_swath, half_swath
+    # A pulse of this line aims this far along the strip, jitter and swing of the mirror included.
+    near, far = (line - 0.25) * spacing - _ROUNDING_M, (line + 1.25) * spacing + _ROUNDING_M
+    for axis in range(2):
+        start, along, right = flight.x, flight.along_x, flight.along_y
+        if axis == 1:
+            start, along, right = flight.y, flight.along_y, -flight.along_x
+        least = extent[axis] - start - max(along * near, along * far) - _ROUNDING_M
+        most = extent[axis + 2] - start - min(along * near, along * far) + _ROUNDING_M
+        if abs(right) * half_swath < _ROUNDING_M:
+            if least > 2.0 * _ROUNDING_M or most < -2.0 * _ROUNDING_M:
+                return 0, 0
+        else:
+            low = max(low, min(least / right, most / right))
+            high = min(high, max(least / right, most / right))
+    first = max(0, math.floor((low + half_swath) / spacing - 1.0))
+    stop = min(pulses_a_line, math.ceil((high + half_swath) / spacing) + 1)
+    return first, max(first, stop)
 
 
 @njit(cache=True, nogil=True)
@@ -98,8 +139,9 @@ def scan_lines(
         What can be hit.
     flight : FlightLine
         The strip.
-    survey : ndarray (9,)
-        Spacing, half swath, altitude, jitter, range noise, beam radius, range resolution, drop-out, speed.
+    survey : ndarray (11,)
+        Spacing, half swath, altitude, jitter, range noise, beam radius, range resolution, drop-out, speed, share of
+        wrong scan rows, their lift.
     extent : ndarray (4,)
         Pulses that aim outside of it at the terrain's base are not fired.
     seed : int
@@ -118,16 +160,28 @@ def scan_lines(
     """
     spacing, half_swath, altitude, jitter = survey[0], survey[1], survey[2], survey[3]
     noise, radius, resolution, drop_out, speed = survey[4], survey[5], survey[6], survey[7], survey[8]
+    wrong_rows, wrong_lift = survey[9], survey[10]
     right_x, right_y = flight.along_y, -flight.along_x
-    base_z = scene.terrain[0]
+    terrain, waves, base_z = scene.terrain, scene.waves, scene.terrain[0]
+    cell_start, entries, n_buildings = scene.cell_start, scene.entries, scene.n_buildings
+    face_start, edge_start, circles, faces = scene.face_start, scene.edge_start, scene.circles, scene.faces
+    edges, trees, spot_start, spots = scene.edges, scene.trees, scene.spot_start, scene.spots
+    grid, cells_across, cells_up = scene.grid, scene.cells_across, scene.cells_up
     hit_z = np.empty(LINES_A_BEAM)
     hit_kind = np.empty(LINES_A_BEAM, np.int64)
     hit_thing = np.empty(LINES_A_BEAM, np.int64)
     hit_face = np.empty(LINES_A_BEAM, np.int64)
     count = 0
+    has_spots = len(spots) > 0
     for line in range(first_line, stop_line):
-        for pulse in range(pulses_a_line):
-            state = _pulse_state(seed, flight.number, line, pulse)
+        first_place, stop_place = _places_in_extent(flight, extent, half_swath, spacing, line, pulses_a_line)
+        this_line = line_state(seed, flight.number, line)
+        lift = flight.shift_z
+        if wrong_rows > 0.0 and row_chance(this_line, 0) < wrong_rows:
+            lift += wrong_lift
+        for step in range(stop_place - first_place):
+            pulse = first_place + step if line % 2 == 0 else pulses_a_line - stop_place + step
+            state = _pulse_state(this_line, pulse)
             if uniform_of(state, 0) < drop_out:
                 continue
             # The mirror swings to and fro; the aircraft flies on within a line.
@@ -143,21 +197,52 @@ def scan_lines(
                 continue
             tangent = across / altitude
             lean_x, lean_y = -tangent * right_x, -tangent * right_y
-            x, y, z = terrain_hit(scene, x, y, base_z, lean_x, lean_y)
-            cell = cell_of(scene, x, y)
+            x, y, z = terrain_hit(terrain, waves, x, y, base_z, lean_x, lean_y)
+            cell = cell_of(grid, cells_across, cells_up, x, y)
             lines = 1
-            if cell >= 0 and not is_clear(scene, cell, x, y, z, lean_x, lean_y, _CLEAR_RADII * radius):
+            if cell >= 0 and not is_clear(
+                cell_start,
+                entries,
+                face_start,
+                edge_start,
+                circles,
+                faces,
+                edges,
+                trees,
+                cell,
+                x,
+                y,
+                z,
+                lean_x,
+                lean_y,
+                _CLEAR_RADII * radius,
+            ):
                 lines = LINES_A_BEAM
             turn = 2.0 * math.pi * uniform_of(state, 3)
+            hits = 0
             for k in range(lines):
                 line_x, line_y, line_z = x, y, z
                 if k > 0:
                     angle = turn + (k - 1) * math.pi / 3.0
                     line_x, line_y, line_z = terrain_hit(
-                        scene, x + radius * math.cos(angle), y + radius * math.sin(angle), z, lean_x, lean_y
+                        terrain,
+                        waves,
+                        x + radius * math.cos(angle),
+                        y + radius * math.sin(angle),
+                        z,
+                        lean_x,
+                        lean_y,
                     )
-                hit_z[k], hit_kind[k], hit_thing[k], hit_face[k] = first_hit(
-                    scene,
+                top, kind, thing, face = first_hit(
+                    cell_start,
+                    entries,
+                    n_buildings,
+                    face_start,
+                    edge_start,
+                    circles,
+                    faces,
+                    edges,
+                    trees,
                     cell,
                     line_x,
                     line_y,
@@ -167,15 +252,21 @@ def scan_lines(
                     state,
                     _DRAWS_BEFORE_CROWNS + k * _DRAWS_A_LINE,
                 )
-            _sort_downwards(hit_z, hit_kind, hit_thing, hit_face, lines)
+                if has_spots and kind == ROOF:
+                    up = top - line_z
+                    if is_wet(spot_start, spots, thing, line_x + up * lean_x, line_y + up * lean_y):
+                        continue
+                hit_z[hits], hit_kind[hits], hit_thing[hits], hit_face[hits] = top, kind, thing, face
+                hits += 1
+            _sort_downwards(hit_z, hit_kind, hit_thing, hit_face, hits)
             time = flight.time + (line + swing) * spacing / speed
             angle_deg = math.degrees(math.atan(tangent))
             length = math.sqrt(1.0 + tangent * tangent)
             first, returns = 0, 0
-            while first < lines:
+            while first < hits:
                 stop = first + 1
                 total = hit_z[first]
-                while stop < lines and hit_z[stop - 1] - hit_z[stop] < resolution:
+                while stop < hits and hit_z[stop - 1] - hit_z[stop] < resolution:
                     total += hit_z[stop]
                     stop += 1
                 main, mixed = _most_frequent(hit_kind, hit_thing, hit_face, first, stop)
@@ -183,7 +274,7 @@ def scan_lines(
                 row = count + returns
                 floats[row, 0] = x + (echo_z - z) * lean_x + flight.shift_x
                 floats[row, 1] = y + (echo_z - z) * lean_y + flight.shift_y
-                floats[row, 2] = echo_z + flight.shift_z
+                floats[row, 2] = echo_z + lift
                 floats[row, 3] = time
                 floats[row, 4] = angle_deg
                 integers[row, 0] = returns + 1
@@ -193,6 +284,7 @@ def scan_lines(
                 integers[row, 4] = hit_thing[main] if is_building else -1
                 integers[row, 5] = hit_face[main] if is_building else -1
                 integers[row, 6] = mixed
+                integers[row, 7] = line
                 returns += 1
                 first = stop
             for row in range(count, count + returns):

@@ -1,44 +1,45 @@
-"""Simulated data sets on disk: a raw LAZ tile, and the truth beside it.
+"""Simulated data sets on disk: raw LAZ tiles, and the truth beside them.
 
 ```
 <suite>.laz                     points without classes, as a survey delivers them
-truth/scene.json                suite, seed, scanner, counts
+tiles/<suite>_<key>.laz         the same of a suite that is made tile by tile (city)
+truth/scene.json                suite, seed, split, scanner, counts, list of the tiles with their points and bounds
 truth/labels.parquet            one row a point, in the order of the LAZ: class, building_id, face, mixed
+truth/labels/<key>.parquet      the same of one tile
+truth/conditions.parquet        one row a building: shape, defects, groups of its faces, slope of the terrain
 truth/buildings, planes, meshes, cityjson      the exact models, laid out and named as in a run directory
+<cell>/ and sweep.json          a suite of several surveys (sweep): such a data set a cell, and the list of the cells
 ```
 """
 
 from __future__ import annotations
 
-import bisect
 import dataclasses
-import datetime as dt
 import json
+import math
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import laspy
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-import shapely
-from laspy.vlrs.known import WktCoordinateSystemVlr
-
-import pipeline
 from pipeline.errors import InputError, SettingsError
-from pipeline.export.records import RecordContext
-from pipeline.export.tile import write_tile
-from pipeline.io.crs import UNKNOWN_REFERENCE, SpatialReference
-from pipeline.model import BoolArray, ByteArray, LabelArray
-from pipeline.synthetic.als import ScanBlock, ScannerSettings, scan, strip_count
+from pipeline.synthetic.als import ScannerSettings, scan, strip_count
+from pipeline.synthetic.conditions import write_conditions
 from pipeline.synthetic.scene import Scene
-from pipeline.synthetic.solids import truth_record
-from pipeline.synthetic.suites import suite_named
+from pipeline.synthetic.suites import Suite, suite_named
+from pipeline.synthetic.survey_files import TileFiles, last_returns, write_points
+from pipeline.synthetic.sweep import Cell, chosen_cells
+from pipeline.synthetic.truth_files import SceneTruth, read_truth, write_manifest, write_models
+
+__all__ = ["ScenePaths", "SceneTruth", "read_truth", "simulate"]
 
 _BUILDINGS_A_PART = 500
-_DATE = dt.date(2025, 4, 1)
-"""Of the simulated survey; goes into the header, so that the same scene gives the same bytes on any day."""
+_TILED_CHUNK_POINTS = 250_000
+"""The scanner goes on while a chunk is compressed; small ones keep it busy."""
+
+OnPoints = Callable[[int], None]
+Extent = tuple[float, float, float, float]
+"""Smallest x, smallest y, largest x, largest y in the scene frame."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,15 +47,20 @@ class ScenePaths:
     """What `simulate` wrote."""
 
     laz: Path
-    """The tile."""
+    """The tile; the folder of the tiles where there are several, the data set's folder where there are cells."""
     truth: Path
-    """The folder of the truth: a run directory of the exact models, plus labels and scene.json."""
+    """The folder of the truth: a run directory of the exact models, plus conditions, labels and scene.json. The data
+    set's folder where there are cells."""
     labels: Path
-    """Per-point truth."""
+    """Per-point truth; the folder of it where there are several tiles, the data set's folder where there are cells."""
     points: int
-    """Returns in the tile."""
+    """Returns in all tiles."""
     buildings: int
-    """Buildings in the scene."""
+    """Buildings in the scene; of all cells together where there are cells."""
+    tiles: int = 1
+    """LAZ files."""
+    cells: tuple[ScenePaths, ...] = ()
+    """What was written for every cell of a suite of several surveys."""
 
 
 def simulate(
@@ -68,9 +74,9 @@ def simulate(
     scanner: ScannerSettings | None = None,
     with_classes: bool = False,
     chunk_points: int = 1_000_000,
-    on_points: Callable[[int], None] | None = None,
+    on_points: OnPoints | None = None,
 ) -> ScenePaths:
-    """Make a suite's scene, scan it, write the tile and the truth.
+    """Make a suite's scene, scan it, write the tiles and the truth.
 
     Parameters
     ----------
@@ -83,7 +89,7 @@ def simulate(
     size_m : tuple of float, optional
         Extent east and north; the suite's own by default.
     density_per_m2, noise_m : float, optional
-        Pulse density and range noise in place of the suite's.
+        Pulse density and range noise in place of the suite's; of a suite of several surveys, which of its cells.
     scanner : ScannerSettings, optional
         A whole survey in place of the suite's.
     with_classes : bool
@@ -107,212 +113,200 @@ def simulate(
     """
     plan = suite_named(suite)
     seed = plan.seed if seed is None else seed
-    size_m = plan.size_m if size_m is None else size_m
-    faults = [f"size is {size:g} m: use 20 to 50000 m" for size in size_m if not 20.0 <= size <= 50_000.0]
-    if not 0 <= seed < 2**32:
-        faults.append(f"seed is {seed}: use 0 to {2**32 - 1}")
+    faults = _faults(plan, seed, size_m)
     if faults:
         raise SettingsError(faults)
+    writing = _Writing(
+        plan=plan,
+        seed=seed,
+        size_m=plan.size_m if size_m is None else size_m,
+        with_classes=with_classes,
+        chunk_points=chunk_points,
+        on_points=on_points,
+    )
     settings = scanner or plan.scanner
+    out = Path(out_dir)
+    if plan.cells:
+        return _simulate_cells(writing, settings, chosen_cells(plan.cells, density_per_m2, noise_m), out)
     if density_per_m2 is not None:
         settings = dataclasses.replace(settings, pulse_density_per_m2=float(density_per_m2))
     if noise_m is not None:
         settings = dataclasses.replace(settings, range_noise_m=float(noise_m))
-    scene = plan.make(seed, size_m)
-    out = Path(out_dir)
-    truth = out / "truth"
-    truth.mkdir(parents=True, exist_ok=True)
-    laz, labels = out / f"{suite}.laz", truth / "labels.parquet"
-    count = write_points(
-        scan(scene, settings, seed, chunk_points=chunk_points), scene, laz, labels, with_classes, on_points
-    )
-    if count == 0:
-        raise InputError(str(laz), "the survey hit nothing", "Use a larger scene or a higher density")
-    write_truth(scene, truth)
-    _write_manifest(scene, settings, seed, count, truth / "scene.json")
-    return ScenePaths(laz=laz, truth=truth, labels=labels, points=count, buildings=len(scene.buildings))
+    if plan.part is not None:
+        return _simulate_tiles(writing, settings, out)
+    return _simulate_one(writing, settings, plan.make(seed, writing.size_m), out)
+
+
+def _faults(plan: Suite, seed: int, size_m: tuple[float, float] | None) -> list[str]:
+    """What is wrong with a request."""
+    faults = []
+    if size_m is not None and not plan.is_sized:
+        faults.append(f"the size of {plan.name} follows from its buildings: leave out --size")
+    elif size_m is not None:
+        faults += [f"size is {size:g} m: use 20 to 50000 m" for size in size_m if not 20.0 <= size <= 50_000.0]
+    if not 0 <= seed < 2**32:
+        faults.append(f"seed is {seed}: use 0 to {2**32 - 1}")
+    return faults
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SceneTruth:
-    """The truth of a simulated tile, without its models: those are read as any run directory's."""
+class _Writing:
+    """What one call makes, and how."""
 
-    folder: Path
-    """The folder of the truth; `pipeline.report.roof_models.read_roof_models` reads its models."""
-    suite: str
-    """Name of the suite."""
+    plan: Suite
     seed: int
-    """Seed of layout and scanner."""
-    crs: str | None
-    """As in `Scene.crs`."""
-    extent: tuple[float, float, float, float]
-    """CRS coordinates: smallest x, smallest y, largest x, largest y."""
-    building_ids: tuple[str, ...]
-    """All true buildings, sorted."""
-    classification: ByteArray
-    """(n,) uint8, true ASPRS class of every point in the order of the LAZ; 1 for small things."""
-    building: LabelArray
-    """(n,) int32, index into building_ids; -1 for none."""
-    face: LabelArray
-    """(n,) int32, roof plane of the building; -1 for walls and for what is no building."""
-    mixed: BoolArray
-    """(n,) bool, True where echoes of different surfaces melted into the return."""
+    size_m: tuple[float, float]
+    with_classes: bool
+    chunk_points: int
+    on_points: OnPoints | None
 
-    @property
-    def wall(self) -> BoolArray:
-        """(n,) bool, True where a wall was hit."""
-        return (self.building >= 0) & (self.face < 0)
+    def tile(self, scene: Scene, settings: ScannerSettings, laz: Path, labels: Path, before: int) -> TileFiles:
+        """Scan a scene into a LAZ file and its labels; `before` points were written by earlier tiles."""
+        blocks = scan(scene, settings, self.seed, chunk_points=self.chunk_points)
+        if self.plan.last_returns_only:
+            blocks = last_returns(blocks)
+        told = self.on_points
+        return write_points(
+            blocks, scene, laz, labels, self.with_classes, None if told is None else lambda n: told(before + n)
+        )
 
 
-def read_truth(truth_dir: str | Path) -> SceneTruth:
-    """Read the truth that `simulate` wrote, all labels in memory: 10 bytes a point.
-
-    Raises
-    ------
-    InputError
-        If scene.json or the labels are missing or not readable.
-    """
-    folder = Path(truth_dir)
-    try:
-        manifest = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
-        labels = pq.read_table(folder / "labels.parquet")
-    except (OSError, ValueError) as error:
-        raise InputError(
-            str(folder), f"no readable truth ({error})", "Give the folder `truth` that `gablework simulate` wrote"
-        ) from error
-    names = labels["building_id"].combine_chunks()
-    ids = sorted(str(name) for name in names.dictionary.to_pylist())
-    place = np.array([bisect.bisect_left(ids, name) for name in names.dictionary.to_pylist()], np.int32)
-    building = np.full(len(labels), -1, np.int32)
-    known = names.indices.is_valid().to_numpy(zero_copy_only=False)
-    building[known] = place[names.indices.drop_null().to_numpy()]
-    return SceneTruth(
-        folder=folder,
-        suite=manifest["suite"],
-        seed=manifest["seed"],
-        crs=manifest["crs"],
-        extent=tuple(manifest["extent"]),
-        building_ids=tuple(ids),
-        classification=labels["class"].to_numpy(),
-        building=building,
-        face=labels["face"].to_numpy().astype(np.int32),
-        mixed=labels["mixed"].to_numpy(),
-    )
-
-
-def spatial_reference(scene: Scene) -> SpatialReference:
-    """The scene's coordinate reference system, in metres."""
-    if scene.crs is None:
-        return UNKNOWN_REFERENCE
-    import pyproj
-
-    crs = pyproj.CRS.from_user_input(scene.crs)
-    return SpatialReference(wkt=crs.to_wkt(), name=crs.name, epsg=crs.to_epsg())
-
-
-def las_header(scene: Scene) -> laspy.LasHeader:
-    """LAS 1.4, point format 6, millimetres, standard GPS time; the CRS as OGC WKT 1, which the format asks for."""
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales = np.full(3, 0.001)
-    header.offsets = np.array(scene.origin)
-    header.creation_date = _DATE
-    header.generating_software = f"gablework {pipeline.__version__}"
-    header.system_identifier = "simulated"
-    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
-    header.global_encoding.wkt = True
-    if scene.crs is not None:
-        import pyproj
-
-        header.vlrs.append(WktCoordinateSystemVlr(pyproj.CRS.from_user_input(scene.crs).to_wkt("WKT1_GDAL")))
-    return header
-
-
-def write_points(
-    blocks: Iterator[ScanBlock],
-    scene: Scene,
-    laz: Path,
-    labels: Path,
-    with_classes: bool = False,
-    on_points: Callable[[int], None] | None = None,
-) -> int:
-    """Stream blocks into a LAZ file and a table of labels; both appear under their names only when whole.
-
-    Returns
-    -------
-    int
-        Number of points.
-    """
-    names = pa.array([building.building_id for building in scene.buildings], pa.string())
-    part_laz, part_labels = laz.with_name(f".{laz.name}"), labels.with_name(f".{labels.name}")
-    header, count = las_header(scene), 0
-    schema = pa.schema(
-        [
-            pa.field("class", pa.uint8(), nullable=False),
-            pa.field("building_id", pa.dictionary(pa.int32(), pa.string())),
-            pa.field("face", pa.int16(), nullable=False),
-            pa.field("mixed", pa.bool_(), nullable=False),
-        ]
-    )
-    with (
-        laspy.open(part_laz, mode="w", header=header, do_compress=True) as tile,
-        pq.ParquetWriter(part_labels, schema, compression="zstd") as table,
-    ):
-        for block in blocks:
-            tile.write_points(_las_points(block, header, with_classes))
-            building = pa.DictionaryArray.from_arrays(pa.array(block.building, mask=block.building < 0), names)
-            columns = [block.points.classification, building, block.face.astype(np.int16), block.mixed]
-            table.write_table(pa.table(columns, schema=schema))
-            count += len(block)
-            if on_points is not None:
-                on_points(count)
-    part_laz.replace(laz)
-    part_labels.replace(labels)
-    return count
-
-
-def _las_points(block: ScanBlock, header: laspy.LasHeader, with_classes: bool) -> laspy.ScaleAwarePointRecord:
-    """A block as LAS points."""
-    cloud = block.points
-    record = laspy.ScaleAwarePointRecord.zeros(len(block), header=header)
-    record.x, record.y, record.z = cloud.xyz[:, 0], cloud.xyz[:, 1], cloud.xyz[:, 2]
-    record["intensity"] = block.intensity
-    record["return_number"] = cloud.return_number
-    record["number_of_returns"] = cloud.return_count
-    record["classification"] = cloud.classification if with_classes else np.ones(len(block), np.uint8)
-    record["scan_angle"] = np.round(block.scan_angle_deg / 0.006).astype(np.int16)
-    record["point_source_id"] = cloud.source_id
-    record["gps_time"] = cloud.gps_time
-    return record
-
-
-def write_truth(scene: Scene, truth: Path) -> None:
-    """Write the exact models as a run directory, some hundred buildings a part."""
-    context = RecordContext(
-        reference=spatial_reference(scene), settings_hash="truth", engine_version=pipeline.__version__
-    )
-    extent = shapely.box(*scene.extent)
+def _simulate_one(writing: _Writing, settings: ScannerSettings, scene: Scene, out: Path, before: int = 0) -> ScenePaths:
+    """A data set of one tile."""
+    truth = out / "truth"
+    truth.mkdir(parents=True, exist_ok=True)
+    laz, labels = out / f"{writing.plan.name}.laz", truth / "labels.parquet"
+    tile = writing.tile(scene, settings, laz, labels, before)
+    if tile.points == 0:
+        raise InputError(str(laz), "the survey hit nothing", "Use a larger scene or a higher density")
+    rows = []
     for first in range(0, len(scene.buildings), _BUILDINGS_A_PART):
-        records = [
-            truth_record(building, scene.origin, touches_data_edge=not extent.contains(building.footprint))
-            for building in scene.buildings[first : first + _BUILDINGS_A_PART]
-        ]
-        write_tile(truth, f"part{first // _BUILDINGS_A_PART:05d}", records, [], context, meshes="tile")
+        part = f"part{first // _BUILDINGS_A_PART:05d}"
+        rows += write_models(scene.buildings[first : first + _BUILDINGS_A_PART], scene, scene.extent, truth, part)
+    write_conditions(rows, truth / "conditions.parquet")
+    write_manifest(
+        scene,
+        settings,
+        writing.seed,
+        [tile],
+        truth,
+        strips=strip_count(scene, settings),
+        buildings=len(scene.buildings),
+        trees=len(scene.trees),
+        cars=len(scene.boxes),
+    )
+    return ScenePaths(laz=laz, truth=truth, labels=labels, points=tile.points, buildings=len(scene.buildings))
 
 
-def _write_manifest(scene: Scene, settings: ScannerSettings, seed: int, points: int, path: Path) -> None:
-    x, y, _ = scene.origin
-    extent = [scene.extent[0] + x, scene.extent[1] + y, scene.extent[2] + x, scene.extent[3] + y]
-    manifest: dict[str, Any] = {
-        "suite": scene.name,
-        "seed": seed,
-        "engine_version": pipeline.__version__,
-        "crs": scene.crs,
-        "extent": extent,
-        "points": points,
-        "strips": strip_count(scene, settings),
-        "buildings": len(scene.buildings),
-        "trees": len(scene.trees),
-        "cars": len(scene.boxes),
-        "scanner": dataclasses.asdict(settings),
-    }
-    path.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+def _simulate_cells(writing: _Writing, settings: ScannerSettings, cells: tuple[Cell, ...], out: Path) -> ScenePaths:
+    """A data set a cell: the same scene under every survey."""
+    scene = writing.plan.make(writing.seed, writing.size_m)
+    made: list[ScenePaths] = []
+    for cell in cells:
+        survey = dataclasses.replace(settings, pulse_density_per_m2=cell.density_per_m2, range_noise_m=cell.noise_m)
+        made.append(_simulate_one(writing, survey, scene, out / cell.key, sum(one.points for one in made)))
+    listed = [
+        {"cell": cell.key, "density_per_m2": cell.density_per_m2, "noise_m": cell.noise_m, "points": one.points}
+        for cell, one in zip(cells, made, strict=True)
+    ]
+    document: dict[str, Any] = {"suite": writing.plan.name, "seed": writing.seed, "cells": listed}
+    (out / "sweep.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    return ScenePaths(
+        laz=out,
+        truth=out,
+        labels=out,
+        points=sum(one.points for one in made),
+        buildings=sum(one.buildings for one in made),
+        tiles=len(made),
+        cells=tuple(made),
+    )
+
+
+def _simulate_tiles(writing: _Writing, settings: ScannerSettings, out: Path) -> ScenePaths:
+    """A data set of many tiles: the whole scene is never in memory.
+
+    While one tile is scanned and written, one thread lays out the next and writes the models of the one before.
+    """
+    size, plan = writing.size_m, writing.plan
+    if plan.part is None:
+        raise TypeError(f"{plan.name} is not made tile by tile")
+    truth, tiles_dir = out / "truth", out / "tiles"
+    labels_dir = truth / "labels"
+    for folder in (tiles_dir, labels_dir):
+        folder.mkdir(parents=True, exist_ok=True)
+    whole: Extent = (0.0, 0.0, *size)
+    part_of = plan.part(writing.seed, size, settings)
+    writing = dataclasses.replace(writing, chunk_points=min(writing.chunk_points, _TILED_CHUNK_POINTS))
+    tiles: list[TileFiles] = []
+    truths: list[Future[_TileTruth]] = []
+    points = 0
+    todo = list(tile_extents(size, plan.tile_m))
+    with ThreadPoolExecutor(1) as aside:
+        ahead = aside.submit(part_of, todo[0][1])
+        for number, (key, extent) in enumerate(todo):
+            scene = ahead.result()
+            if number + 1 < len(todo):
+                ahead = aside.submit(part_of, todo[number + 1][1])
+            truths.append(aside.submit(_tile_truth, scene, extent, whole, truth, key))
+            laz, labels = tiles_dir / f"{plan.name}_{key}.laz", labels_dir / f"{key}.parquet"
+            made = writing.tile(scene, settings, laz, labels, points)
+            points += made.points
+            if made.points:
+                tiles.append(made)
+            else:
+                laz.unlink()
+                labels.unlink()
+        known = [future.result() for future in truths]
+    if points == 0:
+        raise InputError(str(tiles_dir), "the survey hit nothing", "Use a larger scene or a higher density")
+    rows = [row for one in known for row in one.rows]
+    write_conditions(rows, truth / "conditions.parquet")
+    write_manifest(
+        scene,
+        settings,
+        writing.seed,
+        tiles,
+        truth,
+        strips=strip_count(scene, settings),
+        buildings=len(rows),
+        trees=sum(one.trees for one in known),
+        cars=sum(one.cars for one in known),
+    )
+    return ScenePaths(
+        laz=tiles_dir, truth=truth, labels=labels_dir, points=points, buildings=len(rows), tiles=len(tiles)
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _TileTruth:
+    """What a tile owns."""
+
+    rows: list[dict[str, Any]]
+    trees: int
+    cars: int
+
+
+def _tile_truth(scene: Scene, extent: Extent, whole: Extent, truth: Path, key: str) -> _TileTruth:
+    """Write the models that a tile owns."""
+    owned = [building for building in scene.buildings if _owns(extent, whole, building.x, building.y)]
+    middles = [box.corners.mean(axis=0) for box in scene.boxes]
+    return _TileTruth(
+        rows=write_models(owned, scene, whole, truth, key),
+        trees=sum(_owns(extent, whole, tree.x, tree.y) for tree in scene.trees),
+        cars=sum(_owns(extent, whole, float(middle[0]), float(middle[1])) for middle in middles),
+    )
+
+
+def tile_extents(size_m: tuple[float, float], tile_m: float) -> Iterator[tuple[str, Extent]]:
+    """Key and extent of the square tiles that cover a scene from its origin, row by row."""
+    for row in range(math.ceil(size_m[1] / tile_m)):
+        for column in range(math.ceil(size_m[0] / tile_m)):
+            x, y = column * tile_m, row * tile_m
+            yield f"x{column}_y{row}", (x, y, min(x + tile_m, size_m[0]), min(y + tile_m, size_m[1]))
+
+
+def _owns(extent: Extent, whole: Extent, x: float, y: float) -> bool:
+    """Half-open ownership; what has its middle outside of the whole scene belongs to the nearest tile."""
+    inside_x = min(max(x, whole[0]), math.nextafter(whole[2], -math.inf))
+    inside_y = min(max(y, whole[1]), math.nextafter(whole[3], -math.inf))
+    return extent[0] <= inside_x < extent[2] and extent[1] <= inside_y < extent[3]

@@ -2,6 +2,9 @@
 
 A line is given by its point on the terrain and its lean (metres east and north per metre up). The first hit from above
 is then the highest one, so elevation itself is the parameter along the line and no ray marching is needed.
+
+The inner kernels take the arrays that they read one by one: a `SceneArrays` handed down would cost them a count of
+references for every array in it, several times what a hit costs.
 """
 
 from __future__ import annotations
@@ -11,9 +14,10 @@ import math
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
-from pipeline.model import BoolArray, FloatArray, LabelArray
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.synthetic.scene import Scene
 from pipeline.synthetic.scene_arrays import CELL_M, SceneArrays, scene_arrays
 
@@ -21,6 +25,12 @@ GROUND, ROOF, WALL, TREE, BOX = 0, 1, 2, 3, 4
 """Kinds of hits."""
 
 _ON_ROOF_M = 1e-6
+_ON_TERRAIN_M = 1e-7
+_STEPS = 40
+_SLOW = 0.05
+"""A fixed-point step that leaves more of the error than this is followed by a secant step."""
+_ROUNDING_M = 1e-6
+"""Bounds are taken wider by this."""
 
 
 @njit(cache=True, nogil=True)
@@ -39,55 +49,117 @@ def uniform_of(state: np.uint64, draw: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def terrain_z(scene: SceneArrays, x: float, y: float) -> float:
+def terrain_z(terrain: FloatArray, waves: FloatArray, x: float, y: float) -> float:
     """Elevation of the terrain."""
-    z: float = scene.terrain[0] + scene.terrain[1] * x + scene.terrain[2] * y
-    for k in range(len(scene.waves)):
-        z += scene.waves[k, 0] * math.sin(scene.waves[k, 1] * x + scene.waves[k, 2] * y + scene.waves[k, 3])
+    z: float = terrain[0] + terrain[1] * x + terrain[2] * y
+    for k in range(len(waves)):
+        z += waves[k, 0] * math.sin(waves[k, 1] * x + waves[k, 2] * y + waves[k, 3])
     return z
 
 
 @njit(cache=True, nogil=True)
-def terrain_hit(scene: SceneArrays, x: float, y: float, z: float, lean_x: float, lean_y: float) -> Any:
-    """Where the line through (x, y, z) meets the terrain: fixed-point steps, each shrinks the error by slope * lean."""
-    for _ in range(40):
-        ground = terrain_z(scene, x, y)
+def terrain_hit(
+    terrain: FloatArray, waves: FloatArray, x: float, y: float, z: float, lean_x: float, lean_y: float
+) -> Any:
+    """Where the line through (x, y, z) meets the terrain.
+
+    Fixed-point steps, each shrinks the error by slope * lean; where that is slow, secant steps. `scene_arrays` has seen
+    to it that slope * lean is less than 1, so that there is one such place; where the steps get nowhere, bisection
+    finds it.
+    """
+    start_x, start_y, start_z = x, y, z
+    up, rise_before = 0.0, np.inf
+    for _ in range(_STEPS):
+        ground = terrain_z(terrain, waves, x, y)
         rise = ground - z
-        if abs(rise) < 1e-7:
-            break
-        x += rise * lean_x
-        y += rise * lean_y
-        z = ground
-    return x, y, z
+        if abs(rise) < _ON_TERRAIN_M:
+            return x, y, z
+        if abs(rise) > _SLOW * abs(rise_before):
+            up *= rise / (rise_before - rise)
+            z += up
+        else:
+            up = rise
+            z = ground
+        x += up * lean_x
+        y += up * lean_y
+        rise_before = rise
+    low, high = -1.0, 1.0
+    while terrain_z(terrain, waves, start_x + low * lean_x, start_y + low * lean_y) < start_z + low:
+        low *= 2.0
+    while terrain_z(terrain, waves, start_x + high * lean_x, start_y + high * lean_y) > start_z + high:
+        high *= 2.0
+    while high - low > _ON_TERRAIN_M:
+        up = 0.5 * (low + high)
+        if terrain_z(terrain, waves, start_x + up * lean_x, start_y + up * lean_y) > start_z + up:
+            low = up
+        else:
+            high = up
+    return start_x + high * lean_x, start_y + high * lean_y, start_z + high
 
 
 @njit(cache=True, nogil=True)
-def _inside(scene: SceneArrays, face: int, x: float, y: float) -> bool:
-    """Point in polygon by crossings; points on the border belong to one side or the other."""
-    start, end = scene.ring_start[face], scene.ring_start[face + 1]
+def _inside(edges: FloatArray, start: int, stop: int, x: float, y: float) -> bool:
+    """Point in polygon by crossings of all rings; points on the border belong to one side or the other."""
     inside = False
-    before = end - 1
-    for k in range(start, end):
-        y1, y2 = scene.ring_y[before], scene.ring_y[k]
+    for k in range(start, stop):
+        y1, y2 = edges[k, 1], edges[k, 3]
         if (y1 > y) != (y2 > y):
-            x1, x2 = scene.ring_x[before], scene.ring_x[k]
+            x1, x2 = edges[k, 0], edges[k, 2]
             if x < (x2 - x1) * (y - y1) / (y2 - y1) + x1:
                 inside = not inside
-        before = k
     return inside
 
 
 @njit(cache=True, nogil=True)
-def _passes_by(scene: SceneArrays, prism: int, x: float, y: float, z: float, lean: float, radius: float) -> bool:
+def _passes_by(circles: FloatArray, prism: int, x: float, y: float, z: float, lean: float, radius: float) -> bool:
     """Whether a line stays out of the circle around a prism by more than a radius: most do."""
-    away_x, away_y = x - scene.circles[prism, 0], y - scene.circles[prism, 1]
-    reach = scene.circles[prism, 2] + max(0.0, scene.circles[prism, 3] - z) * lean + radius
+    away_x, away_y = x - circles[prism, 0], y - circles[prism, 1]
+    reach = circles[prism, 2] + max(0.0, circles[prism, 3] - z) * lean + radius
     return bool(away_x * away_x + away_y * away_y > reach * reach)
 
 
 @njit(cache=True, nogil=True)
+def _near_bounds(faces: FloatArray, face: int, x1: float, y1: float, x2: float, y2: float, distance: float) -> bool:
+    """Whether the rectangle around two places comes near to the bounds of a face."""
+    reach = distance + _ROUNDING_M
+    return bool(
+        max(x1, x2) > faces[face, 3] - reach
+        and min(x1, x2) < faces[face, 5] + reach
+        and max(y1, y2) > faces[face, 4] - reach
+        and min(y1, y2) < faces[face, 6] + reach
+    )
+
+
+@njit(cache=True, nogil=True)
+def _meets_crown(
+    trees: FloatArray, tree: int, x: float, y: float, z: float, lean_x: float, lean_y: float, radius: float
+) -> bool:
+    """Whether a line comes into a crown that is wider by a radius."""
+    wide, tall = trees[tree, 3] + radius, trees[tree, 4] + radius
+    from_x, from_y, from_z = (x - trees[tree, 0]) / wide, (y - trees[tree, 1]) / wide, (z - trees[tree, 2]) / tall
+    to_x, to_y, to_z = lean_x / wide, lean_y / wide, 1.0 / tall
+    linear = from_x * to_x + from_y * to_y + from_z * to_z
+    square = to_x * to_x + to_y * to_y + to_z * to_z
+    return bool(linear * linear > square * (from_x * from_x + from_y * from_y + from_z * from_z - 1.0))
+
+
+@njit(cache=True, nogil=True)
 def is_clear(
-    scene: SceneArrays, cell: int, x: float, y: float, z: float, lean_x: float, lean_y: float, radius: float
+    cell_start: LabelArray,
+    entries: IntArray,
+    face_start: LabelArray,
+    edge_start: LabelArray,
+    circles: FloatArray,
+    faces: FloatArray,
+    edges: FloatArray,
+    trees: FloatArray,
+    cell: int,
+    x: float,
+    y: float,
+    z: float,
+    lean_x: float,
+    lean_y: float,
+    radius: float,
 ) -> bool:
     """Whether a beam of a radius around a line meets no edge of a roof face and no crown.
 
@@ -95,33 +167,26 @@ def is_clear(
     walls alone (the vertical corners of a house) are not looked at.
     """
     lean = math.sqrt(lean_x * lean_x + lean_y * lean_y)
-    for entry in range(scene.cell_start[cell], scene.cell_start[cell + 1]):
-        number = scene.cell_entries[entry]
+    for entry in range(cell_start[cell], cell_start[cell + 1]):
+        number = entries[entry, 0]
         if number < 0:
-            tree = ~number
-            wide, tall = scene.trees[tree, 3] + radius, scene.trees[tree, 4] + radius
-            from_x, from_y = (x - scene.trees[tree, 0]) / wide, (y - scene.trees[tree, 1]) / wide
-            from_z = (z - scene.trees[tree, 2]) / tall
-            to_x, to_y, to_z = lean_x / wide, lean_y / wide, 1.0 / tall
-            linear = from_x * to_x + from_y * to_y + from_z * to_z
-            square = to_x * to_x + to_y * to_y + to_z * to_z
-            if linear * linear > square * (from_x * from_x + from_y * from_y + from_z * from_z - 1.0):
+            if _meets_crown(trees, ~number, x, y, z, lean_x, lean_y, radius):
                 return False
             continue
-        if _passes_by(scene, number, x, y, z, lean, radius):
+        if _passes_by(circles, number, x, y, z, lean, radius):
             continue
-        for face in range(scene.face_start[number], scene.face_start[number + 1]):
-            a, b, c = scene.planes[face, 0], scene.planes[face, 1], scene.planes[face, 2]
+        for face in range(face_start[number], face_start[number + 1]):
+            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
             leaning = 1.0 - a * lean_x - b * lean_y
             if leaning <= 1e-9:
                 return False
             up = (a * x + b * y + c - z) / leaning
             at_x, at_y = x + up * lean_x, y + up * lean_y
-            before = scene.ring_start[face + 1] - 1
-            for k in range(scene.ring_start[face], scene.ring_start[face + 1]):
-                x1, y1 = scene.ring_x[before], scene.ring_y[before]
-                edge_x, edge_y = scene.ring_x[k] - x1, scene.ring_y[k] - y1
-                before = k
+            if not _near_bounds(faces, face, at_x, at_y, at_x, at_y, radius):
+                continue
+            for k in range(edge_start[face], edge_start[face + 1]):
+                x1, y1 = edges[k, 0], edges[k, 1]
+                edge_x, edge_y = edges[k, 2] - x1, edges[k, 3] - y1
                 along = ((at_x - x1) * edge_x + (at_y - y1) * edge_y) / (edge_x * edge_x + edge_y * edge_y)
                 along = min(1.0, max(0.0, along))
                 off_x, off_y = at_x - x1 - along * edge_x, at_y - y1 - along * edge_y
@@ -131,27 +196,46 @@ def is_clear(
 
 
 @njit(cache=True, nogil=True)
-def _prism_hit(scene: SceneArrays, prism: int, x: float, y: float, z: float, lean_x: float, lean_y: float) -> Any:
-    """Highest hit of a line with the prisms under the faces: elevation (-inf for none), face or -1 for a wall."""
+def _prism_hit(
+    face_start: LabelArray,
+    edge_start: LabelArray,
+    circles: FloatArray,
+    faces: FloatArray,
+    edges: FloatArray,
+    prism: int,
+    x: float,
+    y: float,
+    z: float,
+    lean_x: float,
+    lean_y: float,
+) -> Any:
+    """Highest hit of a line with the prisms under the faces: elevation (-inf for none), face or -1 for a wall.
+
+    Where two faces share an edge in plan but not in height, the line enters the prism of the higher one through its
+    side: the step edge's wall. What of that side lies under the lower face is hidden in the other prism.
+    """
     best, hit = -np.inf, -1
-    if _passes_by(scene, prism, x, y, z, math.sqrt(lean_x * lean_x + lean_y * lean_y), 0.0):
+    if _passes_by(circles, prism, x, y, z, math.sqrt(lean_x * lean_x + lean_y * lean_y), 0.0):
         return best, hit
-    first = scene.face_start[prism]
-    for face in range(first, scene.face_start[prism + 1]):
-        a, b, c = scene.planes[face, 0], scene.planes[face, 1], scene.planes[face, 2]
+    first = face_start[prism]
+    for face in range(first, face_start[prism + 1]):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
         leaning = 1.0 - a * lean_x - b * lean_y
         if leaning > 1e-9:
             top = (a * (x - z * lean_x) + b * (y - z * lean_y) + c) / leaning
-            if top > best and _inside(scene, face, x + (top - z) * lean_x, y + (top - z) * lean_y):
+            if top <= best:
+                continue  # what the line meets of the sides lies below
+            at_x, at_y = x + (top - z) * lean_x, y + (top - z) * lean_y
+            if not _near_bounds(faces, face, at_x, at_y, x, y, 0.0):
+                continue
+            if _inside(edges, edge_start[face], edge_start[face + 1], at_x, at_y):
                 best, hit = top, face - first
+                continue
         if lean_x == 0.0 and lean_y == 0.0:
             continue
-        start, end = scene.ring_start[face], scene.ring_start[face + 1]
-        before = end - 1
-        for k in range(start, end):
-            x1, y1 = scene.ring_x[before], scene.ring_y[before]
-            edge_x, edge_y = scene.ring_x[k] - x1, scene.ring_y[k] - y1
-            before = k
+        for k in range(edge_start[face], edge_start[face + 1]):
+            x1, y1 = edges[k, 0], edges[k, 1]
+            edge_x, edge_y = edges[k, 2] - x1, edges[k, 3] - y1
             # The interior lies left of an edge, so this is positive where a falling line enters the prism.
             entering = lean_x * edge_y - lean_y * edge_x
             if entering <= 1e-12:
@@ -170,13 +254,13 @@ def _prism_hit(scene: SceneArrays, prism: int, x: float, y: float, z: float, lea
 
 @njit(cache=True, nogil=True)
 def _tree_hit(
-    scene: SceneArrays, tree: int, x: float, y: float, z: float, lean_x: float, lean_y: float, chance: float
+    trees: FloatArray, tree: int, x: float, y: float, z: float, lean_x: float, lean_y: float, chance: float
 ) -> float:
     """Elevation where a beam ends in a crown, -inf where it passes: depth = -ln(chance) * free path along the chord."""
-    radius, half_height = scene.trees[tree, 3], scene.trees[tree, 4]
-    from_x = (x - scene.trees[tree, 0]) / radius
-    from_y = (y - scene.trees[tree, 1]) / radius
-    from_z = (z - scene.trees[tree, 2]) / half_height
+    radius, half_height = trees[tree, 3], trees[tree, 4]
+    from_x = (x - trees[tree, 0]) / radius
+    from_y = (y - trees[tree, 1]) / radius
+    from_z = (z - trees[tree, 2]) / half_height
     to_x, to_y, to_z = lean_x / radius, lean_y / radius, 1.0 / half_height
     square = to_x * to_x + to_y * to_y + to_z * to_z
     linear = from_x * to_x + from_y * to_y + from_z * to_z
@@ -184,7 +268,7 @@ def _tree_hit(
     if root <= 0.0:
         return -np.inf
     length = math.sqrt(1.0 + lean_x * lean_x + lean_y * lean_y)
-    depth = -math.log(chance) * scene.trees[tree, 5]
+    depth = -math.log(chance) * trees[tree, 5]
     up = (-linear + math.sqrt(root)) / square - depth / length
     if up <= (-linear - math.sqrt(root)) / square or up <= 0.0:
         return -np.inf
@@ -192,19 +276,27 @@ def _tree_hit(
 
 
 @njit(cache=True, nogil=True)
-def cell_of(scene: SceneArrays, x: float, y: float) -> int:
+def cell_of(grid: FloatArray, across: int, up: int, x: float, y: float) -> int:
     """Number of the grid's cell, -1 outside."""
-    column = math.floor((x - scene.grid[0]) / CELL_M)
-    row = math.floor((y - scene.grid[1]) / CELL_M)
-    if column < 0 or row < 0 or column >= scene.cells_across or row >= scene.cells_up:
+    column = math.floor((x - grid[0]) / CELL_M)
+    row = math.floor((y - grid[1]) / CELL_M)
+    if column < 0 or row < 0 or column >= across or row >= up:
         return -1
-    cell: int = row * scene.cells_across + column
+    cell: int = row * across + column
     return cell
 
 
 @njit(cache=True, nogil=True)
 def first_hit(
-    scene: SceneArrays,
+    cell_start: LabelArray,
+    entries: IntArray,
+    n_buildings: int,
+    face_start: LabelArray,
+    edge_start: LabelArray,
+    circles: FloatArray,
+    faces: FloatArray,
+    edges: FloatArray,
+    trees: FloatArray,
     cell: int,
     x: float,
     y: float,
@@ -216,66 +308,135 @@ def first_hit(
 ) -> Any:
     """Highest hit of the line through the terrain point (x, y, z): elevation, kind, object, roof face.
 
-    A crown's chance is drawn from the state at draw + number of the tree's entry; draw < 0 leaves crowns out.
+    A crown's chance is drawn from the state at draw + the entry's own; draw < 0 leaves crowns out.
     """
     best, kind, thing, face = z, GROUND, -1, -1
     if cell < 0:
         return best, kind, thing, face
-    for entry in range(scene.cell_start[cell], scene.cell_start[cell + 1]):
-        number = scene.cell_entries[entry]
+    for entry in range(cell_start[cell], cell_start[cell + 1]):
+        number = entries[entry, 0]
         if number >= 0:
-            top, hit = _prism_hit(scene, number, x, y, z, lean_x, lean_y)
+            top, hit = _prism_hit(face_start, edge_start, circles, faces, edges, number, x, y, z, lean_x, lean_y)
             if top > best:
                 best, thing, face = top, number, hit
-                kind = (ROOF if hit >= 0 else WALL) if number < scene.n_buildings else BOX
+                kind = (ROOF if hit >= 0 else WALL) if number < n_buildings else BOX
         elif draw >= 0:
-            chance = uniform_of(state, draw + entry - scene.cell_start[cell])
-            top = _tree_hit(scene, ~number, x, y, z, lean_x, lean_y, chance)
+            chance = uniform_of(state, draw + entries[entry, 1])
+            top = _tree_hit(trees, ~number, x, y, z, lean_x, lean_y, chance)
             if top > best:
                 best, kind, thing, face = top, TREE, ~number, -1
     if kind == BOX:
-        thing, face = thing - scene.n_buildings, -1
+        thing, face = thing - n_buildings, -1
     return best, kind, thing, face
 
 
 @njit(cache=True, nogil=True)
-def _surface(
+def is_wet(spot_start: LabelArray, spots: FloatArray, building: int, x: float, y: float) -> bool:
+    """Whether a place on a building's roof lies in one of its wet spots."""
+    for spot in range(spot_start[building], spot_start[building + 1]):
+        away_x, away_y = x - spots[spot, 0], y - spots[spot, 1]
+        if away_x * away_x + away_y * away_y < spots[spot, 2]:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _first_hits(
     scene: SceneArrays,
     x: FloatArray,
     y: FloatArray,
     z: FloatArray,
+    lean_x: FloatArray,
+    lean_y: FloatArray,
+    states: npt.NDArray[np.uint64],
     kind: LabelArray,
     thing: LabelArray,
     face: LabelArray,
 ) -> None:
+    """The first hits of lines through terrain points; z is replaced by the elevation of the hit."""
     for k in range(len(x)):
-        ground = terrain_z(scene, x[k], y[k])
-        cell = cell_of(scene, x[k], y[k])
-        z[k], kind[k], thing[k], face[k] = first_hit(scene, cell, x[k], y[k], ground, 0.0, 0.0, np.uint64(0), -1)
+        z[k], kind[k], thing[k], face[k] = first_hit(
+            scene.cell_start,
+            scene.entries,
+            scene.n_buildings,
+            scene.face_start,
+            scene.edge_start,
+            scene.circles,
+            scene.faces,
+            scene.edges,
+            scene.trees,
+            cell_of(scene.grid, scene.cells_across, scene.cells_up, x[k], y[k]),
+            x[k],
+            y[k],
+            z[k],
+            lean_x[k],
+            lean_y[k],
+            states[k] if len(states) > 0 else np.uint64(0),
+            0 if len(states) > 0 else -1,
+        )
+
+
+@njit(cache=True, nogil=True)
+def _landings(
+    scene: SceneArrays, x: FloatArray, y: FloatArray, z: FloatArray, lean_x: FloatArray, lean_y: FloatArray
+) -> None:
+    """Move points (x, y, z) along their lines to the terrain."""
+    for k in range(len(x)):
+        x[k], y[k], z[k] = terrain_hit(scene.terrain, scene.waves, x[k], y[k], z[k], lean_x[k], lean_y[k])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SurfaceHits:
-    """The true top surface without trees at n places."""
+class Hits:
+    """What n lines hit first."""
 
-    z: FloatArray
-    """(n,) float64, elevation, metres."""
+    xyz: FloatArray
+    """(n, 3) float64, scene frame, metres."""
     kind: LabelArray
-    """(n,) int32: GROUND, ROOF or BOX."""
+    """(n,) int32: GROUND, ROOF, WALL, TREE or BOX."""
     building: LabelArray
     """(n,) int32, number of the building; -1 where there is none."""
     face: LabelArray
-    """(n,) int32, number of its roof face; -1 where there is none."""
+    """(n,) int32, number of its roof face; -1 for walls and where there is no building."""
+
+    @property
+    def z(self) -> FloatArray:
+        """(n,) float64, elevations, metres."""
+        return self.xyz[:, 2]
 
     @property
     def on_roof(self) -> BoolArray:
-        """(n,) bool, True where a building stands."""
-        return self.building >= 0
+        """(n,) bool, True where a roof was hit."""
+        return np.equal(self.kind, ROOF)
 
 
-def top_surface(scene: Scene, x: FloatArray, y: FloatArray) -> SurfaceHits:
+def hits_of_lines(
+    arrays: SceneArrays, places: FloatArray, leans: FloatArray, states: npt.NDArray[np.uint64] | None = None
+) -> Hits:
+    """What leaning lines hit first.
+
+    Parameters
+    ----------
+    arrays : SceneArrays
+        Made for at least this lean.
+    places : ndarray (n, 3)
+        Any place of each line, scene frame.
+    leans : ndarray (n, 2)
+        Metres east and north per metre up.
+    states : ndarray (n,) uint64, optional
+        Random states that decide how deep lines sink into crowns; without them crowns are left out.
+    """
+    x, y, z = (np.array(column, dtype=np.float64) for column in places.T)
+    lean_x, lean_y = (np.array(column, dtype=np.float64) for column in leans.T)
+    _landings(arrays, x, y, z, lean_x, lean_y)
+    top, kind, thing, face = z.copy(), *(np.empty(len(x), np.int32) for _ in range(3))
+    states = np.zeros(0, np.uint64) if states is None else states
+    _first_hits(arrays, x, y, top, lean_x, lean_y, states, kind, thing, face)
+    building = np.where((kind == ROOF) | (kind == WALL), thing, -1).astype(np.int32)
+    xyz = np.column_stack([x + (top - z) * lean_x, y + (top - z) * lean_y, top])
+    return Hits(xyz=xyz, kind=kind, building=building, face=face)
+
+
+def top_surface(scene: Scene, x: FloatArray, y: FloatArray) -> Hits:
     """The top surface (terrain, roofs, boxes; no trees) at scene coordinates x, y, each (n,) float64."""
-    n = len(x)
-    z, kind, thing, face = np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
-    _surface(scene_arrays(scene), np.ascontiguousarray(x), np.ascontiguousarray(y), z, kind, thing, face)
-    return SurfaceHits(z=z, kind=kind, building=np.where(kind == ROOF, thing, -1).astype(np.int32), face=face)
+    places = np.column_stack([x, y, scene.terrain.elevation(x, y)])
+    return hits_of_lines(scene_arrays(scene), places, np.zeros((len(x), 2)))

@@ -1,31 +1,35 @@
-"""Parametric roofs as exact faces: vertices shared between faces, heights over the eave.
-
-The frame of a roof: u along the ridge, v to the left of it, origin in the middle of the (main) rectangle, metres.
-Faces run counter-clockwise seen from above. Together they cover the footprint once, so a surface, its walls and its
-solid all follow from them.
-"""
+"""The parametric roofs: what the records call each shape, and the function that makes its faces."""
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Callable
-from enum import StrEnum
 
-import numpy as np
+from pipeline.model import RoofType
+from pipeline.synthetic.additions import addition_parts
+from pipeline.synthetic.envelope import envelope
+from pipeline.synthetic.roof_dimensions import (
+    Addition,
+    AdditionKind,
+    FaceRings,
+    FlatPart,
+    RoofDimensions,
+    RoofFaces,
+    RoofShape,
+)
+from pipeline.synthetic.roof_parts import PARTS
+from pipeline.synthetic.simple_roofs import flat, gable, hip, l_shape, pent
 
-from pipeline.model import FloatArray, RoofType
-
-
-class RoofShape(StrEnum):
-    """The parametric shapes."""
-
-    FLAT = "flat"
-    PENT = "pent"
-    GABLE = "gable"
-    HIP = "hip"
-    L_SHAPE = "l_shape"
-
+__all__ = [
+    "ROOFS",
+    "ROOF_TYPES",
+    "Addition",
+    "AdditionKind",
+    "FaceRings",
+    "FlatPart",
+    "RoofDimensions",
+    "RoofFaces",
+    "RoofShape",
+]
 
 ROOF_TYPES: dict[RoofShape, RoofType] = {
     RoofShape.FLAT: RoofType.FLAT,
@@ -33,116 +37,42 @@ ROOF_TYPES: dict[RoofShape, RoofType] = {
     RoofShape.GABLE: RoofType.GABLE,
     RoofShape.HIP: RoofType.HIP,
     RoofShape.L_SHAPE: RoofType.COMBINATION,
+    RoofShape.HALF_HIP: RoofType.GABLE,
+    RoofShape.BENT_HIP: RoofType.HIP,
+    RoofShape.PYRAMID: RoofType.HIP,
+    RoofShape.UNEQUAL_GABLE: RoofType.GABLE,
+    RoofShape.MANSARD: RoofType.COMBINATION,
+    RoofShape.GAMBREL: RoofType.COMBINATION,
+    RoofShape.T_SHAPE: RoofType.COMBINATION,
+    RoofShape.U_SHAPE: RoofType.COMBINATION,
+    RoofShape.CROSS: RoofType.COMBINATION,
+    RoofShape.COURTYARD: RoofType.COMBINATION,
+    RoofShape.MULTI_LEVEL_FLAT: RoofType.FLAT,
 }
-"""The roof type of the records for every shape."""
+"""The roof type of the records for every shape, whatever stands on it."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RoofDimensions:
-    """Size of a building's roof."""
-
-    length_m: float
-    """Along the ridge."""
-    width_m: float
-    """Across the ridge."""
-    pitch_deg: float = 0.0
-    """Slope of every sloping face, 0 to 75; without meaning for flat roofs."""
-    wing_length_m: float = 0.0
-    """L-shape: how far the wing stands out of the main rectangle."""
-    wing_width_m: float = 0.0
-    """L-shape: width of the wing, less than width_m, so that its ridge stays under the main ridge."""
-
-    def __post_init__(self) -> None:
-        """Refuse sizes without a roof."""
-        if not (self.length_m > 0 and self.width_m > 0):
-            raise ValueError(f"a roof of {self.length_m:g} x {self.width_m:g} m has no area: both must be positive")
-        if not 0 <= self.pitch_deg <= 75:
-            raise ValueError(f"pitch_deg is {self.pitch_deg:g}: use 0 to 75")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RoofFaces:
-    """A roof in its own frame."""
-
-    vertices: FloatArray
-    """(v, 3) float64: u, v, metres above the eave."""
-    faces: tuple[tuple[int, ...], ...]
-    """Vertex indices of each face, counter-clockwise seen from above."""
-
-
-def _faces(vertices: list[tuple[float, float, float]], *faces: tuple[int, ...]) -> RoofFaces:
-    return RoofFaces(vertices=np.array(vertices, dtype=np.float64), faces=faces)
-
-
-def _corners(size: RoofDimensions, left_height: float = 0.0) -> list[tuple[float, float, float]]:
-    """The main rectangle, counter-clockwise from the rear right; the two left corners may stand higher."""
-    u, v = size.length_m / 2, size.width_m / 2
-    return [(-u, -v, 0.0), (u, -v, 0.0), (u, v, left_height), (-u, v, left_height)]
-
-
-def flat(size: RoofDimensions) -> RoofFaces:
-    """One horizontal face."""
-    return _faces(_corners(size), (0, 1, 2, 3))
-
-
-def pent(size: RoofDimensions) -> RoofFaces:
-    """One sloping face, low at the right side (v < 0)."""
-    return _faces(_corners(size, size.width_m * math.tan(math.radians(size.pitch_deg))), (0, 1, 2, 3))
-
-
-def gable(size: RoofDimensions) -> RoofFaces:
-    """Two faces that meet in the ridge."""
-    u, rise = size.length_m / 2, size.width_m / 2 * math.tan(math.radians(size.pitch_deg))
-    return _faces([*_corners(size), (-u, 0.0, rise), (u, 0.0, rise)], (0, 1, 5, 4), (2, 3, 4, 5))
-
-
-def hip(size: RoofDimensions) -> RoofFaces:
-    """Four faces of equal pitch; a square footprint gives a pyramid.
-
-    Raises
-    ------
-    ValueError
-        If the roof is wider than long: its ridge would have a negative length.
-    """
-    half_ridge = (size.length_m - size.width_m) / 2
-    if half_ridge < 0:
-        raise ValueError(f"a hip roof {size.length_m:g} m long and {size.width_m:g} m wide has no ridge: turn it")
-    rise = size.width_m / 2 * math.tan(math.radians(size.pitch_deg))
-    if half_ridge == 0:
-        return _faces([*_corners(size), (0.0, 0.0, rise)], (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4))
-    ridge = [(-half_ridge, 0.0, rise), (half_ridge, 0.0, rise)]
-    return _faces([*_corners(size), *ridge], (0, 1, 5, 4), (1, 2, 5), (2, 3, 4, 5), (3, 0, 4))
-
-
-def l_shape(size: RoofDimensions) -> RoofFaces:
-    """Two crossing gables of one pitch and one eave; the wing stands at the far end of the left side.
-
-    Both valleys run from the end of the wing's ridge, inside the main roof, to the eave. The main gable's end wall and
-    the wing's outer wall are one plane.
-
-    Raises
-    ------
-    ValueError
-        If the wing is as wide as the main part, longer than its side, or missing.
-    """
-    u, v, wing, out = size.length_m / 2, size.width_m / 2, size.wing_width_m, size.wing_length_m
-    if not (0 < wing < min(size.width_m, size.length_m) and out > 0):
-        raise ValueError(f"a wing {wing:g} m wide and {out:g} m long does not fit {size.length_m:g} x {size.width_m:g}")
-    slope = math.tan(math.radians(size.pitch_deg))
-    rise, wing_rise, middle = v * slope, wing / 2 * slope, u - wing / 2
-    vertices = [
-        *((-u, -v, 0.0), (u, -v, 0.0), (u, v, 0.0), (u, v + out, 0.0)),
-        *((u - wing, v + out, 0.0), (u - wing, v, 0.0), (-u, v, 0.0)),
-        *((-u, 0.0, rise), (u, 0.0, rise), (middle, v - wing / 2, wing_rise), (middle, v + out, wing_rise)),
-    ]
-    return _faces(vertices, (0, 1, 8, 7), (7, 8, 2, 9, 5, 6), (9, 2, 3, 10), (9, 10, 4, 5))
-
-
-ROOFS: dict[RoofShape, Callable[[RoofDimensions], RoofFaces]] = {
+_BARE: dict[RoofShape, Callable[[RoofDimensions], RoofFaces]] = {
     RoofShape.FLAT: flat,
     RoofShape.PENT: pent,
     RoofShape.GABLE: gable,
     RoofShape.HIP: hip,
     RoofShape.L_SHAPE: l_shape,
 }
-"""The function of every shape."""
+
+
+def _maker(shape: RoofShape) -> Callable[[RoofDimensions], RoofFaces]:
+    """The function that makes a roof of a shape, with all that stands on it."""
+    parts = PARTS[shape]
+
+    def make(size: RoofDimensions) -> RoofFaces:
+        bare = _BARE[shape](size) if shape in _BARE else envelope(parts(size))
+        if not size.additions:
+            return bare
+        return envelope([*parts(size), *addition_parts(bare, size.additions)])
+
+    return make
+
+
+ROOFS: dict[RoofShape, Callable[[RoofDimensions], RoofFaces]] = {shape: _maker(shape) for shape in RoofShape}
+"""The function of every shape. It raises ValueError where the sizes give no such roof."""

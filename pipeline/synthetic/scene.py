@@ -8,12 +8,31 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from enum import StrEnum
 
 import numpy as np
 import shapely
 
 from pipeline.model import FloatArray, Plane, RoofType
-from pipeline.synthetic.roofs import ROOF_TYPES, ROOFS, RoofDimensions, RoofShape
+from pipeline.synthetic.roofs import ROOF_TYPES, ROOFS, FaceRings, RoofDimensions, RoofShape
+
+
+class Defect(StrEnum):
+    """What can make a building hard to reconstruct from its points."""
+
+    STRIP_SHIFT = "strip_shift"
+    WRONG_ROWS = "wrong_rows"
+    WET_SPOT = "wet_spot"
+    DORMERS = "dormers"
+    SUPERSTRUCTURE = "superstructure"
+    OVERHANGING_TREE = "overhanging_tree"
+
+
+class FaultKind(StrEnum):
+    """What can be wrong with a survey inside a rectangle."""
+
+    STRIP_SHIFT = "strip_shift"
+    WRONG_ROWS = "wrong_rows"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,6 +78,18 @@ def undulating_terrain(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class WetSpot:
+    """A circle in plan where a roof does not return pulses: water, fresh tar."""
+
+    x: float
+    """Easting of its middle, scene frame."""
+    y: float
+    """Northing of it."""
+    radius_m: float
+    """Radius."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Building:
     """An exact building. Made by `place_building`."""
 
@@ -82,15 +113,26 @@ class Building:
     """Elevation of the eave."""
     vertices: FloatArray
     """(v, 3) float64, roof vertices in the scene frame."""
-    faces: tuple[tuple[int, ...], ...]
-    """Vertex indices of each roof face, counter-clockwise seen from above."""
+    faces: tuple[FaceRings, ...]
+    """Rings of each roof face: its outline counter-clockwise seen from above, then its holes clockwise."""
     planes: tuple[Plane, ...]
     """Exact plane of each roof face in the scene frame, without points (n_points 0, rmse_m 0)."""
+    groups: tuple[int, ...]
+    """A number for every roof face; faces of one number count as one, as the two parts of a bent hip's side."""
+    wet_spots: tuple[WetSpot, ...] = ()
+    """Where its roof does not return pulses."""
+    defects: tuple[Defect, ...] = ()
+    """What makes it hard."""
 
     @property
     def roof_type(self) -> RoofType:
         """As the records call it."""
         return ROOF_TYPES[self.shape]
+
+    @property
+    def is_good(self) -> bool:
+        """Whether nothing makes it hard."""
+        return not self.defects
 
     @property
     def ridge_z_m(self) -> float:
@@ -100,16 +142,25 @@ class Building:
     @property
     def footprint(self) -> shapely.Polygon:
         """2D outline in the scene frame."""
-        outline = shapely.union_all([shapely.Polygon(self.vertices[list(face), :2]) for face in self.faces])
-        if not isinstance(outline, shapely.Polygon):
-            raise TypeError(
-                f"{self.building_id}: the roof faces do not join to one outline but to a {outline.geom_type}"
-            )
-        return outline
+        return _outline(self.vertices[:, :2], self.faces)
 
     def roof_polygons(self) -> tuple[shapely.Polygon, ...]:
         """3D polygons of the roof faces in the scene frame."""
-        return tuple(shapely.Polygon(self.vertices[list(face)]) for face in self.faces)
+        return tuple(_polygon(self.vertices, face) for face in self.faces)
+
+
+def _polygon(vertices: FloatArray, rings: FaceRings) -> shapely.Polygon:
+    """The polygon of a face over vertices (v, 2) or (v, 3)."""
+    return shapely.Polygon(vertices[list(rings[0])], [vertices[list(hole)] for hole in rings[1:]])
+
+
+def _outline(plan: FloatArray, faces: tuple[FaceRings, ...]) -> shapely.Polygon:
+    """What the faces over plan vertices (v, 2) cover together."""
+    union = shapely.union_all([_polygon(plan, face) for face in faces])
+    pieces = [piece for piece in shapely.get_parts(union) if isinstance(piece, shapely.Polygon)]
+    if len(pieces) != 1:
+        raise ValueError(f"the roof faces cover {len(pieces)} separate outlines: let all parts of a building touch")
+    return pieces[0]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -141,6 +192,23 @@ class Box:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class SurveyFault:
+    """What is wrong with the survey inside a rectangle."""
+
+    extent: tuple[float, float, float, float]
+    """Smallest x, smallest y, largest x, largest y in the scene frame."""
+    kind: FaultKind
+    """strip_shift: the border of two strips runs through the middle, and the returns beyond it are shifted.
+    wrong_rows: the returns of some scan rows are shifted."""
+    shift: tuple[float, float, float]
+    """Metres east, north and up that the wrong returns are moved by."""
+    azimuth_deg: float = 0.0
+    """strip_shift: direction of the border, clockwise from north; the returns to the right of it are moved."""
+    share: float = 0.0
+    """wrong_rows: share of the scan rows that are moved."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Scene:
     """Everything that a scanner can hit."""
 
@@ -160,6 +228,10 @@ class Scene:
     """Trees and shrubs."""
     boxes: tuple[Box, ...] = ()
     """Cars."""
+    survey_extent: tuple[float, float, float, float] | None = None
+    """The whole survey that the strips are laid over, in the scene frame, where the scene is one tile of it."""
+    survey_faults: tuple[SurveyFault, ...] = ()
+    """Where the survey is wrong."""
 
 
 def turned(local: FloatArray, x: float, y: float, azimuth_deg: float) -> FloatArray:
@@ -204,6 +276,8 @@ def place_building(
     eave_height_m: float,
     terrain: Terrain,
     block_id: str | None = None,
+    wet_spots: tuple[WetSpot, ...] = (),
+    defects: tuple[Defect, ...] = (),
 ) -> Building:
     """Put a building on the terrain.
 
@@ -223,15 +297,24 @@ def place_building(
         The ground that it stands on.
     block_id : str, optional
         Shared by buildings that touch.
+    wet_spots : tuple of WetSpot
+        Where its roof does not return pulses.
+    defects : tuple of Defect
+        What makes it hard.
 
     Returns
     -------
     Building
         With exact roof vertices and planes; the floor is the lowest terrain at the outline, down to whole millimetres.
+
+    Raises
+    ------
+    ValueError
+        Where the sizes give no such roof.
     """
     roof = ROOFS[shape](dimensions)
     plan = turned(roof.vertices[:, :2], x, y, azimuth_deg)
-    outline = shapely.union_all([shapely.Polygon(plan[list(face)]) for face in roof.faces])
+    outline = _outline(plan, roof.faces)
     samples = outline_samples(shapely.get_coordinates(outline.exterior)[:-1])
     ground = terrain.elevation(samples[:, 0], samples[:, 1])
     eave_z = round(float(ground.max()) + eave_height_m, 3)
@@ -248,5 +331,8 @@ def place_building(
         eave_z_m=eave_z,
         vertices=vertices,
         faces=roof.faces,
-        planes=tuple(face_plane(vertices[list(face)]) for face in roof.faces),
+        planes=tuple(face_plane(vertices[list(face[0])]) for face in roof.faces),
+        groups=roof.groups,
+        wet_spots=wet_spots,
+        defects=defects,
     )

@@ -9,12 +9,15 @@ import shapely
 from shapely import Polygon
 
 from pipeline.model import BuildingResult, FaceKind, FloatArray, Plane, RoofFace, Solid, SolidFace, Status
+from pipeline.roof.partition import RoofPartition
+from pipeline.roof.solid import solid_parts
+from pipeline.synthetic.roof_dimensions import FaceRings
 from pipeline.synthetic.scene import Building
 
 
-def boundary_rings(faces: tuple[tuple[int, ...], ...]) -> list[list[int]]:
+def boundary_rings(faces: tuple[FaceRings, ...]) -> list[list[int]]:
     """Rings of the directed edges that only one face has: outlines counter-clockwise, courtyards clockwise."""
-    directed = {(face[k], face[(k + 1) % len(face)]) for face in faces for k in range(len(face))}
+    directed = {(ring[k], ring[(k + 1) % len(ring)]) for face in faces for ring in face for k in range(len(ring))}
     follower = {start: end for start, end in sorted(directed) if (end, start) not in directed}
     rings = []
     while follower:
@@ -42,12 +45,13 @@ def _from_a_corner(ring: list[int], vertices: FloatArray) -> tuple[list[int], li
 def building_solid(building: Building, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Solid:
     """The closed, outward oriented solid of a building.
 
-    One wall a straight run of the outline, so a gable's end wall is one face of five vertices.
+    Of a roof without steps one wall a straight run of the outline, so a gable's end wall is one face of five vertices;
+    else one wall an edge of the faces in plan, also between two faces of which one stands over the other.
 
     Parameters
     ----------
     building : Building
-        Continuous roof: faces meet in shared vertices.
+        What to extrude.
     origin : tuple of float
         Subtracted from the scene coordinates.
 
@@ -55,10 +59,19 @@ def building_solid(building: Building, origin: tuple[float, float, float] = (0.0
     -------
     Solid
         Vertices rounded to whole millimetres.
+
+    Raises
+    ------
+    ValueError
+        Where the roof falls into parts that share no edge.
+    BuildingError
+        Where it hangs together by no more than a corner.
     """
+    if has_steps(building):
+        return _stepped_solid(building, origin)
     roof = building.vertices - np.array(origin)
     floor_z = building.floor_z_m - origin[2]
-    faces = [SolidFace(rings=(face,), kind=FaceKind.ROOF, plane=k) for k, face in enumerate(building.faces)]
+    faces = [SolidFace(rings=face, kind=FaceKind.ROOF, plane=k) for k, face in enumerate(building.faces)]
     bottom: list[tuple[float, float, float]] = []
     ground_rings = []
     for unturned in boundary_rings(building.faces):
@@ -77,6 +90,26 @@ def building_solid(building: Building, origin: tuple[float, float, float] = (0.0
     ground_rings.sort(key=lambda ring: -float(np.ptp(vertices[list(ring), 0])))
     faces.append(SolidFace(rings=tuple(ground_rings), kind=FaceKind.GROUND))
     return Solid(vertices=np.round(vertices, 3), faces=tuple(faces))
+
+
+def has_steps(building: Building) -> bool:
+    """Whether a roof face stands over another's edge: two vertices over one place."""
+    plan = np.round(building.vertices[:, :2] * 1e6)
+    return len(np.unique(plan, axis=0)) < len(plan)
+
+
+def _stepped_solid(building: Building, origin: tuple[float, float, float]) -> Solid:
+    """The solid of a roof with steps, by the extrusion of the roof models: levels of all faces over each vertex."""
+    plan = np.rint((building.vertices[:, :2] - np.array(origin[:2])) * 1000.0)
+    polygons = tuple(
+        shapely.Polygon(plan[list(face[0])], [plan[list(hole)] for hole in face[1:]]) for face in building.faces
+    )
+    partition = RoofPartition(polygons=polygons, labels=np.arange(len(polygons), dtype=np.int32))
+    planes = [moved_plane(plane, origin) for plane in building.planes]
+    parts = solid_parts(partition, planes, building.floor_z_m - origin[2])
+    if len(parts) != 1:
+        raise ValueError(f"{building.building_id}: the roof falls into {len(parts)} parts that share no edge")
+    return parts[0].solid
 
 
 def moved_plane(plane: Plane, origin: tuple[float, float, float]) -> Plane:

@@ -9,9 +9,14 @@ import numpy as np
 
 from pipeline.errors import SettingsError
 from pipeline.synthetic.als import ScannerSettings
-from pipeline.synthetic.roofs import RoofDimensions, RoofShape
+from pipeline.synthetic.city import CITY_SCANNER, TILE_M, CityPlan, Extent, city
+from pipeline.synthetic.hofmann310 import SCANNER as HOFMANN_SCANNER
+from pipeline.synthetic.hofmann310 import hofmann310
+from pipeline.synthetic.roofs import FlatPart, RoofDimensions, RoofShape
 from pipeline.synthetic.scene import Scene, Terrain, place_building, undulating_terrain
 from pipeline.synthetic.suburb import suburb, tree_at
+from pipeline.synthetic.sweep import CELLS, Cell, sweep
+from pipeline.synthetic.sweep import SCANNER as SWEEP_SCANNER
 from pipeline.synthetic.town import town
 
 
@@ -31,6 +36,17 @@ class Suite:
     """Default extent east and north."""
     seed: int
     """Default seed."""
+    is_sized: bool = True
+    """False where the extent follows from the buildings: `size_m` is then about what comes, and has no say."""
+    last_returns_only: bool = False
+    """Whether the instrument records the last return only."""
+    cells: tuple[Cell, ...] = ()
+    """The surveys of a suite of several; empty where there is one."""
+    part: Callable[[int, tuple[float, float], ScannerSettings], Callable[[Extent], Scene]] | None = None
+    """From seed, size and survey to a function that makes the scene as a tile of that extent sees it; None where the
+    scene is made as a whole."""
+    tile_m: float = 0.0
+    """Edge of the tiles of a suite that is made in parts."""
 
 
 def _suburb(seed: int, size_m: tuple[float, float]) -> Scene:
@@ -39,6 +55,24 @@ def _suburb(seed: int, size_m: tuple[float, float]) -> Scene:
 
 def _town(seed: int, size_m: tuple[float, float]) -> Scene:
     return town(seed, size_m=size_m)
+
+
+def _hofmann310(seed: int, size_m: tuple[float, float]) -> Scene:
+    del size_m
+    return hofmann310(seed)
+
+
+def _sweep(seed: int, size_m: tuple[float, float]) -> Scene:
+    del size_m
+    return sweep(seed)
+
+
+def _city(seed: int, size_m: tuple[float, float]) -> Scene:
+    return city(seed, size_m=size_m)
+
+
+def _city_part(seed: int, size_m: tuple[float, float], settings: ScannerSettings) -> Callable[[Extent], Scene]:
+    return CityPlan(seed, size_m, settings).part
 
 
 def _cube(seed: int, size_m: tuple[float, float]) -> Scene:
@@ -61,6 +95,30 @@ _SINGLE_SIZES = {
     RoofShape.GABLE: RoofDimensions(length_m=13.0, width_m=9.0, pitch_deg=35.0),
     RoofShape.HIP: RoofDimensions(length_m=14.0, width_m=9.0, pitch_deg=35.0),
     RoofShape.L_SHAPE: RoofDimensions(length_m=15.0, width_m=9.0, pitch_deg=35.0, wing_length_m=6.0, wing_width_m=7.0),
+    RoofShape.HALF_HIP: RoofDimensions(length_m=14.0, width_m=9.0, pitch_deg=40.0),
+    RoofShape.BENT_HIP: RoofDimensions(length_m=15.0, width_m=10.0, pitch_deg=40.0, second_pitch_deg=25.0),
+    RoofShape.PYRAMID: RoofDimensions(length_m=10.0, width_m=10.0, pitch_deg=30.0),
+    RoofShape.UNEQUAL_GABLE: RoofDimensions(length_m=13.0, width_m=9.0, pitch_deg=45.0, second_pitch_deg=25.0),
+    RoofShape.MANSARD: RoofDimensions(length_m=16.0, width_m=11.0, pitch_deg=60.0, second_pitch_deg=20.0),
+    RoofShape.GAMBREL: RoofDimensions(
+        length_m=14.0, width_m=10.0, pitch_deg=55.0, second_pitch_deg=25.0, break_share=0.45
+    ),
+    RoofShape.T_SHAPE: RoofDimensions(
+        length_m=18.0, width_m=9.0, pitch_deg=35.0, wing_length_m=6.0, wing_width_m=7.0, wing_offset_m=2.0
+    ),
+    RoofShape.U_SHAPE: RoofDimensions(length_m=24.0, width_m=9.0, pitch_deg=35.0, wing_length_m=8.0, wing_width_m=7.5),
+    RoofShape.CROSS: RoofDimensions(
+        length_m=20.0, width_m=9.0, pitch_deg=35.0, wing_length_m=5.0, wing_width_m=8.0, wing_offset_m=1.0
+    ),
+    RoofShape.COURTYARD: RoofDimensions(length_m=26.0, width_m=22.0, pitch_deg=30.0, wing_width_m=7.0),
+    RoofShape.MULTI_LEVEL_FLAT: RoofDimensions(
+        length_m=18.0,
+        width_m=12.0,
+        levels=(
+            FlatPart(u_m=-3.0, v_m=0.0, length_m=12.0, width_m=12.0, height_m=3.0),
+            FlatPart(u_m=6.0, v_m=0.0, length_m=6.0, width_m=12.0, height_m=0.0),
+        ),
+    ),
 }
 
 
@@ -164,6 +222,36 @@ SUITES: dict[str, Suite] = {
             scanner=_CUBE_SCANNER,
             size_m=(30.0, 30.0),
             seed=1,
+        ),
+        Suite(
+            name="hofmann310",
+            summary="the 310 buildings of Hofmann, Maas and Streilein: types, sizes, 1.2 m spacing, nuisances",
+            make=_hofmann310,
+            scanner=HOFMANN_SCANNER,
+            size_m=(700.0, 700.0),
+            seed=1,
+            is_sized=False,
+            last_returns_only=True,
+        ),
+        Suite(
+            name="sweep",
+            summary="all roof shapes under 21 surveys: 0.5 to 50 pulses a m2, 2 to 10 cm of noise; a data set each",
+            make=_sweep,
+            scanner=SWEEP_SCANNER,
+            size_m=(300.0, 250.0),
+            seed=1,
+            is_sized=False,
+            cells=CELLS,
+        ),
+        Suite(
+            name="city",
+            summary="rows, courtyards, halls, towers and houses of all shapes up to a hillside, of any size, in tiles",
+            make=_city,
+            scanner=CITY_SCANNER,
+            size_m=(1000.0, 1000.0),
+            seed=1,
+            part=_city_part,
+            tile_m=TILE_M,
         ),
         *(_single_suite(shape) for shape in RoofShape),
     )

@@ -15,9 +15,9 @@ import pytest
 import shapely
 
 from pipeline.errors import InputError, SettingsError
+from pipeline.evaluation.reading import read_models
 from pipeline.io import open_source
-from pipeline.report.roof_models import read_roof_models
-from pipeline.report.truth_score import score_against_truth
+from pipeline.synthetic.conditions import CONDITIONS
 from pipeline.synthetic.dataset import ScenePaths, read_truth, simulate
 from pipeline.synthetic.suites import SUITES
 
@@ -68,7 +68,7 @@ def test_labels_stand_in_the_order_of_the_points(made: ScenePaths) -> None:
     xyz = laspy.read(made.laz).xyz
     truth = read_truth(made.truth)
     assert len(truth.classification) == len(xyz)
-    models = {model.building_id: model for model in read_roof_models(made.truth)}
+    models = {model.building_id: model for model in read_models(made.truth).models}
     assert sorted(models) == list(truth.building_ids)
     for number, name in enumerate(truth.building_ids):
         mine = (truth.building == number) & (truth.face >= 0) & ~truth.mixed
@@ -81,7 +81,7 @@ def test_labels_stand_in_the_order_of_the_points(made: ScenePaths) -> None:
 
 def test_the_truth_is_a_run_directory_of_the_exact_models(made: ScenePaths) -> None:
     scene = SUITES["suburb"].make(5, SIZE)
-    models = read_roof_models(made.truth)
+    models = read_models(made.truth).models
     assert made.buildings == len(models) == len(scene.buildings)
     for model, building in zip(models, sorted(scene.buildings, key=lambda b: b.building_id), strict=True):
         outline = shapely.transform(building.footprint, lambda xy: xy + np.array(scene.origin[:2]))
@@ -93,11 +93,32 @@ def test_the_truth_is_a_run_directory_of_the_exact_models(made: ScenePaths) -> N
     assert (made.truth / "meshes" / "part00000" / "part00000.obj").read_text().count("\no ") == len(models)
 
 
-def test_the_truth_scored_against_itself_is_perfect(made: ScenePaths) -> None:
-    models = read_roof_models(made.truth)
-    score = score_against_truth(models, models, sample_m=0.5)
-    assert all(one.type_right and one.iou > 0.999 and one.within_good == 1.0 for one in score.buildings)
-    assert score.rmse_m < 1e-9
+def test_the_conditions_tell_shape_slope_and_the_groups_of_the_faces(made: ScenePaths) -> None:
+    scene = SUITES["suburb"].make(5, SIZE)
+    table = pq.read_table(made.truth / "conditions.parquet")
+    assert table.schema.equals(CONDITIONS)
+    rows = table.to_pylist()
+    assert [row["building_id"] for row in rows] == sorted(one.building_id for one in scene.buildings)
+    buildings = {one.building_id: one for one in scene.buildings}
+    for row in rows:
+        building = buildings[row["building_id"]]
+        assert (row["shape"], row["roof_type"], row["good"]) == (str(building.shape), str(building.roof_type), True)
+        assert row["groups"] == list(range(len(building.planes)))
+        assert row["pitch_deg"] == building.dimensions.pitch_deg
+        ahead = scene.terrain.elevation(building.x + np.array([0.0, 1.0, 0.0]), building.y + np.array([0.0, 0.0, 1.0]))
+        slope = np.degrees(np.arctan(np.hypot(ahead[1] - ahead[0], ahead[2] - ahead[0])))
+        assert row["terrain_slope_deg"] == pytest.approx(float(slope), abs=0.1)
+
+
+def test_the_manifest_lists_the_tile_with_its_points_and_bounds(made: ScenePaths) -> None:
+    manifest = json.loads((made.truth / "scene.json").read_text())
+    (tile,) = manifest["tiles"]
+    header = laspy.open(made.laz).header
+    assert (made.truth / tile["laz"]).resolve() == made.laz.resolve()
+    assert made.truth / tile["labels"] == made.labels
+    assert tile["points"] == manifest["points"] == header.point_count
+    assert tile["bounds"] == pytest.approx([*header.mins[:2], *header.maxs[:2]], abs=1e-6)
+    assert manifest["split"] is None
 
 
 def test_the_same_call_gives_the_same_bytes_whatever_the_chunks(made: ScenePaths, tmp_path: Path) -> None:
@@ -118,7 +139,7 @@ def test_density_and_noise_can_be_chosen(tmp_path: Path) -> None:
     assert told[-1] == paths.points
     assert told == sorted(told)
     assert len(told) > 2
-    truth, models = read_truth(paths.truth), read_roof_models(paths.truth)
+    truth, models = read_truth(paths.truth), read_models(paths.truth).models
     roof = (truth.face >= 0) & ~truth.mixed
     x, y, z = laspy.read(paths.laz).xyz[roof].T
     assert np.nanmedian(np.abs(z - models[0].top(x, y))) < 0.001
@@ -128,7 +149,7 @@ def test_density_and_noise_can_be_chosen(tmp_path: Path) -> None:
 def test_buildings_cut_by_the_end_of_the_data_are_marked(tmp_path: Path) -> None:
     paths = simulate("town", tmp_path, 11, size_m=(120.0, 100.0), density_per_m2=1.0)
     edge = shapely.box(566_000, 5_935_000, 566_120, 5_935_100)
-    models = read_roof_models(paths.truth)
+    models = read_models(paths.truth).models
     assert {m.touches_data_edge for m in models} == {True, False}
     for model in models:
         assert model.touches_data_edge != edge.contains(model.footprint)
@@ -143,7 +164,7 @@ def test_a_tile_without_a_crs_says_so(tmp_path: Path) -> None:
 
 def test_unknown_suites_and_impossible_sizes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        SettingsError, match=r"suite is 'subrub': use one of suburb, town, cube, flat, pent, gable, hip"
+        SettingsError, match=r"suite is 'subrub': use one of suburb, town, cube, hofmann310, sweep, city, flat"
     ):
         simulate("subrub", tmp_path)
     with pytest.raises(SettingsError, match=r"size is 5 m.*; seed is -1"):

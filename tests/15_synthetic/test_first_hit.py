@@ -14,10 +14,8 @@ from pipeline.synthetic.first_hit import (
     ROOF,
     TREE,
     WALL,
-    cell_of,
-    first_hit,
+    hits_of_lines,
     mixed_bits,
-    terrain_hit,
     top_surface,
     uniform_of,
 )
@@ -63,22 +61,19 @@ def test_the_surface_is_that_of_the_solids_faces(scene: Scene) -> None:
 @pytest.mark.parametrize("scene", [SUBURB, TOWN], ids=["suburb", "town"])
 def test_a_leaning_line_hits_where_walking_down_along_it_ends(scene: Scene) -> None:
     """The twin walks down in steps of 4 mm until the surface is above it."""
-    random, kinds, step = np.random.default_rng(4), set(), 0.004
-    arrays = scene_arrays(scene, max_lean=0.45)
+    random, step = np.random.default_rng(4), 0.004
     buildings = [b for b in scene.buildings if 25 < b.x < 95 and 25 < b.y < 95]
-    for _ in range(120):
-        target = buildings[int(random.integers(len(buildings)))]
-        lean_x, lean_y = random.uniform(-0.3, 0.3, 2)
-        start_x, start_y = random.uniform(-9, 9, 2) + np.array([target.x, target.y])
-        x, y, z = terrain_hit(arrays, start_x, start_y, arrays.terrain[0], lean_x, lean_y)
-        assert scene.terrain.elevation(np.array([x]), np.array([y]))[0] == pytest.approx(z, abs=1e-5)
-        got, kind, _, _ = first_hit(arrays, cell_of(arrays, x, y), x, y, z, lean_x, lean_y, np.uint64(0), -1)
-        heights = np.arange(25.0, -0.1, -step)
-        top = top_surface(scene, x + heights * lean_x, y + heights * lean_y).z
-        walked = z + heights[np.argmax(top >= z + heights)]
-        assert got == pytest.approx(walked, abs=0.05 if kind == GROUND else step * 2.5)
-        kinds.add(kind)
-    assert {GROUND, ROOF, WALL} <= kinds
+    targets = [buildings[int(random.integers(len(buildings)))] for _ in range(120)]
+    leans = random.uniform(-0.3, 0.3, (120, 2))
+    starts = random.uniform(-9, 9, (120, 2)) + np.array([(b.x, b.y) for b in targets])
+    places = np.column_stack([starts, np.full(120, scene.terrain.base_z_m)])
+    hits = hits_of_lines(scene_arrays(scene, max_lean=0.45), places, leans)
+    for start, (lean_x, lean_y), z, kind in zip(places, leans, hits.z, hits.kind, strict=True):
+        heights = np.arange(28.0, -4.0, -step)
+        x, y = start[0] + heights * lean_x, start[1] + heights * lean_y
+        walked = start[2] + heights[np.argmax(top_surface(scene, x, y).z >= start[2] + heights)]
+        assert z == pytest.approx(walked, abs=0.05 if kind == GROUND else step * 2.5)
+    assert {GROUND, ROOF, WALL} <= set(hits.kind.tolist())
 
 
 def test_a_crown_lets_beams_pass_as_the_law_of_attenuation_says() -> None:
@@ -92,12 +87,11 @@ def test_a_crown_lets_beams_pass_as_the_law_of_attenuation_says() -> None:
         buildings=(),
         trees=(tree,),
     )
-    arrays = scene_arrays(scene)
-    cell, tries = cell_of(arrays, 10.0, 10.0), 20_000
-    hits = [
-        first_hit(arrays, cell, 10.0, 10.0, 0.0, 0.0, 0.0, np.uint64(mixed_bits(np.uint64(k))), 0) for k in range(tries)
-    ]
-    depth = 10.0 - np.array([z for z, kind, _, _ in hits if kind == TREE])
+    tries = 20_000
+    states = np.array([mixed_bits(np.uint64(k)) for k in range(tries)], np.uint64)
+    places = np.tile([10.0, 10.0, 0.0], (tries, 1))
+    hits = hits_of_lines(scene_arrays(scene), places, np.zeros((tries, 2)), states)
+    depth = 10.0 - hits.z[hits.kind == TREE]
     assert len(depth) / tries == pytest.approx(1 - math.exp(-4.0 / 2.5), abs=0.015)
     assert depth.min() >= 0
     assert depth.max() <= 4.0

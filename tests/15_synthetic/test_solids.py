@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 import shapely
 
-from pipeline.model import FaceKind, RoofType
+from pipeline.model import FaceKind, RoofType, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.synthetic.roofs import ROOF_TYPES, ROOFS, RoofDimensions, RoofShape
-from pipeline.synthetic.scene import Building, Terrain, place_building, undulating_terrain
-from pipeline.synthetic.solids import building_solid, truth_record
+from pipeline.synthetic.additions import random_dormers, random_superstructures
+from pipeline.synthetic.random_dimensions import random_dimensions
+from pipeline.synthetic.roofs import (
+    ROOF_TYPES,
+    ROOFS,
+    Addition,
+    AdditionKind,
+    FlatPart,
+    RoofDimensions,
+    RoofShape,
+)
+from pipeline.synthetic.scene import Building, Defect, Terrain, WetSpot, place_building, undulating_terrain
+from pipeline.synthetic.solids import building_solid, has_steps, truth_record
 from pipeline.synthetic.suites import SUITES
 
 SIZES = {
@@ -49,23 +60,67 @@ def roof_volume(shape: RoofShape) -> float:
     return gable + out * wing * wing / 4 * slope + (wing * wing / 4 * slope) * (wing / 2) / 3
 
 
-def signed_volume(building: Building) -> float:
-    """Volume of the solid by the divergence theorem, from fans of its faces."""
-    solid = building_solid(building, (51.0, 47.0, 30.0))
+def drawn(shape: RoofShape, seed: int, *, furnished: bool) -> Building:
+    """A building anywhere, of any size, with or without dormers and boxes, on a slope."""
+    random = np.random.default_rng([seed, list(RoofShape).index(shape)])
+    size = random_dimensions(shape, random)
+    if furnished:
+        dormers = random_dormers(shape, size, random)
+        boxes = random_superstructures(shape, size, random, besides=dormers)
+        size = dataclasses.replace(size, additions=dormers + boxes)
+    x, y, azimuth_deg = (float(value) for value in random.uniform((0, 0, 0), (2000, 2000, 360)))
+    slope = undulating_terrain(30.0, float(random.uniform(0, 25)), 140.0, 1.0, 60.0, random)
+    return place_building("drawn", shape, size, x=x, y=y, azimuth_deg=azimuth_deg, eave_height_m=3.0, terrain=slope)
+
+
+def signed_volume(solid: Solid) -> float:
+    """Volume by the divergence theorem: a third of corner times area vector, over all faces."""
     total = 0.0
     for face in solid.faces:
-        (ring,) = face.rings
-        corners = solid.vertices[list(ring)]
-        for k in range(1, len(corners) - 1):
-            total += float(corners[0] @ np.cross(corners[k], corners[k + 1])) / 6
+        first = solid.vertices[face.rings[0][0]]
+        for ring in face.rings:
+            corners = solid.vertices[list(ring)]
+            area = np.cross(corners - first, np.roll(corners, -1, axis=0) - first).sum(axis=0) / 2
+            total += float(first @ area) / 3
     return total
 
 
-@pytest.mark.parametrize("shape", list(RoofShape))
+@pytest.mark.parametrize("shape", list(SIZES))
 @pytest.mark.parametrize("azimuth_deg", [0.0, 33.0, 90.0, 217.5])
 def test_every_shape_is_a_valid_solid_wherever_it_looks(shape: RoofShape, azimuth_deg: float) -> None:
     slope = undulating_terrain(30.0, 12.0, 140.0, 1.0, 60.0, np.random.default_rng(3))
     assert check_solid(building_solid(placed(shape, azimuth_deg, slope))) == ()
+
+
+@pytest.mark.parametrize("shape", list(RoofShape))
+@pytest.mark.parametrize("furnished", [False, True], ids=["bare", "furnished"])
+def test_buildings_of_any_size_are_valid_wherever_they_look(shape: RoofShape, furnished: bool) -> None:
+    for seed in range(3):
+        (solid,) = truth_record(drawn(shape, seed, furnished=furnished), (0.0, 0.0, 0.0)).solids
+        assert check_solid(solid) == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", list(RoofShape))
+@pytest.mark.parametrize("furnished", [False, True], ids=["bare", "furnished"])
+def test_fifty_buildings_of_every_shape_are_valid(shape: RoofShape, furnished: bool) -> None:
+    for seed in range(100, 150):
+        (solid,) = truth_record(drawn(shape, seed, furnished=furnished), (0.0, 0.0, 0.0)).solids
+        assert check_solid(solid) == (), seed
+
+
+@pytest.mark.parametrize("shape", list(RoofShape))
+@pytest.mark.parametrize("furnished", [False, True], ids=["bare", "furnished"])
+def test_the_volume_is_the_integral_of_the_roof_over_the_floor(shape: RoofShape, furnished: bool) -> None:
+    """The integral of a plane over a polygon is its area times the height at its centroid."""
+    for seed in range(3):
+        building = drawn(shape, seed, furnished=furnished)
+        integral = 0.0
+        for polygon, plane in zip(building.roof_polygons(), building.planes, strict=True):
+            middle = shapely.force_2d(polygon).centroid
+            integral += polygon.area * (plane.a * middle.x + plane.b * middle.y + plane.c - building.floor_z_m)
+        (solid,) = truth_record(building, (0.0, 0.0, 0.0)).solids
+        assert signed_volume(solid) == pytest.approx(integral, rel=5e-4)
 
 
 @pytest.mark.parametrize("name", ["suburb", "town"])
@@ -83,13 +138,14 @@ def test_all_buildings_of_a_suite_are_valid_and_none_overlap(name: str) -> None:
             assert shapely.intersection(outlines[a], outlines[b]).area < 1e-6
 
 
-@pytest.mark.parametrize("shape", list(RoofShape))
+@pytest.mark.parametrize("shape", list(SIZES))
 def test_the_solid_has_the_volume_of_the_formula(shape: RoofShape) -> None:
     body = placed(shape).footprint.area * 4.0
-    assert signed_volume(placed(shape)) == pytest.approx(body + roof_volume(shape), rel=5e-4)
+    solid = building_solid(placed(shape), (51.0, 47.0, 30.0))
+    assert signed_volume(solid) == pytest.approx(body + roof_volume(shape), rel=5e-4)
 
 
-@pytest.mark.parametrize("shape", list(RoofShape))
+@pytest.mark.parametrize("shape", list(SIZES))
 def test_roof_faces_cover_the_footprint_once_with_the_pitch_asked_for(shape: RoofShape) -> None:
     building = placed(shape)
     polygons = building.roof_polygons()
@@ -97,7 +153,7 @@ def test_roof_faces_cover_the_footprint_once_with_the_pitch_asked_for(shape: Roo
     assert sum(polygon.area for polygon in polygons) == pytest.approx(building.footprint.area)
     for plane, face in zip(building.planes, building.faces, strict=True):
         assert plane.slope_deg == pytest.approx(SIZES[shape].pitch_deg)
-        corners = building.vertices[list(face)]
+        corners = building.vertices[list(face[0])]
         assert np.allclose(plane.a * corners[:, 0] + plane.b * corners[:, 1] + plane.c, corners[:, 2], atol=1e-9)
 
 
@@ -110,10 +166,67 @@ def test_a_gable_wall_is_one_face_of_five_corners() -> None:
     assert sorted(len(face.rings[0]) for face in walls) == [4, 4, 5, 5]
 
 
+def test_inner_steps_get_walls_down_to_the_lower_roof() -> None:
+    size = RoofDimensions(
+        length_m=20.0,
+        width_m=10.0,
+        levels=(
+            FlatPart(u_m=-5.0, v_m=0.0, length_m=10.0, width_m=10.0, height_m=3.0),
+            FlatPart(u_m=5.0, v_m=-1.0, length_m=10.0, width_m=8.0, height_m=0.0),
+        ),
+    )
+    building = place_building(
+        "s", RoofShape.MULTI_LEVEL_FLAT, size, x=0.0, y=0.0, azimuth_deg=90.0, eave_height_m=4.0, terrain=LEVEL
+    )
+    assert has_steps(building)
+    solid = building_solid(building)
+    walls = [solid.vertices[list(face.rings[0])] for face in solid.faces if face.kind is FaceKind.WALL]
+    (inner,) = [wall for wall in walls if wall[:, 2].min() > 30.1]
+    assert sorted(set(inner[:, 2])) == [34.0, 37.0]
+    assert np.ptp(inner[:, 1]) == 8.0
+    assert signed_volume(solid) == pytest.approx(100.0 * 7.0 + 80.0 * 4.0)
+
+
+def test_a_roof_face_around_a_box_has_a_hole_in_record_and_solid() -> None:
+    shaft = Addition(kind=AdditionKind.BOX, u_m=1.0, v_m=0.5, length_m=2.0, width_m=3.0, height_m=1.5)
+    size = dataclasses.replace(SIZES[RoofShape.FLAT], additions=(shaft,))
+    building = place_building(
+        "h", RoofShape.FLAT, size, x=0.0, y=0.0, azimuth_deg=20.0, eave_height_m=4.0, terrain=LEVEL
+    )
+    record = truth_record(building, (0.0, 0.0, 0.0))
+    assert [len(face.polygon.interiors) for face in record.faces] == [1, 0]
+    assert [face.polygon.area for face in record.faces] == pytest.approx([82.0, 6.0], abs=0.02)
+    assert [len(face.rings) for face in record.solids[0].faces if face.kind is FaceKind.ROOF] == [2, 1]
+    assert record.footprint is not None
+    assert record.footprint.area == pytest.approx(88.0, abs=0.02)
+    assert signed_volume(record.solids[0]) == pytest.approx(88.0 * 4.0 + 6.0 * 1.5, rel=5e-4)
+
+
+def test_a_courtyard_is_a_hole_in_footprint_and_floor() -> None:
+    size = RoofDimensions(length_m=24.0, width_m=20.0, pitch_deg=30.0, wing_width_m=6.0)
+    building = place_building(
+        "c", RoofShape.COURTYARD, size, x=5.0, y=5.0, azimuth_deg=20.0, eave_height_m=4.0, terrain=LEVEL
+    )
+    assert not has_steps(building)
+    record = truth_record(building, (0.0, 0.0, 0.0))
+    assert isinstance(record.footprint, shapely.Polygon)
+    assert [shapely.Polygon(hole).area for hole in record.footprint.interiors] == pytest.approx([96.0], abs=0.02)
+    (floor,) = [face for face in record.solids[0].faces if face.kind is FaceKind.GROUND]
+    assert [len(ring) for ring in floor.rings] == [4, 4]
+
+
+def test_defects_decide_whether_a_building_is_good() -> None:
+    building = placed(RoofShape.GABLE)
+    assert building.is_good
+    spot = WetSpot(x=51.0, y=48.0, radius_m=2.0)
+    wet = dataclasses.replace(building, wet_spots=(spot,), defects=(Defect.WET_SPOT,))
+    assert not wet.is_good
+
+
 def test_a_square_hip_roof_is_a_pyramid() -> None:
     size = RoofDimensions(length_m=8.0, width_m=8.0, pitch_deg=30.0)
     building = place_building("p", RoofShape.HIP, size, x=0, y=0, azimuth_deg=0, eave_height_m=3, terrain=LEVEL)
-    assert [len(face) for face in building.faces] == [3, 3, 3, 3]
+    assert [len(face[0]) for face in building.faces] == [3, 3, 3, 3]
     assert check_solid(building_solid(building)) == ()
 
 

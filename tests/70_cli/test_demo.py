@@ -24,21 +24,27 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     return folder, json.loads(result.stdout)
 
 
+def figures(told: dict[str, Any]) -> dict[str, float]:
+    """The measures over all buildings by name."""
+    return {row["name"]: row["value"] for row in told["measures"] if row["subset"] == "all"}
+
+
 def test_every_house_is_found_and_nothing_else(made: tuple[Path, dict[str, Any]]) -> None:
-    score = made[1]["score"]
-    found, houses = score["buildings found (IoU >= 0.5)"].split(" of ")
-    assert found == houses
-    assert int(houses) >= 5
-    assert score["models where no building is"] == "0"
+    measured = figures(made[1])
+    houses = next(row["n"] for row in made[1]["measures"] if row["name"] == "delivery.lod2")
+    assert houses >= 5
+    assert measured["delivery.lod2"] == 1.0
+    assert measured["delivery.false_models"] == 0
 
 
 def test_the_roofs_lie_where_they_are(made: tuple[Path, dict[str, Any]]) -> None:
-    assert float(made[1]["score"]["vertical difference, median"].split(" ")[0]) < 0.05
+    assert figures(made[1])["surface.median"] < 0.05
 
 
 def test_what_the_demo_points_at_is_there(made: tuple[Path, dict[str, Any]]) -> None:
     folder, told = made
     assert Path(told["picture"]).read_bytes().startswith(b"\x89PNG")
+    assert "</html>" in (folder / "report" / "report.html").read_text()
     assert (folder / "scene" / "suburb.laz").is_file()
     assert len(list((folder / "run" / "meshes").glob("*/*.obj"))) == told["statuses"]["ok"] + told["statuses"].get(
         "fallback", 0
@@ -60,7 +66,9 @@ def test_one_process_gives_the_same_content_as_two_workers(made: tuple[Path, dic
     assert json.loads(result.stdout)["digest"] == told["digest"]
 
 
-def test_the_same_picture_and_score_come_from_the_run_alone(made: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_the_same_picture_and_figures_come_from_the_run_alone(
+    made: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
     folder, told = made
     picture = tmp_path / "again.png"
     words = [
@@ -73,5 +81,5 @@ def test_the_same_picture_and_score_come_from_the_run_alone(made: tuple[Path, di
         "--json",
     ]
     result = CliRunner().invoke(app, words)
-    assert json.loads(result.stdout)["score"] == told["score"]
+    assert json.loads(result.stdout)["measures"] == told["measures"]
     assert picture.read_bytes() == (folder / "demo.png").read_bytes()

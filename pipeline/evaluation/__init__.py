@@ -1,0 +1,1 @@
+"""The ruler: models of any origin measured against true models or against classified points."""

@@ -1,0 +1,135 @@
+"""Percentile bootstrap (Efron 1979) of figures that are functions of sums over independent units.
+
+A unit is a building, or a block of raster cells: what lies within one is correlated, so units are drawn, never points.
+Every figure here is a function of sums over the units (a share is a ratio of two, a quantile follows from summed
+histograms), so a resample is a vector of weights and thousands of them are one matrix product.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from pipeline.model import FloatArray
+
+DRAWS = 1000
+"""Resamples."""
+CONFIDENCE = 0.95
+"""Share of the resamples inside the interval."""
+_SEED = 20_030_117
+_ROWS_A_BLOCK = 64
+_LEAST_UNITS = 2
+
+Sums = Mapping[str, FloatArray]
+Statistic = Callable[[Sums], FloatArray]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A figure and its interval."""
+
+    value: float
+    """Of the units as they are."""
+    low: float
+    """Lower end; nan with fewer than two units."""
+    high: float
+    """Upper end."""
+
+
+def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws: int = DRAWS) -> Estimate:
+    """A figure with its percentile interval.
+
+    Parameters
+    ----------
+    columns : mapping of name to (units,) or (units, k) float64
+        What is summed over the units.
+    statistic : callable
+        From sums, each (draws,) or (draws, k), to the figure, (draws,); nan where it is undefined.
+    draws : int
+        Resamples.
+
+    Returns
+    -------
+    Estimate
+        The same for the same columns: the resamples are drawn from a fixed seed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> found = {"found": np.array([1.0, 1.0, 0.0, 1.0]), "all": np.ones(4)}
+    >>> estimate = bootstrap(found, ratio("found", "all"))
+    >>> estimate.value, estimate.low < 0.75 < estimate.high
+    (0.75, True)
+    """
+    arrays = {name: np.asarray(column, np.float64) for name, column in columns.items()}
+    units = {len(column) for column in arrays.values()}
+    if len(units) != 1:
+        raise ValueError(f"columns of a bootstrap have {sorted(units)} units: give one number")
+    count = units.pop()
+    whole = {name: column.sum(axis=0, keepdims=True) for name, column in arrays.items()}
+    value = float(_figures(statistic, whole)[0])
+    if count < _LEAST_UNITS:
+        return Estimate(value=value, low=math.nan, high=math.nan)
+    random = np.random.default_rng(_SEED)
+    chances = np.full(count, 1.0 / count)
+    figures = []
+    for first in range(0, draws, _ROWS_A_BLOCK):
+        weights = random.multinomial(count, chances, size=min(_ROWS_A_BLOCK, draws - first)).astype(np.float64)
+        figures.append(_figures(statistic, {name: weights @ column for name, column in arrays.items()}))
+    drawn = np.concatenate(figures)
+    drawn = drawn[np.isfinite(drawn)]
+    if len(drawn) == 0:
+        return Estimate(value=value, low=math.nan, high=math.nan)
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low, high = np.quantile(drawn, [tail, 1.0 - tail])
+    return Estimate(value=value, low=float(low), high=float(high))
+
+
+def _figures(statistic: Statistic, sums: Sums) -> FloatArray:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(statistic(sums), np.float64)
+
+
+def ratio(numerator: str, denominator: str) -> Statistic:
+    """Sum of one column over the sum of another: shares and means."""
+
+    def statistic(sums: Sums) -> FloatArray:
+        return np.where(sums[denominator] > 0.0, sums[numerator] / sums[denominator], np.nan)
+
+    return statistic
+
+
+def root_mean(squares: str, count: str) -> Statistic:
+    """Root of the mean of squares."""
+    mean = ratio(squares, count)
+    return lambda sums: np.sqrt(mean(sums))
+
+
+def quality(both: str, reference: str, found: str) -> Statistic:
+    """TP / (TP + FP + FN): the quality of completeness and correctness that share their true positives."""
+
+    def statistic(sums: Sums) -> FloatArray:
+        union = sums[reference] + sums[found] - sums[both]
+        return np.where(union > 0.0, sums[both] / union, np.nan)
+
+    return statistic
+
+
+def quantile(histogram: str, edges: FloatArray, share: float) -> Statistic:
+    """A quantile from summed histograms (units, bins) over edges (bins + 1,), linear within the bin."""
+
+    def statistic(sums: Sums) -> FloatArray:
+        cumulated = np.cumsum(sums[histogram], axis=1)
+        total = cumulated[:, -1]
+        wanted = share * total
+        place = np.minimum((cumulated < wanted[:, None]).sum(axis=1), cumulated.shape[1] - 1)
+        rows = np.arange(len(place))
+        below = np.where(place > 0, cumulated[rows, place - 1], 0.0)
+        inside = np.maximum(cumulated[rows, place] - below, 1e-300)
+        position = np.clip((wanted - below) / inside, 0.0, 1.0)
+        return np.where(total > 0.0, edges[place] + position * (edges[place + 1] - edges[place]), np.nan)
+
+    return statistic

@@ -1,0 +1,329 @@
+"""The raster that detection is measured on: cells of 0.5 m, anchored at whole multiples of their side, in windows.
+
+A cell is building where class 6 is more than half of its points, closed twice and opened once by the 3 x 3 cross; a
+polygon fills the cells whose centres lie in it. Windows of 250 m keep a city in bounded memory.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+import shapely
+from numba import njit
+from shapely import MultiPolygon, Polygon
+
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
+
+CELL_M = 0.5
+"""Side of a cell."""
+WINDOW_CELLS = 500
+"""Side of a window."""
+_CLOSINGS = 2
+_REACH_CELLS = 2 * _CLOSINGS + 2
+"""How far closing and opening look."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, order=True)
+class CellWindow:
+    """A rectangle of cells, half-open. Cell (0, 0) begins at the origin of the CRS."""
+
+    row: int
+    """First row; rows grow north."""
+    column: int
+    """First column; columns grow east."""
+    rows: int = WINDOW_CELLS
+    """Number of rows."""
+    columns: int = WINDOW_CELLS
+    """Number of columns."""
+
+    def grown(self, cells: int) -> CellWindow:
+        """With a margin on all sides."""
+        return CellWindow(
+            row=self.row - cells,
+            column=self.column - cells,
+            rows=self.rows + 2 * cells,
+            columns=self.columns + 2 * cells,
+        )
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x_min, y_min, x_max, y_max in metres."""
+        return (
+            self.column * CELL_M,
+            self.row * CELL_M,
+            (self.column + self.columns) * CELL_M,
+            (self.row + self.rows) * CELL_M,
+        )
+
+
+def windows_over(bounds: Sequence[float]) -> Iterator[CellWindow]:
+    """The windows of the lattice that meet x_min, y_min, x_max, y_max, row by row."""
+    side = WINDOW_CELLS * CELL_M
+    for row in range(math.floor(bounds[1] / side), math.floor(bounds[3] / side) + 1):
+        for column in range(math.floor(bounds[0] / side), math.floor(bounds[2] / side) + 1):
+            yield CellWindow(row=row * WINDOW_CELLS, column=column * WINDOW_CELLS)
+
+
+def windows_of(bounds: FloatArray) -> list[CellWindow]:
+    """The windows that any of (n, 4) rectangles meets, or comes within a cell of, sorted."""
+    found: set[CellWindow] = set()
+    for x0, y0, x1, y1 in bounds.tolist():
+        found.update(windows_over((x0 - CELL_M, y0 - CELL_M, x1 + CELL_M, y1 + CELL_M)))
+    return sorted(found)
+
+
+# ------------------------------------------------------------------------------------------------------- morphology
+
+
+def dilated(cells: BoolArray) -> BoolArray:
+    """Grown by the 3 x 3 cross; nothing comes in from outside."""
+    grown = cells.copy()
+    grown[1:] |= cells[:-1]
+    grown[:-1] |= cells[1:]
+    grown[:, 1:] |= cells[:, :-1]
+    grown[:, :-1] |= cells[:, 1:]
+    return grown
+
+
+def eroded(cells: BoolArray) -> BoolArray:
+    """Shrunk by the 3 x 3 cross, but not from outside."""
+    return ~dilated(~cells)
+
+
+def edge_ring(cells: BoolArray) -> BoolArray:
+    """The cells on either side of the borders of what is set: dilation without erosion."""
+    return dilated(cells) & ~eroded(cells)
+
+
+def _cleaned(cells: BoolArray) -> BoolArray:
+    """Closed twice, opened once; right for cells `_REACH_CELLS` from the border."""
+    for step in (*[dilated] * _CLOSINGS, *[eroded] * _CLOSINGS, eroded, dilated):
+        cells = step(cells)
+    return cells
+
+
+# ---------------------------------------------------------------------------------------------------------- polygons
+
+
+@njit(cache=True, nogil=True)
+def _fill(
+    cells: BoolArray, edges: FloatArray, starts: IntArray, chosen: IntArray, x_min: float, y_min: float, cell: float
+) -> None:
+    """Set the cells whose centres lie in one of the chosen polygons: crossings of each row of centres, in pairs."""
+    rows, columns = cells.shape
+    for polygon in chosen:
+        first, last = starts[polygon], starts[polygon + 1]
+        low, high = np.inf, -np.inf
+        for e in range(first, last):
+            low = min(low, edges[e, 1], edges[e, 3])
+            high = max(high, edges[e, 1], edges[e, 3])
+        crossings = np.empty(last - first)
+        r0 = max(0, math.floor((low - y_min) / cell - 0.5))
+        r1 = min(rows - 1, math.ceil((high - y_min) / cell))
+        for r in range(r0, r1 + 1):
+            y = (r + 0.5) * cell
+            n = 0
+            for e in range(first, last):
+                y0 = edges[e, 1] - y_min
+                y1 = edges[e, 3] - y_min
+                if (y0 > y) == (y1 > y):
+                    continue
+                x0 = edges[e, 0] - x_min
+                x1 = edges[e, 2] - x_min
+                if y0 > y1:
+                    x0, x1 = x1, x0
+                    y0, y1 = y1, y0
+                crossings[n] = x0 + (y - y0) * (x1 - x0) / (y1 - y0)
+                n += 1
+            crossings[:n].sort()
+            for k in range(0, n - 1, 2):
+                c0 = max(0, math.ceil(crossings[k] / cell - 0.5))
+                c1 = min(columns, math.ceil(crossings[k + 1] / cell - 0.5))
+                for c in range(c0, c1):
+                    cells[r, c] = True
+
+
+class PlanRaster:
+    """Polygons as a raster, window by window.
+
+    Parameters
+    ----------
+    polygons : sequence of shapely Polygon or MultiPolygon
+        Metres; together they are one set of cells.
+    """
+
+    def __init__(self, polygons: Sequence[Polygon | MultiPolygon]) -> None:
+        parts, owner = shapely.get_parts(np.asarray(polygons, dtype=object), return_index=True)
+        rings, part = shapely.get_rings(parts, return_index=True)
+        xy, ring = shapely.get_coordinates(rings, return_index=True)
+        joined = ring[:-1] == ring[1:]
+        self._edges = np.ascontiguousarray(np.hstack((xy[:-1][joined], xy[1:][joined]))).reshape(-1, 4)
+        face = owner[part[ring[:-1][joined]]]
+        self._starts = np.searchsorted(face, np.arange(len(polygons) + 1)).astype(np.int64)
+        self._tree = shapely.STRtree(polygons)
+
+    def window(self, window: CellWindow) -> BoolArray:
+        """(rows, columns) bool, True for cells whose centre lies in a polygon: borders count at their lower left."""
+        cells = np.zeros((window.rows, window.columns), np.bool_)
+        chosen = np.sort(self._tree.query(shapely.box(*window.bounds))).astype(np.int64)
+        if len(chosen):
+            _fill(cells, self._edges, self._starts, chosen, window.bounds[0], window.bounds[1], CELL_M)
+        return cells
+
+
+# ------------------------------------------------------------------------------------------------------------ points
+
+
+@njit(cache=True, nogil=True)
+def _window_keys(x: FloatArray, y: FloatArray, cell: float, side: int) -> IntArray:
+    """Window that holds each point, row and column in one number."""
+    keys = np.empty(len(x), np.int64)
+    for i in range(len(x)):
+        keys[i] = (math.floor(y[i] / cell) // side << 32) + math.floor(x[i] / cell) // side
+    return keys
+
+
+@njit(cache=True, nogil=True)
+def _vote(
+    balance: LabelArray, slot: IntArray, x: FloatArray, y: FloatArray, counted: BoolArray, cell: float, side: int
+) -> None:
+    """Add one for each counted point to its cell, take one away for each other."""
+    for i in range(len(x)):
+        row = math.floor(y[i] / cell) % side
+        column = math.floor(x[i] / cell) % side
+        balance[slot[i], row, column] += 1 if counted[i] else -1
+
+
+class PointRaster:
+    """Which cells are building by the classes of points, added tile by tile.
+
+    Of a cell only the balance is kept: points of buildings less the others. A window becomes bits as soon as no
+    further tile reaches it.
+    """
+
+    def __init__(self) -> None:
+        self._open: dict[tuple[int, int], LabelArray] = {}
+        self._done: dict[tuple[int, int], np.ndarray[tuple[int], np.dtype[np.uint8]]] = {}
+
+    def add(self, xyz: FloatArray, is_building: BoolArray) -> None:
+        """Count the points of a tile, (n, 3) metres and (n,) bool."""
+        x, y = np.ascontiguousarray(xyz[:, 0]), np.ascontiguousarray(xyz[:, 1])
+        keys, slot = np.unique(_window_keys(x, y, CELL_M, WINDOW_CELLS), return_inverse=True)
+        balance = np.zeros((len(keys), WINDOW_CELLS, WINDOW_CELLS), np.int32)
+        _vote(balance, slot.astype(np.int64), x, y, is_building, CELL_M, WINDOW_CELLS)
+        for place, votes in zip(keys.tolist(), balance, strict=True):
+            row, column = (place + (1 << 31)) >> 32, ((place + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
+            if (row, column) in self._open:
+                self._open[row, column] += votes
+            else:
+                self._open[row, column] = votes.copy()
+
+    def finish(self, still_to_come: Sequence[Sequence[float]] = ()) -> None:
+        """Close the windows that none of the tiles to come reaches; x_min, y_min, x_max, y_max of each of those."""
+        side = WINDOW_CELLS * CELL_M
+        for row, column in list(self._open):
+            x0, y0 = column * side - CELL_M, row * side - CELL_M
+            x1, y1 = x0 + side + 2 * CELL_M, y0 + side + 2 * CELL_M
+            if not any(b[0] <= x1 and b[2] >= x0 and b[1] <= y1 and b[3] >= y0 for b in still_to_come):
+                self._done[row, column] = np.packbits(self._open.pop((row, column)) > 0)
+
+    def window(self, window: CellWindow) -> BoolArray:
+        """(rows, columns) bool, True where buildings have more than half of the points, closed and opened.
+
+        Every tile must have been added and finished.
+        """
+        inner = window.grown(_REACH_CELLS)
+        cells = np.zeros((inner.rows, inner.columns), np.bool_)
+        for place in windows_over(
+            (*inner.bounds[:2], inner.bounds[2] - CELL_M, inner.bounds[3] - CELL_M),
+        ):
+            bits = self._done.get((place.row // WINDOW_CELLS, place.column // WINDOW_CELLS))
+            if bits is None:
+                continue
+            block = np.unpackbits(bits, count=WINDOW_CELLS**2).astype(np.bool_).reshape(WINDOW_CELLS, WINDOW_CELLS)
+            r0, r1 = max(place.row, inner.row), min(place.row + WINDOW_CELLS, inner.row + inner.rows)
+            c0, c1 = max(place.column, inner.column), min(place.column + WINDOW_CELLS, inner.column + inner.columns)
+            cells[r0 - inner.row : r1 - inner.row, c0 - inner.column : c1 - inner.column] = block[
+                r0 - place.row : r1 - place.row, c0 - place.column : c1 - place.column
+            ]
+        return _cleaned(cells)[_REACH_CELLS:-_REACH_CELLS, _REACH_CELLS:-_REACH_CELLS]
+
+    def outlines(self) -> list[Polygon]:
+        """The exact outlines of what hangs together over the sides of cells, with holes; from the south west."""
+        return outlines_of(self._runs())
+
+    def _runs(self) -> IntArray:
+        """(n, 3) int64, row, first column and the column behind the last of every run of set cells in a window."""
+        found = [np.zeros((0, 3), np.int64)]
+        # closing reaches into windows that no point lies in
+        places = {(row + i, column + j) for row, column in self._done for i in (-1, 0, 1) for j in (-1, 0, 1)}
+        for row, column in sorted(places):
+            window = CellWindow(row=row * WINDOW_CELLS, column=column * WINDOW_CELLS)
+            cells = self.window(window)
+            if cells.any():
+                steps = np.diff(np.pad(cells.astype(np.int8), ((0, 0), (1, 1))), axis=1)
+                starts, ends = np.nonzero(steps == 1), np.nonzero(steps == -1)
+                columns = window.column + np.column_stack((starts[1], ends[1]))
+                found.append(np.column_stack((window.row + starts[0], columns)))
+        return np.concatenate(found)
+
+
+def outlines_of(runs: IntArray) -> list[Polygon]:
+    """Outlines of the 4-connected components of runs of cells.
+
+    Parameters
+    ----------
+    runs : (n, 3) int64
+        Row, first column, column behind the last; runs of one row may abut but not overlap.
+
+    Returns
+    -------
+    list of Polygon
+        Metres; vertices only at corners. In the order of each component's first run.
+    """
+    if len(runs) == 0:
+        return []
+    runs = runs[np.lexsort((runs[:, 1], runs[:, 0]))]
+    begins = np.ones(len(runs), np.bool_)
+    begins[1:] = (runs[1:, 0] != runs[:-1, 0]) | (runs[1:, 1] != runs[:-1, 2])
+    ends = np.append(np.flatnonzero(begins)[1:], len(runs)) - 1
+    runs = np.column_stack((runs[begins, 0], runs[begins, 1], runs[ends, 2]))
+    pairs = _neighbours(runs)
+    links = scipy.sparse.coo_array((np.ones(len(pairs), np.bool_), (pairs[:, 0], pairs[:, 1])), (len(runs), len(runs)))
+    n, component = scipy.sparse.csgraph.connected_components(links, directed=False)
+    boxes = shapely.box(*(CELL_M * np.column_stack((runs[:, 1], runs[:, 0], runs[:, 2], runs[:, 0] + 1))).T)
+    order = np.argsort(component, kind="stable")
+    starts = np.searchsorted(component[order], np.arange(n + 1))
+    firsts = order[starts[:-1]]
+    outlines = []
+    for k in np.argsort(firsts).tolist():
+        # all coordinates are multiples of 0.5: the union is exact; normalised rings begin at a corner
+        outline = shapely.normalize(shapely.union_all(boxes[order[starts[k] : starts[k + 1]]]))
+        outlines.append(shapely.simplify(outline, 0.0))
+    return outlines
+
+
+@njit(cache=True, nogil=True)
+def _neighbours(runs: IntArray) -> IntArray:
+    """Pairs of runs in rows that follow one another and share a column."""
+    n = len(runs)
+    # the runs of two rows, each sorted and apart, overlap fewer times than there are runs
+    pairs = np.empty((2 * n, 2), np.int64)
+    found = 0
+    below = 0
+    for i in range(n):
+        row = runs[i, 0] - 1
+        while below < i and (runs[below, 0] < row or (runs[below, 0] == row and runs[below, 2] <= runs[i, 1])):
+            below += 1
+        j = below
+        while j < i and runs[j, 0] == row and runs[j, 1] < runs[i, 2]:
+            pairs[found, 0] = j
+            pairs[found, 1] = i
+            found += 1
+            j += 1
+    return pairs[:found]

@@ -1,0 +1,381 @@
+"""Detection of buildings by area and by object (Rutzinger, Rottensteiner, Pfeifer 2009).
+
+By area: on the raster of `building_raster`, with and without the ring of one cell on either side of the reference's
+edges, which alone holds 9 to 15 % of the area. Where the footprints of a part are given nothing is known outside them:
+cells count inside the given footprints only, and neither correctness nor quality exists.
+
+By object: a reference building is found where at least half of its area is covered by models, whatever their number; a
+model is right where at least half of its area lies on reference buildings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+from shapely import Polygon
+
+from pipeline.evaluation.bootstrap import Statistic, Sums, quality, ratio
+from pipeline.evaluation.building_raster import (
+    CELL_M,
+    CellWindow,
+    PlanRaster,
+    PointRaster,
+    edge_ring,
+    windows_of,
+)
+from pipeline.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.evaluation.models import RoofModel
+from pipeline.evaluation.reference import Reference
+from pipeline.evaluation.subsets import Subset, measured
+from pipeline.model import BoolArray, FloatArray, IntArray
+from pipeline.scene import BUILDING_CLASS
+
+MIN_OVERLAP = 0.5
+"""Share of its own area from which on a building is found, or a model is right."""
+OBJECT_AREAS_M2 = (0.0, 10.0, 50.0)
+"""Measures by object are given for all objects and for those of at least these areas."""
+BLOCK_CELLS = 100
+"""Side of the blocks of 50 m that are the units of the bootstrap by area."""
+
+Geometries: TypeAlias = npt.NDArray[np.object_]
+
+_COUNTS = ("both", "reference", "found")
+_EVERYWHERE = (-np.inf, -np.inf, np.inf, np.inf)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DetectionBlock:
+    """Cells of one block of 50 m, inside the extent of the reference."""
+
+    row: int
+    """Index of the block along northing, 0 at the origin of the CRS."""
+    column: int
+    """Index along easting."""
+    both: int
+    """Cells that are building in the reference and in the models."""
+    reference: int
+    """Cells that are building in the reference."""
+    found: int
+    """Cells that are building in the models."""
+    both_without_ring: int
+    """The same three without the cells at the reference's edges."""
+    reference_without_ring: int
+    """See there."""
+    found_without_ring: int
+    """See there."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DetectedObject:
+    """A reference building or a model, and how much of it lies on the other kind."""
+
+    name: str
+    """Its building_id."""
+    building: int
+    """Index of the reference building; of a model the one that it shares most area with, -1 for none."""
+    area_m2: float
+    """Of its footprint."""
+    overlap: float
+    """Share of its area that lies on models, or of a model on reference buildings."""
+    counts: bool
+    """False where it touches the edge of the data, or for a model where nothing is known about where it stands."""
+
+    @property
+    def found(self) -> bool:
+        """Whether it is found, or for a model right."""
+        return self.overlap >= MIN_OVERLAP
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Detection:
+    """All rows of the measures of detection."""
+
+    blocks: tuple[DetectionBlock, ...]
+    """By row and column, those without any building cell left out; empty without reference buildings."""
+    buildings: tuple[DetectedObject, ...]
+    """One a reference building, in their order."""
+    models: tuple[DetectedObject, ...]
+    """One a model, in their order."""
+    has_correctness: bool
+    """False where the reference is complete nowhere, so that no model can be told wrong."""
+
+
+def detect(models: Sequence[RoofModel], reference: Reference) -> Detection:
+    """Compare where models stand with where buildings are.
+
+    Parameters
+    ----------
+    models : sequence of RoofModel
+        With footprints.
+    reference : Reference
+        Any. Given footprints need the points for the measures by area: one pass over them.
+
+    Returns
+    -------
+    Detection
+        Rows for `detection_measures`.
+    """
+    buildings, right = _objects(models, reference)
+    return Detection(
+        blocks=_blocks(models, reference),
+        buildings=buildings,
+        models=right,
+        has_correctness=reference.extent is not None,
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------- by area
+
+
+def _blocks(models: Sequence[RoofModel], reference: Reference) -> tuple[DetectionBlock, ...]:
+    """Cells counted a block, window by window."""
+    outlines = [building.footprint for building in reference.buildings]
+    found = [model.footprint for model in models]
+    if not outlines and reference.extent is None:
+        return ()
+    of_models = PlanRaster(found)
+    known = PlanRaster(outlines if reference.extent is None else _polygons(reference.extent))
+    of_reference = _class_raster(reference).window if reference.outlines == "given" else PlanRaster(outlines).window
+    blocks: list[DetectionBlock] = []
+    for window in windows_of(shapely.bounds(np.array([*outlines, *found], dtype=object))):
+        around = of_reference(window.grown(1))
+        ring = edge_ring(around)[1:-1, 1:-1]
+        counted = known.window(window)
+        blocks += _count(window, around[1:-1, 1:-1] & counted, of_models.window(window) & counted, ring)
+    return tuple(sorted(blocks, key=lambda block: (block.row, block.column)))
+
+
+def _class_raster(reference: Reference) -> PointRaster:
+    """The raster of class 6: one pass over the points."""
+    raster = PointRaster()
+    for number, tile in enumerate(reference.points()):
+        raster.add(tile.xyz, tile.classification == BUILDING_CLASS)
+        raster.finish(reference.bounds[number + 1 :] if reference.bounds else [_EVERYWHERE])
+    raster.finish()
+    return raster
+
+
+def _count(window: CellWindow, reference: BoolArray, found: BoolArray, ring: BoolArray) -> list[DetectionBlock]:
+    """The blocks of a window that hold any building cell."""
+    layers = []
+    for counted in (np.ones_like(ring), ~ring):
+        layers += [reference & found & counted, reference & counted, found & counted]
+    n_rows, n_columns = window.rows // BLOCK_CELLS, window.columns // BLOCK_CELLS
+    sums = [
+        layer.reshape(n_rows, BLOCK_CELLS, n_columns, BLOCK_CELLS).sum(axis=(1, 3), dtype=np.int64) for layer in layers
+    ]
+    rows, columns = np.nonzero(sums[1] + sums[2])
+    return [
+        DetectionBlock(
+            row=window.row // BLOCK_CELLS + r,
+            column=window.column // BLOCK_CELLS + c,
+            both=int(sums[0][r, c]),
+            reference=int(sums[1][r, c]),
+            found=int(sums[2][r, c]),
+            both_without_ring=int(sums[3][r, c]),
+            reference_without_ring=int(sums[4][r, c]),
+            found_without_ring=int(sums[5][r, c]),
+        )
+        for r, c in zip(rows.tolist(), columns.tolist(), strict=True)
+    ]
+
+
+# --------------------------------------------------------------------------------------------------------- by object
+
+
+def _objects(
+    models: Sequence[RoofModel], reference: Reference
+) -> tuple[tuple[DetectedObject, ...], tuple[DetectedObject, ...]]:
+    """Reference buildings and models with the share of their area that lies on the other kind."""
+    truth = np.array([building.footprint for building in reference.buildings], dtype=object)
+    made = np.array([model.footprint for model in models], dtype=object)
+    known = np.ones(len(made), np.bool_)
+    if reference.extent is None:
+        known[:] = False
+    elif len(made):
+        shapely.prepare(reference.extent)
+        known = np.asarray(shapely.contains_properly(reference.extent, made))
+    if len(truth) and len(made):
+        first, second = shapely.STRtree(made).query(truth, predicate="intersects")
+        shared = shapely.intersection(truth[first], made[second])
+    else:
+        first = second = np.zeros(0, np.int64)
+        shared = np.zeros(0, dtype=object)
+    area_shared = shapely.area(shared)
+    best, most = np.full(len(made), -1), np.zeros(len(made))
+    for building, model, area in zip(first.tolist(), second.tolist(), area_shared.tolist(), strict=True):
+        if area > most[model]:
+            best[model], most[model] = building, area
+    overlap_truth = _covered(first, shared, truth)
+    overlap_made = _covered(second, shared, made)
+    return (
+        tuple(
+            DetectedObject(
+                name=building.building_id,
+                building=number,
+                area_m2=building.footprint.area,
+                overlap=float(overlap_truth[number]),
+                counts=not building.touches_data_edge,
+            )
+            for number, building in enumerate(reference.buildings)
+        ),
+        tuple(
+            DetectedObject(
+                name=model.building_id,
+                building=int(best[number]),
+                area_m2=model.footprint.area,
+                overlap=float(overlap_made[number]),
+                counts=bool(known[number]) and not model.touches_data_edge,
+            )
+            for number, model in enumerate(models)
+        ),
+    )
+
+
+def _covered(owner: IntArray, shared: Geometries, areas: Geometries) -> FloatArray:
+    """Share of each area that its pieces cover together; pieces may overlap."""
+    covered = np.zeros(len(areas))
+    order = np.argsort(owner, kind="stable")
+    starts = np.searchsorted(owner[order], np.arange(len(areas) + 1))
+    for k in range(len(areas)):
+        pieces = shared[order[starts[k] : starts[k + 1]]]
+        if len(pieces) and areas[k].area > 0.0:
+            together = pieces[0].area if len(pieces) == 1 else shapely.union_all(pieces).area
+            covered[k] = together / areas[k].area
+    return covered
+
+
+# ---------------------------------------------------------------------------------------------------------- measures
+
+_RING = {
+    "": ("", "all cells"),
+    "_without_ring": (", without edges", "cells that are not in the ring of one cell on either side of its edges"),
+}
+_CELLS = f"R, F: cells of {CELL_M:g} m that are building in the reference and in the models"
+
+
+def _definitions() -> tuple[Definition, ...]:
+    found = []
+    for suffix, (label, told) in _RING.items():
+        for name, formula in (
+            ("completeness", "count(R and F) / count(R)"),
+            ("correctness", "count(R and F) / count(F)"),
+            ("quality", "count(R and F) / count(R or F)"),
+        ):
+            found.append((f"area_{name}{suffix}", f"{name} by area{label}", f"{formula}; {_CELLS}; {told}"))
+    for least in OBJECT_AREAS_M2:
+        label = f" of at least {least:g} m2" if least else ""
+        for name, formula in (
+            ("completeness", "reference buildings with half of their area on models / reference buildings"),
+            ("correctness", "models with half of their area on reference buildings / models"),
+            ("quality", "1 / (1 / completeness + 1 / correctness - 1)"),
+        ):
+            note = f"; objects{label}, none that touches the edge of the data"
+            found.append((f"object_{name}{_suffix(least)}", f"{name} by object{label}", formula + note))
+    return tuple(
+        Definition(
+            name=f"detection.{name}",
+            group=Group.DETECTION,
+            label=label,
+            unit="share",
+            better=Better.HIGHER,
+            formula=formula,
+        )
+        for name, label, formula in found
+    )
+
+
+def _suffix(least_m2: float) -> str:
+    return f"_{least_m2:g}m2" if least_m2 else ""
+
+
+DEFINITIONS: tuple[Definition, ...] = _definitions()
+"""What this module measures."""
+
+
+def detection_measures(rows: Detection, subset: Subset) -> list[Measure]:
+    """The figures of a subset; by area only over all buildings, since a cell of a model belongs to no building.
+
+    Units of the bootstrap are blocks of 50 m by area; by object the reference buildings, each with the models that
+    share most area with it, and the models that stand on none.
+    """
+    found = _area_measures(rows, subset) if subset.elsewhere else []
+    return found + _object_measures(rows, subset)
+
+
+def _area_measures(rows: Detection, subset: Subset) -> list[Measure]:
+    if not rows.blocks:
+        return []
+    found = []
+    for suffix in _RING:
+        columns = {
+            name: np.array([getattr(block, name + suffix) for block in rows.blocks], np.float64) for name in _COUNTS
+        }
+        union = columns["reference"].sum() + columns["found"].sum() - columns["both"].sum()
+        figures: list[tuple[str, Statistic, float]] = [
+            ("completeness", ratio("both", "reference"), columns["reference"].sum())
+        ]
+        if rows.has_correctness:
+            figures += [
+                ("correctness", ratio("both", "found"), columns["found"].sum()),
+                ("quality", quality("both", "reference", "found"), union),
+            ]
+        found += [
+            measured(f"detection.area_{name}{suffix}", columns, statistic, n=n, subset=subset)
+            for name, statistic, n in figures
+        ]
+    return found
+
+
+def _object_measures(rows: Detection, subset: Subset) -> list[Measure]:
+    """Completeness, correctness and quality of objects from each size on."""
+    if not rows.buildings and not rows.has_correctness:
+        return []
+    found = []
+    place = np.cumsum(subset.buildings) - 1
+    for least in OBJECT_AREAS_M2:
+        columns: dict[str, list[float]] = {name: [0.0] * subset.size for name in ("hit", "wanted", "right", "made")}
+        for building in rows.buildings:
+            if building.counts and building.area_m2 >= least and subset.buildings[building.building]:
+                columns["wanted"][place[building.building]] += 1.0
+                columns["hit"][place[building.building]] += float(building.found)
+        for model in rows.models:
+            if not (model.counts and model.area_m2 >= least):
+                continue
+            if model.building >= 0 and subset.buildings[model.building]:
+                unit = int(place[model.building])
+            elif model.building < 0 and subset.elsewhere:
+                unit = len(columns["made"])
+                for column in columns.values():
+                    column.append(0.0)
+            else:
+                continue
+            columns["made"][unit] += 1.0
+            columns["right"][unit] += float(model.found)
+        arrays = {name: np.array(column) for name, column in columns.items()}
+        wanted, made = arrays["wanted"].sum(), arrays["made"].sum()
+        figures: list[tuple[str, Statistic, float]] = [("completeness", ratio("hit", "wanted"), wanted)]
+        if rows.has_correctness:
+            figures += [("correctness", ratio("right", "made"), made), ("quality", _object_quality, wanted + made)]
+        found += [
+            measured(f"detection.object_{name}{_suffix(least)}", arrays, statistic, n=n, subset=subset)
+            for name, statistic, n in figures
+        ]
+    return found
+
+
+def _object_quality(sums: Sums) -> FloatArray:
+    """TP / (TP + FN + FP) of objects whose true positives differ on both sides; 0 where either share is 0."""
+    complete, correct = sums["hit"] / sums["wanted"], sums["right"] / sums["made"]
+    harmonic = complete * correct / (complete + correct - complete * correct)
+    return np.where((complete == 0.0) | (correct == 0.0), 0.0, harmonic)
+
+
+def _polygons(geometry: shapely.Geometry) -> list[Polygon]:
+    """The polygons of an extent."""
+    return [part for part in shapely.get_parts(geometry).tolist() if isinstance(part, Polygon)]

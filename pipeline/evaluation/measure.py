@@ -1,0 +1,65 @@
+"""What a measure is: a figure with its interval, its denominator, and the subset of buildings that it is over."""
+
+from __future__ import annotations
+
+import dataclasses
+from enum import StrEnum
+
+
+class Better(StrEnum):
+    """Which way is better."""
+
+    HIGHER = "higher"
+    LOWER = "lower"
+    ZERO = "zero"
+    NEITHER = "neither"
+
+
+class Group(StrEnum):
+    """Chapters of a report, in their order."""
+
+    DELIVERY = "delivery"
+    RESIDUALS = "residuals"
+    SURFACE = "surface"
+    FACES = "faces"
+    ROOF_TYPES = "roof_types"
+    FOOTPRINTS = "footprints"
+    DETECTION = "detection"
+    GROUND = "ground"
+    VALIDITY = "validity"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Definition:
+    """One measure, defined once for tables, pages and docs."""
+
+    name: str
+    """Dotted, stable: `faces.completeness_10m2`."""
+    group: Group
+    """Its chapter."""
+    label: str
+    """A few words for tables."""
+    unit: str
+    """m, m2, share (0 to 1), count, or empty."""
+    better: Better
+    """Which way is better."""
+    formula: str
+    """How it is computed, one line of Markdown."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Measure:
+    """A measured figure."""
+
+    name: str
+    """Of its definition."""
+    value: float
+    """nan where the denominator is zero."""
+    low: float = float("nan")
+    """Lower end of the 95 % bootstrap interval; nan where there is none."""
+    high: float = float("nan")
+    """Upper end."""
+    n: int
+    """Denominator: buildings, faces, points, cells."""
+    subset: str = "all"
+    """all, good (buildings without defects), or hard (with)."""

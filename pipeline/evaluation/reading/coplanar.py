@@ -1,0 +1,206 @@
+"""Faces that are parts of one plane: a triangulated roof is to count as the polygons that it was cut from."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.geometry import solve_plane_moments
+from pipeline.model import FloatArray, IntArray
+
+DISTANCE_M = 0.01
+"""Vertices up to this far from a plane lie in it."""
+ANGLE_DEG = 0.1
+"""Normals up to this far apart are the same; more where so much is within `DISTANCE_M` over the width of the face."""
+
+_LEAST_UP = 1e-9
+
+
+@njit(cache=True, nogil=True)
+def face_vectors(xyz: FloatArray, corners: IntArray, ring_offsets: IntArray, face_rings: IntArray) -> FloatArray:
+    """Area vectors of faces (Newell): the direction is the normal, the length the area less the holes'.
+
+    Parameters
+    ----------
+    xyz : (v, 3) float64
+        Vertices in metres, about a near origin.
+    corners : (c,) int64
+        Vertices of all rings, one ring after the other.
+    ring_offsets : (r + 1,) int64
+        Where each ring starts in corners.
+    face_rings : (f + 1,) int64
+        Where each face starts in the rings; its outer ring first, holes the other way round.
+
+    Returns
+    -------
+    (f, 3) float64
+        Square metres.
+    """
+    vectors = np.zeros((len(face_rings) - 1, 3))
+    for f in range(len(vectors)):
+        for r in range(face_rings[f], face_rings[f + 1]):
+            p = corners[ring_offsets[r]] if ring_offsets[r] < ring_offsets[r + 1] else 0
+            for k in range(ring_offsets[r] + 1, ring_offsets[r + 1] - 1):
+                q, s = corners[k], corners[k + 1]
+                ux, uy, uz = xyz[q, 0] - xyz[p, 0], xyz[q, 1] - xyz[p, 1], xyz[q, 2] - xyz[p, 2]
+                vx, vy, vz = xyz[s, 0] - xyz[p, 0], xyz[s, 1] - xyz[p, 1], xyz[s, 2] - xyz[p, 2]
+                vectors[f, 0] += 0.5 * (uy * vz - uz * vy)
+                vectors[f, 1] += 0.5 * (uz * vx - ux * vz)
+                vectors[f, 2] += 0.5 * (ux * vy - uy * vx)
+    return vectors
+
+
+@njit(cache=True, nogil=True)
+def _neighbours(
+    corners: IntArray, ring_offsets: IntArray, face_rings: IntArray, vertices: int
+) -> tuple[IntArray, IntArray]:
+    """Faces that share an edge with each face: offsets (f + 1,) and faces, a face once for every common edge."""
+    keys = np.empty(len(corners), np.int64)
+    owner = np.empty(len(corners), np.int64)
+    faces = len(face_rings) - 1
+    for f in range(faces):
+        for r in range(face_rings[f], face_rings[f + 1]):
+            for k in range(ring_offsets[r], ring_offsets[r + 1]):
+                following = k + 1 if k + 1 < ring_offsets[r + 1] else ring_offsets[r]
+                a, b = min(corners[k], corners[following]), max(corners[k], corners[following])
+                keys[k] = a * vertices + b
+                owner[k] = f
+    order = np.argsort(keys, kind="mergesort")
+    offsets = np.zeros(faces + 1, np.int64)
+    others = np.empty(0, np.int64)
+    fill = np.empty(0, np.int64)
+    for writes in (False, True):
+        start = 0
+        while start < len(order):
+            stop = start + 1
+            while stop < len(order) and keys[order[stop]] == keys[order[start]]:
+                stop += 1
+            for i in range(start, stop):
+                for j in range(start, stop):
+                    f, g = owner[order[i]], owner[order[j]]
+                    if f == g:
+                        continue
+                    if writes:
+                        others[fill[f]] = g
+                        fill[f] += 1
+                    else:
+                        offsets[f + 1] += 1
+            start = stop
+        if not writes:
+            for f in range(faces):
+                offsets[f + 1] += offsets[f]
+            others = np.empty(offsets[faces], np.int64)
+            fill = offsets[:-1].copy()
+    return offsets, others
+
+
+@njit(cache=True, nogil=True)
+def _least_cosine(xyz: FloatArray, corners: IntArray, area: float, distance_m: float, angle_deg: float) -> float:
+    """Cosine of the largest angle that a face may have to a plane that it lies in: what a small error explains."""
+    extent = 0.0
+    for axis in range(3):
+        low, high = xyz[corners[0], axis], xyz[corners[0], axis]
+        for k in range(len(corners)):
+            low, high = min(low, xyz[corners[k], axis]), max(high, xyz[corners[k], axis])
+        extent += (high - low) ** 2
+    width = 2.0 * area / math.sqrt(extent) if extent > 0.0 else 0.0
+    explained = math.atan2(distance_m, width)
+    return math.cos(max(math.radians(angle_deg), explained))
+
+
+@njit(cache=True, nogil=True)
+def coplanar_regions(
+    xyz: FloatArray,
+    corners: IntArray,
+    ring_offsets: IntArray,
+    face_rings: IntArray,
+    vectors: FloatArray,
+    told: IntArray,
+    distance_m: float,
+    angle_deg: float,
+) -> IntArray:
+    """Faces that share edges and lie in one plane, grown from the largest; the plane is fitted again as they join.
+
+    Parameters
+    ----------
+    xyz, corners, ring_offsets, face_rings
+        As for `face_vectors`; vertices in one place are one.
+    vectors : (f, 3) float64
+        Area vectors; which way they point does not matter.
+    told : (f,) int64
+        Faces of different numbers stay apart.
+    distance_m, angle_deg : float
+        As `DISTANCE_M` and `ANGLE_DEG` say.
+
+    Returns
+    -------
+    (f,) int64
+        The number of the region of each face, numbered as they were grown.
+    """
+    faces = len(vectors)
+    areas = np.empty(faces)
+    normals = np.zeros((faces, 3))
+    for f in range(faces):
+        areas[f] = math.sqrt(vectors[f, 0] ** 2 + vectors[f, 1] ** 2 + vectors[f, 2] ** 2)
+        if areas[f] > 0.0:
+            scale = (1.0 if vectors[f, 2] >= 0.0 else -1.0) / areas[f]
+            for axis in range(3):
+                normals[f, axis] = vectors[f, axis] * scale
+    offsets, others = _neighbours(corners, ring_offsets, face_rings, len(xyz))
+    labels = np.full(faces, -1, np.int64)
+    queue = np.empty(faces, np.int64)
+    count = 0
+    for seed in np.argsort(-areas, kind="mergesort"):
+        if labels[seed] >= 0:
+            continue
+        labels[seed] = count
+        queue[0] = seed
+        read, written = 0, 1
+        a, b, c = 0.0, 0.0, 0.0
+        n, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
+        sxx, sxy, syy, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0
+        joining = seed
+        while normals[seed, 2] > _LEAST_UP:
+            if joining >= 0:
+                for k in range(ring_offsets[face_rings[joining]], ring_offsets[face_rings[joining + 1]]):
+                    x, y, z = xyz[corners[k], 0], xyz[corners[k], 1], xyz[corners[k], 2]
+                    n += 1.0
+                    sx, sy, sz = sx + x, sy + y, sz + z
+                    sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
+                    sxz, syz = sxz + x * z, syz + y * z
+                if joining == seed:
+                    a, b = -normals[seed, 0] / normals[seed, 2], -normals[seed, 1] / normals[seed, 2]
+                else:
+                    a, b = solve_plane_moments(
+                        sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n, sxz - sx * sz / n, syz - sy * sz / n
+                    )
+                c = (sz - a * sx - b * sy) / n
+                joining = -1
+            if read == written:
+                break
+            face = queue[read]
+            up = 1.0 / math.sqrt(1.0 + a * a + b * b)
+            for q in range(offsets[face], offsets[face + 1]):
+                other = others[q]
+                if labels[other] >= 0 or told[other] != told[seed] or normals[other, 2] <= _LEAST_UP:
+                    continue
+                first, last = ring_offsets[face_rings[other]], ring_offsets[face_rings[other + 1]]
+                fits = True
+                for k in range(first, last):
+                    x, y, z = xyz[corners[k], 0], xyz[corners[k], 1], xyz[corners[k], 2]
+                    if abs(z - a * x - b * y - c) * up > distance_m:
+                        fits = False
+                        break
+                cosine = (normals[other, 2] - a * normals[other, 0] - b * normals[other, 1]) * up
+                if fits and cosine >= _least_cosine(xyz, corners[first:last], areas[other], distance_m, angle_deg):
+                    labels[other] = count
+                    queue[written] = other
+                    written += 1
+                    joining = other
+                    break
+            if joining < 0:
+                read += 1
+        count += 1
+    return labels

@@ -1,0 +1,155 @@
+"""What readers of foreign files hand on: faces over vertices, before anything is made of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.model import FaceKind, FloatArray
+
+MILLIMETRES_PER_METRE = 1000.0
+
+Rings = tuple[tuple[int, ...], ...]
+"""Vertex indices: outer ring first, the first vertex of a ring not repeated."""
+
+
+class RawFace(NamedTuple):
+    """A polygon as the file has it."""
+
+    rings: Rings
+    """Counter-clockwise seen from outside, holes clockwise; files do not always keep to it."""
+    kind: FaceKind | None
+    """What the file says that it is; None where it says nothing: then the normal decides."""
+    plane: int = -1
+    """Number of its roof plane, where the file tells it as this program does."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RawPart:
+    """One geometry of a building."""
+
+    xyz: FloatArray
+    """(v, 3) float64, absolute metres; only vertices that its faces use."""
+    faces: tuple[RawFace, ...]
+    """Its polygons."""
+    is_solid: bool
+    """True where they are meant to close a solid."""
+
+
+def raw_part(vertices: FloatArray, faces: Iterable[RawFace], *, is_solid: bool) -> RawPart:
+    """A part with only those of many vertices (n, 3) that its faces use.
+
+    Raises
+    ------
+    ValueError
+        If a face names a vertex that is not there.
+    """
+    listed = tuple(faces)
+    used = sorted(set(chain.from_iterable(ring for face in listed for ring in face.rings)))
+    if used and not 0 <= used[0] <= used[-1] < len(vertices):
+        wrong = used[0] if used[0] < 0 else used[-1]
+        raise ValueError(f"a face names vertex {wrong}, there are {len(vertices)}")
+    place = {index: k for k, index in enumerate(used)}
+    return RawPart(
+        xyz=vertices[used] if used else np.empty((0, 3)),
+        faces=tuple(
+            RawFace(tuple(tuple([place[index] for index in ring]) for ring in face.rings), face.kind, face.plane)
+            for face in listed
+        ),
+        is_solid=is_solid,
+    )
+
+
+def is_closed(vertices: FloatArray, faces: Iterable[Rings]) -> bool:
+    """Whether every edge is run both ways equally often: no hole in the surface, neighbours oriented alike.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float64
+        Metres; those that are the same to the millimetre are one.
+    faces : iterable of rings
+        As in `SolidFace.rings`.
+    """
+    names = _welded(vertices)
+    balance: dict[tuple[int, int], int] = {}
+    for rings in faces:
+        for ring in rings:
+            first = names[ring[-1]] if ring else -1
+            for index in ring:
+                second = names[index]
+                if first < second:
+                    balance[first, second] = balance.get((first, second), 0) + 1
+                elif second < first:
+                    balance[second, first] = balance.get((second, first), 0) - 1
+                first = second
+    return bool(balance) and not any(balance.values())
+
+
+def _welded(vertices: FloatArray) -> list[int]:
+    """A number for every vertex, the same for those in one place."""
+    places: dict[tuple[int, ...], int] = {}
+    keys = np.rint(vertices * MILLIMETRES_PER_METRE).astype(np.int64).tolist()
+    return [places.setdefault(tuple(key), len(places)) for key in keys]
+
+
+def connected(part: RawPart) -> list[RawPart]:
+    """The pieces of a part that hang together by common edges, in the order of their first faces."""
+    names = _welded(part.xyz)
+    seen: dict[tuple[int, int], int] = {}
+    pairs = []
+    for number, face in enumerate(part.faces):
+        for ring in face.rings:
+            for a, b in zip(ring, (*ring[1:], ring[0]), strict=True):
+                edge = (min(names[a], names[b]), max(names[a], names[b]))
+                pairs.append((seen.setdefault(edge, number), number))
+    pieces = grouped(len(part.faces), pairs)
+    if len(pieces) == 1:
+        return [part]
+    return [raw_part(part.xyz, [part.faces[number] for number in piece], is_solid=part.is_solid) for piece in pieces]
+
+
+def grouped(count: int, pairs: Iterable[Sequence[int]]) -> list[list[int]]:
+    """Numbers below count that pairs of them tie together, each group sorted, in the order of their first ones.
+
+    Examples
+    --------
+    >>> grouped(4, [(0, 2), (3, 3)])
+    [[0, 2], [1], [3]]
+    """
+    parent = list(range(count))
+
+    def root(number: int) -> int:
+        while parent[number] != number:
+            parent[number] = parent[parent[number]]
+            number = parent[number]
+        return number
+
+    for one, other in pairs:
+        a, b = root(one), root(other)
+        parent[max(a, b)] = min(a, b)
+    groups: dict[int, list[int]] = {}
+    for number in range(count):
+        groups.setdefault(root(number), []).append(number)
+    return list(groups.values())
+
+
+KIND_OF_WORD: Mapping[str, FaceKind] = {
+    "roof": FaceKind.ROOF,
+    "wall": FaceKind.WALL,
+    "facade": FaceKind.WALL,
+    "ground": FaceKind.GROUND,
+    "floor": FaceKind.GROUND,
+    "base": FaceKind.GROUND,
+}
+"""Words in the names of groups and materials, and what they say of a face."""
+
+
+def kind_in_name(name: str) -> FaceKind | None:
+    """What the name of a group or material says of its faces; None where it says nothing, or two things."""
+    lowered = name.lower()
+    kinds = {kind for word, kind in KIND_OF_WORD.items() if word in lowered}
+    return kinds.pop() if len(kinds) == 1 else None

@@ -1,0 +1,204 @@
+"""A run directory, or the truth that `simulate` writes: tables for roof faces, CityJSONSeq for solids."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.errors import UnreadableInputError
+from pipeline.evaluation.models import ModelSet, RoofModel, RoofSurface
+from pipeline.evaluation.reading.cityjson import features
+from pipeline.evaluation.reading.cityjson_geometry import parts_of
+from pipeline.evaluation.reading.collected import Collected
+from pipeline.evaluation.reading.raw import MILLIMETRES_PER_METRE, RawPart
+from pipeline.evaluation.reading.surfaces import GRID_M
+from pipeline.export.geoparquet import read_table
+from pipeline.io.crs import resolve_reference
+from pipeline.model import FaceKind, RoofType, Solid, SolidFace, Status
+from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
+
+TRUTH_METHOD = "truth"
+"""Method of the records of simulated truth."""
+
+Solids = dict[str, tuple[tuple[Solid, ...], tuple[float, float, float]]]
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder is a run directory, or laid out like one."""
+    return path.is_dir() and ((path / NAME).is_file() or (path / "buildings").is_dir())
+
+
+def read_run(path: Path) -> ModelSet:
+    """The buildings of a run directory, or of the truth that `simulate` writes, in metres.
+
+    Raises
+    ------
+    RunError
+        If there are no such tables, or they are damaged.
+    InputError
+        If its CityJSONSeq or the table of conditions is damaged.
+    """
+    into = Collected()
+    units_m = _units_m(path, into)
+    rows = read_table(str(path), "buildings").to_pylist()
+    surfaces = _surfaces(path, units_m)
+    solids = _solids(path, units_m, into)
+    for row in rows:
+        shapes, origin = solids.get(row["building_id"], ((), (0.0, 0.0, 0.0)))
+        into.add(
+            RoofModel(
+                building_id=row["building_id"],
+                footprint=_in_metres(row["geometry"], units_m),
+                roof_type=RoofType(row["roof_type"]),
+                surfaces=tuple(surfaces.get(row["building_id"], ())),
+                touches_data_edge=row["touches_data_edge"],
+                source_id=row["source_id"],
+                status=Status(row["status"]),
+                lod=row["lod"] or "",
+                solids=shapes,
+                solid_origin=origin,
+            )
+        )
+    methods = sorted({row["method"] for row in rows})
+    into.has_footprints = any(row["source_id"] is not None and row["method"] != TRUTH_METHOD for row in rows)
+    return into.finish(name=" and ".join(methods) or _method(path), kind="run", path=str(path))
+
+
+def _method(path: Path) -> str:
+    """The method of a run that has no record."""
+    return read_manifest(path).method if (path / NAME).is_file() else path.name
+
+
+def _units_m(path: Path, into: Collected) -> tuple[float, float]:
+    """Metres a horizontal and a vertical unit, from run.json, else from the tables' own metadata."""
+    if (path / NAME).is_file():
+        manifest = read_manifest(path)
+        if manifest.status is not RunStatus.FINISHED:
+            into.note(f"the run is {manifest.status.value}: not all of its buildings may be there")
+        crs: Mapping[str, Any] = manifest.crs or {}
+        if crs.get("wkt"):
+            into.is_at(f"EPSG:{crs['epsg']}" if crs.get("epsg") else str(crs.get("name")))
+        return float(crs.get("horizontal_unit_m", 1.0)), float(crs.get("vertical_unit_m", 1.0))
+    part = next(iter(sorted((path / "buildings").glob("*/*.parquet"))), None)
+    if part is None:
+        return 1.0, 1.0
+    try:
+        metadata = pq.read_schema(part).metadata or {}
+        projjson = json.loads(metadata.get(b"geo", b"{}")).get("columns", {}).get("geometry", {}).get("crs")
+    except (pa.ArrowInvalid, OSError, ValueError) as error:
+        raise UnreadableInputError(str(part), str(error), "Write the folder again") from error
+    if projjson is None:
+        into.note("no coordinate reference system in the tables: coordinates are taken as metres")
+        return 1.0, 1.0
+    import pyproj
+
+    reference, _ = resolve_reference(path=str(part), header_crs=pyproj.CRS.from_json_dict(projjson))
+    into.is_at(reference.name if reference.epsg is None else f"EPSG:{reference.epsg}")
+    return reference.horizontal_unit_m, reference.vertical_unit_m
+
+
+def _in_metres(wkb: bytes | None, units_m: tuple[float, float]) -> Polygon | MultiPolygon:
+    """A geometry of the tables in plan, metres; empty without one."""
+    if wkb is None:
+        return Polygon()
+    geometry = shapely.force_2d(shapely.from_wkb(wkb))
+    if units_m[0] == 1.0:
+        return geometry
+    return shapely.transform(geometry, lambda xy: np.round(xy * units_m[0], 3))
+
+
+def _surfaces(path: Path, units_m: tuple[float, float]) -> dict[str, list[RoofSurface]]:
+    """Roof faces by building, in the order of their planes. Pieces of one plane that touch are one."""
+    horizontal, vertical = units_m
+    groups = _groups(path)
+    surfaces: dict[str, list[RoofSurface]] = {}
+    for row in read_table(str(path), "planes").to_pylist():
+        if not row["geometry"]:
+            continue
+        normal_x, normal_y, normal_z, offset = row["coefficients"]
+        geometry = _in_metres(row["geometry"], units_m)
+        pieces = shapely.get_parts(geometry)
+        if len(pieces) > 1:
+            pieces = shapely.get_parts(shapely.union_all(pieces, grid_size=GRID_M))
+        building, plane_id = row["building_id"], row["plane_id"]
+        group = groups.get(building, ())
+        for polygon in pieces.tolist():
+            surfaces.setdefault(building, []).append(
+                RoofSurface(
+                    polygon=polygon,
+                    coefficients=(
+                        -normal_x / normal_z * vertical / horizontal,
+                        -normal_y / normal_z * vertical / horizontal,
+                        -offset / normal_z * vertical,
+                    ),
+                    origin=(row["origin_x"] * horizontal, row["origin_y"] * horizontal, row["origin_z"] * vertical),
+                    plane_id=plane_id,
+                    group=group[plane_id] if plane_id < len(group) else -1,
+                )
+            )
+    return surfaces
+
+
+def _groups(path: Path) -> dict[str, list[int]]:
+    """The groups of each building's planes, where the truth tells them."""
+    table = path / "conditions.parquet"
+    if not table.is_file():
+        return {}
+    try:
+        rows = pq.read_table(table, columns=["building_id", "groups"]).to_pylist()
+    except (pa.ArrowInvalid, OSError) as error:
+        raise UnreadableInputError(str(table), str(error), "Simulate the data set again") from error
+    return {row["building_id"]: row["groups"] for row in rows}
+
+
+def _solids(path: Path, units_m: tuple[float, float], into: Collected) -> Solids:
+    """Solids by building, each with its origin."""
+    folder = path / "cityjson"
+    if not folder.is_dir():
+        into.note("no folder cityjson in the run: solids are unknown")
+        return {}
+    found: Solids = {}
+    told = Collected()
+    for file in sorted(folder.glob("*/*.city.jsonl")):
+        for feature, places, where in features(file, told, units_m):
+            try:
+                parts = [
+                    part
+                    for entry in feature["CityObjects"].values()
+                    for geometry in entry.get("geometry", ())
+                    for part in parts_of(geometry, places)
+                    if part.is_solid
+                ]
+                name = feature["id"]
+            except (KeyError, TypeError, ValueError, IndexError, AttributeError) as fault:
+                raise UnreadableInputError(
+                    str(file), f"{where}{fault!r}", "The run directory is damaged: run it again"
+                ) from fault
+            if parts:
+                found[name] = _about_origin(parts)
+    return found
+
+
+def _about_origin(parts: list[RawPart]) -> tuple[tuple[Solid, ...], tuple[float, float, float]]:
+    """Solids about an origin in whole metres."""
+    low = np.min([part.xyz.min(axis=0) for part in parts], axis=0)
+    origin = (float(math.floor(low[0])), float(math.floor(low[1])), float(math.floor(low[2])))
+    solids = tuple(
+        Solid(
+            vertices=np.rint((part.xyz - origin) * MILLIMETRES_PER_METRE) / MILLIMETRES_PER_METRE,
+            faces=tuple(
+                SolidFace(rings=face.rings, kind=face.kind or FaceKind.WALL, plane=face.plane) for face in part.faces
+            ),
+        )
+        for part in parts
+    )
+    return solids, origin

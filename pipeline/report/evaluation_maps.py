@@ -1,0 +1,278 @@
+"""Maps of an evaluation: reference buildings by what became of them, roof faces found, missed and wrong.
+
+The pictures hold no text: legend and scale bar are the page's. What went well is drawn first, what went wrong over it,
+and small things get an edge in their own colour, so that a map of a whole city still shows every fault.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import shapely
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+
+from pipeline.evaluation.counts import floats
+from pipeline.evaluation.evaluate import Evaluation
+from pipeline.model import FloatArray, Status
+from pipeline.report.pictures import blank, paths_of, png_of
+
+WIDTH_PX = 1500
+"""Of a map that takes the width of a page; the height follows the extent."""
+HALF_WIDTH_PX = 1000
+"""Of a map of few buildings."""
+_LEAST_HEIGHT, _MOST_HEIGHT = 0.35, 1.25
+_MARGIN = 0.02
+_SMALL_PX = 14.0
+_HALF_SHARE = 0.04
+_EDGE = "#ffffffa0"
+
+GOOD, FAIR, BAD, MISSING, UNJUDGED = "#3f86b5", "#e3b23c", "#cf4f2a", "#8d4fa8", "#9aa3ab"
+"""Blue, amber, vermilion, purple, grey: told apart by everybody, seen on white and on near black."""
+SHARES = ((0.95, "#3f86b5"), (0.9, "#8bb8d0"), (0.75, "#e3c15c"), (0.5, "#de8a3e"), (-1.0, "#c2401f"))
+"""Least share of points within 0.2 m, and colour."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A line of a legend."""
+
+    label: str
+    """What it is."""
+    colour: str
+    """As #rrggbb."""
+    count: int
+    """How many there are."""
+    hatched: bool = False
+    """True where it is hatched."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Map:
+    """A map with its words."""
+
+    title: str
+    """What is shown."""
+    png: bytes
+    """The picture."""
+    width_px: int
+    """Of it."""
+    height_px: int
+    """Of it."""
+    legend: tuple[Entry, ...]
+    """What its colours mean; only what occurs."""
+    is_half: bool
+    """True where half the width of a page is enough."""
+    scale_label: str
+    """Length of the scale bar."""
+    scale_share: float
+    """That length as a share of the picture's width."""
+
+    @property
+    def description(self) -> str:
+        """For those who cannot see it."""
+        return f"Map: {self.title}. " + ", ".join(f"{entry.label}: {entry.count:,}" for entry in self.legend) + "."
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Layer:
+    """Polygons of one colour."""
+
+    entry: Entry
+    """Its line of the legend."""
+    geometries: Sequence[Any]
+    """What is drawn."""
+    filled: bool = True
+    """False: outlines with a hatch."""
+
+
+def maps(evaluation: Evaluation) -> list[Map]:
+    """The maps that the evaluation allows, in the order of the page."""
+    buildings, faces = evaluation.tables.get("buildings"), evaluation.tables.get("true_faces")
+    made = []
+    if evaluation.reference is None or buildings is None:
+        made.append(_draw("Models by status", _status_layers(evaluation)))
+    else:
+        footprints = {one.building_id: one.footprint for one in evaluation.reference.buildings}
+        geometries = [footprints.get(name) for name in buildings["building_id"].to_pylist()]
+        false = _false_models(evaluation)
+        if "outcome" in buildings.column_names and evaluation.reference.has_faces:
+            made.append(_draw("Buildings by outcome", [*_outcome_layers(buildings, geometries), false]))
+        if {"n_points", "n_within"} <= set(buildings.column_names):
+            layers = [*_share_layers(buildings, geometries), false]
+            made.append(_draw("Buildings by share of points within 0.2 m", layers))
+        if not made:
+            made.append(_draw("Buildings found", [*_found_layers(buildings, geometries), false]))
+    if faces is not None and "geometry" in faces.column_names:
+        made.append(_draw("Roof faces", _face_layers(faces, evaluation.tables.get("model_faces"))))
+    return [one for one in made if one is not None]
+
+
+def _layer(
+    label: str, colour: str, geometries: Sequence[Any], chosen: Any, *, filled: bool = True, hatched: bool = False
+) -> Layer:
+    """Those of the geometries that are chosen."""
+    picked = [geometry for geometry, is_so in zip(geometries, chosen, strict=True) if is_so]
+    entry = Entry(label=label, colour=colour, count=len(picked), hatched=hatched or not filled)
+    return Layer(entry=entry, geometries=picked, filled=filled)
+
+
+def _missing(buildings: pa.Table) -> list[bool]:
+    """Where no model stands for the building."""
+    return [value is None for value in buildings["model_id"].to_pylist()]
+
+
+def _cut(buildings: pa.Table) -> list[bool]:
+    """Where the building is cut by the end of the data."""
+    if "touches_data_edge" not in buildings.column_names:
+        return [False] * buildings.num_rows
+    return [bool(value) for value in buildings["touches_data_edge"].to_pylist()]
+
+
+def _outcome_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
+    """Correct, passable, false, not found, not judged."""
+    kinds = []
+    for outcome, missing, cut in zip(
+        buildings["outcome"].to_pylist(), _missing(buildings), _cut(buildings), strict=True
+    ):
+        kinds.append("unjudged" if cut or (outcome is None and not missing) else "missing" if missing else outcome)
+    named = (
+        ("unjudged", "not judged (cut by the edge of the data)", UNJUDGED),
+        ("correct", "correct", GOOD),
+        ("passable", "passable", FAIR),
+        ("false", "false", BAD),
+        ("missing", "not found", MISSING),
+    )
+    return [_layer(label, colour, geometries, [kind == name for kind in kinds]) for name, label, colour in named]
+
+
+def _share_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
+    """Classes of the share of points within 0.2 m."""
+    n_points = floats(buildings, "n_points")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.where(n_points > 0.0, floats(buildings, "n_within") / n_points, np.nan)
+    missing, cut = np.array(_missing(buildings), bool), np.array(_cut(buildings), bool)
+    unjudged = np.isnan(shares) | cut
+    layers = [_layer("not judged (no points, or cut by the edge of the data)", UNJUDGED, geometries, unjudged)]
+    judged = ~unjudged & ~missing
+    upper = math.inf
+    for least, colour in SHARES:
+        label = f"at least {100.0 * least:.0f} %" if least > 0.0 else f"less than {100.0 * upper:.0f} %"
+        layers.append(_layer(label, colour, geometries, judged & (shares >= least) & (shares < upper)))
+        upper = least
+    return [*layers, _layer("not found", MISSING, geometries, ~unjudged & missing)]
+
+
+def _found_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
+    missing = np.array(_missing(buildings), bool)
+    return [_layer("found", GOOD, geometries, ~missing), _layer("not found", MISSING, geometries, missing)]
+
+
+def _false_models(evaluation: Evaluation) -> Layer:
+    """Models that stand where no building is, hatched."""
+    table = evaluation.tables.get("models")
+    chosen = set()
+    if table is not None and "role" in table.column_names:
+        roles = zip(table["model_id"].to_pylist(), table["role"].to_pylist(), strict=True)
+        chosen = {name for name, role in roles if role == "false"}
+    models = evaluation.models.models
+    is_false = [model.building_id in chosen for model in models]
+    return _layer("model without a building", BAD, [m.footprint for m in models], is_false, filled=False)
+
+
+def _status_layers(evaluation: Evaluation) -> list[Layer]:
+    """The models alone: ok, fallback, failed."""
+    models, failed = evaluation.models.models, evaluation.models.failed
+    ok = [model.status is Status.OK for model in models]
+    footprints = [model.footprint for model in models]
+    return [
+        _layer("model", GOOD, footprints, ok),
+        _layer("fallback (a block)", FAIR, footprints, [not one for one in ok]),
+        _layer("no model", MISSING, [one.footprint for one in failed], [not one.footprint.is_empty for one in failed]),
+    ]
+
+
+def _face_layers(faces: pa.Table, model_faces: pa.Table | None) -> list[Layer]:
+    """Found, missed, not to be found; wrong ones of the models hatched over them."""
+    geometries = shapely.from_wkb(np.array(faces["geometry"].to_pylist(), dtype=object))
+    found = np.array([bool(value) for value in faces["found"].to_pylist()], bool)
+    wanted = np.ones(len(found), bool)
+    if "to_be_found" in faces.column_names:
+        wanted = np.array([bool(value) for value in faces["to_be_found"].to_pylist()], bool)
+    layers = [
+        _layer("too small, too sparse or cut: need not be found", UNJUDGED, geometries, ~wanted & ~found),
+        _layer("found, though it need not be", "#8bb8d0", geometries, ~wanted & found),
+        _layer("found", GOOD, geometries, wanted & found),
+        _layer("missed", FAIR, geometries, wanted & ~found),
+    ]
+    if model_faces is not None and {"wrong", "geometry"} <= set(model_faces.column_names):
+        made = shapely.from_wkb(np.array(model_faces["geometry"].to_pylist(), dtype=object))
+        wrong = [bool(value) for value in model_faces["wrong"].to_pylist()]
+        layers.append(_layer("modelled face that matches none", BAD, made, wrong, filled=False))
+    return layers
+
+
+def _draw(title: str, layers: Sequence[Layer]) -> Map | None:
+    """The layers in their order, the later ones over the earlier; None where there is nothing to draw."""
+    drawn = [layer for layer in layers if layer.geometries]
+    everything = [geometry for layer in drawn for geometry in layer.geometries if geometry is not None]
+    if not everything:
+        return None
+    west, south, east, north = _extent(shapely.total_bounds(everything))
+    width_m, height_m = east - west, north - south
+    typical = float(np.median(np.sqrt(shapely.area(everything)))) / width_m
+    is_half = typical >= _HALF_SHARE
+    width_px = HALF_WIDTH_PX if is_half else WIDTH_PX
+    height_px = round(width_px * height_m / width_m)
+    figure, axes = blank(width_px, height_px)
+    for place, layer in enumerate(drawn):
+        _draw_layer(axes, layer, is_small=typical * width_px < _SMALL_PX, zorder=place + 1)
+    axes.set_xlim(west, east)
+    axes.set_ylim(south, north)
+    length_m = _round_length(width_m / 5.0)
+    return Map(
+        title=title,
+        png=png_of(figure),
+        width_px=width_px,
+        height_px=height_px,
+        legend=tuple(layer.entry for layer in drawn),
+        is_half=is_half,
+        scale_label=f"{length_m / 1000.0:g} km" if length_m >= 1000.0 else f"{length_m:g} m",
+        scale_share=length_m / width_m,
+    )
+
+
+def _draw_layer(axes: Axes, layer: Layer, *, is_small: bool, zorder: int) -> None:
+    colour = layer.entry.colour
+    edge = colour if is_small or not layer.filled else _EDGE
+    drawn = PathCollection(
+        paths_of(layer.geometries),
+        facecolors=colour if layer.filled else "none",
+        edgecolors=edge,
+        linewidths=1.5 if not layer.filled else 1.0 if is_small else 0.8,
+        zorder=zorder,
+    )
+    if not layer.filled:
+        drawn.set_hatch("//////" if is_small else "///")
+    axes.add_collection(drawn, autolim=False)
+
+
+def _extent(bounds: FloatArray) -> tuple[float, float, float, float]:
+    """Bounds with a margin, and no flatter or taller than a page takes."""
+    west, south, east, north = (float(value) for value in bounds)
+    margin = _MARGIN * max(east - west, north - south, 1.0)
+    width, height = east - west + 2.0 * margin, north - south + 2.0 * margin
+    width, height = max(width, height / _MOST_HEIGHT), max(height, width * _LEAST_HEIGHT)
+    x, y = (west + east) / 2.0, (south + north) / 2.0
+    return x - width / 2.0, y - height / 2.0, x + width / 2.0, y + height / 2.0
+
+
+def _round_length(wanted_m: float) -> float:
+    """The largest of 1, 2, 5, 10 ... that is no longer."""
+    step = 10.0 ** math.floor(math.log10(wanted_m))
+    return float(max(step * factor for factor in (1.0, 2.0, 5.0) if step * factor <= wanted_m * (1.0 + 1e-9)))

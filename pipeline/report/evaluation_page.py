@@ -1,0 +1,132 @@
+"""An evaluation as one HTML file: nothing to load, no script, light and dark, for a screen, a phone and a printer."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup, escape
+
+from pipeline.evaluation.chapters import Chapter, Line, chapters
+from pipeline.evaluation.counts import breakdowns
+from pipeline.evaluation.definitions import DEFINITIONS
+from pipeline.evaluation.evaluate import Evaluation
+from pipeline.evaluation.measure import Definition
+from pipeline.evaluation.writing import INTERVALS, all_notes, told_subject
+from pipeline.io.storage import LocalStorage
+from pipeline.report.evaluation_maps import maps
+from pipeline.report.histograms import charts
+from pipeline.report.pictures import data_uri
+from pipeline.report.section import RESIDUAL_CLASSES
+from pipeline.report.worst_cases import MODEL_COLOUR, MOST_NOT_FOUND, TRUTH_COLOUR, worst_cases
+
+PAGE = "report.html"
+"""The file."""
+HEADLINE = (
+    ("delivery.lod2", "delivery.records_ok"),
+    ("validity.models_valid",),
+    ("residuals.within_0_2m",),
+    ("surface.within_0_2m",),
+    ("faces.completeness_10m2",),
+    ("faces.correctness_10m2",),
+    ("roof_types.correct",),
+    ("footprints.iou_median",),
+    ("detection.area_quality_without_ring", "detection.area_completeness_without_ring"),
+    ("residuals.coverage",),
+    ("residuals.median",),
+    ("delivery.records_fallback",),
+    ("delivery.records_failed",),
+)
+"""The figures that decide; of each row the first that was measured, and of all the first eight."""
+HEADLINE_FIGURES = 8
+"""How many at most."""
+
+
+def write_page(
+    evaluation: Evaluation, out_dir: str | Path, definitions: Mapping[str, Definition] = DEFINITIONS
+) -> Path:
+    """Write `report.html`.
+
+    Parameters
+    ----------
+    evaluation : Evaluation
+        What was found.
+    out_dir : str or Path
+        A folder; made where it is not there.
+    definitions : mapping of name to Definition
+        Of all measures.
+
+    Returns
+    -------
+    Path
+        The file: images and styles are in it.
+
+    Raises
+    ------
+    RunError
+        The folder cannot be made.
+    """
+    storage = LocalStorage(root=Path(out_dir))
+    storage.put(PAGE, page(evaluation, definitions).encode())
+    return storage.path(PAGE)
+
+
+def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> str:
+    """The page as text."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("pipeline.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["code"] = _code
+    found = chapters(evaluation, definitions)
+    measured, against = told_subject(evaluation)
+    name = evaluation.models.name
+    return environment.get_template("evaluation.html").render(
+        title=name if evaluation.reference is None else f"{name} against {evaluation.reference.name}",
+        measured=measured,
+        against=against,
+        headline=headline(found),
+        chapters=found,
+        lost=breakdowns(evaluation.tables),
+        maps=[_with_uris(one, png="uri") for one in maps(evaluation)],
+        charts=charts(evaluation.tables),
+        cases=[_with_uris(one, plan_png="plan_uri", view_png="view_uri") for one in worst_cases(evaluation)],
+        most_not_found=MOST_NOT_FOUND,
+        residuals=RESIDUAL_CLASSES,
+        truth_colour=TRUTH_COLOUR,
+        model_colour=MODEL_COLOUR,
+        notes=all_notes(evaluation),
+        intervals=INTERVALS,
+    )
+
+
+def headline(found: Sequence[Chapter]) -> list[tuple[str, Line]]:
+    """The figures over all buildings that decide, with the titles of their chapters."""
+    lines = {
+        line.definition.name: (chapter.title, line)
+        for chapter in found
+        for line in chapter.lines
+        if line.measure.subset == "all"
+    }
+    chosen = [next((lines[name] for name in names if name in lines), None) for names in HEADLINE]
+    return [pair for pair in chosen if pair is not None][:HEADLINE_FIGURES]
+
+
+def _with_uris(thing: Any, **pictures: str) -> dict[str, Any]:
+    """The fields of a dataclass and its properties, its PNG bytes as addresses that hold them."""
+    known = {name: getattr(thing, name) for name in dir(thing) if not name.startswith("_") and name not in pictures}
+    for field, name in pictures.items():
+        png = getattr(thing, field)
+        known[name] = None if png is None else data_uri(png)
+    return known
+
+
+def _code(text: str) -> Markup:
+    """One line of Markdown as HTML: what stands between backticks is code."""
+    return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704 -- escaped

@@ -1,0 +1,165 @@
+"""A city made tile by tile is the city made at once, and grows at its edges only."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline.evaluation.reading import read_models
+from pipeline.model import FloatArray
+from pipeline.synthetic import suites
+from pipeline.synthetic.als import ScanBlock, scan_all
+from pipeline.synthetic.city import CITY_SCANNER, CityPlan, city
+from pipeline.synthetic.conditions import terrain_slope_deg
+from pipeline.synthetic.dataset import ScenePaths, read_truth, simulate, tile_extents
+from pipeline.synthetic.scene import Scene
+from pipeline.synthetic.suites import SUITES
+
+SIZE = (420.0, 330.0)
+SPARSE = dataclasses.replace(CITY_SCANNER, pulse_density_per_m2=1.0)
+TILE_M = 200.0
+
+
+@pytest.fixture(scope="module")
+def whole() -> Scene:
+    return city(1_005, size_m=SIZE)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> ScenePaths:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(suites.SUITES, "city", dataclasses.replace(SUITES["city"], tile_m=TILE_M))
+        return simulate("city", tmp_path_factory.mktemp("city"), 1_005, size_m=SIZE, scanner=SPARSE)
+
+
+def in_order(xyz: FloatArray) -> FloatArray:
+    return xyz[np.lexsort(xyz.T)]
+
+
+def test_the_tiles_together_hold_exactly_the_points_of_the_whole_scan(whole: Scene, made: ScenePaths) -> None:
+    block: ScanBlock = scan_all(whole, SPARSE, 1_005)
+    tiles = np.concatenate([laspy.read(path).xyz for path in sorted((made.laz).iterdir())])
+    assert made.tiles == 6
+    assert len(tiles) == len(block) == made.points
+    assert np.allclose(in_order(tiles), in_order(block.points.xyz), atol=1e-6)
+
+
+def test_labels_of_all_tiles_stand_in_the_order_of_their_points(made: ScenePaths) -> None:
+    manifest = json.loads((made.truth / "scene.json").read_text())
+    xyz = np.concatenate([laspy.read(made.truth / tile["laz"]).xyz for tile in manifest["tiles"]])
+    truth = read_truth(made.truth)
+    assert len(truth.classification) == len(xyz) == made.points
+    models = {model.building_id: model for model in read_models(made.truth).models}
+    assert set(truth.building_ids) <= set(models)
+    errors = []
+    for number, name in enumerate(truth.building_ids):
+        mine = (truth.building == number) & (truth.face >= 0) & ~truth.mixed
+        x, y, z = xyz[mine].T
+        errors.append(z - models[name].top(x, y))
+    assert abs(float(np.nanmedian(np.concatenate(errors)))) < 0.1
+    assert float(np.nanpercentile(np.abs(np.concatenate(errors)), 90)) < 0.4  # strips are shifted
+    for tile in manifest["tiles"]:
+        header = laspy.open(made.truth / tile["laz"]).header
+        assert tile["points"] == header.point_count
+        assert tile["bounds"] == pytest.approx([*header.mins[:2], *header.maxs[:2]], abs=1e-6)
+
+
+def test_every_building_has_one_owner_and_all_are_there(whole: Scene, made: ScenePaths) -> None:
+    expected = sorted(one.building_id for one in whole.buildings)
+    assert sorted(model.building_id for model in read_models(made.truth).models) == expected
+    assert pq.read_table(made.truth / "conditions.parquet")["building_id"].to_pylist() == expected
+    manifest = json.loads((made.truth / "scene.json").read_text())
+    counts = (manifest["buildings"], manifest["trees"], manifest["cars"])
+    assert counts == (len(whole.buildings), len(whole.trees), len(whole.boxes))
+    assert manifest["extent"][2] - manifest["extent"][0] == SIZE[0]
+
+
+def test_a_tile_holds_the_buildings_whose_middle_lies_in_it(made: ScenePaths) -> None:
+    extents = dict(tile_extents(SIZE, TILE_M))
+    middles = {one.building_id: (one.x, one.y) for one in city(1_005, size_m=SIZE).buildings}
+    for key, (x0, y0, x1, y1) in extents.items():
+        rows = pq.read_table(made.truth / "buildings" / f"tile={key}" / "part-0.parquet")["building_id"].to_pylist()
+        assert rows
+        for name in rows:
+            x, y = middles[name]
+            assert x0 <= x < x1 or not 0 <= x < SIZE[0]
+            assert y0 <= y < y1 or not 0 <= y < SIZE[1]
+
+
+def test_the_same_call_gives_the_same_bytes(tmp_path: Path) -> None:
+    digests = []
+    for name in ("a", "b"):
+        paths = simulate("city", tmp_path / name, 7, size_m=(120.0, 100.0), scanner=SPARSE)
+        files = sorted(path for path in (tmp_path / name).rglob("*") if path.is_file())
+        digests.append([hashlib.sha256(path.read_bytes()).hexdigest() for path in files])
+        assert paths.tiles == 1
+    assert digests[0] == digests[1]
+
+
+def test_a_larger_city_holds_the_smaller_one_unchanged(whole: Scene) -> None:
+    larger = {one.building_id: one for one in city(1_005, size_m=(SIZE[0] + 150.0, SIZE[1] + 80.0)).buildings}
+    for one in whole.buildings:
+        assert np.array_equal(one.vertices, larger[one.building_id].vertices)
+    assert set(whole.trees) < set(city(1_005, size_m=(SIZE[0] + 150.0, SIZE[1] + 80.0)).trees)
+
+
+def test_what_a_tile_sees_does_not_depend_on_what_was_seen_before() -> None:
+    fresh, used = CityPlan(3, (900.0, 900.0)), CityPlan(3, (900.0, 900.0))
+    used.part((0.0, 0.0, 200.0, 200.0))
+    extent = (100.0, 100.0, 300.0, 250.0)
+    one, two = fresh.part(extent), used.part(extent)
+    assert [a.building_id for a in one.buildings] == [b.building_id for b in two.buildings]
+    assert one.trees == two.trees
+
+
+@pytest.mark.slow
+def test_a_square_kilometre_has_all_kinds_of_things_and_a_steep_hillside() -> None:
+    scene = city(1_000)
+    shapes = Counter(str(one.shape) for one in scene.buildings)
+    assert len(shapes) == 16
+    assert 1_000 < len(scene.buildings) < 2_000
+    assert {str(defect) for one in scene.buildings for defect in one.defects} == {
+        "wet_spot",
+        "dormers",
+        "superstructure",
+        "overhanging_tree",
+    }
+    slopes = np.array([terrain_slope_deg(scene.terrain, one.x, one.y) for one in scene.buildings])
+    assert 25.0 < slopes.max() < 30.0
+    assert np.median(slopes) < 5.0
+    assert len(scene.trees) > 1_000
+    assert len(scene.boxes) > 1_000
+
+
+@pytest.mark.slow
+def test_a_city_is_written_in_bounded_memory(tmp_path: Path) -> None:
+    """Measured in a process of its own: four times the tiles, about the same peak."""
+    program = (
+        "import resource, sys\n"
+        "from pipeline.synthetic.dataset import simulate\n"
+        "made = simulate('city', sys.argv[1], 1000, size_m=(float(sys.argv[2]),) * 2, density_per_m2=6.0)\n"
+        "print(made.points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    figures = []
+    for size in (1000, 2000):
+        done = subprocess.run(
+            [sys.executable, "-c", program, str(tmp_path / str(size)), str(size)],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        figures.append([int(word) for word in done.stdout.split()])
+    (few, small_kb), (many, large_kb) = figures
+    assert many > 3.8 * few
+    assert large_kb - small_kb < 150_000
+    assert large_kb < 1_500_000

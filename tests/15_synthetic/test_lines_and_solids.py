@@ -1,0 +1,215 @@
+"""What lines hit, against the triangles of the closed solids (Moeller and Trumbore 1997) and steep terrain."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import SettingsError
+from pipeline.model import FaceKind, FloatArray, IntArray
+from pipeline.synthetic.additions import can_have_dormers, random_dormers, random_superstructures
+from pipeline.synthetic.als import ScannerSettings, scan_all
+from pipeline.synthetic.first_hit import GROUND, ROOF, WALL, hits_of_lines
+from pipeline.synthetic.random_dimensions import random_dimensions
+from pipeline.synthetic.roofs import RoofShape
+from pipeline.synthetic.scene import Building, Scene, Terrain, place_building, undulating_terrain
+from pipeline.synthetic.scene_arrays import scene_arrays
+from pipeline.synthetic.solids import building_solid
+
+LEAN = 0.45
+LINES = 3000
+
+
+def scene_of(shape: RoofShape, seed: int, slope_deg: float = 4.0) -> Scene:
+    """One random building with all that can stand on it, on a slope."""
+    random = np.random.default_rng([seed, list(RoofShape).index(shape)])
+    terrain = undulating_terrain(50.0, slope_deg, float(random.uniform(0, 360)), 0.5, 150.0, random)
+    size = random_dimensions(shape, random)
+    boxes = random_superstructures(shape, size, random)
+    size = dataclasses.replace(size, additions=boxes)
+    if can_have_dormers(shape):
+        size = dataclasses.replace(size, additions=(*boxes, *random_dormers(shape, size, random, besides=boxes)))
+    azimuth = float(random.uniform(0, 360))
+    house = place_building("it", shape, size, x=40.0, y=40.0, azimuth_deg=azimuth, eave_height_m=5.0, terrain=terrain)
+    return Scene(name="one", origin=(0, 0, 0), crs=None, extent=(0, 0, 80, 80), terrain=terrain, buildings=(house,))
+
+
+def aimed_lines(building: Building, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Places in and around the building, and leans."""
+    random = np.random.default_rng(seed)
+    low, high = building.vertices.min(axis=0) - 6.0, building.vertices.max(axis=0) + 6.0
+    places = random.uniform((*low[:2], building.floor_z_m), high, (count, 3))
+    return places, random.uniform(-1.0, 1.0, (count, 2)) * LEAN / math.sqrt(2.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SolidHits:
+    """What the twin found for n lines."""
+
+    z: FloatArray
+    """Elevation of the hit; -inf for none."""
+    plane: IntArray
+    """Its roof plane; -1 for a wall or the floor."""
+    incidence: FloatArray
+    """How far the line comes nearer to the face for a metre up."""
+    from_edge: FloatArray
+    """Distance of the hit to the nearest edge of the solid."""
+
+
+def solid_hits(building: Building, places: FloatArray, leans: FloatArray) -> SolidHits:
+    """The twin: highest hit of each line with the solid's faces.
+
+    Every ring is a fan of triangles whose signed hits add up to 1 inside of a face, whatever its form and its holes.
+    """
+    solid = building_solid(building)
+    way = np.column_stack([leans, np.ones(len(leans))])
+    best, owner, margin = np.full(len(places), -np.inf), np.full(len(places), -2), np.full(len(places), np.inf)
+    incidence = np.ones(len(places))
+    for face in solid.faces:
+        winding, z_sum, hit_count = np.zeros(len(places)), np.zeros(len(places)), np.zeros(len(places))
+        for ring in face.rings:
+            corners = solid.vertices[list(ring)]
+            for second, third in itertools.pairwise(corners[1:]):
+                edge1, edge2 = second - corners[0], third - corners[0]
+                across = np.cross(way, edge2)
+                determinant = across @ edge1
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    away = places - corners[0]
+                    u = np.einsum("ij,ij->i", away, across) / determinant
+                    turned = np.cross(away, edge1)
+                    v = np.einsum("ij,ij->i", way, turned) / determinant
+                    t = turned @ edge2 / determinant
+                    inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (np.abs(determinant) > 1e-12)
+                winding[inside] += np.sign(determinant[inside])
+                z_sum[inside] += (places[:, 2] + t)[inside]
+                hit_count[inside] += 1
+        met = np.abs(winding) > 0.5
+        z = np.where(met, z_sum / np.maximum(hit_count, 1), -np.inf)
+        is_higher = z > best
+        best[is_higher] = z[is_higher]
+        owner[is_higher] = face.plane if face.kind is FaceKind.ROOF else -1
+        ends = solid.vertices[list(face.rings[0])] - solid.vertices[face.rings[0][0]]
+        normal = np.cross(ends[:-1], ends[1:]).sum(axis=0)
+        incidence[is_higher] = np.abs(way @ (normal / np.linalg.norm(normal)))[is_higher]
+    at = places + (np.where(np.isfinite(best), best, places[:, 2]) - places[:, 2])[:, None] * way
+    for face in solid.faces:
+        for ring in face.rings:
+            corners = solid.vertices[list(ring)]
+            for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+                edge = end - start
+                along = np.clip((at - start) @ edge / (edge @ edge), 0.0, 1.0)
+                margin = np.minimum(margin, np.linalg.norm(at - start - along[:, None] * edge, axis=1))
+    return SolidHits(z=best, plane=owner, incidence=incidence, from_edge=margin)
+
+
+@pytest.mark.parametrize("shape", list(RoofShape))
+def test_lines_hit_the_faces_of_the_closed_solid(shape: RoofShape) -> None:
+    for seed in (1, 2):
+        scene = scene_of(shape, seed)
+        building = scene.buildings[0]
+        places, leans = aimed_lines(building, LINES, seed)
+        hits = hits_of_lines(scene_arrays(scene, max_lean=LEAN), places, leans)
+        twin = solid_hits(building, places, leans)
+        does_hit = np.isfinite(twin.z)
+        at = places + np.where(does_hit, twin.z - places[:, 2], 0.0)[:, None] * np.column_stack([leans, np.ones(LINES)])
+        above_ground = twin.z > scene.terrain.elevation(at[:, 0], at[:, 1]) + 0.02
+        # The solid's vertices are rounded to whole millimetres.
+        clear = does_hit & above_ground & (twin.from_edge > 0.02) & (twin.incidence > 0.005)
+        assert clear.sum() > 0.1 * LINES
+        assert (np.abs(hits.z - twin.z) * twin.incidence)[clear].max() < 0.002
+        assert (hits.building[clear] == 0).all()
+        assert np.array_equal(hits.face[clear], twin.plane[clear])
+        assert {-1, 0} <= set(twin.plane[clear].tolist())
+        assert not np.isin(hits.kind[~does_hit], (ROOF, WALL)).any()
+
+
+def test_the_wall_between_a_higher_and_a_lower_roof_is_hit() -> None:
+    scene = scene_of(RoofShape.MULTI_LEVEL_FLAT, 3)
+    building = scene.buildings[0]
+    places, leans = aimed_lines(building, 20_000, 5)
+    hits = hits_of_lines(scene_arrays(scene, max_lean=LEAN), places, leans)
+    inner = shapely.distance(building.footprint.exterior, shapely.points(hits.xyz[:, :2])) > 0.1
+    steps = (hits.kind == WALL) & inner
+    assert steps.sum() > 50
+    assert (hits.building[steps] == 0).all()
+    assert (hits.face[steps] == -1).all()
+    levels = sorted(plane.c for plane in building.planes)
+    assert (hits.z[steps] > levels[0]).all()
+    assert (hits.z[steps] < levels[-1]).all()
+
+
+def test_the_ground_of_a_courtyard_is_seen_between_its_walls() -> None:
+    scene = scene_of(RoofShape.COURTYARD, 2)
+    outline = scene.buildings[0].footprint
+    assert len(outline.interiors) == 1
+    court = shapely.Polygon(outline.interiors[0])
+    x, y = np.random.default_rng(1).uniform(10, 70, (2, 20_000))
+    places = np.column_stack([x, y, scene.terrain.elevation(x, y)])
+    arrays = scene_arrays(scene, max_lean=LEAN)
+    inside = shapely.contains(court, shapely.points(x, y))
+    assert inside.sum() > 50
+    from_above = hits_of_lines(arrays, places, np.zeros((len(x), 2)))
+    assert (from_above.kind[inside] == GROUND).all()
+    aside = hits_of_lines(arrays, places, np.tile([0.4, 0.0], (len(x), 1)))
+    walls = aside.kind == WALL
+    near_court = shapely.distance(court.exterior, shapely.points(aside.xyz[:, :2])) < 1e-6
+    assert (walls & near_court).sum() > 30
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    slope_deg=st.floats(0.0, 30.0),
+    aspect_deg=st.floats(0.0, 360.0),
+    lean=st.floats(0.0, 1.1),
+    turn=st.floats(0.0, 2 * math.pi),
+    seed=st.integers(0, 1000),
+)
+def test_lines_land_on_steep_waving_terrain(
+    slope_deg: float, aspect_deg: float, lean: float, turn: float, seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+    terrain = undulating_terrain(100.0, slope_deg, aspect_deg, 3.0, 240.0, random)
+    scene = Scene(name="hill", origin=(0, 0, 0), crs=None, extent=(0, 0, 500, 500), terrain=terrain, buildings=())
+    places = np.column_stack([random.uniform(0, 500, (200, 2)), np.full(200, 100.0)])
+    leans = np.tile([lean * math.cos(turn), lean * math.sin(turn)], (200, 1))
+    arrays = scene_arrays(scene, max_lean=lean)
+    hits = hits_of_lines(arrays, places, leans)
+    x, y, z = hits.xyz.T
+    assert np.abs(terrain.elevation(x, y) - z).max() < 1e-5
+    assert np.abs(hits.xyz[:, :2] - places[:, :2] - (z - 100.0)[:, None] * leans).max() < 1e-9
+
+
+def test_a_survey_of_a_30_degree_slope_measures_it() -> None:
+    terrain = Terrain(base_z_m=200.0, slope_x=math.tan(math.radians(30.0)))
+    scene = Scene(name="hill", origin=(0, 0, 0), crs=None, extent=(0, 0, 150, 150), terrain=terrain, buildings=())
+    settings = ScannerSettings(range_noise_m=0.0, drop_out=0.0, altitude_m=400.0)
+    block = scan_all(scene, settings, 1)
+    x, y, z = block.points.xyz.T
+    assert np.abs(terrain.elevation(x, y) - z).max() < 0.0015  # rounded to whole millimetres
+    assert len(block) == pytest.approx(8.0 * 150.0 * 150.0 * (1 + 18 / 150), rel=0.05)
+
+
+def test_a_house_on_a_steep_slope_is_hit_from_all_the_cells_below_it() -> None:
+    """With a grid cell of reach too little, lines that land downhill would pass through the house."""
+    scene = scene_of(RoofShape.GABLE, 4, slope_deg=30.0)
+    building = scene.buildings[0]
+    places, leans = aimed_lines(building, 20_000, 7)
+    tight = hits_of_lines(scene_arrays(scene, max_lean=LEAN, margin_m=0.0), places, leans)
+    wide = hits_of_lines(scene_arrays(scene, max_lean=LEAN, margin_m=60.0), places, leans)
+    assert np.array_equal(tight.kind, wide.kind)
+    assert np.array_equal(tight.xyz, wide.xyz)
+    assert (wide.kind == WALL).sum() > 500
+
+
+def test_beams_that_graze_the_terrain_are_refused_before_the_first_pulse() -> None:
+    terrain = Terrain(base_z_m=0.0, slope_y=1.0)
+    scene = Scene(name="cliff", origin=(0, 0, 0), crs=None, extent=(0, 0, 50, 50), terrain=terrain, buildings=())
+    with pytest.raises(SettingsError, match=r"beams that lean 54 deg graze terrain of up to 45 deg: raise altitude_m"):
+        scan_all(scene, ScannerSettings(altitude_m=50.0), 1)

@@ -1,0 +1,116 @@
+"""All suites: seeds that never meet, scenes that are the same for the same seed, buildings that stand apart."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.errors import SettingsError
+from pipeline.synthetic.roofs import RoofShape
+from pipeline.synthetic.scene import Scene
+from pipeline.synthetic.seeds import DRAWS, FIRST_SEEDS, Split, seed_of, split_of
+from pipeline.synthetic.suites import SUITES, suite_named
+
+SMALL = {"town": (150.0, 120.0), "city": (260.0, 200.0)}
+
+
+def scene_of(name: str, seed: int) -> Scene:
+    suite = SUITES[name]
+    return suite.make(seed, SMALL.get(name, suite.size_m))
+
+
+def test_dev_and_test_seeds_never_meet() -> None:
+    dev, test = ({seed_of(split, 0), seed_of(split, DRAWS - 1)} for split in Split)
+    assert max(dev) < min(test)
+    assert (seed_of("dev", 0), seed_of("test", 0)) == (1_000, 90_000)
+    assert FIRST_SEEDS[Split.DEV] + DRAWS == FIRST_SEEDS[Split.TEST]
+
+
+@pytest.mark.parametrize(("split", "draw"), [("dev", 0), ("dev", 88_999), ("test", 0), ("test", 12)])
+def test_a_seed_knows_its_split(split: str, draw: int) -> None:
+    assert split_of(seed_of(split, draw)) == split
+
+
+def test_the_suites_own_seeds_belong_to_no_split() -> None:
+    assert {split_of(suite.seed) for suite in SUITES.values()} == {None}
+
+
+def test_an_unknown_split_and_an_impossible_draw_are_both_told() -> None:
+    with pytest.raises(SettingsError, match=r"split is 'tets': use one of dev, test; draw is -1: use 0 to 88999"):
+        seed_of("tets", -1)
+
+
+def test_every_roof_shape_is_a_suite_beside_the_scenes() -> None:
+    assert {"suburb", "town", "cube", "hofmann310", "sweep", "city"} | {str(shape) for shape in RoofShape} == set(
+        SUITES
+    )
+    with pytest.raises(SettingsError, match="suite is 'village': use one of suburb, town"):
+        suite_named("village")
+
+
+@pytest.mark.parametrize("name", list(SUITES))
+def test_the_same_seed_gives_the_same_scene_and_another_one_another(name: str) -> None:
+    first, again, other = scene_of(name, 3), scene_of(name, 3), scene_of(name, 4)
+    assert [one.building_id for one in first.buildings] == [one.building_id for one in again.buildings]
+    for one, two in zip(first.buildings, again.buildings, strict=True):
+        assert np.array_equal(one.vertices, two.vertices)
+    assert first.trees == again.trees
+    if name != "cube":  # the seed has no say
+        assert not all(
+            np.array_equal(one.vertices, two.vertices)
+            for one, two in zip(first.buildings, other.buildings, strict=False)
+        )
+
+
+@pytest.mark.parametrize("name", ["hofmann310", "sweep", "city"])
+def test_buildings_have_names_of_their_own_and_never_overlap(name: str) -> None:
+    scene = scene_of(name, 1003)
+    assert len({one.building_id for one in scene.buildings}) == len(scene.buildings)
+    outlines = [one.footprint for one in scene.buildings]
+    for a, b in zip(*shapely.STRtree(outlines).query(outlines, predicate="intersects"), strict=True):
+        if a < b:
+            assert shapely.intersection(outlines[a], outlines[b]).area < 1e-6
+            assert scene.buildings[a].block_id == scene.buildings[b].block_id
+
+
+@pytest.mark.parametrize("name", ["hofmann310", "sweep", "city"])
+def test_no_trunk_stands_in_a_building_and_no_eave_below_the_ground(name: str) -> None:
+    scene = scene_of(name, 1004)
+    index = shapely.STRtree([one.footprint for one in scene.buildings])
+    for tree in scene.trees:
+        assert len(index.query(shapely.Point(tree.x, tree.y), predicate="intersects")) == 0
+    for building in scene.buildings:
+        x, y = shapely.get_coordinates(building.footprint.segmentize(1.0)).T
+        ground = scene.terrain.elevation(x, y)
+        assert building.floor_z_m <= float(ground.min()) + 1e-6
+        assert building.eave_z_m > float(ground.max()) + 1.5
+
+
+def test_the_command_takes_a_split_and_a_draw_and_writes_them_down(tmp_path: Path) -> None:
+    done = CliRunner().invoke(
+        app, ["simulate", "gable", "--out", str(tmp_path), "--split", "test", "--draw", "2", "--density", "1", "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    manifest = json.loads((tmp_path / "truth" / "scene.json").read_text())
+    assert (manifest["seed"], manifest["split"]) == (90_002, "test")
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--split", "dev", "--seed", "3"], "both --seed 3 and --split dev"),
+        (["--draw", "3"], "draw is 3 of no split"),
+        (["--split", "train"], "split is 'train'"),
+    ],
+)
+def test_the_command_refuses_seeds_that_contradict_each_other(words: list[str], told: str, tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["simulate", "gable", "--out", str(tmp_path), *words])
+    assert done.exit_code == 2
+    assert told in done.output
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,540 @@
+"""Roof faces: the truth is perfect against itself, known damage costs what it should, and naive rasters agree."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import roofs_by_hand as by_hand
+import shapely
+from matplotlib.path import Path
+from roofs_by_hand import bent_gable, flat, gable, hip, lifted, moved, rectangle, reference, surface, turned, with_face
+
+from pipeline.evaluation.faces import DEFINITIONS, FaceScore, FaceVerdict, measures, score_faces
+from pipeline.evaluation.models import RoofModel, RoofSurface
+from pipeline.evaluation.reference import Reference
+from pipeline.evaluation.subsets import subsets
+from pipeline.evaluation.topology import Topology
+from pipeline.model import RoofType
+from pipeline.synthetic.suburb import suburb
+
+TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0)]
+SHARES = [one.name for one in DEFINITIONS if one.unit == "share"]
+
+
+def figures(score: FaceScore, truth: Reference, subset: int = 0) -> dict[str, float]:
+    return by_hand.values(measures(score, subsets(truth)[subset]))
+
+
+def scored(models: list[RoofModel], truth: list[RoofModel], **more: object) -> dict[str, float]:
+    known = reference(truth, **more)
+    return figures(score_faces(models, known), known)
+
+
+def found(models: list[RoofModel], truth: list[RoofModel]) -> list[bool]:
+    return [row.found for row in score_faces(models, reference(truth)).reference]
+
+
+@pytest.mark.parametrize("truth", [TRUTH, [bent_gable("d")], by_hand.models_of_scene(suburb(7, size_m=(120.0, 120.0)))])
+def test_the_truth_scored_against_itself_is_perfect(truth: list[RoofModel]) -> None:
+    known = reference(truth, extent=None)
+    score = score_faces(truth, known)
+    told = {one.name: one for one in measures(score, subsets(known)[0])}
+    assert set(told) == {one.name for one in DEFINITIONS}
+    for name in SHARES:
+        assert (told[name].value, told[name].low, told[name].high) == (
+            1.0,
+            *((1.0, 1.0) if len(truth) > 1 else (pytest.approx(math.nan, nan_ok=True),) * 2),
+        )
+    assert {row.verdict for row in score.models} <= {FaceVerdict.RIGHT, FaceVerdict.NEITHER}
+    assert all(row.found and row.matched and not row.as_group for row in score.reference)
+    assert max(row.angle_deg for row in score.reference) == 0.0
+    assert max(abs(row.offset_m) for row in score.reference) == 0.0
+    assert {one.kind for one in score.components} == {Topology.ONE_TO_ONE}
+    large = len({row.unit for row in score.reference if row.unit_area_m2 >= 10})
+    assert told["faces.topology_1_1"].value == large
+    assert told["faces.completeness_10m2"].n == large
+
+
+def test_a_removed_face_is_missing_and_nothing_is_wrong() -> None:
+    told = scored([TRUTH[0], with_face(TRUTH[1], 0, None), TRUTH[2]], TRUTH)
+    assert told["completeness_10m2"] == told["completeness_all"] == pytest.approx(6 / 7)
+    assert told["correctness_10m2"] == told["correctness_all"] == told["correctness_area"] == 1.0
+    assert told["quality_10m2"] == pytest.approx(6 / 7)
+    slanted = math.sqrt(1 + 0.7**2)
+    whole = (96 + 112) * slanted + 80
+    assert told["completeness_area"] == told["quality_area"] == pytest.approx(1 - 40 * slanted / whole)
+    assert (told["topology_1_1"], told["topology_1_0"]) == (6, 1)
+
+
+def test_a_dropped_building_loses_its_faces() -> None:
+    told = scored([TRUTH[0], TRUTH[2]], TRUTH)
+    assert told["completeness_10m2"] == pytest.approx(3 / 7)
+    assert told["correctness_10m2"] == 1.0
+    assert told["topology_1_0"] == 4
+
+
+@pytest.mark.parametrize(("lift", "kept"), [(0.2, True), (0.3, True), (-0.3, True), (0.31, False), (-0.31, False)])
+def test_a_flat_face_is_found_up_to_a_lift_of_0_3_m(lift: float, kept: bool) -> None:
+    one = TRUTH[2]
+    (row,) = score_faces([with_face(one, 0, lifted(one.surfaces[0], lift))], reference([one])).reference
+    assert row.found is kept
+    assert row.offset_m == pytest.approx(lift)
+    assert row.angle_deg == 0.0
+
+
+def test_a_lift_counts_across_the_plane() -> None:
+    one = TRUTH[0]
+    limit = 0.3 * math.sqrt(1 + 0.7**2)
+    for lift, kept in ((limit - 1e-4, True), (limit + 1e-4, False)):
+        (row, _) = score_faces([with_face(one, 0, lifted(one.surfaces[0], lift))], reference([one])).reference
+        assert row.found is kept
+        assert row.offset_m == pytest.approx(lift / math.sqrt(1 + 0.7**2))
+
+
+@pytest.mark.parametrize("place", [(0, 0), (1, 0), (1, 2), (2, 0)])
+@pytest.mark.parametrize(("angle", "kept"), [(5.0, True), (9.99, True), (10.01, False), (11.0, False)])
+def test_a_face_is_found_up_to_a_turn_of_10_deg(place: tuple[int, int], angle: float, kept: bool) -> None:
+    building, face = place
+    one = TRUTH[building]
+    row = score_faces([with_face(one, face, turned(one.surfaces[face], angle))], reference([one])).reference[face]
+    assert row.found is kept
+    assert row.angle_deg == pytest.approx(angle)
+    assert row.offset_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_lost_face_of_a_model_is_wrong_where_it_should_have_been() -> None:
+    one = with_face(TRUTH[1], 2, turned(TRUTH[1].surfaces[2], 11.0))
+    score = score_faces([TRUTH[0], one], reference(TRUTH[:2]))
+    assert [row.verdict for row in score.models].count(FaceVerdict.WRONG) == 1
+    (wrong,) = [row for row in score.models if row.verdict is FaceVerdict.WRONG]
+    assert (wrong.building, wrong.model_id, wrong.plane_id) == (1, "b", 2)
+    told = figures(score, reference(TRUTH[:2]))
+    assert told["completeness_10m2"] == told["correctness_10m2"] == pytest.approx(5 / 6)
+    assert told["quality_10m2"] == pytest.approx(5 / 7)
+    assert told["topology_1_1"] == 6  # how faces lie on one another does not ask for their planes
+
+
+def test_faces_match_one_to_one() -> None:
+    true = [flat("t", width=12.0)]
+    twice = dataclasses.replace(true[0], surfaces=true[0].surfaces * 2)
+    assert scored([twice], true)["correctness_10m2"] == 0.5
+    halves = [flat("m", width=6.0), flat("n", 6.0, width=6.0)]
+    told = scored(halves, true)
+    assert (told["completeness_10m2"], told["correctness_10m2"], told["topology_1_n"]) == (1.0, 0.5, 1)
+    thirds = [flat(str(x), x, width=4.0) for x in (0.0, 4.0, 8.0)]
+    told = scored(thirds, true)
+    assert (told["completeness_10m2"], told["correctness_10m2"], told["topology_1_n"]) == (0.0, 0.0, 1)
+
+
+def test_faces_joined_and_tangled_are_counted() -> None:
+    true = [flat(str(x), x, width=6.0) for x in (0.0, 6.0, 12.0)]
+    told = scored([flat("m", width=18.0)], true)
+    assert [told[f"topology_{kind}"] for kind in ("1_1", "1_n", "n_1", "n_m", "1_0", "0_1")] == [0, 0, 1, 0, 0, 0]
+    across = [
+        dataclasses.replace(flat(str(y)), surfaces=(surface(rectangle(0, y, 18, y + 4), (0.0, 0.0, 6.0)),))
+        for y in (0.0, 4.0)
+    ]
+    told = scored(across, true)
+    assert [told[f"topology_{kind}"] for kind in ("1_1", "1_n", "n_1", "n_m", "1_0", "0_1")] == [0, 0, 0, 1, 0, 0]
+    told = scored([flat("far", 200.0)], true)
+    assert [told[f"topology_{kind}"] for kind in ("1_1", "1_n", "n_1", "n_m", "1_0", "0_1")] == [0, 0, 0, 0, 3, 1]
+
+
+def test_a_split_building_costs_no_faces() -> None:
+    one = TRUTH[1]
+    parts = [dataclasses.replace(one, building_id=str(k), surfaces=(face,)) for k, face in enumerate(one.surfaces)]
+    told = scored(parts, [one])
+    assert all(told[name.split(".")[1]] == 1.0 for name in SHARES)
+    row = dataclasses.replace(TRUTH[0], surfaces=tuple(face for true in TRUTH for face in true.surfaces))
+    told = scored([row], TRUTH)  # nor does a model that joins buildings
+    assert all(told[name.split(".")[1]] == 1.0 for name in SHARES)
+
+
+# ------------------------------------------------------------------------------------------------------- bent faces
+
+
+def one_sided(name: str, true: RoofModel) -> RoofModel:
+    """A bent gable modelled with one face a side: the chord from eave to ridge."""
+    middle, ridge, eave = 6.0, 4.0 + 2 * 0.4 + 4 * 0.6, 4.0
+    rise = (ridge - eave) / middle
+    sides = [
+        surface(rectangle(0, 0, 12, 6), (0.0, rise, eave), 0),
+        surface(rectangle(0, 6, 12, 12), (0.0, -rise, eave + 12 * rise), 1),
+    ]
+    return dataclasses.replace(true, building_id=name, surfaces=tuple(sides))
+
+
+def test_a_bent_face_is_found_as_one_face_and_as_two() -> None:
+    true = bent_gable("t")
+    for made in (true, one_sided("m", true)):
+        told = scored([made], [true])
+        assert all(told[name.split(".")[1]] == 1.0 for name in SHARES)
+        assert (told["topology_1_1"], told["topology_1_n"]) == (2, 0)
+        known = reference([true])
+        assert {one.n for one in measures(score_faces([made], known), subsets(known)[0]) if "complete" in one.name} == {
+            2
+        }
+
+
+def test_a_bent_face_is_found_by_its_mean_plane_where_no_piece_matches_alone() -> None:
+    true = bent_gable("t", lower=0.30, upper=0.62, bend=3.0)
+    chord = (3 * 0.30 + 3 * 0.62) / 6
+    mean_z = 4.0 + (3.0 * 0.45 + 3.0 * (0.9 + 0.93)) / 6
+    sides = [
+        surface(rectangle(0, 0, 12, 6), (0.0, chord, mean_z - 3 * chord), 0),
+        surface(rectangle(0, 6, 12, 12), (0.0, -chord, mean_z + 9 * chord), 1),
+    ]
+    score = score_faces([dataclasses.replace(true, surfaces=tuple(sides))], reference([true]))
+    assert all(row.found and row.as_group and row.matched for row in score.reference)
+    assert [row.angle_deg for row in score.reference] == pytest.approx([0.0] * 4, abs=1e-9)
+    assert [row.offset_m for row in score.reference] == pytest.approx([0.0] * 4, abs=1e-9)
+    assert [row.overlap_reference for row in score.reference] == pytest.approx([1.0] * 4)
+    assert [row.verdict for row in score.models] == [FaceVerdict.RIGHT] * 2
+    sides[0] = lifted(sides[0], 0.5)
+    score = score_faces([dataclasses.replace(true, surfaces=tuple(sides))], reference([true]))
+    assert [row.found for row in score.reference] == [False, False, True, True]
+
+
+def test_a_bent_face_needs_half_of_its_area_in_matched_pieces() -> None:
+    true = bent_gable("t", bend=2.0)  # lower pieces hold a third
+    assert found([with_face(true, 0, None)], [true]) == [True] * 4
+    assert found([with_face(true, 1, None)], [true]) == [False, False, True, True]
+    score = score_faces([with_face(true, 1, None)], reference([true]))
+    assert [row.verdict for row in score.models] == [FaceVerdict.RIGHT] * 3  # a piece of a lost face is not wrong
+    assert [row.matched for row in score.reference] == [True, False, True, True]
+
+
+def test_area_and_points_of_a_bent_face_are_summed() -> None:
+    true = bent_gable("t", bend=0.5)
+    points = {("t", 0): 4, ("t", 1): 7, ("t", 2): 4, ("t", 3): 6}
+    score = score_faces([true], reference([true], face_points=points))
+    assert [row.to_be_found for row in score.reference] == [True, True, False, False]
+    assert [row.n_points for row in score.reference] == [4, 7, 4, 6]
+    assert score.reference[0].area_m2 < 10.0 < score.reference[0].unit_area_m2
+    assert score.reference[0].unit_area_m2 == pytest.approx(score.reference[0].area_m2 + score.reference[1].area_m2)
+
+
+# ------------------------------------------------------------------------------- what need not be found, what is no fault
+
+
+def test_small_faces_are_neither_right_nor_wrong() -> None:
+    true = [flat("large"), flat("small", 20.0, width=3.0, depth=3.0)]
+    told = scored(true, true)
+    assert (told["completeness_10m2"], told["correctness_10m2"], told["completeness_all"]) == (1.0, 1.0, 1.0)
+    known = reference(true)
+    for models, verdicts, complete in (
+        (true, [FaceVerdict.RIGHT, FaceVerdict.NEITHER], 1.0),
+        ([true[0]], [FaceVerdict.RIGHT], 0.5),
+        ([true[0], flat("little", 60.0, width=3.0, depth=3.0)], [FaceVerdict.RIGHT, FaceVerdict.NEITHER], 0.5),
+        ([true[0], flat("more", 20.0, width=4.0, depth=3.5)], [FaceVerdict.RIGHT, FaceVerdict.NEITHER], 1.0),
+        ([true[0], flat("much", 20.0, width=6.0, depth=6.0)], [FaceVerdict.RIGHT, FaceVerdict.WRONG], 0.5),
+    ):
+        score = score_faces(models, known)
+        assert [row.verdict for row in score.models] == verdicts
+        told = {one.name: one for one in measures(score, subsets(known)[0])}
+        assert told["faces.completeness_10m2"].value == 1.0
+        assert told["faces.completeness_10m2"].n == 1
+        assert told["faces.completeness_all"].value == complete
+        assert told["faces.correctness_10m2"].value == (0.5 if FaceVerdict.WRONG in verdicts else 1.0)
+
+
+def test_faces_with_too_few_points_need_not_be_found() -> None:
+    points = {("a", 0): 11, ("a", 1): 10, ("c", 0): 500}
+    known = reference(TRUTH, face_points=points)
+    score = score_faces(TRUTH, known)
+    assert [row.to_be_found for row in score.reference] == [True, False, *[False] * 4, True]
+    told = {one.name: one for one in measures(score, subsets(known)[0])}
+    assert (told["faces.completeness_10m2"].value, told["faces.completeness_10m2"].n) == (1.0, 2)
+    assert (told["faces.correctness_10m2"].value, told["faces.correctness_10m2"].n) == (1.0, 2)
+    assert told["faces.completeness_all"].n == 7
+
+
+def test_what_the_data_edge_cuts_is_neither_found_nor_wrong() -> None:
+    cut = flat("cut", 20.0, touches_data_edge=True)
+    known = reference([TRUTH[0], cut])
+    beyond, other = flat("beyond", 300.0, touches_data_edge=True), with_face(cut, 0, lifted(cut.surfaces[0], 2.0))
+    for models in (
+        [TRUTH[0]],
+        [TRUTH[0], beyond],
+        [TRUTH[0], cut],
+        [TRUTH[0], dataclasses.replace(other, touches_data_edge=False)],
+    ):
+        score = score_faces(models, known)
+        assert [row.verdict for row in score.models[2:]] == [FaceVerdict.LEFT_OUT] * (len(models) - 1)
+        told = {one.name: one for one in measures(score, subsets(known)[0])}
+        assert [told[name].value for name in SHARES] == [1.0] * len(SHARES)
+        assert told["faces.completeness_all"].n == told["faces.topology_1_1"].value == 2
+    uncut = reference([TRUTH[0], dataclasses.replace(cut, touches_data_edge=False)])
+    assert figures(score_faces([TRUTH[0], cut], uncut), uncut)["completeness_10m2"] == 1.0  # a cut model may find
+
+
+def test_a_face_elsewhere_is_wrong_only_where_the_reference_is_complete() -> None:
+    far = flat("far", 200.0)
+    for extent, verdict in ((by_hand.EXTENT, FaceVerdict.WRONG), (None, FaceVerdict.LEFT_OUT)):
+        known = reference(TRUTH, extent=extent)
+        score = score_faces([*TRUTH, far], known)
+        assert score.models[-1].verdict is verdict
+        assert score.models[-1].building == -1
+        told = figures(score, known)
+        assert told["correctness_10m2"] == pytest.approx(7 / 8 if extent else 1.0)
+        assert told["completeness_10m2"] == 1.0
+    high = with_face(TRUTH[2], 0, lifted(TRUTH[2].surfaces[0], 3.0))
+    assert score_faces([high], reference(TRUTH, extent=None)).models[0].verdict is FaceVerdict.WRONG
+
+
+def test_good_and_hard_buildings_are_told_apart() -> None:
+    known = {
+        "a": by_hand.conditions(good=True),
+        "b": by_hand.conditions(good=False),
+        "c": by_hand.conditions(good=True),
+    }
+    truth = reference(TRUTH, conditions=known)
+    score = score_faces(
+        [TRUTH[0], with_face(TRUTH[1], 1, lifted(TRUTH[1].surfaces[1], 1.0)), flat("far", 200.0)], truth
+    )
+    everything, good, hard = ({one.name: one for one in measures(score, subset)} for subset in subsets(truth))
+    assert [told["faces.completeness_10m2"].value for told in (everything, good, hard)] == pytest.approx(
+        [5 / 7, 2 / 3, 3 / 4]
+    )
+    assert [told["faces.correctness_10m2"].value for told in (everything, good, hard)] == pytest.approx(
+        [5 / 7, 1.0, 3 / 4]
+    )
+    assert [told["faces.quality_10m2"].value for told in (everything, good, hard)] == pytest.approx(
+        [5 / 9, 2 / 3, 3 / 5]
+    )
+    assert [told["faces.topology_0_1"].value for told in (everything, good, hard)] == [1, 0, 0]
+    assert [told["faces.completeness_10m2"].subset for told in (everything, good, hard)] == ["all", "good", "hard"]
+
+
+def test_without_true_faces_there_is_nothing_to_say() -> None:
+    known = reference(TRUTH, has_faces=False)
+    score = score_faces(TRUTH, known)
+    assert score == FaceScore(reference=(), models=(), components=())
+    assert measures(score, subsets(known)[0]) == []
+
+
+def test_no_models_find_nothing_and_are_never_wrong() -> None:
+    told = scored([], TRUTH)
+    assert told["completeness_10m2"] == told["quality_10m2"] == told["completeness_area"] == 0.0
+    assert math.isnan(told["correctness_10m2"])
+    assert told["topology_1_0"] == 7
+
+
+# ------------------------------------------------------------------------------------------------------- invariants
+
+
+@pytest.mark.parametrize(("x", "y", "turn"), [(5e5, 5.8e6, 0.0), (5e5, 5.8e6, 33.0), (-40.0, 12.0, 180.0)])
+def test_the_score_does_not_change_where_the_scene_moves_or_turns(x: float, y: float, turn: float) -> None:
+    random = np.random.default_rng(4)
+    truth = by_hand.models_of_scene(suburb(11, size_m=(90.0, 90.0)))
+    models = damaged(truth, random)
+    before = score_faces(models, reference(truth, extent=None))
+    after = score_faces(
+        [moved(one, x, y, 7.0, turn) for one in models],
+        reference([moved(one, x, y, 7.0, turn) for one in truth], extent=None),
+    )
+    assert [row.found for row in before.reference] == [row.found for row in after.reference]
+    assert [row.verdict for row in before.models] == [row.verdict for row in after.models]
+    assert 0 < sum(row.found for row in before.reference) < len(before.reference)
+
+
+def test_the_score_does_not_depend_on_the_order_of_models() -> None:
+    truth = by_hand.models_of_scene(suburb(12, size_m=(90.0, 90.0)))
+    models = damaged(truth, np.random.default_rng(5))
+    known = reference(truth, extent=None)
+    told, other = figures(score_faces(models, known), known), figures(score_faces(models[::-1], known), known)
+    assert told == pytest.approx(other, nan_ok=True)
+
+
+# ----------------------------------------------------------- the slow twin: rasters of 5 cm, counting, naive double loops
+
+CELL = 0.05
+SURE_OVERLAP, SURE_OFFSET, SURE_ANGLE, SURE_HELD = 0.02, 0.01, 0.05, 0.02
+"""A face is compared where no figure that decides about it is closer to its limit than this: cells are counted."""
+
+
+def damaged(truth: list[RoofModel], random: np.random.Generator) -> list[RoofModel]:
+    """Models with faces dropped, lifted, turned, shifted, cut in two, doubled, and thrown together anew."""
+    models = []
+    for building in truth:
+        if random.random() < 0.08:
+            continue
+        faces: list[RoofSurface] = []
+        for face in building.surfaces:
+            kind = random.choice(["as_is", "drop", "lift", "turn", "shift", "cut", "double", "slip"])
+            if kind == "drop":
+                continue
+            if kind == "lift":
+                face = lifted(face, random.normal(0.0, 0.35))
+            if kind == "turn":
+                face = turned(face, random.uniform(-16.0, 16.0))
+            if kind in ("shift", "slip"):
+                x, y = random.normal(0.0, 1.2, 2)
+                polygon = shapely.affinity.translate(face.polygon, x, y)
+                a, b, c = face.coefficients
+                face = dataclasses.replace(
+                    face, polygon=polygon, coefficients=(a, b, c - (a * x + b * y if kind == "slip" else 0.0))
+                )
+            parts = [face]
+            if kind == "cut":
+                low_x, low_y, high_x, high_y = face.polygon.bounds
+                at = low_x + random.uniform(0.2, 0.8) * (high_x - low_x)
+                boxes = (shapely.box(low_x, low_y, at, high_y), shapely.box(at, low_y, high_x, high_y))
+                cuts = [face.polygon.intersection(box) for box in boxes]
+                parts = [dataclasses.replace(face, polygon=cut) for cut in cuts if cut.geom_type == "Polygon"]
+            if kind == "double":
+                parts = [face, lifted(face, 0.1)]
+            faces += parts
+        if faces:
+            models.append(dataclasses.replace(building, surfaces=tuple(faces)))
+    if len(models) > 3:  # one model of two buildings, and one building in two models
+        joined = dataclasses.replace(models[0], surfaces=models[0].surfaces + models[1].surfaces)
+        split = [dataclasses.replace(models[2], surfaces=(face,)) for face in models[2].surfaces]
+        models = [joined, *split, *models[3:]]
+    return models
+
+
+class SlowFace:
+    """A face as cells of a raster."""
+
+    def __init__(self, face: RoofSurface, x: np.ndarray, y: np.ndarray) -> None:
+        self.face = face
+        self.cells = np.zeros(x.shape, bool)
+        low_x, low_y, high_x, high_y = face.polygon.bounds
+        rows = slice(*np.searchsorted(y[:, 0], [low_y, high_y]))
+        columns = slice(*np.searchsorted(x[0], [low_x, high_x]))
+        places = np.column_stack([x[rows, columns].ravel(), y[rows, columns].ravel()])
+        shape = x[rows, columns].shape
+        corner = places.min(axis=0) if len(places) else np.zeros(2)
+        ring = Path(np.array(face.polygon.exterior.coords) - corner)
+        self.cells[rows, columns] = ring.contains_points(places - corner).reshape(shape)
+        self.count = int(self.cells.sum())
+        self.z = face.elevation(x, y)
+
+
+def slow_pair(
+    cells: np.ndarray, z: np.ndarray, slope: tuple[float, float], other: SlowFace
+) -> tuple[float, float, float]:
+    """Smaller share of both, angle in degrees, offset in metres of a true area and a model face, from cells."""
+    common = cells & other.cells
+    count = int(common.sum())
+    if count == 0:
+        return 0.0, 180.0, 99.0
+    a, b = slope
+    p, q, _ = other.face.coefficients
+    dot = (a * p + b * q + 1.0) / math.sqrt((a * a + b * b + 1.0) * (p * p + q * q + 1.0))
+    offset = float((other.z - z)[common].mean()) / math.sqrt(a * a + b * b + 1.0)
+    return count / max(int(cells.sum()), other.count), math.degrees(math.acos(min(1.0, dot))), offset
+
+
+def slow_fit(figures: tuple[float, float, float]) -> tuple[bool, bool]:
+    """Whether a pair fits, and whether that is sure."""
+    share, angle, offset = figures
+    tests = [(share, 0.5, SURE_OVERLAP, 1), (angle, 10.0, SURE_ANGLE, -1), (abs(offset), 0.3, SURE_OFFSET, -1)]
+    if any(sign * (value - limit) < -margin for value, limit, margin, sign in tests):
+        return False, True
+    return all(sign * (v - limit) >= 0 for v, limit, _, sign in tests), all(
+        abs(v - limit) > margin for v, limit, margin, _ in tests
+    )
+
+
+def slow_found(
+    models: list[RoofModel], truth: list[RoofModel]
+) -> tuple[list[bool], list[bool], list[bool], list[bool]]:
+    """Found and sure of every true face, matched and sure of every model face, by counting cells in naive loops."""
+    boxes = np.array([face.polygon.bounds for one in (*models, *truth) for face in one.surfaces])
+    low, high = boxes[:, :2].min(axis=0) - 1, boxes[:, 2:].max(axis=0) + 1
+    x, y = np.meshgrid(*(np.arange(low[k], high[k], CELL) + CELL / 2 for k in (0, 1)))
+    true = [(owner, face.group, SlowFace(face, x, y)) for owner, one in enumerate(truth) for face in one.surfaces]
+    made = [SlowFace(face, x, y) for one in models for face in one.surfaces]
+    made_group: list[tuple[int, int] | None] = [None] * len(made)
+    found, sure = [False] * len(true), [True] * len(true)
+    matched, matched_sure = [False] * len(made), [True] * len(made)
+    candidates = []
+    for t, (_, _, face) in enumerate(true):
+        for m, other in enumerate(made):
+            fits, certain = slow_fit(slow_pair(face.cells, face.z, face.face.coefficients[:2], other))
+            if not certain:
+                sure[t] = matched_sure[m] = False
+            if fits:
+                candidates.append((-int((face.cells & other.cells).sum()), t, m))
+    own_match = [False] * len(true)
+    for _, t, m in sorted(candidates):
+        if not own_match[t] and not matched[m]:
+            own_match[t] = matched[m] = True
+            made_group[m] = (true[t][0], true[t][1])
+    for t, (owner, group, face) in enumerate(true):
+        pieces = [k for k, (o, g, _) in enumerate(true) if o == owner and g == group] if group >= 0 else [t]
+        if len(pieces) == 1:
+            found[t] = own_match[t]
+            continue
+        areas = [true[k][2].count * math.sqrt(1 + sum(c * c for c in true[k][2].face.coefficients[:2])) for k in pieces]
+        held = sum(area for area, k in zip(areas, pieces, strict=True) if own_match[k]) / sum(areas)
+        found[t] = held >= 0.5
+        certain = all(sure[k] for k in pieces) and abs(held - 0.5) > SURE_HELD
+        if not found[t]:
+            cells = np.any([true[k][2].cells for k in pieces], axis=0)
+            z = np.zeros(x.shape)
+            slopes = np.zeros(2)
+            for k in pieces:
+                z[true[k][2].cells] = true[k][2].z[true[k][2].cells]
+                slopes += np.array(true[k][2].face.coefficients[:2]) * true[k][2].count
+            slopes /= sum(true[k][2].count for k in pieces)
+            centre = np.array([x[cells].mean(), y[cells].mean()])
+            mean = z[cells].mean() + slopes[0] * (x - centre[0]) + slopes[1] * (y - centre[1])
+            for m, other in enumerate(made):
+                fits, known = slow_fit(slow_pair(cells, mean, (slopes[0], slopes[1]), other))
+                certain &= known
+                if fits and (not matched[m] or made_group[m] == (owner, group)):
+                    found[t] = matched[m] = True
+                    made_group[m] = (owner, group)
+        for k in pieces:
+            found[k] = found[t]
+            sure[k] = sure[k] and certain
+        if not certain:
+            matched_sure = [False] * len(made)
+    return found, sure, matched, matched_sure
+
+
+def grouped(truth: list[RoofModel], random: np.random.Generator) -> list[RoofModel]:
+    """Some of the roofs with each face in two by a line across it, its lower part flatter: groups of two."""
+    changed = []
+    for one in truth:
+        faces: list[RoofSurface] = []
+        for number, face in enumerate(one.surfaces):
+            if random.random() < 0.5:
+                faces.append(dataclasses.replace(face, group=number))
+                continue
+            low_x, low_y, high_x, high_y = face.polygon.bounds
+            at = low_y + random.uniform(0.3, 0.7) * (high_y - low_y)
+            for k, box in enumerate((shapely.box(low_x, low_y, high_x, at), shapely.box(low_x, at, high_x, high_y))):
+                part = dataclasses.replace(face, polygon=face.polygon.intersection(box), group=number)
+                faces.append(turned(part, -6.0) if k else part)
+        changed.append(dataclasses.replace(one, surfaces=tuple(faces)))
+    return changed
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_counting_cells_in_naive_loops_finds_the_same_faces(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    plain = by_hand.models_of_scene(suburb(100 + seed, size_m=(64.0, 64.0)))
+    truth = plain if seed % 2 == 0 else grouped(plain, random)
+    models = damaged(plain, random)
+    score = score_faces(models, reference(truth, extent=None))
+    found, sure, matched, matched_sure = slow_found(models, truth)
+    compared = [(row.found, slow) for row, slow, certain in zip(score.reference, found, sure, strict=True) if certain]
+    assert [ours for ours, _ in compared] == [slow for _, slow in compared]
+    assert len(compared) >= 0.75 * len(found)
+    assert {slow for _, slow in compared} == {True, False}
+    ours = [
+        (row.matched, slow) for row, slow, certain in zip(score.models, matched, matched_sure, strict=True) if certain
+    ]
+    assert all(one == slow for one, slow in ours)
+
+
+def test_roof_types_of_models_do_not_matter_to_faces() -> None:
+    renamed = [dataclasses.replace(one, roof_type=RoofType.UNKNOWN, building_id=f"m{k}") for k, one in enumerate(TRUTH)]
+    assert scored(renamed, TRUTH) == scored(TRUTH, TRUTH)

@@ -1,0 +1,135 @@
+"""Run directories, the truth of simulated scenes, and what is nothing that can be read."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import shutil
+import sys
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import model_files as files
+from model_files import small
+
+from pipeline.errors import InputError, RunError
+from pipeline.evaluation.reading import READERS, read_models
+from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
+
+FOOT_M = 0.3048
+
+
+def manifest(status: RunStatus = RunStatus.FINISHED, **crs: object) -> RunManifest:
+    return RunManifest(
+        status=status,
+        engine_version="0",
+        method="arrangement",
+        settings={},
+        settings_hash="ab",
+        started_at=dt.datetime(2025, 1, 1, tzinfo=dt.UTC),
+        crs={"epsg": None, "name": "unknown", "wkt": None, "horizontal_unit_m": 1.0, "vertical_unit_m": 1.0, **crs},
+    )
+
+
+def test_the_manifest_tells_the_units(tmp_path: Path) -> None:
+    metres = read_models(files.write_run(tmp_path / "metres", files.village()))
+    feet = files.write_run(tmp_path / "feet", files.village(), files.reference(None, FOOT_M, 1.0))
+    write_manifest(feet, manifest(horizontal_unit_m=FOOT_M))
+    read = read_models(feet)
+    files.assert_same_models(metres, read)
+    assert (read.crs, read.notes) == (None, ())
+
+
+def test_a_run_that_broke_off_or_lacks_solids_says_so(tmp_path: Path) -> None:
+    run = files.write_run(tmp_path / "run", files.village())
+    write_manifest(run, manifest(RunStatus.INCOMPLETE))
+    shutil.rmtree(run / "cityjson")
+    models = read_models(run)
+    assert len(models.models) == 4
+    assert all(model.solids == () for model in models.models)
+    assert [note.split(":")[0] for note in models.notes] == ["the run is incomplete", "no folder cityjson in the run"]
+
+
+def test_given_footprints_are_known_by_their_ids_but_not_in_the_truth(tmp_path: Path) -> None:
+    for method, wanted in (("fuzzy-sart", True), ("truth", False)):
+        built = [small.gable(source_id="block 1", method=method), small.pent()]
+        models = read_models(files.write_run(tmp_path / method, built))
+        assert models.has_footprints is wanted
+        assert [model.source_id for model in models.models] == ["block 1", None]
+
+
+def test_the_truth_tells_which_faces_count_as_one(tmp_path: Path) -> None:
+    truth = files.write_run(tmp_path / "truth", [small.two_parts(method="truth"), small.gable(method="truth")])
+    assert {surface.group for model in read_models(truth).models for surface in model.surfaces} == {-1}
+    groups = {"building_id": ["gable", "two_parts"], "groups": [[0, 1], [0, 1, 0, 2]]}
+    pq.write_table(pa.table(groups), truth / "conditions.parquet")
+    found = files.by_id(read_models(truth))
+    assert [surface.group for surface in found["gable"].surfaces] == [0, 1]
+    assert {surface.plane_id: surface.group for surface in found["two_parts"].surfaces} == {0: 0, 1: 1, 2: 0, 3: 2}
+    (truth / "conditions.parquet").write_text("no table")
+    with pytest.raises(InputError, match=r"conditions\.parquet"):
+        read_models(truth)
+
+
+def test_a_failed_record_keeps_its_outline(tmp_path: Path) -> None:
+    outline = small.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)])
+    run = files.write_run(tmp_path / "run", [dataclasses.replace(small.failed(), footprint=outline)])
+    models = read_models(run)
+    assert models.models == ()
+    assert [model.footprint.area for model in models.failed] == [64.0]
+
+
+def test_a_run_without_any_building_is_read(tmp_path: Path) -> None:
+    run = files.write_run(tmp_path / "run", [])
+    write_manifest(run, manifest())
+    models = read_models(run)
+    assert (models.name, models.models, models.failed) == ("arrangement", (), ())
+
+
+def test_damaged_runs_are_refused(tmp_path: Path) -> None:
+    run = files.write_run(tmp_path / "run", files.village())
+    sequence = run / "cityjson" / "tile=t1" / "part-0.city.jsonl"
+    whole = sequence.read_text()
+    sequence.write_text(whole[:-40])
+    with pytest.raises(InputError, match=r"part-0\.city\.jsonl: line \d+"):
+        read_models(run)
+    sequence.write_text(whole)
+    (run / "planes" / "tile=t1" / "part-0.parquet").write_text("no table")
+    with pytest.raises(RunError, match="planes"):
+        read_models(run)
+    shutil.rmtree(run / "planes")
+    with pytest.raises(RunError, match="planes"):
+        read_models(run)
+
+
+def test_what_cannot_be_read_is_told_with_what_can(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("nothing")
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    (mixed / "a.obj").write_text("o a\n")
+    (mixed / "a.city.jsonl").write_text("{}")
+    outer = tmp_path / "data"
+    files.write_run(outer / "truth", [small.gable()])
+    (tmp_path / "empty").mkdir()
+    cases = {
+        tmp_path / "nowhere": "nothing is there",
+        tmp_path / "notes.txt": "'.txt'",
+        mixed: "several kinds",
+        outer: "truth",
+        tmp_path / "empty": "without files",
+    }
+    for path, told in cases.items():
+        with pytest.raises(InputError) as caught:
+            read_models(path)
+        assert told in caught.value.problem
+        assert all(reader.told in caught.value.fix for reader in READERS)
+
+
+def test_a_path_may_be_given_as_text(tmp_path: Path) -> None:
+    run = files.write_run(tmp_path / "run", [small.gable()])
+    assert read_models(str(run)).path == str(run)

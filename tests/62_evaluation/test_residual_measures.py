@@ -1,0 +1,313 @@
+"""Points against models: counted by hand, by a slow twin with shapely, and as damage moves the figures."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+import shapely
+from scipy.spatial import cKDTree
+
+from pipeline.evaluation.measure import Measure
+from pipeline.evaluation.models import RoofModel, RoofSurface
+from pipeline.evaluation.reference import Reference, ReferencePoints
+from pipeline.evaluation.residuals import (
+    DEFINITIONS,
+    EDGES_M,
+    BuildingResiduals,
+    building_residuals,
+    residual_measures,
+)
+from pipeline.evaluation.subsets import subsets
+from pipeline.model import FloatArray, LabelArray, RoofType
+
+Bounds = tuple[float, float, float, float]
+
+
+def house(name: str, x: float, y: float, *, length: float = 10.0, edge: bool = False) -> RoofModel:
+    """A gable roof of 8 m width, its ridge along x at 10 m, its eaves at 8 m."""
+    halves = (shapely.box(x, y, x + length, y + 4), shapely.box(x, y + 4, x + length, y + 8))
+    return RoofModel(
+        building_id=name,
+        footprint=shapely.box(x, y, x + length, y + 8),
+        roof_type=RoofType.GABLE,
+        surfaces=tuple(
+            RoofSurface(polygon=half, coefficients=(0.0, slope, 10.0), origin=(x, y + 4.0, 0.0), plane_id=k)
+            for k, (half, slope) in enumerate(zip(halves, (0.5, -0.5), strict=True))
+        ),
+        touches_data_edge=edge,
+    )
+
+
+def tile(xyz: FloatArray, building: LabelArray, name: str = "t") -> ReferencePoints:
+    return ReferencePoints(
+        name=name,
+        xyz=xyz,
+        classification=np.full(len(xyz), 6, np.int32),
+        building=building,
+        face=np.zeros(len(xyz), np.int32),
+        is_roof=building >= 0,
+        last=np.ones(len(xyz), np.bool_),
+    )
+
+
+def reader(points: ReferencePoints) -> Callable[[], ReferencePoints]:
+    return lambda: points
+
+
+def reference_of(
+    buildings: Sequence[RoofModel], parts: Sequence[ReferencePoints], bounds: Sequence[Bounds] = ()
+) -> Reference:
+    return Reference(
+        name="r",
+        kind="truth",
+        buildings=tuple(buildings),
+        has_faces=True,
+        outlines="truth",
+        tiles=tuple(reader(part) for part in parts),
+        bounds=tuple(bounds),
+    )
+
+
+def lattice(model: RoofModel, step: float, noise: float = 0.0, seed: int = 0) -> FloatArray:
+    """Points of the model's roof at the centres of a lattice."""
+    x0, y0, x1, y1 = model.footprint.bounds
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(x0 + step / 2, x1, step), np.arange(y0 + step / 2, y1, step)))
+    return np.column_stack((x, y, model.top(x, y) + np.random.default_rng(seed).normal(0.0, noise, len(x))))
+
+
+def figures(rows: Sequence[BuildingResiduals], reference: Reference) -> dict[str, Measure]:
+    return {m.name.removeprefix("residuals."): m for m in residual_measures(rows, subsets(reference)[0])}
+
+
+def test_a_handful_of_points_counts_as_by_hand() -> None:
+    model = house("a", 0, 0)
+    # eave at 8, ridge at 10: the roof at y = 2 is 9 m high
+    xyz = np.array([(1, 2, 9.1), (2, 2, 8.9), (3, 2, 9.4), (4, 2, 9.0), (12, 2, 9.0)], float)
+    reference = reference_of([dataclasses.replace(model, footprint=shapely.box(0, 0, 13, 8))], [tile(xyz, zeros(5))])
+    (row,) = building_residuals([model], reference)
+    tally = row.all_points
+    assert (tally.n_points, tally.n_covered, tally.n_within) == (5, 4, 3)
+    assert tally.sum_m == pytest.approx(0.4)
+    assert tally.rmse_m == pytest.approx(math.sqrt((0.01 + 0.01 + 0.16) / 4))
+    assert tally.share_within == 0.6
+    assert tally.coverage == 0.8
+    measured = figures([row], reference)
+    assert measured["within_0_2m"].value == 0.6
+    assert measured["coverage"].value == 0.8
+    assert measured["rmse"].value == pytest.approx(tally.rmse_m)
+    assert measured["building_rmse"].value == pytest.approx(tally.rmse_m)
+    assert measured["bias"].value == pytest.approx(0.1)
+    assert (measured["coverage"].n, measured["rmse"].n) == (5, 4)
+
+
+def zeros(n: int) -> LabelArray:
+    return np.zeros(n, np.int32)
+
+
+def random_world(seed: int, n: int = 4000) -> tuple[list[RoofModel], Reference, FloatArray, LabelArray]:
+    """Houses beside one another at large coordinates, models that are off, and noisy points with facades below."""
+    rng = np.random.default_rng(seed)
+    corner = np.array([685_000.0, 5_334_000.0])
+    truth = [house(f"b{k}", corner[0] + 10 * k, corner[1] + 3 * (k % 3)) for k in range(6)]
+    models = []
+    for model in truth:
+        surfaces = tuple(
+            dataclasses.replace(s, origin=(s.origin[0], s.origin[1], rng.normal(0, 0.2))) for s in model.surfaces
+        )
+        turned = tuple(
+            dataclasses.replace(s, polygon=shapely.affinity.rotate(s.polygon, rng.uniform(-9, 9))) for s in surfaces
+        )
+        models.append(dataclasses.replace(model, surfaces=turned))
+    x, y = corner[0] + rng.uniform(0, 60, n), corner[1] + rng.uniform(-1, 14, n)
+    building = np.full(n, -1, np.int32)
+    z = np.zeros(n)
+    for k, model in enumerate(truth):
+        inside = shapely.contains_xy(model.footprint, x, y)
+        building[inside] = k
+        z[inside] = model.top(x[inside], y[inside]) - np.where(rng.random(inside.sum()) < 0.2, 3.0, 0.0)
+    z += rng.normal(0, 0.1, n)
+    xyz = np.round(np.column_stack((x, y, z)), 3)
+    return models, reference_of(truth, [tile(xyz, building)]), xyz, building
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rows_are_those_of_a_slow_twin_point_by_point(seed: int) -> None:
+    models, reference, xyz, building = random_world(seed)
+    rows = building_residuals(models, reference)
+    surfaces = [surface for model in models for surface in model.surfaces]
+    tree = cKDTree(xyz[:, :2])
+    for row in rows:
+        own = np.flatnonzero(building == row.building)
+        residuals, seen = [], []
+        for i in own:
+            x, y, z = xyz[i]
+            apart = [s.polygon.distance(shapely.Point(x, y)) for s in surfaces]
+            # a gap of up to 1 mm is one of rounding
+            limit = 0.0 if min(apart) == 0.0 else 0.001
+            tops = [
+                float(s.elevation(np.array([x]), np.array([y]))[0])
+                for s, distance in zip(surfaces, apart, strict=True)
+                if distance <= limit
+            ]
+            residuals.append(z - max(tops) if tops else math.nan)
+            near = [j for j in tree.query_ball_point((x, y), 0.5) if building[j] == row.building]
+            seen.append(bool(np.all(xyz[near, 2] <= z + 1.1 + 1e-6)))
+        for tally, chosen in ((row.all_points, np.ones(len(own), bool)), (row.top_visible, np.array(seen))):
+            all_of = np.array(residuals)[chosen]
+            of = all_of[~np.isnan(all_of)]
+            assert (tally.n_points, tally.n_covered) == (len(all_of), len(of))
+            assert tally.n_within == np.sum(np.abs(of) <= 0.2)
+            assert tally.sum_m == pytest.approx(of.sum(), abs=1e-6)
+            assert tally.sum_squares_m2 == pytest.approx((of**2).sum(), rel=1e-6)
+            # bins of 5 mm up to 1 m, of 50 mm beyond; residuals at the very border of two may fall to either
+            assert np.abs(tally.histogram - np.histogram(np.abs(of), EDGES_M)[0]).sum() <= 2
+            for share, found in ((0.5, tally.median_m), (0.95, tally.p95_m)):
+                low, high = (np.quantile(np.abs(of), share, method=end) for end in ("lower", "higher"))
+                width = 0.005 if high < 1.0 else 0.05
+                assert low - width <= found <= high + width
+
+
+def test_the_truth_against_itself_is_perfect() -> None:
+    truth = [house("a", 500_000, 5_000_000), house("b", 500_010, 5_000_000)]
+    xyz = np.concatenate([lattice(model, 0.25) for model in truth])
+    reference = reference_of(truth, [tile(xyz, np.repeat(np.arange(2, dtype=np.int32), len(xyz) // 2))])
+    measured = figures(building_residuals(truth, reference), reference)
+    for suffix in ("", "_top_visible"):
+        assert measured[f"coverage{suffix}"].value == 1.0
+        assert measured[f"within_0_2m{suffix}"].value == 1.0
+        assert measured[f"rmse{suffix}"].value < 1e-6
+        assert measured[f"bias{suffix}"].value == pytest.approx(0.0, abs=1e-6)
+
+
+def test_footprints_shrunk_by_half_a_metre_lose_the_coverage_of_the_ring() -> None:
+    truth = [house("a", 0, 0)]
+    xyz = lattice(truth[0], 0.1)
+    reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
+    inner = truth[0].footprint.buffer(-0.5, join_style="mitre")
+    shrunk = dataclasses.replace(
+        truth[0],
+        footprint=inner,
+        surfaces=tuple(dataclasses.replace(s, polygon=s.polygon.intersection(inner)) for s in truth[0].surfaces),
+    )
+    measured = figures(building_residuals([shrunk], reference), reference)
+    assert measured["coverage"].value == pytest.approx(9 * 7 / 80, abs=1e-9)
+    assert measured["within_0_2m"].value == measured["coverage"].value
+    assert measured["rmse"].value < 1e-6
+
+
+def test_a_face_moved_by_0_3_m_or_dropped_is_half_of_the_points() -> None:
+    truth = [house("a", 0, 0)]
+    xyz = lattice(truth[0], 0.1)
+    reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
+    south, north = truth[0].surfaces
+    moved = dataclasses.replace(truth[0], surfaces=(dataclasses.replace(south, origin=(0.0, 4.0, 0.3)), north))
+    measured = figures(building_residuals([moved], reference), reference)
+    assert measured["within_0_2m"].value == 0.5
+    assert measured["rmse"].value == pytest.approx(0.3 / math.sqrt(2.0))
+    assert measured["bias"].value == pytest.approx(-0.15)
+    dropped = dataclasses.replace(truth[0], surfaces=(north,))
+    measured = figures(building_residuals([dropped], reference), reference)
+    assert (measured["within_0_2m"].value, measured["coverage"].value) == (0.5, 0.5)
+
+
+def test_a_face_turned_by_5_deg_is_off_in_proportion_to_the_distance_from_its_axis() -> None:
+    truth = [house("a", 0, 0)]
+    xyz = lattice(truth[0], 0.05)
+    reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
+    tilt = math.tan(math.atan(0.5) + math.radians(5.0)) - 0.5
+    turned = tuple(
+        dataclasses.replace(s, coefficients=(0.0, (0.5 + tilt) * sign, 10.0))
+        for s, sign in zip(truth[0].surfaces, (1, -1), strict=True)
+    )
+    measured = figures(building_residuals([dataclasses.replace(truth[0], surfaces=turned)], reference), reference)
+    # dz = tilt |y - 4|, evenly spread between 0 and 4 m from the ridge
+    assert measured["rmse"].value == pytest.approx(tilt * 4 / math.sqrt(3.0), rel=1e-3)
+    assert measured["median"].value == pytest.approx(tilt * 2, abs=0.006)
+    assert measured["p95"].value == pytest.approx(tilt * 3.8, abs=0.01)
+    assert measured["within_0_2m"].value == pytest.approx(0.2 / tilt / 4, abs=0.01)
+
+
+def test_of_several_models_over_a_point_the_highest_counts() -> None:
+    low, high = house("low", 0, 0), house("high", 0, 0)
+    high = dataclasses.replace(
+        high, surfaces=tuple(dataclasses.replace(s, origin=(0.0, 4.0, 2.0)) for s in high.surfaces)
+    )
+    xyz = lattice(low, 0.5)
+    reference = reference_of([low], [tile(xyz, zeros(len(xyz)))])
+    measured = figures(building_residuals([low, high], reference), reference)
+    assert measured["bias"].value == pytest.approx(-2.0)
+
+
+def test_moving_the_world_by_whole_metres_changes_nothing() -> None:
+    models, reference, xyz, building = random_world(11)
+    shift = np.array([-400_000.0, 300_000.0])
+
+    def moved(model: RoofModel) -> RoofModel:
+        return dataclasses.replace(
+            model,
+            footprint=shapely.affinity.translate(model.footprint, *shift),
+            surfaces=tuple(
+                dataclasses.replace(
+                    s,
+                    polygon=shapely.affinity.translate(s.polygon, *shift),
+                    origin=(s.origin[0] + shift[0], s.origin[1] + shift[1], s.origin[2]),
+                )
+                for s in model.surfaces
+            ),
+        )
+
+    there = reference_of([moved(b) for b in reference.buildings], [tile(xyz + np.array([*shift, 0.0]), building)])
+    before = figures(building_residuals(models, reference), reference)
+    after = figures(building_residuals([moved(m) for m in models], there), there)
+    for name, measure in before.items():
+        assert after[name].value == pytest.approx(measure.value, abs=1e-6), name
+
+
+@pytest.mark.parametrize("cut", [685_023.4, 685_030.0])
+def test_tiles_that_cut_buildings_change_nothing(cut: float) -> None:
+    models, whole, xyz, building = random_world(21)
+    west = xyz[:, 0] < cut
+    parts = [tile(xyz[side], building[side]) for side in (west, ~west)]
+    bounds = [(*xyz[side, :2].min(axis=0), *xyz[side, :2].max(axis=0)) for side in (west, ~west)]
+    split = reference_of(whole.buildings, parts, bounds)
+    for one, two in zip(building_residuals(models, whole), building_residuals(models, split), strict=True):
+        for a, b in ((one.all_points, two.all_points), (one.top_visible, two.top_visible)):
+            assert (a.n_points, a.n_covered, a.n_within) == (b.n_points, b.n_covered, b.n_within)
+            assert (a.histogram == b.histogram).all()
+            assert a.sum_squares_m2 == pytest.approx(b.sum_squares_m2)
+    assert sum(row.top_visible.n_points for row in building_residuals(models, whole)) < (building >= 0).sum()
+
+
+def test_buildings_at_the_edge_of_the_data_need_not_be_found() -> None:
+    truth = [house("a", 0, 0), house("cut", 20, 0, edge=True)]
+    xyz = np.concatenate([lattice(model, 0.5) for model in truth])
+    building = np.repeat(np.arange(2, dtype=np.int32), len(xyz) // 2)
+    reference = reference_of(truth, [tile(xyz, building)])
+    assert figures(building_residuals(truth[:1], reference), reference)["coverage"].value == 1.0
+    # outlines of the raster that are cut hold most points of a dense town: they count
+    raster = dataclasses.replace(reference, outlines="raster")
+    assert figures(building_residuals(truth[:1], raster), raster)["coverage"].value == 0.5
+
+
+def test_without_models_all_is_missed_and_without_points_nothing_is_measured() -> None:
+    truth = [house("a", 0, 0)]
+    xyz = lattice(truth[0], 0.5)
+    reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
+    measured = figures(building_residuals([], reference), reference)
+    assert (measured["coverage"].value, measured["within_0_2m"].value) == (0.0, 0.0)
+    assert math.isnan(measured["rmse"].value)
+    assert math.isnan(measured["building_rmse"].value)
+    empty = reference_of(truth, [])
+    assert figures(building_residuals(truth, empty), empty) == {}
+
+
+def test_every_figure_has_its_definition() -> None:
+    truth = [house("a", 0, 0)]
+    xyz = lattice(truth[0], 0.5)
+    reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
+    names = [m.name for m in residual_measures(building_residuals(truth, reference), subsets(reference)[0])]
+    assert sorted(names) == sorted(definition.name for definition in DEFINITIONS)
