@@ -148,6 +148,15 @@ def measured(entry: Entry, out: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def run_facts(folder: Path) -> list[str]:
+    """Candidates by status, seconds, and peak memory of the largest process, as the run's own record has them."""
+    manifest = json.loads((folder / "run" / "run.json").read_text(encoding="utf-8"))
+    counts = manifest["counts"]
+    statuses = "/".join(str(counts[name]) for name in ("ok", "fallback", "failed"))
+    peak = max(manifest["peak_memory_bytes"].values(), default=0) / 1e6
+    return [statuses, f"{manifest['timings_s']['total']:.1f}", f"{peak:.0f}"]
+
+
 def figure(row: dict[str, Any] | None) -> str:
     """A measure as a cell."""
     if row is None or row["value"] is None or math.isnan(row["value"]):
@@ -197,8 +206,11 @@ def main() -> None:
             if entry.name.startswith(wanted) and all(tile.exists() for tile in entry.tiles):
                 results[entry.name] = measured(entry, arguments.out)
     overview = table(
-        ["entry", *(head for _, head in SHOWN)],
-        [[name, *(cell(rows, measure) for measure, _ in SHOWN)] for name, rows in results.items()],
+        ["entry", "ok/block/failed", "s", "peak MB", *(head for _, head in SHOWN)],
+        [
+            [name, *run_facts(arguments.out / name), *(cell(rows, measure) for measure, _ in SHOWN)]
+            for name, rows in results.items()
+        ],
     )
     (arguments.out / "report.md").write_text(overview, encoding="utf-8")
     (arguments.out / "sweep.md").write_text(sweep_table(results), encoding="utf-8")

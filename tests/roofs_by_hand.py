@@ -15,7 +15,9 @@ from pipeline.evaluation.measure import Measure
 from pipeline.evaluation.models import RoofModel, RoofSurface
 from pipeline.evaluation.reference import Conditions, Reference
 from pipeline.model import RoofType
-from pipeline.synthetic.scene import Scene
+from pipeline.synthetic.random_dimensions import random_dimensions
+from pipeline.synthetic.roofs import RoofShape
+from pipeline.synthetic.scene import Scene, Terrain, place_building
 
 ORIGIN = (1000.0, 2000.0, 0.0)
 EXTENT = shapely.box(900.0, 1900.0, 1600.0, 2300.0)
@@ -130,6 +132,32 @@ def moved(one: RoofModel, x: float, y: float, z: float, turn_deg: float = 0.0) -
         slope = cosine * a - sine * b, sine * a + cosine * b
         faces.append(dataclasses.replace(face, polygon=placed(face.polygon), coefficients=(*slope, c), origin=origin))
     return dataclasses.replace(one, footprint=placed(one.footprint), surfaces=tuple(faces))
+
+
+def scene_of_all_shapes(seed: int) -> Scene:
+    """One building of every shape, of random size and direction, in a row."""
+    random, terrain = np.random.default_rng(seed), Terrain(base_z_m=10.0)
+    buildings = tuple(
+        place_building(
+            shape.value,
+            shape,
+            random_dimensions(shape, random),
+            x=60.0 * number,
+            y=0.0,
+            azimuth_deg=random.uniform(0.0, 360.0),
+            eave_height_m=random.uniform(3.0, 9.0),
+            terrain=terrain,
+        )
+        for number, shape in enumerate(RoofShape)
+    )
+    return Scene(
+        name="shapes",
+        origin=(5000.0, 7000.0, 0.0),
+        crs=None,
+        extent=(-60.0, -60.0, 60.0 * len(buildings), 60.0),
+        terrain=terrain,
+        buildings=buildings,
+    )
 
 
 def models_of_scene(scene: Scene) -> list[RoofModel]:

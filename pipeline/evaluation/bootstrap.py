@@ -8,10 +8,12 @@ histograms), so a resample is a vector of weights and thousands of them are one 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.model import FloatArray
 
@@ -22,9 +24,31 @@ CONFIDENCE = 0.95
 _SEED = 20_030_117
 _ROWS_A_BLOCK = 64
 _LEAST_UNITS = 2
+_MOST_KEPT_UNITS = 50_000
+"""50 MB of resamples."""
 
 Sums = Mapping[str, FloatArray]
 Statistic = Callable[[Sums], FloatArray]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Share:
+    """A figure from 0 to 1. Where all units agree on an end of it, resampling says nothing and a limit is given."""
+
+    figure: Statistic
+    """The figure itself."""
+    denominator: str
+    """Column of which units with something in it count as trials."""
+
+    def __call__(self, sums: Sums) -> FloatArray:
+        """As any statistic."""
+        return self.figure(sums)
+
+    def limits(self, value: float, columns: Mapping[str, FloatArray]) -> tuple[float, float]:
+        """The exact interval of n trials that all failed or all succeeded (Clopper and Pearson 1934)."""
+        trials = int(np.count_nonzero(columns[self.denominator]))
+        missed = ((1.0 - CONFIDENCE) / 2.0) ** (1.0 / trials)
+        return (missed, 1.0) if value == 1.0 else (0.0, 1.0 - missed)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,7 +84,7 @@ def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws:
     --------
     >>> import numpy as np
     >>> found = {"found": np.array([1.0, 1.0, 0.0, 1.0]), "all": np.ones(4)}
-    >>> estimate = bootstrap(found, ratio("found", "all"))
+    >>> estimate = bootstrap(found, share("found", "all"))
     >>> estimate.value, estimate.low < 0.75 < estimate.high
     (0.75, True)
     """
@@ -73,11 +97,9 @@ def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws:
     value = float(_figures(statistic, whole)[0])
     if count < _LEAST_UNITS:
         return Estimate(value=value, low=math.nan, high=math.nan)
-    random = np.random.default_rng(_SEED)
-    chances = np.full(count, 1.0 / count)
     figures = []
-    for first in range(0, draws, _ROWS_A_BLOCK):
-        weights = random.multinomial(count, chances, size=min(_ROWS_A_BLOCK, draws - first)).astype(np.float64)
+    for counts in _resamples(count, draws):
+        weights = counts.astype(np.float64)
         figures.append(_figures(statistic, {name: weights @ column for name, column in arrays.items()}))
     drawn = np.concatenate(figures)
     drawn = drawn[np.isfinite(drawn)]
@@ -85,7 +107,30 @@ def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws:
         return Estimate(value=value, low=math.nan, high=math.nan)
     tail = (1.0 - CONFIDENCE) / 2.0
     low, high = np.quantile(drawn, [tail, 1.0 - tail])
+    if isinstance(statistic, Share) and value in {0.0, 1.0} and low == high:
+        low, high = statistic.limits(value, arrays)
     return Estimate(value=value, low=float(low), high=float(high))
+
+
+def _resamples(units: int, draws: int) -> Iterator[npt.NDArray[np.uint8]]:
+    """How often each unit is drawn, (rows, units), some rows at a time; the same for the same numbers."""
+    if units <= _MOST_KEPT_UNITS:
+        yield from _kept_resamples(units, draws)
+        return
+    yield from _drawn_resamples(units, draws)
+
+
+@functools.lru_cache(maxsize=4)
+def _kept_resamples(units: int, draws: int) -> tuple[npt.NDArray[np.uint8], ...]:
+    """All of them, kept: most figures of an evaluation are over the same units, and drawing costs most."""
+    return tuple(_drawn_resamples(units, draws))
+
+
+def _drawn_resamples(units: int, draws: int) -> Iterator[npt.NDArray[np.uint8]]:
+    random = np.random.default_rng(_SEED)
+    chances = np.full(units, 1.0 / units)
+    for first in range(0, draws, _ROWS_A_BLOCK):
+        yield random.multinomial(units, chances, size=min(_ROWS_A_BLOCK, draws - first)).astype(np.uint8)
 
 
 def _figures(statistic: Statistic, sums: Sums) -> FloatArray:
@@ -93,8 +138,13 @@ def _figures(statistic: Statistic, sums: Sums) -> FloatArray:
         return np.asarray(statistic(sums), np.float64)
 
 
+def share(numerator: str, denominator: str) -> Share:
+    """Sum of one column over the sum of another that holds it."""
+    return Share(figure=ratio(numerator, denominator), denominator=denominator)
+
+
 def ratio(numerator: str, denominator: str) -> Statistic:
-    """Sum of one column over the sum of another: shares and means."""
+    """Sum of one column over the sum of another: means."""
 
     def statistic(sums: Sums) -> FloatArray:
         return np.where(sums[denominator] > 0.0, sums[numerator] / sums[denominator], np.nan)
@@ -108,14 +158,14 @@ def root_mean(squares: str, count: str) -> Statistic:
     return lambda sums: np.sqrt(mean(sums))
 
 
-def quality(both: str, reference: str, found: str) -> Statistic:
+def quality(both: str, reference: str, found: str) -> Share:
     """TP / (TP + FP + FN): the quality of completeness and correctness that share their true positives."""
 
     def statistic(sums: Sums) -> FloatArray:
         union = sums[reference] + sums[found] - sums[both]
         return np.where(union > 0.0, sums[both] / union, np.nan)
 
-    return statistic
+    return Share(figure=statistic, denominator=reference)
 
 
 def quantile(histogram: str, edges: FloatArray, share: float) -> Statistic:

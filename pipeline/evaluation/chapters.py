@@ -53,7 +53,7 @@ class Line:
     value: str
     """`93.4 %`, `0.052 m`; a dash where there is none."""
     interval: str
-    """`92.9 to 94.0 %`; empty where there is none."""
+    """`92.9 to 94.0 %`; empty where there is none, or resampling did not change the figure."""
     n: str
     """Denominator with separated thousands."""
 
@@ -111,7 +111,9 @@ def definition_of(name: str, definitions: Mapping[str, Definition] = DEFINITIONS
 
 
 def chapters(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> tuple[Chapter, ...]:
-    """The measures of an evaluation by chapter, in the order of `Group`; chapters without measures are left out.
+    """The measures of an evaluation by chapter, in the order of `Group`.
+
+    Chapters without measures are left out, and subsets without anything in them.
 
     Parameters
     ----------
@@ -121,7 +123,10 @@ def chapters(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEF
         Of all measures.
     """
     by_group: dict[Group, dict[str, list[Measure]]] = {group: {} for group in Group}
+    filled = {measure.subset for measure in evaluation.measures if measure.n > 0} | {"all"}
     for measure in evaluation.measures:
+        if measure.subset not in filled:
+            continue
         group = definition_of(measure.name, definitions).group
         by_group[group].setdefault(measure.name, []).append(measure)
     tables = count_tables(evaluation.tables)
@@ -144,7 +149,7 @@ def printed(measure: Measure, definition: Definition) -> Line:
     unit, signed = definition.unit, definition.better is Better.ZERO
     decimals = supported_decimals(measure.low, measure.high, unit)
     interval = ""
-    if math.isfinite(measure.low) and math.isfinite(measure.high):
+    if measure.low < measure.high:
         low, high = (number_text(end, unit, decimals, signed=signed) for end in (measure.low, measure.high))
         interval = f"{low} to {high}{unit_sign(unit)}"
     value = NOTHING

@@ -57,15 +57,17 @@ def _in_order_of_types(names: set[str]) -> list[str]:
 
 
 def _outcomes(table: pa.Table) -> list[CountTable]:
-    """As the paper prints them: a row a roof type, the sum beneath; one table a subset."""
+    """As the paper prints them: a row a roof type, the sum beneath; one table a subset that is not empty."""
     printed = []
     rows = table.to_pylist()
     for subset in dict.fromkeys(row["subset"] for row in rows):
         by_type = {row["true_type"]: [int(row[name]) for name in OUTCOMES] for row in rows if row["subset"] == subset}
+        if not sum(sum(counts) for counts in by_type.values()):
+            continue
         kinds = [kind for kind in _in_order_of_types(set(by_type)) if kind != "all"]
         lines = [(kind, by_type[kind]) for kind in kinds]
         lines.append(("all", [sum(counts[i] for _, counts in lines) for i in range(len(OUTCOMES))]))
-        header = ("roof type", *OUTCOMES, "buildings", "correct", "at least passable")
+        header = ("roof type", *OUTCOMES, "buildings", "share correct", "share passable or better")
         body = tuple((kind, *_outcome_cells(counts)) for kind, counts in lines)
         told = {"all": "all buildings", "good": "buildings without defects", "hard": "buildings with defects"}
         printed.append(CountTable(title=f"Outcomes: {told.get(subset, subset)}", header=header, rows=body))

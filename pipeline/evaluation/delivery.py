@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from pipeline.evaluation.bootstrap import ratio
+from pipeline.evaluation.bootstrap import share
 from pipeline.evaluation.matching import MIN_SHARE, Matching
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import ModelSet, RoofModel
@@ -209,8 +209,8 @@ def measures(delivery: Delivery, subset: Subset) -> list[Measure]:
         ("delivery.joining_models", Stands.JOINS.name),
     ]
     return [
-        *(measured(name, columns, ratio(column, "buildings"), n=n_buildings, subset=subset) for name, column in shares),
-        measured("delivery.correctness", columns, ratio("standing", "models"), n=n_models, subset=subset),
+        *(measured(name, columns, share(column, "buildings"), n=n_buildings, subset=subset) for name, column in shares),
+        measured("delivery.correctness", columns, share("standing", "models"), n=n_models, subset=subset),
         *(measured(name, columns, total(column), n=n_models, subset=subset) for name, column in counts),
     ]
 
@@ -221,7 +221,7 @@ def record_measures(models: ModelSet) -> list[Measure]:
     columns = {"records": np.ones(len(status))}
     columns |= {kind.value: np.array([one is kind for one in status], np.float64) for kind in Status}
     return [
-        measured(f"delivery.records_{kind.value}", columns, ratio(kind.value, "records"), n=len(status), subset=_ALONE)
+        measured(f"delivery.records_{kind.value}", columns, share(kind.value, "records"), n=len(status), subset=_ALONE)
         for kind in Status
     ]
 

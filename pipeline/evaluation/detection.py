@@ -19,7 +19,7 @@ import numpy.typing as npt
 import shapely
 from shapely import Polygon
 
-from pipeline.evaluation.bootstrap import Statistic, Sums, quality, ratio
+from pipeline.evaluation.bootstrap import Share, Statistic, Sums, quality, share
 from pipeline.evaluation.building_raster import (
     CELL_M,
     CellWindow,
@@ -192,8 +192,8 @@ def _objects(
     models: Sequence[RoofModel], reference: Reference
 ) -> tuple[tuple[DetectedObject, ...], tuple[DetectedObject, ...]]:
     """Reference buildings and models with the share of their area that lies on the other kind."""
-    truth = np.array([building.footprint for building in reference.buildings], dtype=object)
-    made = np.array([model.footprint for model in models], dtype=object)
+    truth = _valid([building.footprint for building in reference.buildings])
+    made = _valid([model.footprint for model in models])
     known = np.ones(len(made), np.bool_)
     if reference.extent is None:
         known[:] = False
@@ -218,7 +218,7 @@ def _objects(
             DetectedObject(
                 name=building.building_id,
                 building=number,
-                area_m2=building.footprint.area,
+                area_m2=float(truth[number].area),
                 overlap=float(overlap_truth[number]),
                 counts=not building.touches_data_edge,
             )
@@ -228,13 +228,21 @@ def _objects(
             DetectedObject(
                 name=model.building_id,
                 building=int(best[number]),
-                area_m2=model.footprint.area,
+                area_m2=float(made[number].area),
                 overlap=float(overlap_made[number]),
                 counts=bool(known[number]) and not model.touches_data_edge,
             )
             for number, model in enumerate(models)
         ),
     )
+
+
+def _valid(footprints: Sequence[shapely.Geometry]) -> Geometries:
+    """The footprints, those repaired that cross themselves: areas of overlap need valid polygons."""
+    areas: Geometries = np.array(footprints, dtype=object)
+    wrong = ~shapely.is_valid(areas) if len(areas) else np.zeros(0, np.bool_)
+    areas[wrong] = shapely.make_valid(areas[wrong])
+    return areas
 
 
 def _covered(owner: IntArray, shared: Geometries, areas: Geometries) -> FloatArray:
@@ -318,11 +326,11 @@ def _area_measures(rows: Detection, subset: Subset) -> list[Measure]:
         }
         union = columns["reference"].sum() + columns["found"].sum() - columns["both"].sum()
         figures: list[tuple[str, Statistic, float]] = [
-            ("completeness", ratio("both", "reference"), columns["reference"].sum())
+            ("completeness", share("both", "reference"), columns["reference"].sum())
         ]
         if rows.has_correctness:
             figures += [
-                ("correctness", ratio("both", "found"), columns["found"].sum()),
+                ("correctness", share("both", "found"), columns["found"].sum()),
                 ("quality", quality("both", "reference", "found"), union),
             ]
         found += [
@@ -359,9 +367,9 @@ def _object_measures(rows: Detection, subset: Subset) -> list[Measure]:
             columns["right"][unit] += float(model.found)
         arrays = {name: np.array(column) for name, column in columns.items()}
         wanted, made = arrays["wanted"].sum(), arrays["made"].sum()
-        figures: list[tuple[str, Statistic, float]] = [("completeness", ratio("hit", "wanted"), wanted)]
+        figures: list[tuple[str, Statistic, float]] = [("completeness", share("hit", "wanted"), wanted)]
         if rows.has_correctness:
-            figures += [("correctness", ratio("right", "made"), made), ("quality", _object_quality, wanted + made)]
+            figures += [("correctness", share("right", "made"), made), ("quality", _OBJECT_QUALITY, wanted + made)]
         found += [
             measured(f"detection.object_{name}{_suffix(least)}", arrays, statistic, n=n, subset=subset)
             for name, statistic, n in figures
@@ -374,6 +382,9 @@ def _object_quality(sums: Sums) -> FloatArray:
     complete, correct = sums["hit"] / sums["wanted"], sums["right"] / sums["made"]
     harmonic = complete * correct / (complete + correct - complete * correct)
     return np.where((complete == 0.0) | (correct == 0.0), 0.0, harmonic)
+
+
+_OBJECT_QUALITY = Share(figure=_object_quality, denominator="wanted")
 
 
 def _polygons(geometry: shapely.Geometry) -> list[Polygon]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import pyarrow as pa
 
@@ -16,7 +16,7 @@ from pipeline.evaluation.measure import Measure
 from pipeline.evaluation.models import ModelSet
 from pipeline.evaluation.reference import Reference
 from pipeline.evaluation.residuals import building_residuals, residual_measures
-from pipeline.evaluation.subsets import subsets
+from pipeline.evaluation.subsets import Subset, subsets
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,10 +97,10 @@ def evaluate(
         )
     if needs_blocks(models, reference) if blocks is None else blocks:
         reference = joined_reference(reference)
-    groups = subsets(reference)
+    groups = [group for group in subsets(reference) if group.elsewhere or group.size]
     measures: list[Measure] = []
     if reference.buildings or reference.extent is not None:
-        measures += _buildings(models, reference, solids, found, on_step)
+        measures += _buildings(models, reference, groups, solids, found, on_step)
     else:
         measures += delivery.record_measures(models)
         found["models"] = tables.model_table(models, solids, None)
@@ -117,12 +117,12 @@ def evaluate(
 def _buildings(
     models: ModelSet,
     reference: Reference,
+    groups: Sequence[Subset],
     solids: tuple[validity.ModelValidity, ...],
     found: dict[str, pa.Table],
     on_step: Callable[[str], None],
 ) -> list[Measure]:
     """Everything that asks for buildings; adds the tables to `found`."""
-    groups = subsets(reference)
     on_step("footprints")
     matching = match_footprints(models.models, reference)
     delivered = delivery.score_delivery(models.models, reference, matching)
@@ -159,7 +159,7 @@ def _buildings(
 
 
 def _notes(models: ModelSet, reference: Reference) -> tuple[str, ...]:
-    if not models.crs or not reference.crs or models.crs == reference.crs:
+    codes = [crs for crs in (models.crs, reference.crs) if crs is not None and crs.startswith("EPSG:")]
+    if len(set(codes)) < 2:  # a name and a code may well mean the same
         return ()
-    told = f"The models say their CRS is {models.crs}, the reference says {reference.crs}"
-    return (f"{told}: coordinates were compared as they are.",)
+    return (f"The models are in {codes[0]}, the reference in {codes[1]}: coordinates were compared as they are.",)

@@ -19,7 +19,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from pipeline.evaluation.bootstrap import Sums, quality, ratio
+from pipeline.evaluation.bootstrap import Share, Sums, quality, share
 from pipeline.evaluation.face_matching import FaceMatch, match_faces
 from pipeline.evaluation.matching import (
     MIN_SHARE,
@@ -342,14 +342,20 @@ def measures(score: FaceScore, subset: Subset) -> list[Measure]:
         made = float(columns[f"made_{suffix}"].sum())
         union = n[true] + float(columns[wrong].sum())
         found += [
-            measured(f"faces.completeness_{suffix}", columns, ratio(both, true), n=n[true], subset=subset),
-            measured(f"faces.correctness_{suffix}", columns, ratio(both, f"made_{suffix}"), n=made, subset=subset),
+            measured(f"faces.completeness_{suffix}", columns, share(both, true), n=n[true], subset=subset),
+            measured(f"faces.correctness_{suffix}", columns, share(both, f"made_{suffix}"), n=made, subset=subset),
             measured(f"faces.quality_{suffix}", columns, quality(both, true, f"made_{suffix}"), n=union, subset=subset),
         ]
     found += [
-        measured("faces.completeness_area", columns, ratio("found_m2", "true_m2"), n=n["true"], subset=subset),
-        measured("faces.correctness_area", columns, ratio("right_m2", "made_m2"), n=n["made"], subset=subset),
-        measured("faces.quality_area", columns, _quality_by_area, n=n["true"] + n["made"], subset=subset),
+        measured("faces.completeness_area", columns, share("found_m2", "true_m2"), n=n["true"], subset=subset),
+        measured("faces.correctness_area", columns, share("right_m2", "made_m2"), n=n["made"], subset=subset),
+        measured(
+            "faces.quality_area",
+            columns,
+            Share(figure=_quality_by_area, denominator="true_m2"),
+            n=n["true"] + n["made"],
+            subset=subset,
+        ),
     ]
     for kind in Topology:
         found.append(measured(TOPOLOGY_NAMES[kind], columns, total(kind.value), n=n["components"], subset=subset))

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from pipeline.evaluation.bootstrap import CONFIDENCE, DRAWS, ratio
+from pipeline.evaluation.bootstrap import CONFIDENCE, DRAWS, ratio, share
 from pipeline.evaluation.matching import MIN_SHARE, Geometries, Matching, sound_polygons
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import RoofModel
@@ -123,7 +123,13 @@ def measures(rows: Sequence[FootprintRow], subset: Subset) -> list[Measure]:
         _median("footprints.offset_median", np.array([row.offset_m for row in found]), subset),
     ]
     figures += [
-        _mean(f"footprints.iou_from_{round(100 * limit)}", (iou >= limit - _ROUNDING).astype(np.float64), subset)
+        measured(
+            f"footprints.iou_from_{round(100 * limit)}",
+            {"reaches": (iou >= limit - _ROUNDING).astype(np.float64), "buildings": np.ones(len(iou))},
+            share("reaches", "buildings"),
+            n=len(iou),
+            subset=subset,
+        )
         for limit in LIMITS
     ]
     return figures

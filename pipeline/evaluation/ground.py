@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from pipeline.errors import InconsistentInputError
-from pipeline.evaluation.bootstrap import Statistic, Sums, ratio
+from pipeline.evaluation.bootstrap import Statistic, Sums, share
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.reference import Reference, ReferencePoints
 from pipeline.evaluation.subsets import Subset, measured
@@ -109,10 +109,13 @@ def ground_blocks(reference: Reference, found: FoundGround) -> list[GroundBlock]
         is_ground = points.classification[judged] == GROUND_CLASS
         outcome = np.where(is_ground, 0, 2) + np.where(labels[judged] == is_ground, 0, 1)
         place = np.floor(points.xyz[judged, :2] / BLOCK_M).astype(np.int64)
-        blocks, unit = np.unique(place[:, ::-1], axis=0, return_inverse=True)
-        counts = np.bincount(4 * unit.reshape(-1) + outcome, minlength=4 * len(blocks)).reshape(-1, 4)
+        west = place[:, 0].min(initial=0)
+        width = int(place[:, 0].max(initial=0) - west) + 1
+        blocks, unit = np.unique(place[:, 1] * width + (place[:, 0] - west), return_inverse=True)
+        counts = np.bincount(4 * unit + outcome, minlength=4 * len(blocks)).reshape(-1, 4)
+        rows_columns = zip((blocks // width).tolist(), (west + blocks % width).tolist(), strict=True)
         for (row, column), (right, missed, wrong, other) in zip(
-            blocks.tolist(), counts[:, [0, 1, 3, 2]].tolist(), strict=True
+            rows_columns, counts[:, [0, 1, 3, 2]].tolist(), strict=True
         ):
             rows.append(
                 GroundBlock(
@@ -370,9 +373,9 @@ def _kappa(sums: Sums) -> FloatArray:
 
 
 _STATISTICS: tuple[tuple[str, Statistic, str], ...] = (
-    ("type_1", ratio("missed", "ground"), "ground"),
-    ("type_2", ratio("taken", "object"), "object"),
-    ("total", ratio("wrong", "all"), "all"),
+    ("type_1", share("missed", "ground"), "ground"),
+    ("type_2", share("taken", "object"), "object"),
+    ("total", share("wrong", "all"), "all"),
     ("kappa", _kappa, "all"),
 )
 

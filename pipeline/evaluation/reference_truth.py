@@ -190,6 +190,9 @@ def _read_tile(laz: Path, labels: Path, number_of: Mapping[str, int], footprints
         raise InconsistentInputError(str(labels), f"{len(table)} labels for the {len(xyz)} points of {laz}", FIX)
     building = np.concatenate([_numbers(ids, number_of, labels) for ids in table["building_id"].chunks])
     face = table["face"].to_numpy().astype(np.int32)
+    is_roof = (building >= 0) & (face >= 0)
+    hits = np.flatnonzero(is_roof)
+    is_roof[hits] = footprints.face(xyz[hits, 0], xyz[hits, 1]) == building[hits]
     return_number = np.concatenate([cloud.return_number for cloud in clouds])
     return ReferencePoints(
         name=laz.name,
@@ -197,7 +200,7 @@ def _read_tile(laz: Path, labels: Path, number_of: Mapping[str, int], footprints
         classification=table["class"].to_numpy().astype(np.int32),
         building=building,
         face=face,
-        is_roof=(building >= 0) & (face >= 0) & (footprints.face(xyz[:, 0], xyz[:, 1]) == building),
+        is_roof=is_roof,
         last=np.concatenate([cloud.return_number >= cloud.return_count for cloud in clouds]),
         return_number=return_number,
     )

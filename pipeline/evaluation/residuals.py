@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from pipeline.evaluation.bootstrap import Statistic, quantile, ratio, root_mean
+from pipeline.evaluation.bootstrap import Statistic, quantile, ratio, root_mean, share
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import RoofModel
 from pipeline.evaluation.reference import Reference, ReferencePoints
@@ -346,8 +346,8 @@ def residual_measures(rows: Sequence[BuildingResiduals], subset: Subset) -> list
         n_points, n_covered = columns["n_points"].sum(), columns["n_covered"].sum()
         histogram = np.array([tally.histogram for tally in tallies], np.float64).reshape(-1, len(EDGES_M) - 1)
         figures: tuple[tuple[str, dict[str, FloatArray], Statistic, float], ...] = (
-            ("within_0_2m", columns, ratio("n_within", "n_points"), n_points),
-            ("coverage", columns, ratio("n_covered", "n_points"), n_points),
+            ("within_0_2m", columns, share("n_within", "n_points"), n_points),
+            ("coverage", columns, share("n_covered", "n_points"), n_points),
             ("rmse", columns, root_mean("sum_squares_m2", "n_covered"), n_covered),
             ("median", {"h": histogram}, quantile("h", EDGES_M, 0.5), n_covered),
             ("p95", {"h": histogram}, quantile("h", EDGES_M, 0.95), n_covered),

@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from pipeline.evaluation.bootstrap import Sums, ratio
+from pipeline.evaluation.bootstrap import Sums, share
 from pipeline.evaluation.faces import FaceScore, FaceVerdict
 from pipeline.evaluation.matching import Matching
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
@@ -202,11 +202,11 @@ def measures(rows: Sequence[RoofTypeRow], subset: Subset) -> list[Measure]:
     n, found = len(counted), float(columns["modelled"].sum())
     return [
         *(
-            measured(f"roof_types.{one.value}", columns, ratio(one.value, "buildings"), n=n, subset=subset)
+            measured(f"roof_types.{one.value}", columns, share(one.value, "buildings"), n=n, subset=subset)
             for one in Outcome
         ),
-        measured("roof_types.accuracy", columns, ratio("right", "buildings"), n=n, subset=subset),
-        measured("roof_types.accuracy_found", columns, ratio("right", "modelled"), n=found, subset=subset),
+        measured("roof_types.accuracy", columns, share("right", "buildings"), n=n, subset=subset),
+        measured("roof_types.accuracy_found", columns, share("right", "modelled"), n=found, subset=subset),
         measured("roof_types.kappa", columns, _kappa, n=n, subset=subset),
     ]
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.evaluation.bootstrap import quantile, ratio, root_mean
+from pipeline.evaluation.bootstrap import quantile, ratio, root_mean, share
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import RoofModel
 from pipeline.evaluation.reference import Reference
@@ -190,8 +190,8 @@ def measures(rows: Sequence[SurfaceRow], subset: Subset) -> list[Measure]:
     places, covered = float(columns["n_places"].sum()), float(columns["n_covered"].sum())
     bins = {"bins": histogram}
     return [
-        measured("surface.coverage", columns, ratio("n_covered", "n_places"), n=places, subset=subset),
-        measured("surface.within_0_2m", columns, ratio("n_within", "n_places"), n=places, subset=subset),
+        measured("surface.coverage", columns, share("n_covered", "n_places"), n=places, subset=subset),
+        measured("surface.within_0_2m", columns, share("n_within", "n_places"), n=places, subset=subset),
         measured(
             "surface.within_0_2m_mean", columns, ratio("within", "buildings"), n=float(with_roof.sum()), subset=subset
         ),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.evaluation.bootstrap import bootstrap, ratio
+from pipeline.evaluation.bootstrap import bootstrap, share
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import ModelSet
 from pipeline.evaluation.reading.raw import is_closed
@@ -132,7 +132,6 @@ def measures(rows: Sequence[ModelValidity], subset: str = "all") -> list[Measure
         "models_closed": np.array([row.is_closed for row in rows], np.float64),
         "no_solid": np.array([row.n_solids == 0 for row in rows], np.float64),
     }
-    columns["faulty"] = columns["solids"] - columns["solids_valid"]
     n_solids = int(columns["solids"].sum())
     shares = (
         (SOLIDS_VALID, "solids_valid", "solids", n_solids),
@@ -142,17 +141,7 @@ def measures(rows: Sequence[ModelValidity], subset: str = "all") -> list[Measure
     )
     found = []
     for name, part, whole, n in shares:
-        estimate = bootstrap(columns, ratio(part, whole))
+        estimate = bootstrap({key: columns[key] for key in (part, whole)}, share(part, whole))
         found.append(Measure(name=name, value=estimate.value, low=estimate.low, high=estimate.high, n=n, subset=subset))
-    estimate = bootstrap(columns, lambda sums: sums["faulty"])
-    found.append(
-        Measure(
-            name=FAULTY_SOLIDS,
-            value=estimate.value,
-            low=estimate.low,
-            high=estimate.high,
-            n=n_solids,
-            subset=subset,
-        )
-    )
-    return found
+    faulty = float(n_solids - columns["solids_valid"].sum())
+    return [*found, Measure(name=FAULTY_SOLIDS, value=faulty, n=n_solids, subset=subset)]

@@ -29,8 +29,8 @@ MEASURES = "measures.parquet"
 REPORT = "report.md"
 """The file for people."""
 INTERVALS = (
-    "Intervals hold 95 % of 1,000 bootstrap resamples of whole buildings (rasters: blocks); "
-    "a figure has no more digits than its interval supports."
+    "Intervals hold 95 % of 1,000 bootstrap resamples of whole buildings (rasters: blocks); where all of them agree on "
+    "0 or 100 %, they are the exact binomial limits. A figure has no more digits than its interval supports."
 )
 """What an interval is, for readers."""
 _SCHEMA = pa.schema(

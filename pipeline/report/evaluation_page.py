@@ -21,7 +21,7 @@ from pipeline.report.evaluation_maps import maps
 from pipeline.report.histograms import charts
 from pipeline.report.pictures import data_uri
 from pipeline.report.section import RESIDUAL_CLASSES
-from pipeline.report.worst_cases import MODEL_COLOUR, MOST_NOT_FOUND, TRUTH_COLOUR, worst_cases
+from pipeline.report.worst_cases import MODEL_COLOUR, MOST_NOT_FOUND, SECTION_COLOUR, TRUTH_COLOUR, worst_cases
 
 PAGE = "report.html"
 """The file."""
@@ -101,6 +101,7 @@ def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINIT
         residuals=RESIDUAL_CLASSES,
         truth_colour=TRUTH_COLOUR,
         model_colour=MODEL_COLOUR,
+        section_colour=SECTION_COLOUR,
         notes=all_notes(evaluation),
         intervals=INTERVALS,
     )

@@ -36,12 +36,21 @@ class Chart:
 
 
 def charts(tables: Mapping[str, pa.Table]) -> list[Chart]:
-    """The charts that the tables allow, in the order of the page."""
+    """The charts that the tables allow, in the order of the page; buildings at the edge of the data are left out."""
     made = [_residuals(tables["residual_histogram"])] if "residual_histogram" in tables else []
+    cut: set[str] = set()
     if "buildings" in tables:
-        made += _of_buildings(tables["buildings"])
+        buildings = tables["buildings"]
+        if "touches_data_edge" in buildings.column_names:
+            is_cut = buildings["touches_data_edge"].to_pylist()
+            cut = {name for name, at_edge in zip(buildings["building_id"].to_pylist(), is_cut, strict=True) if at_edge}
+            buildings = buildings.filter(pa.array([not at_edge for at_edge in is_cut], pa.bool_()))
+        made += _of_buildings(buildings)
     if "true_faces" in tables:
-        made += _of_faces(tables["true_faces"])
+        faces = tables["true_faces"]
+        if cut:
+            faces = faces.filter(pa.array([name not in cut for name in faces["building_id"].to_pylist()], pa.bool_()))
+        made += _of_faces(faces)
     return [chart for chart in made if chart is not None]
 
 
@@ -102,7 +111,7 @@ def _plain(
         return None
     heights = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0].astype(np.float64)
     middle = float(np.median(values))
-    told = f"{100.0 * middle:.1f} %" if percent else f"{middle:.3g}"
+    told = f"{100.0 * middle:.1f} %" if percent else f"{middle:.3f}"
     return Chart(
         title=title,
         svg=histogram_svg(
@@ -198,13 +207,13 @@ def _of_faces(table: pa.Table) -> list[Chart | None]:
             shown = edges[edges >= -1e-12] if unsigned else edges
             made.append(_plain(values, shown, title=title, x_name=x_name, what="found faces", marks=marks))
     areas = floats(table, "area_m2")
-    made.append(_completeness(areas, found, _FACE_AREAS_M2, "Faces found, by area", "area of the true face, m²", True))
+    counted = areas >= _LEAST_FACE_M2
+    if "to_be_found" in names:
+        counted = np.array([bool(value) for value in table["to_be_found"].to_pylist()], bool)
+    classed = counted | (areas < _LEAST_FACE_M2)
+    title, x_name = "Faces found, by area", "area of the true face, m²"
+    made.append(_completeness(areas[classed], found[classed], _FACE_AREAS_M2, title, x_name, True))
     if "slope_deg" in names:
-        counted = (
-            np.array([bool(value) for value in table["to_be_found"].to_pylist()], bool)
-            if "to_be_found" in names
-            else areas >= _LEAST_FACE_M2
-        )
         slopes = floats(table, "slope_deg")
         title, x_name = "Faces found, by slope", "slope of the true face, degrees"
         made.append(_completeness(slopes[counted], found[counted], _SLOPES_DEG, title, x_name, False))
@@ -230,7 +239,11 @@ def _completeness(
         if count
     )
     caption = "Over the bars: true faces. "
-    caption += "Pale: too small to have to be found." if by_area else "Only faces that have to be found."
+    caption += (
+        "Pale: too small to have to be found; too sparse ones are left out."
+        if by_area
+        else "Only faces that have to be found."
+    )
     return Chart(
         title=title,
         svg=category_svg(

@@ -31,7 +31,7 @@ def blank(width_px: int, height_px: int) -> tuple[Figure, Axes]:
 
 def png_of(figure: Figure) -> bytes:
     """The figure as a PNG with a transparent background, so that it stands on a light page and on a dark one."""
-    canvas = FigureCanvasAgg(figure)
+    canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     reduced = Image.fromarray(np.asarray(canvas.buffer_rgba())).quantize(COLOURS, Image.Quantize.FASTOCTREE)
     written = io.BytesIO()

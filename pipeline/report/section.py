@@ -43,6 +43,10 @@ _LEAST_HEIGHT, _MOST_HEIGHT = 130.0, 330.0
 _MARGIN_M = 2.0
 _BELOW_M = 1.5
 _STEPS = 400
+_STRETCH_M = 2.0
+_GOOD_M = 0.2
+_FAR_M = 1.0
+_CLEARLY_WORSE = 1.5
 _REACHES_M = (0.5, 1.0, 2.0)
 _ENOUGH_POINTS = 40
 _POINTS = 400
@@ -64,7 +68,7 @@ def residual_class(residual: FloatArray) -> LabelArray:
 
 
 def section_svg(truth: RoofModel, models: Sequence[RoofModel], xyz: FloatArray) -> Markup | None:
-    """The profile across the middle of a building, along the shorter side of its footprint's rectangle.
+    """The profile of a building where `profile_line` puts it.
 
     Parameters
     ----------
@@ -80,7 +84,7 @@ def section_svg(truth: RoofModel, models: Sequence[RoofModel], xyz: FloatArray) 
     Markup or None
         An `svg` element; None where there is neither a roof nor a point.
     """
-    middle, along, half = _profile_line(truth)
+    middle, along, half = profile_line(truth, models, xyz)
     s = np.linspace(-half - _MARGIN_M, half + _MARGIN_M, _STEPS)
     x, y = (middle[axis] + s * along[axis] for axis in (0, 1))
     roofs = {"truth": top_of([truth], x, y), "model": top_of(models, x, y)}
@@ -163,14 +167,44 @@ class _Frame:
         return found
 
 
-def _profile_line(truth: RoofModel) -> tuple[FloatArray, FloatArray, float]:
-    """Middle, unit direction and half length of the profile."""
+def profile_line(
+    truth: RoofModel, models: Sequence[RoofModel], xyz: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Where the profile lies: across the building, where its points are farthest from the models.
+
+    Returns
+    -------
+    middle : (2,) float64
+        On the longer axis of the footprint's rectangle: of its stretches of 2 m the one with the largest sum of
+        distances beyond 0.2 m, each counted as 1 m at most; the middle of the building where none is clearly worse.
+    along : (2,) float64
+        Unit vector of the shorter side.
+    half : float
+        Half the length of that side, metres.
+    """
     rectangle = shapely.get_coordinates(shapely.minimum_rotated_rectangle(truth.footprint))
     sides = np.diff(rectangle[:3], axis=0)
     lengths = np.hypot(sides[:, 0], sides[:, 1])
     shorter = int(np.argmin(lengths))
-    along = sides[shorter] / lengths[shorter]
-    return rectangle[:4].mean(axis=0), along if along[0] >= 0.0 else -along, float(lengths[shorter]) / 2.0
+    along, across = sides[shorter] / lengths[shorter], sides[1 - shorter] / lengths[1 - shorter]
+    along, across = (axis if axis[0] >= 0.0 else -axis for axis in (along, across))
+    middle = rectangle[:4].mean(axis=0)
+    half = float(lengths[shorter]) / 2.0
+    if len(xyz) == 0 or not models:
+        return middle, along, half
+    residual = xyz[:, 2] - top_of(models, xyz[:, 0], xyz[:, 1])
+    away_m = np.nan_to_num(np.abs(residual), nan=_FAR_M)
+    weight = np.where(away_m > _GOOD_M, np.minimum(away_m, _FAR_M), 0.0)
+    long_half = float(lengths[1 - shorter]) / 2.0
+    stretches = max(1, round(2.0 * long_half / _STRETCH_M))
+    edges = np.linspace(-long_half, long_half, stretches + 1)
+    place = (xyz[:, :2] - middle) @ across
+    sums = np.histogram(place, edges, weights=weight)[0]
+    worst = int(np.argmax(sums))
+    if sums[worst] <= _CLEARLY_WORSE * np.median(sums):
+        return middle, along, half
+    in_it = (place >= edges[worst]) & (place <= edges[worst + 1])
+    return middle + across * np.average(place[in_it], weights=weight[in_it]), along, half
 
 
 def _near_points(

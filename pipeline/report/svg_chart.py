@@ -16,7 +16,7 @@ from pipeline.model import FloatArray
 
 WIDTH, HEIGHT = 380.0, 230.0
 """Of the view box; the page scales it."""
-_LEFT, _RIGHT, _TOP, _BOTTOM = 58.0, 14.0, 10.0, 40.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58.0, 20.0, 10.0, 40.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from pipeline.model import FaceKind, FloatArray, LabelArray
 from pipeline.report.perspective import View, ViewedFace, draw_view
 from pipeline.report.pictures import blank, paths_of, png_of
 from pipeline.report.render import ROOF_COLOURS, WALL_COLOUR
-from pipeline.report.section import RESIDUAL_CLASSES, UNCOVERED, residual_class, section_svg, top_of
+from pipeline.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg, top_of
 
 CASES = 12
 """How many are shown."""
@@ -32,7 +32,7 @@ POINTS_A_CASE = 12_000
 """More points of a building are thinned evenly."""
 SIDE_PX = 560
 """Width and height of a picture."""
-TRUTH_COLOUR, MODEL_COLOUR = "#2a9470", "#7f93a6"
+TRUTH_COLOUR, MODEL_COLOUR, SECTION_COLOUR = "#2a9470", "#7f93a6", "#777d86"
 _MARGIN_M = 1.5
 _BADNESS = {"false": 0, "passable": 1, "correct": 2}
 
@@ -144,7 +144,7 @@ def _case(
     return Case(
         building_id=truth.building_id,
         figures=_figures(row),
-        plan_png=_plan(truth, around, xyz),
+        plan_png=_plan(truth, own, around, xyz),
         view_png=_view(viewed),
         view_is_truth=view_is_truth,
         section=section_svg(truth, own, xyz),
@@ -198,8 +198,8 @@ def _square(truth: RoofModel) -> tuple[float, float, float]:
     return (west + east) / 2.0, (south + north) / 2.0, max(east - west, north - south) + 2.0 * _MARGIN_M
 
 
-def _plan(truth: RoofModel, around: Sequence[RoofModel], xyz: FloatArray) -> bytes:
-    """Faces of the models, points by residual, true outlines dashed."""
+def _plan(truth: RoofModel, own: Sequence[RoofModel], around: Sequence[RoofModel], xyz: FloatArray) -> bytes:
+    """Faces of the models, points by residual, true outlines dashed, and where the section lies."""
     figure, axes = blank(SIDE_PX, SIDE_PX)
     x, y, side = _square(truth)
     faces = [surface.polygon for model in around for surface in model.surfaces]
@@ -225,6 +225,9 @@ def _plan(truth: RoofModel, around: Sequence[RoofModel], xyz: FloatArray) -> byt
     outlines = [surface.polygon for surface in truth.surfaces] or [truth.footprint]
     rings = [shapely.get_coordinates(ring)[:, :2] for ring in shapely.get_rings(outlines)]
     axes.add_collection(LineCollection(rings, colors=TRUTH_COLOUR, linewidths=2.0, linestyles=(0, (5, 2.5)), zorder=5))
+    middle, along, half = profile_line(truth, own, xyz)
+    line = np.array([middle - (half + _MARGIN_M) * along, middle + (half + _MARGIN_M) * along])
+    axes.plot(line[:, 0], line[:, 1], color=SECTION_COLOUR, linewidth=1.3, marker="o", markersize=4.0, zorder=6)
     axes.set_xlim(x - side / 2.0, x + side / 2.0)
     axes.set_ylim(y - side / 2.0, y + side / 2.0)
     return png_of(figure)

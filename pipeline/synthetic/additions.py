@@ -18,9 +18,6 @@ _EDGE_M = 0.3
 _APART_M = 0.5
 _LEAST_CLEARANCE_M = 0.05
 _TRIES = 40
-_OFF_THE_LINE_M = (0.0, 0.06, -0.07)
-"""Dormers of a row stand this far off its line: corners that are collinear but for the rounding to millimetres would
-make triangles of any tilt."""
 _ON_FLAT_ROOFS = (1.5, 1.5, 0.8), (4.5, 4.0, 3.2)
 _CHIMNEY = (0.5, 0.5, 0.5), (1.1, 1.1, 1.1)
 _ATTIC_BOX = (1.4, 1.4, 0.3), (2.8, 2.4, 0.8)
@@ -189,7 +186,7 @@ def _row_of_dormers(
     taken: Sequence[shapely.Polygon],
     random: np.random.Generator,
 ) -> tuple[Addition, ...]:
-    """Up to so many dormers of one size, nearly in line, inside a polygon of one slope."""
+    """Up to so many dormers of one size and one front line inside a polygon of one slope."""
     across = abs(plane[1]) >= abs(plane[0])
     fall = math.hypot(plane[0], plane[1])
     kind = AdditionKind.PENT_DORMER if random.random() < 0.5 else AdditionKind.GABLE_DORMER
@@ -211,9 +208,9 @@ def _row_of_dormers(
         u, v = (round(float(value), 2) for value in random.uniform((0.0, 0.0), (room_u, room_v)))
         u, v = round(u0 + length / 2, 2) + u, round(v0 + width / 2, 2) + v
         if row and across:
-            v = round(row[0].v_m + _OFF_THE_LINE_M[len(row)], 2)
+            v = row[0].v_m
         elif row:
-            u = round(row[0].u_m + _OFF_THE_LINE_M[len(row)], 2)
+            u = row[0].u_m
         one = Addition(kind=kind, u_m=u, v_m=v, length_m=length, width_m=width, height_m=height)
         own = shapely.Polygon(plan_rectangle(one))
         others = [*taken, *(shapely.Polygon(plan_rectangle(other)) for other in row)]
@@ -225,9 +222,14 @@ def _row_of_dormers(
 
 
 def random_superstructures(
-    shape: RoofShape, size: RoofDimensions, random: np.random.Generator, *, besides: Sequence[Addition] = ()
+    shape: RoofShape,
+    size: RoofDimensions,
+    random: np.random.Generator,
+    *,
+    besides: Sequence[Addition] = (),
+    at_most: int = 3,
 ) -> tuple[Addition, ...]:
-    """Draw one to three boxes: lift shafts and attic boxes on flat faces, chimneys on sloping ones.
+    """Draw one to three boxes, or one to so many: lift shafts and attic boxes on flat faces, chimneys on sloping ones.
 
     Parameters
     ----------
@@ -237,6 +239,8 @@ def random_superstructures(
         Where chance comes from.
     besides : sequence of Addition
         What stands there already: they keep clear of it.
+    at_most : int
+        Largest number.
 
     Returns
     -------
@@ -250,7 +254,7 @@ def random_superstructures(
     ground = max(flat, key=lambda polygon: polygon.area) if flat else shapely.union_all(polygons)
     free = shapely.buffer(ground, -_EDGE_M, join_style="mitre")
     taken = [shapely.Polygon(plan_rectangle(one)) for one in besides]
-    wanted = int(random.integers(1, 4))
+    wanted = int(random.integers(1, at_most + 1))
     found: list[Addition] = []
     for _ in range(_TRIES):
         length, width, height = (

@@ -32,8 +32,8 @@ CITY_SCANNER = ScannerSettings(
     strip_spacing_m=400.0,
     strip_overlap=0.15,
     flight_azimuth_deg=90.0,
-    strip_shift_m=0.10,
-    strip_lift_m=0.04,
+    strip_shift_m=0.06,
+    strip_lift_m=0.02,
     wrong_row_share=0.0005,
     wrong_row_lift_m=0.6,
 )

@@ -6,7 +6,6 @@ Every block is made from its own random state, so it is the same in a city of an
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 
@@ -33,6 +32,8 @@ TALLEST_M = 60.0
 
 _DEPTH_M = 11.5
 _INSET_M = 2.0
+_OVERHANGING = 0.25
+"""Share of the trees that may hang over a house."""
 _STEEP_DEG = 9.0
 """On steeper ground only detached houses and parks stand."""
 
@@ -90,6 +91,7 @@ class Block:
         self.buildings: list[Building] = []
         self.trees: list[Tree] = []
         self.boxes: list[Box] = []
+        self._outlines: list[shapely.Polygon] = []
         self.kind = self._drawn_kind()
         _MAKERS[self.kind](self)
         self._kerb()
@@ -208,7 +210,7 @@ class Block:
                 self._uniform(30.0, 45.0),
                 "row" + "-+"[side > 0],
             )
-        self._planted(8, BLOCK_M[0] / 2 - 6.0, BLOCK_M[1] / 2 - _INSET_M - _DEPTH_M - 1.0)
+        self._planted(24, BLOCK_M[0] / 2 - 6.0, BLOCK_M[1] / 2 - _INSET_M - _DEPTH_M - 1.0)
 
     def perimeter(self) -> None:
         """Four rows around a courtyard with trees and a low shed."""
@@ -220,7 +222,7 @@ class Block:
             self._row(False, side * (half_u - _DEPTH_M / 2), 2 * (half_v - _DEPTH_M), storeys, pitch, "perimeter")
         shed = RoofDimensions(length_m=self._uniform(6.0, 14.0), width_m=self._uniform(4.0, 7.0), pitch_deg=8.0)
         self._build(RoofShape.PENT, shed, self._uniform(-18.0, 18.0), 0.0, eave_m=2.8)
-        self._planted(7, half_u - _DEPTH_M - 3.0, half_v - _DEPTH_M - 3.0)
+        self._planted(20, half_u - _DEPTH_M - 3.0, half_v - _DEPTH_M - 3.0)
 
     def courtyards(self) -> None:
         """Two large buildings: closed around a court, U-shaped, or with a mansard roof."""
@@ -228,7 +230,7 @@ class Block:
             shape = (RoofShape.COURTYARD, RoofShape.U_SHAPE, RoofShape.MANSARD)[int(self.random.integers(3))]
             area = self._uniform(600.0, 900.0)
             self._fitted(shape, side * BLOCK_M[0] / 4, 0.0, (44.0, 54.0), area, storeys=(3, 6), dormers=0.4)
-        self._planted(6, BLOCK_M[0] / 2 - 3.0, BLOCK_M[1] / 2 - 3.0)
+        self._planted(18, BLOCK_M[0] / 2 - 3.0, BLOCK_M[1] / 2 - 3.0)
 
     def detached(self) -> None:
         """Eight detached houses of all shapes with gardens."""
@@ -246,7 +248,7 @@ class Block:
                 )
                 if self.random.random() < 0.3:
                     self._overhanging(len(self.buildings) - 1, house)
-        self._planted(16, BLOCK_M[0] / 2 - 2.0, BLOCK_M[1] / 2 - 2.0)
+        self._planted(44, BLOCK_M[0] / 2 - 2.0, BLOCK_M[1] / 2 - 2.0)
 
     def hall(self) -> None:
         """A large flat hall with superstructures, and a building of several levels or an office that touches it."""
@@ -260,7 +262,7 @@ class Block:
         self._fitted(
             RoofShape.MULTI_LEVEL_FLAT, BLOCK_M[0] / 2 - 10.0, 0.0, (16.0, 50.0), 220.0, storeys=(1, 3), boxes=0.5
         )
-        self._planted(4, BLOCK_M[0] / 2 - 2.0, BLOCK_M[1] / 2 - 2.0)
+        self._planted(14, BLOCK_M[0] / 2 - 2.0, BLOCK_M[1] / 2 - 2.0)
 
     def towers(self) -> None:
         """Two slabs of 6 to 12 storeys with lift shafts, and a low pavilion."""
@@ -278,7 +280,7 @@ class Block:
                 wet=0.3,
             )
         self._fitted(RoofShape.MULTI_LEVEL_FLAT, 0.0, 0.0, (14.0, 22.0), 160.0, storeys=(1, 2))
-        self._planted(14, BLOCK_M[0] / 2 - 3.0, BLOCK_M[1] / 2 - 3.0)
+        self._planted(40, BLOCK_M[0] / 2 - 3.0, BLOCK_M[1] / 2 - 3.0)
 
     def church(self) -> None:
         """A steep nave with transepts, and a tower with a pyramid that touches its western end."""
@@ -296,12 +298,12 @@ class Block:
         tower = RoofDimensions(length_m=side, width_m=side, pitch_deg=self._uniform(55.0, 68.0))
         west = 4.0 - nave.length_m / 2 - side / 2
         self._build(RoofShape.PYRAMID, tower, west, 0.0, eave_m=self._uniform(22.0, 32.0), block=block)
-        self._planted(14, BLOCK_M[0] / 2 - 3.0, BLOCK_M[1] / 2 - 3.0)
+        self._planted(40, BLOCK_M[0] / 2 - 3.0, BLOCK_M[1] / 2 - 3.0)
 
     def park(self) -> None:
         """Trees and a kiosk."""
         self._build(RoofShape.PYRAMID, RoofDimensions(length_m=5.0, width_m=5.0, pitch_deg=25.0), 0.0, 0.0, eave_m=2.6)
-        self._planted(26, BLOCK_M[0] / 2 - 4.0, BLOCK_M[1] / 2 - 4.0)
+        self._planted(60, BLOCK_M[0] / 2 - 4.0, BLOCK_M[1] / 2 - 4.0)
 
     def _fitted(
         self,
@@ -348,19 +350,34 @@ class Block:
         radius = self._uniform(2.0, 3.8)
         x, y = np.array([at.x, at.y]) + away * radius * self._uniform(0.35, 0.7)
         height = max(2.4 * radius, house.eave_z_m - house.floor_z_m + self._uniform(1.0, 4.0))
-        if all(_distance(one, float(x), float(y)) > 0.35 * radius for one in self.buildings):
+        if (self._distances(float(x), float(y)) > 0.35 * radius).all():
             self.trees.append(tree_at(float(x), float(y), radius, height, self.terrain))
-            self.buildings[number] = dataclasses.replace(house, defects=(*house.defects, Defect.OVERHANGING_TREE))
+            self._mark(number, Defect.OVERHANGING_TREE)
 
     def _planted(self, count: int, half_length_m: float, half_width_m: float) -> None:
-        """Trees and shrubs in a rectangle, none with its crown over a house."""
+        """Trees and shrubs in a rectangle; the crowns of some hang over a house."""
         for _ in range(count):
             u, v = self._uniform(-half_length_m, half_length_m), self._uniform(-half_width_m, half_width_m)
-            radius = self._uniform(0.6, 4.0)
+            radius = self._uniform(0.6, 4.8)
             height = radius * self._uniform(2.2, 3.0)
+            reach = radius * (0.4 if self.random.random() < _OVERHANGING else 1.0)
             x, y = self._place(u, v)
-            if all(_distance(one, x, y) > radius + 0.2 for one in self.buildings):
-                self.trees.append(tree_at(x, y, radius, height, self.terrain))
+            away = self._distances(x, y)
+            if (away <= reach).any():
+                continue
+            self.trees.append(tree_at(x, y, radius, height, self.terrain))
+            for k in np.flatnonzero(away < radius):
+                self._mark(int(k), Defect.OVERHANGING_TREE)
+
+    def _distances(self, x: float, y: float) -> FloatArray:
+        """From a place to the outline of every building in plan; 0 inside."""
+        self._outlines += [building.footprint for building in self.buildings[len(self._outlines) :]]
+        return np.asarray(shapely.distance(self._outlines, shapely.Point(x, y)))
+
+    def _mark(self, number: int, defect: Defect) -> None:
+        building = self.buildings[number]
+        if defect not in building.defects:
+            self.buildings[number] = dataclasses.replace(building, defects=(*building.defects, defect))
 
     def _kerb(self) -> None:
         """Cars and trees at the kerbs of the long sides."""
@@ -370,10 +387,10 @@ class Block:
                 if kind < 0.45:
                     x, y = self._place(float(u) + shift, side * (BLOCK_M[1] / 2 + 1.3))
                     self.boxes.append(car_at(x, y, CITY_AZIMUTH_DEG, self.terrain, self.random))
-                elif kind < 0.6:
-                    radius = self._uniform(1.5, 2.8)
+                elif kind < 0.75:
+                    radius = self._uniform(1.5, 3.2)
                     height = radius * 2.8
-                    x, y = self._place(float(u) + shift, side * (BLOCK_M[1] / 2 + 3.6))
+                    x, y = self._place(float(u) + shift, side * (BLOCK_M[1] / 2 + 3.4))
                     self.trees.append(tree_at(x, y, radius, height, self.terrain))
 
 
@@ -387,10 +404,3 @@ _MAKERS: Mapping[BlockKind, Callable[[Block], None]] = {
     BlockKind.CHURCH: Block.church,
     BlockKind.PARK: Block.park,
 }
-
-
-def _distance(building: Building, x: float, y: float) -> float:
-    """From a place to a building's outline in plan; 0 inside. Far away it is a lower bound."""
-    low, high = building.vertices.min(axis=0), building.vertices.max(axis=0)
-    away = math.hypot(max(low[0] - x, 0.0, x - high[0]), max(low[1] - y, 0.0, y - high[1]))
-    return away if away > 5.0 else float(building.footprint.distance(shapely.Point(x, y)))

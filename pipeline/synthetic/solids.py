@@ -13,6 +13,7 @@ from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import solid_parts
 from pipeline.synthetic.roof_dimensions import FaceRings
 from pipeline.synthetic.scene import Building
+from pipeline.synthetic.straight_walls import with_straight_walls
 
 
 def boundary_rings(faces: tuple[FaceRings, ...]) -> list[list[int]]:
@@ -45,8 +46,8 @@ def _from_a_corner(ring: list[int], vertices: FloatArray) -> tuple[list[int], li
 def building_solid(building: Building, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Solid:
     """The closed, outward oriented solid of a building.
 
-    Of a roof without steps one wall a straight run of the outline, so a gable's end wall is one face of five vertices;
-    else one wall an edge of the faces in plan, also between two faces of which one stands over the other.
+    One wall a straight run of the outline, so a gable's end wall is one face of five vertices. Where a roof face stands
+    over another there is a wall between them.
 
     Parameters
     ----------
@@ -109,7 +110,7 @@ def _stepped_solid(building: Building, origin: tuple[float, float, float]) -> So
     parts = solid_parts(partition, planes, building.floor_z_m - origin[2])
     if len(parts) != 1:
         raise ValueError(f"{building.building_id}: the roof falls into {len(parts)} parts that share no edge")
-    return parts[0].solid
+    return with_straight_walls(parts[0].solid)
 
 
 def moved_plane(plane: Plane, origin: tuple[float, float, float]) -> Plane:

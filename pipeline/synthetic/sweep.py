@@ -29,6 +29,17 @@ _MARGIN_M = 5.0
 SCANNER = ScannerSettings(altitude_m=800.0, strip_spacing_m=_STRIP_M, strip_overlap=0.1, flight_azimuth_deg=0.0)
 
 
+def cell_name(density_per_m2: float, noise_m: float) -> str:
+    """Folder of a cell.
+
+    Examples
+    --------
+    >>> cell_name(0.5, 0.1)
+    'd0.5_n0.10'
+    """
+    return f"d{density_per_m2:g}_n{noise_m:.2f}"
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cell:
     """One survey of the sweep."""
@@ -40,8 +51,8 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """Name of its folder: d8_n0.05."""
-        return f"d{self.density_per_m2:g}_n{self.noise_m:.2f}"
+        """Name of its folder."""
+        return cell_name(self.density_per_m2, self.noise_m)
 
 
 CELLS = tuple(Cell(density_per_m2=density, noise_m=noise) for density in DENSITIES_PER_M2 for noise in NOISES_M)

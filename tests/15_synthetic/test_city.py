@@ -25,9 +25,9 @@ from pipeline.synthetic.dataset import ScenePaths, read_truth, simulate, tile_ex
 from pipeline.synthetic.scene import Scene
 from pipeline.synthetic.suites import SUITES
 
-SIZE = (420.0, 330.0)
+SIZE = (300.0, 220.0)
 SPARSE = dataclasses.replace(CITY_SCANNER, pulse_density_per_m2=1.0)
-TILE_M = 200.0
+TILE_M = 150.0
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def in_order(xyz: FloatArray) -> FloatArray:
 def test_the_tiles_together_hold_exactly_the_points_of_the_whole_scan(whole: Scene, made: ScenePaths) -> None:
     block: ScanBlock = scan_all(whole, SPARSE, 1_005)
     tiles = np.concatenate([laspy.read(path).xyz for path in sorted((made.laz).iterdir())])
-    assert made.tiles == 6
+    assert made.tiles == 4
     assert len(tiles) == len(block) == made.points
     assert np.allclose(in_order(tiles), in_order(block.points.xyz), atol=1e-6)
 
@@ -84,9 +84,9 @@ def test_every_building_has_one_owner_and_all_are_there(whole: Scene, made: Scen
     assert manifest["extent"][2] - manifest["extent"][0] == SIZE[0]
 
 
-def test_a_tile_holds_the_buildings_whose_middle_lies_in_it(made: ScenePaths) -> None:
+def test_a_tile_holds_the_buildings_whose_middle_lies_in_it(whole: Scene, made: ScenePaths) -> None:
     extents = dict(tile_extents(SIZE, TILE_M))
-    middles = {one.building_id: (one.x, one.y) for one in city(1_005, size_m=SIZE).buildings}
+    middles = {one.building_id: (one.x, one.y) for one in whole.buildings}
     for key, (x0, y0, x1, y1) in extents.items():
         rows = pq.read_table(made.truth / "buildings" / f"tile={key}" / "part-0.parquet")["building_id"].to_pylist()
         assert rows
@@ -99,7 +99,7 @@ def test_a_tile_holds_the_buildings_whose_middle_lies_in_it(made: ScenePaths) ->
 def test_the_same_call_gives_the_same_bytes(tmp_path: Path) -> None:
     digests = []
     for name in ("a", "b"):
-        paths = simulate("city", tmp_path / name, 7, size_m=(120.0, 100.0), scanner=SPARSE)
+        paths = simulate("city", tmp_path / name, 7, size_m=(60.0, 50.0), scanner=SPARSE)
         files = sorted(path for path in (tmp_path / name).rglob("*") if path.is_file())
         digests.append([hashlib.sha256(path.read_bytes()).hexdigest() for path in files])
         assert paths.tiles == 1
@@ -107,16 +107,17 @@ def test_the_same_call_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_a_larger_city_holds_the_smaller_one_unchanged(whole: Scene) -> None:
-    larger = {one.building_id: one for one in city(1_005, size_m=(SIZE[0] + 150.0, SIZE[1] + 80.0)).buildings}
+    larger = city(1_005, size_m=(SIZE[0] + 60.0, SIZE[1] + 30.0))
+    known = {one.building_id: one for one in larger.buildings}
     for one in whole.buildings:
-        assert np.array_equal(one.vertices, larger[one.building_id].vertices)
-    assert set(whole.trees) < set(city(1_005, size_m=(SIZE[0] + 150.0, SIZE[1] + 80.0)).trees)
+        assert np.array_equal(one.vertices, known[one.building_id].vertices)
+    assert set(whole.trees) < set(larger.trees)
 
 
 def test_what_a_tile_sees_does_not_depend_on_what_was_seen_before() -> None:
-    fresh, used = CityPlan(3, (900.0, 900.0)), CityPlan(3, (900.0, 900.0))
-    used.part((0.0, 0.0, 200.0, 200.0))
-    extent = (100.0, 100.0, 300.0, 250.0)
+    fresh, used = CityPlan(3, (400.0, 400.0)), CityPlan(3, (400.0, 400.0))
+    used.part((0.0, 0.0, 150.0, 120.0))
+    extent = (100.0, 80.0, 200.0, 180.0)
     one, two = fresh.part(extent), used.part(extent)
     assert [a.building_id for a in one.buildings] == [b.building_id for b in two.buildings]
     assert one.trees == two.trees

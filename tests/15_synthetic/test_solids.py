@@ -181,9 +181,11 @@ def test_inner_steps_get_walls_down_to_the_lower_roof() -> None:
     assert has_steps(building)
     solid = building_solid(building)
     walls = [solid.vertices[list(face.rings[0])] for face in solid.faces if face.kind is FaceKind.WALL]
-    (inner,) = [wall for wall in walls if wall[:, 2].min() > 30.1]
-    assert sorted(set(inner[:, 2])) == [34.0, 37.0]
-    assert np.ptp(inner[:, 1]) == 8.0
+    (step,) = [wall for wall in walls if np.ptp(wall[:, 0]) == 0.0 and wall[0, 0] == 0.0]
+    # Over the lower roof and, in the same plane, beside it down to the floor.
+    assert sorted(map(tuple, step[:, 1:].tolist())) == [
+        *((-5.0, 34.0), (-5.0, 37.0), (3.0, 30.0), (3.0, 34.0), (5.0, 30.0), (5.0, 37.0))
+    ]
     assert signed_volume(solid) == pytest.approx(100.0 * 7.0 + 80.0 * 4.0)
 
 
@@ -200,6 +202,20 @@ def test_a_roof_face_around_a_box_has_a_hole_in_record_and_solid() -> None:
     assert record.footprint is not None
     assert record.footprint.area == pytest.approx(88.0, abs=0.02)
     assert signed_volume(record.solids[0]) == pytest.approx(88.0 * 4.0 + 6.0 * 1.5, rel=5e-4)
+
+
+def test_the_front_of_a_gable_dormer_is_one_wall_and_the_roof_beneath_has_no_corner_under_its_ridge() -> None:
+    dormer = Addition(kind=AdditionKind.GABLE_DORMER, u_m=0.0, v_m=-2.2, length_m=2.0, width_m=2.2, height_m=1.0)
+    size = dataclasses.replace(SIZES[RoofShape.GABLE], additions=(dormer,))
+    building = place_building(
+        "d", RoofShape.GABLE, size, x=0.0, y=0.0, azimuth_deg=77.0, eave_height_m=4.0, terrain=LEVEL
+    )
+    solid = building_solid(building)
+    walls = [face.rings[0] for face in solid.faces if face.kind is FaceKind.WALL]
+    assert sorted(len(ring) for ring in walls) == [3, 3, 4, 4, 5, 5, 5]
+    (around,) = [face.rings for face in solid.faces if len(face.rings) == 2]
+    assert [len(ring) for ring in around] == [4, 5]
+    assert {vertex for face in solid.faces for ring in face.rings for vertex in ring} == set(range(len(solid.vertices)))
 
 
 def test_a_courtyard_is_a_hole_in_footprint_and_floor() -> None:

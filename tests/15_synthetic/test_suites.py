@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 
@@ -17,9 +18,10 @@ from pipeline.synthetic.scene import Scene
 from pipeline.synthetic.seeds import DRAWS, FIRST_SEEDS, Split, seed_of, split_of
 from pipeline.synthetic.suites import SUITES, suite_named
 
-SMALL = {"town": (150.0, 120.0), "city": (260.0, 200.0)}
+SMALL = {"town": (150.0, 120.0), "city": (150.0, 100.0)}
 
 
+@functools.cache
 def scene_of(name: str, seed: int) -> Scene:
     suite = SUITES[name]
     return suite.make(seed, SMALL.get(name, suite.size_m))
@@ -56,7 +58,7 @@ def test_every_roof_shape_is_a_suite_beside_the_scenes() -> None:
 
 @pytest.mark.parametrize("name", list(SUITES))
 def test_the_same_seed_gives_the_same_scene_and_another_one_another(name: str) -> None:
-    first, again, other = scene_of(name, 3), scene_of(name, 3), scene_of(name, 4)
+    first, again, other = scene_of(name, 1003), scene_of.__wrapped__(name, 1003), scene_of(name, 1004)
     assert [one.building_id for one in first.buildings] == [one.building_id for one in again.buildings]
     for one, two in zip(first.buildings, again.buildings, strict=True):
         assert np.array_equal(one.vertices, two.vertices)
@@ -81,7 +83,7 @@ def test_buildings_have_names_of_their_own_and_never_overlap(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["hofmann310", "sweep", "city"])
 def test_no_trunk_stands_in_a_building_and_no_eave_below_the_ground(name: str) -> None:
-    scene = scene_of(name, 1004)
+    scene = scene_of(name, 1003)
     index = shapely.STRtree([one.footprint for one in scene.buildings])
     for tree in scene.trees:
         assert len(index.query(shapely.Point(tree.x, tree.y), predicate="intersects")) == 0

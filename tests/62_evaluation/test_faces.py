@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import roofs_by_hand as by_hand
 import shapely
 from matplotlib.path import Path
 from roofs_by_hand import bent_gable, flat, gable, hip, lifted, moved, rectangle, reference, surface, turned, with_face
+from shapely import affinity
 
 from pipeline.evaluation.faces import DEFINITIONS, FaceScore, FaceVerdict, measures, score_faces
 from pipeline.evaluation.models import RoofModel, RoofSurface
@@ -37,17 +39,23 @@ def found(models: list[RoofModel], truth: list[RoofModel]) -> list[bool]:
     return [row.found for row in score_faces(models, reference(truth)).reference]
 
 
-@pytest.mark.parametrize("truth", [TRUTH, [bent_gable("d")], by_hand.models_of_scene(suburb(7, size_m=(120.0, 120.0)))])
+@pytest.mark.parametrize(
+    "truth",
+    [
+        TRUTH,
+        [bent_gable("d")],
+        by_hand.models_of_scene(suburb(7, size_m=(120.0, 120.0))),
+        by_hand.models_of_scene(by_hand.scene_of_all_shapes(1)),
+    ],
+)
 def test_the_truth_scored_against_itself_is_perfect(truth: list[RoofModel]) -> None:
     known = reference(truth, extent=None)
     score = score_faces(truth, known)
     told = {one.name: one for one in measures(score, subsets(known)[0])}
     assert set(told) == {one.name for one in DEFINITIONS}
     for name in SHARES:
-        assert (told[name].value, told[name].low, told[name].high) == (
-            1.0,
-            *((1.0, 1.0) if len(truth) > 1 else (pytest.approx(math.nan, nan_ok=True),) * 2),
-        )
+        assert told[name].value == 1.0
+        assert told[name].high == 1.0 or len(truth) == 1
     assert {row.verdict for row in score.models} <= {FaceVerdict.RIGHT, FaceVerdict.NEITHER}
     assert all(row.found and row.matched and not row.as_group for row in score.reference)
     assert max(row.angle_deg for row in score.reference) == 0.0
@@ -92,6 +100,13 @@ def test_a_lift_counts_across_the_plane() -> None:
         (row, _) = score_faces([with_face(one, 0, lifted(one.surfaces[0], lift))], reference([one])).reference
         assert row.found is kept
         assert row.offset_m == pytest.approx(lift / math.sqrt(1 + 0.7**2))
+
+
+def test_the_offset_of_a_turned_face_is_across_the_true_plane() -> None:
+    one = TRUTH[0]
+    face = lifted(turned(one.surfaces[0], 8.0), 0.2)
+    (row, _) = score_faces([with_face(one, 0, face)], reference([one])).reference
+    assert row.offset_m == pytest.approx(0.2 / math.sqrt(1 + 0.7**2))
 
 
 @pytest.mark.parametrize("place", [(0, 0), (1, 0), (1, 2), (2, 0)])
@@ -179,13 +194,17 @@ def test_a_bent_face_is_found_as_one_face_and_as_two() -> None:
         }
 
 
-def test_a_bent_face_is_found_by_its_mean_plane_where_no_piece_matches_alone() -> None:
-    true = bent_gable("t", lower=0.30, upper=0.62, bend=3.0)
-    chord = (3 * 0.30 + 3 * 0.62) / 6
-    mean_z = 4.0 + (3.0 * 0.45 + 3.0 * (0.9 + 0.93)) / 6
+@pytest.mark.parametrize(("lower", "upper", "bend"), [(0.30, 0.62, 3.0), (-0.10, 0.70, 2.0)])
+def test_a_bent_face_is_found_by_its_mean_plane_where_no_piece_matches_alone(
+    lower: float, upper: float, bend: float
+) -> None:
+    true = bent_gable("t", lower=lower, upper=upper, bend=bend)
+    rest = 6.0 - bend
+    rise = (bend * lower + rest * upper) / 6
+    mean_z = (bend * (4.0 + lower * bend / 2) + rest * (4.0 + lower * bend + upper * rest / 2)) / 6
     sides = [
-        surface(rectangle(0, 0, 12, 6), (0.0, chord, mean_z - 3 * chord), 0),
-        surface(rectangle(0, 6, 12, 12), (0.0, -chord, mean_z + 9 * chord), 1),
+        surface(rectangle(0, 0, 12, 6), (0.0, rise, mean_z - 3 * rise), 0),
+        surface(rectangle(0, 6, 12, 12), (0.0, -rise, mean_z + 9 * rise), 1),
     ]
     score = score_faces([dataclasses.replace(true, surfaces=tuple(sides))], reference([true]))
     assert all(row.found and row.as_group and row.matched for row in score.reference)
@@ -196,6 +215,14 @@ def test_a_bent_face_is_found_by_its_mean_plane_where_no_piece_matches_alone() -
     sides[0] = lifted(sides[0], 0.5)
     score = score_faces([dataclasses.replace(true, surfaces=tuple(sides))], reference([true]))
     assert [row.found for row in score.reference] == [False, False, True, True]
+
+
+def test_a_model_face_that_matches_another_face_does_not_find_a_group_too() -> None:
+    single = flat("single", width=5.0)
+    halves = [surface(rectangle(x, 0, x + 2.5, 8), (0.0, 0.0, 6.0), k, 0) for k, x in enumerate((5.0, 7.5))]
+    group = by_hand.model("group", RoofType.FLAT, halves)
+    assert found([flat("m", width=10.0)], [single, group]) == [True, False, False]
+    assert found([flat("m", 3.0, width=7.0)], [single, group]) == [False, True, True]
 
 
 def test_a_bent_face_needs_half_of_its_area_in_matched_pieces() -> None:
@@ -217,7 +244,7 @@ def test_area_and_points_of_a_bent_face_are_summed() -> None:
     assert score.reference[0].unit_area_m2 == pytest.approx(score.reference[0].area_m2 + score.reference[1].area_m2)
 
 
-# ------------------------------------------------------------------------------- what need not be found, what is no fault
+# ----------------------------------------------------------------------- what need not be found, what is no fault
 
 
 def test_small_faces_are_neither_right_nor_wrong() -> None:
@@ -349,7 +376,7 @@ def test_the_score_does_not_depend_on_the_order_of_models() -> None:
     assert told == pytest.approx(other, nan_ok=True)
 
 
-# ----------------------------------------------------------- the slow twin: rasters of 5 cm, counting, naive double loops
+# ------------------------------------------------ the slow twin: rasters of 5 cm, counting, naive double loops
 
 CELL = 0.05
 SURE_OVERLAP, SURE_OFFSET, SURE_ANGLE, SURE_HELD = 0.02, 0.01, 0.05, 0.02
@@ -363,31 +390,8 @@ def damaged(truth: list[RoofModel], random: np.random.Generator) -> list[RoofMod
         if random.random() < 0.08:
             continue
         faces: list[RoofSurface] = []
-        for face in building.surfaces:
-            kind = random.choice(["as_is", "drop", "lift", "turn", "shift", "cut", "double", "slip"])
-            if kind == "drop":
-                continue
-            if kind == "lift":
-                face = lifted(face, random.normal(0.0, 0.35))
-            if kind == "turn":
-                face = turned(face, random.uniform(-16.0, 16.0))
-            if kind in ("shift", "slip"):
-                x, y = random.normal(0.0, 1.2, 2)
-                polygon = shapely.affinity.translate(face.polygon, x, y)
-                a, b, c = face.coefficients
-                face = dataclasses.replace(
-                    face, polygon=polygon, coefficients=(a, b, c - (a * x + b * y if kind == "slip" else 0.0))
-                )
-            parts = [face]
-            if kind == "cut":
-                low_x, low_y, high_x, high_y = face.polygon.bounds
-                at = low_x + random.uniform(0.2, 0.8) * (high_x - low_x)
-                boxes = (shapely.box(low_x, low_y, at, high_y), shapely.box(at, low_y, high_x, high_y))
-                cuts = [face.polygon.intersection(box) for box in boxes]
-                parts = [dataclasses.replace(face, polygon=cut) for cut in cuts if cut.geom_type == "Polygon"]
-            if kind == "double":
-                parts = [face, lifted(face, 0.1)]
-            faces += parts
+        for whole in building.surfaces:
+            faces += damaged_face(whole, random)
         if faces:
             models.append(dataclasses.replace(building, surfaces=tuple(faces)))
     if len(models) > 3:  # one model of two buildings, and one building in two models
@@ -397,37 +401,87 @@ def damaged(truth: list[RoofModel], random: np.random.Generator) -> list[RoofMod
     return models
 
 
-class SlowFace:
-    """A face as cells of a raster."""
-
-    def __init__(self, face: RoofSurface, x: np.ndarray, y: np.ndarray) -> None:
-        self.face = face
-        self.cells = np.zeros(x.shape, bool)
+def damaged_face(face: RoofSurface, random: np.random.Generator) -> list[RoofSurface]:
+    """What became of one face."""
+    kind = random.choice(["as_is", "drop", "lift", "turn", "shift", "slip", "cut", "double"])
+    if kind == "drop":
+        return []
+    if kind == "lift":
+        return [lifted(face, random.normal(0.0, 0.35))]
+    if kind == "turn":
+        return [turned(face, random.uniform(-16.0, 16.0))]
+    if kind == "double":
+        return [face, lifted(face, 0.1)]
+    if kind in ("shift", "slip"):  # the outline alone, or the whole face
+        x, y = random.normal(0.0, 1.2, 2)
+        a, b, c = face.coefficients
+        plane = (a, b, c - (a * x + b * y if kind == "slip" else 0.0))
+        return [dataclasses.replace(face, polygon=affinity.translate(face.polygon, x, y), coefficients=plane)]
+    if kind == "cut":
         low_x, low_y, high_x, high_y = face.polygon.bounds
-        rows = slice(*np.searchsorted(y[:, 0], [low_y, high_y]))
-        columns = slice(*np.searchsorted(x[0], [low_x, high_x]))
-        places = np.column_stack([x[rows, columns].ravel(), y[rows, columns].ravel()])
-        shape = x[rows, columns].shape
-        corner = places.min(axis=0) if len(places) else np.zeros(2)
-        ring = Path(np.array(face.polygon.exterior.coords) - corner)
-        self.cells[rows, columns] = ring.contains_points(places - corner).reshape(shape)
-        self.count = int(self.cells.sum())
-        self.z = face.elevation(x, y)
+        at = low_x + random.uniform(0.2, 0.8) * (high_x - low_x)
+        boxes = (shapely.box(low_x, low_y, at, high_y), shapely.box(at, low_y, high_x, high_y))
+        cuts = [face.polygon.intersection(box) for box in boxes]
+        return [dataclasses.replace(face, polygon=cut) for cut in cuts if cut.geom_type == "Polygon"]
+    return [face]
+
+
+class Cells:
+    """A window of a raster with 5 cm cells: row and column of its corner, and which cells are in."""
+
+    def __init__(self, row: int, column: int, inside: np.ndarray) -> None:
+        self.row, self.column, self.inside = row, column, inside
+        self.count = int(inside.sum())
+
+    @property
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Middles of the cells that are in."""
+        rows, columns = np.nonzero(self.inside)
+        return (columns + self.column + 0.5) * CELL, (rows + self.row + 0.5) * CELL
+
+    def common(self, other: Cells) -> Cells:
+        row, column = max(self.row, other.row), max(self.column, other.column)
+        end = [min(one.row + one.inside.shape[0] for one in (self, other)) - row]
+        end.append(min(one.column + one.inside.shape[1] for one in (self, other)) - column)
+        if min(end) <= 0:
+            return Cells(row, column, np.zeros((0, 0), bool))
+        parts = [
+            one.inside[row - one.row : row - one.row + end[0], column - one.column : column - one.column + end[1]]
+            for one in (self, other)
+        ]
+        return Cells(row, column, parts[0] & parts[1])
+
+
+def rasterised(face: RoofSurface) -> Cells:
+    """Cells whose middles matplotlib sees inside the outline."""
+    ring = np.array(face.polygon.exterior.coords)
+    corner, end = np.floor(ring.min(axis=0) / CELL).astype(int), np.ceil(ring.max(axis=0) / CELL).astype(int)
+    columns, rows = (np.arange(end[k] - corner[k]) + 0.5 for k in (0, 1))
+    places = np.stack(np.meshgrid(columns * CELL, rows * CELL), axis=-1)
+    flat_places = places.reshape(-1, 2)
+    inside = Path(ring - corner * CELL).contains_points(flat_places)
+    for hole in face.polygon.interiors:
+        inside &= ~Path(np.array(hole.coords) - corner * CELL).contains_points(flat_places)
+    inside = inside.reshape(places.shape[:2])
+    return Cells(int(corner[1]), int(corner[0]), inside)
+
+
+Slope = tuple[float, float]
+Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def slow_pair(
-    cells: np.ndarray, z: np.ndarray, slope: tuple[float, float], other: SlowFace
+    cells: Cells, height: Height, slope: Slope, other: Cells, face: RoofSurface
 ) -> tuple[float, float, float]:
     """Smaller share of both, angle in degrees, offset in metres of a true area and a model face, from cells."""
-    common = cells & other.cells
-    count = int(common.sum())
-    if count == 0:
+    common = cells.common(other)
+    if common.count == 0:
         return 0.0, 180.0, 99.0
-    a, b = slope
-    p, q, _ = other.face.coefficients
+    (a, b), (p, q, _) = slope, face.coefficients
     dot = (a * p + b * q + 1.0) / math.sqrt((a * a + b * b + 1.0) * (p * p + q * q + 1.0))
-    offset = float((other.z - z)[common].mean()) / math.sqrt(a * a + b * b + 1.0)
-    return count / max(int(cells.sum()), other.count), math.degrees(math.acos(min(1.0, dot))), offset
+    difference = face.elevation(*common.places) - height(*common.places)
+    offset = float(difference.mean()) / math.sqrt(a * a + b * b + 1.0)
+    return common.count / max(cells.count, other.count), math.degrees(math.acos(min(1.0, dot))), offset
 
 
 def slow_fit(figures: tuple[float, float, float]) -> tuple[bool, bool]:
@@ -441,62 +495,69 @@ def slow_fit(figures: tuple[float, float, float]) -> tuple[bool, bool]:
     )
 
 
-def slow_found(
-    models: list[RoofModel], truth: list[RoofModel]
-) -> tuple[list[bool], list[bool], list[bool], list[bool]]:
+def slow_found(models: list[RoofModel], truth: list[RoofModel]) -> tuple[list[bool], ...]:
     """Found and sure of every true face, matched and sure of every model face, by counting cells in naive loops."""
-    boxes = np.array([face.polygon.bounds for one in (*models, *truth) for face in one.surfaces])
-    low, high = boxes[:, :2].min(axis=0) - 1, boxes[:, 2:].max(axis=0) + 1
-    x, y = np.meshgrid(*(np.arange(low[k], high[k], CELL) + CELL / 2 for k in (0, 1)))
-    true = [(owner, face.group, SlowFace(face, x, y)) for owner, one in enumerate(truth) for face in one.surfaces]
-    made = [SlowFace(face, x, y) for one in models for face in one.surfaces]
-    made_group: list[tuple[int, int] | None] = [None] * len(made)
-    found, sure = [False] * len(true), [True] * len(true)
+    true = [(owner, face, rasterised(face)) for owner, one in enumerate(truth) for face in one.surfaces]
+    made = [(face, rasterised(face)) for one in models for face in one.surfaces]
+    group_of: list[tuple[int, int] | None] = [None] * len(made)
+    own_match, found, sure = [False] * len(true), [False] * len(true), [True] * len(true)
     matched, matched_sure = [False] * len(made), [True] * len(made)
     candidates = []
-    for t, (_, _, face) in enumerate(true):
-        for m, other in enumerate(made):
-            fits, certain = slow_fit(slow_pair(face.cells, face.z, face.face.coefficients[:2], other))
+    for t, (_, face, cells) in enumerate(true):
+        for m, (other, others) in enumerate(made):
+            fits, certain = slow_fit(slow_pair(cells, face.elevation, face.coefficients[:2], others, other))
             if not certain:
                 sure[t] = matched_sure[m] = False
             if fits:
-                candidates.append((-int((face.cells & other.cells).sum()), t, m))
-    own_match = [False] * len(true)
+                candidates.append((-cells.common(others).count, t, m))
     for _, t, m in sorted(candidates):
         if not own_match[t] and not matched[m]:
             own_match[t] = matched[m] = True
-            made_group[m] = (true[t][0], true[t][1])
-    for t, (owner, group, face) in enumerate(true):
-        pieces = [k for k, (o, g, _) in enumerate(true) if o == owner and g == group] if group >= 0 else [t]
-        if len(pieces) == 1:
-            found[t] = own_match[t]
+            group_of[m] = (true[t][0], true[t][1].group)
+    done = set()
+    for t, (owner, first, _) in enumerate(true):
+        pieces = [k for k, (o, other, _) in enumerate(true) if o == owner and other.group == first.group >= 0] or [t]
+        if t in done:
             continue
-        areas = [true[k][2].count * math.sqrt(1 + sum(c * c for c in true[k][2].face.coefficients[:2])) for k in pieces]
-        held = sum(area for area, k in zip(areas, pieces, strict=True) if own_match[k]) / sum(areas)
-        found[t] = held >= 0.5
-        certain = all(sure[k] for k in pieces) and abs(held - 0.5) > SURE_HELD
-        if not found[t]:
-            cells = np.any([true[k][2].cells for k in pieces], axis=0)
-            z = np.zeros(x.shape)
-            slopes = np.zeros(2)
-            for k in pieces:
-                z[true[k][2].cells] = true[k][2].z[true[k][2].cells]
-                slopes += np.array(true[k][2].face.coefficients[:2]) * true[k][2].count
-            slopes /= sum(true[k][2].count for k in pieces)
-            centre = np.array([x[cells].mean(), y[cells].mean()])
-            mean = z[cells].mean() + slopes[0] * (x - centre[0]) + slopes[1] * (y - centre[1])
-            for m, other in enumerate(made):
-                fits, known = slow_fit(slow_pair(cells, mean, (slopes[0], slopes[1]), other))
+        done.update(pieces)
+        area = {k: true[k][2].count * math.hypot(1.0, *true[k][1].coefficients[:2]) for k in pieces}
+        held = sum(area[k] for k in pieces if own_match[k]) / sum(area.values())
+        is_found, certain = held >= 0.5, all(sure[k] for k in pieces) and abs(held - 0.5) > SURE_HELD
+        if not is_found and len(pieces) > 1:
+            whole, height, slope = slow_union([(true[k][1], true[k][2]) for k in pieces])
+            for m, (other, others) in enumerate(made):
+                fits, known = slow_fit(slow_pair(whole, height, slope, others, other))
                 certain &= known
-                if fits and (not matched[m] or made_group[m] == (owner, group)):
-                    found[t] = matched[m] = True
-                    made_group[m] = (owner, group)
+                if fits and (not matched[m] or group_of[m] == (owner, first.group)):
+                    is_found = matched[m] = True
         for k in pieces:
-            found[k] = found[t]
-            sure[k] = sure[k] and certain
-        if not certain:
+            found[k], sure[k] = is_found, certain
+        if not certain and len(pieces) > 1:
             matched_sure = [False] * len(made)
     return found, sure, matched, matched_sure
+
+
+def slow_union(pieces: list[tuple[RoofSurface, Cells]]) -> tuple[Cells, Height, Slope]:
+    """All cells of some faces, and the plane with the mean of their elevations and rises."""
+    row, column = min(cells.row for _, cells in pieces), min(cells.column for _, cells in pieces)
+    rows = max(cells.row + cells.inside.shape[0] for _, cells in pieces) - row
+    columns = max(cells.column + cells.inside.shape[1] for _, cells in pieces) - column
+    inside = np.zeros((rows, columns), bool)
+    x, y, z, a, b = [], [], [], [], []
+    for face, cells in pieces:
+        at = cells.row - row, cells.column - column
+        inside[at[0] : at[0] + cells.inside.shape[0], at[1] : at[1] + cells.inside.shape[1]] |= cells.inside
+        x += list(cells.places[0])
+        y += list(cells.places[1])
+        z += list(face.elevation(*cells.places))
+        a += [face.coefficients[0]] * cells.count
+        b += [face.coefficients[1]] * cells.count
+    mean_x, mean_y, mean_z, rise_x, rise_y = (float(np.mean(one)) for one in (x, y, z, a, b))
+    return (
+        Cells(row, column, inside),
+        lambda u, v: mean_z + rise_x * (u - mean_x) + rise_y * (v - mean_y),
+        (rise_x, rise_y),
+    )
 
 
 def grouped(truth: list[RoofModel], random: np.random.Generator) -> list[RoofModel]:
@@ -517,22 +578,29 @@ def grouped(truth: list[RoofModel], random: np.random.Generator) -> list[RoofMod
     return changed
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_counting_cells_in_naive_loops_finds_the_same_faces(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    plain = by_hand.models_of_scene(suburb(100 + seed, size_m=(64.0, 64.0)))
-    truth = plain if seed % 2 == 0 else grouped(plain, random)
-    models = damaged(plain, random)
+def assert_the_slow_twin_agrees(models: list[RoofModel], truth: list[RoofModel]) -> None:
     score = score_faces(models, reference(truth, extent=None))
     found, sure, matched, matched_sure = slow_found(models, truth)
     compared = [(row.found, slow) for row, slow, certain in zip(score.reference, found, sure, strict=True) if certain]
     assert [ours for ours, _ in compared] == [slow for _, slow in compared]
-    assert len(compared) >= 0.75 * len(found)
+    assert len(compared) >= 0.7 * len(found)
     assert {slow for _, slow in compared} == {True, False}
-    ours = [
-        (row.matched, slow) for row, slow, certain in zip(score.models, matched, matched_sure, strict=True) if certain
-    ]
-    assert all(one == slow for one, slow in ours)
+    made = [row.matched for row, certain in zip(score.models, matched_sure, strict=True) if certain]
+    assert made == [slow for slow, certain in zip(matched, matched_sure, strict=True) if certain]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_counting_cells_in_naive_loops_finds_the_same_faces(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    plain = by_hand.models_of_scene(suburb(100 + seed, size_m=(150.0, 150.0)))
+    assert_the_slow_twin_agrees(damaged(plain, random), plain if seed % 2 == 0 else grouped(plain, random))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_counting_cells_agrees_on_roofs_of_all_shapes(seed: int) -> None:
+    truth = by_hand.models_of_scene(by_hand.scene_of_all_shapes(seed))
+    assert max(face.group for one in truth for face in one.surfaces) < max(len(one.surfaces) for one in truth)
+    assert_the_slow_twin_agrees(damaged(truth, np.random.default_rng(seed)), truth)
 
 
 def test_roof_types_of_models_do_not_matter_to_faces() -> None:

@@ -66,7 +66,7 @@ def test_indices_from_the_end_slashes_colours_and_comments_are_read(tmp_path: Pa
         "o a\n" + corners(more=" 0.2 0.3 0.4") + faces(),
         "o a\n" + corners() + "vn 0 0 1\nvt 0 0\n" + faces(style="{}/1/1"),
         "o a\n" + corners() + faces(style="{}//1"),
-        "o a\r\n" + corners().replace("\n", "\r\n") + "s off\r\n" + faces(first=-8 + 1 - 1 + 1 - 1),
+        "o a\r\n" + corners().replace("\n", "\r\n") + "s off\r\n" + faces(first=-8),
     ):
         files.assert_same_models(plain, read(tmp_path, text))
 

@@ -55,16 +55,15 @@ def test_a_run_that_broke_off_or_lacks_solids_says_so(tmp_path: Path) -> None:
     assert [note.split(":")[0] for note in models.notes] == ["the run is incomplete", "no folder cityjson in the run"]
 
 
-def test_given_footprints_are_known_by_their_ids_but_not_in_the_truth(tmp_path: Path) -> None:
-    for method, wanted in (("fuzzy-sart", True), ("truth", False)):
-        built = [small.gable(source_id="block 1", method=method), small.pent()]
-        models = read_models(files.write_run(tmp_path / method, built))
-        assert models.has_footprints is wanted
-        assert [model.source_id for model in models.models] == ["block 1", None]
+def test_given_footprints_are_known_by_their_ids(tmp_path: Path) -> None:
+    for name, source_id in (("given", "block 1"), ("none", None)):
+        models = read_models(files.write_run(tmp_path / name, [small.gable(source_id=source_id), small.pent()]))
+        assert models.has_footprints is (source_id is not None)
+        assert [model.source_id for model in models.models] == [source_id, None]
 
 
 def test_the_truth_tells_which_faces_count_as_one(tmp_path: Path) -> None:
-    truth = files.write_run(tmp_path / "truth", [small.two_parts(method="truth"), small.gable(method="truth")])
+    truth = files.write_run(tmp_path / "truth", [small.two_parts(), small.gable()])
     assert {surface.group for model in read_models(truth).models for surface in model.surfaces} == {-1}
     groups = {"building_id": ["gable", "two_parts"], "groups": [[0, 1], [0, 1, 0, 2]]}
     pq.write_table(pa.table(groups), truth / "conditions.parquet")

@@ -26,6 +26,8 @@ from pipeline.model import FloatArray, RoofType, Status
 VERSIONS = ("1.0", "1.1", "2.0")
 """Versions that are read."""
 
+_TRANSFORM_IS_OPTIONAL = "1.0"
+_IDENTITY = {"scale": [1.0, 1.0, 1.0], "translate": [0.0, 0.0, 0.0]}
 _BUILDING_TYPES = ("Building", "BuildingPart")
 _FOOTPRINT_PREFIXES = ("b3_", "rf_")
 _FAULTS = (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError)
@@ -57,7 +59,8 @@ class Frame:
         ValueError
             If they are no finite triples.
         """
-        metres = (_triples(vertices) * self.scale + self.translate) * self.units_m
+        with np.errstate(over="ignore", invalid="ignore"):
+            metres = (_triples(vertices) * self.scale + self.translate) * self.units_m
         return Places(
             vertices=metres,
             units_m=self.units_m,
@@ -218,7 +221,8 @@ def _frame(path: Path, where: str, header: Any, into: Collected, units_m: tuple[
         reference = _reference(path, header.get("metadata") or {}, into)
         if units_m is None:
             units_m = (reference.horizontal_unit_m, reference.vertical_unit_m)
-        transform = header.get("transform") or {"scale": [1.0, 1.0, 1.0], "translate": [0.0, 0.0, 0.0]}
+        is_optional = version.startswith(_TRANSFORM_IS_OPTIONAL) and not where
+        transform = header.get("transform", _IDENTITY) if is_optional else header["transform"]
         templates = header.get("geometry-templates") or {}
         return Frame(
             scale=_triples([transform["scale"]])[0],
@@ -286,8 +290,7 @@ def _model(
     if any(has_inner_shells(geometry, places) for geometry in geometries):
         into.count("cavities of solids are not looked at: {n} buildings have some")
     source_id = attributes.get("source_id")
-    if source_id is not None and attributes.get("method") != "truth":
-        into.has_footprints = True
+    into.has_footprints = into.has_footprints or source_id is not None
     if not into.has_footprints and any(key.startswith(_FOOTPRINT_PREFIXES) for key in attributes):
         into.has_footprints = True
         into.note("attributes of roofer or 3DBAG: the models are taken to follow given footprints")

@@ -120,6 +120,8 @@ def parts_of(geometry: Object, places: Places) -> Iterator[RawPart]:
     vertices = places.vertices if template is geometry else _placed(geometry, places)
     kind, boundaries = template["type"], template["boundaries"]
     semantics = template.get("semantics") or {}
+    if not isinstance(semantics, Mapping):
+        raise TypeError(f"semantics is a {type(semantics).__name__}, not an object")
     surfaces = [_told(surface) for surface in semantics.get("surfaces", ())]
     values = semantics.get("values")
     is_model = level(template.get("lod", "")) >= _LEAST_MODEL_LOD
@@ -185,9 +187,10 @@ def _placed(instance: Object, places: Places) -> FloatArray:
     anchor = places.vertices[_index(instance["boundaries"][0], len(places.vertices), "vertex")]
     matrix = np.array(instance["transformationMatrix"], np.float64).reshape(4, 4)
     turned = np.empty_like(places.template_vertices)
-    for axis in range(3):
-        turned[:, axis] = matrix[axis, 3]
-        for k in range(3):
-            turned[:, axis] += matrix[axis, k] * places.template_vertices[:, k]
-    placed: FloatArray = turned * places.units_m + anchor
+    with np.errstate(over="ignore", invalid="ignore"):
+        for axis in range(3):
+            turned[:, axis] = matrix[axis, 3]
+            for k in range(3):
+                turned[:, axis] += matrix[axis, k] * places.template_vertices[:, k]
+        placed: FloatArray = turned * places.units_m + anchor
     return placed

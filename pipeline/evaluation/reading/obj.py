@@ -91,7 +91,8 @@ def _buildings(mesh: _Mesh, path: Path, into: Collected, *, alone: bool) -> dict
         buildings: dict[str, list[RawPart]] = {}
         for name, faces in objects.items():
             building = name.rpartition("-")[0] or name if mesh.is_own else name or path.stem
-            buildings.setdefault(building, []).extend(_parts(vertices, faces))
+            parts = [_part(vertices, faces)] if mesh.is_own else _parts(vertices, faces)
+            buildings.setdefault(building, []).extend(parts)
         return buildings
     groups = {name: faces for name, faces in mesh.groups.items() if faces}
     if len(groups) > 1 and all(name and len(faces) >= _LEAST_SOLID_FACES for name, faces in groups.items()):
@@ -105,13 +106,15 @@ def _buildings(mesh: _Mesh, path: Path, into: Collected, *, alone: bool) -> dict
     return {f"{path.stem}-{number}": members for number, members in enumerate(touching)}
 
 
+def _part(vertices: FloatArray, faces: Sequence[RawFace]) -> RawPart:
+    """Faces as one part; a solid where they are closed."""
+    part = raw_part(vertices, faces, is_solid=False)
+    return dataclasses.replace(part, is_solid=is_closed(part.xyz, (face.rings for face in part.faces)))
+
+
 def _parts(vertices: FloatArray, faces: Sequence[RawFace]) -> list[RawPart]:
-    """Pieces that hang together; the closed ones are solids."""
-    pieces = connected(raw_part(vertices, faces, is_solid=False))
-    return [
-        dataclasses.replace(piece, is_solid=is_closed(piece.xyz, (face.rings for face in piece.faces)))
-        for piece in pieces
-    ]
+    """Pieces that hang together, a part each."""
+    return [_part(piece.xyz, piece.faces) for piece in connected(raw_part(vertices, faces, is_solid=False))]
 
 
 def _touching(parts: Sequence[RawPart]) -> list[list[RawPart]]:

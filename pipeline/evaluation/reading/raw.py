@@ -12,6 +12,8 @@ import numpy as np
 from pipeline.model import FaceKind, FloatArray
 
 MILLIMETRES_PER_METRE = 1000.0
+FARTHEST_M = 1e8
+"""Coordinates beyond it are no lengths on the ground."""
 
 Rings = tuple[tuple[int, ...], ...]
 """Vertex indices: outer ring first, the first vertex of a ring not repeated."""
@@ -46,7 +48,7 @@ def raw_part(vertices: FloatArray, faces: Iterable[RawFace], *, is_solid: bool) 
     Raises
     ------
     ValueError
-        If a face names a vertex that is not there.
+        If a face names a vertex that is not there, or one beyond `FARTHEST_M`.
     """
     listed = tuple(faces)
     used = sorted(set(chain.from_iterable(ring for face in listed for ring in face.rings)))
@@ -54,8 +56,11 @@ def raw_part(vertices: FloatArray, faces: Iterable[RawFace], *, is_solid: bool) 
         wrong = used[0] if used[0] < 0 else used[-1]
         raise ValueError(f"a face names vertex {wrong}, there are {len(vertices)}")
     place = {index: k for k, index in enumerate(used)}
+    xyz = vertices[used] if used else np.empty((0, 3))
+    if not (np.abs(xyz) <= FARTHEST_M).all():
+        raise ValueError(f"a coordinate is farther than {FARTHEST_M:g} m from the origin")
     return RawPart(
-        xyz=vertices[used] if used else np.empty((0, 3)),
+        xyz=xyz,
         faces=tuple(
             RawFace(tuple(tuple([place[index] for index in ring]) for ring in face.rings), face.kind, face.plane)
             for face in listed
@@ -97,19 +102,34 @@ def _welded(vertices: FloatArray) -> list[int]:
 
 
 def connected(part: RawPart) -> list[RawPart]:
-    """The pieces of a part that hang together by common edges, in the order of their first faces."""
-    names = _welded(part.xyz)
+    """The pieces of a part that hang together, in the order of their first faces.
+
+    First by the edges that the file itself shares, so that bodies with vertices of their own stay apart where they
+    touch; what is not closed then, by edges in one place, since some files repeat the vertices of every face.
+    """
+    closed: list[list[int]] = []
+    rest: list[list[int]] = []
+    for numbers in _by_edges(part.faces, range(len(part.xyz))):
+        whole = is_closed(part.xyz, (part.faces[number].rings for number in numbers))
+        (closed if whole else rest).append(numbers)
+    left = sorted(number for numbers in rest for number in numbers)
+    again = _by_edges([part.faces[number] for number in left], _welded(part.xyz))
+    pieces = sorted([*closed, *([left[number] for number in numbers] for numbers in again)])
+    if len(pieces) == 1:
+        return [part]
+    return [raw_part(part.xyz, [part.faces[number] for number in piece], is_solid=part.is_solid) for piece in pieces]
+
+
+def _by_edges(faces: Sequence[RawFace], names: Sequence[int]) -> list[list[int]]:
+    """Faces that common edges tie together; a name for every vertex says which are one."""
     seen: dict[tuple[int, int], int] = {}
     pairs = []
-    for number, face in enumerate(part.faces):
+    for number, face in enumerate(faces):
         for ring in face.rings:
             for a, b in zip(ring, (*ring[1:], ring[0]), strict=True):
                 edge = (min(names[a], names[b]), max(names[a], names[b]))
                 pairs.append((seen.setdefault(edge, number), number))
-    pieces = grouped(len(part.faces), pairs)
-    if len(pieces) == 1:
-        return [part]
-    return [raw_part(part.xyz, [part.faces[number] for number in piece], is_solid=part.is_solid) for piece in pieces]
+    return grouped(len(faces), pairs)
 
 
 def grouped(count: int, pairs: Iterable[Sequence[int]]) -> list[list[int]]:

@@ -26,9 +26,6 @@ from pipeline.io.crs import resolve_reference
 from pipeline.model import FaceKind, RoofType, Solid, SolidFace, Status
 from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
 
-TRUTH_METHOD = "truth"
-"""Method of the records of simulated truth."""
-
 Solids = dict[str, tuple[tuple[Solid, ...], tuple[float, float, float]]]
 
 
@@ -69,7 +66,7 @@ def read_run(path: Path) -> ModelSet:
             )
         )
     methods = sorted({row["method"] for row in rows})
-    into.has_footprints = any(row["source_id"] is not None and row["method"] != TRUTH_METHOD for row in rows)
+    into.has_footprints = any(row["source_id"] is not None for row in rows)
     return into.finish(name=" and ".join(methods) or _method(path), kind="run", path=str(path))
 
 

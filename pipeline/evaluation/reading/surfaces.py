@@ -32,7 +32,7 @@ _LEAST_AREA_M2 = 1e-6
 _SLIVER_M = 0.004
 """A hole in a footprint that is narrower on average is where two files' roundings met."""
 _COVERED_SHARE = 0.5
-"""An unnamed face with more of its area under other roofs is no roof."""
+"""A doubtful face with more of its area under other roofs is no roof."""
 
 Coefficients = tuple[float, float, float]
 
@@ -184,7 +184,11 @@ def _united(polygons: Sequence[Polygon | MultiPolygon]) -> Polygon | MultiPolygo
 
 
 def _kinds(soup: _Soup) -> tuple[list[FaceKind], dict[int, Polygon | MultiPolygon]]:
-    """What every face is, and the plan of the roof faces that have area there, by face."""
+    """What every face is, and the plan of the roof faces that have area there, by face.
+
+    Faces that no name makes roofs, and named ones that look down, as the undersides of eaves do in some files, are
+    roofs only where no other roof is above them.
+    """
     unnamed = [face.kind is None for face in soup.faces]
     by_normal = _kinds_by_normal(soup) if any(unnamed) else []
     kinds = [face.kind or by_normal[number] for number, face in enumerate(soup.faces)]
@@ -192,8 +196,9 @@ def _kinds(soup: _Soup) -> tuple[list[FaceKind], dict[int, Polygon | MultiPolygo
     plans = soup.plan(roofs)
     areas = shapely.area(plans)
     kept = [(int(face), plan) for face, plan, area in zip(roofs, plans, areas, strict=True) if area > _LEAST_AREA_M2]
-    if any(unnamed[face] for face, _ in kept):
-        covered = _covered(soup, kept, np.array([unnamed[face] for face, _ in kept]))
+    doubtful = np.array([unnamed[face] or soup.vectors[face, 2] < 0.0 for face, _ in kept], np.bool_)
+    if doubtful.any():
+        covered = _covered(soup, kept, doubtful)
         for (face, _), is_covered in zip(kept, covered, strict=True):
             if is_covered:
                 kinds[face] = FaceKind.GROUND
@@ -222,14 +227,14 @@ def _kinds_by_normal(soup: _Soup) -> list[FaceKind]:
     return [FaceKind.ROOF if z > LEAST_UP else FaceKind.GROUND if z < -LEAST_UP else FaceKind.WALL for z in up]
 
 
-def _covered(soup: _Soup, roofs: list[tuple[int, Polygon | MultiPolygon]], unnamed: BoolArray) -> BoolArray:
-    """Which unnamed faces have most of their area under other roof faces."""
+def _covered(soup: _Soup, roofs: list[tuple[int, Polygon | MultiPolygon]], doubtful: BoolArray) -> BoolArray:
+    """Which doubtful faces have most of their area under other roof faces."""
     plans = np.array([plan for _, plan in roofs], object)
     covered = np.zeros(len(roofs), np.bool_)
     if shapely.area(plans).sum() - shapely.union_all(plans, grid_size=GRID_M).area < _LEAST_AREA_M2 * len(plans):
         return covered
     lower, upper = shapely.STRtree(plans).query(plans, predicate="intersects")
-    pairs = (lower != upper) & unnamed[lower]
+    pairs = (lower != upper) & doubtful[lower]
     lower, upper = lower[pairs], upper[pairs]
     common = shapely.intersection(plans[lower], plans[upper])
     met = shapely.area(common) > _LEAST_AREA_M2
