@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
+
 from pipeline.synthetic.sweep import DENSITIES_PER_M2, NOISES_M, cell_name
 
 GABLEWORK = str(Path(sys.executable).with_name("gablework"))
@@ -140,7 +141,7 @@ def measured(entry: Entry, out: Path) -> list[dict[str, Any]]:
                 target = entry.scene.parent if entry.simulate[0] == "sweep" else entry.scene
                 gablework("simulate", *entry.simulate, "--out", target)
             tiles = sorted(str(path) for path in [*entry.scene.glob("*.laz"), *entry.scene.glob("tiles/*.laz")])
-            reference = ("--truth", str(entry.scene / "truth"))
+            reference = ("--truth", str(entry.scene / "truth"), "--as-surveyed")
         gablework("reconstruct", *tiles, "--out", folder / "run", "--overwrite", *entry.run_options)
         gablework("evaluate", folder / "run", *reference, "--out", folder / "report")
         print(f"{entry.name}: {time.perf_counter() - started:.0f} s", flush=True)

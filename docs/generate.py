@@ -14,6 +14,8 @@ from typing import Any
 import typer
 
 from pipeline.console import EXIT_CODES
+from pipeline.evaluation.chapters import TITLES
+from pipeline.evaluation.definitions import DEFINITIONS
 from pipeline.methods import METHODS
 from pipeline.parameters import Parameters
 from pipeline.quality import validity as checker
@@ -260,12 +262,43 @@ def service() -> str:
     return "\n".join(lines) + "\n"
 
 
+def measures() -> str:
+    """The page of measures, from their definitions."""
+    lines = [
+        NOTE,
+        "# Measures",
+        "",
+        "What `gablework evaluate` tells, chapter by chapter: [how to use it](../how_to/evaluate.md). Shares are of",
+        "all reference buildings, faces or points unless the formula says otherwise. Intervals hold 95 % of 1000",
+        "resamples of buildings, or of blocks of 50 m where cells or ground points are counted (percentile bootstrap,",
+        "Efron 1979); a share of 0 or 1 on which all units agree has the exact binomial limit instead (Clopper and",
+        "Pearson 1934). Where conditions are known every figure is given for all buildings, for those without defects",
+        "(*good*) and for those with (*hard*). Buildings that the end of the data cuts are left out.",
+        "",
+        "The measures follow F. Rottensteiner et al.: The ISPRS benchmark on urban object classification and 3D",
+        "building reconstruction (2012), M. Rutzinger, F. Rottensteiner, N. Pfeifer: A comparison of evaluation",
+        "techniques for building extraction from airborne laser scanning (2009), A. D. Hofmann, H.-G. Maas, A. Streilein",
+        "(2003) for *correct*, *passable* and *false*, and G. Sithole, G. Vosselman: Experimental comparison of filter",
+        "algorithms (2004) for the errors of ground filters.",
+        "",
+    ]
+    for group, title in TITLES.items():
+        rows: list[list[object]] = [
+            [f"`{one.name}`", one.label, one.unit, str(one.better), one.formula]
+            for one in DEFINITIONS.values()
+            if one.group is group
+        ]
+        lines += [f"## {title}", "", *table(["measure", "what", "unit", "better", "formula"], rows), ""]
+    return "\n".join(lines)
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
     "command_line.md": command_line,
     "exit_codes.md": exit_codes,
     "validity.md": validity,
     "service.md": service,
+    "measures.md": measures,
 }
 """The generated pages by file name."""
 

@@ -303,6 +303,9 @@ def evaluate(
     ] = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
+    as_surveyed: Annotated[
+        bool, typer.Option("--as-surveyed", help="Move each true building by the shift of the strips that saw it.")
+    ] = False,
     blocks: Annotated[
         bool | None,
         typer.Option(
@@ -329,6 +332,7 @@ def evaluate(
             ground=tuple(ground or ()),
             crs=crs,
             vertical_unit=vertical_unit,
+            as_surveyed=as_surveyed,
             blocks=blocks,
         )
 

@@ -38,6 +38,8 @@ class EvaluationRequest:
     """Of the point files, where their header has none or a wrong one."""
     vertical_unit: str | None = None
     """Unit of their elevations."""
+    as_surveyed: bool = False
+    """Move true buildings to where the survey saw them."""
     blocks: bool | None = None
     """Join true buildings that touch; None: as the models need it."""
 
@@ -54,6 +56,8 @@ class EvaluationRequest:
             faults.append("both a truth and points are given as the reference: use one of --truth and --points")
         if self.footprints is not None and not self.points:
             faults.append(f"footprints are {self.footprints} without points: give the classified tile by --points")
+        if self.as_surveyed and self.truth is None:
+            faults.append("as-surveyed is asked for without a truth: only simulated strips tell their shifts")
         if self.ground and self.truth is None and not self.points:
             faults.append(f"ground is {', '.join(self.ground)} without a reference: give --points or --truth")
         if faults:
@@ -84,7 +88,7 @@ def evaluate_files(request: EvaluationRequest, on_step: Callable[[str], None] = 
     if request.truth is not None or request.points:
         on_step("reference")
     if request.truth is not None:
-        reference = read_truth_reference(request.truth)
+        reference = read_truth_reference(request.truth, as_surveyed=request.as_surveyed)
     elif request.points:
         reference = read_points_reference(request.points, footprints=request.footprints, read_options=options)
     ground = None if reference is None else _ground(request.ground, models, reference, options)

@@ -18,8 +18,9 @@ from pipeline.errors import InconsistentInputError, InputError
 from pipeline.evaluation.models import ModelSet, RoofModel
 from pipeline.evaluation.reading import read_models as read_models_of_any_program
 from pipeline.evaluation.reference import Conditions, Reference, ReferencePoints
+from pipeline.evaluation.survey_shift import mean_shifts, moved_buildings, strip_shifts
 from pipeline.io import ReadOptions, open_source
-from pipeline.model import LabelArray
+from pipeline.model import FloatArray, LabelArray, PointCloud
 from pipeline.quality.residuals import TopSurface, plan_index
 
 FIX = "Give the folder `truth` that `gablework simulate` wrote, with the point files where it wrote them"
@@ -31,7 +32,10 @@ _NOTE = "Returns that melt echoes of two surfaces are roof points where their la
 
 
 def read_truth_reference(
-    truth_dir: str | Path, read_models: Callable[[str | Path], ModelSet] = read_models_of_any_program
+    truth_dir: str | Path,
+    read_models: Callable[[str | Path], ModelSet] = read_models_of_any_program,
+    *,
+    as_surveyed: bool = False,
 ) -> Reference:
     """The truth of one simulated data set, its points read tile by tile when asked for.
 
@@ -42,6 +46,8 @@ def read_truth_reference(
         where it is there. The point files lie where scene.json says, else as the one LAZ beside the folder.
     read_models : callable
         Reads the models.
+    as_surveyed : bool
+        Move each building to where the survey saw it: by the mean shift of the strips of its points.
 
     Returns
     -------
@@ -61,6 +67,12 @@ def read_truth_reference(
     buildings = tuple(_grouped(model, groups.get(model.building_id, ())) for model in models.models)
     pairs = _tile_files(folder, scene)
     number_of = {building.building_id: number for number, building in enumerate(buildings)}
+    notes = (*models.notes, _NOTE)
+    if as_surveyed:
+        shifts = strip_shifts(scene, str(folder / "scene.json"))
+        shift = mean_shifts(len(buildings), (_roof_strips(*pair, number_of) for pair in pairs), shifts)
+        buildings = moved_buildings(buildings, shift)
+        notes = (*notes, _told_shift(shift))
     footprints = plan_index([building.footprint for building in buildings])
     name = folder.parent.name if folder.name == "truth" else folder.name
     return Reference(
@@ -76,8 +88,26 @@ def read_truth_reference(
         extent=shapely.box(*scene["extent"]),
         has_ground=True,
         crs=scene.get("crs"),
-        notes=(*models.notes, _NOTE),
+        notes=notes,
     )
+
+
+def _told_shift(shift: FloatArray) -> str:
+    away = np.hypot(shift[:, 0], shift[:, 1])
+    plan, up = (float(np.median(values)) if len(shift) else 0.0 for values in (away, np.abs(shift[:, 2])))
+    return (
+        "True buildings stand where the survey saw them: moved by the mean shift of the strips of their points, in the "
+        f"median {plan:.2f} m in plan and {up:.2f} m in elevation."
+    )
+
+
+def _roof_strips(laz: Path, labels: Path, number_of: Mapping[str, int]) -> tuple[LabelArray, LabelArray]:
+    """Building and strip, from 0, of the points on roofs of one tile."""
+    table, clouds = _labelled(laz, labels)
+    building = np.concatenate([_numbers(ids, number_of, labels) for ids in table["building_id"].chunks])
+    strip = np.concatenate([np.zeros(0, np.int32), *(cloud.source_id.astype(np.int32) - 1 for cloud in clouds)])
+    on_roof = (building >= 0) & (table["face"].to_numpy() >= 0)
+    return building[on_roof], strip[on_roof]
 
 
 def _scene(folder: Path) -> dict[str, Any]:
@@ -180,14 +210,8 @@ def _indices(ids: pa.DictionaryArray) -> LabelArray:
 
 def _read_tile(laz: Path, labels: Path, number_of: Mapping[str, int], footprints: TopSurface) -> ReferencePoints:
     """The points of one tile with their labels, which stand in the same order."""
-    try:
-        table = pq.read_table(labels, columns=["class", "building_id", "face"], read_dictionary=["building_id"])
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(str(labels), f"not a table of labels ({error})", FIX) from error
-    clouds = list(open_source(laz, _ALL_POINTS).chunks())
+    table, clouds = _labelled(laz, labels)
     xyz = np.concatenate([cloud.xyz for cloud in clouds]) if clouds else np.zeros((0, 3))
-    if len(xyz) != len(table):
-        raise InconsistentInputError(str(labels), f"{len(table)} labels for the {len(xyz)} points of {laz}", FIX)
     building = np.concatenate([_numbers(ids, number_of, labels) for ids in table["building_id"].chunks])
     face = table["face"].to_numpy().astype(np.int32)
     is_roof = (building >= 0) & (face >= 0)
@@ -204,6 +228,19 @@ def _read_tile(laz: Path, labels: Path, number_of: Mapping[str, int], footprints
         last=np.concatenate([cloud.return_number >= cloud.return_count for cloud in clouds]),
         return_number=return_number,
     )
+
+
+def _labelled(laz: Path, labels: Path) -> tuple[pa.Table, list[PointCloud]]:
+    """Labels and points of a tile, as many of the one as of the other."""
+    try:
+        table = pq.read_table(labels, columns=["class", "building_id", "face"], read_dictionary=["building_id"])
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(str(labels), f"not a table of labels ({error})", FIX) from error
+    clouds = list(open_source(laz, _ALL_POINTS).chunks())
+    points = sum(len(cloud) for cloud in clouds)
+    if points != len(table):
+        raise InconsistentInputError(str(labels), f"{len(table)} labels for the {points} points of {laz}", FIX)
+    return table, clouds
 
 
 def _numbers(ids: pa.DictionaryArray, number_of: Mapping[str, int], path: Path) -> LabelArray:

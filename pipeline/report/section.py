@@ -43,6 +43,7 @@ _LEAST_HEIGHT, _MOST_HEIGHT = 130.0, 330.0
 _MARGIN_M = 2.0
 _BELOW_M = 1.5
 _STEPS = 400
+_INNER = 0.85
 _STRETCH_M = 2.0
 _GOOD_M = 0.2
 _FAR_M = 1.0
@@ -175,8 +176,9 @@ def profile_line(
     Returns
     -------
     middle : (2,) float64
-        On the longer axis of the footprint's rectangle: of its stretches of 2 m the one with the largest sum of
-        distances beyond 0.2 m, each counted as 1 m at most; the middle of the building where none is clearly worse.
+        On the longer axis of the footprint's rectangle, not at its ends: of its stretches of 2 m the one with the
+        largest sum of distances beyond 0.2 m, each counted as 1 m at most; the middle of the building where none is
+        clearly worse.
     along : (2,) float64
         Unit vector of the shorter side.
     half : float
@@ -195,7 +197,7 @@ def profile_line(
     residual = xyz[:, 2] - top_of(models, xyz[:, 0], xyz[:, 1])
     away_m = np.nan_to_num(np.abs(residual), nan=_FAR_M)
     weight = np.where(away_m > _GOOD_M, np.minimum(away_m, _FAR_M), 0.0)
-    long_half = float(lengths[1 - shorter]) / 2.0
+    long_half = _INNER * float(lengths[1 - shorter]) / 2.0
     stretches = max(1, round(2.0 * long_half / _STRETCH_M))
     edges = np.linspace(-long_half, long_half, stretches + 1)
     place = (xyz[:, :2] - middle) @ across

@@ -61,7 +61,8 @@ def worst_cases(evaluation: Evaluation) -> list[Case]:
     Returns
     -------
     list of Case
-        False ones first, then by the share of the roof (of the points) within 0.2 m; empty without a reference.
+        Those without a model and false ones first, then by the mean of the shares of roof and points within 0.2 m;
+        empty without a reference.
     """
     reference, table = evaluation.reference, evaluation.tables.get("buildings")
     if reference is None or table is None:
@@ -104,12 +105,18 @@ def chosen_rows(table: pa.Table) -> list[dict[str, Any]]:
 
 
 def _within(row: Mapping[str, Any]) -> float:
-    """Share of the roof, else of the points, within 0.2 m; 1 where nothing is known."""
+    """Mean of the shares of the true roof and of the points within 0.2 m, as far as known; 1 where neither is.
+
+    Both count: a survey that is shifted as a whole puts good models beside the true roofs, but not beside the points.
+    """
+    known = []
     share = row.get("surface_within")
     if share is not None and math.isfinite(share):
-        return float(share)
+        known.append(float(share))
     points, within = row.get("n_points"), row.get("n_within")
-    return float(within / points) if points and within is not None else 1.0
+    if points and within is not None:
+        known.append(float(within / points))
+    return sum(known) / len(known) if known else 1.0
 
 
 def _points_of(reference: Reference, wanted: Sequence[int]) -> dict[int, FloatArray]:
@@ -192,23 +199,28 @@ def _figures(row: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     return tuple(told)
 
 
-def _square(truth: RoofModel) -> tuple[float, float, float]:
-    """Middle and side of what the plan shows."""
+def _square(truth: RoofModel, own: Sequence[RoofModel]) -> tuple[float, float, float]:
+    """Middle and side of what the plan shows: the building and its models, but no more than twice the building."""
     west, south, east, north = truth.footprint.bounds
+    side = max(east - west, north - south)
+    x, y = (west + east) / 2.0, (south + north) / 2.0
+    reach = shapely.box(x - side, y - side, x + side, y + side)
+    bounds = shapely.total_bounds([truth.footprint, *(shapely.intersection(one.footprint, reach) for one in own)])
+    west, south, east, north = (float(value) for value in bounds)
     return (west + east) / 2.0, (south + north) / 2.0, max(east - west, north - south) + 2.0 * _MARGIN_M
 
 
 def _plan(truth: RoofModel, own: Sequence[RoofModel], around: Sequence[RoofModel], xyz: FloatArray) -> bytes:
     """Faces of the models, points by residual, true outlines dashed, and where the section lies."""
     figure, axes = blank(SIDE_PX, SIDE_PX)
-    x, y, side = _square(truth)
+    x, y, side = _square(truth, own)
     faces = [surface.polygon for model in around for surface in model.surfaces]
     axes.add_collection(
         PathCollection(paths_of(faces), facecolors=f"{MODEL_COLOUR}38", edgecolors=MODEL_COLOUR, linewidths=1.4)
     )
     if len(xyz):
         kinds = residual_class(xyz[:, 2] - top_of(around, xyz[:, 0], xyz[:, 1]))
-        size = float(np.clip(60_000.0 / len(xyz), 3.0, 28.0))
+        size = float(np.clip(60_000.0 / len(xyz), 3.0, 40.0))
         for place in (2, 1, 3, 0, 4):
             at = kinds == place
             axes.scatter(xyz[at, 0], xyz[at, 1], s=size, c=RESIDUAL_CLASSES[place].colour, linewidths=0, zorder=3)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -34,6 +35,8 @@ from pipeline.synthetic.truth_files import SceneTruth, read_truth, write_manifes
 __all__ = ["ScenePaths", "SceneTruth", "read_truth", "simulate"]
 
 _BUILDINGS_A_PART = 500
+_TRUTH_FILES = ("scene.json", "labels.parquet", "conditions.parquet")
+_TRUTH_FOLDERS = ("labels", "buildings", "planes", "rejected", "meshes", "cityjson")
 _TILED_CHUNK_POINTS = 250_000
 """The scanner goes on while a chunk is compressed; small ones keep it busy."""
 
@@ -173,8 +176,7 @@ class _Writing:
 
 def _simulate_one(writing: _Writing, settings: ScannerSettings, scene: Scene, out: Path, before: int = 0) -> ScenePaths:
     """A data set of one tile."""
-    truth = out / "truth"
-    truth.mkdir(parents=True, exist_ok=True)
+    truth = _emptied(out, writing.plan.name)
     laz, labels = out / f"{writing.plan.name}.laz", truth / "labels.parquet"
     tile = writing.tile(scene, settings, laz, labels, before)
     if tile.points == 0:
@@ -196,6 +198,20 @@ def _simulate_one(writing: _Writing, settings: ScannerSettings, scene: Scene, ou
         cars=len(scene.boxes),
     )
     return ScenePaths(laz=laz, truth=truth, labels=labels, points=tile.points, buildings=len(scene.buildings))
+
+
+def _emptied(out: Path, suite: str) -> Path:
+    """The folder of the truth, made where it is missing, without what an earlier call left there."""
+    truth = out / "truth"
+    truth.mkdir(parents=True, exist_ok=True)
+    for name in _TRUTH_FILES:
+        (truth / name).unlink(missing_ok=True)
+    for name in _TRUTH_FOLDERS:
+        if (truth / name).is_dir():
+            shutil.rmtree(truth / name)
+    for laz in (out / "tiles").glob(f"{suite}_x*_y*.laz"):
+        laz.unlink()
+    return truth
 
 
 def _simulate_cells(writing: _Writing, settings: ScannerSettings, cells: tuple[Cell, ...], out: Path) -> ScenePaths:
@@ -230,8 +246,8 @@ def _simulate_tiles(writing: _Writing, settings: ScannerSettings, out: Path) -> 
     size, plan = writing.size_m, writing.plan
     if plan.part is None:
         raise TypeError(f"{plan.name} is not made tile by tile")
-    truth, tiles_dir = out / "truth", out / "tiles"
-    labels_dir = truth / "labels"
+    truth = _emptied(out, plan.name)
+    tiles_dir, labels_dir = out / "tiles", truth / "labels"
     for folder in (tiles_dir, labels_dir):
         folder.mkdir(parents=True, exist_ok=True)
     whole: Extent = (0.0, 0.0, *size)

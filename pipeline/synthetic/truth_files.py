@@ -20,11 +20,11 @@ from pipeline.errors import InputError
 from pipeline.export.records import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.model import BoolArray, ByteArray, LabelArray
-from pipeline.synthetic.als import ScannerSettings
 from pipeline.synthetic.conditions import condition_row
 from pipeline.synthetic.scene import Building, Scene
 from pipeline.synthetic.seeds import split_of
 from pipeline.synthetic.solids import truth_record
+from pipeline.synthetic.strips import ScannerSettings, flight_lines
 from pipeline.synthetic.survey_files import TileFiles, spatial_reference
 
 
@@ -186,6 +186,10 @@ def write_manifest(
         "points": sum(tile.points for tile in listed),
         **counts,
         "scanner": dataclasses.asdict(settings),
+        "strip_shifts_m": [
+            [round(line.shift_x, 6), round(line.shift_y, 6), round(line.shift_z, 6)]
+            for line in flight_lines(scene, settings, seed)
+        ],
         "tiles": [
             {
                 "laz": Path(os.path.relpath(tile.laz, truth)).as_posix(),

@@ -35,7 +35,7 @@ def generator() -> ModuleType:
     return module
 
 
-GENERATED = ("settings.md", "command_line.md", "exit_codes.md", "validity.md", "service.md")
+GENERATED = ("settings.md", "command_line.md", "exit_codes.md", "validity.md", "service.md", "measures.md")
 
 
 @pytest.mark.parametrize("page", GENERATED)

@@ -106,6 +106,16 @@ def test_the_same_call_gives_the_same_bytes(tmp_path: Path) -> None:
     assert digests[0] == digests[1]
 
 
+def test_a_smaller_city_in_the_same_folder_leaves_nothing_of_the_larger_one(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(suites.SUITES, "city", dataclasses.replace(SUITES["city"], tile_m=50.0))
+        assert simulate("city", tmp_path, 7, size_m=(90.0, 50.0), scanner=SPARSE).tiles == 2
+        again = simulate("city", tmp_path, 7, size_m=(50.0, 50.0), scanner=SPARSE)
+    assert [path.name for path in (tmp_path / "tiles").iterdir()] == ["city_x0_y0.laz"]
+    assert len(read_models(again.truth).models) == again.buildings
+    assert len(read_truth(again.truth).classification) == again.points
+
+
 def test_a_larger_city_holds_the_smaller_one_unchanged(whole: Scene) -> None:
     larger = city(1_005, size_m=(SIZE[0] + 60.0, SIZE[1] + 30.0))
     known = {one.building_id: one for one in larger.buildings}

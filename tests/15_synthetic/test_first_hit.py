@@ -8,17 +8,8 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.synthetic.first_hit import (
-    BOX,
-    GROUND,
-    ROOF,
-    TREE,
-    WALL,
-    hits_of_lines,
-    mixed_bits,
-    top_surface,
-    uniform_of,
-)
+from pipeline.synthetic.first_hit import BOX, GROUND, ROOF, TREE, WALL, mixed_bits, uniform_of
+from pipeline.synthetic.line_hits import hits_of_lines, top_surface
 from pipeline.synthetic.scene import Scene, Terrain, Tree
 from pipeline.synthetic.scene_arrays import scene_arrays
 from pipeline.synthetic.solids import building_solid

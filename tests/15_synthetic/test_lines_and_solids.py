@@ -16,9 +16,10 @@ from pipeline.errors import SettingsError
 from pipeline.model import FaceKind, FloatArray, IntArray
 from pipeline.synthetic.additions import can_have_dormers, random_dormers, random_superstructures
 from pipeline.synthetic.als import ScannerSettings, scan_all
-from pipeline.synthetic.first_hit import GROUND, ROOF, WALL, hits_of_lines
+from pipeline.synthetic.first_hit import GROUND, ROOF, WALL
+from pipeline.synthetic.line_hits import hits_of_lines
 from pipeline.synthetic.random_dimensions import random_dimensions
-from pipeline.synthetic.roofs import RoofShape
+from pipeline.synthetic.roofs import RoofDimensions, RoofShape
 from pipeline.synthetic.scene import Building, Scene, Terrain, place_building, undulating_terrain
 from pipeline.synthetic.scene_arrays import scene_arrays
 from pipeline.synthetic.solids import building_solid
@@ -196,16 +197,26 @@ def test_a_survey_of_a_30_degree_slope_measures_it() -> None:
     assert len(block) == pytest.approx(8.0 * 150.0 * 150.0 * (1 + 18 / 150), rel=0.05)
 
 
-def test_a_house_on_a_steep_slope_is_hit_from_all_the_cells_below_it() -> None:
-    """With a grid cell of reach too little, lines that land downhill would pass through the house."""
-    scene = scene_of(RoofShape.GABLE, 4, slope_deg=30.0)
-    building = scene.buildings[0]
-    places, leans = aimed_lines(building, 20_000, 7)
-    tight = hits_of_lines(scene_arrays(scene, max_lean=LEAN, margin_m=0.0), places, leans)
-    wide = hits_of_lines(scene_arrays(scene, max_lean=LEAN, margin_m=60.0), places, leans)
-    assert np.array_equal(tight.kind, wide.kind)
-    assert np.array_equal(tight.xyz, wide.xyz)
-    assert (wide.kind == WALL).sum() > 500
+@pytest.mark.parametrize("shift_m", np.arange(0.0, 5.0, 0.5).tolist())
+def test_a_house_on_a_steep_slope_is_hit_by_lines_that_land_far_below_it(shift_m: float) -> None:
+    """The grid must enter the house into cells down the slope: the cells' borders lie at any distance from it."""
+    terrain = Terrain(base_z_m=50.0, slope_x=math.tan(math.radians(30.0)))
+    size = RoofDimensions(length_m=10.0, width_m=10.0)
+    house = place_building(
+        "it",
+        RoofShape.FLAT,
+        size,
+        x=60.0 + shift_m,
+        y=60.0,
+        azimuth_deg=0.0,
+        eave_height_m=6.0,
+        terrain=terrain,
+    )
+    scene = Scene(name="one", origin=(0, 0, 0), crs=None, extent=(0, 0, 120, 120), terrain=terrain, buildings=(house,))
+    y = np.linspace(56.0, 64.0, 50)
+    places = np.column_stack([np.full(50, house.x - 5.0 + 0.01), y, np.full(50, house.eave_z_m)])
+    hits = hits_of_lines(scene_arrays(scene, max_lean=LEAN, margin_m=0.0), places, np.tile([LEAN, 0.0], (50, 1)))
+    assert (hits.kind == ROOF).all()
 
 
 def test_beams_that_graze_the_terrain_are_refused_before_the_first_pulse() -> None:

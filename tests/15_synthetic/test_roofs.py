@@ -432,6 +432,8 @@ def test_drawn_additions_stand_clear_of_each_other_on_the_roof(shape: RoofShape)
         found += len(kinds) > 1
         assert all(outline.buffer(-0.29).contains(one) for one in taken)
         assert all(a.distance(b) >= 0.5 for k, a in enumerate(taken) for b in taken[:k])
+        alone = random_superstructures(shape, drawn(shape, seed), np.random.default_rng(seed), at_most=1)
+        assert len(alone) == 1
     assert found >= 5 if can_have_dormers(shape) else found == 0
 
 

@@ -272,6 +272,14 @@ def test_worst_cases_are_false_ones_first_and_only_some_that_were_not_found() ->
     assert chosen_rows(case_rows([("sound", "m", "correct", 1.0)])) == []
 
 
+def test_in_a_shifted_survey_a_model_that_misses_its_points_is_worse_than_one_beside_the_truth() -> None:
+    rows = [
+        {"building_id": name, "model_id": "m", "outcome": "false", "surface_within": 0.0, "n_points": 50, "n_within": n}
+        for name, n in (("shifted", 50), ("broken", 10), ("unknown", None))
+    ]
+    assert [row["building_id"] for row in chosen_rows(pa.Table.from_pylist(rows))] == ["unknown", "broken", "shifted"]
+
+
 def test_worst_cases_are_drawn_with_the_points_in_the_colours_of_their_distances() -> None:
     evaluation = damaged_evaluation()
     cases = {case.building_id: case for case in worst_cases(evaluation)}
@@ -341,7 +349,7 @@ def test_the_section_lies_where_the_points_are_farthest_from_the_model() -> None
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0.25, 30.0, 0.5), np.arange(0.25, 10.0, 0.5)))
     level = np.column_stack([x, y, np.full(len(x), 5.0)])
     shed = level + np.column_stack([0.0 * x, 0.0 * x, np.where((x > 21.0) & (x < 23.0), 1.5, 0.0)])
-    for points, place in ((level, 15.0), (shed, 22.0), (level + [0.0, 0.0, 0.4], 15.0), (level[:0], 15.0)):
+    for points, place in ((level, 15.0), (shed, 22.0), (level + np.array([0.0, 0.0, 0.4]), 15.0), (level[:0], 15.0)):
         middle, along, half = profile_line(house, [house], points)
         assert middle == pytest.approx([place, 5.0], abs=0.6)
         assert np.abs(along) == pytest.approx([0.0, 1.0])
@@ -356,7 +364,7 @@ def test_charts_and_tables_leave_out_what_the_edge_of_the_data_cuts() -> None:
         for name in ("cut", "whole")
     ]
     drawn = charts({"buildings": pa.Table.from_pylist([cut, whole]), "true_faces": pa.Table.from_pylist(faces)})
-    assert [chart.caption.split(".")[0] for chart in drawn][0] == "1 buildings, median 0"
+    assert drawn[0].caption.startswith("1 buildings, median 0.900.")
     assert "20-50: 100 % of 1." in drawn[1].svg
 
 
@@ -397,7 +405,7 @@ def test_charts_tell_the_figures_of_a_hand_made_case() -> None:
         "Faces found, by slope",
     ]
     assert "75.0 % of them within 0.2 m" in drawn["Vertical distance of points to the models"].svg
-    assert drawn["Footprint IoU of found buildings"].caption.startswith("2 buildings, median 0.85.")
+    assert drawn["Footprint IoU of found buildings"].caption.startswith("2 buildings, median 0.850.")
     assert "0-5: 100 % of 1; 20-50: 67 % of 3." in drawn["Faces found, by area"].svg
     assert "30-40: 50 % of 2; 40-50: 100 % of 1." in drawn["Faces found, by slope"].svg
     assert drawn["Faces found, by area"].svg.count('class="bar pale"') == 2
