@@ -277,9 +277,9 @@ def measures() -> str:
         "",
         "The measures follow F. Rottensteiner et al.: The ISPRS benchmark on urban object classification and 3D",
         "building reconstruction (2012), M. Rutzinger, F. Rottensteiner, N. Pfeifer: A comparison of evaluation",
-        "techniques for building extraction from airborne laser scanning (2009), A. D. Hofmann, H.-G. Maas, A. Streilein",
-        "(2003) for *correct*, *passable* and *false*, and G. Sithole, G. Vosselman: Experimental comparison of filter",
-        "algorithms (2004) for the errors of ground filters.",
+        "techniques for building extraction from airborne laser scanning (2009), A. D. Hofmann, H.-G. Maas, A.",
+        "Streilein (2003) for *correct*, *passable* and *false*, and G. Sithole, G. Vosselman: Experimental comparison",
+        "of filter algorithms (2004) for the errors of ground filters.",
         "",
     ]
     for group, title in TITLES.items():

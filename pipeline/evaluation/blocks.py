@@ -18,13 +18,17 @@ from pipeline.model import LabelArray, RoofType
 
 BLOCK_SHAPE = "block"
 """Shape of a block of several buildings, in their conditions."""
+_TOUCH_M = 0.02
+"""What is closer than this is in touch, and in one plane."""
+_LEAST_BORDER_M = 0.5
 
 
 def joined_reference(reference: Reference) -> Reference:
     """The reference with buildings that share a source_id as one; those alone, or without one, stay as they are.
 
     The roof type of a block is that of its parts where they agree, else combination; it has the defects of all. Faces
-    keep their planes and groups under new numbers, counted through the parts.
+    keep their planes and groups under new numbers, counted through the parts; faces of one plane that touch become one
+    group, for nothing in the points tells them apart.
     """
     groups: dict[str, list[int]] = {}
     for number, building in enumerate(reference.buildings):
@@ -49,7 +53,7 @@ def joined_reference(reference: Reference) -> Reference:
                 if count is not None:
                     face_points[name, surface.plane_id + shift] = count
             shift += 1 + max((max(s.plane_id, s.group) for s in part.surfaces), default=-1)
-        buildings.append(parts[0] if len(parts) == 1 else _block(parts, surfaces))
+        buildings.append(parts[0] if len(parts) == 1 else _block(parts, _with_common_groups(surfaces)))
         known = [reference.conditions[p.building_id] for p in parts if p.building_id in reference.conditions]
         if known:
             conditions[name] = known[0] if len(parts) == 1 else _together(known)
@@ -71,6 +75,47 @@ def _shifted(surface: RoofSurface, shift: int) -> RoofSurface:
     plane_id = surface.plane_id + shift if surface.plane_id >= 0 else -1
     group = surface.group + shift if surface.group >= 0 else -1
     return dataclasses.replace(surface, plane_id=plane_id, group=group)
+
+
+def _with_common_groups(surfaces: Sequence[RoofSurface]) -> list[RoofSurface]:
+    """The surfaces, those of one plane that touch in one group, together with the groups that they had."""
+    parent = list(range(len(surfaces)))
+
+    def root(k: int) -> int:
+        while parent[k] != k:
+            k = parent[k]
+        return k
+
+    first_of: dict[int, int] = {}
+    for k, surface in enumerate(surfaces):
+        if surface.group >= 0:
+            parent[k] = root(first_of.setdefault(surface.group, k))
+    polygons = np.array([surface.polygon for surface in surfaces], dtype=object)
+    tree = shapely.STRtree(polygons)
+    for one, other in tree.query(polygons, predicate="dwithin", distance=_TOUCH_M).T.tolist():
+        if one < other and _one_plane(surfaces[one], surfaces[other]) and _touch(polygons[one], polygons[other]):
+            low, high = sorted((root(one), root(other)))
+            parent[high] = low
+    roots = [root(k) for k in range(len(surfaces))]
+    shared = {k for k in roots if roots.count(k) > 1}
+    return [
+        dataclasses.replace(surface, group=surfaces[k].plane_id) if k in shared else surface
+        for surface, k in zip(surfaces, roots, strict=True)
+    ]
+
+
+def _one_plane(one: RoofSurface, other: RoofSurface) -> bool:
+    """Whether the planes agree at all corners of both."""
+    for surface in (one, other):
+        x, y = shapely.get_coordinates(surface.polygon).T
+        if float(np.abs(one.elevation(x, y) - other.elevation(x, y)).max()) > _TOUCH_M:
+            return False
+    return True
+
+
+def _touch(one: shapely.Polygon, other: shapely.Polygon) -> bool:
+    """Whether two polygons have a piece of border in common, not a corner alone."""
+    return bool(shapely.length(shapely.intersection(one.buffer(_TOUCH_M), other.exterior)) > _LEAST_BORDER_M)
 
 
 def _block(parts: Sequence[RoofModel], surfaces: Sequence[RoofSurface]) -> RoofModel:

@@ -39,7 +39,7 @@ def area_vector(vertices: FloatArray, rings: Sequence[Sequence[int]]) -> FloatAr
     anchor = vertices[rings[0][0]]
     for ring in rings:
         corner = vertices[list(ring)] - anchor
-        following = np.roll(corner, -1, axis=0)
+        following = np.concatenate((corner[1:], corner[:1]))
         total[0] += np.sum(corner[:, 1] * following[:, 2] - corner[:, 2] * following[:, 1])
         total[1] += np.sum(corner[:, 2] * following[:, 0] - corner[:, 0] * following[:, 2])
         total[2] += np.sum(corner[:, 0] * following[:, 1] - corner[:, 1] * following[:, 0])

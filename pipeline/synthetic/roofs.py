@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 from pipeline.model import RoofType
@@ -65,6 +66,7 @@ def _maker(shape: RoofShape) -> Callable[[RoofDimensions], RoofFaces]:
     """The function that makes a roof of a shape, with all that stands on it."""
     parts = PARTS[shape]
 
+    @functools.lru_cache(maxsize=256)  # a layout asks for the same roof while it draws additions and places it
     def make(size: RoofDimensions) -> RoofFaces:
         bare = _BARE[shape](size) if shape in _BARE else envelope(parts(size))
         if not size.additions:

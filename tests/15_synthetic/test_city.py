@@ -61,13 +61,16 @@ def test_labels_of_all_tiles_stand_in_the_order_of_their_points(made: ScenePaths
     assert len(truth.classification) == len(xyz) == made.points
     models = {model.building_id: model for model in read_models(made.truth).models}
     assert set(truth.building_ids) <= set(models)
+    source = np.concatenate([laspy.read(made.truth / tile["laz"]).point_source_id for tile in manifest["tiles"]])
+    unshifted = xyz - np.array(manifest["strip_shifts_m"])[source.astype(int) - 1]
     errors = []
     for number, name in enumerate(truth.building_ids):
         mine = (truth.building == number) & (truth.face >= 0) & ~truth.mixed
-        x, y, z = xyz[mine].T
+        x, y, z = unshifted[mine].T
         errors.append(z - models[name].top(x, y))
-    assert abs(float(np.nanmedian(np.concatenate(errors)))) < 0.1
-    assert float(np.nanpercentile(np.abs(np.concatenate(errors)), 90)) < 0.4  # strips are shifted
+    away = np.abs(np.concatenate(errors))
+    assert float(np.nanmedian(away)) < 0.03  # 3 cm of noise along the beam; steep faces move with it
+    assert float(np.nanpercentile(away, 95)) < 0.12
     for tile in manifest["tiles"]:
         header = laspy.open(made.truth / tile["laz"]).header
         assert tile["points"] == header.point_count

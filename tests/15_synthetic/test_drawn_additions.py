@@ -42,12 +42,7 @@ def test_dormers_stand_apart_and_make_faces_of_their_own(shape: RoofShape) -> No
         if dormers:
             more = len(dormers) * (2 if dormers[0].kind is AdditionKind.GABLE_DORMER else 1)
             assert len(full.faces) >= len(bare.faces) + more
-        assert (
-            shapely.equals_exact(
-                outline(full).normalize().simplify(0.001), outline(bare).normalize().simplify(0.001), 0.01
-            )
-            or outline(full).symmetric_difference(outline(bare)).area < 0.01
-        )
+        assert outline(full).symmetric_difference(outline(bare)).area < 0.01
     assert found > 0
 
 

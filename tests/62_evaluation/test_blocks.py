@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
+import pytest
 import shapely
 
 from pipeline.evaluation.blocks import BLOCK_SHAPE, joined_reference
@@ -68,7 +71,35 @@ def test_houses_of_a_row_become_one_block_and_others_stay() -> None:
 
 def test_faces_keep_apart_under_new_numbers() -> None:
     block = joined_reference(REFERENCE).buildings[0]
-    assert [(s.plane_id, s.group) for s in block.surfaces] == [(0, 0), (1, 0), (2, 2), (3, 2)]
+    assert [s.plane_id for s in block.surfaces] == [0, 1, 2, 3]
+
+
+def lifted(model: RoofModel, up_m: float) -> RoofModel:
+    surfaces = tuple(dataclasses.replace(s, coefficients=(0.0, 0.2, 4.0 + up_m)) for s in model.surfaces)
+    return dataclasses.replace(model, surfaces=surfaces)
+
+
+@pytest.mark.parametrize(("up_m", "groups"), [(0.0, [0, 0, 0, 0]), (0.5, [0, 0, 2, 2])])
+def test_faces_of_one_plane_that_touch_are_one_face_of_the_block(up_m: float, groups: list[int]) -> None:
+    """Nothing in the points tells where the one roof ends and the next begins, unless there is a step."""
+    parts = (house("a", 0, "row"), lifted(house("b", 8, "row"), up_m))
+    joined = joined_reference(
+        Reference(name="r", kind="truth", buildings=parts, has_faces=True, outlines="truth", tiles=())
+    )
+    assert [surface.group for surface in joined.buildings[0].surfaces] == groups
+
+
+def test_faces_of_one_plane_that_are_apart_stay_apart() -> None:
+    alone = [dataclasses.replace(s, group=-1) for s in house("a", 0, "row").surfaces[:1]]
+    far = [dataclasses.replace(s, group=-1) for s in house("b", 9, "row").surfaces[:1]]
+    parts = tuple(
+        dataclasses.replace(house(name, x, "row"), surfaces=tuple(surfaces))
+        for name, x, surfaces in (("a", 0, alone), ("b", 9, far))
+    )
+    joined = joined_reference(
+        Reference(name="r", kind="truth", buildings=parts, has_faces=True, outlines="truth", tiles=())
+    )
+    assert [surface.group for surface in joined.buildings[0].surfaces] == [-1, -1]
 
 
 def test_points_follow_their_buildings_and_faces() -> None:
