@@ -28,15 +28,15 @@ PAGE = "report.html"
 HEADLINE = (
     ("delivery.lod2", "delivery.records_ok"),
     ("validity.models_valid",),
-    ("residuals.within_0_2m",),
+    ("residuals.within_0_2m_top_visible",),
     ("surface.within_0_2m",),
     ("faces.completeness_10m2",),
     ("faces.correctness_10m2",),
     ("roof_types.correct",),
     ("footprints.iou_median",),
     ("detection.area_quality_without_ring", "detection.area_completeness_without_ring"),
-    ("residuals.coverage",),
-    ("residuals.median",),
+    ("residuals.coverage_top_visible",),
+    ("residuals.median_top_visible",),
     ("delivery.records_fallback",),
     ("delivery.records_failed",),
 )

@@ -82,8 +82,8 @@ def face_normal(rings: Sequence[FloatArray]) -> FloatArray:
     return normal
 
 
-def draw_view(axes: Axes, buildings: Sequence[Sequence[ViewedFace]], view: View) -> None:
-    """Draw buildings with their shadows.
+def draw_view(axes: Axes, buildings: Sequence[Sequence[ViewedFace]], view: View, *, shadows: bool = True) -> None:
+    """Draw buildings.
 
     Parameters
     ----------
@@ -93,13 +93,16 @@ def draw_view(axes: Axes, buildings: Sequence[Sequence[ViewedFace]], view: View)
         The faces of each building.
     view : View
         Where one looks from.
+    shadows : bool
+        Throw them onto the ground.
     """
     right, up, towards = _basis(view)
     centres = [np.mean(np.vstack([face.rings[0] for face in faces]), axis=0) for faces in buildings]
     order = sorted(range(len(buildings)), key=lambda i: (float(centres[i][:2] @ towards[:2]), i))
     screen = np.stack([right, up])
-    shadows = [drawn_path([ring @ screen.T for ring in rings]) for faces in buildings for rings in _shadow(faces)]
-    axes.add_collection(PathCollection(shadows, facecolors=_SHADOW, edgecolors=_SHADOW, linewidths=0.3))
+    if shadows:
+        thrown = [drawn_path([ring @ screen.T for ring in rings]) for faces in buildings for rings in _shadow(faces)]
+        axes.add_collection(PathCollection(thrown, facecolors=_SHADOW, edgecolors=_SHADOW, linewidths=0.3))
     paths: list[DrawnPath] = []
     fills: list[Colour] = []
     lines: list[Colour] = []

@@ -256,9 +256,8 @@ def _view(models: Sequence[RoofModel]) -> bytes | None:
         for faces in viewed
     ]
     figure, axes = blank(SIDE_PX, SIDE_PX)
-    draw_view(axes, local, View())
-    shadows, drawn = axes.collections
-    shadows.set_visible(False)
+    draw_view(axes, local, View(), shadows=False)
+    (drawn,) = axes.collections
     corners = np.concatenate([path.vertices for path in drawn.get_paths()])
     low, high = corners.min(axis=0), corners.max(axis=0)
     half = 0.54 * float((high - low).max())

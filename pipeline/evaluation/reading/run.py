@@ -79,6 +79,7 @@ def _units_m(path: Path, into: Collected) -> tuple[float, float]:
     """Metres a horizontal and a vertical unit, from run.json, else from the tables' own metadata."""
     if (path / NAME).is_file():
         manifest = read_manifest(path)
+        into.note(f"made by gablework {manifest.engine_version} with settings {manifest.settings_hash[:12]}")
         if manifest.status is not RunStatus.FINISHED:
             into.note(f"the run is {manifest.status.value}: not all of its buildings may be there")
         crs: Mapping[str, Any] = manifest.crs or {}
