@@ -180,7 +180,13 @@ def compared(data: Path, seed: int) -> dict[str, dict[str, dict[str, str]]]:
         CITY_SCANNER, pulse_density_per_m2=6.0, range_noise_m=0.02, strip_overlap=1.0, wrong_row_share=0.0
     )
     like_isprs = dataclasses.replace(
-        CITY_SCANNER, pulse_density_per_m2=1.0, range_noise_m=0.05, altitude_m=1000.0, beam_radius_m=0.3
+        CITY_SCANNER,
+        pulse_density_per_m2=0.8,
+        range_noise_m=0.04,
+        altitude_m=1000.0,
+        strip_overlap=0.4,
+        jitter=1.0,
+        beam_radius_m=0.3,
     )
     delft = {"delft_west": measured(real_points(data / "ahn3" / "delft_west.laz"))}
     for density in (8.0, 16.0):
@@ -196,7 +202,7 @@ def compared(data: Path, seed: int) -> dict[str, dict[str, dict[str, str]]]:
         stuttgart[f"sweep {cell_name(1.0, noise)}"] = measured(
             simulated_points(fields, cell(1.0, noise), seed, with_classes=False)
         )
-    stuttgart["city, 1 a m2"] = measured(
+    stuttgart["city, 0.8 a m2, irregular"] = measured(
         simulated_points(city_part(seed, like_isprs), like_isprs, seed, with_classes=False)
     )
     return {"delft_west": delft, "CSite2": stuttgart}

@@ -1,0 +1,103 @@
+"""`gablework evaluate` as a user types it: against truth, against points, alone, and on files of other programs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.console import ExitCode
+from pipeline.synthetic.dataset import ScenePaths, simulate
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> ScenePaths:
+    """A classified tile of a few houses, and its truth."""
+    folder = tmp_path_factory.mktemp("scene")
+    return simulate("suburb", folder, 90_003, size_m=(110.0, 100.0), density_per_m2=6.0, with_classes=True)
+
+
+def evaluated(*words: str | Path) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["evaluate", *(str(word) for word in words), "--json"])
+    assert result.exit_code == 0, result.stderr
+    document: dict[str, Any] = json.loads(result.stdout)
+    return document
+
+
+def figures(document: dict[str, Any]) -> dict[str, float]:
+    """Measures over all buildings."""
+    return {row["name"]: row["value"] for row in document["measures"] if row["subset"] == "all"}
+
+
+def refused(*words: str | Path) -> str:
+    result = CliRunner().invoke(app, ["evaluate", *(str(word) for word in words)])
+    assert result.exit_code in {ExitCode.USAGE, ExitCode.INPUT}
+    return " ".join(result.stderr.split())
+
+
+def test_a_report_holds_page_text_and_tables(scene: ScenePaths, tmp_path: Path) -> None:
+    document = evaluated(scene.truth, "--truth", scene.truth, "--out", tmp_path / "report")
+    measured = figures(document)
+    assert measured["faces.quality_10m2"] == measured["delivery.lod2"] == measured["validity.solids_valid"] == 1.0
+    names = {Path(path).name for path in document["written"]}
+    assert {"report.html", "report.md", "measures.parquet", "buildings.parquet", "true_faces.parquet"} <= names
+    assert all(Path(path).stat().st_size > 0 for path in document["written"])
+    stored = pq.read_table(tmp_path / "report" / "measures.parquet").to_pylist()
+    assert stored == document["measures"]
+
+
+def test_the_class_of_the_points_can_be_the_reference(scene: ScenePaths) -> None:
+    measured = figures(evaluated(scene.truth, "--points", scene.laz))
+    assert measured["residuals.within_0_2m_top_visible"] > 0.95
+    assert measured["detection.area_quality_without_ring"] > 0.95
+    assert not any(name.startswith(("faces.", "roof_types.")) for name in measured)
+
+
+def test_without_a_reference_only_what_was_delivered_is_told(scene: ScenePaths) -> None:
+    measured = figures(evaluated(scene.truth))
+    assert {name.split(".")[0] for name in measured} == {"delivery", "validity"}
+    assert measured["delivery.records_ok"] == 1.0
+
+
+def test_models_of_other_programs_are_held_to_the_same_ruler(scene: ScenePaths, tmp_path: Path) -> None:
+    own = figures(evaluated(scene.truth, "--truth", scene.truth))
+    (sequence,) = scene.truth.glob("cityjson/*/part-0.city.jsonl")
+    shutil.copy(sequence, tmp_path / "city.city.jsonl")
+    foreign = figures(evaluated(tmp_path / "city.city.jsonl", "--truth", scene.truth))
+    meshes = figures(evaluated(scene.truth / "meshes", "--truth", scene.truth))
+    for name, value in own.items():
+        # OBJ has no roof types, and cannot say where the data end
+        if not name.startswith(("roof_types", "delivery.records")):
+            assert foreign[name] == pytest.approx(value, abs=2e-3), name
+            assert name.startswith("delivery") or meshes[name] == pytest.approx(value, abs=5e-3), name
+    assert foreign["roof_types.accuracy"] == 1.0
+
+
+def test_the_ground_of_any_program_is_judged(scene: ScenePaths, tmp_path: Path) -> None:
+    tile = laspy.read(scene.laz)
+    wrong = np.flatnonzero(np.asarray(tile.classification) == 2)[::10]
+    tile.classification[wrong] = 1
+    tile.write(tmp_path / "classified.laz")
+    measured = figures(evaluated(scene.truth, "--points", scene.laz, "--ground", tmp_path / "classified.laz"))
+    assert measured["ground.type_1"] == pytest.approx(0.1, abs=0.01)
+    assert measured["ground.type_2"] == 0.0
+
+
+def test_what_does_not_go_together_is_refused(scene: ScenePaths, tmp_path: Path) -> None:
+    assert "use one of --truth and --points" in refused("run", "--truth", scene.truth, "--points", scene.laz)
+    assert "nothing is there" in refused(tmp_path / "nowhere", "--truth", scene.truth)
+    assert "no readable scene.json" in refused(scene.truth, "--truth", tmp_path)
+    unclassified = laspy.read(scene.laz)
+    unclassified.classification[:] = 1
+    unclassified.write(tmp_path / "raw.laz")
+    told = refused(scene.truth, "--points", tmp_path / "raw.laz")
+    assert "raw.laz" in told
+    assert "class" in told
