@@ -5,6 +5,7 @@
 #   make slow      the slow tests: minutes, real processes, real data
 #   make viewer    build the web page (types, unit tests, bundle); brings its own Node
 #   make serve     the service on this machine, web page and all
+#   make ruler     every suite and real tile, reconstructed and measured: all tables of docs/results/ (an hour)
 #   make lock      resolve the dependencies anew (the locks name versions and hashes, no hosts)
 #   make docs      write docs/reference/ from the code
 #   make format    format the sources
@@ -12,6 +13,8 @@
 
 PYTHON ?= python3
 OUT ?= demo
+RULER ?= ruler
+DATA ?= ../shared/data
 VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/uv --no-progress
@@ -25,7 +28,7 @@ KERNELS = $(shell cat $(KERNEL_SOURCES) | cksum | tr ' ' '-')
 TEST_ENV = NUMBA_CACHE_DIR="$(CURDIR)/.cache/numba/$(KERNELS)" OPENBLAS_NUM_THREADS=1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check unit slow viewer serve lock docs format clean
+.PHONY: help demo test check unit slow viewer serve ruler lock docs format clean
 .DELETE_ON_ERROR:
 
 help:
@@ -104,6 +107,12 @@ viewer: service/viewer/dist/index.html
 
 serve: $(VENV)/.warm-stamp viewer
 	@$(BIN)/gablework serve
+
+ruler: $(VENV)/.warm-stamp
+	@mkdir -p $(RULER)
+	$(BIN)/python benchmarks/ruler.py --out $(RULER) --data $(DATA)
+	$(BIN)/python benchmarks/hofmann_statistics.py > $(RULER)/hofmann_statistics.md
+	$(BIN)/python benchmarks/simulated_against_real.py --data $(DATA) > $(RULER)/simulated_against_real.md
 
 docs: $(VENV)/.run-stamp
 	$(BIN)/python docs/generate.py

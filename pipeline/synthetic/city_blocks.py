@@ -13,8 +13,8 @@ import numpy as np
 import shapely
 
 from pipeline.model import FloatArray
+from pipeline.synthetic.additions import can_have_dormers, random_dormers, random_superstructures
 from pipeline.synthetic.conditions import terrain_slope_deg
-from pipeline.synthetic.drawn_additions import can_have_dormers, random_dormers, random_superstructures
 from pipeline.synthetic.plots import PlannedBuilding
 from pipeline.synthetic.random_dimensions import random_dimensions
 from pipeline.synthetic.roofs import RoofDimensions, RoofShape

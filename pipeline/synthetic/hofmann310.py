@@ -19,8 +19,8 @@ import numpy as np
 import shapely
 
 from pipeline.model import FloatArray, RoofType
+from pipeline.synthetic.additions import can_have_dormers, random_dormers, random_superstructures
 from pipeline.synthetic.als import ScannerSettings
-from pipeline.synthetic.drawn_additions import can_have_dormers, random_dormers, random_superstructures
 from pipeline.synthetic.plots import PlannedBuilding, Plot, packed_plots
 from pipeline.synthetic.random_dimensions import random_dimensions
 from pipeline.synthetic.roofs import ROOF_TYPES, RoofDimensions, RoofShape

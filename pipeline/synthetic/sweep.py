@@ -9,8 +9,8 @@ import numpy as np
 import shapely
 
 from pipeline.errors import SettingsError
+from pipeline.synthetic.additions import can_have_dormers, random_dormers, random_superstructures
 from pipeline.synthetic.als import ScannerSettings
-from pipeline.synthetic.drawn_additions import can_have_dormers, random_dormers, random_superstructures
 from pipeline.synthetic.plots import PlannedBuilding, packed_plots
 from pipeline.synthetic.random_dimensions import random_dimensions
 from pipeline.synthetic.roofs import RoofDimensions, RoofShape
