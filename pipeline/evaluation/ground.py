@@ -1,6 +1,7 @@
 """The ground filter against reference classes: type I, type II and total error, and kappa (Sithole, Vosselman 2003).
 
-Judged are last returns, the ones that a ground filter decides on; noise and water are left out. What was found comes
+Judged are last returns, the ones that a ground filter decides on; noise and water are left out, and where a file tells
+objects by their classes also what it leaves unclassified: nobody looked whether that is ground. What was found comes
 from a classified file that any program wrote, or from the ground stage of a run: its filter over the same points, with
 its settings, where a point closer than `tolerance_m` to the terrain is ground.
 """
@@ -29,6 +30,8 @@ from pipeline.terrain.outliers import OutlierSettings, dense_enough
 
 NOT_JUDGED = (7, 9, 18)
 """Reference classes that are neither ground nor object: low noise, water, high noise."""
+UNCLASSIFIED = (0, 1)
+"""Classes that name no object. In the benchmark's samples all that is not ground has one of them."""
 BLOCK_M = 50
 """Side of the blocks that are the units of the bootstrap."""
 MM = 1000
@@ -103,9 +106,10 @@ def ground_blocks(reference: Reference, found: FoundGround) -> list[GroundBlock]
     if not reference.has_ground:
         return []
     rows: list[GroundBlock] = []
+    left_out = NOT_JUDGED if reference.unclassified_is_object else (*NOT_JUDGED, *UNCLASSIFIED)
     for points in reference.points():
         labels = found(points)
-        judged = points.last & ~np.isin(points.classification, NOT_JUDGED)
+        judged = points.last & ~np.isin(points.classification, left_out)
         is_ground = points.classification[judged] == GROUND_CLASS
         outcome = np.where(is_ground, 0, 2) + np.where(labels[judged] == is_ground, 0, 1)
         place = np.floor(points.xyz[judged, :2] / BLOCK_M).astype(np.int64)
@@ -386,7 +390,7 @@ DEFINITIONS: tuple[Definition, ...] = tuple(
         label=label,
         unit=unit,
         better=better,
-        formula=f"{formula}; last returns, without the reference's noise and water",
+        formula=f"{formula}; last returns without noise and water, nor what is left unclassified beside objects",
     )
     for name, label, unit, better, formula in (
         ("type_1", "type I error", "share", Better.LOWER, "ground taken for object / ground"),

@@ -76,6 +76,8 @@ class Reference:
     """Where the reference is complete, so that a model elsewhere is wrong; None: nowhere (footprints of a part)."""
     has_ground: bool = False
     """True where class 2 of the points is the true ground."""
+    unclassified_is_object: bool = True
+    """False where classes 0 and 1 say nothing: other classes tell what the objects are."""
     crs: str | None = None
     """Name or code; None where unknown."""
     notes: tuple[str, ...] = ()

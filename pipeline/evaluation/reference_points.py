@@ -15,6 +15,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import InconsistentInputError, InputError, SettingsError
 from pipeline.evaluation.building_raster import PointRaster
+from pipeline.evaluation.ground import NOT_JUDGED, UNCLASSIFIED
 from pipeline.evaluation.models import RoofModel
 from pipeline.evaluation.reference import Reference, ReferencePoints
 from pipeline.io import ReadOptions, open_source
@@ -110,6 +111,11 @@ def read_points_reference(
     if not classes[BUILDING_CLASS]:
         areas, names = [], []
         notes.append(f"The points have no class {BUILDING_CLASS}: only the ground can be measured")
+    if classes[GROUND_CLASS] and _tells_objects(classes) and classes[list(UNCLASSIFIED)].any():
+        notes.append(
+            "Points that the file leaves unclassified (0, 1) are judged neither as ground nor as object, for other "
+            "classes name the objects"
+        )
     whole = extent.buffer(-_SEAM_M, join_style="mitre")
     buildings = tuple(
         RoofModel(
@@ -134,9 +140,17 @@ def read_points_reference(
         bounds=bounds,
         extent=None if footprints is not None or not buildings else extent,
         has_ground=bool(classes[GROUND_CLASS]),
+        unclassified_is_object=not _tells_objects(classes),
         crs=None if reference.wkt is None else (f"EPSG:{reference.epsg}" if reference.epsg else reference.name),
         notes=tuple(notes),
     )
+
+
+def _tells_objects(classes: Counts) -> bool:
+    """Whether any class names an object: then classes 0 and 1 hold what nobody looked at."""
+    named = classes.copy()
+    named[[GROUND_CLASS, *NOT_JUDGED, *UNCLASSIFIED]] = 0
+    return bool(named.any())
 
 
 def _one_reference(sources: Sequence[Source]) -> SpatialReference:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -142,6 +143,18 @@ def test_only_last_returns_are_judged_and_neither_noise_nor_water() -> None:
     assert figures.ground + figures.object == 90 - 15
     assert math.isnan(figures.type_2) if figures.object == 0 else figures.type_2 == 0.0
     assert figures.type_1 == 1.0
+
+
+def test_what_a_file_leaves_unclassified_is_object_only_where_it_names_no_objects() -> None:
+    xyz, is_ground = hilly(100)
+    points = tile(xyz, is_ground)
+    points.classification[:] = np.repeat([2, 0, 1, 6], 25)
+    reference = reference_of([points])
+    (every,) = tile_figures(ground_blocks(reference, lambda _: np.ones(100, np.bool_)))
+    assert (every.ground, every.object) == (25, 75)
+    named = dataclasses.replace(reference, unclassified_is_object=False)
+    (told,) = tile_figures(ground_blocks(named, lambda _: np.ones(100, np.bool_)))
+    assert (told.ground, told.object) == (25, 25)
 
 
 def test_tiles_are_told_apart_and_add_up() -> None:
