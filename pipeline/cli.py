@@ -309,7 +309,7 @@ def evaluate(
     blocks: Annotated[
         bool | None,
         typer.Option(
-            "--blocks/--no-blocks", help="Join true buildings that touch; default: for runs without footprints."
+            "--blocks/--no-blocks", help="Join true buildings that touch; default: for models without footprints."
         ),
     ] = None,
     out: Annotated[

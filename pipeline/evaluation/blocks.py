@@ -59,7 +59,7 @@ def joined_reference(reference: Reference) -> Reference:
             conditions[name] = known[0] if len(parts) == 1 else _together(known)
     joined = (
         f"{len(reference.buildings)} true buildings were joined to {len(buildings)}: those that touch count as one "
-        "block, for the models were made without footprints"
+        "block, for nothing says that the models follow given footprints"
     )
     return dataclasses.replace(
         reference,

@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 
 from pipeline.evaluation.bootstrap import share
-from pipeline.evaluation.matching import MIN_SHARE, Matching
+from pipeline.evaluation.matching import MIN_SHARE, Matching, excused_models
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import ModelSet, RoofModel
 from pipeline.evaluation.reference import Reference
@@ -39,11 +39,11 @@ class Stands(StrEnum):
     PART = "part"
     """It stands for none, but at least half of it lies on reference buildings."""
     JOINS = "joins"
-    """It covers at least half of each of several reference buildings, whether it stands for one or not."""
+    """It covers at least half of each of several reference buildings, and lies on them by half or stands for one."""
     FALSE = "false"
     """Less than half of it lies on reference buildings, and the reference is complete there."""
     LEFT_OUT = "left_out"
-    """It touches the data edge, or stands where the reference says nothing, and stands for no building."""
+    """It stands for no building, and lies on one that the data edge cuts, at that edge, or where nothing is known."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,7 @@ class DeliveryRow:
     parts: int
     """Number of models that are parts (`Stands.PART`) and lie mostly on it."""
     joined: bool
-    """Whether a model that joins covers at least half of it."""
+    """Whether a model that covers at least half of another one too covers at least half of it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,21 +115,25 @@ def score_delivery(models: Sequence[RoofModel], reference: Reference, matching: 
     cut = np.array([building.touches_data_edge for building in reference.buildings], np.bool_)
     covering = pairs.common_m2 >= (MIN_SHARE - _ROUNDING) * matching.reference_m2[pairs.first]
     covers = np.bincount(pairs.second[covering], minlength=len(models))
+    excused = excused_models(models, reference)
     rows = []
     for k, model in enumerate(models):
         own = int(matching.reference_of[k])
         mostly = int(matching.mostly_on[k])
         on, inside = float(matching.share_on_reference[k]), float(matching.share_in_extent[k])
-        if covers[k] > 1:
+        lies_on = on >= MIN_SHARE - _ROUNDING
+        if covers[k] > 1 and (own >= 0 or lies_on):
             stands = Stands.JOINS
         elif own >= 0:
             stands = Stands.FOR_BUILDING
-        elif model.touches_data_edge or (mostly >= 0 and cut[mostly]):
+        elif covers[k] <= 1 and (cut[mostly] if mostly >= 0 else excused[k]):
             stands = Stands.LEFT_OUT
-        elif on >= MIN_SHARE - _ROUNDING:
+        elif lies_on:
             stands = Stands.PART
+        elif reference.extent is not None and (inside >= MIN_SHARE - _ROUNDING or covers[k] > 1):
+            stands = Stands.FALSE
         else:
-            stands = Stands.FALSE if inside >= MIN_SHARE - _ROUNDING else Stands.LEFT_OUT
+            stands = Stands.LEFT_OUT
         rows.append(
             DeliveredModel(
                 model=k,
@@ -141,9 +145,8 @@ def score_delivery(models: Sequence[RoofModel], reference: Reference, matching: 
                 stands=stands,
             )
         )
-    joins = np.array([row.stands is Stands.JOINS for row in rows], np.bool_)
     joined = np.zeros(len(reference.buildings), np.bool_)
-    joined[pairs.first[covering][joins[pairs.second[covering]]]] = True
+    joined[pairs.first[covering][covers[pairs.second[covering]] > 1]] = True
     on_building = np.array([row.building for row in rows if row.stands is Stands.PART], np.int64)
     parts = np.bincount(on_building, minlength=len(reference.buildings))
     buildings = tuple(
@@ -252,8 +255,8 @@ DEFINITIONS = (
     _definition(
         "split",
         "buildings split",
-        f"{_OF_ALL}with several models: one that stands for it, and others of which at least half lies on reference "
-        "buildings, most of it on this one",
+        f"{_OF_ALL}with several models: the one that stands for it, if any, and those that stand for none, lie on "
+        "reference buildings by at least half, and on this one most",
         Better.LOWER,
     ),
     _definition(
@@ -271,8 +274,8 @@ DEFINITIONS = (
     _definition(
         "false_models",
         "models where no building is",
-        "models of which less than half lies on reference buildings, that stand for none, in the extent of the "
-        "reference and not at the data edge",
+        "models of which less than half lies on reference buildings, that stand for none, half in the extent of the "
+        "reference or over several buildings, and not at the data edge",
         Better.LOWER,
         "count",
     ),
@@ -286,7 +289,8 @@ DEFINITIONS = (
     _definition(
         "joining_models",
         "models that join buildings",
-        "models that cover at least half of each of several reference buildings",
+        "models that cover at least half of each of several reference buildings, and lie on such by at least half or "
+        "stand for one",
         Better.LOWER,
         "count",
     ),

@@ -28,11 +28,19 @@ from pipeline.evaluation.building_raster import (
     edge_ring,
     windows_of,
 )
+from pipeline.evaluation.matching import (
+    excused_models,
+    mostly_on,
+    overlapping,
+    share_covered,
+    sound_polygons,
+    where_judged,
+)
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import RoofModel
 from pipeline.evaluation.reference import Reference
 from pipeline.evaluation.subsets import Subset, measured
-from pipeline.model import BoolArray, FloatArray, IntArray
+from pipeline.model import BoolArray, FloatArray
 from pipeline.scene import BUILDING_CLASS
 
 MIN_OVERLAP = 0.5
@@ -83,7 +91,8 @@ class DetectedObject:
     overlap: float
     """Share of its area that lies on models, or of a model on reference buildings."""
     counts: bool
-    """False where it touches the edge of the data, or for a model where nothing is known about where it stands."""
+    """False where it touches the edge of the data; for a model where it lies on such a building or at that edge, or
+    where nothing is known."""
 
     @property
     def found(self) -> bool:
@@ -142,12 +151,23 @@ def _blocks(models: Sequence[RoofModel], reference: Reference) -> tuple[Detectio
     known = PlanRaster(outlines if reference.extent is None else _polygons(reference.extent))
     of_reference = _class_raster(reference).window if reference.outlines == "given" else PlanRaster(outlines).window
     blocks: list[DetectionBlock] = []
-    for window in windows_of(shapely.bounds(np.array([*outlines, *found], dtype=object))):
+    for window in windows_of(
+        _bounds_within([*outlines, *found], outlines if reference.extent is None else [reference.extent])
+    ):
         around = of_reference(window.grown(1))
         ring = edge_ring(around)[1:-1, 1:-1]
         counted = known.window(window)
         blocks += _count(window, around[1:-1, 1:-1] & counted, of_models.window(window) & counted, ring)
     return tuple(sorted(blocks, key=lambda block: (block.row, block.column)))
+
+
+def _bounds_within(areas: Sequence[shapely.Geometry], known: Sequence[shapely.Geometry]) -> FloatArray:
+    """(n, 4) bounds of areas, cut at the bounds of what is known: no cell counts beyond, however far a model goes."""
+    bounds = shapely.bounds(np.array([*areas], dtype=object)).reshape(-1, 4)
+    whole = shapely.total_bounds(np.array([*known], dtype=object))
+    low, high = np.maximum(bounds[:, :2], whole[:2]), np.minimum(bounds[:, 2:], whole[2:])
+    cut: FloatArray = np.hstack((low, high))[(low <= high).all(axis=1)]
+    return cut
 
 
 def _class_raster(reference: Reference) -> PointRaster:
@@ -192,27 +212,17 @@ def _objects(
     models: Sequence[RoofModel], reference: Reference
 ) -> tuple[tuple[DetectedObject, ...], tuple[DetectedObject, ...]]:
     """Reference buildings and models with the share of their area that lies on the other kind."""
-    truth = _valid([building.footprint for building in reference.buildings])
-    made = _valid([model.footprint for model in models])
-    known = np.ones(len(made), np.bool_)
-    if reference.extent is None:
-        known[:] = False
-    elif len(made):
-        shapely.prepare(reference.extent)
-        known = np.asarray(shapely.contains_properly(reference.extent, made))
-    if len(truth) and len(made):
-        first, second = shapely.STRtree(made).query(truth, predicate="intersects")
-        shared = shapely.intersection(truth[first], made[second])
-    else:
-        first = second = np.zeros(0, np.int64)
-        shared = np.zeros(0, dtype=object)
-    area_shared = shapely.area(shared)
-    best, most = np.full(len(made), -1), np.zeros(len(made))
-    for building, model, area in zip(first.tolist(), second.tolist(), area_shared.tolist(), strict=True):
-        if area > most[model]:
-            best[model], most[model] = building, area
-    overlap_truth = _covered(first, shared, truth)
-    overlap_made = _covered(second, shared, made)
+    truth = sound_polygons([building.footprint for building in reference.buildings])
+    made = sound_polygons([model.footprint for model in models])
+    pairs = overlapping(truth, made)
+    best = mostly_on(len(made), pairs)
+    cut = np.array([building.touches_data_edge for building in reference.buildings], np.bool_)
+    known = np.zeros(len(made), np.bool_)
+    if reference.extent is not None:
+        known = where_judged(made, truth, pairs, reference.extent)
+        known &= ~np.where(best >= 0, cut[best] if len(cut) else False, excused_models(models, reference))
+    overlap_truth = share_covered(truth, made, pairs.swapped())
+    overlap_made = share_covered(made, truth, pairs)
     return (
         tuple(
             DetectedObject(
@@ -230,32 +240,11 @@ def _objects(
                 building=int(best[number]),
                 area_m2=float(made[number].area),
                 overlap=float(overlap_made[number]),
-                counts=bool(known[number]) and not model.touches_data_edge,
+                counts=bool(known[number]),
             )
             for number, model in enumerate(models)
         ),
     )
-
-
-def _valid(footprints: Sequence[shapely.Geometry]) -> Geometries:
-    """The footprints, those repaired that cross themselves: areas of overlap need valid polygons."""
-    areas: Geometries = np.array(footprints, dtype=object)
-    wrong = ~shapely.is_valid(areas) if len(areas) else np.zeros(0, np.bool_)
-    areas[wrong] = shapely.make_valid(areas[wrong])
-    return areas
-
-
-def _covered(owner: IntArray, shared: Geometries, areas: Geometries) -> FloatArray:
-    """Share of each area that its pieces cover together; pieces may overlap."""
-    covered = np.zeros(len(areas))
-    order = np.argsort(owner, kind="stable")
-    starts = np.searchsorted(owner[order], np.arange(len(areas) + 1))
-    for k in range(len(areas)):
-        pieces = shared[order[starts[k] : starts[k + 1]]]
-        if len(pieces) and areas[k].area > 0.0:
-            together = pieces[0].area if len(pieces) == 1 else shapely.union_all(pieces).area
-            covered[k] = together / areas[k].area
-    return covered
 
 
 # ---------------------------------------------------------------------------------------------------------- measures

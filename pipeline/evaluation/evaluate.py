@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
 import pyarrow as pa
+import shapely
 
 from pipeline.evaluation import delivery, faces, footprints, roof_types, surface, tables, validity
 from pipeline.evaluation.blocks import joined_reference
@@ -17,6 +18,7 @@ from pipeline.evaluation.models import ModelSet
 from pipeline.evaluation.reference import Reference
 from pipeline.evaluation.residuals import building_residuals, residual_measures
 from pipeline.evaluation.subsets import Subset, subsets
+from pipeline.model import RoofType
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -49,8 +51,17 @@ class Evaluation:
 
 
 def needs_blocks(models: ModelSet, reference: Reference) -> bool:
-    """Whether single houses of a row cannot be asked for: a run without footprints against simulated truth."""
-    return reference.kind == "truth" and models.kind == "run" and not models.has_footprints
+    """Whether single houses of a row cannot be asked for: models without footprints against simulated truth.
+
+    Whatever wrote them: a run and its own CityJSON are held to one reference.
+    """
+    return reference.kind == "truth" and not models.has_footprints
+
+
+def tells_types(models: ModelSet) -> bool:
+    """Whether any model says a roof type, so that types can be judged; True without models: none is found then."""
+    untold = {RoofType.UNKNOWN, RoofType.NONE}
+    return not models.models or any(model.roof_type not in untold for model in models.models)
 
 
 def evaluate(
@@ -129,7 +140,7 @@ def _buildings(
     outlines = footprints.score_footprints(models.models, reference, matching)
     on_step("roof faces")
     face_score = faces.score_faces(models.models, reference)
-    types = roof_types.score_roof_types(models.models, reference, matching, face_score)
+    types = roof_types.score_roof_types(models.models, reference, matching, face_score) if tells_types(models) else ()
     on_step("roof surfaces")
     surfaces = surface.score_surface(models.models, reference)
     on_step("points")
@@ -145,7 +156,7 @@ def _buildings(
         found["true_faces"] = tables.true_face_table(face_score, reference)
         found["model_faces"] = tables.model_face_table(face_score, models.models, reference)
         found["topology"] = tables.topology_table(face_score)
-        found |= tables.outcome_tables(types, groups)
+        found |= tables.outcome_tables(types, groups) if types else {}
     measures = delivery.record_measures(models)
     for group in groups:
         measures += delivery.measures(delivered, group)
@@ -159,7 +170,31 @@ def _buildings(
 
 
 def _notes(models: ModelSet, reference: Reference) -> tuple[str, ...]:
+    found = []
     codes = [crs for crs in (models.crs, reference.crs) if crs is not None and crs.startswith("EPSG:")]
-    if len(set(codes)) < 2:  # a name and a code may well mean the same
-        return ()
-    return (f"The models are in {codes[0]}, the reference in {codes[1]}: coordinates were compared as they are.",)
+    if len(set(codes)) > 1:  # a name and a code may well mean the same
+        found.append(
+            f"The models are in {codes[0]}, the reference in {codes[1]}: coordinates were compared as they are."
+        )
+    if reference.has_faces and not tells_types(models):
+        found.append("No model tells its roof type: types, and the outcomes that ask for them, are not judged.")
+    if models.has_footprints and reference.outlines == "given":
+        found.append(
+            "The models follow given footprints, and so does the reference: where these are the same, outlines and "
+            "detection agree by themselves and say nothing of the method."
+        )
+    known = [building.footprint for building in reference.buildings]
+    if reference.extent is not None:
+        known.append(reference.extent)
+    if known and models.models:
+        place = shapely.box(*shapely.total_bounds(known))
+        away = int((~shapely.intersects(place, [model.footprint for model in models.models])).sum())
+        if away == len(models.models):
+            found.append(
+                "None of the models stands where the reference is: another place, or another reference system."
+            )
+        elif away:
+            found.append(
+                f"{away:,} of the {len(models.models):,} models stand beyond the reference and are not judged."
+            )
+    return tuple(found)

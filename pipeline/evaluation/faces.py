@@ -22,13 +22,12 @@ import numpy as np
 from pipeline.evaluation.bootstrap import Share, Sums, quality, share
 from pipeline.evaluation.face_matching import FaceMatch, match_faces
 from pipeline.evaluation.matching import (
-    MIN_SHARE,
+    excused_models,
     mostly_on,
     overlapping,
-    share_covered,
-    share_in_extent,
     sound_polygons,
     summed,
+    where_judged,
 )
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import RoofModel
@@ -54,7 +53,7 @@ class FaceVerdict(StrEnum):
     NEITHER = "neither"
     """Too small to be wrong, or matches a true face that need not be found."""
     LEFT_OUT = "left_out"
-    """Of a building or model that touches the data edge, or where the reference says nothing."""
+    """On a building that touches the data edge, of a model at that edge, or where the reference says nothing."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -156,9 +155,9 @@ def score_faces(models: Sequence[RoofModel], reference: Reference) -> FaceScore:
     Returns
     -------
     FaceScore
-        A model face is judged where it matches a true face of a building that is not cut by the data edge, or where
-        at least half of it lies on reference buildings or in the reference's extent, its model is not cut and it does
-        not lie on a cut building. A cut model may still find faces.
+        A model face is judged where it matches a true face of a building that is not cut by the data edge, else as
+        `where_judged` says, but not where it lies on a cut building, or on none as part of a model that the edge of
+        the data excuses (`excused_models`). A cut model may still find faces.
     """
     if not reference.has_faces:
         return FaceScore(reference=(), models=(), components=())
@@ -224,11 +223,10 @@ def _judged(
     footprints = sound_polygons([building.footprint for building in reference.buildings])
     over = overlapping(footprints, match.made.polygon)
     building = mostly_on(len(match.made.owner), over)
-    covered = share_covered(match.made.polygon, footprints, over)
-    known = np.maximum(covered, share_in_extent(match.made.polygon, reference.extent)) >= MIN_SHARE - _ROUNDING
-    cut_model = np.array([model.touches_data_edge for model in models], np.bool_)[match.made.owner]
-    left_out = cut_model | ~known
-    left_out[building >= 0] |= cut[building[building >= 0]]
+    left_out = ~where_judged(match.made.polygon, footprints, over, reference.extent)
+    elsewhere = building < 0
+    left_out[elsewhere] |= excused_models(models, reference)[match.made.owner[elsewhere]]
+    left_out[~elsewhere] |= cut[building[~elsewhere]]
     matched = match.matched_unit >= 0
     building[matched] = unit_building[match.matched_unit[matched]]
     left_out[matched] = unit_cut[match.matched_unit[matched]]

@@ -9,19 +9,17 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from pipeline.evaluation.bootstrap import CONFIDENCE, DRAWS, ratio, share
+from pipeline.evaluation.bootstrap import ratio, share
 from pipeline.evaluation.matching import MIN_SHARE, Geometries, Matching, sound_polygons
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import RoofModel
 from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.subsets import Subset, measured
+from pipeline.evaluation.subsets import Subset, measured, measured_median
 from pipeline.model import FloatArray
 
 LIMITS = (0.5, 0.8, 0.9)
 """IoU from which on shares are told."""
 _ROUNDING = 1e-9
-_SEED = 20_090_402
-_VALUES_A_BLOCK = 1_000_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -113,14 +111,14 @@ def measures(rows: Sequence[FootprintRow], subset: Subset) -> list[Measure]:
     iou = np.array([row.iou for row in counted])
     iou_found = np.array([row.iou for row in found])
     figures = [
-        _median("footprints.iou_median", iou, subset),
+        measured_median("footprints.iou_median", iou, subset),
         _mean("footprints.iou_mean", iou, subset),
-        _median("footprints.iou_median_found", iou_found, subset),
+        measured_median("footprints.iou_median_found", iou_found, subset),
         _mean("footprints.iou_mean_found", iou_found, subset),
-        _median("footprints.iou_together_median", np.array([row.iou_together for row in counted]), subset),
+        measured_median("footprints.iou_together_median", np.array([row.iou_together for row in counted]), subset),
         _mean("footprints.iou_together_mean", np.array([row.iou_together for row in counted]), subset),
-        _median("footprints.area_bias_median", np.array([row.area_bias for row in found]), subset),
-        _median("footprints.offset_median", np.array([row.offset_m for row in found]), subset),
+        measured_median("footprints.area_bias_median", np.array([row.area_bias for row in found]), subset),
+        measured_median("footprints.offset_median", np.array([row.offset_m for row in found]), subset),
     ]
     figures += [
         measured(
@@ -138,27 +136,6 @@ def measures(rows: Sequence[FootprintRow], subset: Subset) -> list[Measure]:
 def _mean(name: str, values: FloatArray, subset: Subset) -> Measure:
     columns = {"value": values, "count": np.ones(len(values))}
     return measured(name, columns, ratio("value", "count"), n=len(values), subset=subset)
-
-
-def _median(name: str, values: FloatArray, subset: Subset) -> Measure:
-    """The median over buildings with its percentile interval: a value a unit, so the units themselves are redrawn."""
-    count = len(values)
-    if count == 0:
-        return Measure(name=name, value=math.nan, n=0, subset=subset.name)
-    value = float(np.median(values))
-    if count == 1:
-        return Measure(name=name, value=value, n=1, subset=subset.name)
-    random = np.random.default_rng(_SEED)
-    rows = max(1, _VALUES_A_BLOCK // count)
-    drawn = np.concatenate(
-        [
-            np.median(values[random.integers(0, count, (min(rows, DRAWS - first), count))], axis=1)
-            for first in range(0, DRAWS, rows)
-        ]
-    )
-    tail = (1.0 - CONFIDENCE) / 2.0
-    low, high = np.quantile(drawn, [tail, 1.0 - tail])
-    return Measure(name=name, value=value, low=float(low), high=float(high), n=count, subset=subset.name)
 
 
 def _definition(name: str, label: str, formula: str, unit: str = "share", better: Better = Better.HIGHER) -> Definition:

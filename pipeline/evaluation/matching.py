@@ -22,6 +22,8 @@ MIN_IOU = 0.5
 """Overlap from which on a building is found."""
 MIN_SHARE = 0.5
 """Share of a footprint or face from which on it counts as lying on another."""
+EDGE_M = 5.0
+"""Farther inside the extent of a reference no model is cut by the edge of the data, whatever it says of itself."""
 _LEAST_M2 = 1e-6
 _ROUNDING = 1e-9
 _PAIRS_A_BLOCK = 65_536
@@ -42,6 +44,16 @@ class Overlaps:
     """(p,) float64, common area in plan, over 1e-6 m2."""
     middle: FloatArray
     """(p, 2) float64, centroid of the common area."""
+
+    def swapped(self) -> Overlaps:
+        """The same pairs the other way round."""
+        order = np.lexsort((self.first, self.second))
+        return Overlaps(
+            first=self.second[order],
+            second=self.first[order],
+            common_m2=self.common_m2[order],
+            middle=self.middle[order],
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -216,3 +228,36 @@ def mostly_on(count: int, pairs: Overlaps) -> IntArray:
     order = np.lexsort((-pairs.first, pairs.common_m2))  # ascending: the largest area, then the smallest index, last
     found[pairs.second[order]] = pairs.first[order]
     return found
+
+
+def where_judged(
+    polygons: Geometries, cover: Geometries, pairs: Overlaps, extent: shapely.Geometry | None
+) -> BoolArray:
+    """Which polygons, (n,), of a model stand where the reference says something.
+
+    At least half of such a one lies on reference buildings or in the extent, or it covers at least half of a reference
+    building: to be so large that most of it lies beyond the extent is no excuse. `pairs` name the buildings first.
+    """
+    known = np.maximum(share_covered(polygons, cover, pairs), share_in_extent(polygons, extent))
+    judged: BoolArray = known >= MIN_SHARE - _ROUNDING
+    covering = pairs.common_m2 >= (MIN_SHARE - _ROUNDING) * shapely.area(cover)[pairs.first]
+    judged[pairs.second[covering]] = True
+    return judged
+
+
+def excused_models(models: Sequence[RoofModel], reference: Reference) -> BoolArray:
+    """Which models, (m,), are excused by the edge of the data where they stand on no reference building.
+
+    Those that lie across the border of the extent, and those that say they touch the edge and are not farther than 5 m
+    inside. Of a model on a reference building the reference alone says whether it is cut: what is judged has no say in
+    what is judged.
+    """
+    claims = np.array([model.touches_data_edge for model in models], np.bool_)
+    if reference.extent is None or len(claims) == 0:
+        return claims
+    made = sound_polygons([model.footprint for model in models])
+    inside = reference.extent.buffer(-EDGE_M, join_style="mitre")
+    for area in (reference.extent, inside):
+        shapely.prepare(area)
+    excused: BoolArray = ~shapely.covers(reference.extent, made) | (claims & ~shapely.contains(inside, made))
+    return excused

@@ -76,7 +76,7 @@ def read_truth_reference(
     footprints = plan_index([building.footprint for building in buildings])
     name = folder.parent.name if folder.name == "truth" else folder.name
     return Reference(
-        name=f"{scene.get('suite', name)} (truth)",
+        name=f"{scene.get('suite', name)} (truth{', as surveyed' if as_surveyed else ''})",
         kind="truth",
         buildings=buildings,
         has_faces=True,

@@ -15,13 +15,15 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 from numba import njit
+from shapely import MultiPolygon, Polygon
 
 from pipeline.evaluation.bootstrap import Statistic, quantile, ratio, root_mean, share
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import RoofModel
 from pipeline.evaluation.reference import Reference, ReferencePoints
-from pipeline.evaluation.subsets import Subset, measured
+from pipeline.evaluation.subsets import Subset, measured, measured_median
 from pipeline.geometry import top_visible
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.quality.residuals import TopSurface
@@ -37,6 +39,7 @@ EDGES_M: FloatArray = np.concatenate(
 )
 """Borders of the bins of |residual|: 5 mm up to 1 m, 50 mm up to 5 m, 0.5 m up to 50 m, and all beyond."""
 
+_BEYOND_M = 10.0
 _COLUMNS = ("n_points", "n_covered", "n_within")
 
 
@@ -108,15 +111,46 @@ class BuildingResiduals:
     in a dense town they hang together, and the blocks that are cut hold most of the points."""
 
 
-def top_surface_of(models: Sequence[RoofModel], tolerance_m: float = ROUNDING_M) -> TopSurface:
-    """The highest roof face of all models, to be asked at any place."""
+def top_surface_of(
+    models: Sequence[RoofModel], tolerance_m: float = ROUNDING_M, *, near: Sequence[RoofModel] | None = None
+) -> TopSurface:
+    """The highest roof face of all models, to be asked at any place.
+
+    Parameters
+    ----------
+    models : sequence of RoofModel
+        Whose roof faces.
+    tolerance_m : float
+        A gap between faces that is narrower is none.
+    near : sequence of RoofModel, optional
+        It will be asked over these footprints only: what lies beyond their bounds is cut away, for one model at a
+        wrong place in the world would make the index of all others coarse.
+    """
     surfaces = [surface for model in models for surface in model.surfaces]
+    polygons = [surface.polygon for surface in surfaces]
+    if near is not None:
+        west, south, east, north = shapely.total_bounds([building.footprint for building in near])
+        reach = shapely.box(west - _BEYOND_M, south - _BEYOND_M, east + _BEYOND_M, north + _BEYOND_M)
+        shapely.prepare(reach)
+        kept = np.flatnonzero(shapely.intersects(reach, polygons)).tolist()
+        surfaces = [surfaces[k] for k in kept]
+        whole = shapely.contains(reach, [surface.polygon for surface in surfaces])
+        polygons = [
+            surface.polygon if is_whole else _area_within(surface.polygon, reach)
+            for surface, is_whole in zip(surfaces, whole.tolist(), strict=True)
+        ]
     return TopSurface(
-        [surface.polygon for surface in surfaces],
+        polygons,
         np.array([surface.coefficients for surface in surfaces]).reshape(-1, 3),
         np.array([surface.origin for surface in surfaces]).reshape(-1, 3),
         tolerance_m=tolerance_m,
     )
+
+
+def _area_within(polygon: Polygon, reach: Polygon) -> Polygon | MultiPolygon:
+    """What of a polygon lies within reach; lines and points of it are left out."""
+    pieces = shapely.get_parts(shapely.intersection(shapely.make_valid(polygon), reach)).tolist()
+    return MultiPolygon([piece for piece in pieces if isinstance(piece, Polygon)])
 
 
 def point_residuals(points: ReferencePoints, surface: TopSurface) -> tuple[IntArray, FloatArray]:
@@ -160,7 +194,7 @@ def building_residuals(models: Sequence[RoofModel], reference: Reference) -> lis
     list of BuildingResiduals
         One a reference building, in their order.
     """
-    surface = top_surface_of(models)
+    surface = top_surface_of(models, near=reference.buildings)
     everything, visible = _Tallies(len(reference.buildings)), _Tallies(len(reference.buildings))
     seam = _Seam(reference.bounds)
     for number, points in enumerate(reference.points()):
@@ -357,14 +391,6 @@ def residual_measures(rows: Sequence[BuildingResiduals], subset: Subset) -> list
             measured(f"residuals.{name}{suffix}", used, statistic, n=n, subset=subset)
             for name, used, statistic, n in figures
         ]
-        found.append(_building_rmse(f"residuals.building_rmse{suffix}", tallies, subset))
+        rmse = np.array([tally.rmse_m for tally in tallies if tally.n_covered])
+        found.append(measured_median(f"residuals.building_rmse{suffix}", rmse, subset))
     return found
-
-
-def _building_rmse(name: str, tallies: Sequence[ResidualTally], subset: Subset) -> Measure:
-    """The median of the buildings' RMSE; its interval from bins, since a median is no function of sums."""
-    rmse = np.array([tally.rmse_m for tally in tallies if tally.n_covered])
-    bins = np.zeros((len(rmse), len(EDGES_M) - 1))
-    bins[np.arange(len(rmse)), np.minimum(np.searchsorted(EDGES_M, rmse, side="right") - 1, len(EDGES_M) - 2)] = 1.0
-    binned = measured(name, {"h": bins}, quantile("h", EDGES_M, 0.5), n=len(rmse), subset=subset)
-    return dataclasses.replace(binned, value=float(np.median(rmse)) if len(rmse) else math.nan)

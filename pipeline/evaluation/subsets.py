@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.evaluation.bootstrap import Statistic, Sums, bootstrap
+from pipeline.evaluation.bootstrap import CONFIDENCE, DRAWS, Statistic, Sums, bootstrap
 from pipeline.evaluation.matching import summed
 from pipeline.evaluation.measure import Measure
 from pipeline.evaluation.reference import Reference
 from pipeline.model import BoolArray, FloatArray, IntArray
+
+_SEED = 20_090_402
+_VALUES_A_BLOCK = 1_000_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -103,6 +107,37 @@ def measured(
     return Measure(
         name=name, value=estimate.value, low=estimate.low, high=estimate.high, n=round(n), subset=subset.name
     )
+
+
+def measured_median(name: str, values: FloatArray, subset: Subset) -> Measure:
+    """The median over buildings with its percentile interval: a value a unit, so the units themselves are redrawn.
+
+    Parameters
+    ----------
+    name : str
+        Of the measure.
+    values : (n,) float64
+        One a building, finite; nan comes back for none, no interval for one.
+    subset : Subset
+        Which they are of.
+    """
+    count = len(values)
+    if count == 0:
+        return Measure(name=name, value=math.nan, n=0, subset=subset.name)
+    value = float(np.median(values))
+    if count == 1:
+        return Measure(name=name, value=value, n=1, subset=subset.name)
+    random = np.random.default_rng(_SEED)
+    rows = max(1, _VALUES_A_BLOCK // count)
+    drawn = np.concatenate(
+        [
+            np.median(values[random.integers(0, count, (min(rows, DRAWS - first), count))], axis=1)
+            for first in range(0, DRAWS, rows)
+        ]
+    )
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low, high = np.quantile(drawn, [tail, 1.0 - tail])
+    return Measure(name=name, value=value, low=float(low), high=float(high), n=count, subset=subset.name)
 
 
 class _LookedAt(dict[str, FloatArray]):

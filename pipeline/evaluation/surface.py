@@ -106,7 +106,7 @@ def score_surface(
     """
     if not reference.has_faces:
         return ()
-    truth, made = top_surface_of(reference.buildings), top_surface_of(models)
+    truth, made = top_surface_of(reference.buildings), top_surface_of(models, near=reference.buildings)
     owner = np.repeat(np.arange(len(reference.buildings)), [len(one.surfaces) for one in reference.buildings])
     owner = np.append(owner, -1)  # of face -1: none
     rows: list[SurfaceRow] = []

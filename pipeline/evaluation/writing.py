@@ -127,20 +127,24 @@ def told_subject(evaluation: Evaluation) -> tuple[str, str]:
     """What was measured, and against what, as two sentences."""
     models, reference = evaluation.models, evaluation.reference
     kinds = {"run": "a run", "cityjson": "CityJSON", "cityjsonseq": "CityJSONSeq", "obj": "OBJ"}
-    measured = f"{models.name}: {len(models.models):,} models ({kinds[models.kind]})"
+    measured = f"{models.name}: {_counted(len(models.models), 'model')} ({kinds[models.kind]})"
     if models.failed:
-        measured += f", {len(models.failed):,} records without a model"
+        measured += f", {_counted(len(models.failed), 'record')} without a model"
     if reference is None:
         return f"{measured}.", "Nothing: the models alone."
-    against = f"{reference.name}: {len(reference.buildings):,} buildings"
+    against = f"{reference.name}: {_counted(len(reference.buildings), 'building')}"
     if reference.has_faces:
         against += " with true roof faces"
     else:
         origins = {"given": "given footprints", "raster": "outlines of the class-6 raster", "truth": "true footprints"}
         against += f" ({origins.get(reference.outlines, reference.outlines)})"
     points = len(reference.tiles)
-    against += f", points of {points:,} tile{'' if points == 1 else 's'}" if points else ", no points"
+    against += f", points of {_counted(points, 'tile')}" if points else ", no points"
     return f"{measured}.", f"{against}."
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
 def all_notes(evaluation: Evaluation) -> tuple[str, ...]:

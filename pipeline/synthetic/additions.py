@@ -17,10 +17,10 @@ _TOLERANCE_M = 1e-6
 _EDGE_M = 0.3
 _APART_M = 0.5
 _LEAST_CLEARANCE_M = 0.05
+_ALONG_M = 1e-3
 _TRIES = 40
 _ON_FLAT_ROOFS = (1.5, 1.5, 0.8), (4.5, 4.0, 3.2)
 _CHIMNEY = (0.5, 0.5, 0.5), (1.1, 1.1, 1.1)
-_ATTIC_BOX = (1.4, 1.4, 0.3), (2.8, 2.4, 0.8)
 """Smallest and largest length, width and height in metres."""
 _WITHOUT_DORMERS = {RoofShape.FLAT, RoofShape.PENT, RoofShape.MULTI_LEVEL_FLAT}
 
@@ -229,7 +229,7 @@ def random_superstructures(
     besides: Sequence[Addition] = (),
     at_most: int = 3,
 ) -> tuple[Addition, ...]:
-    """Draw one to three boxes, or one to so many: lift shafts and attic boxes on flat faces, chimneys on sloping ones.
+    """Draw one to three boxes, or one to so many: lift shafts on flat faces, chimneys on sloping ones.
 
     Parameters
     ----------
@@ -253,13 +253,12 @@ def random_superstructures(
     flat = [polygon for polygon, face in zip(polygons, bare.faces, strict=True) if _plane(bare, face)[:2] == (0.0, 0.0)]
     ground = max(flat, key=lambda polygon: polygon.area) if flat else shapely.union_all(polygons)
     free = shapely.buffer(ground, -_EDGE_M, join_style="mitre")
+    edges = shapely.buffer(shapely.union_all([polygon.boundary for polygon in polygons]), _ALONG_M)
     taken = [shapely.Polygon(plan_rectangle(one)) for one in besides]
     wanted = int(random.integers(1, at_most + 1))
     found: list[Addition] = []
     for _ in range(_TRIES):
-        length, width, height = (
-            random.uniform((1.5, 1.5, 0.8), (4.5, 4.0, 3.2)) if flat else random.uniform(0.5, 1.1, 3)
-        )
+        length, width, height = random.uniform(*(_ON_FLAT_ROOFS if flat else _CHIMNEY))
         u0, v0, u1, v1 = free.bounds
         length, width = min(float(length), 0.6 * (u1 - u0)), min(float(width), 0.6 * (v1 - v0))
         u, v = random.uniform((u0, v0), (u1, v1))
@@ -274,6 +273,8 @@ def random_superstructures(
         own = shapely.Polygon(plan_rectangle(one))
         if not free.contains(own) or any(shapely.dwithin(own, other, _APART_M) for other in taken):
             continue
+        if shapely.intersection(own.exterior, edges).length > _LEAST_CLEARANCE_M:
+            continue  # a side along a ridge would leave a wall without height on it
         both = envelope([*parts, *addition_parts(bare, [one])])
         if min(shapely.minimum_clearance(_polygon(both, face)) for face in both.faces) < _LEAST_CLEARANCE_M:
             continue

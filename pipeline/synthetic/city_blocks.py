@@ -6,6 +6,7 @@ Every block is made from its own random state, so it is the same in a city of an
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 
@@ -95,6 +96,7 @@ class Block:
         self.kind = self._drawn_kind()
         _MAKERS[self.kind](self)
         self._kerb()
+        self._mark_overhung()
 
     def _drawn_kind(self) -> BlockKind:
         shares = np.array(list(_SHARES.values()))
@@ -247,7 +249,7 @@ class Block:
                     dormers=0.3,
                 )
                 if self.random.random() < 0.3:
-                    self._overhanging(len(self.buildings) - 1, house)
+                    self._overhanging(house)
         self._planted(44, BLOCK_M[0] / 2 - 2.0, BLOCK_M[1] / 2 - 2.0)
 
     def hall(self) -> None:
@@ -341,7 +343,7 @@ class Block:
             wet=0.1 if flat else 0.02,
         )
 
-    def _overhanging(self, number: int, house: Building) -> None:
+    def _overhanging(self, house: Building) -> None:
         """A tree whose crown hangs over a house."""
         outline = house.footprint.exterior
         at = outline.interpolate(self._uniform(0.0, outline.length))
@@ -352,7 +354,6 @@ class Block:
         height = max(2.4 * radius, house.eave_z_m - house.floor_z_m + self._uniform(1.0, 4.0))
         if (self._distances(float(x), float(y)) > 0.35 * radius).all():
             self.trees.append(tree_at(float(x), float(y), radius, height, self.terrain))
-            self._mark(number, Defect.OVERHANGING_TREE)
 
     def _planted(self, count: int, half_length_m: float, half_width_m: float) -> None:
         """Trees and shrubs in a rectangle; the crowns of some hang over a house."""
@@ -362,22 +363,24 @@ class Block:
             height = radius * self._uniform(2.2, 3.0)
             reach = radius * (0.4 if self.random.random() < _OVERHANGING else 1.0)
             x, y = self._place(u, v)
-            away = self._distances(x, y)
-            if (away <= reach).any():
-                continue
-            self.trees.append(tree_at(x, y, radius, height, self.terrain))
-            for k in np.flatnonzero(away < radius):
-                self._mark(int(k), Defect.OVERHANGING_TREE)
+            if (self._distances(x, y) > reach).all():
+                self.trees.append(tree_at(x, y, radius, height, self.terrain))
 
     def _distances(self, x: float, y: float) -> FloatArray:
         """From a place to the outline of every building in plan; 0 inside."""
         self._outlines += [building.footprint for building in self.buildings[len(self._outlines) :]]
         return np.asarray(shapely.distance(self._outlines, shapely.Point(x, y)))
 
-    def _mark(self, number: int, defect: Defect) -> None:
-        building = self.buildings[number]
-        if defect not in building.defects:
-            self.buildings[number] = dataclasses.replace(building, defects=(*building.defects, defect))
+    def _mark_overhung(self) -> None:
+        """Mark the houses with a crown over their roof: one that rises over the eave where it crosses the outline."""
+        for tree in self.trees:
+            away = self._distances(tree.x, tree.y) / tree.crown_radius_m
+            for k in np.flatnonzero(away < 1.0).tolist():
+                house = self.buildings[k]
+                top_z_m = tree.crown_z_m + tree.crown_half_height_m * math.sqrt(1.0 - float(away[k]) ** 2)
+                if top_z_m > house.eave_z_m and Defect.OVERHANGING_TREE not in house.defects:
+                    defects = (*house.defects, Defect.OVERHANGING_TREE)
+                    self.buildings[k] = dataclasses.replace(house, defects=defects)
 
     def _kerb(self) -> None:
         """Cars and trees at the kerbs of the long sides."""

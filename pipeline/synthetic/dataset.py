@@ -27,6 +27,7 @@ from pipeline.errors import InputError, SettingsError
 from pipeline.synthetic.als import ScannerSettings, scan, strip_count
 from pipeline.synthetic.conditions import write_conditions
 from pipeline.synthetic.scene import Scene
+from pipeline.synthetic.strips import survey_extent
 from pipeline.synthetic.suites import Suite, suite_named
 from pipeline.synthetic.survey_files import TileFiles, last_returns, write_points
 from pipeline.synthetic.sweep import Cell, chosen_cells
@@ -86,7 +87,7 @@ def simulate(
     suite : str
         Name of a suite.
     out_dir : str or Path
-        Folder, made where it does not exist; files of an earlier call are replaced.
+        Folder, made where it does not exist; what an earlier call made there, of whatever suite, is replaced.
     seed : int, optional
         Of layout and scanner; the suite's own by default. The same call gives the same bytes.
     size_m : tuple of float, optional
@@ -112,11 +113,13 @@ def simulate(
     SettingsError
         Unknown suite, negative seed, or a size or survey out of range.
     InputError
-        The survey hits nothing.
+        The survey hits nothing, or the folder cannot be written or holds somebody else's truth.
     """
     plan = suite_named(suite)
     seed = plan.seed if seed is None else seed
     faults = _faults(plan, seed, size_m)
+    if "://" in str(out_dir):
+        faults.append(f"out is {out_dir}: simulate writes to a folder of this machine")
     if faults:
         raise SettingsError(faults)
     writing = _Writing(
@@ -184,7 +187,7 @@ def _simulate_one(writing: _Writing, settings: ScannerSettings, scene: Scene, ou
     rows = []
     for first in range(0, len(scene.buildings), _BUILDINGS_A_PART):
         part = f"part{first // _BUILDINGS_A_PART:05d}"
-        rows += write_models(scene.buildings[first : first + _BUILDINGS_A_PART], scene, scene.extent, truth, part)
+        rows += write_models(scene.buildings[first : first + _BUILDINGS_A_PART], scene, settings, truth, part)
     write_conditions(rows, truth / "conditions.parquet")
     write_manifest(
         scene,
@@ -203,7 +206,20 @@ def _simulate_one(writing: _Writing, settings: ScannerSettings, scene: Scene, ou
 def _emptied(out: Path, suite: str) -> Path:
     """The folder of the truth, made where it is missing, without what an earlier call left there."""
     truth = out / "truth"
-    truth.mkdir(parents=True, exist_ok=True)
+    try:
+        truth.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            str(out), f"cannot be written ({error.strerror})", "Give --out a folder of your own"
+        ) from error
+    manifest, begun = truth / "scene.json", truth / ".scene.json"
+    held = [name for name in (*_TRUTH_FILES, *_TRUTH_FOLDERS) if (truth / name).exists()]
+    if held and not (manifest.is_file() or begun.is_file()):
+        problem = f"holds {', '.join(held)} that simulate did not write"
+        raise InputError(str(truth), problem, "Give another --out, or move them away")
+    for laz in _known_tiles(manifest):
+        laz.unlink(missing_ok=True)
+    begun.touch()  # until scene.json takes its place it tells the next call that what lies here is ours
     for name in _TRUTH_FILES:
         (truth / name).unlink(missing_ok=True)
     for name in _TRUTH_FOLDERS:
@@ -212,6 +228,17 @@ def _emptied(out: Path, suite: str) -> Path:
     for laz in (out / "tiles").glob(f"{suite}_x*_y*.laz"):
         laz.unlink()
     return truth
+
+
+def _known_tiles(manifest: Path) -> list[Path]:
+    """The LAZ files of an earlier call, of whatever suite, that lie in its folder."""
+    try:
+        names = [str(tile["laz"]) for tile in json.loads(manifest.read_text(encoding="utf-8"))["tiles"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    tiles = [(manifest.parent / name).resolve() for name in names]
+    out = manifest.parent.parent.resolve()
+    return [tile for tile in tiles if tile.suffix == ".laz" and tile.parent in {out, out / "tiles"}]
 
 
 def _simulate_cells(writing: _Writing, settings: ScannerSettings, cells: tuple[Cell, ...], out: Path) -> ScenePaths:
@@ -250,7 +277,6 @@ def _simulate_tiles(writing: _Writing, settings: ScannerSettings, out: Path) -> 
     tiles_dir, labels_dir = out / "tiles", truth / "labels"
     for folder in (tiles_dir, labels_dir):
         folder.mkdir(parents=True, exist_ok=True)
-    whole: Extent = (0.0, 0.0, *size)
     part_of = plan.part(writing.seed, size, settings)
     writing = dataclasses.replace(writing, chunk_points=min(writing.chunk_points, _TILED_CHUNK_POINTS))
     tiles: list[TileFiles] = []
@@ -263,7 +289,7 @@ def _simulate_tiles(writing: _Writing, settings: ScannerSettings, out: Path) -> 
             scene = ahead.result()
             if number + 1 < len(todo):
                 ahead = aside.submit(part_of, todo[number + 1][1])
-            truths.append(aside.submit(_tile_truth, scene, extent, whole, truth, key))
+            truths.append(aside.submit(_tile_truth, scene, settings, extent, truth, key))
             laz, labels = tiles_dir / f"{plan.name}_{key}.laz", labels_dir / f"{key}.parquet"
             made = writing.tile(scene, settings, laz, labels, points)
             points += made.points
@@ -302,12 +328,13 @@ class _TileTruth:
     cars: int
 
 
-def _tile_truth(scene: Scene, extent: Extent, whole: Extent, truth: Path, key: str) -> _TileTruth:
+def _tile_truth(scene: Scene, settings: ScannerSettings, extent: Extent, truth: Path, key: str) -> _TileTruth:
     """Write the models that a tile owns."""
+    whole = survey_extent(scene)
     owned = [building for building in scene.buildings if _owns(extent, whole, building.x, building.y)]
     middles = [box.corners.mean(axis=0) for box in scene.boxes]
     return _TileTruth(
-        rows=write_models(owned, scene, whole, truth, key),
+        rows=write_models(owned, scene, settings, truth, key),
         trees=sum(_owns(extent, whole, tree.x, tree.y) for tree in scene.trees),
         cars=sum(_owns(extent, whole, float(middle[0]), float(middle[1])) for middle in middles),
     )

@@ -305,7 +305,8 @@ def _overhanging(
 ) -> Tree:
     """A tree beside a wall, higher than the eave, with a third to two thirds of its crown's radius over the roof.
 
-    It is made smaller until it is clear of the neighbours; the last one is, whatever their distance.
+    It is made smaller until its trunk is outside (away from the middle of an L can be into its wing) and it is clear of
+    the neighbours; the last one is, whatever their distance.
     """
     height = building.eave_z_m - building.floor_z_m + float(random.uniform(2.0, 5.0))
     for left in range(_TREE_TRIES, -1, -1):
@@ -316,6 +317,7 @@ def _overhanging(
         radius = 1.8 + share * float(random.uniform(0.0, 2.2))
         x, y = np.array([line.x, line.y]) + away * radius * (0.35 + share * float(random.uniform(0.0, 0.3)))
         crown = radius + _FREE_GROUND_M[0]
-        if len(index.query(shapely.Point(x, y), predicate="dwithin", distance=crown)) <= 1:
+        place = shapely.Point(x, y)
+        if footprint.distance(place) > 0.0 and len(index.query(place, predicate="dwithin", distance=crown)) <= 1:
             break
     return tree_at(float(x), float(y), radius, max(height, 2.4 * radius), terrain)

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from pipeline.model import BoolArray, FloatArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.synthetic.beam import FlightLine
 from pipeline.synthetic.scene import Scene, Terrain
@@ -142,6 +143,24 @@ def flight_lines(scene: Scene, settings: ScannerSettings, seed: int) -> list[Fli
         )
         time += (end - start) / settings.speed_m_s + _TURN_S
     return lines
+
+
+def reached(places: FloatArray, scene: Scene, settings: ScannerSettings) -> BoolArray:
+    """Which places (n, 3) of the scene frame some strip can hit: n flags.
+
+    Pulses aim at the terrain's base elevation. On ground that lies higher they land nearer to the flight line, so there
+    the points end inside of the extent.
+    """
+    x0, y0, x1, y1 = survey_extent(scene)
+    x, y, z = places.T
+    found = np.zeros(len(places), np.bool_)
+    for line in flight_lines(scene, settings, 0):
+        across = (x - line.x) * line.along_y - (y - line.y) * line.along_x
+        aim = across / (1.0 - (z - scene.terrain.base_z_m) / settings.altitude_m)
+        aim_x, aim_y = x + (aim - across) * line.along_y, y - (aim - across) * line.along_x
+        in_extent = (aim_x >= x0) & (aim_y >= y0) & (aim_x <= x1) & (aim_y <= y1)
+        found |= in_extent & (np.abs(aim) <= settings.half_swath_m)
+    return found
 
 
 def lines_over(flight: FlightLine, scene: Scene, settings: ScannerSettings) -> range:

@@ -24,7 +24,7 @@ from pipeline.synthetic.conditions import condition_row
 from pipeline.synthetic.scene import Building, Scene
 from pipeline.synthetic.seeds import split_of
 from pipeline.synthetic.solids import truth_record
-from pipeline.synthetic.strips import ScannerSettings, flight_lines
+from pipeline.synthetic.strips import ScannerSettings, flight_lines, reached
 from pipeline.synthetic.survey_files import TileFiles, spatial_reference
 
 
@@ -107,7 +107,7 @@ def _numbers(names: pa.DictionaryArray, ids: Sequence[str]) -> LabelArray:
 def write_models(
     buildings: Sequence[Building],
     scene: Scene,
-    extent: tuple[float, float, float, float],
+    settings: ScannerSettings,
     truth: Path,
     part: str,
 ) -> list[dict[str, Any]]:
@@ -119,8 +119,8 @@ def write_models(
         What goes into the part.
     scene : Scene
         Their frame and terrain.
-    extent : tuple of float
-        End of the data, scene frame: smallest x, smallest y, largest x, largest y.
+    settings : ScannerSettings
+        The survey: with the extent it says where the data end.
     truth : Path
         The run directory.
     part : str
@@ -134,8 +134,7 @@ def write_models(
     context = RecordContext(
         reference=spatial_reference(scene), settings_hash="truth", engine_version=pipeline.__version__
     )
-    data = shapely.box(*extent)
-    cut = [not data.contains(building.footprint) for building in buildings]
+    cut = _cut_by_the_end_of_the_data(buildings, scene, settings)
     records = [
         truth_record(building, scene.origin, touches_data_edge=at_edge)
         for building, at_edge in zip(buildings, cut, strict=True)
@@ -145,6 +144,17 @@ def write_models(
         condition_row(building, scene.terrain, touches_data_edge=at_edge)
         for building, at_edge in zip(buildings, cut, strict=True)
     ]
+
+
+def _cut_by_the_end_of_the_data(buildings: Sequence[Building], scene: Scene, settings: ScannerSettings) -> list[bool]:
+    """Which buildings reach out of the extent; in a survey of tiles, on ground that may lie high, out of the strips."""
+    data = shapely.box(*(scene.survey_extent or scene.extent))
+    cut = [not data.contains(building.footprint) for building in buildings]
+    if scene.survey_extent is None or not buildings:
+        return cut
+    ends = np.cumsum([len(building.vertices) for building in buildings])[:-1]
+    seen = np.split(reached(np.concatenate([building.vertices for building in buildings]), scene, settings), ends)
+    return [outside or not bool(flags.all()) for outside, flags in zip(cut, seen, strict=True)]
 
 
 def write_manifest(

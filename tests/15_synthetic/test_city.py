@@ -14,6 +14,7 @@ import laspy
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import shapely
 
 from pipeline.evaluation.reading import read_models
 from pipeline.model import FloatArray
@@ -22,8 +23,10 @@ from pipeline.synthetic.als import ScanBlock, scan_all
 from pipeline.synthetic.city import CITY_SCANNER, CityPlan, city
 from pipeline.synthetic.conditions import terrain_slope_deg
 from pipeline.synthetic.dataset import ScenePaths, read_truth, simulate, tile_extents
-from pipeline.synthetic.scene import Scene
+from pipeline.synthetic.scene import Defect, Scene
+from pipeline.synthetic.strips import reached
 from pipeline.synthetic.suites import SUITES
+from pipeline.synthetic.truth_files import write_models
 
 SIZE = (300.0, 220.0)
 SPARSE = dataclasses.replace(CITY_SCANNER, pulse_density_per_m2=1.0)
@@ -134,6 +137,44 @@ def test_what_a_tile_sees_does_not_depend_on_what_was_seen_before() -> None:
     one, two = fresh.part(extent), used.part(extent)
     assert [a.building_id for a in one.buildings] == [b.building_id for b in two.buildings]
     assert one.trees == two.trees
+
+
+def test_a_house_counts_as_overhung_only_where_a_crown_is_over_its_eave(whole: Scene) -> None:
+    """A shrub beside a wall covers no roof, however near it stands."""
+    index = shapely.STRtree([one.footprint for one in whole.buildings])
+    beside: set[int] = set()
+    over: set[int] = set()
+    for tree in whole.trees:
+        place = shapely.Point(tree.x, tree.y)
+        for k in index.query(place, predicate="dwithin", distance=tree.crown_radius_m).tolist():
+            share = whole.buildings[k].footprint.distance(place) / tree.crown_radius_m
+            top_z_m = tree.crown_z_m + tree.crown_half_height_m * np.sqrt(1.0 - share**2)
+            (over if top_z_m > whole.buildings[k].eave_z_m else beside).add(k)
+    inside = {k for k, one in enumerate(whole.buildings) if one.vertices[:, :2].min() > 20.0}
+    inside &= {
+        k for k, one in enumerate(whole.buildings) if (one.vertices[:, :2].max(axis=0) < np.array(SIZE) - 20.0).all()
+    }
+    marked = {k for k, one in enumerate(whole.buildings) if Defect.OVERHANGING_TREE in one.defects}
+    assert marked & inside == over & inside
+    assert len(marked & inside) > 3
+    assert (beside - over) & inside
+
+
+def test_buildings_behind_the_last_beam_on_high_ground_touch_the_edge_of_the_data(tmp_path: Path) -> None:
+    """The plateau lies 150 m over the base that pulses aim at: points end up to 20 m before the extent does."""
+    plan = CityPlan(1_000, (2_000.0, 790.0))
+    scene = plan.part((1_500.0, 0.0, 1_850.0, 100.0))
+    xyz = scan_all(scene, CITY_SCANNER, 1_000).points.xyz[:, :2] - np.array(scene.origin[:2])
+    points = shapely.STRtree(shapely.points(xyz))
+    rows = write_models(scene.buildings, scene, CITY_SCANNER, tmp_path, "part")
+    is_cut = {one.building_id: row["touches_data_edge"] for one, row in zip(scene.buildings, rows, strict=True)}
+    inside = [one for one in scene.buildings if shapely.box(1_530.0, 0.0, 1_820.0, 60.0).contains(one.footprint)]
+    known = [is_cut[one.building_id] for one in inside]
+    densities = [len(points.query(one.footprint, predicate="contains")) / one.footprint.area for one in inside]
+    assert known == [not reached(one.vertices, scene, CITY_SCANNER).all() for one in inside]
+    assert min(density for density, cut in zip(densities, known, strict=True) if not cut) > 5.0
+    assert min(densities) == 0.0
+    assert 3 < sum(known) < len(known)
 
 
 @pytest.mark.slow

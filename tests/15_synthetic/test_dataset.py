@@ -174,6 +174,45 @@ def test_unknown_suites_and_impossible_sizes_are_refused(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == []
 
 
+def test_another_suite_in_the_same_folder_leaves_no_points_of_the_first(tmp_path: Path) -> None:
+    simulate("cube", tmp_path)
+    (tmp_path / "survey.laz").write_bytes(b"of somebody else")
+    simulate("city", tmp_path, 7, size_m=(50.0, 50.0), density_per_m2=1.0)
+    simulate("gable", tmp_path, density_per_m2=1.0)
+    assert sorted(path.name for path in tmp_path.rglob("*.laz")) == ["gable.laz", "survey.laz"]
+
+
+def test_a_truth_that_simulate_did_not_write_is_left_alone(tmp_path: Path) -> None:
+    theirs = tmp_path / "truth" / "buildings" / "surveyed.gpkg"
+    theirs.parent.mkdir(parents=True)
+    theirs.write_text("by hand")
+    with pytest.raises(InputError, match=r"holds buildings that simulate did not write.*Give another --out"):
+        simulate("cube", tmp_path)
+    assert theirs.read_text() == "by hand"
+    assert not (tmp_path / "cube.laz").exists()
+
+
+def test_a_call_that_was_interrupted_can_be_made_again(tmp_path: Path) -> None:
+    def stop(points: int) -> None:
+        raise KeyboardInterrupt
+
+    simulate("cube", tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        simulate("cube", tmp_path, on_points=stop)
+    assert not (tmp_path / "truth" / "scene.json").exists()
+    (tmp_path / "truth" / "labels").mkdir()  # of tiles that were written before it stopped
+    assert simulate("cube", tmp_path).points > 0
+    assert not (tmp_path / "truth" / ".scene.json").exists()
+
+
+def test_a_folder_that_cannot_be_one_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"file: cannot be written \(Not a directory\)"):
+        simulate("cube", tmp_path / "file")
+    with pytest.raises(SettingsError, match=r"out is s3://bucket/scene: simulate writes to a folder of this machine"):
+        simulate("cube", "s3://bucket/scene")
+
+
 def test_missing_truth_is_an_error_that_names_the_fix(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no readable truth.*gablework simulate"):
         read_truth(tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import cast
 
 import numpy as np
 import pytest
@@ -418,6 +419,31 @@ def test_the_same_seed_draws_the_same_and_too_small_areas_are_refused() -> None:
     for shape in (RoofShape.GABLE, RoofShape.U_SHAPE):
         with pytest.raises(ValueError, match="area_m2 is 15: too small"):
             random_dimensions(shape, np.random.default_rng(0), area_m2=15.0)
+
+
+class Drawn:
+    """Draws what it was given, place by place."""
+
+    def __init__(self, *draws: tuple[float, ...]) -> None:
+        self.draws = list(draws)
+
+    def integers(self, low: int, high: int) -> int:
+        del high
+        return low
+
+    def uniform(self, low: object, high: object) -> FloatArray:
+        del low, high
+        return np.array(self.draws.pop(0))
+
+
+def test_no_drawn_box_has_a_side_along_a_ridge() -> None:
+    """Rounding to millimetres would leave a wall without height on the ridge (val3dity's 204)."""
+    size = RoofDimensions(length_m=14.0, width_m=9.0, pitch_deg=40.0)
+    along, across = (1.0, 0.3), (2.0, 0.1)  # middles of boxes that are 0.6 m wide; the ridge is at 0
+    random = Drawn((0.8, 0.6, 0.7), along, (0.8, 0.6, 0.7), across)
+    (box,) = random_superstructures(RoofShape.GABLE, size, cast("np.random.Generator", random))
+    assert (box.u_m, box.v_m) == across
+    assert random.draws == []
 
 
 @pytest.mark.parametrize("shape", SHAPES)

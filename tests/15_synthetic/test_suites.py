@@ -94,6 +94,13 @@ def test_no_trunk_stands_in_a_building_and_no_eave_below_the_ground(name: str) -
         assert building.eave_z_m > float(ground.max()) + 1.5
 
 
+def test_no_trunk_stands_in_the_wing_of_an_l() -> None:
+    scene = scene_of("hofmann310", 1_007)  # away from the middle of its building 286 lies that building's own wing
+    index = shapely.STRtree([one.footprint for one in scene.buildings])
+    places = [shapely.Point(tree.x, tree.y) for tree in scene.trees]
+    assert index.query(places, predicate="intersects").size == 0
+
+
 def test_the_command_takes_a_split_and_a_draw_and_writes_them_down(tmp_path: Path) -> None:
     done = CliRunner().invoke(
         app, ["simulate", "gable", "--out", str(tmp_path), "--split", "test", "--draw", "2", "--density", "1", "--json"]

@@ -63,8 +63,34 @@ def test_a_model_where_no_building_is_is_false_where_the_reference_is_complete()
     assert figures["lod2"] == 1.0
     assert stands([*TRUTH, tree], reference(TRUTH, extent=None))[4] is Stands.LEFT_OUT
     assert told([*TRUTH, tree], reference(TRUTH, extent=None))["correctness"] == 1.0
-    at_edge = dataclasses.replace(tree, touches_data_edge=True)
-    assert stands([*TRUTH, at_edge], truth)[4] is Stands.LEFT_OUT
+    at_edge = flat("at the edge", -99.0, touches_data_edge=True)  # the extent begins at -100
+    assert stands([at_edge, *TRUTH], truth)[0] is Stands.LEFT_OUT
+
+
+def test_no_model_is_excused_by_what_it_says_of_itself() -> None:
+    truth = reference(TRUTH)
+    tree = flat("tree", 200.0, touches_data_edge=True)
+    half = flat("half", 0.0, width=5.0, depth=4.0, touches_data_edge=True)
+    assert stands([tree, half], truth) == [Stands.FALSE, Stands.PART]
+    unclaimed = flat("at the edge", -99.0)
+    assert stands([unclaimed], truth) == [Stands.FALSE]
+
+
+def test_one_model_over_everything_is_false_and_joins_all_buildings() -> None:
+    truth = reference(TRUTH)
+    for name, grown in (("inside", -1.0), ("beyond", 2_000.0)):
+        footprint = by_hand.EXTENT.buffer(grown)
+        giant = dataclasses.replace(flat(name), footprint=footprint)
+        assert stands([giant], truth) == [Stands.FALSE]
+        figures = told([giant], truth)
+        assert (figures["correctness"], figures["false_models"], figures["joined"]) == (0.0, 1, 1.0)
+        assert stands([giant], reference(TRUTH, extent=None)) == [Stands.LEFT_OUT]
+
+
+def test_a_building_in_parts_of_which_none_stands_for_it_is_split() -> None:
+    thirds = [flat(str(x), 40.0 + 10.0 * x / 3.0, width=10.0 / 3.0) for x in range(3)]
+    figures = told(thirds, reference([flat("c", 40.0)]))
+    assert (figures["split"], figures["nothing"], figures["part_models"]) == (1.0, 1.0, 3)
 
 
 def test_parts_of_a_building_are_no_false_models() -> None:

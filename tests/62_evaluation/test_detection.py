@@ -316,11 +316,32 @@ def test_objects_at_the_edge_of_the_data_are_left_out_on_both_sides() -> None:
     made = [
         *truth[:2],
         model("of the cut one", shapely.box(981, 2050, 990, 2060)),
-        model("x", shapely.box(1200, 2000, 1210, 2010), edge=True),
+        model("x", shapely.box(1289, 2000, 1299, 2010), edge=True),
     ]
     measured = figures(detect(made, reference), reference)
     assert (measured["object_completeness"].value, measured["object_completeness"].n) == (1.0, 2)
     assert (measured["object_correctness"].value, measured["object_correctness"].n) == (1.0, 2)
+
+
+def test_no_model_is_excused_by_what_it_says_of_itself_or_by_its_size() -> None:
+    reference = truth_of(squares(2), EXTENT)
+    made = [
+        *squares(2),
+        model("y", shapely.box(1200, 2000, 1210, 2010), edge=True),
+        model("z", EXTENT.buffer(1_000.0)),
+    ]
+    measured = figures(detect(made, reference), reference)
+    assert (measured["object_correctness"].value, measured["object_correctness"].n) == (0.5, 4)
+
+
+def test_cells_beyond_what_is_known_cost_nothing() -> None:
+    reference = truth_of(squares(2), EXTENT)
+    stray = model("stray", shapely.box(0, 0, 4e7, 4e7))  # as with a vertex at (0, 0): billions of cells
+    measured = figures(detect([stray], reference), reference)
+    assert measured["area_completeness"].value == 1.0
+    assert measured["area_correctness"].n == round(EXTENT.area / 0.25)
+    far = model("far", shapely.box(1e7, 1e7, 1e7 + 10, 1e7 + 10))
+    assert figures(detect([far], reference), reference)["area_completeness"].value == 0.0
 
 
 def test_a_footprint_that_crosses_itself_counts_with_the_area_that_it_encloses() -> None:

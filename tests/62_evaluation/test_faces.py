@@ -282,7 +282,7 @@ def test_faces_with_too_few_points_need_not_be_found() -> None:
 def test_what_the_data_edge_cuts_is_neither_found_nor_wrong() -> None:
     cut = flat("cut", 20.0, touches_data_edge=True)
     known = reference([TRUTH[0], cut])
-    beyond, other = flat("beyond", 300.0, touches_data_edge=True), with_face(cut, 0, lifted(cut.surfaces[0], 2.0))
+    beyond, other = flat("beyond", -99.0, touches_data_edge=True), with_face(cut, 0, lifted(cut.surfaces[0], 2.0))
     for models in (
         [TRUTH[0]],
         [TRUTH[0], beyond],
@@ -296,6 +296,26 @@ def test_what_the_data_edge_cuts_is_neither_found_nor_wrong() -> None:
         assert told["faces.completeness_all"].n == told["faces.topology_1_1"].value == 2
     uncut = reference([TRUTH[0], dataclasses.replace(cut, touches_data_edge=False)])
     assert figures(score_faces([TRUTH[0], cut], uncut), uncut)["completeness_10m2"] == 1.0  # a cut model may find
+
+
+def test_faces_of_models_that_call_themselves_cut_are_wrong_all_the_same() -> None:
+    known = reference(TRUTH)
+    lifted_all = [dataclasses.replace(one, surfaces=tuple(lifted(face, 2.0) for face in one.surfaces)) for one in TRUTH]
+    tree = flat("tree", 200.0)
+    plain = score_faces([*lifted_all, tree], known)
+    claimed = score_faces([dataclasses.replace(one, touches_data_edge=True) for one in (*lifted_all, tree)], known)
+    assert [row.verdict for row in claimed.models] == [row.verdict for row in plain.models]
+    assert figures(claimed, known)["correctness_10m2"] == 0.0
+
+
+def test_a_face_over_everything_is_wrong_however_far_it_goes_beyond_the_extent() -> None:
+    known = reference(TRUTH)
+    lid = flat("lid")
+    lid = dataclasses.replace(
+        lid, surfaces=(dataclasses.replace(lid.surfaces[0], polygon=by_hand.EXTENT.buffer(2_000.0)),)
+    )
+    score = score_faces([*TRUTH, lid], known)
+    assert score.models[-1].verdict is FaceVerdict.WRONG
 
 
 def test_a_face_elsewhere_is_wrong_only_where_the_reference_is_complete() -> None:

@@ -20,6 +20,7 @@ from pipeline.evaluation.residuals import (
     BuildingResiduals,
     building_residuals,
     residual_measures,
+    top_surface_of,
 )
 from pipeline.evaluation.subsets import subsets
 from pipeline.model import FloatArray, LabelArray, RoofType
@@ -311,3 +312,30 @@ def test_every_figure_has_its_definition() -> None:
     reference = reference_of(truth, [tile(xyz, zeros(len(xyz)))])
     names = [m.name for m in residual_measures(building_residuals(truth, reference), subsets(reference)[0])]
     assert sorted(names) == sorted(definition.name for definition in DEFINITIONS)
+
+
+def test_a_model_at_a_wrong_place_in_the_world_changes_no_residual_and_no_index() -> None:
+    true = [house("a", 0.0, 0.0), house("b", 30.0, 0.0)]
+    near = top_surface_of(true, near=true)
+    astray = dataclasses.replace(house("far", 1e7, 1e7), building_id="far")
+    lid = RoofSurface(polygon=shapely.box(-1e6, -1e6, 1e6, 1e6), coefficients=(0.0, 0.0, 3.0))
+    wide = dataclasses.replace(house("wide", 0.0, 0.0), surfaces=(lid,))
+    x, y = np.meshgrid(np.arange(-9.7, 49.0, 0.5), np.arange(-9.7, 17.0, 0.5))
+    both = top_surface_of([*true, astray, wide], near=true)
+    told = near.elevation(x.ravel(), y.ravel())
+    assert both.elevation(x.ravel(), y.ravel()) == pytest.approx(np.where(np.isnan(told), 3.0, told))
+    assert np.isnan(top_surface_of([astray], near=true).elevation(np.array([5.0]), np.array([4.0]))).all()
+
+
+def test_the_median_of_the_buildings_lies_in_its_interval() -> None:
+    true = [house(str(k), 30.0 * k, 0.0) for k in range(40)]
+    xyz, building = [], []
+    for k, one in enumerate(true):
+        x, y = np.array([2.0, 5.0, 8.0]) + 30.0 * k, np.array([1.0, 2.0, 3.0])
+        xyz.append(np.column_stack((x, y, one.top(x, y) + 0.0652)))
+        building += [k] * 3
+    points = tile(np.concatenate(xyz), np.array(building, np.int32))
+    reference = reference_of(true, [points])
+    found = residual_measures(building_residuals(true, reference), subsets(reference)[0])
+    rmse = next(one for one in found if one.name == "residuals.building_rmse")
+    assert (rmse.low, rmse.value, rmse.high) == pytest.approx((0.0652, 0.0652, 0.0652))
