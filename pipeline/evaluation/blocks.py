@@ -7,6 +7,7 @@ names the block of every building as its source_id.
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -97,7 +98,7 @@ def _with_common_groups(surfaces: Sequence[RoofSurface]) -> list[RoofSurface]:
             low, high = sorted((root(one), root(other)))
             parent[high] = low
     roots = [root(k) for k in range(len(surfaces))]
-    shared = {k for k in roots if roots.count(k) > 1}
+    shared = {k for k, count in Counter(roots).items() if count > 1}
     return [
         dataclasses.replace(surface, group=surfaces[k].plane_id) if k in shared else surface
         for surface, k in zip(surfaces, roots, strict=True)

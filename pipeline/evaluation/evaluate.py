@@ -172,7 +172,8 @@ def _buildings(
 def _notes(models: ModelSet, reference: Reference) -> tuple[str, ...]:
     found = []
     codes = [crs for crs in (models.crs, reference.crs) if crs is not None and crs.startswith("EPSG:")]
-    if len(set(codes)) > 1:  # a name and a code may well mean the same
+    # a name and a code may well mean the same; of a compound code the first part is the horizontal one
+    if len({code.split("+")[0] for code in codes}) > 1:
         found.append(
             f"The models are in {codes[0]}, the reference in {codes[1]}: coordinates were compared as they are."
         )

@@ -29,7 +29,7 @@ from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
 MIN_BUILDING_POINTS = 11
 """A given footprint with fewer points of class 6 is no reference building: nothing was measured of it."""
 MIN_OUTLINE_M2 = 10.0
-"""Smaller outlines of the raster are told."""
+"""Smaller outlines of the raster are specks, not buildings: they need not be found, but their points count."""
 _SEAM_M = 1.0
 """Gap between the bounds of adjacent tiles that is no edge of the data."""
 
@@ -105,7 +105,8 @@ def read_points_reference(
         if areas:
             notes.append(
                 f"Reference buildings are the {len(areas)} outlines of class {BUILDING_CLASS} on the raster: houses "
-                f"that touch are one; {small} of them are smaller than {MIN_OUTLINE_M2:g} m2"
+                f"that touch are one; {small} of them are smaller than {MIN_OUTLINE_M2:g} m2 and need not be found, as "
+                "those that the end of the data cuts"
             )
     _check_classes(sources, classes)
     if not classes[BUILDING_CLASS]:
@@ -123,7 +124,7 @@ def read_points_reference(
             footprint=area,
             roof_type=RoofType.UNKNOWN,
             surfaces=(),
-            touches_data_edge=not whole.contains(area),
+            touches_data_edge=not whole.contains(area) or (footprints is None and area.area < MIN_OUTLINE_M2),
             source_id=name if footprints is not None else None,
             lod="",
         )

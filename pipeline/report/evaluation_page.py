@@ -35,7 +35,7 @@ HEADLINE = (
     ("roof_types.correct",),
     ("footprints.iou_median",),
     ("detection.area_quality_without_ring", "detection.area_completeness_without_ring"),
-    ("residuals.coverage_top_visible",),
+    ("residuals.rmse_top_visible",),
     ("residuals.median_top_visible",),
     ("delivery.records_fallback",),
     ("delivery.records_failed",),

@@ -133,3 +133,15 @@ def test_what_cannot_be_read_is_told_with_what_can(tmp_path: Path) -> None:
 def test_a_path_may_be_given_as_text(tmp_path: Path) -> None:
     run = files.write_run(tmp_path / "run", [small.gable()])
     assert read_models(str(run)).path == str(run)
+
+
+@pytest.mark.parametrize("coefficients", [[0.0, 1.0, 0.0, 2.0], [0.0, float("nan"), 1.0, 2.0]])
+def test_a_plane_that_does_not_look_up_is_named(tmp_path: Path, coefficients: list[float]) -> None:
+    run = files.write_run(tmp_path / "run", files.village())
+    part = next((run / "planes").glob("*/*.parquet"))
+    table = pq.read_table(part, partitioning=None)
+    column = table.schema.get_field_index("coefficients")
+    values = [coefficients, *table["coefficients"].to_pylist()[1:]]
+    pq.write_table(table.set_column(column, table.field(column), pa.array(values, table.field(column).type)), part)
+    with pytest.raises(RunError, match=rf"plane \d+ of {table['building_id'][0].as_py()} has the coefficients"):
+        read_models(run)

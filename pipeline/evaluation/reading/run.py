@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.errors import UnreadableInputError
+from pipeline.errors import RunError, UnreadableInputError
 from pipeline.evaluation.models import ModelSet, RoofModel, RoofSurface
 from pipeline.evaluation.reading.cityjson import features
 from pipeline.evaluation.reading.cityjson_geometry import parts_of
@@ -123,6 +123,11 @@ def _surfaces(path: Path, units_m: tuple[float, float]) -> dict[str, list[RoofSu
         if not row["geometry"]:
             continue
         normal_x, normal_y, normal_z, offset = row["coefficients"]
+        if not (math.isfinite(sum(row["coefficients"])) and normal_z > 0.0):
+            raise RunError(
+                f"{path}: plane {row['plane_id']} of {row['building_id']} has the coefficients {row['coefficients']}: "
+                "a roof plane looks up. Write the run again"
+            )
         geometry = _in_metres(row["geometry"], units_m)
         pieces = shapely.get_parts(geometry)
         if len(pieces) > 1:
