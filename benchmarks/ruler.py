@@ -128,6 +128,12 @@ def real_tiles(data: Path) -> Iterator[Entry]:
     yield Entry(name="autzen_trim", tiles=(data / "oregon" / "autzen_trim.las",), run_options=("--classes", "ignore"))
 
 
+def is_finished(run_dir: Path) -> bool:
+    """Whether a run is there, whole."""
+    manifest = run_dir / "run.json"
+    return manifest.exists() and json.loads(manifest.read_text(encoding="utf-8"))["status"] == "finished"
+
+
 def measured(entry: Entry, out: Path) -> list[dict[str, Any]]:
     """Reconstruct and evaluate one entry; its measures."""
     folder = out / entry.name
@@ -142,7 +148,8 @@ def measured(entry: Entry, out: Path) -> list[dict[str, Any]]:
                 gablework("simulate", *entry.simulate, "--out", target)
             tiles = sorted(str(path) for path in [*entry.scene.glob("*.laz"), *entry.scene.glob("tiles/*.laz")])
             reference = ("--truth", str(entry.scene / "truth"), "--as-surveyed")
-        gablework("reconstruct", *tiles, "--out", folder / "run", "--overwrite", *entry.run_options)
+        if not is_finished(folder / "run"):
+            gablework("reconstruct", *tiles, "--out", folder / "run", "--overwrite", *entry.run_options)
         gablework("evaluate", folder / "run", *reference, "--out", folder / "report")
         print(f"{entry.name}: {time.perf_counter() - started:.0f} s", flush=True)
     rows: list[dict[str, Any]] = pq.read_table(table).to_pylist()
