@@ -176,6 +176,8 @@ def score_faces(models: Sequence[RoofModel], reference: Reference) -> FaceScore:
     building, left_out = _judged(models, reference, match, unit_building, unit_cut, cut)
     made_large = match.made.area_m2 >= MIN_FACE_AREA_M2 - _ROUNDING
     unit_of = match.matched_unit
+    # pieces of a bent face may be small: with the large unit that they match they count
+    matched_large = np.append(large, False)[unit_of]
     components, unit_topology, made_topology = face_components(
         TopologyInput(
             unit=match.unit[match.pairs.overlaps.first],
@@ -184,7 +186,7 @@ def score_faces(models: Sequence[RoofModel], reference: Reference) -> FaceScore:
             unit_m2=summed(match.unit, match.true.plan_m2, units),
             face_m2=match.made.plan_m2,
             unit_counts=large & ~unit_cut,
-            face_counts=made_large & ~left_out,
+            face_counts=(made_large | matched_large) & ~left_out,
             unit_building=unit_building,
             face_building=building,
             face_model=match.made.owner,
