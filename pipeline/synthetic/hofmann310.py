@@ -264,8 +264,10 @@ def _faults(building: Building, plot: Plot, random: np.random.Generator) -> list
         found.append(fault)
     if Defect.WRONG_ROWS in building.defects:
         up = float(random.uniform(0.5, 1.5)) * (1.0 if random.random() < 0.5 else -1.0)
-        share = float(random.uniform(0.08, 0.2))
-        found.append(SurveyFault(extent=plot.extent, kind=FaultKind.WRONG_ROWS, shift=(0.0, 0.0, up), share=share))
+        # One row or two through the middle of the building: rows that are drawn by chance may miss a small house.
+        half = SCANNER.pulse_spacing_m * (0.5 if random.random() < 0.5 else 1.0)
+        extent = (plot.extent[0], building.y - half, plot.extent[2], building.y + half)
+        found.append(SurveyFault(extent=extent, kind=FaultKind.WRONG_ROWS, shift=(0.0, 0.0, up), share=1.0))
     return found
 
 
