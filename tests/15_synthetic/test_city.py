@@ -112,6 +112,7 @@ def test_the_same_call_gives_the_same_bytes(tmp_path: Path) -> None:
     assert digests[0] == digests[1]
 
 
+@pytest.mark.slow
 def test_a_smaller_city_in_the_same_folder_leaves_nothing_of_the_larger_one(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(suites.SUITES, "city", dataclasses.replace(SUITES["city"], tile_m=50.0))
@@ -122,6 +123,7 @@ def test_a_smaller_city_in_the_same_folder_leaves_nothing_of_the_larger_one(tmp_
     assert len(read_truth(again.truth).classification) == again.points
 
 
+@pytest.mark.slow
 def test_a_larger_city_holds_the_smaller_one_unchanged(whole: Scene) -> None:
     larger = city(1_005, size_m=(SIZE[0] + 60.0, SIZE[1] + 30.0))
     known = {one.building_id: one for one in larger.buildings}
@@ -130,6 +132,7 @@ def test_a_larger_city_holds_the_smaller_one_unchanged(whole: Scene) -> None:
     assert set(whole.trees) < set(larger.trees)
 
 
+@pytest.mark.slow
 def test_what_a_tile_sees_does_not_depend_on_what_was_seen_before() -> None:
     fresh, used = CityPlan(3, (400.0, 400.0)), CityPlan(3, (400.0, 400.0))
     used.part((0.0, 0.0, 150.0, 120.0))
@@ -160,6 +163,7 @@ def test_a_house_counts_as_overhung_only_where_a_crown_is_over_its_eave(whole: S
     assert (beside - over) & inside
 
 
+@pytest.mark.slow
 def test_buildings_behind_the_last_beam_on_high_ground_touch_the_edge_of_the_data(tmp_path: Path) -> None:
     """The plateau lies 150 m over the base that pulses aim at: points end up to 20 m before the extent does."""
     plan = CityPlan(1_000, (2_000.0, 790.0))

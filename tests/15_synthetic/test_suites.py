@@ -94,6 +94,7 @@ def test_no_trunk_stands_in_a_building_and_no_eave_below_the_ground(name: str) -
         assert building.eave_z_m > float(ground.max()) + 1.5
 
 
+@pytest.mark.slow
 def test_no_trunk_stands_in_the_wing_of_an_l() -> None:
     scene = scene_of("hofmann310", 1_007)  # away from the middle of its building 286 lies that building's own wing
     index = shapely.STRtree([one.footprint for one in scene.buildings])

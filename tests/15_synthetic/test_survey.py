@@ -93,7 +93,9 @@ def rows(block: ScanBlock, scene: Scene) -> list[tuple[object, ...]]:
     )
 
 
-@pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 37.0, 251.0])
+@pytest.mark.parametrize(
+    "azimuth_deg", [37.0, 251.0, *(pytest.param(along, marks=pytest.mark.slow) for along in (0.0, 90.0))]
+)
 def test_the_tiles_of_a_survey_give_together_the_returns_of_the_whole(azimuth_deg: float) -> None:
     fault = SurveyFault(extent=(60, 40, 130, 90), kind=FaultKind.STRIP_SHIFT, shift=(0.4, 0.2, -0.1), azimuth_deg=20.0)
     row_fault = SurveyFault(extent=(100, 70, 190, 140), kind=FaultKind.WRONG_ROWS, shift=(0, 0, 0.9), share=0.2)

@@ -197,6 +197,7 @@ def test_colours_of_a_map_cover_the_area_of_their_buildings() -> None:
     assert good / metre_px**2 == pytest.approx(areas["correct"], rel=0.06)
 
 
+@pytest.mark.slow
 def test_one_false_building_is_seen_on_the_map_of_a_whole_city() -> None:
     pattern = true_models()[0]
     corners = [(20.0 * (k % 100), 20.0 * (k // 100)) for k in range(10_000)]
