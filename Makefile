@@ -5,7 +5,7 @@
 #   make slow      the slow tests: minutes, real processes, real data
 #   make viewer    build the web page (types, unit tests, bundle); brings its own Node
 #   make serve     the service on this machine, web page and all
-#   make ruler     every suite and real tile, reconstructed and measured: all tables of docs/results/ (an hour)
+#   make ruler     every suite and real tile, reconstructed and measured: all tables of docs/results/ (half an hour)
 #   make lock      resolve the dependencies anew (the locks name versions and hashes, no hosts)
 #   make docs      write docs/reference/ from the code
 #   make format    format the sources

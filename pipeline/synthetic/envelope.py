@@ -40,20 +40,6 @@ class RoofPart:
     labels: tuple[str, ...]
     """What each plane counts to: faces of one label are one group, and where their planes agree too, one face."""
 
-    def height(self, u: float, v: float) -> float:
-        """Height of the roof; -inf outside of the outline."""
-        x1, y1 = self.outline[-1]
-        for x2, y2 in self.outline:
-            if (x2 - x1) * (v - y1) - (y2 - y1) * (u - x1) < 0.0:
-                return -math.inf
-            x1, y1 = x2, y2
-        return min(a * u + b * v + c for a, b, c in self.planes)
-
-
-def top_height(parts: Sequence[RoofPart], u: float, v: float) -> float:
-    """Height of the highest part at a place; -inf where there is none."""
-    return max((part.height(u, v) for part in parts), default=-math.inf)
-
 
 def envelope(parts: Sequence[RoofPart]) -> RoofFaces:
     """The faces that one sees from above.
