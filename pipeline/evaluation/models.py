@@ -58,8 +58,8 @@ class RoofModel:
     surfaces: tuple[RoofSurface, ...]
     """Its roof faces."""
     touches_data_edge: bool = False
-    """True where it is cut, or a speck of the raster: as reference it need not be found. Of a model it is the model's own
-    claim, which excuses it only at the end of the reference's extent."""
+    """True where it is cut, or a speck of the raster: as reference it need not be found. Of a model it is the model's
+    own claim, which excuses it only at the end of the reference's extent."""
     source_id: str | None = None
     """As in the record; in simulated truth the block, which buildings that touch share."""
     status: Status = Status.OK
