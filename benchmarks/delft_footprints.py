@@ -125,7 +125,7 @@ def main() -> int:
     arguments = parser.parse_args()
     candidates = load_candidates(arguments.data)
     modelled = [Candidate(**{**vars(c), "footprint": None}) if arguments.without_footprints else c for c in candidates]
-    settings = ReconstructSettings(method=FuzzySartSettings.literal() if arguments.literal else FuzzySartSettings())
+    settings = ReconstructSettings(method=FuzzySartSettings.faithful() if arguments.literal else FuzzySartSettings())
     reconstruct_building(modelled[0], "fuzzy-sart", settings)
     results, seconds = [], []
     for candidate in modelled:

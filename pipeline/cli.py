@@ -35,6 +35,45 @@ VerticalUnit = Annotated[
 Workers = Annotated[
     int, typer.Option(min=0, help="Processes of the embedded cluster; 0 runs serially in this process.")
 ]
+Method = Annotated[
+    str | None,
+    typer.Option(
+        metavar="METHOD",
+        help="fuzzy-sart, parameter-space-2d, parameter-space-3d or kmeans; default as the settings say.",
+    ),
+]
+Footprints = Annotated[
+    str | None, typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, Shapefile) to model.")
+]
+Bbox = Annotated[
+    tuple[float, float, float, float] | None,
+    typer.Option(metavar="XMIN YMIN XMAX YMAX", help="Only this rectangle, in the CRS's units."),
+]
+Aoi = Annotated[
+    str | None, typer.Option(metavar="FILE", help="Only what lies inside the polygons of this vector file.")
+]
+Classes = Annotated[
+    Literal["trust", "audit", "ignore"] | None,
+    typer.Option(help="What the file's own classes are worth; default as the settings say."),
+]
+SettingsFile = Annotated[str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
+]
+Meshes = Annotated[Literal["building", "tile", "none"], typer.Option(help="One OBJ a building, one a tile, or none.")]
+Licence = Annotated[
+    str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
+]
+Truth = Annotated[
+    str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: measure the models against it.")
+]
+Points = Annotated[
+    list[str] | None,
+    typer.Option(metavar="TILE", help="A classified tile to measure against; several by several --points."),
+]
+AsSurveyed = Annotated[
+    bool, typer.Option("--as-surveyed", help="Move each true building by the shift of the strips that saw it.")
+]
 Isolate = typer.Option(
     "--isolate/--no-isolate",
     help="Model buildings in a supervised child process, so that a bad one costs only itself.",
@@ -75,38 +114,22 @@ def reconstruct(
         list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
     ],
     out: Annotated[str, typer.Option(metavar="RUN", help="The run directory to write.")],
-    method: Annotated[
-        str | None, typer.Option(metavar="METHOD", help="fuzzy-sart; default as the settings say.")
+    method: Method = None,
+    preset: Annotated[
+        Literal["robust", "faithful"] | None,
+        typer.Option(help="Settings of the method that measured better, or that keep to its paper."),
     ] = None,
-    footprints: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, Shapefile) to model.")
-    ] = None,
+    footprints: Footprints = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
-    bbox: Annotated[
-        tuple[float, float, float, float] | None,
-        typer.Option(metavar="XMIN YMIN XMAX YMAX", help="Only this rectangle, in the CRS's units."),
-    ] = None,
-    aoi: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Only what lies inside the polygons of this vector file.")
-    ] = None,
-    classes: Annotated[
-        Literal["trust", "audit", "ignore"] | None,
-        typer.Option(help="What the file's own classes are worth; default as the settings say."),
-    ] = None,
-    settings: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")
-    ] = None,
+    bbox: Bbox = None,
+    aoi: Aoi = None,
+    classes: Classes = None,
+    settings: SettingsFile = None,
     workers: Workers = 2,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
-    ] = None,
-    meshes: Annotated[
-        Literal["building", "tile", "none"], typer.Option(help="One OBJ a building, one a tile, or none.")
-    ] = "building",
-    licence: Annotated[
-        str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
-    ] = None,
+    scheduler: Scheduler = None,
+    meshes: Meshes = "building",
+    licence: Licence = None,
     overwrite: Overwrite = False,
     isolate: Annotated[bool | None, Isolate] = None,
     building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
@@ -121,7 +144,7 @@ def reconstruct(
         request = RunRequest(
             inputs=tuple(tiles),
             out=out,
-            settings=_run_settings(settings, method=method, classes=classes),
+            settings=_run_settings(settings, method=method, preset=preset, classes=classes),
             footprints=footprints,
             crs=crs,
             vertical_unit=vertical_unit,
@@ -140,6 +163,101 @@ def reconstruct(
         show_summary(console, summary)
         console.document(dataclasses.asdict(summary))
         if summary.failed_tiles:
+            raise typer.Exit(ExitCode.TILES_FAILED)
+
+
+@app.command()
+def compare(
+    tiles: Annotated[
+        list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
+    ],
+    methods: Annotated[
+        list[str],
+        typer.Option(metavar="M1,M2,…", help="METHOD or METHOD:PRESET, two or more; preset robust or faithful."),
+    ],
+    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: a run a method, and the page.")],
+    footprints: Footprints = None,
+    crs: Crs = None,
+    vertical_unit: VerticalUnit = None,
+    bbox: Bbox = None,
+    aoi: Aoi = None,
+    classes: Classes = None,
+    settings: SettingsFile = None,
+    truth: Truth = None,
+    points: Points = None,
+    as_surveyed: AsSurveyed = False,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    meshes: Meshes = "none",
+    licence: Licence = None,
+    overwrite: Overwrite = False,
+    isolate: Annotated[bool | None, Isolate] = None,
+    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
+    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Model the same candidates by several methods and write one page on what came out."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.evaluation.chapters import chapters
+        from pipeline.evaluation.files import EvaluationRequest
+        from pipeline.report.compare_files import compare_files, comparison_facts
+        from pipeline.report.evaluation_page import headline
+        from pipeline.runtime.compare import CompareRequest, parse_variants
+        from pipeline.runtime.run import RunRequest
+
+        request = CompareRequest(
+            run=RunRequest(
+                inputs=tuple(tiles),
+                out=out,
+                settings=_run_settings(settings, classes=classes),
+                footprints=footprints,
+                crs=crs,
+                vertical_unit=vertical_unit,
+                bbox=bbox,
+                aoi=aoi,
+                workers=workers,
+                scheduler=scheduler,
+                meshes=meshes,
+                licence=licence,
+                overwrite=overwrite,
+                isolate=isolate,
+                building_timeout_s=building_timeout,
+                building_memory_bytes=round(building_memory * 2**30),
+            ),
+            variants=parse_variants(methods),
+        )
+        reference = None
+        if truth is not None or points or as_surveyed:
+            reference = EvaluationRequest(
+                models=out,
+                truth=truth,
+                points=tuple(points or ()),
+                footprints=footprints if points else None,
+                crs=crs,
+                vertical_unit=vertical_unit,
+                as_surveyed=as_surveyed,
+            )
+        made = compare_files(request, reference, console.on_event)
+        facts = comparison_facts(request, made.summary)
+        names = ("ok", "fallback", "failed")
+        rows = [
+            (
+                told["label"],
+                *(told["statuses"].get(name, 0) for name in names),
+                told["counts"]["roof_faces"],
+                f"{1e3 * told['seconds_a_building'].get('median', 0.0):.1f} ms",
+            )
+            for told in facts["variants"]
+        ]
+        console.table("Methods", ["method", *names, "roof faces", "a building (median)"], rows)
+        for label, evaluation in made.evaluations.items():
+            decisive = [(line.label, line.value, line.interval, line.n) for _, line in headline(chapters(evaluation))]
+            console.table(f"{label} against the reference", ["measure", "value", "95 % interval", "n"], decisive)
+        for path in made.written:
+            console.say(f"wrote {path}")
+        console.document(facts | {"out": made.summary.out, "written": [str(path) for path in made.written]})
+        if any(run.failed_tiles for run in made.summary.runs.values()):
             raise typer.Exit(ExitCode.TILES_FAILED)
 
 
@@ -287,13 +405,8 @@ def evaluate(
     models: Annotated[
         str, typer.Argument(metavar="MODELS", help="A run directory; CityJSON, CityJSONSeq or OBJ of any program.")
     ],
-    truth: Annotated[
-        str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: measure the models against it.")
-    ] = None,
-    points: Annotated[
-        list[str] | None,
-        typer.Option(metavar="TILE", help="A classified tile to measure against; several by several --points."),
-    ] = None,
+    truth: Truth = None,
+    points: Points = None,
     footprints: Annotated[
         str | None, typer.Option(metavar="FILE", help="Building outlines that go with the points.")
     ] = None,
@@ -303,9 +416,7 @@ def evaluate(
     ] = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
-    as_surveyed: Annotated[
-        bool, typer.Option("--as-surveyed", help="Move each true building by the shift of the strips that saw it.")
-    ] = False,
+    as_surveyed: AsSurveyed = False,
     blocks: Annotated[
         bool | None,
         typer.Option(

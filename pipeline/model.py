@@ -185,6 +185,16 @@ class Candidate:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanFace:
+    """A roof face as a method itself draws it in plan."""
+
+    plane: int
+    """Index into the segmentation's planes."""
+    polygon: Polygon
+    """2D, local metres; the faces of one building do not overlap."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Segmentation:
     """What a segmentation method returns: planes, and the plane of every point."""
 
@@ -192,6 +202,11 @@ class Segmentation:
     """The roof planes."""
     labels: LabelArray
     """(n,) int32, index into planes for every point of the candidate; -1 where no plane explains it."""
+    faces: tuple[PlanFace, ...] | None = None
+    """The building primitive of a method that knows the whole form: its roof faces in plan, closed by walls as they
+    are. None where the faces are to be drawn from the labels."""
+    roof_type: RoofType | None = None
+    """What the method itself takes the roof for; None leaves it to the rule over the delivered planes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -102,8 +102,17 @@ class Parameters:
         return []
 
 
-def build(kind: type[Parameters], section: str, values: Mapping[str, Any], faults: list[str]) -> Any:
-    """One settings object, or None with its faults appended, each under the name of its table."""
+def build(
+    kind: type[Parameters],
+    section: str,
+    values: Mapping[str, Any],
+    faults: list[str],
+    base: Parameters | None = None,
+) -> Any:
+    """One settings object, or None with its faults appended, each under the name of its table.
+
+    What `values` does not name is taken from `base`, or from the defaults.
+    """
     names = {field.name: field for field in dataclasses.fields(kind)}
     prefix = f"[{section}] " if section else ""
     unknown = [name for name in values if name not in names]
@@ -115,7 +124,7 @@ def build(kind: type[Parameters], section: str, values: Mapping[str, Any], fault
             wants_float = isinstance(names[name].default, float) and isinstance(value, int)
             given[name] = float(value) if wants_float and not isinstance(value, bool) else value
     try:
-        return kind(**given)
+        return kind(**given) if base is None else dataclasses.replace(base, **given)
     except SettingsError as error:
         faults.extend(f"{prefix}{fault}" for fault in error.faults)
         return None

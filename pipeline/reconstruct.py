@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import PurePath
 
 import numpy as np
@@ -18,8 +19,11 @@ from pipeline.model import BuildingResult, Candidate, Plane, Reason, RoofFace, R
 from pipeline.quality.residuals import summarise, vertical_residuals
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_parts, block_plane
+from pipeline.roof.flush_walls import unite_flush_walls
 from pipeline.roof.footprint import hull_of_points, outline
+from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPlan, RoofPoints, level_unsupported_faces, partition_roof, plan_forms, roof_points
+from pipeline.roof.primitives import primitive_partition
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.solid import SolidPart, solid_parts
@@ -88,10 +92,18 @@ def _reconstruct(
         segmentation = segment(candidate)
         roof = dataclasses.replace(bare, labels=segmentation.labels[bare.index])
         _require_planes(segmentation, roof)
-        plan = partition_roof(roof, segmentation.planes, settings.roof)
-        parts, planes, codes = _own_solids(candidate, roof, plan, segmentation.planes, settings.roof)
+        forms: Iterable[Callable[[], RoofPartition]]
+        if segmentation.faces is not None:
+            forms = (partial(primitive_partition, segmentation.faces),)
+        else:
+            plan = partition_roof(roof, segmentation.planes, settings.roof)
+            forms = plan_forms(plan, roof, settings.roof)
+        parts, planes, codes = _own_solids(
+            candidate, roof, forms, segmentation.planes, settings.roof, is_primitive=segmentation.faces is not None
+        )
         if parts:
-            return _result(candidate, method, settings, parts, planes, status=Status.OK, lod="2.2")
+            own_type = segmentation.roof_type
+            return _result(candidate, method, settings, parts, planes, own_type, status=Status.OK, lod="2.2")
         reason = Reason.INVALID_SOLID
         detail = f"validity codes {', '.join(map(str, codes)) or 'none'}: no form of the solid passes"
     except BuildingError as error:
@@ -114,16 +126,20 @@ def _require_planes(segmentation: Segmentation, roof: RoofPoints) -> None:
 def _own_solids(
     candidate: Candidate,
     roof: RoofPoints,
-    plan: RoofPlan,
+    forms: Iterable[Callable[[], RoofPartition]],
     planes: Sequence[Plane],
     settings: RoofSettings,
+    *,
+    is_primitive: bool,
 ) -> tuple[list[SolidPart], list[Plane], tuple[int, ...]]:
     """The first form of the method's solids that is valid throughout; no parts and all codes met where none is."""
     codes: set[int] = set()
-    for form in plan_forms(plan, roof, settings):
+    for form in forms:
         try:
             drawn, own_planes = level_unsupported_faces(form(), roof, planes, candidate.ground_z_m, settings)
             parts = large_parts(solid_parts(drawn, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
+            if is_primitive:
+                parts = [unite_flush_walls(part) for part in parts]
         except (BuildingError, shapely.errors.GEOSException):
             continue
         faults = {code for part in parts for code in check_solid(part.solid)}
@@ -173,6 +189,7 @@ def _result(
     settings: ReconstructSettings,
     parts: Sequence[SolidPart],
     planes: Sequence[Plane],
+    own_type: RoofType | None = None,
     *,
     status: Status,
     lod: str,
@@ -196,7 +213,7 @@ def _result(
         reason=reason,
         reason_detail=detail,
         method=method,
-        roof_type=roof_type(delivered, faces, solids, settings.roof_type),
+        roof_type=own_type or roof_type(delivered, faces, solids, settings.roof_type),
         lod=lod,
         footprint=footprint,
         planes=delivered,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import SettingsError
-from pipeline.methods import METHODS, ReconstructSettings, method_named
+from pipeline.methods import METHODS, PRESETS, ReconstructSettings, method_named
 from pipeline.parameters import Parameters, build, parameter
 from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings
@@ -28,6 +28,12 @@ class GeneralSettings(Parameters):
     """Settings of the run as a whole."""
 
     method: str = parameter("fuzzy-sart", "The method that models the buildings.", choices=tuple(METHODS))
+    preset: str = parameter(
+        "robust",
+        "Where the method's settings start: those that measured better, or those that keep to its paper.",
+        choices=PRESETS,
+        changes_geometry=False,
+    )
     classes: str = parameter(
         "trust",
         "What the file's own classes are worth: believed, only compared with what is found, or not looked at.",
@@ -82,7 +88,7 @@ class RunSettings:
         """Fill in the method's defaults and refuse a halo that is too narrow."""
         entry = method_named(self.general.method)
         if self.building.method is None:
-            building = dataclasses.replace(self.building, method=entry.settings_type())
+            building = dataclasses.replace(self.building, method=entry.preset(self.general.preset))
             object.__setattr__(self, "building", building)
         support = self.scene.support_m
         if 0.0 < self.general.halo_m < support:
@@ -155,7 +161,8 @@ class RunSettings:
             if name not in known:
                 faults.append(f"[{name}] is no table of settings: use one of {', '.join(known)}")
             else:
-                built[name] = build(known[name], name, values, faults)
+                base = METHODS[name].preset(general.preset) if general is not None and name in METHODS else None
+                built[name] = build(known[name], name, values, faults, base)
         if faults:
             raise SettingsError(faults)
         scene_names = {field.name for field in dataclasses.fields(SceneSettings)}

@@ -64,7 +64,32 @@ class EvaluationRequest:
             raise SettingsError(faults)
 
 
-def evaluate_files(request: EvaluationRequest, on_step: Callable[[str], None] = lambda _: None) -> Evaluation:
+def read_reference(request: EvaluationRequest) -> Reference | None:
+    """What a request measures against; None where it names nothing.
+
+    Parameters
+    ----------
+    request : EvaluationRequest
+        Its models are not looked at.
+
+    Raises
+    ------
+    InputError
+        The reference cannot be read.
+    """
+    if request.truth is not None:
+        return read_truth_reference(request.truth, as_surveyed=request.as_surveyed)
+    if request.points:
+        options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit)
+        return read_points_reference(request.points, footprints=request.footprints, read_options=options)
+    return None
+
+
+def evaluate_files(
+    request: EvaluationRequest,
+    on_step: Callable[[str], None] = lambda _: None,
+    reference: Reference | None = None,
+) -> Evaluation:
     """Read and measure.
 
     Parameters
@@ -73,6 +98,8 @@ def evaluate_files(request: EvaluationRequest, on_step: Callable[[str], None] = 
         What, against what.
     on_step : callable
         Told the name of each step as it begins.
+    reference : Reference, optional
+        From `read_reference` of the same request, where it serves several models.
 
     Raises
     ------
@@ -83,14 +110,10 @@ def evaluate_files(request: EvaluationRequest, on_step: Callable[[str], None] = 
     """
     on_step("models")
     models = read_models(request.models)
-    reference: Reference | None = None
-    options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit)
-    if request.truth is not None or request.points:
+    if reference is None and (request.truth is not None or request.points):
         on_step("reference")
-    if request.truth is not None:
-        reference = read_truth_reference(request.truth, as_surveyed=request.as_surveyed)
-    elif request.points:
-        reference = read_points_reference(request.points, footprints=request.footprints, read_options=options)
+        reference = read_reference(request)
+    options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit)
     ground = None if reference is None else _ground(request.ground, models, reference, options)
     return evaluate(models, reference, blocks=request.blocks, ground=ground, on_step=on_step)
 

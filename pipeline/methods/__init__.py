@@ -8,11 +8,14 @@ from types import MappingProxyType
 from typing import Any
 
 from pipeline.errors import SettingsError
-from pipeline.methods import fuzzy_sart
+from pipeline.methods import fuzzy_sart, kmeans, parameter_space
 from pipeline.model import Candidate, Segmentation
 from pipeline.parameters import Parameters
 from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings
+
+PRESETS = ("robust", "faithful")
+"""Named settings that every method has: those that measured better, the default, and those that keep to the paper."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,13 +28,55 @@ class Method:
     """Its settings class."""
     segment: Callable[[Candidate, Any], Segmentation]
     """From a candidate and an instance of `settings_type` to planes and labels."""
+    faithful: Parameters
+    """The settings that keep to the paper's words; the defaults of `settings_type` are those that measured better."""
+
+    def preset(self, name: str) -> Parameters:
+        """The settings of a named preset.
+
+        Parameters
+        ----------
+        name : str
+            ``robust``, the defaults, or ``faithful``, the paper to the letter as far as it is printed.
+
+        Raises
+        ------
+        SettingsError
+            For another name.
+        """
+        if name not in PRESETS:
+            raise SettingsError([f"preset is {name!r}: use one of {', '.join(PRESETS)}"])
+        return self.faithful if name == "faithful" else self.settings_type()
 
 
 METHODS: Mapping[str, Method] = MappingProxyType(
     {
         method.name: method
         for method in (
-            Method(name="fuzzy-sart", settings_type=fuzzy_sart.FuzzySartSettings, segment=fuzzy_sart.segment),
+            Method(
+                name="fuzzy-sart",
+                settings_type=fuzzy_sart.FuzzySartSettings,
+                segment=fuzzy_sart.segment,
+                faithful=fuzzy_sart.FuzzySartSettings.faithful(),
+            ),
+            Method(
+                name="parameter-space-2d",
+                settings_type=parameter_space.ParameterSpace2dSettings,
+                segment=parameter_space.segment_2d,
+                faithful=parameter_space.ParameterSpace2dSettings.faithful(),
+            ),
+            Method(
+                name="parameter-space-3d",
+                settings_type=parameter_space.ParameterSpace3dSettings,
+                segment=parameter_space.segment_3d,
+                faithful=parameter_space.ParameterSpace3dSettings.faithful(),
+            ),
+            Method(
+                name="kmeans",
+                settings_type=kmeans.KMeansSettings,
+                segment=kmeans.segment,
+                faithful=kmeans.KMeansSettings.faithful(),
+            ),
         )
     }
 )

@@ -22,7 +22,8 @@ from pipeline.geometry import (
     point_spacing_m,
     top_visible,
 )
-from pipeline.model import BoolArray, Candidate, FloatArray, Plane, Reason, Segmentation
+from pipeline.methods.local_frame import check_extent, ground_around, local_metres, plane_over_origin
+from pipeline.model import BoolArray, Candidate, FloatArray, Reason, Segmentation
 from pipeline.parameters import parameter
 from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
 from pipeline.segmentation.fuzzy_sart import (
@@ -34,13 +35,8 @@ from pipeline.segmentation.fuzzy_sart import (
 from pipeline.segmentation.leftover_planes import cluster_leftovers
 from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes, refine_planes
 from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
-from pipeline.segmentation.surrounding_ground import far_from
 from pipeline.terrain.height_rule import facets_above_z_avg
 from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily
-from pipeline.tin.predicates import MAX_EXTENT_MM
-
-_MAX_EXTENT_M = MAX_EXTENT_MM / 1000.0 - 10.0
-"""The TIN's limit, less its margins."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,7 +100,7 @@ class FuzzySartSettings(FuzzySartClusteringSettings, PlaneRefinementSettings):
     )
 
     @classmethod
-    def literal(cls) -> FuzzySartSettings:
+    def faithful(cls) -> FuzzySartSettings:
         """The paper's words: scaled spherical vectors, V = 0.7, 0.2 m and 60 degrees, Z_avg, fixed thresholds."""
         return cls(
             vectors="spherical_scaled",
@@ -158,7 +154,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     candidate : Candidate
         Its points, and the terrain around it.
     settings : FuzzySartSettings
-        `FuzzySartSettings()` or `FuzzySartSettings.literal()`.
+        `FuzzySartSettings()` or `FuzzySartSettings.faithful()`.
 
     Returns
     -------
@@ -170,7 +166,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     BuildingError
         Reason ``too_few_points`` below the fewest points of a plane; ``too_complex`` beyond a limit of work.
     """
-    points, shift = _local_metres(candidate.points)
+    points, shift = local_metres(candidate.points)
     visible = np.flatnonzero(top_visible(points))
     roof = points[visible]
     if len(roof) < settings.least_points:
@@ -185,9 +181,9 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
 
     # 3.1: the TIN of the building with its ground; points near a facet are absorbed by it.
     gap_m = max(settings.ground_gap_spacings * spacing_m, settings.ground_gap_min_m)
-    ground = _ground_around(candidate, shift, roof, gap_m)
+    ground = ground_around(candidate.ground, shift, roof, gap_m)
     building_with_ground = np.concatenate([roof, ground])
-    _check_extent(building_with_ground)
+    check_extent(building_with_ground)
     greedy = insert_greedily(building_with_ground, settings.insertion(sigma_m), candidate.ground_z_m - float(shift[2]))
     facets = greedy.tin.facets
     normals = facet_normals(greedy.vertices, facets)
@@ -230,35 +226,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     all_labels = np.full(len(points), -1, np.int32)
     all_labels[visible] = labels
     described = describe_planes(points, planes, all_labels)
-    return Segmentation(planes=tuple(_moved(plane, shift) for plane in described), labels=all_labels)
-
-
-def _moved(plane: Plane, shift: FloatArray) -> Plane:
-    """The plane over the candidate's own origin."""
-    x, y, z = shift.tolist()
-    return dataclasses.replace(plane, c=plane.c + z - plane.a * x - plane.b * y)
-
-
-def _local_metres(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Points about an origin of their own, in whole metres: the outcome is the same wherever the building stands."""
-    millimetres = np.rint(points * 1000.0).astype(np.int64)
-    shift_m = millimetres.min(axis=0) // 1000 if len(points) else np.zeros(3, np.int64)
-    return (millimetres - shift_m * 1000) / 1000.0, shift_m.astype(np.float64)
-
-
-def _check_extent(points: FloatArray) -> None:
-    """Refuse what no single TIN can hold."""
-    extent_m = float(np.ptp(points[:, :2], axis=0).max())
-    if extent_m > _MAX_EXTENT_M:
-        raise BuildingError(
-            Reason.TOO_COMPLEX, f"the candidate extends over {extent_m:.0f} m, a TIN over at most {_MAX_EXTENT_M:.0f} m"
-        )
-
-
-def _ground_around(candidate: Candidate, shift: FloatArray, roof: FloatArray, gap_m: float) -> FloatArray:
-    """Samples of the terrain beside the building, and in its courtyards, about the same origin."""
-    ground = (np.rint(candidate.ground * 1000.0) - shift * 1000.0) / 1000.0
-    return np.asarray(ground[far_from(ground, roof, gap_m)])
+    return Segmentation(planes=tuple(plane_over_origin(plane, shift) for plane in described), labels=all_labels)
 
 
 def _roof_facets(greedy: GreedyTin, normals: FloatArray, n_roof: int, settings: FuzzySartSettings) -> BoolArray:

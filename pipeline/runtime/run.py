@@ -14,7 +14,7 @@ from pathlib import Path
 from uuid import uuid4
 
 from pipeline import __version__
-from pipeline.errors import RunCancelledError, RunError
+from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.io import LocalStorage, ReadOptions, SpatialReference, find_inputs, open_source
 from pipeline.io.footprints import read_area
 from pipeline.io.storage import sha256_of
@@ -112,6 +112,28 @@ class RunSummary:
     """Tiles that could not be published."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunVariant:
+    """One way to model the candidates of a run, and where its results go."""
+
+    settings: RunSettings
+    """Those of the request but for method, preset and what models a building."""
+    out: str
+    """Its own run directory."""
+    label: str = ""
+    """What messages call it; empty where there is but one."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VariantOutcome:
+    """What became of one variant."""
+
+    summary: RunSummary
+    """As of a run."""
+    seconds: dict[str, float]
+    """Wall-clock seconds of each building, by its id."""
+
+
 def run(
     request: RunRequest,
     on_event: Listener = ignore,
@@ -149,75 +171,193 @@ def run(
     ClusterError
         The scheduler does not answer or was lost, or its processes run other versions; the run may be tried again.
     """
+    variant = RunVariant(settings=request.settings, out=request.out)
+    (outcome,) = run_variants(request, (variant,), request.out, on_event, executor, cancelled)
+    return outcome.summary
+
+
+def run_variants(
+    request: RunRequest,
+    variants: Sequence[RunVariant],
+    work_dir: str,
+    on_event: Listener = ignore,
+    executor: Executor | None = None,
+    cancelled: Callable[[], bool] = never,
+) -> list[VariantOutcome]:
+    """Model the same candidates in several ways: ingest, split and join run once, the rest once a variant.
+
+    Parameters
+    ----------
+    request : RunRequest
+        The inputs and how to run; its `settings` and `out` are not looked at.
+    variants : sequence of RunVariant
+        At least one; they agree in all that finds candidates.
+    work_dir : str
+        Folder for the scratch.
+    on_event, executor, cancelled
+        As of `run`. Progress of a stage counts all variants together.
+
+    Returns
+    -------
+    list of VariantOutcome
+        In the variants' order.
+
+    Raises
+    ------
+    SettingsError
+        The variants would not find the same candidates.
+    InputError, RunError, RunCancelledError, ClusterError
+        As `run`.
+    """
     started_at = dt.datetime.now(tz=dt.UTC)
-    progress = Progress(on_event)
+    shared = Progress(on_event)
     began = time.perf_counter()
-    progress.tell("run", "plan", f"run into {request.out}")
-    plan, paths = _plan(request, progress)
+    settings = _common_settings(variants)
+    shared.tell("run", "plan", f"run into {work_dir}")
+    plan, paths = _plan(request, settings, shared)
     footprints = None if request.footprints is None else given_footprints(request.footprints, plan)
     for warning in () if footprints is None else footprints.warnings:
-        progress.warn("plan", warning)
-    run_dir = _checked(request)
-    scratch = Scratch(str(run_dir / _SCRATCH / uuid4().hex))
+        shared.warn("plan", warning)
+    run_dirs = [_checked(variant.out, overwrite=request.overwrite) for variant in variants]
+    scratch_dir = Path(work_dir).resolve() / _SCRATCH
+    _remove(scratch_dir)
+    scratch = Scratch(str(scratch_dir / uuid4().hex))
     reference = plan.sources[0].reference
-    manifest = RunManifest(
-        status=RunStatus.RUNNING,
-        engine_version=__version__,
-        method=request.settings.general.method,
-        settings=request.settings.as_dict(),
-        settings_hash=request.settings.settings_hash,
-        started_at=started_at,
-        crs=_crs_facts(reference),
-        source_licence=request.licence,
-    )
-    progress.timings["plan"] = time.perf_counter() - began
+    manifests = [
+        RunManifest(
+            status=RunStatus.RUNNING,
+            engine_version=__version__,
+            method=variant.settings.general.method,
+            settings=variant.settings.as_dict(),
+            settings_hash=variant.settings.settings_hash,
+            started_at=started_at,
+            crs=_crs_facts(reference),
+            source_licence=request.licence,
+        )
+        for variant in variants
+    ]
+    shared.timings["plan"] = time.perf_counter() - began
     engine = executor or executor_for(
-        workers=request.workers, scheduler=request.scheduler, local_directory=str(run_dir / _SCRATCH / "dask")
+        workers=request.workers, scheduler=request.scheduler, local_directory=str(scratch_dir / "dask")
     )
     scratch.create()
     try:
         starting = time.perf_counter()
         with _calling_off(scratch, cancelled) as called_off, engine:
-            progress.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)
-            engine.prepare("plan", progress.watch)
-            progress.timings["start workers"] = time.perf_counter() - starting
+            shared.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)
+            engine.prepare("plan", shared.watch)
+            shared.timings["start workers"] = time.perf_counter() - starting
             check_memory(plan, engine.memory_limit_bytes)
             # nothing of an earlier run goes before all that can be checked is checked
-            _clear_results(run_dir)
-            write_manifest(run_dir, manifest, LocalStorage(root=run_dir).put)
+            for run_dir, manifest in zip(run_dirs, manifests, strict=True):
+                _clear_results(run_dir)
+                write_manifest(run_dir, manifest, LocalStorage(root=run_dir).put)
             stages = Stages(
-                settings=request.settings,
+                settings=settings,
                 meshes=request.meshes,
                 plan=plan,
-                progress=progress,
+                progress=shared,
                 executor=engine,
                 scratch=scratch,
                 isolation=request.isolation,
-                quarantine=str(run_dir / _QUARANTINE),
             )
+            progresses: list[Progress] = []
             try:
                 ingested = stages.ingest(paths)
                 splits = stages.split(ingested, footprints)
                 joined = stages.join(splits, footprints, reference)
-                modelled = stages.reconstruct(joined)
-                tiles, failed_tiles = stages.publish(splits, joined, modelled, reference, str(run_dir))
+                progresses.extend(shared.part(k, len(variants), v.label) for k, v in enumerate(variants))
+                each = [
+                    dataclasses.replace(
+                        stages, settings=v.settings, progress=own, variant=k, quarantine=str(run_dirs[k] / _QUARANTINE)
+                    )
+                    for k, (v, own) in enumerate(zip(variants, progresses, strict=True))
+                ]
+                modelled = [own.reconstruct(joined) for own in each]
+                published = [
+                    own.publish(splits, joined, models, reference, str(run_dir))
+                    for own, models, run_dir in zip(each, modelled, run_dirs, strict=True)
+                ]
             except BaseException as error:
                 scratch.cancel()
-                told = (*progress.warnings, f"{type(error).__name__}: {error}".removesuffix(": "))
                 off = isinstance(error, RunCancelledError | KeyboardInterrupt)
                 status = RunStatus.CANCELLED if off else RunStatus.FAILED
-                broken = dataclasses.replace(manifest, status=status, warnings=told)
-                write_manifest(run_dir, broken, LocalStorage(root=run_dir).put)
+                message = f"{type(error).__name__}: {error}".removesuffix(": ")
+                for k, (run_dir, manifest) in enumerate(zip(run_dirs, manifests, strict=True)):
+                    warnings = (progresses[k] if progresses else shared).warnings
+                    broken = dataclasses.replace(manifest, status=status, warnings=(*warnings, message))
+                    write_manifest(run_dir, broken, LocalStorage(root=run_dir).put)
                 raise
     finally:
-        _remove(run_dir / _SCRATCH)
-    finishing = time.perf_counter()
-    digest = run_digest(str(run_dir))
-    progress.timings["digest"] = time.perf_counter() - finishing
-    progress.timings["total"] = time.perf_counter() - began
+        _remove(scratch_dir)
+    inputs = _inputs_told(request, paths, ingested)
     driver, peak_bytes = peak_of_process()
-    progress.peaks[driver] = peak_bytes
-    counts = _counts(plan, ingested, splits, joined, modelled)
+    outcomes = []
+    for k, (run_dir, own) in enumerate(zip(run_dirs, progresses, strict=True)):
+        finishing = time.perf_counter()
+        digest = run_digest(str(run_dir))
+        own.timings["digest"] = time.perf_counter() - finishing
+        # of several variants each is told with what it took alone: the shared stages and its own
+        alone = len(variants) == 1
+        own.timings["total"] = time.perf_counter() - began if alone else sum(own.timings.values())
+        own.peaks[driver] = peak_bytes
+        tiles, failed_tiles = published[k]
+        counts = _counts(plan, ingested, splits, joined, modelled[k])
+        write_manifest(
+            run_dir,
+            dataclasses.replace(
+                manifests[k],
+                status=RunStatus.INCOMPLETE if failed_tiles else RunStatus.FINISHED,
+                finished_at=dt.datetime.now(tz=dt.UTC),
+                inputs=inputs,
+                tiles=tuple(tiles),
+                failed_tiles=tuple(failed_tiles),
+                counts=counts,
+                timings_s={name: round(seconds, 3) for name, seconds in own.timings.items()},
+                peak_memory_bytes=own.peaks,
+                warnings=tuple(own.warnings),
+                content_sha256=digest,
+            ),
+            LocalStorage(root=run_dir).put,
+        )
+        summary = RunSummary(
+            run_dir=str(run_dir),
+            digest=digest,
+            statuses=dict(Counter(m.status for m in modelled[k])),
+            reasons=dict(Counter(m.reason for m in modelled[k] if m.reason is not None)),
+            rejected=dict(Counter(site.verdict.reason.value for site in joined.rejected)),
+            roof_types=dict(Counter(m.roof_type for m in modelled[k])),
+            counts=counts,
+            timings_s=own.timings,
+            peak_memory_bytes=own.peaks,
+            warnings=tuple(own.warnings),
+            failed_tiles=tuple(failed_tiles),
+        )
+        outcomes.append(VariantOutcome(summary=summary, seconds={m.building_id: m.seconds for m in modelled[k]}))
+    seconds = time.perf_counter() - began
+    shared.tell("finished", "", f"{outcomes[0].summary.counts['candidates']} candidates in {seconds:.1f} s")
+    return outcomes
+
+
+def _common_settings(variants: Sequence[RunVariant]) -> RunSettings:
+    """The settings that find the candidates.
+
+    Raises
+    ------
+    SettingsError
+        The variants differ in them.
+    """
+    first = variants[0].settings
+    method, preset = first.general.method, first.general.preset
+    for variant in variants[1:]:
+        general = dataclasses.replace(variant.settings.general, method=method, preset=preset)
+        if variant.settings.scene != first.scene or general != first.general:
+            raise SettingsError([f"{variant.label} would find other candidates than {variants[0].label}"])
+    return first
+
+
+def _inputs_told(request: RunRequest, paths: Sequence[str], ingested: Sequence[Ingested]) -> tuple[InputFile, ...]:
+    """The inputs as the manifest tells them."""
     inputs = [
         InputFile(
             path=path,
@@ -230,37 +370,7 @@ def run(
     if request.footprints is not None:
         path = Path(request.footprints)
         inputs.append(InputFile(path=str(path), sha256=sha256_of(path), size_bytes=path.stat().st_size))
-    write_manifest(
-        run_dir,
-        dataclasses.replace(
-            manifest,
-            status=RunStatus.INCOMPLETE if failed_tiles else RunStatus.FINISHED,
-            finished_at=dt.datetime.now(tz=dt.UTC),
-            inputs=tuple(inputs),
-            tiles=tuple(tiles),
-            failed_tiles=tuple(failed_tiles),
-            counts=counts,
-            timings_s={name: round(seconds, 3) for name, seconds in progress.timings.items()},
-            peak_memory_bytes=progress.peaks,
-            warnings=tuple(progress.warnings),
-            content_sha256=digest,
-        ),
-        LocalStorage(root=run_dir).put,
-    )
-    progress.tell("finished", "", f"{counts['candidates']} candidates in {progress.timings['total']:.1f} s")
-    return RunSummary(
-        run_dir=str(run_dir),
-        digest=digest,
-        statuses=dict(Counter(m.status for m in modelled)),
-        reasons=dict(Counter(m.reason for m in modelled if m.reason is not None)),
-        rejected=dict(Counter(site.verdict.reason.value for site in joined.rejected)),
-        roof_types=dict(Counter(m.roof_type for m in modelled)),
-        counts=counts,
-        timings_s=progress.timings,
-        peak_memory_bytes=progress.peaks,
-        warnings=tuple(progress.warnings),
-        failed_tiles=tuple(failed_tiles),
-    )
+    return tuple(inputs)
 
 
 @contextlib.contextmanager
@@ -296,7 +406,7 @@ def _calling_off(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Ca
         asking.join()
 
 
-def _plan(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
+def _plan(request: RunRequest, settings: RunSettings, progress: Progress) -> tuple[Plan, list[str]]:
     """The plan and the input files in order."""
     # workers elsewhere do not share this process's folder
     paths = sorted(str(path.resolve()) for path in find_inputs(request.inputs))
@@ -304,7 +414,7 @@ def _plan(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
         options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
-    plan = make_plan(paths, options, request.settings)
+    plan = make_plan(paths, options, settings)
     for warning in plan.warnings:
         progress.warn("plan", warning)
     if not any(info.has_returns for info in plan.sources):
@@ -312,7 +422,7 @@ def _plan(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
     return plan, paths
 
 
-def _checked(request: RunRequest) -> Path:
+def _checked(out: str, *, overwrite: bool) -> Path:
     """The run directory, which may be written.
 
     Raises
@@ -320,17 +430,16 @@ def _checked(request: RunRequest) -> Path:
     RunError
         It holds something and `overwrite` is not asked for, it is no local path, or it cannot be written.
     """
-    if "://" in request.out:
-        raise RunError(f"{request.out} is no local path: this version writes local run directories only")
-    run_dir = Path(request.out).resolve()
+    if "://" in out:
+        raise RunError(f"{out} is no local path: this version writes local run directories only")
+    run_dir = Path(out).resolve()
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         left = sorted(entry.name for entry in run_dir.iterdir())
-        if left and not request.overwrite:
+        if left and not overwrite:
             raise RunError(f"{run_dir} is not empty ({left[0]} …): give another --out, or --overwrite")
         if left and NAME not in left:
             raise RunError(f"{run_dir} holds {left[0]} and no run.json, so it is no run: give another --out")
-        _remove(run_dir / _SCRATCH)
     except OSError as error:
         raise RunError(f"{run_dir} cannot be written: {error.strerror or error}. Give another --out") from error
     return run_dir

@@ -22,7 +22,7 @@ from pipeline.runtime.events import Event, EventKind, Listener, Watch
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.ingest import Ingested, IngestTask, ingest, spread_m
 from pipeline.runtime.isolation import IsolationLimits
-from pipeline.runtime.join import Joined, RejectedSite, join, join_footprints
+from pipeline.runtime.join import CandidateSite, Joined, RejectedSite, join, join_footprints
 from pipeline.runtime.modelling import BatchTask, Modelled, batches, model_batch
 from pipeline.runtime.plan import Plan, check_windows
 from pipeline.runtime.publish import PublishTask, publish
@@ -127,6 +127,24 @@ class Progress:
         self.timings: dict[str, float] = {}
         self.peaks: dict[str, int] = {}
         self.warnings: list[str] = []
+        self._part, self._parts, self._label = 0, 1, ""
+
+    def part(self, number: int, parts: int, label: str) -> Progress:
+        """The progress of one of several equal parts of what follows: a copy that knows what was before.
+
+        Parameters
+        ----------
+        number : int
+            Which part, from 0.
+        parts : int
+            Of how many; done and total of a stage count all of them, one after the other.
+        label : str
+            What messages call it.
+        """
+        own = Progress(self._listener, self.watch)
+        own.timings, own.peaks, own.warnings = dict(self.timings), dict(self.peaks), list(self.warnings)
+        own._part, own._parts, own._label = number, parts, label
+        return own
 
     def tell(self, kind: EventKind, stage: str, message: str = "", done: int = 0, total: int = 0) -> None:
         """Send an event."""
@@ -150,8 +168,8 @@ class Progress:
         """Run a stage's tasks and report its progress in units of `weight`."""
         started = time.perf_counter()
         whole = len(tasks) if total is None else total
-        done = 0
-        self.tell("stage", name, total=whole)
+        done, all_parts = self._part * whole, self._parts * whole
+        self.tell("stage", name, self._label, done=done, total=all_parts)
         results = []
         # closed at once where the listener raises, so that no task goes on for nobody
         with contextlib.closing(executor.map(name, function, tasks, self.watch)) as running:
@@ -159,7 +177,7 @@ class Progress:
                 results.append(measured.result)
                 self.peaks[measured.process] = max(self.peaks.get(measured.process, 0), measured.peak_bytes)
                 done += weight(measured.result)
-                self.tell("progress", name, done=done, total=whole)
+                self.tell("progress", name, done=done, total=all_parts)
         self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started
         return results
 
@@ -178,6 +196,8 @@ class Stages:
     """Limits of the supervised children that model buildings; None models in the workers themselves."""
     quarantine: str = ""
     """Folder for the bundles of buildings that cost their process; empty keeps none."""
+    variant: int = 0
+    """Which of the run's variants this is: keeps their models apart in scratch."""
 
     def ingest(self, paths: Sequence[str]) -> list[Ingested]:
         """Bucket all points by tile, and look at what they are."""
@@ -275,12 +295,17 @@ class Stages:
                 quarantine=self.quarantine,
                 reference=self.plan.sources[0].reference,
             )
-            for number, sites in enumerate(batches(joined.candidates))
+            for number, sites in self._numbered(joined)
         ]
         parts = self.progress.stage(
             self.executor, "reconstruct", model_batch, tasks, weight=len, total=len(joined.candidates)
         )
         return [building for part in parts for building in part]
+
+    def _numbered(self, joined: Joined) -> list[tuple[int, tuple[CandidateSite, ...]]]:
+        """The batches of this variant, by numbers that no other variant uses."""
+        groups = batches(joined.candidates)
+        return list(enumerate(groups, start=self.variant * len(groups)))
 
     def publish(
         self,
@@ -291,9 +316,7 @@ class Stages:
         run_dir: str,
     ) -> tuple[list[str], list[str]]:
         """Write every tile; the keys of all, and of those that failed."""
-        batch_of = {
-            site.building_id: number for number, sites in enumerate(batches(joined.candidates)) for site in sites
-        }
+        batch_of = {site.building_id: number for number, sites in self._numbered(joined) for site in sites}
         numbers: dict[Tile, set[int]] = {}
         for building in modelled:
             numbers.setdefault(building.owner, set()).add(batch_of[building.building_id])

@@ -268,16 +268,20 @@ class SupervisedChild:
             time.sleep(_TICK_S)
 
     def _cut_stderr(self) -> None:
-        """Keep a talkative child from filling the disk."""
+        """Keep a talkative child from filling the disk, but not from being heard: the end of what it said stays."""
         if os.fstat(self._stderr.fileno()).st_size > _STDERR_KEPT_BYTES:
+            tail = self._end_of_stderr()
             os.ftruncate(self._stderr.fileno(), 0)
+            os.write(self._stderr.fileno(), tail)
+
+    def _end_of_stderr(self) -> bytes:
+        size = os.fstat(self._stderr.fileno()).st_size
+        return os.pread(self._stderr.fileno(), _STDERR_TOLD_BYTES, max(0, size - _STDERR_TOLD_BYTES))
 
     @property
     def last_words(self) -> str:
         """The end of its standard error."""
-        size = os.fstat(self._stderr.fileno()).st_size
-        tail = os.pread(self._stderr.fileno(), _STDERR_TOLD_BYTES, max(0, size - _STDERR_TOLD_BYTES))
-        return tail.decode("utf-8", errors="replace").strip()
+        return self._end_of_stderr().decode("utf-8", errors="replace").strip()
 
 
 def _system_kills() -> int:

@@ -107,7 +107,7 @@ def toml_blocks() -> list[tuple[str, str]]:
 def test_a_settings_file_of_the_docs_is_valid(page: str, block: str) -> None:
     settings = RunSettings.from_mapping(tomllib.loads(block)["settings"])
     if page == "docs/methods/fuzzy_sart.md":
-        assert settings.building.method == FuzzySartSettings.literal()
+        assert settings.building.method == FuzzySartSettings.faithful()
 
 
 @pytest.mark.parametrize("table", list(SCHEMAS))

@@ -83,7 +83,7 @@ def same_partition(a: LabelArray, b: LabelArray) -> bool:
     return len(pairs) == len(set(a.tolist())) == len(set(b.tolist()))
 
 
-@pytest.mark.parametrize("settings", [FuzzySartSettings(), FuzzySartSettings.literal()], ids=["default", "literal"])
+@pytest.mark.parametrize("settings", [FuzzySartSettings(), FuzzySartSettings.faithful()], ids=["default", "literal"])
 def test_the_plane_of_the_papers_cube_lies_within_5_cm_and_leaves_the_noise_as_residual(
     settings: FuzzySartSettings,
 ) -> None:
@@ -252,7 +252,7 @@ def test_the_literal_recipe_is_worse_on_a_house_as_the_paper_says() -> None:
             right += len(segment(candidate, settings).planes) == len(planes)
         return right
 
-    assert share(FuzzySartSettings.literal()) < share(FuzzySartSettings())
+    assert share(FuzzySartSettings.faithful()) < share(FuzzySartSettings())
 
 
 def test_a_candidate_without_points_has_too_few() -> None:
@@ -266,7 +266,7 @@ def test_a_candidate_without_points_has_too_few() -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_every_plane_has_points_and_every_label_a_plane(seed: int) -> None:
     points = np.random.default_rng(seed).uniform(-4, 4, (300, 3)) * np.array([1, 1, 0.2]) + np.array([0, 0, 6])
-    for settings in (FuzzySartSettings(), FuzzySartSettings.literal()):
+    for settings in (FuzzySartSettings(), FuzzySartSettings.faithful()):
         found = segment(candidate_of(points), settings)
         assert set(found.labels.tolist()) - {-1} == set(range(len(found.planes)))
         assert [plane.n_points for plane in found.planes] == np.bincount(
@@ -311,7 +311,7 @@ def test_thresholds_follow_the_noise_within_their_bounds() -> None:
     chosen = FuzzySartSettings()
     assert [chosen.absorption_distance_m(s) for s in (0.01, 0.05, 0.5)] == pytest.approx([0.10, 0.15, 0.30])
     assert [chosen.plane_distance_m(s) for s in (0.01, 0.06, 0.5)] == pytest.approx([0.15, 0.18, 0.30])
-    literal = FuzzySartSettings.literal()
+    literal = FuzzySartSettings.faithful()
     assert {literal.absorption_distance_m(s) for s in (0.0, 0.1, 9.0)} == {0.2}
     assert (literal.vectors, literal.vigilance, literal.absorption_max_slope_deg) == ("spherical_scaled", 0.7, 60.0)
 

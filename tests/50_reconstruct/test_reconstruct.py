@@ -16,7 +16,7 @@ from shapely import Polygon
 from pipeline import reconstruct
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.methods import METHODS, Method, ReconstructSettings, method_named
-from pipeline.model import Candidate, FaceKind, Plane, Reason, RoofType, Segmentation, Solid, Status
+from pipeline.model import Candidate, FaceKind, Plane, PlanFace, Reason, RoofType, Segmentation, Solid, Status
 from pipeline.parameters import Parameters
 from pipeline.quality.validity import check_solid
 from pipeline.reconstruct import reconstruct_building
@@ -52,7 +52,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Install:
     """`stub(function)` makes a segmentation function the method `stub`."""
 
     def install(segment: Callable[[Candidate], Segmentation]) -> None:
-        method = Method(name="stub", settings_type=Parameters, segment=lambda c, _: segment(c))
+        method = Method(name="stub", settings_type=Parameters, segment=lambda c, _: segment(c), faithful=Parameters())
         monkeypatch.setattr(reconstruct, "method_named", lambda _: method)
 
     return install
@@ -265,3 +265,47 @@ def test_one_plane_over_everything_is_one_roof_face(
     result = reconstruct_building(gable(footprint=shapely.box(0, 0, 12, 8)), "stub", DEFAULTS)
     assert len(result.faces) == 1
     assert len(result.solids[0].vertices) == 8
+
+
+def tent(c: Candidate, *, eave_z: float = 3.0) -> Segmentation:
+    """The two sides of a gable of 12 x 8 m that draws its own faces, wider than its points."""
+    south = shapely.box(-1.0, -1.0, 13.0, 4.0)
+    north = shapely.box(-1.0, 4.0, 13.0, 9.0)
+    planes = tuple(Plane(a=0.0, b=b, c=z, n_points=0, rmse_m=0.0) for b, z in ((0.7, eave_z), (-0.7, eave_z + 5.6)))
+    return Segmentation(
+        planes=planes,
+        labels=(c.points[:, 1] > 4.0).astype(np.int32),
+        faces=(PlanFace(plane=0, polygon=south), PlanFace(plane=1, polygon=north)),
+        roof_type=RoofType.PENT,
+    )
+
+
+def test_a_primitive_is_delivered_as_the_method_draws_it(stub: Install) -> None:
+    stub(tent)
+    result = reconstruct_building(gable(), "stub", DEFAULTS)
+    assert (result.status, result.lod) == (Status.OK, "2.2")
+    assert result.footprint is not None
+    assert result.footprint.equals(shapely.box(-1.0, -1.0, 13.0, 9.0))
+    assert len(result.solids[0].vertices) == 10
+    assert check_solid(result.solids[0]) == ()
+
+
+def test_what_a_method_calls_its_roof_stands_above_the_rule(stub: Install) -> None:
+    stub(tent)
+    assert reconstruct_building(gable(), "stub", DEFAULTS).roof_type is RoofType.PENT
+    stub(lambda c: dataclasses.replace(tent(c), roof_type=None))
+    assert reconstruct_building(gable(), "stub", DEFAULTS).roof_type is RoofType.GABLE
+
+
+def test_a_primitive_that_makes_no_valid_solid_becomes_a_block(stub: Install) -> None:
+    def overlapping(c: Candidate) -> Segmentation:
+        whole = tent(c)
+        return dataclasses.replace(
+            whole, faces=tuple(PlanFace(plane=k, polygon=shapely.box(0, 0, 12, 8)) for k in (0, 1))
+        )
+
+    stub(overlapping)
+    result = reconstruct_building(gable(), "stub", DEFAULTS)
+    assert (result.status, result.reason, result.lod) == (Status.FALLBACK, Reason.INVALID_SOLID, "1.2")
+    assert check_solid(result.solids[0]) == ()
+    assert result.roof_type is RoofType.FLAT

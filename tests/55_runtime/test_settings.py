@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import SettingsError
+from pipeline.methods import METHODS
 from pipeline.settings import RunSettings
 
 
@@ -38,6 +39,31 @@ def test_the_hash_ignores_what_cannot_change_results() -> None:
     plain = RunSettings()
     assert RunSettings.from_mapping({"tile_size_m": 77.0, "lattice_x_m": 3.0}).settings_hash == plain.settings_hash
     assert RunSettings.from_mapping({"classes": "ignore"}).settings_hash != plain.settings_hash
+
+
+@pytest.mark.parametrize("name", list(METHODS))
+def test_a_preset_is_where_the_settings_of_a_method_start(name: str) -> None:
+    faithful = RunSettings.from_mapping({"method": name, "preset": "faithful"})
+    assert faithful.building.method == METHODS[name].faithful
+    assert RunSettings.from_mapping({"method": name}).building.method == METHODS[name].settings_type()
+    field = next(f for f in dataclasses.fields(METHODS[name].settings_type) if isinstance(f.default, int | float))
+    changed = RunSettings.from_mapping({"method": name, "preset": "faithful", name: {field.name: field.default}})
+    assert changed.building.method == dataclasses.replace(METHODS[name].faithful, **{field.name: field.default})
+
+
+def test_an_unknown_preset_is_told_with_the_known_ones() -> None:
+    with pytest.raises(SettingsError, match="preset is 'bold': use one of robust, faithful"):
+        RunSettings.from_mapping({"preset": "bold", "fuzzy-sart": {"vigilance": 0.8}})
+
+
+@pytest.mark.parametrize("name", list(METHODS))
+def test_the_hash_is_of_the_values_and_not_of_the_preset_that_gave_them(name: str) -> None:
+    values = {
+        field.name: getattr(METHODS[name].faithful, field.name) for field in dataclasses.fields(METHODS[name].faithful)
+    }
+    spelt_out = RunSettings.from_mapping({"method": name, name: values})
+    preset = RunSettings.from_mapping({"method": name, "preset": "faithful"})
+    assert spelt_out.settings_hash == preset.settings_hash != RunSettings.from_mapping({"method": name}).settings_hash
 
 
 @pytest.mark.parametrize("section", sorted(RunSettings().sections()))

@@ -1,0 +1,499 @@
+"""K-means on facet normals (Zeng, Lai, Li, Mao and Liu 2008): from the points of one building to its model.
+
+The order of the steps is the paper's: TIN of the building's points, k-means of its facets' normals with the cosine as
+similarity, points to planes (2.1), least squares and convex hulls (2.2), the line of intersection, the minimal
+rectangle on it that holds the hull of either side, both made equal by the larger one (2.3), the model of ten vertices
+and fifteen parameters (2.4), or its flat and pent counterparts.
+
+`KMeansSettings.faithful` is that and no more. The defaults choose the number of clusters, refine their planes, and
+draw the paper's model only where it explains the building; other roofs are drawn from the labels of their points.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import shapely
+
+from pipeline.errors import BuildingError
+from pipeline.geometry import (
+    facet_areas_m2,
+    facet_normals,
+    nearest_neighbours,
+    noise_sigma_m,
+    point_spacing_m,
+    top_visible,
+    vertical_residuals_m,
+)
+from pipeline.methods.local_frame import check_extent, local_metres, plane_over_origin
+from pipeline.model import Candidate, FloatArray, IntArray, LabelArray, Plane, PlanFace, Reason, Segmentation, Tin
+from pipeline.parameters import parameter
+from pipeline.roof.primitives import BuildingPrimitive, fit_box, fit_gable
+from pipeline.segmentation.facet_clusters import connected_parts
+from pipeline.segmentation.facet_smoothing import passes_for_noise, smoothed_normals
+from pipeline.segmentation.kmeans_normals import (
+    FacetClusters,
+    NormalClusteringSettings,
+    choose_clusters,
+    labels_by_angle,
+)
+from pipeline.segmentation.leftover_planes import cluster_leftovers
+from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes, refine_planes
+from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
+from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
+from pipeline.segmentation.surrounding_ground import far_from
+from pipeline.tin.delaunay import triangulate, unique_xy
+
+_LEAST_FACETS = 3
+"""Fewer facets are no two groups."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class KMeansSettings(NormalClusteringSettings, PlaneRefinementSettings):
+    """Settings of the recipe; those of the clustering and of the refinement are among them."""
+
+    longest_edge_spacings: float = parameter(
+        4.0,
+        "Facets with a longer edge in plan, in mean point spacings, bridge gaps and are left out; 0 keeps all.",
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    normal_noise_deg: float = parameter(
+        6.0,
+        "Normals are averaged over the facets around until the noise turns them by about this angle.",
+        unit="deg",
+        minimum=0.1,
+        maximum=45.0,
+    )
+    smoothing_passes: int = parameter(
+        6, "Most passes of that, by one ring of facets each; 0 for none (as the paper).", minimum=0, maximum=100
+    )
+    refine: bool = parameter(
+        True,
+        "Whether clusters are split where they do not hang together, merged where they are one plane, and their points "
+        "assigned anew; without it there is one least-squares fit a cluster (as the paper).",
+    )
+    plane_distance_min_m: float = parameter(
+        0.15, "Least distance up to which a point belongs to a plane.", unit="m", minimum=0.0, maximum=10.0
+    )
+    plane_distance_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
+    noise_factor: float = parameter(
+        3.0,
+        "That distance is this many standard deviations of the noise, within its bounds.",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    neighbours: int = parameter(
+        9, "Nearest points whose planes a point chooses among.", unit="points", minimum=3, maximum=64
+    )
+    leftover_rounds: int = parameter(
+        2,
+        "Rounds of refinement with clusters that grow among the points no plane explains; 0 for none.",
+        unit="rounds",
+        minimum=0,
+        maximum=50,
+    )
+    ridge_reach_spacings: float = parameter(
+        1.5, "Distance in plan up to which points are near a ridge, in mean point spacings.", minimum=0.0, maximum=10.0
+    )
+    one_plane_deg: float = parameter(
+        6.0,
+        "Two planes of unrefined clusters with a smaller angle between them are one plane.",
+        unit="deg",
+        minimum=0.0,
+        maximum=45.0,
+    )
+    flat_below_deg: float = parameter(
+        3.0, "The model of one plane is level below this slope, pent above.", unit="deg", minimum=0.0, maximum=45.0
+    )
+    model: str = parameter(
+        "fitting",
+        "When one or two planes become the paper's model: where it explains the building, always, or never.",
+        choices=("fitting", "always", "never"),
+    )
+    outline: str = parameter(
+        "footprint",
+        "Whether a given footprint is kept, its roof drawn from the labels, or the model's rectangle is the outline.",
+        choices=("footprint", "rectangle"),
+    )
+    least_side_share: float = parameter(
+        0.5,
+        "Share of a plane's points that must lie on its side of the line in which the two planes meet.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    margin_spacings: float = parameter(
+        0.0,
+        "By how much the rectangles go beyond the outermost points, in mean point spacings.",
+        minimum=0.0,
+        maximum=2.0,
+    )
+    model_distance_m: float = parameter(
+        0.5,
+        "Points farther than this above or below the model are not explained by it.",
+        unit="m",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    fitting_share: float = parameter(
+        0.95,
+        "The model explains a building where this share of its roof points lies within the distance of a plane.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    fitting_fill: float = parameter(
+        0.95,
+        "The model explains a building where this share of its rectangle has roof points near.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    fill_gap_spacings: float = parameter(1.2, "What near means, in mean point spacings.", minimum=0.1, maximum=10.0)
+
+    @classmethod
+    def faithful(cls) -> KMeansSettings:
+        """The paper's words: k = 2, equal facets, one fit a cluster, the model always, its own outline."""
+        return cls(
+            clusters=2,
+            facet_weights="equal",
+            longest_edge_spacings=0.0,
+            smoothing_passes=0,
+            refine=False,
+            leftover_rounds=0,
+            model="always",
+            outline="rectangle",
+        )
+
+    def cross_faults(self) -> list[str]:
+        """The distance must be a range."""
+        faults = super().cross_faults()
+        low, high = self.plane_distance_min_m, self.plane_distance_max_m
+        if low > high:
+            faults.append(f"plane_distance_min_m is {low:g}: use at most plane_distance_max_m, {high:g}")
+        return faults
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BuildingTop:
+    """The points of a building that see the sky, one a position, and their TIN."""
+
+    points: FloatArray
+    """(n, 3) float64, metres about an origin of their own."""
+    index: IntArray
+    """(n,) int64, which of the candidate's points they are."""
+    spacing_m: float
+    """Mean point spacing in plan."""
+    sigma_m: float
+    """Standard deviation of the vertical noise."""
+    distance_m: float
+    """Up to which a point belongs to a plane, by the noise."""
+    tin: Tin
+    """Planar Delaunay triangulation; vertex i is point i."""
+
+
+def segment(candidate: Candidate, settings: KMeansSettings) -> Segmentation:
+    """Find the roof planes of one building, and the model that they make.
+
+    Points that a higher point of the building hides (facades, returns from below the roof) take no part and keep the
+    label -1, as do points that neither a plane nor the model explains.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Its points, and the height of the ground.
+    settings : KMeansSettings
+        `KMeansSettings()` or `KMeansSettings.faithful()`.
+
+    Returns
+    -------
+    Segmentation
+        With `faces` where the building is a model of ten or eight vertices; its planes are then the model's own.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_few_points`` or ``no_plane`` where there is too little to cluster; ``no_partition`` where two
+        planes must make a model and meet beside the building; ``too_complex`` beyond a limit of work.
+    """
+    points, shift = local_metres(candidate.points)
+    top = building_top(points, settings)
+    planes, labels = planes_of(top, settings)
+    described = describe_planes(top.points, planes, labels)
+    faces: tuple[PlanFace, ...] | None = None
+    roof_type = None
+    keeps_footprint = settings.outline == "footprint" and candidate.footprint is not None
+    if settings.model != "never" and not keeps_footprint:
+        model = model_of(top, described, labels, candidate.ground_z_m - float(shift[2]), settings)
+        if model is not None:
+            labels = sides_of(model, top.points, settings.model_distance_m)
+            described = describe_planes(top.points, np.array([plane.coefficients for plane in model.planes]), labels)
+            roof_type = model.roof_type
+            x, y, _ = shift.tolist()
+            faces = tuple(_moved(face, x, y) for face in model.faces)
+    all_labels = np.full(len(points), -1, np.int32)
+    all_labels[top.index] = labels
+    return Segmentation(
+        planes=tuple(plane_over_origin(plane, shift) for plane in described),
+        labels=all_labels,
+        faces=faces,
+        roof_type=roof_type,
+    )
+
+
+def building_top(points: FloatArray, settings: KMeansSettings) -> BuildingTop:
+    """The TIN of a building's visible points: the highest one of every position.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        From `local_metres`.
+    settings : KMeansSettings
+        `least_points`, and the distance that follows the noise.
+
+    Returns
+    -------
+    BuildingTop
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_few_points`` or ``too_complex``.
+    """
+    index = np.flatnonzero(top_visible(points))
+    grid = np.rint(points[index] * 1000.0).astype(np.int64)
+    kept, _ = unique_xy(grid[:, :2], grid[:, 2])
+    index = index[kept]
+    top = points[index]
+    if len(top) < settings.least_points:
+        raise BuildingError(
+            Reason.TOO_FEW_POINTS,
+            f"{len(top)} of {len(points)} points are visible from above, least_points is {settings.least_points}",
+        )
+    check_extent(top)
+    sigma_m = noise_sigma_m(top)
+    return BuildingTop(
+        points=top,
+        index=index,
+        spacing_m=point_spacing_m(top),
+        sigma_m=sigma_m,
+        distance_m=min(
+            max(settings.noise_factor * sigma_m, settings.plane_distance_min_m), settings.plane_distance_max_m
+        ),
+        tin=triangulate(grid[kept, :2]),
+    )
+
+
+def cluster_facets(top: BuildingTop, settings: KMeansSettings) -> tuple[LabelArray, FacetClusters]:
+    """Section 2.1: the facets of the TIN in clusters of one direction.
+
+    Returns
+    -------
+    labels : (m,) int32
+        Cluster of every facet of the TIN, -1 for those that are too steep or too long.
+    clusters : FacetClusters
+        Of the others, in their order.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``no_plane`` where fewer than three facets are left; ``too_complex``.
+    """
+    facets = top.tin.facets
+    normals, areas_m2 = facet_normals(top.points, facets), facet_areas_m2(top.points, facets)
+    gentle = normals[:, 2] > math.cos(math.radians(settings.max_slope_deg))
+    usable = gentle & (_longest_edges_m(top) <= settings.longest_edge_spacings * top.spacing_m)
+    if settings.longest_edge_spacings == 0.0 or usable.sum() < _LEAST_FACETS:
+        usable = gentle
+    if usable.sum() < _LEAST_FACETS:
+        raise BuildingError(
+            Reason.NO_PLANE,
+            f"{int(usable.sum())} of {len(facets)} facets are not steeper than max_slope_deg, "
+            f"{settings.max_slope_deg:g}; clusters need {_LEAST_FACETS}",
+        )
+    passes = passes_for_noise(top.sigma_m, top.spacing_m, settings.normal_noise_deg, settings.smoothing_passes)
+    normals = smoothed_normals(normals, areas_m2, top.tin.neighbours, usable, passes)
+    index = np.flatnonzero(usable)
+
+    def on_all_facets(labels: LabelArray) -> LabelArray:
+        everywhere = np.full(len(facets), -1, np.int32)
+        everywhere[index] = labels
+        return everywhere
+
+    def explained(labels: LabelArray) -> float:
+        return _share_explained(top, connected_parts(on_all_facets(labels), top.tin.neighbours))
+
+    clusters = choose_clusters(normals[index], settings.weights(areas_m2[index]), explained, settings)
+    return on_all_facets(clusters.labels), clusters
+
+
+def planes_of(top: BuildingTop, settings: KMeansSettings) -> tuple[FloatArray, LabelArray]:
+    """Sections 2.1 and 2.2: points in sets of one plane, and the planes by least squares.
+
+    Returns
+    -------
+    planes : (k, 3) float64
+        (a, b, c); none where no cluster has a plane.
+    labels : (n,) int32
+        Plane of every point of the top, -1 for none.
+
+    Raises
+    ------
+    BuildingError
+        As `cluster_facets`; ``too_complex`` beyond the work of the refinement.
+    """
+    clusters, _ = cluster_facets(top, settings)
+    if settings.refine:
+        return _refined_planes(top, clusters, settings)
+    labels = labels_by_angle(top.points, top.tin.facets, clusters)
+    planes, labels = _best_fit_planes(top.points, labels)
+    if len(planes) == 2 and _angle_deg(planes[0], planes[1]) < settings.one_plane_deg:
+        # one plane on which the clusters told only noise apart
+        planes, labels = _best_fit_planes(top.points, np.zeros(len(labels), np.int32))
+    return planes, labels
+
+
+def _refined_planes(top: BuildingTop, clusters: LabelArray, settings: KMeansSettings) -> tuple[FloatArray, LabelArray]:
+    """Parts that hang together, best-fit planes, merging, assignment anew, straight ridges."""
+    points, spacing_m, distance_m = top.points, top.spacing_m, top.distance_m
+    parts = connected_parts(clusters, top.tin.neighbours)
+    rough = labels_by_angle(points, top.tin.facets, parts)
+    neighbours = nearest_neighbours(points, settings.neighbours)
+    fewest_points = settings.fewest_points(spacing_m)
+    planes, labels = refine_planes(
+        points, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=settings
+    )
+    rough = cluster_leftovers(points, neighbours, labels, distance_m, fewest_points)
+    if settings.leftover_rounds > 0 and (rough != labels).any():
+        again = dataclasses.replace(settings, rounds=settings.leftover_rounds)
+        planes, labels = refine_planes(
+            points, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=again
+        )
+    reach_m = settings.ridge_reach_spacings * spacing_m
+    ridges = find_ridges(points, planes, labels, neighbours, distance_m=distance_m, reach_m=reach_m)
+    labels = label_by_ridges(points, planes, labels, ridges, distance_m=distance_m, reach_m=reach_m)
+    # A sliver along a ridge can lose all its points to the two sides: it is no plane any more.
+    kept = np.unique(labels[labels >= 0])
+    return planes[kept], np.where(labels >= 0, np.searchsorted(kept, labels), -1).astype(np.int32)
+
+
+def model_of(
+    top: BuildingTop,
+    planes: tuple[Plane, ...],
+    labels: LabelArray,
+    ground_z_m: float,
+    settings: KMeansSettings,
+) -> BuildingPrimitive | None:
+    """Sections 2.3 and 2.4: the gable of two planes, or the flat or pent counterpart of one.
+
+    Returns
+    -------
+    BuildingPrimitive or None
+        None for no plane or more than two; with `model: fitting` also where the model does not explain the building.
+
+    Raises
+    ------
+    BuildingError
+        With `model: always`: reason ``no_partition`` where the planes make none.
+    """
+    margin_m = settings.margin_spacings * top.spacing_m
+    try:
+        if len(planes) == 1:
+            model = fit_box(
+                top.points[labels == 0],
+                planes[0],
+                ground_z_m,
+                flat_below_deg=settings.flat_below_deg,
+                margin_m=margin_m,
+            )
+        elif len(planes) == 2:
+            fit = fit_gable(
+                top.points,
+                labels,
+                (planes[0], planes[1]),
+                ground_z_m,
+                least_side_share=settings.least_side_share,
+                margin_m=margin_m,
+            )
+            model = fit.model
+        else:
+            return None
+    except BuildingError:
+        if settings.model == "always":
+            raise
+        return None
+    if settings.model == "always" or _explains(model, top, settings):
+        return model
+    return None
+
+
+def sides_of(model: BuildingPrimitive, points: FloatArray, distance_m: float) -> LabelArray:
+    """The plane of the model at every point, (n,) int32: by the side of the ridge; -1 beyond a vertical distance."""
+    labels = np.zeros(len(points), np.int32)
+    planes = model.planes
+    if len(planes) == 2:
+        (x1, y1), (x2, y2) = model.corners[:2]
+        left = (x2 - x1) * (points[:, 1] - y1) - (y2 - y1) * (points[:, 0] - x1)
+        labels[left > 0.0] = 1
+    residuals = np.stack([vertical_residuals_m(points, plane.coefficients) for plane in planes])
+    own = residuals[labels, np.arange(len(points))]
+    labels[np.abs(own) > distance_m] = -1
+    return labels
+
+
+def _explains(model: BuildingPrimitive, top: BuildingTop, settings: KMeansSettings) -> bool:
+    """Whether a model is near the roof points, and has them near everywhere."""
+    if model.eave_z_m > model.top_z_m:
+        return False
+    if float(np.mean(sides_of(model, top.points, top.distance_m) >= 0)) < settings.fitting_share:
+        return False
+    corners = np.array(model.corners[-4:])
+    along, up = corners[1] - corners[0], corners[3] - corners[0]
+    columns, rows = (max(2, math.ceil(math.hypot(*side) / top.spacing_m)) for side in (along.tolist(), up.tolist()))
+    s, t = (np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows
+    samples = corners[0] + s[:, None, None] * along + t[None, :, None] * up
+    flat = np.column_stack([samples.reshape(-1, 2), np.zeros(columns * rows)])
+    empty = far_from(flat, top.points, settings.fill_gap_spacings * top.spacing_m)
+    return float(1.0 - empty.mean()) >= settings.fitting_fill
+
+
+def _longest_edges_m(top: BuildingTop) -> FloatArray:
+    """Longest edge of every facet in plan, (m,) float64."""
+    corners = top.points[top.tin.facets, :2]
+    edges = corners - np.roll(corners, 1, axis=1)
+    return np.asarray(np.hypot(edges[:, :, 0], edges[:, :, 1]).max(axis=1, initial=0.0))
+
+
+def _share_explained(top: BuildingTop, parts: LabelArray) -> float:
+    """Share of the points that lie on the best-fit plane of their part of the TIN."""
+    planes, labels = _best_fit_planes(top.points, labels_by_angle(top.points, top.tin.facets, parts))
+    labelled = np.flatnonzero(labels >= 0)
+    a, b, c = planes[labels[labelled]].T
+    x, y, z = top.points[labelled].T
+    off = np.abs(z - (a * x + b * y + c)) / np.sqrt(1.0 + a * a + b * b)
+    return float((off <= top.distance_m).sum()) / len(top.points)
+
+
+def _best_fit_planes(points: FloatArray, labels: LabelArray) -> tuple[FloatArray, LabelArray]:
+    """Least-squares planes of the sets that have one, and the labels renumbered."""
+    count = int(labels.max()) + 1
+    sums = cluster_sums(points, labels.astype(np.int32), count)
+    fits = [best_fit_plane(one) for one in sums]
+    kept = [k for k, fit in enumerate(fits) if fit[3]]
+    number = np.full(count + 1, -1, np.int32)
+    number[kept] = np.arange(len(kept), dtype=np.int32)
+    return np.array([fits[k][:3] for k in kept]).reshape(len(kept), 3), number[labels]
+
+
+def _angle_deg(first: FloatArray, second: FloatArray) -> float:
+    """Angle between two planes (a, b, c)."""
+    (a, b), (p, q) = first[:2].tolist(), second[:2].tolist()
+    across = math.sqrt((b - q) ** 2 + (a - p) ** 2 + (a * q - b * p) ** 2)
+    return math.degrees(math.atan2(across, 1.0 + a * p + b * q))
+
+
+def _moved(face: PlanFace, x: float, y: float) -> PlanFace:
+    """The face over the candidate's own origin, on whole millimetres."""
+    shift = np.array([x, y])
+    polygon = shapely.transform(face.polygon, lambda xy: np.rint((xy + shift) * 1000.0) / 1000.0)
+    return dataclasses.replace(face, polygon=polygon)

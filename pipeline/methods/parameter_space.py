@@ -1,0 +1,309 @@
+"""Parameter spaces (Hofmann, Maas and Streilein 2003): from the facets of a building's TIN to roof type and planes.
+
+The order of the steps is the paper's: TIN about the barycentre (2), slope, orientation and O-distance of its facets,
+clusters in two (3.1, 3.2) or three dimensions (4.1), decision tree (3.3, 4.2), and the building primitive of the
+outlook (5, Figure 5-1): planes interpolated in the groups of points that the clusters hold, closed by walls.
+`faithful()` is the paper to the letter, as far as it is printed; the defaults are what measured better.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pipeline.errors import BuildingError
+from pipeline.geometry import facet_areas_m2, nearest_neighbours, noise_sigma_m, point_spacing_m, top_visible
+from pipeline.methods.local_frame import check_extent, ground_around, local_metres, plane_over_origin
+from pipeline.model import BoolArray, Candidate, FloatArray, LabelArray, Reason, RoofType, Segmentation, Tin
+from pipeline.parameters import parameter
+from pipeline.segmentation.cluster_membership import ClusterMembershipSettings, may_be_roof, refine_clusters
+from pipeline.segmentation.facet_clusters import labels_of_points
+from pipeline.segmentation.facet_parameters import about_barycentre, cluster_means, facet_parameters
+from pipeline.segmentation.parameter_boxes import ParameterBoxSettings, coarse_clusters
+from pipeline.segmentation.plane_refinement import describe_planes
+from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
+from pipeline.segmentation.point_assignment import vote_among_neighbours
+from pipeline.segmentation.region_growing import RegionGrowingSettings, grow_regions
+from pipeline.segmentation.roof_trees import RoofTreeSettings, classify_2d, classify_3d, plausible_slopes
+from pipeline.segmentation.single_linkage import SingleLinkageSettings, cluster_by_linkage
+from pipeline.tin.delaunay import triangulate, unique_xy
+
+_LEAST_POINTS = 4
+"""Below this there is neither a spacing nor a noise to speak of."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ParameterSpaceSettings(RegionGrowingSettings, RoofTreeSettings):
+    """What both methods share."""
+
+    surroundings_m: float = parameter(
+        5.0, "Terrain takes part up to this distance from the roof's points.", unit="m", minimum=0.0, maximum=1000.0
+    )
+    ground_gap_spacings: float = parameter(
+        0.7,
+        "Terrain samples nearer to a roof point than this many mean point spacings count as beneath the roof.",
+        minimum=0.01,
+        maximum=100.0,
+    )
+    ground_clusters: str = parameter(
+        "drop",
+        "Clusters of terrain and walls: all kept but those that the paper eliminates; dropped where fewer than half of "
+        "their facets touch roof points alone; or facets that touch terrain not clustered at all.",
+        choices=("keep", "drop", "leave_out"),
+    )
+    point_groups: str = parameter(
+        "region_growing",
+        "Points of a roof face: those of the facets that are members of a cluster, or a region grown from its mean.",
+        choices=("membership", "region_growing"),
+    )
+    least_area_m2: float = parameter(
+        3.0, "A region has at least as many points as this area holds in plan.", unit="m2", minimum=0.0, maximum=1000.0
+    )
+    least_points: int = parameter(
+        5, "Fewest points of a roof face, however sparse the cloud.", unit="points", minimum=3, maximum=10_000
+    )
+    type_from: str = parameter(
+        "faces",
+        "What names the roof type: the paper's decision tree, or the rule over the delivered faces.",
+        choices=("tree", "faces"),
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
+    """Settings of the method in slope and orientation."""
+
+    least_slope_deg: float = parameter(
+        7.0, "Clusters with less mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
+    )
+    most_slope_deg: float = parameter(
+        75.0, "Clusters with more mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
+    )
+
+    @classmethod
+    def faithful(cls) -> ParameterSpace2dSettings:
+        """The paper's words: terrain as it is clustered, points by membership, its own tree."""
+        return cls(ground_clusters="keep", point_groups="membership", type_from="tree")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ParameterSpace3dSettings(ParameterSpaceSettings, ParameterBoxSettings, ClusterMembershipSettings):
+    """Settings of the method in slope, orientation and O-distance."""
+
+    @classmethod
+    def faithful(cls) -> ParameterSpace3dSettings:
+        """The paper's words: terrain as it is clustered, points by membership, its own tree."""
+        return cls(ground_clusters="keep", point_groups="membership", type_from="tree")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Facets:
+    """The TIN of a building with its surroundings, and the parameters of its facets."""
+
+    roof: FloatArray
+    """(n, 3) float64, the points visible from above, metres about an origin of whole metres."""
+    visible: LabelArray
+    """(n,) their indices among the candidate's points."""
+    shift: FloatArray
+    """(3,) that origin."""
+    spacing_m: float
+    """Mean point spacing of the roof."""
+    vertices: FloatArray
+    """(v, 3) float64, roof points and terrain samples about their barycentre."""
+    vertex_point: LabelArray
+    """(v,) int32, roof point at every vertex, -1 for terrain."""
+    vertex_of_point: LabelArray
+    """(n,) int32, the vertex that stands for each roof point."""
+    tin: Tin
+    """Its facets."""
+    parameters: FloatArray
+    """(m, 3) float64, slope, orientation, O-distance."""
+    is_roof: BoolArray
+    """(m,) bool, True where all vertices are roof points."""
+
+
+def segment_2d(candidate: Candidate, settings: ParameterSpace2dSettings) -> Segmentation:
+    """Roof planes and type of one building from clusters of its facets in slope and orientation (section 3).
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Its points, and the terrain around it.
+    settings : ParameterSpace2dSettings
+        `ParameterSpace2dSettings()` or `ParameterSpace2dSettings.faithful()`.
+
+    Returns
+    -------
+    Segmentation
+        Without planes where no cluster of roof points is left.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_few_points`` where hardly any are visible; ``too_complex`` beyond a limit of work.
+    """
+    facets = _facets_of(candidate, settings)
+    taken = _facets_to_cluster(facets, settings)
+
+    # 3.2: single linkage in slope and orientation; the distance shrinks while one cluster holds most of all facets.
+    labels = np.full(len(facets.tin), -1, np.int32)
+    if len(taken):
+        slopes, orientations, _ = facets.parameters[taken].T
+        labels[taken] = cluster_by_linkage(slopes, orientations, settings).labels
+    centres = cluster_means(facets.parameters, labels, int(labels.max(initial=-1)) + 1)
+
+    # 3.3: clusters with a plausible slope are faces; their arrangement is the type.
+    kept = plausible_slopes(centres, settings.least_slope_deg, settings.most_slope_deg)
+    kept &= _not_terrain(facets, labels, len(centres), settings)
+    labels, centres = _kept_clusters(labels, centres, kept)
+    return _primitive(candidate, facets, labels, centres, classify_2d(centres, settings).roof_type, settings)
+
+
+def segment_3d(candidate: Candidate, settings: ParameterSpace3dSettings) -> Segmentation:
+    """Roof planes and type of one building from clusters of its facets in all three parameters (section 4).
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Its points, and the terrain around it.
+    settings : ParameterSpace3dSettings
+        `ParameterSpace3dSettings()` or `ParameterSpace3dSettings.faithful()`.
+
+    Returns
+    -------
+    Segmentation
+        Without planes where no cluster of roof points is left.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_few_points`` where hardly any are visible; ``too_complex`` beyond a limit of work.
+    """
+    facets = _facets_of(candidate, settings)
+    taken = _facets_to_cluster(facets, settings)
+
+    # 4.1: coarse clusters of dense boxes, then weighted centres and membership.
+    parameters = facets.parameters[taken]
+    refined = refine_clusters(parameters, coarse_clusters(parameters, settings), facets.spacing_m, settings)
+    labels = np.full(len(facets.tin), -1, np.int32)
+    labels[taken] = refined.labels
+
+    # 4.2: ground and walls are eliminated; the arrangement of the others is the type.
+    kept = may_be_roof(refined.centres, settings) & _not_terrain(facets, labels, len(refined.centres), settings)
+    labels, centres = _kept_clusters(labels, refined.centres, kept)
+    return _primitive(candidate, facets, labels, centres, classify_3d(centres, settings).roof_type, settings)
+
+
+def _facets_of(candidate: Candidate, settings: ParameterSpaceSettings) -> _Facets:
+    """Section 2: the Delaunay TIN of the building with some surrounding ground, about its barycentre."""
+    points, shift = local_metres(candidate.points)
+    visible = np.flatnonzero(top_visible(points)).astype(np.int32)
+    roof = points[visible]
+    if len(roof) < _LEAST_POINTS:
+        raise BuildingError(
+            Reason.TOO_FEW_POINTS,
+            f"{len(roof)} of {len(points)} points are visible from above, at least {_LEAST_POINTS} are needed",
+        )
+    spacing_m = point_spacing_m(roof)
+    gap_m = max(settings.ground_gap_spacings * spacing_m, 1e-3)
+    ground = ground_around(candidate.ground, shift, roof, gap_m, settings.surroundings_m)
+    cloud = np.concatenate([roof, ground])
+    check_extent(cloud)
+    millimetres = np.rint(cloud * 1000.0).astype(np.int64)
+    kept, kept_of_point = unique_xy(millimetres[:, :2], millimetres[:, 2])
+    tin = triangulate(millimetres[kept, :2])
+    vertices, _ = about_barycentre(cloud[kept])
+    vertex_point = np.where(kept < len(roof), kept, -1).astype(np.int32)
+    return _Facets(
+        roof=roof,
+        visible=visible,
+        shift=shift,
+        spacing_m=spacing_m,
+        vertices=vertices,
+        vertex_point=vertex_point,
+        vertex_of_point=kept_of_point[: len(roof)],
+        tin=tin,
+        parameters=facet_parameters(vertices, tin.facets),
+        is_roof=np.asarray((vertex_point >= 0)[tin.facets].all(axis=1)),
+    )
+
+
+def _facets_to_cluster(facets: _Facets, settings: ParameterSpaceSettings) -> LabelArray:
+    """Indices of the facets whose parameters are clustered."""
+    if settings.ground_clusters == "leave_out":
+        return np.flatnonzero(facets.is_roof).astype(np.int32)
+    return np.arange(len(facets.tin), dtype=np.int32)
+
+
+def _not_terrain(facets: _Facets, labels: LabelArray, n_clusters: int, settings: ParameterSpaceSettings) -> BoolArray:
+    """Clusters that are not mostly facets of terrain and walls: (k,) bool; all where they are to be kept."""
+    if settings.ground_clusters == "keep":
+        return np.ones(n_clusters, np.bool_)
+    own = np.bincount(labels[(labels >= 0) & facets.is_roof], minlength=n_clusters)
+    return np.asarray(2 * own >= np.bincount(labels[labels >= 0], minlength=n_clusters))
+
+
+def _kept_clusters(labels: LabelArray, centres: FloatArray, kept: BoolArray) -> tuple[LabelArray, FloatArray]:
+    """The clusters that are left, numbered anew in their order."""
+    number = np.full(len(kept) + 1, -1, np.int32)
+    number[:-1][kept] = np.arange(int(kept.sum()), dtype=np.int32)
+    return number[labels], centres[kept]
+
+
+def _primitive(
+    candidate: Candidate,
+    facets: _Facets,
+    labels: LabelArray,
+    centres: FloatArray,
+    roof_type: RoofType,
+    settings: ParameterSpaceSettings,
+) -> Segmentation:
+    """Section 5, Figure 5-1: planes interpolated in the groups of points; the faces are closed by walls later."""
+    areas_m2 = facet_areas_m2(facets.vertices, facets.tin.facets)
+    no_facet = np.full(len(facets.roof), -1, np.int32)
+    groups = labels_of_points(facets.tin.facets, labels, areas_m2, facets.vertex_point, no_facet)
+    if settings.point_groups == "region_growing":
+        planes, groups = _grown(facets, groups, centres, settings)
+    else:
+        planes, groups = _interpolated(facets.roof, groups, len(centres), settings.least_points)
+    all_labels = np.full(len(candidate.points), -1, np.int32)
+    all_labels[facets.visible] = groups
+    described = describe_planes(facets.roof, planes, groups)
+    return Segmentation(
+        planes=tuple(plane_over_origin(plane, facets.shift) for plane in described),
+        labels=all_labels,
+        roof_type=roof_type if settings.type_from == "tree" and len(planes) else None,
+    )
+
+
+def _interpolated(
+    roof: FloatArray, groups: LabelArray, n_groups: int, least_points: int
+) -> tuple[FloatArray, LabelArray]:
+    """Least-squares planes of groups of points; groups that hold no plane are none any more."""
+    sums = cluster_sums(roof, groups, n_groups)
+    fits = [best_fit_plane(row) for row in sums]
+    kept = np.array([fit[3] and row[0] >= least_points for fit, row in zip(fits, sums, strict=True)], np.bool_)
+    planes = np.array([fit[:3] for fit in fits]).reshape(-1, 3)
+    groups, planes = _kept_clusters(groups, planes, kept)
+    return planes, groups
+
+
+def _grown(
+    facets: _Facets, groups: LabelArray, centres: FloatArray, settings: ParameterSpaceSettings
+) -> tuple[FloatArray, LabelArray]:
+    """Regions grown from the clusters' means; points between two of them go to the nearer plane."""
+    roof = facets.roof
+    sigma_m = noise_sigma_m(roof)
+    distance_m = settings.growing_distance_m(sigma_m)
+    neighbours = nearest_neighbours(roof, settings.growing_neighbours)
+    fewest = max(settings.least_points, min(int(settings.least_area_m2 / facets.spacing_m**2), 10_000))
+    tangent, turn = np.tan(np.radians(np.minimum(centres[:, 0], 89.0))), np.radians(centres[:, 1])
+    gradients = np.column_stack([-tangent * np.sin(turn), -tangent * np.cos(turn)])
+    planes, labels = grow_regions(
+        roof, neighbours, groups, gradients, distance_m=distance_m, fewest_points=fewest, settings=settings
+    )
+    labels = vote_among_neighbours(
+        roof, neighbours, labels, planes, np.ones(len(planes), np.bool_), distance_m, 0.04, 4
+    )
+    return _interpolated(roof, labels, len(planes), settings.least_points)

@@ -1,0 +1,144 @@
+"""Several methods over the same candidates: each as if it had run alone, the scene split once."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import RunCancelledError, RunError, SettingsError
+from pipeline.runtime.compare import CompareRequest, CompareSummary, Variant, compare, parse_variants, settings_of
+from pipeline.runtime.events import Event
+from pipeline.runtime.run import RunRequest, RunVariant, run, run_variants
+from pipeline.settings import RunSettings
+
+BOTH = parse_variants(["fuzzy-sart,fuzzy-sart:faithful"])
+
+
+def request(suburb: Path, out: Path, **fields: object) -> CompareRequest:
+    run_request = RunRequest(inputs=(str(suburb),), out=str(out), workers=0)
+    return CompareRequest(run=dataclasses.replace(run_request, **fields), variants=BOTH)
+
+
+@pytest.fixture(scope="module")
+def compared(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[CompareSummary, list[Event]]:
+    """Both presets of Fuzzy SART on the suburb, and what was told meanwhile."""
+    events: list[Event] = []
+    return compare(request(suburb, tmp_path_factory.mktemp("compared") / "out"), events.append), events
+
+
+@pytest.mark.parametrize("variant", BOTH, ids=lambda variant: variant.label)
+def test_each_variant_has_the_content_of_a_run_of_its_own(
+    suburb: Path, compared: tuple[CompareSummary, list[Event]], variant: Variant, tmp_path: Path
+) -> None:
+    settings = RunSettings.from_mapping({"method": variant.method, "preset": variant.preset})
+    alone = run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "alone"), settings=settings, workers=0))
+    beside = compared[0].runs[variant.label]
+    assert beside.digest == alone.digest
+    assert beside.counts == alone.counts
+    manifests = [json.loads((Path(found.run_dir) / "run.json").read_text()) for found in (alone, beside)]
+    for name in ("status", "method", "settings", "settings_hash", "inputs", "tiles", "counts", "content_sha256"):
+        assert manifests[0][name] == manifests[1][name], name
+
+
+def test_the_presets_differ(compared: tuple[CompareSummary, list[Event]]) -> None:
+    assert len({found.digest for found in compared[0].runs.values()}) == 2
+
+
+def test_candidates_are_found_once_and_modelled_once_a_variant(compared: tuple[CompareSummary, list[Event]]) -> None:
+    summary, events = compared
+    stages = [event.stage for event in events if event.kind == "stage"]
+    assert stages == ["ingest", "split", "join", "reconstruct", "reconstruct", "publish", "publish"]
+    candidates = summary.runs["fuzzy-sart"].counts["candidates"]
+    counted = [
+        (event.done, event.total) for event in events if (event.kind, event.stage) == ("progress", "reconstruct")
+    ]
+    assert counted == sorted(counted)
+    assert counted[-1] == (2 * candidates, 2 * candidates)
+    assert {event.total for event in events if event.stage == "reconstruct"} == {2 * candidates}
+
+
+def test_every_building_has_its_seconds(compared: tuple[CompareSummary, list[Event]]) -> None:
+    summary, _ = compared
+    first, second = summary.seconds.values()
+    assert set(first) == set(second)
+    assert len(first) == summary.runs["fuzzy-sart"].counts["candidates"]
+    assert min(first.values()) > 0.0
+
+
+def test_nothing_but_the_runs_is_left(compared: tuple[CompareSummary, list[Event]]) -> None:
+    out = Path(compared[0].out)
+    assert [entry.name for entry in out.iterdir()] == ["runs"]
+    assert sorted(entry.name for entry in (out / "runs").iterdir()) == ["fuzzy-sart", "fuzzy-sart-faithful"]
+
+
+def test_a_comparison_that_is_called_off_says_so_in_every_run(suburb: Path, tmp_path: Path) -> None:
+    seen: list[str] = []
+
+    def listen(event: Event) -> None:
+        seen.append(event.stage)
+        if event.stage == "reconstruct" and event.done > 0:
+            raise RunCancelledError("the listener calls it off")
+
+    with pytest.raises(RunCancelledError):
+        compare(request(suburb, tmp_path / "out"), listen)
+    states = [json.loads(path.read_text())["status"] for path in sorted((tmp_path / "out").glob("runs/*/run.json"))]
+    assert states == ["cancelled", "cancelled"]
+    assert not (tmp_path / "out" / "scratch").exists()
+
+
+def test_another_comparison_replaces_all_of_the_earlier_one_when_asked(suburb: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    stale = out / "runs" / "an-earlier-method"
+    stale.mkdir(parents=True)
+    (stale / "run.json").write_text("{}")
+    with pytest.raises(RunError, match="is not empty"):
+        compare(request(suburb, out))
+    assert stale.exists()
+    compare(request(suburb, out, overwrite=True))
+    assert not stale.exists()
+
+
+def test_a_folder_of_something_else_is_never_replaced(suburb: Path, tmp_path: Path) -> None:
+    (tmp_path / "thesis.docx").write_text("years of work")
+    with pytest.raises(RunError, match="is no comparison"):
+        compare(request(suburb, tmp_path, overwrite=True))
+    assert (tmp_path / "thesis.docx").exists()
+
+
+def test_variants_that_would_find_other_candidates_are_refused(suburb: Path, tmp_path: Path) -> None:
+    given = RunRequest(inputs=(str(suburb),), out=str(tmp_path), workers=0)
+    ways = [
+        RunVariant(settings=RunSettings.from_mapping(table), out=str(tmp_path / label), label=label)
+        for label, table in (("a", {}), ("b", {"ground": {"max_slope": 0.5}}))
+    ]
+    with pytest.raises(SettingsError, match="b would find other candidates than a"):
+        run_variants(given, ways, str(tmp_path / "work"))
+
+
+@pytest.mark.parametrize(
+    ("texts", "told"),
+    [
+        (["magic,fuzzy-sart"], "method is 'magic': use one of"),
+        (["fuzzy-sart:bold,fuzzy-sart"], "preset is 'bold': use one of robust, faithful"),
+        (["fuzzy-sart", "fuzzy-sart"], "methods holds fuzzy-sart twice"),
+        (["fuzzy-sart"], "give two or more"),
+        ([""], "method is ''"),
+    ],
+)
+def test_variants_that_make_no_sense_are_told(texts: list[str], told: str) -> None:
+    with pytest.raises(SettingsError, match=told):
+        parse_variants(texts)
+
+
+def test_own_settings_of_a_method_hold_for_its_variant_alone() -> None:
+    own = RunSettings.from_mapping({"fuzzy-sart": {"vigilance": 0.8}, "roof": {"minimum_points": 12}})
+    kept, other = (settings_of(own, variant) for variant in BOTH)
+    assert kept is own
+    assert other.building.roof.minimum_points == 12
+    assert (
+        other.settings_hash
+        == RunSettings.from_mapping({"preset": "faithful", "roof": {"minimum_points": 12}}).settings_hash
+    )
