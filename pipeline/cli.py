@@ -251,9 +251,12 @@ def compare(
             for told in facts["variants"]
         ]
         console.table("Methods", ["method", *names, "roof faces", "a building (median)"], rows)
-        for label, evaluation in made.evaluations.items():
-            decisive = [(line.label, line.value, line.interval, line.n) for _, line in headline(chapters(evaluation))]
-            console.table(f"{label} against the reference", ["measure", "value", "95 % interval", "n"], decisive)
+        found = {label: headline(chapters(evaluation)) for label, evaluation in made.evaluations.items()}
+        if found:
+            values = {label: {line.label: line.value for _, line in lines} for label, lines in found.items()}
+            measures = [line.label for _, line in next(iter(found.values()))]
+            compared = [(name, *(values[label].get(name, "") for label in values)) for name in measures]
+            console.table("Against the reference", ["measure", *values], compared)
         for path in made.written:
             console.say(f"wrote {path}")
         console.document(facts | {"out": made.summary.out, "written": [str(path) for path in made.written]})

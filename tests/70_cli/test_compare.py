@@ -1,0 +1,98 @@
+"""`gablework compare` as a user runs it: one command, one folder, one page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+
+
+def invoke(*words: str) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a command line."""
+    result = CliRunner().invoke(app, list(words))
+    return result.exit_code, result.stdout, result.stderr
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a small simulated suburb."""
+    folder = tmp_path_factory.mktemp("scene")
+    size = ("--size", "70", "70", "--density", "4", "--seed", "3")
+    assert invoke("simulate", "suburb", "--out", str(folder), *size, "--quiet")[0] == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def compared(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Three variants measured against the truth: the folder, and the JSON document."""
+    out = tmp_path_factory.mktemp("compared") / "out"
+    methods = ("--methods", "fuzzy-sart,kmeans:faithful", "--methods", "parameter-space-3d")
+    options = ("--truth", str(scene / "truth"), "--workers", "0", "--json")
+    code, said, told = invoke("compare", str(scene / "suburb.laz"), *methods, "--out", str(out), *options)
+    assert code == 0, told
+    return out, json.loads(said)
+
+
+def test_everything_is_in_one_folder(compared: tuple[Path, dict[str, Any]]) -> None:
+    out, _ = compared
+    assert {entry.name for entry in out.iterdir()} == {
+        "runs", "compare.json", "buildings.parquet", "compare.md", "index.html",
+    }  # fmt: skip
+    assert {entry.name for entry in (out / "runs").iterdir()} == {
+        "fuzzy-sart", "kmeans-faithful", "parameter-space-3d",
+    }  # fmt: skip
+
+
+def test_the_document_is_what_compare_json_holds(compared: tuple[Path, dict[str, Any]]) -> None:
+    out, document = compared
+    stored = json.loads((out / "compare.json").read_text())
+    assert {name: document[name] for name in stored} == stored
+    candidates = {told["counts"]["candidates"] for told in stored["variants"]}
+    assert len(candidates) == 1
+    for told in stored["variants"]:
+        assert sum(told["statuses"].values()) == candidates.copy().pop()
+        assert json.loads((out / told["run_dir"] / "run.json").read_text())["content_sha256"] == told["content_sha256"]
+        assert told["seconds_a_building"]["median"] > 0.0
+
+
+def test_every_building_has_a_row_a_method(compared: tuple[Path, dict[str, Any]]) -> None:
+    out, document = compared
+    table = pq.read_table(out / "buildings.parquet")
+    candidates = document["variants"][0]["counts"]["candidates"]
+    assert table.num_rows == 3 * candidates
+    assert set(table.column("label").to_pylist()) == {told["label"] for told in document["variants"]}
+    assert "outcome" in table.column_names
+
+
+def test_the_page_names_every_method_and_every_building(compared: tuple[Path, dict[str, Any]]) -> None:
+    out, document = compared
+    page = (out / "index.html").read_text()
+    for told in document["variants"]:
+        assert told["label"] in page
+    for building_id in set(pq.read_table(out / "buildings.parquet").column("building_id").to_pylist()):
+        assert building_id in page
+
+
+def test_bad_variants_are_refused_before_anything_is_written(scene: Path, tmp_path: Path) -> None:
+    code, _, told = invoke(
+        "compare", str(scene / "suburb.laz"), "--methods", "magic,fuzzy-sart:bold", "--out", str(tmp_path / "out")
+    )
+    assert code == 2
+    assert "magic" in told
+    assert "bold" in told
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_reference_that_cannot_be_read_is_told_before_the_runs(scene: Path, tmp_path: Path) -> None:
+    nowhere = ("--truth", str(tmp_path / "nowhere"), "--workers", "0")
+    methods = ("--methods", "fuzzy-sart,fuzzy-sart:faithful")
+    code, _, told = invoke("compare", str(scene / "suburb.laz"), *methods, "--out", str(tmp_path / "out"), *nowhere)
+    assert code != 0
+    assert "nowhere" in told
+    assert not (tmp_path / "out").exists()
