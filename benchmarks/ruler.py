@@ -1,30 +1,38 @@
-"""The whole report: every suite and every real tile, reconstructed as a user would and measured by the ruler.
+"""All methods, held to one ruler: every suite and every real tile.
 
-    python benchmarks/ruler.py --out DIR [--data ../shared/data] [--split test] [--only hofmann310 delft]
+    python benchmarks/ruler.py --out DIR [--data ../shared/data] [--split test] [--only hofmann310 delft] [--jobs 2]
+                               [--methods METHOD[:PRESET] ...] [--no-pages]
 
-For each entry of the table below: `gablework simulate` (suites), `gablework reconstruct`, `gablework evaluate --out`;
-DIR/<entry>/report holds the page, the Markdown and the tables. DIR/report.md then holds one line an entry, DIR/sweep.md
-the planes of at least 10 m2 by density and noise. What is there already is not done again: delete it to repeat it.
+By default every method with its default settings. An entry of the table below is simulated once (suites), its
+candidates are found once, each method models them, and each run is measured; `benchmarks/entries.py` tells where
+everything lies. DIR/methods.md then holds one line an entry and method, DIR/sweep.md a table a method: the roof faces
+of at least 10 m2 by density and noise. What is there already is not done again: delete it to repeat it.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import math
-import subprocess
+import statistics
 import sys
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
+from benchmarks.entries import (
+    Entry,
+    SimulatedScene,
+    Workplace,
+    all_variants,
+    hofmann_entries,
+    markdown_table,
+    measure_all,
+    sweep_entries,
+)
+from pipeline.runtime.compare import Variant
+from pipeline.synthetic.seeds import seed_of
 
-from pipeline.synthetic.sweep import DENSITIES_PER_M2, NOISES_M, cell_name
-
-GABLEWORK = str(Path(sys.executable).with_name("gablework"))
 CUBES = 20
 """Draws of the cube: it is one building."""
 
@@ -48,183 +56,162 @@ SHOWN = (
 """Measures of the overview, with their column heads."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Entry:
-    """One line of the overview."""
-
-    name: str
-    """Also its folder."""
-    tiles: tuple[Path, ...] = ()
-    """What is reconstructed; of a simulated scene what `scene` holds."""
-    scene: Path | None = None
-    """Folder of the simulated scene."""
-    simulate: tuple[str, ...] = ()
-    """Arguments of `simulate`, where the scene is not there yet."""
-    run_options: tuple[str, ...] = ()
-    """Of `reconstruct`."""
-    reference: tuple[str, ...] = ()
-    """Options of `evaluate`."""
-
-
-def gablework(*arguments: str | Path) -> dict[str, Any]:
-    """Run the console command; the JSON document that it prints."""
-    command = [GABLEWORK, *(str(argument) for argument in arguments), "--json"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    if done.returncode:
-        sys.exit(f"{' '.join(command)}\nexit code {done.returncode}\n{done.stderr[-3000:]}")
-    document: dict[str, Any] = json.loads(done.stdout)
-    return document
-
-
-def suites(out: Path, split: str) -> Iterator[Entry]:
-    """The suites."""
-    scenes = out / "scenes"
-    serial = ("--workers", "0")
+def suites(split: str) -> Iterator[Entry]:
+    """The suites, the largest first."""
+    yield Entry(name="city", scene=SimulatedScene(suite="city", seed=seed_of(split, 0)))
+    yield from sweep_entries(split)
+    yield from hofmann_entries(split, 1)
     for draw in range(CUBES):
-        arguments = ("cube", "--split", split, "--draw", str(draw))
-        yield Entry(name=f"cube-{draw:02d}", scene=scenes / f"cube-{draw:02d}", simulate=arguments, run_options=serial)
-    for suite in ("hofmann310", "city"):
-        yield Entry(name=suite, scene=scenes / suite, simulate=(suite, "--split", split))
-    for density in DENSITIES_PER_M2:
-        for noise in NOISES_M:
-            arguments = ("sweep", "--split", split, "--density", f"{density:g}", "--noise", f"{noise:g}")
-            yield Entry(
-                name=f"sweep-{cell_name(density, noise)}",
-                scene=scenes / "sweep" / cell_name(density, noise),
-                simulate=arguments,
-                run_options=serial,
-            )
+        scene = SimulatedScene(suite="cube", seed=seed_of(split, draw))
+        yield Entry(name=f"cube-{draw:02d}", scene=scene, has_page=False)
 
 
 def real_tiles(data: Path) -> Iterator[Entry]:
-    """The real tiles, with what each has as reference."""
-    ahn = ("--crs", "EPSG:7415")
-    west, east = data / "ahn3" / "delft_west.laz", data / "ahn3" / "delft_east.laz"
-    outlines = ("--footprints", str(data / "ahn3" / "footprints.gpkg"))
-    both = ("--points", str(west), "--points", str(east))
-    yield Entry(
-        name="delft-footprints",
-        tiles=(west, east),
-        run_options=(*ahn, *outlines, "--classes", "trust"),
-        reference=(*ahn, *outlines, *both),
-    )
+    """The real tiles that are there, with what each has as reference."""
+    crs = "EPSG:7415"
+    delft = (data / "ahn3" / "delft_west.laz", data / "ahn3" / "delft_east.laz")
+    outlines = data / "ahn3" / "footprints.gpkg"
+    entries = [Entry(name="delft-footprints", tiles=delft, crs=crs, footprints=outlines, points=delft)]
     for classes in ("trust", "ignore"):
-        options = (*ahn, "--classes", classes)
-        yield Entry(name=f"delft-{classes}", tiles=(west, east), run_options=options, reference=(*ahn, *both))
+        entries.append(Entry(name=f"delft-{classes}", tiles=delft, crs=crs, classes=classes, points=delft))
         for tile in ("hdf_870000_6617100", "hd_770500_6277500"):
             path = data / "ign" / f"{tile}.laz"
-            reference = ("--points", str(path))
-            yield Entry(
-                name=f"{tile}-{classes}", tiles=(path,), run_options=("--classes", classes), reference=reference
-            )
+            entries.append(Entry(name=f"{tile}-{classes}", tiles=(path,), classes=classes, points=(path,)))
     for path in sorted((data / "isprs").glob("samp*-utm.laz")):
-        yield Entry(
-            name=path.stem.removesuffix("-utm"),
-            tiles=(path,),
-            run_options=("--classes", "ignore"),
-            reference=("--points", str(path)),
-        )
-    yield Entry(name="CSite2", tiles=(data / "isprs" / "CSite2_orig-utm.laz",), run_options=("--classes", "ignore"))
-    yield Entry(name="autzen_trim", tiles=(data / "oregon" / "autzen_trim.las",), run_options=("--classes", "ignore"))
+        name = path.stem.removesuffix("-utm")
+        entries.append(Entry(name=name, tiles=(path,), classes="ignore", points=(path,)))
+    entries.append(Entry(name="CSite2", tiles=(data / "isprs" / "CSite2_orig-utm.laz",), classes="ignore"))
+    entries.append(Entry(name="autzen_trim", tiles=(data / "oregon" / "autzen_trim.las",), classes="ignore"))
+    yield from (entry for entry in entries if all(path.exists() for path in entry.tiles))
 
 
-def is_finished(run_dir: Path) -> bool:
-    """Whether a run is there, whole."""
-    manifest = run_dir / "run.json"
-    return manifest.exists() and json.loads(manifest.read_text(encoding="utf-8"))["status"] == "finished"
-
-
-def measured(entry: Entry, out: Path) -> list[dict[str, Any]]:
-    """Reconstruct and evaluate one entry; its measures."""
-    folder = out / entry.name
-    table = folder / "report" / "measures.parquet"
-    if not table.exists():
-        started = time.perf_counter()
-        tiles = [str(tile) for tile in entry.tiles]
-        reference = entry.reference
-        if entry.scene is not None:
-            if not (entry.scene / "truth" / "scene.json").exists():
-                target = entry.scene.parent if entry.simulate[0] == "sweep" else entry.scene
-                gablework("simulate", *entry.simulate, "--out", target)
-            tiles = sorted(str(path) for path in [*entry.scene.glob("*.laz"), *entry.scene.glob("tiles/*.laz")])
-            reference = ("--truth", str(entry.scene / "truth"), "--as-surveyed")
-        if not is_finished(folder / "run"):
-            gablework("reconstruct", *tiles, "--out", folder / "run", "--overwrite", *entry.run_options)
-        gablework("evaluate", folder / "run", *reference, "--out", folder / "report")
-        print(f"{entry.name}: {time.perf_counter() - started:.0f} s", flush=True)
-    rows: list[dict[str, Any]] = pq.read_table(table).to_pylist()
-    return rows
-
-
-def run_facts(folder: Path) -> list[str]:
-    """Candidates by status, seconds, and peak memory of the largest process, as the run's own record has them."""
-    manifest = json.loads((folder / "run" / "run.json").read_text(encoding="utf-8"))
-    counts = manifest["counts"]
-    statuses = "/".join(str(counts[name]) for name in ("ok", "fallback", "failed"))
-    peak = max(manifest["peak_memory_bytes"].values(), default=0) / 1e6
-    return [statuses, f"{manifest['timings_s']['total']:.1f}", f"{peak:.0f}"]
-
-
-def figure(row: dict[str, Any] | None) -> str:
+def figure(row: Mapping[str, Any] | None) -> str:
     """A measure as a cell."""
     if row is None or row["value"] is None or math.isnan(row["value"]):
         return ""
     return f"{row['value']:.3f} m" if row["unit"] == "m" else f"{row['value']:.3f}"
 
 
-def cell(rows: Sequence[dict[str, Any]], name: str) -> str:
+def cell(rows: Sequence[Mapping[str, Any]], name: str) -> str:
     """The figure of one measure over all buildings."""
     return figure(next((row for row in rows if row["name"] == name and row["subset"] == "all"), None))
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+def run_facts(manifest: Mapping[str, Any]) -> list[str]:
+    """Candidates by status, and milliseconds a candidate of the stage that models them."""
+    counts = manifest["counts"]
+    statuses = "/".join(str(counts[name]) for name in ("ok", "fallback", "failed"))
+    if not counts["candidates"]:
+        return [statuses, ""]
+    return [statuses, f"{1000.0 * manifest['timings_s']['reconstruct'] / counts['candidates']:.1f}"]
 
 
-def sweep_table(results: dict[str, list[dict[str, Any]]]) -> str:
-    """Quality of the planes of at least 10 m2: densities down, noises across."""
-    cells = {}
-    for name, rows in results.items():
-        if name.startswith("sweep-"):
-            density, noise = name.removeprefix("sweep-d").split("_n")
-            cells[float(density), float(noise)] = cell(rows, "faces.quality_10m2")
-    noises = sorted({noise for _, noise in cells})
+def _reading_order(entry: Entry) -> tuple[bool, bool, float, float]:
+    """Suites before real tiles, the cells of the sweep together and from sparse to dense."""
+    cell_of = None if entry.scene is None else entry.scene.cell
+    density, noise = (0.0, 0.0) if cell_of is None else (cell_of.density_per_m2, cell_of.noise_m)
+    return entry.scene is None, cell_of is not None, density, noise
+
+
+def methods_table(entries: Sequence[Entry], variants: Sequence[Variant], place: Workplace) -> str:
+    """One line an entry and method; the cubes, one building each, are one entry: their means."""
+    lines = []
+    cubes = [entry for entry in entries if entry.name.startswith("cube-")]
+    for entry in entries:
+        if entry not in cubes:
+            for variant in variants:
+                if place.is_measured(variant, entry):
+                    rows = place.table(variant, entry, "measures")
+                    shown = [cell(rows, name) for name, _ in SHOWN]
+                    lines.append([entry.name, variant.label, *run_facts(place.manifest(variant, entry)), *shown])
+    for variant in variants:
+        measured = [entry for entry in cubes if place.is_measured(variant, entry)]
+        if measured:
+            tables = [place.table(variant, entry, "measures") for entry in measured]
+            facts = [place.manifest(variant, entry) for entry in measured]
+            lines.append([f"cube, {len(measured)} draws", variant.label, *run_facts(_summed(facts)), *_means(tables)])
+    return markdown_table(["entry", "method", "ok/block/failed", "ms a building", *(head for _, head in SHOWN)], lines)
+
+
+def _summed(manifests: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What `run_facts` looks at, of several runs together."""
+    names = ("ok", "fallback", "failed", "candidates")
+    return {
+        "counts": {name: sum(one["counts"][name] for one in manifests) for name in names},
+        "timings_s": {"reconstruct": sum(one["timings_s"]["reconstruct"] for one in manifests)},
+    }
+
+
+def _means(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[str]:
+    """The shown measures as means over several entries, of those that have a figure."""
+    cells = []
+    for name, _ in SHOWN:
+        rows = [row for table in tables for row in table if row["name"] == name and row["subset"] == "all"]
+        values = [row["value"] for row in rows if row["value"] is not None]
+        cells.append(figure({**rows[0], "value": statistics.fmean(values)}) if values else "")
+    return cells
+
+
+def sweep_table(qualities: Mapping[tuple[float, float], float]) -> str:
+    """Quality of the roof faces of at least 10 m2, by (density, noise): densities down, noises across."""
+    noises = sorted({noise for _, noise in qualities})
     lines = [
-        [f"{density:g}", *(cells.get((density, noise), "") for noise in noises)]
-        for density in sorted({density for density, _ in cells})
+        [
+            f"{density:g}",
+            *(f"{qualities[density, noise]:.3f}" if (density, noise) in qualities else "" for noise in noises),
+        ]
+        for density in sorted({density for density, _ in qualities})
     ]
-    return table(["pulses a m2", *(f"{noise:g} m of noise" for noise in noises)], lines)
+    return markdown_table(["pulses a m2", *(f"{noise:g} m of noise" for noise in noises)], lines)
 
 
-def main() -> None:
+def sweep_qualities(
+    variant: Variant, place: Workplace, entries: Sequence[Entry], name: str = "faces.quality_10m2"
+) -> dict[tuple[float, float], float]:
+    """A measure of the cells of the sweep that were measured, by density and noise; 0 where it is undefined."""
+    found = {}
+    for entry in entries:
+        if entry.scene is not None and entry.scene.cell is not None and place.is_measured(variant, entry):
+            cell_of = entry.scene.cell
+            rows = place.table(variant, entry, "measures")
+            value = next(row["value"] for row in rows if row["name"] == name and row["subset"] == "all")
+            found[cell_of.density_per_m2, cell_of.noise_m] = 0.0 if value is None else float(value)
+    return found
+
+
+def parsed_variants(texts: Sequence[str] | None) -> list[Variant]:
+    """The methods that a user asks for; by default all with their default settings."""
+    return all_variants(with_faithful=False) if not texts else [Variant.parse(text) for text in texts]
+
+
+def main() -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--split", choices=("dev", "test"), default="test")
-    parser.add_argument("--only", nargs="*", default=None, help="beginnings of the names of entries")
+    parser.add_argument("--only", nargs="*", default=[""], help="beginnings of the names of entries")
+    parser.add_argument("--methods", nargs="*", metavar="METHOD[:PRESET]", help="default: all methods")
+    parser.add_argument("--jobs", type=int, default=2, help="entries at a time")
+    parser.add_argument("--no-pages", action="store_true", help="tables only")
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    results: dict[str, list[dict[str, Any]]] = {}
-    wanted = tuple(arguments.only) if arguments.only is not None else ("",)
-    for source in (suites(arguments.out, arguments.split), real_tiles(arguments.data)):
-        for entry in source:
-            if entry.name.startswith(wanted) and all(tile.exists() for tile in entry.tiles):
-                results[entry.name] = measured(entry, arguments.out)
-    overview = table(
-        ["entry", "ok/block/failed", "s", "peak MB", *(head for _, head in SHOWN)],
-        [
-            [name, *run_facts(arguments.out / name), *(cell(rows, measure) for measure, _ in SHOWN)]
-            for name, rows in results.items()
-        ],
-    )
-    (arguments.out / "report.md").write_text(overview, encoding="utf-8")
-    (arguments.out / "sweep.md").write_text(sweep_table(results), encoding="utf-8")
-    print(overview)
-    print(sweep_table(results))
+    variants, place = parsed_variants(arguments.methods), Workplace(root=arguments.out)
+    entries = [
+        dataclasses.replace(entry, has_page=entry.has_page and not arguments.no_pages)
+        for source in (real_tiles(arguments.data), suites(arguments.split))
+        for entry in source
+        if entry.name.startswith(tuple(arguments.only))
+    ]
+    faults = measure_all([(entry, variants) for entry in entries], place, arguments.jobs)
+    overview = methods_table(sorted(entries, key=_reading_order), variants, place)
+    (place.root / "methods.md").write_text(overview, encoding="utf-8")
+    swept = {variant.label: sweep_qualities(variant, place, entries) for variant in variants}
+    tables = [f"## {label}\n\n{sweep_table(qualities)}" for label, qualities in swept.items() if qualities]
+    (place.root / "sweep.md").write_text("\n".join(tables), encoding="utf-8")
+    print(overview, *tables, sep="\n")
+    print("\n".join(faults), file=sys.stderr)
+    return int(bool(faults))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -14,7 +14,8 @@ import numpy as np
 from pipeline.model import BoolArray, ByteArray, IntArray, LabelArray
 from pipeline.terrain.candidates import CandidateSettings
 from pipeline.terrain.facets import VertexKind
-from pipeline.terrain.ground import CELL_MM, NO_DATA, GroundSettings, Terrain, ground_of, height_above
+from pipeline.terrain.ground import GroundSettings, Terrain, ground_of
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
 from pipeline.terrain.outliers import OutlierSettings, dense_enough
 from pipeline.terrain.surfaces import Fragments, ScenePoints, SceneVertices, SurfaceSettings, fragments_of
 from pipeline.terrain.thinning import highest_per_cell

@@ -39,6 +39,11 @@ class Catalogue:
         return self._choices("method")
 
     @property
+    def presets(self) -> tuple[str, ...]:
+        """Names of the presets that every method has; the default first."""
+        return self._choices("preset")
+
+    @property
     def classes(self) -> tuple[str, ...]:
         """What the file's own classes may be worth."""
         return self._choices("classes")

@@ -68,6 +68,10 @@ class StateFolder:
         """The run directory."""
         return self.attempt(job_id, attempt) / "run"
 
+    def comparison(self, job_id: str, attempt: int) -> Path:
+        """The folder of a comparison: a run directory a method, and what was made of them."""
+        return self.attempt(job_id, attempt) / "comparison"
+
     def outputs(self, job_id: str, attempt: int) -> Path:
         """The outputs, assembled for download."""
         return self.attempt(job_id, attempt) / "outputs"

@@ -35,7 +35,8 @@ PAGE_POLICY = (
 """Content security policy of the web page."""
 
 DATA_POLICY = "default-src 'none'; frame-ancestors 'none'"
-"""Content security policy of all else: whatever a file claims to be, a browser runs nothing of it."""
+"""Content security policy of all else, unless its route names another: whatever a file claims to be, a browser runs
+nothing of it."""
 
 
 class Guard:
@@ -103,7 +104,8 @@ class Guard:
             is_page = headers.get("content-type", "").startswith("text/html")
             headers["X-Content-Type-Options"] = "nosniff"
             headers["Referrer-Policy"] = "no-referrer"
-            headers["Content-Security-Policy"] = PAGE_POLICY if is_page else DATA_POLICY
+            # a page among the results is told less than the service's own
+            headers.setdefault("Content-Security-Policy", PAGE_POLICY if is_page else DATA_POLICY)
             headers["Cross-Origin-Resource-Policy"] = "same-origin"
         await send(message)
 

@@ -83,7 +83,9 @@ class JobRequest:
     bbox: tuple[float, float, float, float] | None = None
     """x_min, y_min, x_max, y_max in the CRS's units."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """What differs from the defaults, as the tables of a settings file; `method` and `classes` included."""
+    """What differs from the defaults, as the tables of a settings file; `method`, `preset` and `classes` included."""
+    methods: tuple[str, ...] = ()
+    """What a comparison runs, each METHOD or METHOD:PRESET; empty of other processes."""
     meshes: str = "building"
     """One OBJ a building, one a tile, or none."""
     licence: str | None = None
@@ -109,7 +111,7 @@ class JobRequest:
         values["tiles"] = tuple(InputReference(**tile) for tile in stored["tiles"])
         if stored.get("footprints") is not None:
             values["footprints"] = InputReference(**stored["footprints"])
-        for name in ("bbox", "outputs"):
+        for name in ("bbox", "outputs", "methods"):
             if stored.get(name) is not None:
                 values[name] = tuple(stored[name])
         return cls(**values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self, TypeVar
@@ -12,6 +12,7 @@ from typing import Any, Self, TypeVar
 import pytest
 
 from pipeline.errors import RunCancelledError
+from pipeline.runtime.compare import CompareRequest, CompareSummary
 from pipeline.runtime.events import Event
 from pipeline.runtime.run import RunSummary
 from service.driver.attempt import Tools
@@ -61,6 +62,7 @@ class Script:
     def __init__(self) -> None:
         self.runs = 0
         self.seen: list[Any] = []
+        self.compared: list[CompareRequest] = []
         self.steps: list[Callable[[Any, Callable[[Event], None], Callable[[], bool]], None]] = []
         self.go_on = threading.Event()
 
@@ -83,6 +85,21 @@ class Script:
         on_event(Event(kind="warning", stage="split", message=f"{request.inputs[0]}: odd, see {request.out}/run.json"))
         if len(self.steps) >= self.runs:
             self.steps[self.runs - 1](request, on_event, cancelled)
+        return self._summary(request)
+
+    def compare(
+        self, request: CompareRequest, on_event: Callable[[Event], None], executor: Any, cancelled: Any
+    ) -> CompareSummary:
+        """A comparison that runs the script's run once, and says the same of every variant."""
+        summary = self.run(request.run, on_event, executor, cancelled)
+        labels = [variant.label for variant in request.variants]
+        for number, label in enumerate(labels):
+            on_event(Event(kind="stage", stage="reconstruct", done=number, total=len(labels), message=label))
+        self.compared.append(request)
+        return CompareSummary(out=request.run.out, runs=dict.fromkeys(labels, summary), seconds={})
+
+    @staticmethod
+    def _summary(request: Any) -> RunSummary:
         return RunSummary(
             run_dir=request.out,
             digest="d" * 64,
@@ -102,6 +119,13 @@ class Script:
         out_dir.mkdir()
         (out_dir / "outputs.json").write_text("{}")
         on_progress(1, 1)
+
+    def write_comparison(
+        self, _folder: Path, labels: Any, out_dir: Path, _wanted: Any, on_progress: Callable[[int, int], None]
+    ) -> None:
+        out_dir.mkdir()
+        (out_dir / "outputs.json").write_text("{}")
+        on_progress(len(labels), len(labels))
 
     def raises(self, error: Exception) -> None:
         """The next run raises."""
@@ -140,7 +164,13 @@ class Bench:
 
     def driver(self, *, parent_pipe: int | None = None, **changed: Any) -> Driver:
         settings = self.settings.model_copy(update=changed)
-        tools = Tools(gather=self.script.gather, run=self.script.run, write_outputs=self.script.write_outputs)
+        tools = Tools(
+            gather=self.script.gather,
+            run=self.script.run,
+            compare=self.script.compare,
+            write_outputs=self.script.write_outputs,
+            write_comparison=self.script.write_comparison,
+        )
         cluster = SharedCluster(settings, Engine)
         driver = Driver(settings, name=f"d{len(self._running)}", parent_pipe=parent_pipe, tools=tools, cluster=cluster)
         thread = threading.Thread(target=lambda: self.codes.append(driver.run()), daemon=True)
@@ -148,8 +178,8 @@ class Bench:
         thread.start()
         return driver
 
-    def submit(self, **values: Any) -> Job:
-        request = JobRequest(tiles=(InputReference(kind="path", value="/data/a.laz"),))
+    def submit(self, asked: Mapping[str, Any] | None = None, **values: Any) -> Job:
+        request = JobRequest(tiles=(InputReference(kind="path", value="/data/a.laz"),), **(asked or {}))
         return self.store.create(request, owner=None, max_queued=100, max_queued_per_key=100, **values)
 
     def becomes(self, job: Job, *statuses: JobStatus) -> Job:

@@ -145,6 +145,8 @@ class StoreContract:
             tiles=(InputReference(kind="path", value="/a"), InputReference(kind="url", value="https://b/c")),
             footprints=InputReference(kind="path", value="/f"),
             bbox=(1.0, 2.0, 3.5, 4.25),
+            process_id="compare",
+            methods=("fuzzy-sart", "fuzzy-sart:faithful"),
             settings={"general": {"method": "arrangement"}},
             outputs=("buildings", "report"),
             title="Straße \N{HOUSE BUILDING}",

@@ -25,7 +25,8 @@ from pipeline.evaluation.subsets import Subset, measured
 from pipeline.io import ReadOptions, open_source
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.scene import GROUND_CLASS, SceneSettings
-from pipeline.terrain.ground import CELL_MM, NO_DATA, Elevations, ground_of, height_above, lowest_per_cell
+from pipeline.terrain.ground import ground_of
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, height_above, lowest_per_cell
 from pipeline.terrain.outliers import OutlierSettings, dense_enough
 
 NOT_JUDGED = (7, 9, 18)

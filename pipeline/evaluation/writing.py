@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from pipeline.evaluation.chapters import Chapter, chapters, definition_of
 from pipeline.evaluation.counts import CountTable, breakdowns
 from pipeline.evaluation.definitions import DEFINITIONS
 from pipeline.evaluation.evaluate import Evaluation
+from pipeline.evaluation.markdown import markdown_cell, markdown_table
 from pipeline.evaluation.measure import Definition
 from pipeline.export.geoparquet import geo_metadata, parquet_bytes
 from pipeline.io.storage import LocalStorage
@@ -156,11 +157,11 @@ def all_notes(evaluation: Evaluation) -> tuple[str, ...]:
 def markdown(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> str:
     """The report for people: what, against what, notes, a table a chapter, breakdowns, formulas."""
     measured, against = told_subject(evaluation)
-    parts = ["# Evaluation", f"- Measured: {_cell(measured)}\n- Against: {_cell(against)}"]
+    parts = ["# Evaluation", f"- Measured: {markdown_cell(measured)}\n- Against: {markdown_cell(against)}"]
     parts.append(INTERVALS)
     notes = all_notes(evaluation)
     if notes:
-        parts.append("## Notes\n\n" + "\n".join(f"- {_cell(note)}" for note in notes))
+        parts.append("## Notes\n\n" + "\n".join(f"- {markdown_cell(note)}" for note in notes))
     found = chapters(evaluation, definitions)
     parts += [_chapter(chapter) for chapter in found]
     lost = breakdowns(evaluation.tables)
@@ -181,31 +182,18 @@ def _chapter(chapter: Chapter) -> str:
             (line.label, *((line.subset,) if subsets else ()), line.value, line.interval, line.n)
             for line in chapter.lines
         ]
-        parts.append(_table(header, rows, texts=2 if subsets else 1))
+        parts.append(markdown_table(header, rows, texts=2 if subsets else 1))
     parts += [_count_table(table) for table in chapter.tables]
     return "\n\n".join(parts)
 
 
 def _count_table(table: CountTable) -> str:
-    return f"### {_cell(table.title)}\n\n{_table(table.header, table.rows)}"
+    return f"### {markdown_cell(table.title)}\n\n{markdown_table(table.header, table.rows)}"
 
 
 def _definitions(chapter: Chapter) -> str:
     rows = {line.definition.name: (line.label, f"`{line.definition.name}`", line.definition) for line in chapter.lines}
     return "\n".join(
-        f"- **{_cell(label)}** ({name}): {definition.formula.replace(chr(10), ' ')}"
+        f"- **{markdown_cell(label)}** ({name}): {definition.formula.replace(chr(10), ' ')}"
         for label, name, definition in rows.values()
     )
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
-    """A Markdown table; columns after the first `texts` are set to the right."""
-    marks = ["---"] * texts + ["---:"] * (len(header) - texts)
-    lines = [header, marks, *rows]
-    return "\n".join("| " + " | ".join(_cell(text) for text in line) + " |" for line in lines)
-
-
-def _cell(text: str) -> str:
-    """A text that is neither HTML nor the border of a cell."""
-    safe = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    return safe.replace("|", "\\|").replace("\n", " ").replace("\r", " ")

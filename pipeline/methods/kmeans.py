@@ -37,7 +37,7 @@ from pipeline.segmentation.kmeans_normals import (
     FacetClusters,
     NormalClusteringSettings,
     choose_clusters,
-    labels_by_angle,
+    labels_around,
 )
 from pipeline.segmentation.leftover_planes import cluster_leftovers
 from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes, refine_planes
@@ -125,7 +125,7 @@ class KMeansSettings(NormalClusteringSettings, PlaneRefinementSettings):
         maximum=1.0,
     )
     margin_spacings: float = parameter(
-        0.0,
+        0.13,
         "By how much the rectangles go beyond the outermost points, in mean point spacings.",
         minimum=0.0,
         maximum=2.0,
@@ -138,13 +138,13 @@ class KMeansSettings(NormalClusteringSettings, PlaneRefinementSettings):
         maximum=100.0,
     )
     fitting_share: float = parameter(
-        0.95,
+        0.9,
         "The model explains a building where this share of its roof points lies within the distance of a plane.",
         minimum=0.0,
         maximum=1.0,
     )
     fitting_fill: float = parameter(
-        0.95,
+        0.9,
         "The model explains a building where this share of its rectangle has roof points near.",
         minimum=0.0,
         maximum=1.0,
@@ -163,6 +163,7 @@ class KMeansSettings(NormalClusteringSettings, PlaneRefinementSettings):
             leftover_rounds=0,
             model="always",
             outline="rectangle",
+            margin_spacings=0.0,
         )
 
     def cross_faults(self) -> list[str]:
@@ -314,6 +315,7 @@ def cluster_facets(top: BuildingTop, settings: KMeansSettings) -> tuple[LabelArr
     passes = passes_for_noise(top.sigma_m, top.spacing_m, settings.normal_noise_deg, settings.smoothing_passes)
     normals = smoothed_normals(normals, areas_m2, top.tin.neighbours, usable, passes)
     index = np.flatnonzero(usable)
+    fewest_points = settings.fewest_points(top.spacing_m)
 
     def on_all_facets(labels: LabelArray) -> LabelArray:
         everywhere = np.full(len(facets), -1, np.int32)
@@ -321,7 +323,7 @@ def cluster_facets(top: BuildingTop, settings: KMeansSettings) -> tuple[LabelArr
         return everywhere
 
     def explained(labels: LabelArray) -> float:
-        return _share_explained(top, connected_parts(on_all_facets(labels), top.tin.neighbours))
+        return _share_explained(top, connected_parts(on_all_facets(labels), top.tin.neighbours), fewest_points)
 
     clusters = choose_clusters(normals[index], settings.weights(areas_m2[index]), explained, settings)
     return on_all_facets(clusters.labels), clusters
@@ -345,7 +347,7 @@ def planes_of(top: BuildingTop, settings: KMeansSettings) -> tuple[FloatArray, L
     clusters, _ = cluster_facets(top, settings)
     if settings.refine:
         return _refined_planes(top, clusters, settings)
-    labels = labels_by_angle(top.points, top.tin.facets, clusters)
+    labels = labels_around(top.points, top.tin.facets, clusters)
     planes, labels = _best_fit_planes(top.points, labels)
     if len(planes) == 2 and _angle_deg(planes[0], planes[1]) < settings.one_plane_deg:
         # one plane on which the clusters told only noise apart
@@ -357,7 +359,7 @@ def _refined_planes(top: BuildingTop, clusters: LabelArray, settings: KMeansSett
     """Parts that hang together, best-fit planes, merging, assignment anew, straight ridges."""
     points, spacing_m, distance_m = top.points, top.spacing_m, top.distance_m
     parts = connected_parts(clusters, top.tin.neighbours)
-    rough = labels_by_angle(points, top.tin.facets, parts)
+    rough = labels_around(points, top.tin.facets, parts)
     neighbours = nearest_neighbours(points, settings.neighbours)
     fewest_points = settings.fewest_points(spacing_m)
     planes, labels = refine_planes(
@@ -464,9 +466,12 @@ def _longest_edges_m(top: BuildingTop) -> FloatArray:
     return np.asarray(np.hypot(edges[:, :, 0], edges[:, :, 1]).max(axis=1, initial=0.0))
 
 
-def _share_explained(top: BuildingTop, parts: LabelArray) -> float:
-    """Share of the points that lie on the best-fit plane of their part of the TIN."""
-    planes, labels = _best_fit_planes(top.points, labels_by_angle(top.points, top.tin.facets, parts))
+def _share_explained(top: BuildingTop, parts: LabelArray, fewest_points: int) -> float:
+    """Share of the points that lie on the best-fit plane of their part of the TIN, where it has points enough."""
+    labels = labels_around(top.points, top.tin.facets, parts)
+    counts = np.bincount(labels[labels >= 0], minlength=int(parts.max()) + 1)
+    labels[(labels >= 0) & (counts[labels] < fewest_points)] = -1
+    planes, labels = _best_fit_planes(top.points, labels)
     labelled = np.flatnonzero(labels >= 0)
     a, b, c = planes[labels[labelled]].T
     x, y, z = top.points[labelled].T

@@ -31,6 +31,8 @@ from pipeline.tin.delaunay import triangulate, unique_xy
 
 _LEAST_POINTS = 4
 """Below this there is neither a spacing nor a noise to speak of."""
+_VOTING_PASSES = 4
+"""Repetitions of the choice between regions; it ends when nothing changes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,7 +49,7 @@ class ParameterSpaceSettings(RegionGrowingSettings, RoofTreeSettings):
         maximum=100.0,
     )
     ground_clusters: str = parameter(
-        "drop",
+        "leave_out",
         "Clusters of terrain and walls: all kept but those that the paper eliminates; dropped where fewer than half of "
         "their facets touch roof points alone; or facets that touch terrain not clustered at all.",
         choices=("keep", "drop", "leave_out"),
@@ -56,6 +58,13 @@ class ParameterSpaceSettings(RegionGrowingSettings, RoofTreeSettings):
         "region_growing",
         "Points of a roof face: those of the facets that are members of a cluster, or a region grown from its mean.",
         choices=("membership", "region_growing"),
+    )
+    growing_vote: float = parameter(
+        0.04,
+        "Between regions a point takes the nearer plane; share of the largest squared distance that one neighbour's "
+        "vote outweighs.",
+        minimum=0.0,
+        maximum=1.0,
     )
     least_area_m2: float = parameter(
         3.0, "A region has at least as many points as this area holds in plan.", unit="m2", minimum=0.0, maximum=1000.0
@@ -75,7 +84,7 @@ class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
     """Settings of the method in slope and orientation."""
 
     least_slope_deg: float = parameter(
-        7.0, "Clusters with less mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
+        0.0, "Clusters with less mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
     )
     most_slope_deg: float = parameter(
         75.0, "Clusters with more mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
@@ -83,8 +92,14 @@ class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
 
     @classmethod
     def faithful(cls) -> ParameterSpace2dSettings:
-        """The paper's words: terrain as it is clustered, points by membership, its own tree."""
-        return cls(ground_clusters="keep", point_groups="membership", type_from="tree")
+        """The paper's words: terrain is clustered too, at least 11 facets, points by membership, its own tree."""
+        return cls(
+            ground_clusters="keep",
+            least_slope_deg=7.0,
+            least_members=11,
+            point_groups="membership",
+            type_from="tree",
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -93,8 +108,14 @@ class ParameterSpace3dSettings(ParameterSpaceSettings, ParameterBoxSettings, Clu
 
     @classmethod
     def faithful(cls) -> ParameterSpace3dSettings:
-        """The paper's words: terrain as it is clustered, points by membership, its own tree."""
-        return cls(ground_clusters="keep", point_groups="membership", type_from="tree")
+        """The paper's words: terrain is clustered too, at least 11 facets, points by membership, its own tree."""
+        return cls(
+            ground_clusters="keep",
+            dense_box_facets=5,
+            least_members=11,
+            point_groups="membership",
+            type_from="tree",
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -205,7 +226,7 @@ def _facets_of(candidate: Candidate, settings: ParameterSpaceSettings) -> _Facet
             Reason.TOO_FEW_POINTS,
             f"{len(roof)} of {len(points)} points are visible from above, at least {_LEAST_POINTS} are needed",
         )
-    spacing_m = point_spacing_m(roof)
+    spacing_m = max(point_spacing_m(roof), 1e-3)
     gap_m = max(settings.ground_gap_spacings * spacing_m, 1e-3)
     ground = ground_around(candidate.ground, shift, roof, gap_m, settings.surroundings_m)
     cloud = np.concatenate([roof, ground])
@@ -304,6 +325,13 @@ def _grown(
         roof, neighbours, groups, gradients, distance_m=distance_m, fewest_points=fewest, settings=settings
     )
     labels = vote_among_neighbours(
-        roof, neighbours, labels, planes, np.ones(len(planes), np.bool_), distance_m, 0.04, 4
+        roof,
+        neighbours,
+        labels,
+        planes,
+        np.ones(len(planes), np.bool_),
+        distance_m,
+        settings.growing_vote,
+        _VOTING_PASSES,
     )
     return _interpolated(roof, labels, len(planes), settings.least_points)

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import jinja2
-from markupsafe import Markup, escape
 
 from pipeline.evaluation.chapters import Chapter, Line, chapters
 from pipeline.evaluation.counts import breakdowns
@@ -19,6 +15,7 @@ from pipeline.evaluation.writing import INTERVALS, all_notes, told_subject
 from pipeline.io.storage import LocalStorage
 from pipeline.report.evaluation_maps import maps
 from pipeline.report.histograms import charts
+from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
 from pipeline.report.section import RESIDUAL_CLASSES
 from pipeline.report.worst_cases import MODEL_COLOUR, MOST_NOT_FOUND, SECTION_COLOUR, TRUTH_COLOUR, worst_cases
@@ -76,18 +73,10 @@ def write_page(
 
 def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> str:
     """The page as text."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pipeline.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["code"] = _code
     found = chapters(evaluation, definitions)
     measured, against = told_subject(evaluation)
     name = evaluation.models.name
-    return environment.get_template("evaluation.html").render(
+    return page_template("evaluation.html").render(
         title=name if evaluation.reference is None else f"{name} against {evaluation.reference.name}",
         measured=measured,
         against=against,
@@ -126,8 +115,3 @@ def _with_uris(thing: Any, **pictures: str) -> dict[str, Any]:
         png = getattr(thing, field)
         known[name] = None if png is None else data_uri(png)
     return known
-
-
-def _code(text: str) -> Markup:
-    """One line of Markdown as HTML: what stands between backticks is code."""
-    return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704 -- escaped

@@ -123,6 +123,12 @@ def draw_view(axes: Axes, buildings: Sequence[Sequence[ViewedFace]], view: View,
     axes.set_axis_off()
 
 
+def projected(xyz: FloatArray, view: View) -> FloatArray:
+    """Where points (n, 3) are on the screen, (n, 2) metres to the right and up: as `draw_view` draws them."""
+    right, up, _ = _basis(view)
+    return xyz @ np.stack([right, up]).T
+
+
 def _basis(view: View) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Unit vectors to the right and up on the screen, and towards the eye."""
     azimuth, altitude = math.radians(view.azimuth_deg), math.radians(view.altitude_deg)

@@ -14,13 +14,13 @@ from markupsafe import Markup
 from matplotlib.collections import LineCollection, PathCollection
 
 from pipeline.evaluation.evaluate import Evaluation
-from pipeline.evaluation.models import RoofModel, RoofSurface
+from pipeline.evaluation.models import RoofModel
 from pipeline.evaluation.reference import Reference
-from pipeline.model import FaceKind, FloatArray, LabelArray
-from pipeline.report.perspective import View, ViewedFace, draw_view
+from pipeline.model import FloatArray, LabelArray
+from pipeline.report.perspective import View, draw_view
 from pipeline.report.pictures import blank, paths_of, png_of
-from pipeline.report.render import ROOF_COLOURS, WALL_COLOUR
 from pipeline.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg, top_of
+from pipeline.report.viewed_models import viewed_faces
 
 CASES = 12
 """How many are shown."""
@@ -247,7 +247,7 @@ def _plan(truth: RoofModel, own: Sequence[RoofModel], around: Sequence[RoofModel
 
 def _view(models: Sequence[RoofModel]) -> bytes | None:
     """Bird's-eye view; None where there is no face."""
-    viewed = [faces for model in models if (faces := _viewed(model))]
+    viewed = [faces for model in models if (faces := viewed_faces(model))]
     if not viewed:
         return None
     middle = np.mean([face.rings[0].mean(axis=0) for faces in viewed for face in faces], axis=0)
@@ -264,27 +264,3 @@ def _view(models: Sequence[RoofModel]) -> bytes | None:
     axes.set_xlim((low[0] + high[0]) / 2.0 - half, (low[0] + high[0]) / 2.0 + half)
     axes.set_ylim((low[1] + high[1]) / 2.0 - half, (low[1] + high[1]) / 2.0 + half)
     return png_of(figure)
-
-
-def _viewed(model: RoofModel) -> list[ViewedFace]:
-    """Roofs and walls of the solids; roofs alone where there are none."""
-    roof = ROOF_COLOURS[model.roof_type]
-    if not model.solids:
-        return [ViewedFace(rings=_lifted(surface), colour=roof) for surface in model.surfaces]
-    origin = np.array(model.solid_origin)
-    return [
-        ViewedFace(
-            rings=tuple(solid.vertices[list(ring)] + origin for ring in face.rings),
-            colour=roof if face.kind is FaceKind.ROOF else WALL_COLOUR,
-        )
-        for solid in model.solids
-        for face in solid.faces
-        if face.kind is not FaceKind.GROUND
-    ]
-
-
-def _lifted(surface: RoofSurface) -> tuple[FloatArray, ...]:
-    """The rings of a roof face in 3D, counter-clockwise from above, the first vertex not repeated."""
-    oriented = shapely.orient_polygons(surface.polygon)
-    corners = [shapely.get_coordinates(ring)[:-1] for ring in shapely.get_rings(oriented)]
-    return tuple(np.column_stack([xy, surface.elevation(xy[:, 0], xy[:, 1])]) for xy in corners)

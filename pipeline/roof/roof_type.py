@@ -1,7 +1,9 @@
 """Roof type from the delivered planes, their areas and their ridges.
 
-Flat is below 7 degrees, a gable has two opposite sides of similar slope, a hip roof two such pairs
-(Hofmann, Maas and Streilein 2003); faces of one direction count as one side.
+Flat is below 7 degrees, a gable has two opposite sides "whose inclinations must not be the same", a hip roof two such
+pairs (Hofmann, Maas and Streilein 2003). Faces of one direction and similar slope count as one side, and so do those
+that meet in a bend with the steeper one above: the flatter foot of a bent hip. Where a flatter face lies above a
+steeper one (gambrel, mansard) the roof is a combination.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-from pipeline.model import FaceKind, Plane, RoofFace, RoofType, Solid
+from pipeline.model import FaceKind, Plane, RoofFace, RoofType, Solid, SolidFace
 from pipeline.parameters import Parameters, parameter
 
 
@@ -29,10 +31,23 @@ class RoofTypeSettings(Parameters):
         maximum=45.0,
     )
     slope_tolerance_deg: float = parameter(
-        10.0, "Slopes within this are similar.", unit="deg", minimum=1.0, maximum=45.0
+        10.0, "Faces of one direction with slopes within this are one side.", unit="deg", minimum=1.0, maximum=45.0
+    )
+    sliver_height_m: float = parameter(
+        0.5,
+        "Roof planes meet across a wall that is nowhere higher: fitted planes seldom meet in one line.",
+        unit="m",
+        minimum=0.0,
+        maximum=5.0,
     )
     minor_share: float = parameter(
         0.12, "Directions with a smaller share of the roof's area do not decide the type.", minimum=0.0, maximum=0.4
+    )
+    minor_share_together: float = parameter(
+        0.20,
+        "Where all that does not decide has this share of the roof's area the roof is a combination.",
+        minimum=0.0,
+        maximum=1.0,
     )
 
 
@@ -44,6 +59,10 @@ class _Side:
     aspect_deg: float
     area: float
     planes: set[int]
+
+
+_Folds = dict[tuple[int, int], float]
+"""Length in plan over which two planes meet, by their numbers in both orders; each edge counts from both sides."""
 
 
 def _turn(a_deg: float, b_deg: float) -> float:
@@ -79,23 +98,27 @@ def roof_type(
     if total <= 0.0:
         return RoofType.NONE
     flat_area = math.fsum(area for p, area in areas.items() if planes[p].slope_deg < settings.flat_below_deg)
-    sides = _sides(planes, areas, settings)
+    ridges, bends = _folds(planes, solids, settings.sliver_height_m)
+    sides = _sides(planes, areas, bends, settings)
     major = [side for side in sides if side.area >= settings.minor_share * total]
-    if flat_area >= settings.minor_share * total:
+    is_flat = flat_area >= settings.minor_share * total
+    decided = math.fsum(side.area for side in major) + (flat_area if is_flat else 0.0)
+    if total - decided >= settings.minor_share_together * total:
+        return RoofType.COMBINATION
+    if is_flat:
         return RoofType.COMBINATION if major else RoofType.FLAT
     if not major:
         return RoofType.UNKNOWN
-    ridges = _ridges(planes, solids)
     if len(major) == 1:
         return RoofType.PENT
-    if len(major) == 2 and _opposite(major[0], major[1], settings) and _meet(major[0], major[1], ridges):
+    if len(major) == 2 and _opposite(major[0], major[1], settings) and _length(major[0], major[1], ridges) > 0.0:
         return RoofType.GABLE
-    if len(major) == 4 and _is_hip(major, ridges, settings):
+    if len(major) == 4 and _is_hip(major, ridges, bends, settings):
         return RoofType.HIP
     return RoofType.COMBINATION
 
 
-def _sides(planes: Sequence[Plane], areas: dict[int, float], settings: RoofTypeSettings) -> list[_Side]:
+def _sides(planes: Sequence[Plane], areas: dict[int, float], bends: _Folds, settings: RoofTypeSettings) -> list[_Side]:
     """Sloping planes gathered by direction, largest first."""
     sides: list[_Side] = []
     for p in sorted(areas, key=lambda p: (-areas[p], p)):
@@ -103,9 +126,9 @@ def _sides(planes: Sequence[Plane], areas: dict[int, float], settings: RoofTypeS
         if plane.slope_deg < settings.flat_below_deg:
             continue
         for side in sides:
-            if (
-                _turn(side.aspect_deg, plane.aspect_deg) <= settings.aspect_tolerance_deg
-                and abs(side.slope_deg - plane.slope_deg) <= settings.slope_tolerance_deg
+            if _turn(side.aspect_deg, plane.aspect_deg) <= settings.aspect_tolerance_deg and (
+                abs(side.slope_deg - plane.slope_deg) <= settings.slope_tolerance_deg
+                or any((p, other) in bends for other in side.planes)
             ):
                 side.area += areas[p]
                 side.planes.add(p)
@@ -115,53 +138,71 @@ def _sides(planes: Sequence[Plane], areas: dict[int, float], settings: RoofTypeS
     return sides
 
 
-def _ridges(planes: Sequence[Plane], solids: Sequence[Solid]) -> set[tuple[int, int]]:
-    """Pairs of planes that meet in a common edge and fall away from it on both sides."""
-    ridges: set[tuple[int, int]] = set()
+def _folds(planes: Sequence[Plane], solids: Sequence[Solid], sliver_height_m: float) -> tuple[_Folds, _Folds]:
+    """Where planes meet and fall away from there on both sides (ridges, hips), and where they do not (bends, valleys).
+
+    They meet in a common edge, or across a wall that is nowhere higher than a sliver.
+    """
+    ridges: _Folds = {}
+    bends: _Folds = {}
     for solid in solids:
-        owner: dict[tuple[int, int], int] = {}
+        owner = {edge: face.plane for face in solid.faces if face.kind is FaceKind.ROOF for edge in _edges(face)}
+        met = [(edge, owner[edge[::-1]]) for edge in owner if edge[::-1] in owner]
         for face in solid.faces:
-            if face.kind is not FaceKind.ROOF:
-                continue
-            for ring in face.rings:
-                for a, b in zip(ring, ring[1:] + ring[:1], strict=True):
-                    owner[a, b] = face.plane
-        for (a, b), left in owner.items():
-            right = owner.get((b, a), left)
+            if face.kind is FaceKind.WALL and _height_m(solid, face) <= sliver_height_m:
+                roof_edges = [edge[::-1] for edge in _edges(face) if edge[::-1] in owner]
+                met += [(edge, owner[other]) for edge in roof_edges for other in roof_edges]
+        for (a, b), right in met:
+            left = owner[a, b]
             if right == left:
                 continue
             # a step of one metre to the left of the edge: the left plane lies below the right one's continuation
             (xa, ya), (xb, yb) = solid.vertices[a, :2].tolist(), solid.vertices[b, :2].tolist()
             p, q = planes[left], planes[right]
-            if (p.a - q.a) * (ya - yb) + (p.b - q.b) * (xb - xa) < 0.0:
-                ridges.add((left, right))
-                ridges.add((right, left))
-    return ridges
+            falls = (p.a - q.a) * (ya - yb) + (p.b - q.b) * (xb - xa) < 0.0
+            folds = ridges if falls else bends
+            for pair in ((left, right), (right, left)):
+                folds[pair] = folds.get(pair, 0.0) + math.hypot(xb - xa, yb - ya)
+    return ridges, bends
+
+
+def _edges(face: SolidFace) -> list[tuple[int, int]]:
+    """Directed edges of all rings."""
+    return [edge for ring in face.rings for edge in zip(ring, ring[1:] + ring[:1], strict=True)]
+
+
+def _height_m(solid: Solid, face: SolidFace) -> float:
+    """Greatest height of a wall over one place."""
+    heights: dict[tuple[float, float], list[float]] = {}
+    for vertex in face.rings[0]:
+        x, y, z = solid.vertices[vertex].tolist()
+        heights.setdefault((x, y), []).append(z)
+    return max(max(z) - min(z) for z in heights.values())
 
 
 def _opposite(a: _Side, b: _Side, settings: RoofTypeSettings) -> bool:
-    return (
-        180.0 - _turn(a.aspect_deg, b.aspect_deg) <= settings.aspect_tolerance_deg
-        and abs(a.slope_deg - b.slope_deg) <= settings.slope_tolerance_deg
-    )
+    return 180.0 - _turn(a.aspect_deg, b.aspect_deg) <= settings.aspect_tolerance_deg
 
 
-def _meet(a: _Side, b: _Side, ridges: set[tuple[int, int]]) -> bool:
-    return any((p, q) in ridges for p in a.planes for q in b.planes)
+def _length(a: _Side, b: _Side, folds: _Folds) -> float:
+    """Over which the faces of two sides meet."""
+    return math.fsum(folds.get((p, q), 0.0) for p in sorted(a.planes) for q in sorted(b.planes))
 
 
-def _is_hip(sides: list[_Side], ridges: set[tuple[int, int]], settings: RoofTypeSettings) -> bool:
-    """Two opposite pairs, square to one another, each side meeting both of the other pair (slopes may differ)."""
+def _is_hip(sides: list[_Side], ridges: _Folds, bends: _Folds, settings: RoofTypeSettings) -> bool:
+    """Two opposite pairs, square to one another, with a hip at each corner; slopes may differ.
+
+    Valleys as long as the hips are those of a courtyard; short ones are those of dormers.
+    """
     by_aspect = sorted(sides, key=lambda side: side.aspect_deg)
-    tolerance = settings.aspect_tolerance_deg
-    for k in range(4):
-        following = by_aspect[(k + 1) % 4]
-        if abs(_turn(by_aspect[k].aspect_deg, following.aspect_deg) - 90.0) > tolerance:
+    corners = [(by_aspect[k], by_aspect[(k + 1) % 4]) for k in range(4)]
+    for side, following in corners:
+        if abs(_turn(side.aspect_deg, following.aspect_deg) - 90.0) > settings.aspect_tolerance_deg:
             return False
-        if not _meet(by_aspect[k], following, ridges):
-            return False
-    return all(
-        180.0 - _turn(by_aspect[k].aspect_deg, by_aspect[k + 2].aspect_deg) <= tolerance
-        and abs(by_aspect[k].slope_deg - by_aspect[k + 2].slope_deg) <= settings.slope_tolerance_deg
-        for k in range(2)
+    hips = [_length(side, following, ridges) for side, following in corners]
+    valleys = math.fsum(_length(side, following, bends) for side, following in corners)
+    return (
+        min(hips) > 0.0
+        and valleys <= 0.5 * math.fsum(hips)
+        and all(_opposite(by_aspect[k], by_aspect[k + 2], settings) for k in range(2))
     )

@@ -17,7 +17,7 @@ from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.model import BoolArray, Candidate
 from pipeline.runtime.join import CandidateSite
 from pipeline.runtime.scratch import POINT, Scratch
-from pipeline.terrain.ground import CELL_MM, NO_DATA
+from pipeline.terrain.lattice import CELL_MM, NO_DATA
 from pipeline.tiling import MM, TileGrid, Window
 
 _GROUND_MARGIN_M = 4

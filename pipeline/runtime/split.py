@@ -23,7 +23,8 @@ from pipeline.scene import (
     terrain_of,
 )
 from pipeline.spatial_hash import first_of_each
-from pipeline.terrain.ground import NO_DATA, Terrain, height_above
+from pipeline.terrain.ground import Terrain
+from pipeline.terrain.lattice import NO_DATA, height_above
 from pipeline.terrain.surfaces import Fragments
 from pipeline.tiling import MM, Tile, TileGrid, Window
 

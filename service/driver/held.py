@@ -171,7 +171,12 @@ class HeldJob:
         if event.kind == "finished" or (event.kind == "run" and not self._waited):
             return None
         # where nothing more is known, the stage itself says what happens; after a pause it says so again
-        message = event.message or (WORDS.get(event.stage, "") if event.kind == "stage" or self._waited else "")
+        words = WORDS.get(event.stage, "") if event.kind == "stage" or self._waited else ""
+        if event.kind == "stage" and event.message and words:
+            # one of several methods, by its label
+            message = f"{event.message}: {words}"
+        else:
+            message = event.message or words
         if event.kind != "warning":
             self._waited = event.kind == "waiting"
         if event.kind in {"stage", "progress"}:

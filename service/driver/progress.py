@@ -27,10 +27,14 @@ WORDS = MappingProxyType(
         "join": "surfaces are united over the borders of tiles",
         "reconstruct": "buildings are modelled",
         "publish": "tiles are written",
+        "records": "the runs are put side by side",
+        "points": "points are read for the pictures",
+        "pictures": "pictures are drawn",
+        "page": "the page is written",
         "outputs": "outputs are assembled",
     }
 )
-"""What a stage does, for people."""
+"""What a stage does, for people; those without a weight are of a comparison, and short."""
 
 _LAST = 99
 

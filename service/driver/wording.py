@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pipeline.runtime.compare import CompareSummary
     from pipeline.runtime.run import RunSummary
 
 # two components or more, not within a URL, a fraction or a relative path
@@ -48,9 +49,7 @@ class Scrubber:
 
 def outcome(summary: RunSummary) -> str:
     """What came out, in one sentence."""
-    total = sum(summary.statuses.values())
-    parts = [f"{summary.statuses.get(status, 0)} {status}" for status in ("ok", "fallback", "failed")]
-    told = f"{total} {'building' if total == 1 else 'buildings'}: {', '.join(parts)}"
+    told = f"{_buildings(summary)}: {_by_status(summary)}"
     rejected = sum(summary.rejected.values())
     if rejected:
         told += f"; {rejected} {'object' if rejected == 1 else 'objects'} rejected"
@@ -61,6 +60,30 @@ def outcome(summary: RunSummary) -> str:
     if summary.warnings:
         told += f"; {len(summary.warnings)} {'warning' if len(summary.warnings) == 1 else 'warnings'}"
     return told
+
+
+def _buildings(summary: RunSummary) -> str:
+    total = sum(summary.statuses.values())
+    return f"{total} {'building' if total == 1 else 'buildings'}"
+
+
+def _by_status(summary: RunSummary) -> str:
+    return ", ".join(f"{summary.statuses.get(status, 0)} {status}" for status in ("ok", "fallback", "failed"))
+
+
+def comparison_outcome(summary: CompareSummary) -> str:
+    """What came out of every method, in one sentence."""
+    first = next(iter(summary.runs.values()))
+    parts = [f"{label} {_by_status(run)}" for label, run in summary.runs.items()]
+    told = f"{len(summary.runs)} methods on {_buildings(first)}: {'; '.join(parts)}"
+    broken = [label for label, run in summary.runs.items() if run.failed_tiles]
+    return f"{told}; tiles are missing of {', '.join(broken)}" if broken else told
+
+
+def comparison_digest(summary: CompareSummary, scrub: Scrubber, engine_version: str) -> dict[str, Any]:
+    """What is kept of a comparison beside its files: that of every run by its label."""
+    runs = {label: digest_of(run, scrub, engine_version) for label, run in summary.runs.items()}
+    return {"engine_version": engine_version, "runs": runs}
 
 
 def digest_of(summary: RunSummary, scrub: Scrubber, engine_version: str) -> dict[str, Any]:

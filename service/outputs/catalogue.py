@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import NoSuchOutputError
-from service.outputs.kinds import OUTPUTS
+from service.outputs.kinds import KINDS, OUTPUTS
 
 NAME = "outputs.json"
 """File name of the catalogue; a folder without it is not finished."""
@@ -49,11 +49,13 @@ class Catalogue:
     """What a folder of outputs holds."""
 
     outputs: Mapping[str, StoredOutput]
-    """By id, in the order of `OUTPUTS`."""
+    """By id, in the order of the process's table."""
     crs: ResultsCrs
     """Of the results."""
     n_buildings: int
     """Rows of the buildings table."""
+    runs: tuple[str, ...] = ()
+    """Of a comparison the labels of its runs, each with a folder of outputs of its own; else none."""
 
     def to_json(self) -> str:
         """The catalogue as JSON text."""
@@ -67,7 +69,23 @@ class Catalogue:
             outputs={name: StoredOutput(**entry) for name, entry in found["outputs"].items()},
             crs=ResultsCrs(**found["crs"]),
             n_buildings=found["n_buildings"],
+            runs=tuple(found.get("runs", ())),
         )
+
+    def missing(self, output_id: str) -> NoSuchOutputError:
+        """Why there is no such output, and what there is."""
+        there = ", ".join(self.outputs) or "none"
+        if self.runs and output_id in OUTPUTS:
+            told = f"{output_id} is an output of each of this job's runs: ask with ?method= and one of"
+            return NoSuchOutputError(f"{told} {', '.join(self.runs)}")
+        if output_id not in KINDS:
+            return NoSuchOutputError(f"there is no output {output_id[:80]!r}; this job has: {there}")
+        return NoSuchOutputError(f"this job was asked not to make {output_id}, or had nothing for it; it has: {there}")
+
+
+def run_outputs(out_dir: Path, label: str) -> Path:
+    """Where the outputs of one run of a comparison lie, below those of the comparison."""
+    return out_dir / "runs" / label
 
 
 def read_catalogue(out_dir: Path) -> Catalogue:
@@ -92,13 +110,10 @@ def output_file(out_dir: Path, output_id: str) -> Path:
     NoSuchOutputError
         The process has no such output, the job was asked not to make it, or its file is gone.
     """
-    stored = read_catalogue(out_dir).outputs
-    there = ", ".join(stored) or "none"
-    if output_id not in OUTPUTS:
-        raise NoSuchOutputError(f"there is no output {output_id!r}; this job has: {there}")
-    if output_id not in stored:
-        raise NoSuchOutputError(f"this job was asked not to make {output_id}, or had nothing for it; it has: {there}")
-    path = out_dir / OUTPUTS[output_id].filename
+    catalogue = read_catalogue(out_dir)
+    if output_id not in catalogue.outputs:
+        raise catalogue.missing(output_id)
+    path = out_dir / KINDS[output_id].filename
     if not path.is_file():
         raise NoSuchOutputError(f"the file of {output_id} is no longer in the state folder: submit the job again")
     return path

@@ -1,4 +1,4 @@
-"""The outputs of the process `reconstruct`: one table of what a finished job offers for download."""
+"""The outputs of the processes: tables of what a finished job offers for download."""
 
 from __future__ import annotations
 
@@ -18,11 +18,15 @@ GEOJSON = "application/geo+json"
 """Media type of RFC 7946."""
 OBJ = "model/obj"
 """Media type of Wavefront OBJ."""
+HTML = "text/html"
+"""Media type of a page."""
+ZIP = "application/zip"
+"""Media type of a zip file."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OutputKind:
-    """One output of the process."""
+    """One output of a process."""
 
     output_id: str
     """Its name in requests, results and paths."""
@@ -42,7 +46,7 @@ def _binary(media_type: str) -> dict[str, Any]:
     return {"type": "string", "contentEncoding": "binary", "contentMediaType": media_type}
 
 
-_KINDS = (
+_OF_A_RUN = (
     OutputKind(
         output_id="buildings",
         title="Buildings as GeoParquet",
@@ -73,9 +77,9 @@ _KINDS = (
         title="Meshes as OBJ in a zip file",
         description="The solids as Wavefront OBJ in full coordinates, one file a building (or a tile, if asked for). "
         "The names in the zip file are those of the column mesh_path.",
-        media_type="application/zip",
+        media_type=ZIP,
         filename="meshes.zip",
-        schema=_binary("application/zip"),
+        schema=_binary(ZIP),
     ),
     OutputKind(
         output_id="cityjson",
@@ -106,11 +110,54 @@ _KINDS = (
     ),
 )
 
-OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _KINDS}
-"""The outputs by their ids, in the order in which they are told."""
+_OF_A_COMPARISON = (
+    OutputKind(
+        output_id="page",
+        title="Comparison as a page",
+        description="One page for a browser: the methods side by side, with pictures and a table a building. It holds "
+        "all that it shows, and nothing of it may reach the service.",
+        media_type=HTML,
+        filename="index.html",
+        schema={"type": "string", "contentMediaType": HTML},
+    ),
+    OutputKind(
+        output_id="table",
+        title="Comparison as GeoParquet",
+        description="One row a building and method: status and reason, roof type, planes, residuals, seconds, "
+        "footprint.",
+        media_type=GEOPARQUET,
+        filename="buildings.parquet",
+        schema=_binary(GEOPARQUET),
+    ),
+    OutputKind(
+        output_id="summary",
+        title="Summary of the comparison",
+        description="Methods with their presets, hashes of settings, digests, inputs, counts and seconds.",
+        media_type="application/json",
+        filename="compare.json",
+        schema={"type": "object", "contentMediaType": "application/json"},
+    ),
+    OutputKind(
+        output_id="archive",
+        title="The whole comparison in a zip file",
+        description="Page, table, summary, and a run directory a method with all its tables and models.",
+        media_type=ZIP,
+        filename="comparison.zip",
+        schema=_binary(ZIP),
+    ),
+)
+
+OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_RUN}
+"""The outputs of a run by their ids, in the order in which they are told: those of the process `reconstruct`."""
+
+COMPARISON_OUTPUTS: Mapping[str, OutputKind] = {kind.output_id: kind for kind in _OF_A_COMPARISON}
+"""The outputs of the process `compare`."""
+
+KINDS: Mapping[str, OutputKind] = {**OUTPUTS, **COMPARISON_OUTPUTS}
+"""All outputs; no two processes mean different things by one id."""
 
 
-def chosen(wanted: Iterable[str] | None) -> tuple[OutputKind, ...]:
+def chosen(wanted: Iterable[str] | None, kinds: Mapping[str, OutputKind] = OUTPUTS) -> tuple[OutputKind, ...]:
     """The kinds of some ids, in the table's order; all of them for None.
 
     Raises
@@ -124,9 +171,9 @@ def chosen(wanted: Iterable[str] | None) -> tuple[OutputKind, ...]:
     ['buildings', 'report']
     """
     if wanted is None:
-        return _KINDS
+        return tuple(kinds.values())
     names = set(wanted)
-    unknown = sorted(names - set(OUTPUTS))
+    unknown = sorted(names - set(kinds))
     if unknown:
-        raise NoSuchOutputError(f"there is no output {', '.join(unknown)}: use {', '.join(OUTPUTS)}")
-    return tuple(kind for kind in _KINDS if kind.output_id in names)
+        raise NoSuchOutputError(f"there is no output {', '.join(unknown)}: use {', '.join(kinds)}")
+    return tuple(kind for kind in kinds.values() if kind.output_id in names)

@@ -1,4 +1,4 @@
-"""The OBJ files of a run: all of them as one zip file, and one building's."""
+"""The OBJ files of a run: all of them as one zip file, and one building's; zip files whose bytes tell no time."""
 
 from __future__ import annotations
 
@@ -24,13 +24,23 @@ def zip_files(archive: zipfile.ZipFile, run_dir: Path, names: list[str]) -> None
         Paths relative to it, in the order in which they are to lie in the archive.
     """
     for name in names:
-        entry = zipfile.ZipInfo(name, date_time=_EPOCH)
-        entry.compress_type = zipfile.ZIP_DEFLATED
-        entry.external_attr = _FILE_MODE
+        entry = _entry(name)
         source_path = run_dir / name
         entry.file_size = source_path.stat().st_size
         with source_path.open("rb") as source, archive.open(entry, "w") as target:
             shutil.copyfileobj(source, target)
+
+
+def zip_text(archive: zipfile.ZipFile, name: str, text: str) -> None:
+    """Add a text as a file, likewise without a time."""
+    archive.writestr(_entry(name), text.encode())
+
+
+def _entry(name: str) -> zipfile.ZipInfo:
+    entry = zipfile.ZipInfo(name, date_time=_EPOCH)
+    entry.compress_type = zipfile.ZIP_DEFLATED
+    entry.external_attr = _FILE_MODE
+    return entry
 
 
 def building_lines(path: Path, building_id: str) -> Iterator[str]:

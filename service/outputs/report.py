@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +73,7 @@ def report(
     run_dir : Path
         The run directory, whose name is not told.
     """
-    clean = _cleaner([entry["path"] for entry in manifest["inputs"]], run_dir)
+    clean = cleaner([entry["path"] for entry in manifest["inputs"]], run_dir)
     inputs = [{"name": Path(entry["path"]).name, **_without(entry, "path")} for entry in manifest["inputs"]]
     facts = manifest.get("crs") or {}
     return {
@@ -131,7 +131,7 @@ def _without(entry: Mapping[str, Any], name: str) -> dict[str, Any]:
     return {key: value for key, value in entry.items() if key != name}
 
 
-def _cleaner(paths: Sequence[str], run_dir: Path) -> Any:
+def cleaner(paths: Sequence[str], run_dir: Path) -> Callable[[str], str]:
     """A function that takes the server's folders out of a text: what remains are file names."""
     folders = {str(Path(path).parent) for path in paths} | {str(run_dir), str(run_dir.resolve())}
     # longest first, or a folder's own subfolder would keep its tail

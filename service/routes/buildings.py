@@ -32,7 +32,7 @@ from service.outputs.single_building import (
 )
 from service.routes.bound import Base
 from service.routes.documented import JOB_ID, problems
-from service.routes.finished_jobs import Finished, FinishedJob
+from service.routes.finished_jobs import FinishedJob, FinishedRun
 from service.routes.negotiation import preferred
 from service.routes.results import FAILED
 from service.routes.status import link
@@ -146,7 +146,7 @@ _Coordinates = Annotated[
 )
 def buildings(
     request: Request,
-    finished: Finished,
+    finished: FinishedRun,
     base: Base,
     bbox: Annotated[
         str | None,
@@ -199,6 +199,7 @@ def buildings(
         ),
     )
     asked = [
+        ("method", finished.label),
         ("bbox", bbox),
         ("bbox-crs", None if bbox_crs is None else bbox_crs.value),
         ("crs", None if crs is None else crs.value),
@@ -241,7 +242,7 @@ def buildings(
 )
 def building(
     request: Request,
-    finished: Finished,
+    finished: FinishedRun,
     base: Base,
     building_id: Annotated[
         str, Path(alias="buildingID", description="As the lists tell it.", examples=["3givd2mvtyerfjxv2yytjbmi"])
@@ -276,12 +277,12 @@ def _feature(found: StoredBuilding, finished: FinishedJob, base: str, *, native:
     collection = f"{base}/jobs/{finished.job.job_id}"
     place = f"{collection}/buildings/{found.building_id}"
     links = [
-        link(place, "self", "This building", GEOJSON),
-        link(f"{collection}/buildings", "collection", "The buildings", GEOJSON),
-        link(f"{place}?f=cityjson", "alternate", "As CityJSON", CITYJSON),
+        link(finished.address(place), "self", "This building", GEOJSON),
+        link(finished.address(f"{collection}/buildings"), "collection", "The buildings", GEOJSON),
+        link(finished.address(place, f="cityjson"), "alternate", "As CityJSON", CITYJSON),
     ]
     if found.mesh_path is not None:
-        links.append(link(f"{place}?f=obj", "alternate", "As OBJ", OBJ))
+        links.append(link(finished.address(place, f="obj"), "alternate", "As OBJ", OBJ))
     return {
         **found.feature,
         "properties": {**found.feature["properties"], "planes": found.planes},

@@ -171,6 +171,13 @@ SCHEMAS: Mapping[str, dict[str, Any]] = {
         verticalUnit=_TEXT,
         bbox={**_TEXT, "description": "x_min,y_min,x_max,y_max in the tiles' CRS."},
         method=_TEXT,
+        preset={**_TEXT, "description": "Where the method's settings start."},
+        methods={
+            "type": "array",
+            "items": _TEXT,
+            "description": "Makes the job a comparison of these, each METHOD or METHOD:PRESET, in the place of "
+            "method and preset: the field several times, or with commas.",
+        },
         classes=_TEXT,
         settings={**_TEXT, "description": "JSON."},
         meshes=_TEXT,

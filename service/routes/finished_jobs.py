@@ -1,16 +1,18 @@
-"""Jobs whose results are there: where they lie, or why there are none."""
+"""Jobs whose results are there: where they lie, or why there are none; of a comparison those of one run."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import urlencode
 
-from fastapi import Depends
+from fastapi import Depends, Query
 
-from service.errors import ResultNotReadyError
+from service.errors import RequestError, ResultNotReadyError
 from service.jobs import Job, JobStatus
-from service.outputs import Catalogue, read_catalogue
+from service.outputs import Catalogue, read_catalogue, run_outputs
+from service.outputs.comparison import RUNS
 from service.problems import JobFailedError
 from service.routes.bound import Folder, Reader, Store
 from service.routes.jobs import JobId
@@ -25,9 +27,35 @@ class FinishedJob:
     out_dir: Path
     """Its outputs."""
     run_dir: Path
-    """Its run directory."""
+    """Its run directory, or the folder of its comparison."""
     catalogue: Catalogue
     """What the outputs are."""
+    label: str | None = None
+    """Which run of a comparison was asked for; None for the comparison as a whole, and of other jobs."""
+
+    def run(self, label: str) -> FinishedJob:
+        """One run of a comparison, as if it were a job of its own.
+
+        Raises
+        ------
+        RequestError
+            There is no such run.
+        NoSuchOutputError
+            Its files are gone.
+        """
+        if label not in self.catalogue.runs:
+            if not self.catalogue.runs:
+                raise RequestError([f"query method is {label[:80]!r}: this job ran one method, leave it out"])
+            raise RequestError([f"query method is {label[:80]!r}: use one of {', '.join(self.catalogue.runs)}"])
+        out_dir = run_outputs(self.out_dir, label)
+        return dataclasses.replace(
+            self, out_dir=out_dir, run_dir=self.run_dir / RUNS / label, catalogue=read_catalogue(out_dir), label=label
+        )
+
+    def address(self, path: str, **query: str) -> str:
+        """A path below the job with a query that leads to the same run again."""
+        given = {**({} if self.label is None else {"method": self.label}), **query}
+        return f"{path}?{urlencode(given)}" if given else path
 
 
 def _finished(job_id: JobId, store: Store, folder: Folder, caller: Reader) -> FinishedJob:
@@ -54,10 +82,37 @@ def _finished(job_id: JobId, store: Store, folder: Folder, caller: Reader) -> Fi
             f"job {job.job_id} is {job.status.value} ({job.progress} %): ask again when it is over"
         )
     out_dir = folder.outputs(job.job_id, job.attempt)
-    return FinishedJob(
-        job=job, out_dir=out_dir, run_dir=folder.run(job.job_id, job.attempt), catalogue=read_catalogue(out_dir)
-    )
+    catalogue = read_catalogue(out_dir)
+    place = folder.comparison if catalogue.runs else folder.run
+    return FinishedJob(job=job, out_dir=out_dir, run_dir=place(job.job_id, job.attempt), catalogue=catalogue)
 
 
-Finished = Annotated[FinishedJob, Depends(_finished)]
-"""The job of the path, with its results."""
+_Finished = Annotated[FinishedJob, Depends(_finished)]
+
+_Label = Annotated[
+    str | None,
+    Query(
+        alias="method",
+        description="Of a comparison the run that is meant, by its label: METHOD, or METHOD-PRESET.",
+        examples=["fuzzy-sart"],
+    ),
+]
+
+
+def _results(finished: _Finished, label: _Label = None) -> FinishedJob:
+    """What the job offers, or one run of it."""
+    return finished if label is None else finished.run(label)
+
+
+def _buildings(finished: _Finished, label: _Label = None) -> FinishedJob:
+    """The run whose buildings are meant: of a comparison the first one, unless another is named."""
+    if label is None and finished.catalogue.runs:
+        return finished.run(finished.catalogue.runs[0])
+    return finished if label is None else finished.run(label)
+
+
+Finished = Annotated[FinishedJob, Depends(_results)]
+"""The job of the path, with its results; of a comparison those of one run, where it is named."""
+
+FinishedRun = Annotated[FinishedJob, Depends(_buildings)]
+"""The job of the path, with the results of one run."""

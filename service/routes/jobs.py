@@ -76,13 +76,15 @@ async def submit(
 ) -> JSONResponse:
     """Send one tile or more as a form and start a job with them: files go to storage as they come in.
 
-    If anything is refused, nothing of the call is kept.
+    With the field `methods` the job compares these methods, else it reconstructs with one. If anything is refused,
+    nothing of the call is kept.
     """
     async with Submission(
         store=store, folder=folder, settings=settings, caller=caller, threads=request.app.state.submitting
     ) as submission:
         inputs, outputs = await _read(request, submission, settings)
-        draft = process_named("reconstruct").draft(inputs, outputs, settings)
+        # who names several methods means to compare them
+        draft = process_named("compare" if "methods" in inputs else "reconstruct").draft(inputs, outputs, settings)
         job = await submission.submit(draft)
     return JSONResponse(status_info(job, base), status_code=201, headers={"Location": f"{base}/jobs/{job.job_id}"})
 
@@ -114,7 +116,9 @@ async def _read(
         if name in {"tiles", "footprints"}:
             inputs.setdefault(name, []).append({"href": text.strip()})
         elif name == "outputs":
-            outputs = [*(outputs or ()), *(word.strip() for word in text.split(",") if word.strip())]
+            outputs = [*(outputs or ()), *_words(text)]
+        elif name == "methods":
+            inputs.setdefault(name, []).extend(_words(text))
         elif name in inputs:
             faults.append(f"{shortened(name)} is given twice: give it once")
         elif text.strip():
@@ -130,6 +134,11 @@ async def _stored(part: Part, submission: Submission, number: int, settings: Ser
         raise RequestError([f"{part.name} comes more than {settings.max_inputs} times: use fewer files"])
     kept = await submission.keep(part.chunks(), part.filename or "")
     return {"href": f"/uploads/{kept.value}"}
+
+
+def _words(text: str) -> list[str]:
+    """Words with commas between them."""
+    return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def _value(name: str, text: str, faults: list[str]) -> Any:

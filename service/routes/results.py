@@ -10,9 +10,9 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import FileResponse, JSONResponse
 from starlette.exceptions import HTTPException
 
-from service.errors import NoSuchOutputError, RequestError
-from service.jobs import Job
-from service.outputs import OUTPUTS, output_file
+from service.errors import RequestError
+from service.outputs import KINDS, OUTPUTS, output_file
+from service.outputs.kinds import HTML
 from service.routes.bound import Base
 from service.routes.documented import JOB_ID, problems
 from service.routes.finished_jobs import Finished
@@ -22,6 +22,13 @@ router = APIRouter(tags=["results"])
 
 FAILED = (422, 500, 503)
 """What the results of a failed job answer, by the cause."""
+
+SANDBOX = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; font-src data:; script-src 'unsafe-inline'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
+)
+"""Content security policy of a page among the results. It is whole by itself: it may show what it holds, but load and
+send nothing, and it is of an origin of its own, so that nothing in it reaches the service, its keys or its storage."""
 
 _RANGES = re.compile(r"bytes=\s*(\d{1,18}-\d{0,18}|-\d{1,18})(\s*,\s*(\d{1,18}-\d{0,18}|-\d{1,18}))*\s*", re.IGNORECASE)
 _HEX = "[0-9a-f]"
@@ -77,19 +84,19 @@ def results(
     """List what a finished job offers, each with media type, size and sha256."""
     stored = finished.catalogue.outputs
     wanted = [word.strip() for value in outputs or () for word in value.split(",") if word.strip()]
-    unknown = [name for name in wanted if name not in OUTPUTS]
+    unknown = [name for name in wanted if name not in KINDS]
     if unknown:
-        raise RequestError([f"query outputs names {unknown[0][:80]!r}: use {', '.join(OUTPUTS)}"])
+        raise RequestError([f"query outputs names {unknown[0][:80]!r}: use {', '.join(KINDS)}"])
     missing = [name for name in wanted if name not in stored]
     if missing:
-        raise NoSuchOutputError(f"this job has no output {missing[0]}; it has: {', '.join(stored) or 'none'}")
+        raise finished.catalogue.missing(missing[0])
     place = f"{base}/jobs/{finished.job.job_id}/results"
     found = {
         name: {
-            "href": f"{place}/{name}",
+            "href": finished.address(f"{place}/{name}"),
             "rel": "item",
-            "type": OUTPUTS[name].media_type,
-            "title": OUTPUTS[name].title,
+            "type": KINDS[name].media_type,
+            "title": KINDS[name].title,
             "bytes": entry.size_bytes,
             "sha256": entry.sha256,
         }
@@ -102,7 +109,7 @@ def results(
 def _file_answers() -> dict[int | str, dict[str, Any]]:
     """What the path of a file answers: one media type an output."""
     content: dict[str, dict[str, Any]] = {}
-    for kind in OUTPUTS.values():
+    for kind in KINDS.values():
         value = {"type": "object"} if kind.schema["type"] == "object" else {"type": "string", "format": "binary"}
         content[kind.media_type] = {"schema": value}
     headers = {
@@ -130,29 +137,39 @@ def result(
     request: Request,
     finished: Finished,
     output_id: Annotated[
-        str, Path(alias="outputID", description=f"One of {', '.join(OUTPUTS)}.", examples=["buildings"])
+        str, Path(alias="outputID", description=f"One of {', '.join(KINDS)}.", examples=["buildings"])
     ],
 ) -> Response:
     """Send one output; ranges of bytes are served, so that Parquet can be read from afar."""
     path = output_file(finished.out_dir, output_id)
-    kind, stored = OUTPUTS[output_id], finished.catalogue.outputs[output_id]
+    kind, stored = KINDS[output_id], finished.catalogue.outputs[output_id]
     preferred(request.headers.get("accept"), [kind.media_type])
     etag = f'"{stored.sha256}"'
     headers = {"ETag": etag, "Cache-Control": "private, no-cache", "Vary": "Accept"}
+    is_page = kind.media_type == HTML
+    if is_page:
+        headers["Content-Security-Policy"] = SANDBOX
     if _is_known(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
     _check_range(request, stored.size_bytes)
-    return FileResponse(path, media_type=kind.media_type, headers=headers, filename=_saved_name(finished.job, path))
+    return FileResponse(
+        path,
+        media_type=kind.media_type,
+        headers=headers,
+        filename=_saved_name(finished.job.job_id, finished.label, path),
+        content_disposition_type="inline" if is_page else "attachment",
+    )
 
 
-def _saved_name(job: Job, path: FilePath) -> str:
+def _saved_name(job_id: str, label: str | None, path: FilePath) -> str:
     """The name under which a browser saves a file.
 
-    >>> from types import SimpleNamespace
-    >>> _saved_name(SimpleNamespace(title=None, job_id="ab" * 16), FilePath("buildings.parquet"))
+    >>> _saved_name("ab" * 16, None, FilePath("buildings.parquet"))
     'gablework-abababab-buildings.parquet'
+    >>> _saved_name("ab" * 16, "kmeans", FilePath("report.json"))
+    'gablework-abababab-kmeans-report.json'
     """
-    return f"gablework-{job.job_id[:8]}-{path.name}"
+    return "-".join(part for part in ("gablework", job_id[:8], label, path.name) if part is not None)
 
 
 def _is_known(if_none_match: str, etag: str) -> bool:

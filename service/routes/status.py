@@ -48,6 +48,8 @@ def status_info(job: Job, base: str, *, with_request: bool = True) -> dict[str, 
             link(f"{place}/results", f"{RELATIONS}results", "The results"),
             link(f"{place}/buildings", "items", "The buildings", "application/geo+json"),
         ]
+        if job.request.methods and (job.request.outputs is None or "page" in job.request.outputs):
+            links.append(link(f"{place}/results/page", "alternate", "The comparison as a page", "text/html"))
     if job.status is JobStatus.FAILED:
         links.append(link(f"{place}/results", f"{RELATIONS}exceptions", "Why it failed", "application/problem+json"))
     info: dict[str, Any] = {
@@ -102,6 +104,7 @@ def execute_request(request: JobRequest, base: str, priority: int) -> dict[str, 
         "crs": request.crs,
         "verticalUnit": request.vertical_unit,
         "bbox": None if request.bbox is None else list(request.bbox),
+        "methods": list(request.methods) or None,
         "settings": dict(request.settings) or None,
         "meshes": request.meshes,
         "licence": request.licence,

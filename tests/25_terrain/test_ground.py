@@ -13,7 +13,9 @@ from hypothesis.extra.numpy import arrays
 from scipy.ndimage import grey_opening, map_coordinates
 
 from pipeline.terrain import ground
-from pipeline.terrain.ground import CELL_MM, NO_DATA, GroundSettings, Terrain, ground_of, height_above, lowest_per_cell
+from pipeline.terrain.ground import GroundSettings, Terrain, ground_of
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above, lowest_per_cell, without_pits
+from pipeline.terrain.morphological import objects, opened
 
 Grid = npt.NDArray[np.int32]
 Points = npt.NDArray[np.int64]
@@ -93,7 +95,7 @@ def test_a_pit_of_up_to_three_cells_is_cleared(cells: list[tuple[int, int]]) -> 
 def test_a_ditch_of_a_whole_row_is_no_pit() -> None:
     z = np.full((20, 20), 5000)
     z[10, :] = 2000
-    cleaned = ground._without_pits(z.astype(np.int32), 1000)
+    cleaned = without_pits(z.astype(np.int32), 1000)
     # at the data's edge the ditch has but two neighbours of its own depth: there it looks like a pit
     np.testing.assert_array_equal(cleaned[:, 1:-1], z[:, 1:-1])
 
@@ -109,7 +111,7 @@ def test_pits_agree_with_a_plain_loop(grid: Grid, seed: int) -> None:
         others = np.delete(around, np.searchsorted(around, lowest[r, c]))
         if len(others) > 2 and (others - lowest[r, c] <= 1000).sum() <= 2:
             expected[r, c] = NO_DATA
-    np.testing.assert_array_equal(ground._without_pits(lowest, 1000), expected)
+    np.testing.assert_array_equal(without_pits(lowest, 1000), expected)
 
 
 # -- openings ----------------------------------------------------------------------------------------------------------
@@ -118,7 +120,7 @@ def test_pits_agree_with_a_plain_loop(grid: Grid, seed: int) -> None:
 @settings(deadline=None)
 @given(grid=grids, half=st.integers(1, 11))
 def test_an_opening_of_full_data_is_that_of_scipy(grid: Grid, half: int) -> None:
-    np.testing.assert_array_equal(ground._opened(grid, half), grey_opening(grid, size=2 * half + 1))
+    np.testing.assert_array_equal(opened(grid, half), grey_opening(grid, size=2 * half + 1))
 
 
 @settings(deadline=None)
@@ -134,18 +136,18 @@ def test_cells_without_data_are_skipped(grid: Grid, half: int, seed: int) -> Non
         return out
 
     values = with_gaps(grid, seed, 0.7)
-    np.testing.assert_array_equal(ground._opened(values, half), extreme(extreme(values, "min"), "max"))
+    np.testing.assert_array_equal(opened(values, half), extreme(extreme(values, "min"), "max"))
 
 
 @settings(deadline=None)
 @given(grid=grids, half=st.integers(1, 5), seed=st.integers(0, 100))
 def test_an_opening_lies_below_its_data_and_opening_again_changes_nothing(grid: Grid, half: int, seed: int) -> None:
     values = with_gaps(grid, seed)
-    opened = ground._opened(values, half)
+    once = opened(values, half)
     data = values != NO_DATA
-    assert (opened[data] <= values[data]).all()
-    again = ground._opened(opened, half)
-    np.testing.assert_array_equal(again[data], opened[data])
+    assert (once[data] <= values[data]).all()
+    again = opened(once, half)
+    np.testing.assert_array_equal(again[data], once[data])
 
 
 def test_objects_are_what_a_step_of_the_openings_of_scipy_cuts_off() -> None:
@@ -160,7 +162,7 @@ def test_objects_are_what_a_step_of_the_openings_of_scipy_cuts_off() -> None:
         after = grey_opening(lowest, size=2 * half + 1)
         expected |= before - after > 350.0 + 250.0 * (half - half_before)
         before, half_before = after, half
-    flagged = ground._objects(lowest, np.array(windows, np.int64), 0.25, 350.0)
+    flagged = objects(lowest, np.array(windows, np.int64), 0.25, 350.0)
     np.testing.assert_array_equal(flagged, expected)
     assert flagged[20:32, 10:30].all()
 

@@ -19,7 +19,8 @@ from pipeline.runtime.split import Split
 from pipeline.scene import ClassesInUse, SceneSettings, SplitTile, WindowPoints, lattice_of, split_tile
 from pipeline.terrain.candidates import CandidateSettings, Surfaces, Verdict, judge_surface, unite_levels
 from pipeline.terrain.facets import FacetKind
-from pipeline.terrain.ground import NO_DATA, GroundSettings
+from pipeline.terrain.ground import GroundSettings
+from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.outliers import OutlierSettings
 from pipeline.terrain.surfaces import Fragments, Sum, SurfaceSettings
 from pipeline.terrain.vegetation import VegetationSettings

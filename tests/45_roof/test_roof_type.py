@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.model import RoofType
 from pipeline.roof.roof_type import RoofTypeSettings, roof_type
+from pipeline.roof.solid import solid_parts
+from pipeline.synthetic.random_dimensions import random_dimensions
+from pipeline.synthetic.roofs import ROOF_TYPES, RoofShape
+from pipeline.synthetic.scene import Terrain, place_building
+from pipeline.synthetic.solids import truth_record
 
 ExactRoofs = Callable[..., Any]
 
@@ -40,6 +47,58 @@ def test_two_pent_roofs_that_fall_towards_one_another_are_no_gable(exact_roof: E
     # the same faces on planes turned upside down meet in a valley
     valley = [type(p)(a=-p.a, b=-p.b, c=p.c, n_points=1, rmse_m=0.0) for p in roof.planes]
     assert roof_type(valley, faces, [part.solid for part in parts], RoofTypeSettings()) is RoofType.COMBINATION
+
+
+@pytest.mark.parametrize("shape", list(RoofShape))
+def test_the_truth_of_every_shape_has_its_type(shape: RoofShape) -> None:
+    random = np.random.default_rng([17, *str(shape).encode()])
+    for draw in range(8):
+        size = random_dimensions(shape, random)
+        building = place_building(
+            f"{shape}-{draw}",
+            shape,
+            size,
+            x=50.0,
+            y=50.0,
+            azimuth_deg=float(random.uniform(0.0, 360.0)),
+            eave_height_m=4.0,
+            terrain=Terrain(base_z_m=0.0),
+        )
+        truth = truth_record(building, (0.0, 0.0, 0.0))
+        told = roof_type(truth.planes, truth.faces, truth.solids, RoofTypeSettings())
+        assert told is ROOF_TYPES[shape], size
+
+
+def with_lifted_plane(roof: Any, lift_m: float, settings: RoofTypeSettings | None = None) -> RoofType:
+    """The type of an exact roof whose last plane is drawn higher: along its borders stand walls."""
+    planes = [*roof.planes[:-1], dataclasses.replace(roof.planes[-1], c=roof.planes[-1].c + lift_m)]
+    parts = solid_parts(roof.drawn(), planes, 0.0)
+    faces = [face for part in parts for face in part.faces]
+    return roof_type(planes, faces, [part.solid for part in parts], settings or RoofTypeSettings())
+
+
+@pytest.mark.parametrize("kind", ["hip", "gable"])
+def test_planes_meet_across_a_sliver_of_wall_and_not_across_a_step(exact_roof: ExactRoofs, kind: str) -> None:
+    roof = exact_roof(kind, with_footprint=True)
+    for lift_m in (0.0, 0.05, 0.3, -0.3):
+        assert with_lifted_plane(roof, lift_m) is TYPES[kind]
+    assert with_lifted_plane(roof, 1.5) is RoofType.COMBINATION
+    assert with_lifted_plane(roof, 0.3, RoofTypeSettings(sliver_height_m=0.1)) is RoofType.COMBINATION
+
+
+def test_a_roof_of_many_small_directions_is_a_combination_though_its_top_is_flat() -> None:
+    size = random_dimensions(RoofShape.MANSARD, np.random.default_rng(5), area_m2=220.0)
+    mansard = dataclasses.replace(size, second_pitch_deg=0.0, pitch_deg=65.0, break_share=0.2)
+    terrain = Terrain(base_z_m=0.0)
+    building = place_building(
+        "m", RoofShape.MANSARD, mansard, x=0.0, y=0.0, azimuth_deg=20.0, eave_height_m=4.0, terrain=terrain
+    )
+    truth = truth_record(building, (0.0, 0.0, 0.0))
+    shares = [face.polygon.area / truth.footprint.area for face in truth.faces]  # type: ignore[union-attr]
+    assert sorted(shares)[-2] < RoofTypeSettings().minor_share
+    assert roof_type(truth.planes, truth.faces, truth.solids, RoofTypeSettings()) is RoofType.COMBINATION
+    alone = RoofTypeSettings(minor_share_together=1.0)
+    assert roof_type(truth.planes, truth.faces, truth.solids, alone) is RoofType.FLAT
 
 
 def test_without_faces_there_is_no_type() -> None:

@@ -30,7 +30,7 @@ from pipeline.evaluation.reference_points import read_points_reference
 from pipeline.evaluation.subsets import subsets
 from pipeline.model import BoolArray, FloatArray
 from pipeline.scene import ClassesInUse, SceneSettings, WindowPoints, terrain_of
-from pipeline.terrain.ground import NO_DATA, height_above
+from pipeline.terrain.lattice import NO_DATA, height_above
 from pipeline.tiling import Window
 
 SETTINGS = SceneSettings()

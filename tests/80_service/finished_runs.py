@@ -8,6 +8,7 @@ import dataclasses
 import datetime as dt
 import hashlib
 import json
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -27,7 +28,7 @@ from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_m
 from service.app import create_app
 from service.files import StateFolder
 from service.jobs import InputReference, Job, JobFailure, JobRequest
-from service.outputs import write_outputs
+from service.outputs import write_comparison_outputs, write_outputs
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -151,6 +152,30 @@ def write_run(
     return run_dir
 
 
+LABELS = ("fuzzy-sart", "fuzzy-sart-faithful")
+"""The runs of the comparison."""
+
+
+def write_comparison(folder: Path) -> Path:
+    """A comparison of two runs that tell where their inputs lay in every way they can."""
+    write_run(folder / "runs" / LABELS[0])
+    # the second found the one building only
+    write_run(
+        folder / "runs" / LABELS[1], {"x850_y4470": [placed(small.gable(), "gable", 0.0, 0.0)]}, failed_tile="x9_y9"
+    )
+    quarantined = folder / "runs" / LABELS[1] / "quarantine"
+    quarantined.mkdir()
+    (quarantined / "b.bundle").write_bytes(b"points")
+    facts = {"inputs": [f"{SERVER_FOLDER}/tile.laz"], "variants": [{"label": label} for label in LABELS], "share": 0.1}
+    (folder / "compare.json").write_text(json.dumps(facts))
+    script = "<script>document.title = 'compared'</script>"
+    page = f"<!doctype html><title>Comparison</title><p>{SERVER_FOLDER}/tile.laz</p>{script}"
+    (folder / "index.html").write_text(page)
+    (folder / "compare.md").write_text(f"# Comparison\n{folder}/runs of {SERVER_FOLDER}/tile.laz\n")
+    shutil.copy(folder / "runs" / LABELS[0] / "buildings/tile=x850_y4470/part-0.parquet", folder / "buildings.parquet")
+    return folder
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Service:
     """A service on this process's own state folder."""
@@ -174,6 +199,15 @@ class Service:
         run_dir = self.folder.run(job.job_id, job.attempt)
         write(run_dir)
         write_outputs(run_dir, self.folder.outputs(job.job_id, job.attempt), job.request.outputs)
+        self.store.succeed(job, message="done", summary={})
+        return job.job_id
+
+    def compared(self, **request: Any) -> str:
+        """The id of a comparison that is over."""
+        job = self.running(process_id="compare", methods=("fuzzy-sart", "fuzzy-sart:faithful"), **request)
+        folder = write_comparison(self.folder.comparison(job.job_id, job.attempt))
+        out_dir = self.folder.outputs(job.job_id, job.attempt)
+        write_comparison_outputs(folder, LABELS, out_dir, job.request.outputs)
         self.store.succeed(job, message="done", summary={})
         return job.job_id
 

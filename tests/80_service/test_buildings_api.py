@@ -487,7 +487,7 @@ def test_the_openapi_document_describes_pages_and_buildings(client: TestClient) 
     described = client.get("/openapi.json").json()["paths"]
     listed = described["/jobs/{jobID}/buildings"]["get"]
     assert {entry["name"] for entry in listed["parameters"]} == {
-        *("jobID", "bbox", "bbox-crs", "crs", "status", "roof_type", "reason", "limit", "offset")
+        *("jobID", "method", "bbox", "bbox-crs", "crs", "status", "roof_type", "reason", "limit", "offset")
     }
     text = (Path(__file__).resolve().parents[2] / "docs/how_to/results_by_rest.md").read_text()
     rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]

@@ -8,7 +8,7 @@ import json
 import jsonschema
 import pytest
 
-from pipeline.methods import METHODS
+from pipeline.methods import METHODS, PRESETS
 from pipeline.settings import RunSettings
 from service import catalogue
 from service.drafts import Inputs, reference_of
@@ -75,6 +75,7 @@ def test_the_schema_of_settings_is_a_json_schema_whose_defaults_fit_it() -> None
 def test_the_description_names_methods_and_outputs_of_the_code(local_service) -> None:
     described = local_service.client.get("/processes/reconstruct").json()
     assert described["inputs"]["method"]["schema"]["enum"] == list(METHODS)
+    assert described["inputs"]["preset"]["schema"]["enum"] == list(PRESETS)
     assert set(described["outputs"]) == set(OUTPUTS)
     assert described["jobControlOptions"] == ["async-execute", "dismiss"]
     for described_input in described["inputs"].values():
@@ -85,7 +86,10 @@ def test_the_description_names_methods_and_outputs_of_the_code(local_service) ->
 def test_the_list_of_processes_has_pages(local_service) -> None:
     page = local_service.client.get("/processes?limit=1").json()
     assert [process["id"] for process in page["processes"]] == ["reconstruct"]
-    assert {link["rel"] for link in page["links"]} == {"self"}
+    assert {link["rel"] for link in page["links"]} == {"self", "next"}
+    rest = local_service.client.get(next(link["href"] for link in page["links"] if link["rel"] == "next")).json()
+    assert [process["id"] for process in rest["processes"]] == ["compare"]
+    assert {link["rel"] for link in rest["links"]} == {"self"}
     assert local_service.client.get("/processes?limit=0").status_code == 400
 
 
@@ -238,6 +242,19 @@ def test_a_body_that_is_no_json_is_refused_with_the_reason(local_service) -> Non
         answer = local_service.client.post("/processes/reconstruct/execution", content=content, headers=json_type)
         assert answer.status_code == 400, content[:20]
         assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_preset_stands_beside_the_method(local_service) -> None:
+    tile = {"href": f"/uploads/{local_service.upload()}"}
+    inputs = {"tiles": tile, "crs": "EPSG:28992", "method": "fuzzy-sart", "preset": "faithful"}
+    answer = execute(local_service, inputs)
+    assert answer.status_code == 201, answer.text
+    stored = local_service.store.get(answer.json()["jobID"]).request.settings
+    assert stored == {"method": "fuzzy-sart", "preset": "faithful"}
+    assert RunSettings.from_mapping(stored).building.method == METHODS["fuzzy-sart"].preset("faithful")
+    assert "preset is" in faults_of(execute(local_service, {**inputs, "preset": "loose"}))
+    contradicted = {**inputs, "settings": {"preset": "robust"}}
+    assert "settings.preset" in faults_of(execute(local_service, contradicted))
 
 
 def test_method_and_settings_may_not_contradict_each_other(local_service) -> None:

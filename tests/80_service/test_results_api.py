@@ -21,7 +21,7 @@ import finished_runs as runs
 
 from service.jobs import Fault, JobFailure
 from service.keys import Scope, new_key
-from service.outputs import OUTPUTS
+from service.outputs import COMPARISON_OUTPUTS, KINDS, OUTPUTS
 
 OGC = "http://www.opengis.net/def/exceptions/ogcapi-processes-1/1.0/"
 
@@ -292,7 +292,7 @@ def test_the_openapi_document_declares_every_answer_with_its_type(client: TestCl
         answers = described[path]["get"]["responses"]
         assert {"200", "400", "401", "403", "404", "422", "429", "500", "503"} <= set(answers)
     file = described["/jobs/{jobID}/results/{outputID}"]["get"]["responses"]
-    assert set(file["200"]["content"]) == {kind.media_type for kind in OUTPUTS.values()}
+    assert set(file["200"]["content"]) == {kind.media_type for kind in KINDS.values()}
     assert {"206", "304", "406", "416"} <= set(file)
     assert all(set(file[status]["content"]) == {"application/problem+json"} for status in ("404", "406", "416"))
     listed = described["/jobs/{jobID}/results"]["get"]["responses"]["200"]["content"]["application/json"]
@@ -303,4 +303,7 @@ def test_the_page_on_results_tells_every_output_with_its_type_and_file() -> None
     page = Path(__file__).resolve().parents[2] / "docs/how_to/results_by_rest.md"
     rows = [line.split("|")[1:4] for line in page.read_text().splitlines() if line.startswith("| `")]
     told = [tuple(cell.strip().strip("`") for cell in row) for row in rows]
-    assert told[: len(OUTPUTS)] == [(kind.output_id, kind.media_type, kind.filename) for kind in OUTPUTS.values()]
+    of_a_run = [(kind.output_id, kind.media_type, kind.filename) for kind in OUTPUTS.values()]
+    of_a_comparison = [(kind.output_id, kind.media_type, kind.filename) for kind in COMPARISON_OUTPUTS.values()]
+    assert told[: len(of_a_run)] == of_a_run
+    assert [row for row in told if row in of_a_comparison] == of_a_comparison

@@ -45,10 +45,13 @@ class Ids:
 
     def __init__(self, service: finished_runs.Service) -> None:
         self._service = service
-        self._finished = service.finished()
-        page = service.client.get(f"/jobs/{self._finished}/buildings").json()
+        alone = service.finished()
+        self._finished = itertools.cycle([alone, service.compared()])
+        page = service.client.get(f"/jobs/{alone}/buildings").json()
         self._buildings = itertools.cycle([feature["id"] for feature in page["features"]])
-        self._outputs = itertools.cycle(["buildings", "report", "cityjson", "meshes"])
+        self._outputs = itertools.cycle(["buildings", "report", "cityjson", "meshes", "page", "summary", "archive"])
+        self._processes = itertools.cycle(["reconstruct", "compare"])
+        self._methods = itertools.cycle(finished_runs.LABELS)
         self._turn = itertools.count()
         points = b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(20) for y in range(20))
         sent = service.client.post("/uploads?filename=points.xyz", content=points)
@@ -64,12 +67,17 @@ class Ids:
         parameters = case.path_parameters or {}
         if next(self._turn) % 2:
             return
+        process = next(self._processes)
         if case.path.endswith("/execution") and mode is GenerationMode.POSITIVE:
             case.body = {"inputs": {"tiles": [{"href": f"/uploads/{self._upload}"}], "crs": "EPSG:28992"}}
+            if process == "compare":
+                case.body["inputs"]["methods"] = ["fuzzy-sart", "fuzzy-sart:faithful"]
         if "processID" in parameters:
-            parameters["processID"] = "reconstruct"
+            parameters["processID"] = process
+        if mode is GenerationMode.POSITIVE and "method" in (case.query or {}):
+            case.query["method"] = next(self._methods)
         if "jobID" in parameters:
-            parameters["jobID"] = self._waiting() if case.method == "DELETE" else self._finished
+            parameters["jobID"] = self._waiting() if case.method == "DELETE" else next(self._finished)
         if "uploadID" in parameters and case.method == "GET":
             parameters["uploadID"] = self._upload
         if "buildingID" in parameters:

@@ -64,6 +64,15 @@ def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
+@pytest.fixture(scope="session")
+def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated tile with one gabled house."""
+    folder = tmp_path_factory.mktemp("house")
+    subprocess.run([_gablework(), "simulate", "gable", "--out", folder], check=True, capture_output=True)
+    (found,) = folder.glob("*.laz")
+    return found
+
+
 def _gablework() -> Path:
     return program("gablework")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,60 @@ def test_the_way_to_a_record_and_back_needs_no_pointer(visit: Open, service: str
     expect(page.get_by_role("button", name="All buildings")).to_be_focused()
     page.keyboard.press("Enter")
     expect(page.locator(f'.building[href="{chosen}"]')).to_be_focused()
+
+
+def test_a_comparison_shows_each_method_and_the_page_of_all(
+    visit: Open, service: str, tmp_path: Path, house: Path
+) -> None:
+    opened = visit(service)
+    page = opened.page
+    page.set_input_files("#tiles", house)
+    expect(page.locator(".facts")).to_contain_text("points")
+    page.locator("summary", has_text="Options").click()
+    expect(page.get_by_label("Preset")).to_have_value("robust")
+    # what is chosen above cannot be chosen once more
+    expect(page.get_by_role("checkbox", name="fuzzy-sart", exact=True)).to_be_disabled()
+    page.get_by_role("checkbox", name="fuzzy-sart, faithful").check()
+    page.get_by_role("checkbox", name="kmeans", exact=True).check()
+    page.get_by_role("button", name="Compare 3 methods").click()
+    opened.wait_for_models()
+    found = re.search(r"#/jobs/(\w{32})$", page.url)
+    assert found is not None
+    told = httpx.get(f"{service}jobs/{found[1]}").json()
+    labels = ["fuzzy-sart", "fuzzy-sart-faithful", "kmeans"]
+    assert (told["processID"], list(told["summary"]["runs"])) == ("compare", labels)
+
+    page.locator(".building").first.click()
+    building = page.locator(".record-id").inner_text()
+    choice = page.get_by_role("combobox", name="Models of the method")
+    assert choice.locator("option").all_inner_texts() == labels
+    choice.select_option("kmeans")
+    opened.wait_for_models()
+    expect(page.locator(".record-id")).to_have_text(building)
+    assert page.url.endswith(f"#/jobs/{found[1]}/methods/kmeans/buildings/{building}")
+    planes = httpx.get(f"{service}jobs/{found[1]}/buildings/{building}?method=kmeans").json()["properties"]["n_planes"]
+    expect(page.locator(".record tbody tr")).to_have_count(planes)
+    page.screenshot(path=tmp_path / "kmeans.png")
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    page.set_viewport_size({"width": 1280, "height": 800})
+
+    page.locator(".menu summary", has_text="Download").click()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="All methods, zip").click()
+    with zipfile.ZipFile(download.value.path()) as archive:
+        assert {f"runs/{label}/run.json" for label in labels} <= set(archive.namelist())
+
+    with page.context.expect_page() as other:
+        page.locator(".job-page a").first.click()
+    side_by_side = Visit(other.value, service)
+    other.value.wait_for_load_state()
+    expect(other.value.get_by_role("heading", level=1)).to_contain_text("kmeans")
+    assert other.value.evaluate("self.origin") == "null", "the page could reach the service"
+    other.value.screenshot(path=tmp_path / "side_by_side.png")
+    other.value.reload()
+    other.value.wait_for_load_state()
+    assert (side_by_side.errors, side_by_side.elsewhere) == ([], [])
 
 
 def test_a_refused_file_is_told_with_what_to_do(visit: Open, service: str, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ export type Status = "accepted" | "running" | "successful" | "failed" | "dismiss
 
 export interface StatusInfo {
   jobID: string;
+  processID?: string;
   status: Status;
   message?: string;
   progress?: number;
@@ -39,6 +40,8 @@ export interface StatusInfo {
   stage?: string;
   links?: Link[];
   request?: unknown;
+  /** Of a comparison: what came out of each run, by its label. */
+  summary?: { runs?: Record<string, unknown> };
   exception?: { title?: string; detail?: string };
 }
 

@@ -1,3 +1,4 @@
+import { ofRun } from "./address";
 import { currentKey, getJson, request, serviceUrl, type Link } from "./api";
 import { el } from "./elements";
 import { asProblem, problemNotice } from "./notices";
@@ -12,6 +13,13 @@ const OUTPUTS: Record<string, [string, string, string]> = {
   rejected: ["GeoParquet, rejected", "What was judged to be no building, and why", "rejected.parquet"],
   geojson: ["GeoJSON", "Footprints with the record, for any GIS", "buildings.geojson"],
   report: ["Report", "Settings, inputs, counts, timings, digest", "report.json"],
+};
+
+/** Those of a comparison as a whole; its page is a link of its own. */
+const COMPARED: typeof OUTPUTS = {
+  table: ["All methods, GeoParquet", "A row a building and method", "compared.parquet"],
+  summary: ["All methods, summary", "Presets, hashes, counts, seconds", "compare.json"],
+  archive: ["All methods, zip", "The page, the table, every run", "comparison.zip"],
 };
 
 /**
@@ -40,20 +48,27 @@ async function save(path: string, filename: string): Promise<void> {
   setTimeout(() => URL.revokeObjectURL(address), 60_000);
 }
 
+/** Shows the page of a comparison; with a key it can only be saved, and then opened. */
+export function pageLink(jobPath: string, name: string): HTMLAnchorElement {
+  const path = `${jobPath}/results/page`;
+  if (currentKey() !== null) {
+    const saved = downloadLink("Save the comparison", path, "comparison.html");
+    saved.setAttribute("aria-label", `Save: ${name}`);
+    return saved;
+  }
+  return el("a", { href: serviceUrl(path), target: "_blank", rel: "noopener", "aria-label": name }, "Comparison");
+}
+
 type Offered = Record<string, Link & { bytes?: number }>;
 
-/** A menu of all outputs that the job has. */
-export async function downloadMenu(jobPath: string, signal: AbortSignal): Promise<HTMLElement> {
-  const offered = await getJson<Offered>(`${jobPath}/results`, { signal });
-  const known = Object.keys(OUTPUTS).filter((name) => name in offered);
-  const others = Object.keys(offered).filter((name) => !(name in OUTPUTS));
-  const entries = [...known, ...others].map((name) => {
-    const [label, words, filename] = OUTPUTS[name] ?? [name, offered[name]?.title ?? "", name];
-    const size = offered[name]?.bytes;
-    const note = el("span", { class: "hint" }, words);
-    const weight = el("span", { class: "menu-size" }, typeof size === "number" ? bytes(size) : "");
-    return el("li", {}, downloadLink(label, `${jobPath}/results/${name}`, filename, weight, note));
-  });
+/** A menu of all outputs that the job has; of a comparison those of one run, then those of all. */
+export async function downloadMenu(jobPath: string, method: string | null, signal: AbortSignal): Promise<HTMLElement> {
+  const offer = (of: string | null): Promise<Offered> => getJson<Offered>(ofRun(`${jobPath}/results`, of), { signal });
+  const entries = listed(await offer(method), OUTPUTS, jobPath, method);
+  if (method !== null) {
+    const { page: _page, ...compared } = await offer(null);
+    entries.push(...listed(compared, COMPARED, jobPath, null));
+  }
   const menu = el(
     "details",
     { class: "menu" },
@@ -69,4 +84,19 @@ export async function downloadMenu(jobPath: string, signal: AbortSignal): Promis
     if (!menu.contains(event.target as Node)) menu.open = false;
   }, { signal });
   return menu;
+}
+
+/** Entries of the menu: those that are known in their order, then any others. */
+function listed(offered: Offered, known: typeof OUTPUTS, jobPath: string, method: string | null): HTMLElement[] {
+  const names = [...Object.keys(known), ...Object.keys(offered).filter((name) => !(name in known))];
+  return names
+    .filter((name) => name in offered)
+    .map((name) => {
+      const [label, words, filename] = known[name] ?? [name, offered[name]?.title ?? "", name];
+      const size = offered[name]?.bytes;
+      const note = el("span", { class: "hint" }, words);
+      const weight = el("span", { class: "menu-size" }, typeof size === "number" ? bytes(size) : "");
+      const saved = method === null ? filename : `${method}-${filename}`;
+      return el("li", {}, downloadLink(label, ofRun(`${jobPath}/results/${name}`, method), saved, weight, note));
+    });
 }

@@ -1,4 +1,5 @@
 import { getJson, isOver, type Problem, type StatusInfo } from "./api";
+import { pageLink } from "./downloads";
 import { el } from "./elements";
 import { asProblem, problemNotice } from "./notices";
 import { ago } from "./numbers";
@@ -61,8 +62,8 @@ export class JobList {
 
   private draw(): void {
     const now = new Date();
-    const focused = document.activeElement?.closest<HTMLAnchorElement>(".job")?.getAttribute("href");
-    this.list.replaceChildren(...this.jobs.map((job) => el("li", {}, this.entry(job, now))));
+    const focused = this.list.contains(document.activeElement) ? document.activeElement?.getAttribute("href") : null;
+    this.list.replaceChildren(...this.jobs.map((job) => el("li", {}, this.entry(job, now), pageOf(job))));
     if (focused != null) this.list.querySelector<HTMLAnchorElement>(`a[href="${CSS.escape(focused)}"]`)?.focus();
   }
 
@@ -80,6 +81,12 @@ export class JobList {
       el("span", { class: "job-when" }, job.created === undefined ? "" : ago(new Date(job.created), now)),
     );
   }
+}
+
+/** Of a comparison that is done, the way to its page. */
+function pageOf(job: StatusInfo): HTMLElement | null {
+  if (job.links?.some(({ type }) => type === "text/html") !== true) return null;
+  return el("div", { class: "job-page" }, pageLink(`jobs/${encodeURIComponent(job.jobID)}`, `Comparison of ${titleOf(job)}`));
 }
 
 /** The user's title of a job, else its inputs' names, else the beginning of its id. */

@@ -1,3 +1,4 @@
+import type { Place } from "./address";
 import { Problem, getJson, isOver, request, type Status, type StatusInfo } from "./api";
 import { el } from "./elements";
 import { follow, type ServerEvent } from "./event_stream";
@@ -35,11 +36,23 @@ const STAGES: [string, string, string][] = [
   ["outputs", "Assemble the downloads", ""],
 ];
 
+/** What a comparison does besides, before its downloads are assembled. */
+const SIDE_BY_SIDE: typeof STAGES = [
+  ["records", "Put the runs side by side", ""],
+  ["points", "Read points for the pictures", ""],
+  ["pictures", "Draw the pictures", ""],
+  ["page", "Write the page", ""],
+];
+
+function stagesOf(job: StatusInfo): typeof STAGES {
+  return job.processID === "compare" ? [...STAGES.slice(0, -1), ...SIDE_BY_SIDE, ...STAGES.slice(-1)] : STAGES;
+}
+
 /** Show a job: its progress, why it failed, or what came out. What comes back ends the view. */
-export function showJob(place: HTMLElement, jobId: string, buildingId: string | null, hooks: Hooks): () => void {
+export function showJob(place: HTMLElement, named: Place, hooks: Hooks): () => void {
   const calledOff = new AbortController();
   let leaveResults: () => void = () => undefined;
-  const path = `jobs/${encodeURIComponent(jobId)}`;
+  const path = `jobs/${encodeURIComponent(named.job)}`;
 
   const look = async (): Promise<void> => {
     const job = await getJson<StatusInfo>(path, { signal: calledOff.signal });
@@ -49,7 +62,7 @@ export function showJob(place: HTMLElement, jobId: string, buildingId: string | 
       // the 3D library is only loaded where there is something to draw
       const { showResults } = await import("./results_view");
       if (calledOff.signal.aborted) return;
-      leaveResults = showResults(place, job, buildingId, hooks);
+      leaveResults = showResults(place, job, named, hooks);
     } else if (isOver(job.status)) {
       place.replaceChildren(ended(job));
     } else {
@@ -109,7 +122,7 @@ class ProgressView {
 
   constructor(job: StatusInfo, cancel: () => Promise<void>) {
     this.started = Date.parse(job.started ?? job.created ?? new Date().toISOString());
-    for (const [name, words] of STAGES) this.addStage(name, words);
+    for (const [name, words] of stagesOf(job)) this.addStage(name, words);
     const button = el("button", { type: "button", class: "quiet" }, "Cancel the job");
     button.addEventListener("click", () => {
       button.disabled = true;

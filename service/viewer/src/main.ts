@@ -1,5 +1,6 @@
 /** The page: what the address names is shown, the rest follows. */
 
+import { placeOf } from "./address";
 import { Problem, currentKey, getJson, keepKey } from "./api";
 import { byId, el } from "./elements";
 import { JobList } from "./job_list";
@@ -18,21 +19,21 @@ new Submission(byId("submission"), (jobId) => {
 let shown = "";
 let leave: () => void = () => undefined;
 
-/** `#/jobs/<job>` and `#/jobs/<job>/buildings/<building>`. */
 function route(): void {
-  const [, jobId = "", buildingId = null] = /^#\/jobs\/([^/]+)(?:\/buildings\/([^/]+))?/.exec(location.hash) ?? [];
-  jobs.mark(jobId);
-  document.body.classList.toggle("has-job", jobId !== "");
-  if (jobId === shown && jobId !== "") return; // only the building changed: the job's view hears of it itself
+  const place = placeOf(location.hash);
+  jobs.mark(place?.job ?? "");
+  document.body.classList.toggle("has-job", place !== null);
+  const run = place === null ? "" : `${place.job} ${place.method ?? ""}`;
+  if (run === shown && place !== null) return; // only the building changed: the job's view hears of it itself
   leave();
-  shown = jobId;
-  if (jobId === "") {
+  shown = run;
+  if (place === null) {
     document.title = "gablework";
     main.replaceChildren(welcome());
     leave = () => undefined;
     return;
   }
-  leave = showJob(main, decodeURIComponent(jobId), buildingId === null ? null : decodeURIComponent(buildingId), {
+  leave = showJob(main, place, {
     onChange: () => void jobs.refresh(),
     onProblem,
   });

@@ -1,3 +1,4 @@
+import { ofRun } from "./address";
 import { getJson, type Feature, type Problem } from "./api";
 import { downloadLink } from "./downloads";
 import { el, swatch } from "./elements";
@@ -74,6 +75,7 @@ export function reasonWords(reason: string): string {
 export function showRecord(
   place: HTMLElement,
   jobPath: string,
+  method: string | null,
   buildingId: string,
   verticalUnit: string,
   onProblem: (problem: Problem) => void,
@@ -82,9 +84,9 @@ export function showRecord(
   const path = `${jobPath}/buildings/${encodeURIComponent(buildingId)}`;
   const load = (): void => {
     place.replaceChildren(el("p", { class: "loading" }, "Loading…"));
-    getJson<Feature>(path, { signal: calledOff.signal, headers: { Accept: "application/geo+json" } }).then(
+    getJson<Feature>(ofRun(path, method), { signal: calledOff.signal, headers: { Accept: "application/geo+json" } }).then(
       ({ properties }) => {
-        if (!calledOff.signal.aborted) place.replaceChildren(...record(properties, path, buildingId, verticalUnit));
+        if (!calledOff.signal.aborted) place.replaceChildren(...record(properties, path, method, buildingId, verticalUnit));
       },
       (error: unknown) => {
         if (calledOff.signal.aborted) return;
@@ -98,7 +100,13 @@ export function showRecord(
   return () => calledOff.abort();
 }
 
-function record(properties: Record_, path: string, buildingId: string, verticalUnit: string): HTMLElement[] {
+function record(
+  properties: Record_,
+  path: string,
+  method: string | null,
+  buildingId: string,
+  verticalUnit: string,
+): HTMLElement[] {
   const { status, reason, reason_detail: detail, lod, valid } = properties;
   const category = categoryOf(status, properties["roof_type"]);
   const modelled = status === "ok" || status === "fallback";
@@ -139,7 +147,7 @@ function record(properties: Record_, path: string, buildingId: string, verticalU
     ...(codes.length > 0 ? [el("p", { class: "hint" }, `Codes of the method's own solid: ${codes.join(", ")}`)] : []),
     ...tables,
     ...planes(properties["planes"]),
-    ...(modelled ? [takeAway(path, buildingId)] : []),
+    ...(modelled ? [takeAway(path, method, buildingId)] : []),
   ];
 }
 
@@ -167,12 +175,12 @@ function planes(value: unknown): HTMLElement[] {
   ];
 }
 
-function takeAway(path: string, buildingId: string): HTMLElement {
+function takeAway(path: string, method: string | null, buildingId: string): HTMLElement {
   return el(
     "div",
     { class: "record-links" },
-    downloadLink("OBJ", `${path}?f=obj`, `${buildingId}.obj`),
-    downloadLink("CityJSON", `${path}?f=cityjson`, `${buildingId}.city.json`),
+    downloadLink("OBJ", ofRun(`${path}?f=obj`, method), `${buildingId}.obj`),
+    downloadLink("CityJSON", ofRun(`${path}?f=cityjson`, method), `${buildingId}.city.json`),
   );
 }
 

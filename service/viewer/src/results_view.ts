@@ -1,7 +1,8 @@
+import { addressOf, ofRun, placeOf, type Place } from "./address";
 import { getJson, request, type Feature, type StatusInfo } from "./api";
 import type { Listed } from "./batching";
 import { BuildingList } from "./building_list";
-import { downloadMenu } from "./downloads";
+import { downloadMenu, pageLink } from "./downloads";
 import { el } from "./elements";
 import { failedFootprints } from "./failed_footprints";
 import type { Hooks } from "./job_view";
@@ -23,15 +24,19 @@ interface Report {
 }
 
 /** Show what a job found: the models, the list and the records, the downloads. What comes back ends the view. */
-export function showResults(place: HTMLElement, job: StatusInfo, first: string | null, hooks: Hooks): () => void {
-  const view = new ResultsView(place, job, hooks);
-  view.start(first).catch((error: unknown) => view.fail(error));
+export function showResults(place: HTMLElement, job: StatusInfo, named: Place, hooks: Hooks): () => void {
+  const view = new ResultsView(place, job, named.method, hooks);
+  view.start(named.building).catch((error: unknown) => view.fail(error));
   return () => view.leave();
 }
 
 class ResultsView {
   private readonly calledOff = new AbortController();
   private readonly jobPath: string;
+  /** Labels of the runs of a comparison; empty of other jobs. */
+  private readonly methods: string[];
+  /** The one whose models are shown. */
+  private readonly method: string | null;
   private readonly canvas = el("canvas", {
     tabindex: 0,
     role: "img",
@@ -56,8 +61,11 @@ class ResultsView {
   constructor(
     place: HTMLElement,
     private readonly job: StatusInfo,
+    private readonly named: string | null,
     private readonly hooks: Hooks,
   ) {
+    this.methods = Object.keys(job.summary?.runs ?? {});
+    this.method = named ?? this.methods[0] ?? null;
     this.jobPath = `jobs/${encodeURIComponent(job.jobID)}`;
     this.list = new BuildingList((id) => this.address(id));
     this.legend = new Legend((category, visible) => {
@@ -90,10 +98,10 @@ class ResultsView {
 
   async start(first: string | null): Promise<void> {
     window.addEventListener("hashchange", () => this.followAddress(), { signal: this.calledOff.signal });
-    const [report, menu] = await Promise.all([this.loadReport(), downloadMenu(this.jobPath, this.calledOff.signal)]);
+    const [report, menu] = await Promise.all([this.loadReport(), downloadMenu(this.jobPath, this.method, this.calledOff.signal)]);
     if (this.calledOff.signal.aborted) return;
     this.report = report;
-    this.downloads.replaceChildren(menu, this.removal());
+    this.downloads.replaceChildren(...this.comparison(), menu, this.removal());
     this.showFacts();
     try {
       this.scene = new ModelScene(this.canvas, (id) => this.open(id));
@@ -105,7 +113,7 @@ class ResultsView {
     this.note.append(el("p", { class: "loading" }, "Loading the models…"));
     const { crs } = report;
     await loadModels(
-      `${this.jobPath}/results/cityjson`,
+      ofRun(`${this.jobPath}/results/cityjson`, this.method),
       { horizontalUnitM: crs?.horizontal_unit_m ?? 1, verticalUnitM: crs?.vertical_unit_m ?? 1 },
       (message) => {
         if (message.kind === "frame") this.origin = message.origin;
@@ -136,7 +144,7 @@ class ResultsView {
   /** The report, or nothing where the job was asked not to make it. */
   private async loadReport(): Promise<Report> {
     try {
-      return await getJson<Report>(`${this.jobPath}/results/report`, { signal: this.calledOff.signal });
+      return await getJson<Report>(ofRun(`${this.jobPath}/results/report`, this.method), { signal: this.calledOff.signal });
     } catch (error) {
       if (asProblem(error).status === 404) return {};
       throw error;
@@ -171,7 +179,8 @@ class ResultsView {
   /** Footprints of those that have no model: only the records tell where they are. */
   private async drawFailed(): Promise<void> {
     const { crs } = this.report;
-    const page = await getJson<{ features: Feature[] }>(`${this.jobPath}/buildings?status=failed&limit=10000&crs=native`, {
+    const failed = ofRun(`${this.jobPath}/buildings?status=failed&limit=10000&crs=native`, this.method);
+    const page = await getJson<{ features: Feature[] }>(failed, {
       signal: this.calledOff.signal,
       headers: { Accept: "application/geo+json" },
     });
@@ -235,24 +244,44 @@ class ResultsView {
     );
   }
 
+  // --- the methods of a comparison
+
+  /** Whose models are shown, and the way to the page that shows all side by side. */
+  private comparison(): HTMLElement[] {
+    if (this.methods.length === 0) return [];
+    const choice = el(
+      "select",
+      { "aria-label": "Models of the method" },
+      ...this.methods.map((label) => el("option", { value: label, selected: label === this.method }, label)),
+    );
+    choice.addEventListener("change", () => {
+      // the same building by another method
+      location.hash = addressOf({ job: this.job.jobID, method: choice.value, building: this.selected });
+    });
+    const hasPage = this.job.links?.some(({ type }) => type === "text/html") === true;
+    const page = pageLink(this.jobPath, "The methods side by side");
+    page.classList.add("button", "quiet");
+    return hasPage ? [choice, page] : [choice];
+  }
+
   // --- the record of one building
 
-  private address(id: string): string {
-    return `#/jobs/${encodeURIComponent(this.job.jobID)}/buildings/${encodeURIComponent(id)}`;
+  private address(building: string | null): string {
+    return addressOf({ job: this.job.jobID, method: this.named, building });
   }
 
   /** A click in the scene: the address follows, and the rest follows the address. */
   private open(id: string | null): void {
-    const hash = id === null ? `#/jobs/${encodeURIComponent(this.job.jobID)}` : this.address(id);
+    const hash = this.address(id);
     if (location.hash === hash) return;
     this.fromScene = id !== null;
     location.hash = hash;
   }
 
   private followAddress(): void {
-    const [, jobId, id] = /^#\/jobs\/([^/]+)(?:\/buildings\/([^/]+))?/.exec(location.hash) ?? [];
-    if (jobId === undefined || decodeURIComponent(jobId) !== this.job.jobID) return;
-    this.select(id === undefined ? null : decodeURIComponent(id));
+    const place = placeOf(location.hash);
+    if (place?.job !== this.job.jobID || place.method !== this.named) return;
+    this.select(place.building);
   }
 
   private select(id: string | null): void {
@@ -287,7 +316,7 @@ class ResultsView {
     this.panel.scrollTop = 0;
     if (!fly) this.panel.scrollIntoView({ block: "nearest" }); // on narrow screens it is below the models
     if (fly && before === null) back.focus({ preventScroll: true });
-    this.stopRecord = showRecord(body, this.jobPath, id, unitName(this.report.crs?.vertical_unit_m), this.hooks.onProblem);
+    this.stopRecord = showRecord(body, this.jobPath, this.method, id, unitName(this.report.crs?.vertical_unit_m), this.hooks.onProblem);
   }
 
   /** Remove the job and its results, after asking. */

@@ -1,3 +1,4 @@
+import { variantOf } from "./address";
 import { Problem, getJson, request, upload, type UploadInfo } from "./api";
 import { el, svg } from "./elements";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
@@ -32,6 +33,9 @@ export class Submission {
   private readonly crs = el("input", { id: "crs", type: "text", placeholder: "EPSG:28992", autocomplete: "off", spellcheck: "false" });
   private readonly verticalUnit = choice("vertical-unit", VERTICAL_UNITS);
   private readonly method = choice("method", {});
+  private readonly preset = choice("preset", {});
+  private usualPreset = "";
+  private readonly others = el("div", { class: "others" });
   private readonly classes = choice("classes", {});
   private readonly title = el("input", { id: "title", type: "text", autocomplete: "off", maxlength: 200 });
   private readonly options = el("details", { class: "options" });
@@ -65,11 +69,14 @@ export class Submission {
       field("CRS", this.crs, "Where the file names none or a wrong one."),
       field("Vertical unit", this.verticalUnit),
       field("Method", this.method),
+      field("Preset", this.preset, "What measured better, or what keeps to the method's paper."),
+      el("fieldset", { class: "field" }, el("legend", {}, "Compare with"), this.others),
       field("Classes of the file", this.classes, "Trusted, only compared with what is found, or not looked at."),
       field("Footprints", footprintPicker, "GeoPackage or GeoJSON: one model a polygon."),
       this.footprintRow,
       field("Title", this.title),
     );
+    for (const select of [this.method, this.preset]) select.addEventListener("change", () => this.draw());
     const form = el(
       "form",
       { novalidate: true },
@@ -94,15 +101,38 @@ export class Submission {
   private async describe(): Promise<void> {
     try {
       const process = await getJson<{ inputs: Record<string, InputDescription> }>("processes/reconstruct");
-      for (const [select, name] of [[this.method, "method"], [this.classes, "classes"]] as const) {
+      const selects = [[this.method, "method"], [this.preset, "preset"], [this.classes, "classes"]] as const;
+      for (const [select, name] of selects) {
         const schema = process.inputs[name]?.schema;
         select.replaceChildren(
           ...(schema?.enum ?? []).map((value) => el("option", { value, selected: value === schema?.default }, value)),
         );
       }
+      this.usualPreset = this.preset.value;
+      this.offerOthers(process.inputs["method"]?.schema.enum ?? [], process.inputs["preset"]?.schema.enum ?? [""]);
     } catch (error) {
       this.tell(asProblem(error));
     }
+  }
+
+  /** A box for every method with every preset: any that is set makes the job a comparison. */
+  private offerOthers(methods: string[], presets: string[]): void {
+    const words = methods.flatMap((method) => presets.map((preset) => variantOf(method, preset, this.usualPreset)));
+    this.others.replaceChildren(
+      ...words.map((value) => el("label", {}, el("input", { type: "checkbox", value }), ` ${value.replace(":", ", ")}`)),
+    );
+    this.others.addEventListener("change", () => this.draw());
+    this.draw();
+  }
+
+  /** All that is to be run; more than one is a comparison. */
+  private variants(): string[] {
+    const boxes = [...this.others.querySelectorAll<HTMLInputElement>("input:checked")];
+    return [...new Set([this.chosen(), ...boxes.map(({ value }) => value)])];
+  }
+
+  private chosen(): string {
+    return variantOf(this.method.value, this.preset.value, this.usualPreset);
   }
 
   /** Files may be dropped anywhere on the page: a miss by some pixels must not leave the page. */
@@ -207,12 +237,14 @@ export class Submission {
       const chosen: [string, string][] = [
         ["crs", this.crs.value.trim()],
         ["verticalUnit", this.verticalUnit.value],
-        ["method", this.method.value],
         ["classes", this.classes.value],
       ];
+      const variants = this.variants();
+      if (variants.length > 1) inputs["methods"] = variants;
+      else chosen.push(["method", this.method.value], ["preset", this.preset.value]);
       for (const [name, value] of chosen) if (value !== "") inputs[name] = value;
       if (this.footprints?.uploaded != null) inputs["footprints"] = { href: this.footprints.uploaded.href };
-      const response = await request("processes/reconstruct/execution", {
+      const response = await request(`processes/${variants.length > 1 ? "compare" : "reconstruct"}/execution`, {
         method: "POST",
         headers: { "Content-Type": "application/json" },
         body: JSON.stringify({ inputs }),
@@ -248,6 +280,8 @@ export class Submission {
     const refused = files.some(({ problem }) => problem !== null);
     const waiting = files.some(({ uploaded, problem }) => uploaded === null && problem === null);
     const ready = this.tiles.length > 0 && !refused && !waiting && !this.starting;
+    const chosen = this.chosen();
+    for (const box of this.others.querySelectorAll("input")) box.disabled = box.value === chosen;
     // not `disabled`: the button keeps its place in the tab order and its name tells why it waits
     this.go.setAttribute("aria-disabled", String(!ready));
     this.go.textContent = this.starting
@@ -256,7 +290,9 @@ export class Submission {
         ? "Uploading…"
         : refused
           ? "Remove what was refused"
-          : "Reconstruct";
+          : this.variants().length > 1
+            ? `Compare ${this.variants().length} methods`
+            : "Reconstruct";
   }
 }
 

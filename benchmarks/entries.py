@@ -1,0 +1,315 @@
+"""What is measured, and how: scenes and tiles, each modelled by several methods and held against its reference.
+
+The parts that the programs of this folder share: `ruler.py`, `hofmann_tables.py`, `sweep_limits.py`, `method_times.py`.
+All work in one folder, so that each finds what another made; what is there already is not done again,
+as long as the settings are the same (delete DIR after the code changed).
+
+    DIR/scenes/<entry>/           the simulated scene and its truth, made once for all methods
+    DIR/<label>/<entry>/run/      the run directory of a method (label: METHOD, or METHOD-PRESET)
+    DIR/<label>/<entry>/report/   its measures as tables; with a page where the entry has one
+
+A run is what `gablework compare` does: points are read, ground is found and candidates are isolated once for all
+methods, then each models the same candidates. Everything happens in one process an entry; entries share the processors.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import os
+import shutil
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.evaluation.evaluate import Evaluation, evaluate
+from pipeline.evaluation.ground import GroundOfRun
+from pipeline.evaluation.reading import read_models
+from pipeline.evaluation.reference import Reference
+from pipeline.evaluation.reference_points import read_points_reference
+from pipeline.evaluation.reference_truth import read_truth_reference
+from pipeline.evaluation.writing import write_tables
+from pipeline.io.source import ReadOptions
+from pipeline.methods import METHODS
+from pipeline.runtime.compare import Variant, settings_of
+from pipeline.runtime.run import RunRequest, RunVariant, run_variants
+from pipeline.settings import RunSettings
+from pipeline.synthetic.dataset import simulate
+from pipeline.synthetic.seeds import seed_of
+from pipeline.synthetic.sweep import CELLS, Cell
+
+GROUND = "ground."
+"""Beginning of the names of the measures that are of the scene, not of a method."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SimulatedScene:
+    """A scene that is made where it is not there yet."""
+
+    suite: str
+    """Name of the suite."""
+    seed: int
+    """Of the scene."""
+    cell: Cell | None = None
+    """Which survey of a suite of several."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A scene or some tiles, with what there is to hold models against."""
+
+    name: str
+    """Also its folder."""
+    scene: SimulatedScene | None = None
+    """What is simulated; None for real tiles."""
+    tiles: tuple[Path, ...] = ()
+    """Real tiles."""
+    crs: str | None = None
+    """Where the files tell none."""
+    footprints: Path | None = None
+    """Given outlines, for the run and the reference."""
+    classes: str = "trust"
+    """What the classes of the files are worth to the run."""
+    points: tuple[Path, ...] = ()
+    """Classified points as reference; none: a real entry is measured by itself."""
+    has_page: bool = True
+    """Whether there is a page to look at beside the tables."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Workplace:
+    """The folder of all that is made."""
+
+    root: Path
+
+    def scene(self, entry: Entry) -> Path:
+        """Folder of an entry's scene: its LAZ files and `truth`."""
+        folder = self.root / "scenes" / entry.name
+        return folder / entry.scene.cell.key if entry.scene is not None and entry.scene.cell is not None else folder
+
+    def run(self, variant: Variant, entry: Entry) -> Path:
+        """The run directory of a method."""
+        return self.root / variant.label / entry.name / "run"
+
+    def report(self, variant: Variant, entry: Entry) -> Path:
+        """The tables of a method."""
+        return self.root / variant.label / entry.name / "report"
+
+    def is_run(self, variant: Variant, entry: Entry) -> bool:
+        """Whether a run is there, whole and by these settings."""
+        if not (self.run(variant, entry) / "run.json").exists():
+            return False
+        manifest, settings = self.manifest(variant, entry), settings_of(run_settings(entry), variant)
+        return (manifest["status"], manifest["settings_hash"]) == ("finished", settings.settings_hash)
+
+    def is_measured(self, variant: Variant, entry: Entry) -> bool:
+        """Whether the measures of such a run are there: of all files of a report `report.md` is written last."""
+        report = self.report(variant, entry) / "report.md"
+        return self.is_run(variant, entry) and report.exists()
+
+    def table(self, variant: Variant, entry: Entry, name: str) -> list[dict[str, Any]]:
+        """The rows of a table of a report, such as `measures`; none where the entry has no such table."""
+        path = self.report(variant, entry) / f"{name}.parquet"
+        rows: list[dict[str, Any]] = pq.read_table(path).to_pylist() if path.exists() else []
+        return rows
+
+    def manifest(self, variant: Variant, entry: Entry) -> dict[str, Any]:
+        """The run's own record."""
+        path = self.run(variant, entry) / "run.json"
+        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return document
+
+
+def hofmann_entries(split: str, draws: int) -> Iterator[Entry]:
+    """Draws of `hofmann310`; the first is the one that the ruler measures too."""
+    for draw in range(draws):
+        yield Entry(
+            name="hofmann310" if draw == 0 else f"hofmann310-{draw}",
+            scene=SimulatedScene(suite="hofmann310", seed=seed_of(split, draw)),
+            has_page=draw == 0,
+        )
+
+
+def sweep_entries(split: str, cells: Sequence[Cell] = CELLS) -> Iterator[Entry]:
+    """Cells of `sweep`, the dense ones first: they take longest."""
+    for cell in sorted(cells, key=lambda one: -one.density_per_m2):
+        scene = SimulatedScene(suite="sweep", seed=seed_of(split, 0), cell=cell)
+        yield Entry(name=f"sweep-{cell.key}", scene=scene, has_page=False)
+
+
+def all_variants(*, with_faithful: bool) -> list[Variant]:
+    """Every method with its default settings, and on demand each as its paper has it."""
+    presets = ("robust", "faithful") if with_faithful else ("robust",)
+    return [Variant(method=method, preset=preset) for method in METHODS for preset in presets]
+
+
+def tiles_of(entry: Entry, place: Workplace) -> tuple[str, ...]:
+    """The point files of an entry; its scene is simulated where it is not there yet."""
+    if entry.scene is None:
+        return tuple(str(tile) for tile in entry.tiles)
+    folder, scene = place.scene(entry), entry.scene
+    if not (folder / "truth" / "scene.json").exists():
+        target = folder if scene.cell is None else folder.parent
+        density = None if scene.cell is None else scene.cell.density_per_m2
+        noise = None if scene.cell is None else scene.cell.noise_m
+        simulate(scene.suite, target, scene.seed, density_per_m2=density, noise_m=noise)
+    return tuple(sorted(str(path) for path in [*folder.glob("*.laz"), *folder.glob("tiles/*.laz")]))
+
+
+def run_settings(entry: Entry) -> RunSettings:
+    """The settings that find the candidates of an entry; those of the methods are their defaults."""
+    return RunSettings.from_mapping({"classes": entry.classes})
+
+
+def run_request(entry: Entry, place: Workplace, out: Path) -> RunRequest:
+    """What is asked of a run on an entry, serially and in this process, so that seconds are of the method alone."""
+    return RunRequest(
+        inputs=tiles_of(entry, place),
+        out=str(out),
+        settings=run_settings(entry),
+        footprints=None if entry.footprints is None else str(entry.footprints),
+        crs=entry.crs,
+        workers=0,
+        meshes="none",
+        overwrite=True,
+    )
+
+
+def measure_entry(entry: Entry, variants: Sequence[Variant], place: Workplace) -> list[tuple[str, float]]:
+    """Simulate, run and evaluate what is not there yet.
+
+    Returns
+    -------
+    list of (str, float)
+        What was done, with its wall-clock seconds; empty where all was there.
+    """
+    unmeasured = [variant for variant in variants if not place.is_measured(variant, entry)]
+    if not unmeasured:
+        return []
+    laps: list[tuple[str, float]] = []
+    began = time.perf_counter()
+
+    def lap(name: str) -> None:
+        nonlocal began
+        now = time.perf_counter()
+        laps.append((name, now - began))
+        began = now
+
+    tiles_of(entry, place)
+    lap("scene")
+    to_run = [variant for variant in unmeasured if not place.is_run(variant, entry)]
+    if to_run:
+        folder = place.root / "scratch" / entry.name
+        folder.mkdir(parents=True, exist_ok=True)
+        request = run_request(entry, place, folder)
+        ways = [
+            RunVariant(
+                settings=settings_of(request.settings, variant),
+                out=str(place.run(variant, entry)),
+                label=variant.label,
+            )
+            for variant in to_run
+        ]
+        for variant in to_run:  # of the measures nothing may be left that is of an earlier run
+            shutil.rmtree(place.report(variant, entry), ignore_errors=True)
+        run_variants(request, ways, str(folder))
+        shutil.rmtree(folder)
+        lap("runs")
+    _evaluate(entry, unmeasured, place)
+    lap("measures")
+    return laps
+
+
+def _evaluate(entry: Entry, variants: Sequence[Variant], place: Workplace) -> None:
+    """Hold the runs of an entry against one reference, read once; the ground is that of the scene, measured once."""
+    reference = _reference(entry, place)
+    found: Evaluation | None = None
+    for variant in variants:
+        models = read_models(place.run(variant, entry))
+        if found is None and reference is not None and reference.has_ground:
+            found = evaluate(models, reference, ground=GroundOfRun(reference, run_settings(entry).scene))
+            evaluation = found
+        else:
+            evaluation = _with_ground(evaluate(models, reference), found)
+        folder = place.report(variant, entry)
+        if entry.has_page:
+            from pipeline.report.evaluation_page import write_page
+
+            write_page(evaluation, folder)
+        write_tables(evaluation, folder)
+
+
+def _reference(entry: Entry, place: Workplace) -> Reference | None:
+    """What the models of an entry are held against."""
+    if entry.scene is not None:
+        return read_truth_reference(place.scene(entry) / "truth", as_surveyed=True)
+    if not entry.points:
+        return None
+    return read_points_reference(
+        [str(path) for path in entry.points],
+        footprints=None if entry.footprints is None else str(entry.footprints),
+        read_options=ReadOptions(crs=entry.crs),
+    )
+
+
+def _with_ground(evaluation: Evaluation, other: Evaluation | None) -> Evaluation:
+    """An evaluation with the ground measures of another one of the same scene."""
+    if other is None:
+        return evaluation
+    ground = tuple(measure for measure in other.measures if measure.name.startswith(GROUND))
+    tables: dict[str, pa.Table] = dict(evaluation.tables)
+    if "ground" in other.tables:
+        tables["ground"] = other.tables["ground"]
+    return dataclasses.replace(evaluation, measures=(*evaluation.measures, *ground), tables=tables)
+
+
+def measure_all(wanted: Iterable[tuple[Entry, Sequence[Variant]]], place: Workplace, jobs: int) -> list[str]:
+    """Measure many entries, some at a time; tell each on the terminal as it is done.
+
+    Parameters
+    ----------
+    wanted : iterable of (Entry, sequence of Variant)
+        Entries with the methods to be measured on each; the largest first, so that no long one is left for the end.
+    place : Workplace
+        Where everything goes.
+    jobs : int
+        Processes; 0 measures in this one.
+
+    Returns
+    -------
+    list of str
+        What went wrong, an entry each: the others are measured all the same.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    todo = [(entry, ways) for entry, ways in wanted if any(not place.is_measured(variant, entry) for variant in ways)]
+    faults: list[str] = []
+    if jobs == 0:
+        for entry, ways in todo:
+            _tell(entry, measure_entry(entry, ways, place))
+        return faults
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        running = {pool.submit(measure_entry, entry, ways, place): entry for entry, ways in todo}
+        for done in as_completed(running):
+            error = done.exception()
+            if error is None:
+                _tell(running[done], done.result())
+            else:
+                faults.append(f"{running[done].name}: {type(error).__name__}: {error}")
+                print(faults[-1], flush=True)
+    return faults
+
+
+def _tell(entry: Entry, laps: Sequence[tuple[str, float]]) -> None:
+    print(f"{entry.name}: " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in laps), flush=True)
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"

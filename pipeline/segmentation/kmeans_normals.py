@@ -1,0 +1,409 @@
+"""K-means of facet normals with the cosine as similarity (Zeng, Lai, Li, Mao and Liu 2008, section 2.1).
+
+The facets of a TIN over one roof plane have alike normals, those over another plane different ones: k-means with "the
+cosine of [the] angle between normal vectors" groups them. The centre of a cluster is the direction of the sum of its
+normals, which is what maximises the sum of cosines, so every round lowers the inertia, the sum of 1 - cosine.
+
+The paper tells neither the start nor how many clusters there are. Here the start is deterministic, and the silhouette
+judges the number: with the cosine distance the mean distance of a facet to a whole cluster is one minus its product
+with the mean normal, so the silhouette is exact at the cost of one product a facet and cluster.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit
+
+from pipeline.errors import BuildingError
+from pipeline.model import FloatArray, LabelArray, Reason
+from pipeline.parameters import Parameters, parameter
+
+_EQUAL_INERTIA = 1e-9
+"""Starts whose inertia differs by less than this share of it ended in the same clusters."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NormalClusteringSettings(Parameters):
+    """Settings of the clustering of facets; the paper has k = 2 and publishes no others."""
+
+    clusters: int = parameter(
+        0,
+        "The k of k-means: how many directions of roof planes there are (the paper: 2); 0 chooses it (k: auto).",
+        minimum=0,
+        maximum=32,
+    )
+    most_clusters: int = parameter(6, "Largest k that is tried where k is chosen.", minimum=1, maximum=32)
+    residual_weight: float = parameter(
+        2.0,
+        "The k is chosen by the silhouette plus this many times the share of points that lie on their planes.",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    one_cluster_silhouette: float = parameter(
+        0.6, "What counts as the silhouette of a single cluster, which has none.", minimum=-1.0, maximum=1.0
+    )
+    facet_weights: str = parameter(
+        "area", "Whether large facets count more in the centres of clusters.", choices=("area", "equal")
+    )
+    starts: int = parameter(
+        8,
+        "Starts of k-means, of which the one with the least inertia counts: each leaves out one more of the farthest "
+        "normals, which may be alone.",
+        minimum=1,
+        maximum=1000,
+    )
+    kmeans_rounds: int = parameter(
+        100, "Most rounds of k-means; it ends when no facet changes.", unit="rounds", minimum=1, maximum=10_000
+    )
+    kmeans_work_limit: int = parameter(
+        2_000_000_000,
+        "Products of facets with centres after which a building is too complex.",
+        minimum=1,
+        maximum=10**15,
+    )
+
+    def weights(self, areas_m2: FloatArray) -> FloatArray:
+        """Weight of every facet, (m,) float64."""
+        return areas_m2 if self.facet_weights == "area" else np.ones(len(areas_m2))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FacetClusters:
+    """Facets by direction."""
+
+    labels: LabelArray
+    """(m,) int32, cluster of every facet."""
+    centres: FloatArray
+    """(k, 3) float64, unit vectors, one a cluster; a cluster may have no facets."""
+    inertia: float
+    """Weighted sum of 1 - cosine between facets and their centres."""
+    silhouette: float
+    """Weighted mean silhouette with the cosine distance, -1 to 1; nan for one cluster."""
+    rounds: int
+    """Rounds until nothing changed."""
+
+
+def cluster_normals(
+    normals: FloatArray, weights: FloatArray, k: int, settings: NormalClusteringSettings
+) -> FacetClusters:
+    """K-means of unit normals from farthest-point starts.
+
+    Parameters
+    ----------
+    normals : (m, 3) float64
+        Unit vectors, at least one.
+    weights : (m,) float64
+        Above 0.
+    k : int
+        Number of clusters, at least 1; fewer are found where there are fewer different normals.
+    settings : NormalClusteringSettings
+        `starts`, and limits of work.
+
+    Returns
+    -------
+    FacetClusters
+        Of the start with the least inertia, of equal ones the first. The numbers of the clusters follow the start.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_complex`` where the products of facets with centres pass the limit.
+    """
+    normals, weights = np.ascontiguousarray(normals), np.ascontiguousarray(weights)
+    farthest = farthest_point_start(normals, weights, k + settings.starts - 1)
+    k = min(k, len(farthest))
+    starts = max(1, len(farthest) - k + 1)
+    most_rounds = min(settings.kmeans_rounds, settings.kmeans_work_limit // (len(normals) * k * starts))
+    if most_rounds == 0:
+        raise BuildingError(
+            Reason.TOO_COMPLEX,
+            f"{len(normals)} facets with {k} centres of {starts} starts, "
+            f"kmeans_work_limit is {settings.kmeans_work_limit}",
+        )
+    labels, centres, inertia, rounds = kmeans(normals, weights, farthest[:k], most_rounds)
+    for first in range(1, starts):
+        another = kmeans(normals, weights, farthest[first : first + k], most_rounds)
+        if another[2] < inertia * (1.0 - _EQUAL_INERTIA):
+            labels, centres, inertia, rounds = another
+    return FacetClusters(
+        labels=labels,
+        centres=centres,
+        inertia=inertia,
+        silhouette=silhouette(normals, weights, labels, len(centres)),
+        rounds=rounds,
+    )
+
+
+def choose_clusters(
+    normals: FloatArray,
+    weights: FloatArray,
+    explained: Callable[[LabelArray], float],
+    settings: NormalClusteringSettings,
+) -> FacetClusters:
+    """K-means with the k of the settings, or with the k that the facets speak for.
+
+    Parameters
+    ----------
+    normals : (m, 3) float64
+        Unit vectors, at least one.
+    weights : (m,) float64
+        Above 0.
+    explained : callable
+        From the labels of the facets to the share of points, 0 to 1, that lie on the planes of these clusters.
+    settings : NormalClusteringSettings
+        `clusters`, or 0 for the choice: the silhouette plus `residual_weight` times the share explained is largest;
+        of equal ones the smaller k.
+
+    Returns
+    -------
+    FacetClusters
+        With at least one cluster.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_complex`` as in `cluster_normals`.
+    """
+    if settings.clusters > 0:
+        return cluster_normals(normals, weights, settings.clusters, settings)
+    best, highest = cluster_normals(normals, weights, 1, settings), -math.inf
+    for k in range(1, min(settings.most_clusters, len(normals)) + 1):
+        clusters = cluster_normals(normals, weights, k, settings)
+        if len(clusters.centres) < k:
+            break
+        apart = settings.one_cluster_silhouette if k == 1 else clusters.silhouette
+        score = apart + settings.residual_weight * explained(clusters.labels)
+        if score > highest:
+            best, highest = clusters, score
+    return best
+
+
+@njit(cache=True, nogil=True)
+def farthest_point_start(normals: FloatArray, weights: FloatArray, k: int) -> FloatArray:
+    """The first centres: the normal farthest from the mean direction, then always the one farthest from all chosen.
+
+    Parameters
+    ----------
+    normals : (m, 3) float64
+        Unit vectors.
+    weights : (m,) float64
+        For the mean direction.
+    k : int
+        Centres wanted.
+
+    Returns
+    -------
+    (j, 3) float64
+        j <= k: as many as there are different normals. Equal distances: the lower index.
+    """
+    mean = np.zeros(3)
+    for i in range(normals.shape[0]):
+        for c in range(3):
+            mean[c] += weights[i] * normals[i, c]
+    nearest = np.full(normals.shape[0], -np.inf)
+    chosen = np.empty((k, 3))
+    centre = mean
+    for j in range(k):
+        lowest = np.inf
+        farthest = -1
+        for i in range(normals.shape[0]):
+            cosine = normals[i, 0] * centre[0] + normals[i, 1] * centre[1] + normals[i, 2] * centre[2]
+            if j == 0:
+                similarity = cosine
+            else:
+                nearest[i] = max(nearest[i], cosine)
+                similarity = nearest[i]
+            if similarity < lowest:
+                lowest = similarity
+                farthest = i
+        if j > 0 and lowest >= 1.0 - 1e-12:
+            return chosen[:j].copy()
+        chosen[j] = normals[farthest]
+        centre = chosen[j]
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def kmeans(
+    normals: FloatArray, weights: FloatArray, start: FloatArray, most_rounds: int
+) -> tuple[LabelArray, FloatArray, float, int]:
+    """Rounds of assignment to the most similar centre and of new centres, until no facet changes.
+
+    Parameters
+    ----------
+    normals : (m, 3) float64
+        Unit vectors.
+    weights : (m,) float64
+        Above 0.
+    start : (k, 3) float64
+        Unit vectors.
+    most_rounds : int
+        At least 1.
+
+    Returns
+    -------
+    labels : (m,) int32
+        Cluster with the largest cosine, of equal ones the lowest.
+    centres : (k, 3) float64
+        Unit vectors; a cluster that lost all its facets keeps its centre.
+    inertia : float
+        Weighted sum of 1 - cosine.
+    rounds : int
+        Rounds done.
+    """
+    m, k = normals.shape[0], start.shape[0]
+    centres = start.copy()
+    labels = np.full(m, -1, np.int32)
+    sums = np.empty((k, 3))
+    inertia = 0.0
+    rounds = 0
+    for _ in range(most_rounds):
+        rounds += 1
+        changed = False
+        inertia = 0.0
+        sums[:] = 0.0
+        for i in range(m):
+            best = -2.0
+            label = 0
+            for j in range(k):
+                cosine = normals[i, 0] * centres[j, 0] + normals[i, 1] * centres[j, 1] + normals[i, 2] * centres[j, 2]
+                if cosine > best:
+                    best = cosine
+                    label = j
+            if labels[i] != label:
+                labels[i] = label
+                changed = True
+            inertia += weights[i] * (1.0 - best)
+            for c in range(3):
+                sums[label, c] += weights[i] * normals[i, c]
+        if not changed:
+            break
+        for j in range(k):
+            length = math.sqrt(sums[j, 0] ** 2 + sums[j, 1] ** 2 + sums[j, 2] ** 2)
+            if length > 0.0:
+                for c in range(3):
+                    centres[j, c] = sums[j, c] / length
+    return labels, centres, inertia, rounds
+
+
+@njit(cache=True, nogil=True)
+def silhouette(normals: FloatArray, weights: FloatArray, labels: LabelArray, k: int) -> float:
+    """Weighted mean silhouette (Rousseeuw 1987) with the distance 1 - cosine.
+
+    Parameters
+    ----------
+    normals : (m, 3) float64
+        Unit vectors.
+    weights : (m,) float64
+        A facet of weight 2 counts as two facets in one place, but one of them.
+    labels : (m,) int32
+        From 0 to k - 1.
+    k : int
+        Number of clusters.
+
+    Returns
+    -------
+    float
+        -1 to 1; a cluster of one facet counts 0; nan where fewer than two clusters have facets.
+    """
+    sums = np.zeros((k, 3))
+    totals = np.zeros(k)
+    counts = np.zeros(k, np.int64)
+    for i in range(labels.size):
+        totals[labels[i]] += weights[i]
+        counts[labels[i]] += 1
+        for c in range(3):
+            sums[labels[i], c] += weights[i] * normals[i, c]
+    if (counts > 0).sum() < 2:
+        return math.nan
+    total = 0.0
+    weight = 0.0
+    for i in range(labels.size):
+        own = labels[i]
+        weight += weights[i]
+        if counts[own] < 2:
+            continue
+        within = 0.0
+        beside = np.inf
+        for j in range(k):
+            if counts[j] == 0:
+                continue
+            cosines = normals[i, 0] * sums[j, 0] + normals[i, 1] * sums[j, 1] + normals[i, 2] * sums[j, 2]
+            # distances to all facets of the cluster together; that to itself is 0
+            together = max(0.0, totals[j] - cosines)
+            if j == own:
+                within = together / (totals[j] - weights[i])
+            else:
+                beside = min(beside, together / totals[j])
+        larger = max(within, beside)
+        if larger > 0.0:
+            total += weights[i] * (beside - within) / larger
+    return total / weight
+
+
+@njit(cache=True, nogil=True)
+def labels_around(xyz: FloatArray, facets: LabelArray, facet_labels: LabelArray) -> LabelArray:
+    """Cluster of every point: the one that most facets around the point belong to, by the sines of their angles there.
+
+    The sine of the angle in plan is near 0 for slivers, such as a TIN has along its hull: their normals point anywhere.
+
+    Parameters
+    ----------
+    xyz : (n, 3) float64
+        Points, the vertices of the facets.
+    facets : (m, 3) int32
+        Vertex indices.
+    facet_labels : (m,) int32
+        Cluster of every facet, -1 for none.
+
+    Returns
+    -------
+    (n,) int32
+        Equal sums: the cluster of the facet that comes first; -1 where no labelled facet touches the point.
+    """
+    n = xyz.shape[0]
+    start = np.zeros(n + 1, np.int64)
+    for t in range(facets.shape[0]):
+        for k in range(3):
+            start[facets[t, k] + 1] += 1
+    for i in range(n):
+        start[i + 1] += start[i]
+    corner = np.empty(start[n], np.int64)
+    end = start[:-1].copy()
+    for t in range(facets.shape[0]):
+        for k in range(3):
+            i = facets[t, k]
+            corner[end[i]] = 3 * t + k
+            end[i] += 1
+    labels = np.full(n, -1, np.int32)
+    for i in range(n):
+        largest = -1.0
+        for first in range(start[i], start[i + 1]):
+            label = facet_labels[corner[first] // 3]
+            if label < 0:
+                continue
+            together = 0.0
+            for q in range(start[i], start[i + 1]):
+                if facet_labels[corner[q] // 3] == label:
+                    together += _sine_in_plan(xyz, facets, corner[q] // 3, corner[q] % 3)
+            if together > largest:
+                largest = together
+                labels[i] = label
+    return labels
+
+
+@njit(cache=True, nogil=True)
+def _sine_in_plan(xyz: FloatArray, facets: LabelArray, t: int, k: int) -> float:
+    """Sine of the angle of a facet at one of its corners, in plan."""
+    p = facets[t, k]
+    q = facets[t, (k + 1) % 3]
+    r = facets[t, (k + 2) % 3]
+    ux = xyz[q, 0] - xyz[p, 0]
+    uy = xyz[q, 1] - xyz[p, 1]
+    vx = xyz[r, 0] - xyz[p, 0]
+    vy = xyz[r, 1] - xyz[p, 1]
+    return abs(ux * vy - uy * vx) / math.sqrt((ux * ux + uy * uy) * (vx * vx + vy * vy))

@@ -1,0 +1,205 @@
+"""Points of roof faces by region growing from the mean of clusters (the outlook of Hofmann et al. 2003, section 5).
+
+A region starts where the neighbourhood of a point fits the mean direction of its cluster best, and grows over nearest
+neighbours that lie near the running plane and do not stand alone there. What a cluster holds in several places, as the
+parallel faces of two roofs, becomes several regions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import FloatArray, LabelArray
+from pipeline.parameters import Parameters, parameter
+from pipeline.segmentation.plane_regression import N_SUMS, add_point, best_fit_plane, cosine_of_slope
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RegionGrowingSettings(Parameters):
+    """Settings of region growing."""
+
+    growing_neighbours: int = parameter(
+        9, "Nearest points over which a region grows.", unit="points", minimum=3, maximum=64
+    )
+    growing_noises: float = parameter(
+        3.0,
+        "Distance up to which a region takes points, in standard deviations of the noise.",
+        minimum=0.1,
+        maximum=100.0,
+    )
+    growing_min_m: float = parameter(0.15, "Least such distance.", unit="m", minimum=0.001, maximum=10.0)
+    growing_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.001, maximum=10.0)
+    agreeing_share: float = parameter(
+        0.4,
+        "A point joins where at least this share of its neighbours lies as near to the plane.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    free_plane_points: int = parameter(
+        8, "Points from which on a region has a plane of its own, and no more its cluster's direction.", unit="points",
+        minimum=4, maximum=10_000,
+    )  # fmt: skip
+
+    def cross_faults(self) -> list[str]:
+        """The distances must be a range."""
+        faults = super().cross_faults()
+        if self.growing_min_m > self.growing_max_m:
+            faults.append(f"growing_min_m is {self.growing_min_m:g}: use at most growing_max_m, {self.growing_max_m:g}")
+        return faults
+
+    def growing_distance_m(self, sigma_m: float) -> float:
+        """Distance of a point from its plane for a noise."""
+        return min(max(self.growing_noises * sigma_m, self.growing_min_m), self.growing_max_m)
+
+
+def grow_regions(
+    points: FloatArray,
+    neighbours: LabelArray,
+    clusters: LabelArray,
+    gradients: FloatArray,
+    *,
+    distance_m: float,
+    fewest_points: int,
+    settings: RegionGrowingSettings,
+) -> tuple[FloatArray, LabelArray]:
+    """Regions that start at points of clusters.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Roof points, metres.
+    neighbours : (n, k) int32
+        Nearest neighbours of every point, -1 where there are fewer.
+    clusters : (n,) int32
+        Cluster of every point, -1 for none.
+    gradients : (c, 2) float64
+        (a, b) of the mean plane of each cluster.
+    distance_m : float
+        Largest perpendicular distance of a point to the plane of the region that it joins.
+    fewest_points : int
+        Smaller regions are not kept.
+    settings : RegionGrowingSettings
+        All else.
+
+    Returns
+    -------
+    planes : (r, 3) float64
+        (a, b, c) of the least-squares plane of each region.
+    labels : (n,) int32
+        Region of every point, -1 for none; numbered in the order in which they grew, from the best fitting seed on.
+    """
+    planes, labels = _grow_regions(
+        np.ascontiguousarray(points),
+        np.ascontiguousarray(neighbours, dtype=np.int32),
+        clusters.astype(np.int32),
+        np.ascontiguousarray(gradients, dtype=np.float64),
+        distance_m,
+        max(fewest_points, 3),
+        settings.agreeing_share,
+        settings.free_plane_points,
+    )
+    return planes, labels
+
+
+@njit(cache=True, nogil=True)
+def _misfits(points: FloatArray, neighbours: LabelArray, clusters: LabelArray, gradients: FloatArray) -> FloatArray:
+    """Mean square perpendicular distance of a point's neighbourhood to the best plane of its cluster's direction."""
+    misfits = np.full(len(points), np.inf)
+    for i in range(len(points)):
+        k = clusters[i]
+        if k < 0:
+            continue
+        a, b = gradients[k]
+        count = 1
+        total = 0.0
+        squares = 0.0
+        for j in neighbours[i]:
+            if j >= 0:
+                rise = (
+                    points[j, 2] - points[i, 2] - a * (points[j, 0] - points[i, 0]) - b * (points[j, 1] - points[i, 1])
+                )
+                total += rise
+                squares += rise * rise
+                count += 1
+        misfits[i] = max(0.0, squares / count - (total / count) ** 2) * cosine_of_slope(a, b) ** 2
+    return misfits
+
+
+@njit(cache=True, nogil=True)
+def _near(points: FloatArray, i: int, a: float, b: float, c: float, reach: float) -> bool:
+    """Whether a point lies within a vertical reach of a plane."""
+    return bool(abs(points[i, 2] - a * points[i, 0] - b * points[i, 1] - c) <= reach)
+
+
+@njit(cache=True, nogil=True)
+def _grow_regions(
+    points: FloatArray,
+    neighbours: LabelArray,
+    clusters: LabelArray,
+    gradients: FloatArray,
+    distance_m: float,
+    fewest_points: int,
+    agreeing_share: float,
+    free_plane_points: int,
+) -> tuple[FloatArray, LabelArray]:
+    """Kernel of `grow_regions`."""
+    n = len(points)
+    labels = np.full(n, -1, np.int32)
+    asked = np.full(n, -1, np.int64)
+    queue = np.empty(n, np.int32)
+    planes = np.empty((n // fewest_points + 1, 3))
+    count = 0
+    misfits = _misfits(points, neighbours, clusters, gradients)
+    for seed in np.argsort(misfits, kind="mergesort"):
+        if misfits[seed] > distance_m * distance_m:
+            break
+        if labels[seed] >= 0:
+            continue
+        a, b = gradients[clusters[seed]]
+        c = points[seed, 2] - a * points[seed, 0] - b * points[seed, 1]
+        reach = distance_m / cosine_of_slope(a, b)
+        sums = np.zeros(N_SUMS)
+        queue[0] = seed
+        asked[seed] = seed
+        held = 1
+        at = 0
+        refit = free_plane_points
+        while at < held:
+            i = queue[at]
+            at += 1
+            add_point(sums, points, i)
+            if sums[0] >= refit:
+                own_a, own_b, own_c, fitted = best_fit_plane(sums)
+                if fitted:
+                    a, b, c = own_a, own_b, own_c
+                    reach = distance_m / cosine_of_slope(a, b)
+                refit = int(1.3 * sums[0]) + 1
+            elif sums[0] < free_plane_points:
+                c = (sums[3] - a * sums[1] - b * sums[2]) / sums[0]
+            for j in neighbours[i]:
+                if j < 0 or labels[j] >= 0 or asked[j] == seed:
+                    continue
+                if not _near(points, j, a, b, c, reach):
+                    continue
+                known = 0
+                agreeing = 0
+                for other in neighbours[j]:
+                    if other >= 0:
+                        known += 1
+                        agreeing += _near(points, other, a, b, c, reach)
+                if agreeing >= agreeing_share * known:
+                    asked[j] = seed
+                    queue[held] = j
+                    held += 1
+        a, b, c, fitted = best_fit_plane(sums)
+        if held >= fewest_points and fitted:
+            for q in range(held):
+                labels[queue[q]] = count
+            planes[count, 0] = a
+            planes[count, 1] = b
+            planes[count, 2] = c
+            count += 1
+    return planes[:count].copy(), labels

@@ -1,0 +1,219 @@
+"""Clusters of facets in slope and orientation by single linkage (Hofmann et al. 2003, sections 3.1 and 3.2).
+
+A cluster grows from a point to all neighbours nearer than a distance, and on from those: the connected components of
+the graph of near pairs, so the seeds do not matter. While one cluster holds most of all points the distance shrinks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.errors import BuildingError
+from pipeline.model import FloatArray, IntArray, LabelArray, Reason
+from pipeline.parameters import Parameters, parameter
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleLinkageSettings(Parameters):
+    """Settings of the clustering in two dimensions."""
+
+    linkage_start_deg: float = parameter(
+        10.0, "Distance up to which two facets are linked, at first.", unit="deg", minimum=0.1, maximum=90.0
+    )
+    linkage_least_deg: float = parameter(4.0, "Least reasonable such distance.", unit="deg", minimum=0.1, maximum=90.0)
+    linkage_factor: float = parameter(
+        0.9, "The distance is multiplied by this while a cluster is too large.", minimum=0.1, maximum=0.99
+    )
+    largest_cluster_share: float = parameter(
+        0.8, "A cluster that holds more of all facets than this is too large.", minimum=0.1, maximum=1.0
+    )
+    least_members: int = parameter(6, "Fewest facets of a cluster.", unit="facets", minimum=1, maximum=100_000)
+    linkage_work_limit: int = parameter(
+        200_000_000, "Comparisons of facets after which a building is too complex.", minimum=1, maximum=10**15
+    )
+
+    def cross_faults(self) -> list[str]:
+        """The distances must be a range."""
+        faults = super().cross_faults()
+        if self.linkage_least_deg > self.linkage_start_deg:
+            faults.append(
+                f"linkage_least_deg is {self.linkage_least_deg:g}: use at most linkage_start_deg, "
+                f"{self.linkage_start_deg:g}"
+            )
+        return faults
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LinkedClusters:
+    """Clusters found by single linkage."""
+
+    labels: LabelArray
+    """(m,) int32, cluster of every facet, numbered by their first facet; -1 in clusters that are too small."""
+    distance_deg: float
+    """The distance that was used in the end."""
+
+
+def cluster_by_linkage(
+    slope_deg: FloatArray, orientation_deg: FloatArray, settings: SingleLinkageSettings
+) -> LinkedClusters:
+    """Clusters of facets in slope and orientation, by the paper's rules.
+
+    Parameters
+    ----------
+    slope_deg, orientation_deg : (m,) float64
+        Slope 0 to 90, orientation 0 to 360, degrees.
+    settings : SingleLinkageSettings
+        The rules.
+
+    Returns
+    -------
+    LinkedClusters
+        Without clusters where none has members enough.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_complex`` beyond ``linkage_work_limit``.
+    """
+    distance = settings.linkage_start_deg
+    work = 0
+    while True:
+        labels, comparisons = link(slope_deg, orientation_deg, distance, settings.linkage_work_limit - work)
+        work += comparisons
+        if work > settings.linkage_work_limit:
+            raise BuildingError(
+                Reason.TOO_COMPLEX,
+                f"single linkage stood at {work} comparisons for {len(labels)} facets, "
+                f"linkage_work_limit is {settings.linkage_work_limit}",
+            )
+        counts = np.bincount(labels, minlength=1)
+        smaller = distance * settings.linkage_factor
+        if counts.max() <= settings.largest_cluster_share * len(labels) or distance <= settings.linkage_least_deg:
+            break
+        distance = max(smaller, settings.linkage_least_deg)
+    number = np.full(len(counts), -1, np.int32)
+    large = counts >= settings.least_members
+    number[large] = np.arange(int(large.sum()), dtype=np.int32)
+    return LinkedClusters(labels=number[labels], distance_deg=distance)
+
+
+def link(
+    slope_deg: FloatArray, orientation_deg: FloatArray, distance_deg: float, work_limit: int = 10**15
+) -> tuple[LabelArray, int]:
+    """Connected components of the facets nearer to one another than a distance; orientation wraps at 360.
+
+    Parameters
+    ----------
+    slope_deg, orientation_deg : (m,) float64
+        Degrees.
+    distance_deg : float
+        Facets at most this far apart are linked; at most 90.
+    work_limit : int
+        The labels are incomplete where the comparisons pass it.
+
+    Returns
+    -------
+    labels : (m,) int32
+        Component of every facet, numbered by its first facet.
+    work : int
+        Comparisons of facets.
+    """
+    return _link(
+        np.ascontiguousarray(slope_deg, dtype=np.float64),
+        np.ascontiguousarray(orientation_deg, dtype=np.float64),
+        float(distance_deg),
+        work_limit,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _root(parent: LabelArray, i: int) -> int:
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@njit(cache=True, nogil=True)
+def _join(parent: LabelArray, i: int, j: int) -> None:
+    a, b = _root(parent, i), _root(parent, j)
+    parent[max(a, b)] = min(a, b)
+
+
+@njit(cache=True, nogil=True)
+def _link(slope: FloatArray, orientation: FloatArray, distance: float, work_limit: int) -> tuple[LabelArray, int]:
+    """Kernel: union-find over a grid whose cells are so small that all points of one are linked."""
+    n = slope.size
+    parent = np.arange(n).astype(np.int32)
+    # the orientation's cells divide the circle; a hair smaller than the diagonal allows
+    columns = math.ceil(360.0 / (distance / math.sqrt(2.0) * (1.0 - 1e-9)))
+    width = 360.0 / columns
+    rows = int(90.0 / width) + 1
+    cell = np.empty(n, np.int64)
+    for i in range(n):
+        column = min(int(orientation[i] / width), columns - 1)
+        cell[i] = min(int(slope[i] / width), rows - 1) * columns + column
+    order = np.argsort(cell, kind="mergesort")
+    start = np.zeros(rows * columns + 1, np.int64)
+    for i in range(n):
+        start[cell[i] + 1] += 1
+    for c in range(rows * columns):
+        start[c + 1] += start[c]
+    for c in range(rows * columns):
+        for q in range(start[c] + 1, start[c + 1]):
+            _join(parent, order[start[c]], order[q])
+    reach = math.ceil(distance / width)
+    work = 0
+    for c in range(rows * columns):
+        if start[c] == start[c + 1]:
+            continue
+        row = c // columns
+        column = c % columns
+        for dr in range(reach + 1):
+            if row + dr >= rows:
+                break
+            for dc in range(-reach if dr > 0 else 1, reach + 1):
+                other = (row + dr) * columns + (column + dc) % columns
+                if start[other] == start[other + 1] or other == c:
+                    continue
+                if _root(parent, order[start[c]]) == _root(parent, order[start[other]]):
+                    continue
+                joined, comparisons = _near(slope, orientation, order, start, c, other, distance)
+                work += comparisons
+                if joined:
+                    _join(parent, order[start[c]], order[start[other]])
+                if work > work_limit:
+                    return parent, work
+    labels = np.empty(n, np.int32)
+    count = 0
+    for i in range(n):
+        root = _root(parent, i)
+        if root == i:
+            labels[i] = count
+            count += 1
+        else:
+            labels[i] = labels[root]
+    return labels, work
+
+
+@njit(cache=True, nogil=True)
+def _near(
+    slope: FloatArray, orientation: FloatArray, order: IntArray, start: IntArray, a: int, b: int, distance: float
+) -> tuple[bool, int]:
+    """Whether two cells hold points that are linked, and the comparisons that took."""
+    work = 0
+    for p in range(start[a], start[a + 1]):
+        i = order[p]
+        for q in range(start[b], start[b + 1]):
+            j = order[q]
+            work += 1
+            turn = abs(orientation[i] - orientation[j])
+            turn = min(turn, 360.0 - turn)
+            steeper = slope[i] - slope[j]
+            if turn * turn + steeper * steeper <= distance * distance:
+                return True, work
+    return False, work

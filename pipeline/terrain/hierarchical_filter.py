@@ -1,0 +1,236 @@
+"""The hierarchical ground filter: TIN densification and planar fitting, from coarse cells to fine ones.
+
+It stands for the "TIN filtering and planar-fitting filtering with the hierarchical filtering strategy" by which Zeng et
+al. (2008) prepare their scenes, whose own description is not public. The lowest point of every coarse cell is ground.
+Level by level the lowest points of finer cells join it, judged by the TIN of the ground found so far, or by a plane
+through it where no facet decides. Every pass looks one reach far, so the whole filter looks as far as their sum.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray
+from pipeline.parameters import Parameters, parameter
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, PIT_CELLS, Elevations, without_pits
+from pipeline.terrain.planar_fitting import join_planes
+from pipeline.terrain.tin_densification import join_facets
+
+_CLUMP_MATES = 3
+"""A clump no wider than a cell may lie in four of them."""
+
+_WHOLE_SHARE = 2 / 3
+"""A cell of seeds whose points extend over less of its side than this is cut by the data's edge."""
+
+_CUT_SLOPE = 0.1
+"""Rise over run that a seed in a cut cell may have to any point around."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Level:
+    """One pass of the densification; lengths in cells of the terrain lattice, which are metres."""
+
+    cell: int
+    """Side of the cells whose lowest points may join."""
+    reach: int
+    """How far the decision on a point looks."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HierarchicalFilterSettings(Parameters):
+    """The hierarchy of cells and the tests of a joining point; read only where the filter is hierarchical."""
+
+    seed_cell_m: int = parameter(
+        48,
+        "Side of the coarsest cells, whose lowest points are ground: wider than most buildings.",
+        unit="m",
+        minimum=8,
+        maximum=120,
+    )
+    level_ratio: int = parameter(
+        4, "Each level's cells are as many times smaller than those before; the last are of 1 m.", minimum=2, maximum=8
+    )
+    passes: int = parameter(
+        4,
+        "How often each level after the first is gone through, each time on the TIN of the last.",
+        minimum=1,
+        maximum=8,
+    )
+    min_reach_m: int = parameter(
+        8,
+        "Least distance that a decision looks; coarse levels look one cell of their TIN far.",
+        unit="m",
+        minimum=3,
+        maximum=40,
+    )
+    max_angle_deg: float = parameter(
+        10.0,
+        "Largest angle between a facet and the lines from a joining point to its vertices.",
+        unit="deg",
+        minimum=1.0,
+        maximum=60.0,
+    )
+    max_distance_m: float = parameter(
+        0.6,
+        "Farthest that a joining point lies above its facet or plane, perpendicularly.",
+        unit="m",
+        minimum=0.05,
+        maximum=5.0,
+    )
+    distance_rise: float = parameter(
+        0.1, "How much more that distance may be for each metre of the level's cells.", minimum=0.0, maximum=1.0
+    )
+    noise_m: float = parameter(
+        0.5, "Points this close to their facet join it at any angle.", unit="m", minimum=0.0, maximum=3.0
+    )
+    lone_slope: float = parameter(
+        0.1,
+        "Steepest rise over run from the nearest ground to a point beyond it, where that ground carries no plane.",
+        minimum=0.0,
+        maximum=2.0,
+    )
+    clump_m: int = parameter(
+        3,
+        "Side of the cells in which pits are searched a second time, so that clumps of low outliers go too.",
+        unit="m",
+        minimum=1,
+        maximum=12,
+    )
+
+    def levels(self) -> Iterator[Level]:
+        """The passes, coarse to fine."""
+        before, first = self.seed_cell_m, True
+        while before > 1:
+            cell = max(1, before // self.level_ratio)
+            for _ in range(1 if first else self.passes):
+                yield Level(cell, max(before, self.min_reach_m))
+            before, first = cell, False
+
+    @property
+    def hierarchical_support_m(self) -> float:
+        """How far the filter looks: both pit tests, a cell of seeds, and the reaches of all passes."""
+        pits = PIT_CELLS + (PIT_CELLS + 1) * self.clump_m - 1
+        return float(pits + self.seed_cell_m - 1 + sum(level.reach for level in self.levels()))
+
+
+@njit(cache=True, nogil=True)
+def _lowest_of_cells(lowest: Elevations, size: int, column0: int, row0: int) -> BoolArray:
+    """Mask of the lowest lattice cell of each cell of `size` anchored at the origin; of equal ones the first by row."""
+    rows, columns = lowest.shape
+    corner_c, corner_r = column0 // size, row0 // size
+    coarse = np.full(((row0 + rows - 1) // size - corner_r + 1, (column0 + columns - 1) // size - corner_c + 1), -1)
+    for r in range(rows):
+        for c in range(columns):
+            if lowest[r, c] != NO_DATA:
+                i, j = (row0 + r) // size - corner_r, (column0 + c) // size - corner_c
+                best = coarse[i, j]
+                if best < 0 or lowest[r, c] < lowest[best // columns, best % columns]:
+                    coarse[i, j] = r * columns + c
+    out = np.zeros((rows, columns), np.bool_)
+    for best in coarse.ravel():
+        if best >= 0:
+            out[best // columns, best % columns] = True
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _without_cut_off(lowest: Elevations, seeds: BoolArray, size: int, corner: tuple[int, int], step_mm: float) -> None:
+    """Clear seeds whose cells the data's edge cuts, so that a roof may fill what is left of them.
+
+    Such a seed is kept only where nothing within one cell of seeds lies more than step_mm, and _CUT_SLOPE of the
+    distance, below it.
+    """
+    rows, columns = lowest.shape
+    for r in range(rows):
+        for c in range(columns):
+            if not seeds[r, c]:
+                continue
+            r0 = r - (corner[1] + r) % size
+            c0 = c - (corner[0] + c) % size
+            low_r, high_r, low_c, high_c = r, r, c, c
+            for k in range(max(r0, 0), min(r0 + size, rows)):
+                for m in range(max(c0, 0), min(c0 + size, columns)):
+                    if lowest[k, m] != NO_DATA:
+                        low_r, high_r = min(low_r, k), max(high_r, k)
+                        low_c, high_c = min(low_c, m), max(high_c, m)
+            if min(high_r - low_r, high_c - low_c) + 1 >= _WHOLE_SHARE * size:
+                continue
+            for k in range(max(r - size + 1, 0), min(r + size, rows)):
+                for m in range(max(c - size + 1, 0), min(c + size, columns)):
+                    if lowest[k, m] == NO_DATA:
+                        continue
+                    far = math.sqrt((k - r) * (k - r) + (m - c) * (m - c))
+                    if lowest[r, c] - float(lowest[k, m]) > step_mm + _CUT_SLOPE * CELL_MM * far:
+                        seeds[r, c] = False
+
+
+@njit(cache=True, nogil=True)
+def _without_clumps(lowest: Elevations, size: int, column0: int, row0: int, depth_mm: int) -> Elevations:
+    """Clear what lies deeper than depth_mm below all but three of the 24 cells of `size` around its own.
+
+    The test of `without_pits` on coarser cells; of a cell only the points that are too deep are cleared.
+    """
+    rows, columns = lowest.shape
+    corner_c, corner_r = column0 // size, row0 // size
+    coarse_rows = (row0 + rows - 1) // size - corner_r + 1
+    coarse_columns = (column0 + columns - 1) // size - corner_c + 1
+    coarse = np.full((coarse_rows, coarse_columns), NO_DATA, np.int32)
+    for r in range(rows):
+        for c in range(columns):
+            i, j = (row0 + r) // size - corner_r, (column0 + c) // size - corner_c
+            coarse[i, j] = min(coarse[i, j], lowest[r, c])
+    cleared = without_pits(coarse, depth_mm, _CLUMP_MATES)
+    out = lowest.copy()
+    for r in range(rows):
+        for c in range(columns):
+            i, j = (row0 + r) // size - corner_r, (column0 + c) // size - corner_c
+            if lowest[r, c] == NO_DATA or cleared[i, j] != NO_DATA:
+                continue
+            near = 0
+            for k in range(max(i - PIT_CELLS, 0), min(i + PIT_CELLS + 1, coarse_rows)):
+                for m in range(max(j - PIT_CELLS, 0), min(j + PIT_CELLS + 1, coarse_columns)):
+                    if (k != i or m != j) and coarse[k, m] - np.int64(lowest[r, c]) <= depth_mm:
+                        near += 1
+            if near <= _CLUMP_MATES:
+                out[r, c] = NO_DATA
+    return out
+
+
+def hierarchical_ground(
+    lowest: Elevations, corner: tuple[int, int], settings: HierarchicalFilterSettings, pit_depth_mm: int
+) -> BoolArray:
+    """Mask of the cells that hold ground.
+
+    Parameters
+    ----------
+    lowest : (rows, columns) int32
+        Elevation in mm of the lowest point of each cell, single pits cleared; NO_DATA where there is none.
+    corner : tuple of int
+        Absolute column and row of the first cell: the coarse cells are anchored at the CRS's origin.
+    settings : HierarchicalFilterSettings
+        Levels and tests.
+    pit_depth_mm : int
+        Depth of a pit.
+
+    Returns
+    -------
+    (rows, columns) bool
+        Ground; none where there is no data.
+    """
+    lowest = _without_clumps(lowest, settings.clump_m, *corner, pit_depth_mm)
+    ground = _lowest_of_cells(lowest, settings.seed_cell_m, *corner)
+    step = 1000.0 * (settings.max_distance_m + settings.distance_rise * settings.seed_cell_m / settings.level_ratio)
+    _without_cut_off(lowest, ground, settings.seed_cell_m, corner, step)
+    noise, sine = 1000.0 * settings.noise_m, math.sin(math.radians(settings.max_angle_deg))
+    for level in settings.levels():
+        distance = 1000.0 * (settings.max_distance_m + settings.distance_rise * level.cell)
+        asked = _lowest_of_cells(lowest, level.cell, *corner) & ~ground
+        joined, judged = join_facets(lowest, ground, asked, level.reach, (distance, noise, sine))
+        join_planes(lowest, ground, asked & ~judged, joined, level.reach, (distance, noise, settings.lone_slope))
+        ground = ground | joined
+    return ground

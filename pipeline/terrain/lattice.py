@@ -1,0 +1,90 @@
+"""The lattice of the ground: cells of 1 m, anchored at the CRS's origin, that hold integer millimetres."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.model import BoolArray, IntArray
+
+CELL_MM = 1000
+"""Side of a cell of the terrain lattice."""
+
+NO_DATA = np.int32(2**31 - 1)
+"""Elevation of a cell without one."""
+
+Elevations = npt.NDArray[np.int32]
+
+PIT_CELLS = 2
+"""How many cells far the pit test looks."""
+
+PIT_MATES = 2
+"""At most as many neighbours of a pit lie as deep."""
+
+
+@njit(cache=True, nogil=True)
+def lowest_per_cell(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, used: BoolArray, column0: int, row0: int, columns: int, rows: int
+) -> Elevations:
+    """Elevation of the lowest used point of each cell, int32 (rows, columns), NO_DATA where there is none."""
+    lowest = np.full((rows, columns), NO_DATA, np.int32)
+    for i in range(x_mm.size):
+        if used[i]:
+            c = x_mm[i] // CELL_MM - column0
+            r = y_mm[i] // CELL_MM - row0
+            if 0 <= c < columns and 0 <= r < rows and z_mm[i] < lowest[r, c]:
+                lowest[r, c] = z_mm[i]
+    return lowest
+
+
+@njit(cache=True, nogil=True)
+def without_pits(lowest: Elevations, depth_mm: int, mates: int = PIT_MATES) -> Elevations:
+    """Clear cells that lie deeper than depth_mm below all but at most `mates` of the 24 cells around."""
+    rows, columns = lowest.shape
+    out = lowest.copy()
+    for r in range(rows):
+        for c in range(columns):
+            z = lowest[r, c]
+            if z == NO_DATA:
+                continue
+            near, filled = 0, 0
+            for dr in range(-PIT_CELLS, PIT_CELLS + 1):
+                for dc in range(-PIT_CELLS, PIT_CELLS + 1):
+                    if (dr != 0 or dc != 0) and 0 <= r + dr < rows and 0 <= c + dc < columns:
+                        other = lowest[r + dr, c + dc]
+                        if other != NO_DATA:
+                            filled += 1
+                            if other - z <= depth_mm:
+                                near += 1
+            if filled > mates and near <= mates:
+                out[r, c] = NO_DATA
+    return out
+
+
+@njit(cache=True, nogil=True)
+def height_above(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, terrain: Elevations, column0: int, row0: int
+) -> IntArray:
+    """Heights of points above the bilinear terrain in mm, int64 (n,); NO_DATA where there is no terrain."""
+    rows, columns = terrain.shape
+    out = np.empty(x_mm.size, np.int64)
+    half = CELL_MM // 2
+    for i in range(x_mm.size):
+        gx, gy = x_mm[i] - half, y_mm[i] - half
+        c, r = gx // CELL_MM, gy // CELL_MM
+        fx, fy = (gx - c * CELL_MM) / CELL_MM, (gy - r * CELL_MM) / CELL_MM
+        c -= column0
+        r -= row0
+        weight, total = 0.0, 0.0
+        for dr in range(2):
+            for dc in range(2):
+                if 0 <= r + dr < rows and 0 <= c + dc < columns and terrain[r + dr, c + dc] != NO_DATA:
+                    w = (fx if dc == 1 else 1.0 - fx) * (fy if dr == 1 else 1.0 - fy)
+                    weight += w
+                    total += w * terrain[r + dr, c + dc]
+        if weight > 1e-9:
+            out[i] = z_mm[i] - round(total / weight)
+        else:
+            out[i] = NO_DATA
+    return out

@@ -1,0 +1,139 @@
+"""Planar fitting: least-squares planes through the ground cells of a square, from integral images.
+
+All sums are integers, and the moments are taken about the place in question: a plane does not depend on where the
+lattice's window begins, nor on the order of anything.
+
+Two stages stand on it: the terrain is drawn by such planes, and the hierarchical filter judges by them the points that
+no facet of its TIN holds (`join_planes`): beyond the hull of the ground found so far, and where facets are too wide.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.model import BoolArray
+from pipeline.terrain.lattice import CELL_MM, Elevations
+
+Sums = npt.NDArray[np.int64]
+"""(9, rows + 1, columns + 1) integral images of 1, x, y, z, xx, xy, yy, xz, yz; x and y are cell indices, z in mm."""
+
+MIN_CELLS = 5
+"""Fewest cells of a plane."""
+
+MIN_SPREAD = 0.05
+"""A plane needs det(scatter) above this times trace(scatter)^2: cells in a row carry none."""
+
+
+@njit(cache=True, nogil=True)
+def plane_sums(elevation: Elevations, used: BoolArray) -> Sums:
+    """Integral images of the used cells."""
+    rows, columns = elevation.shape
+    sums = np.zeros((9, rows + 1, columns + 1), np.int64)
+    for r in range(rows):
+        run = np.zeros(9, np.int64)
+        for c in range(columns):
+            if used[r, c]:
+                z = np.int64(elevation[r, c])
+                run[0] += 1
+                run[1] += c
+                run[2] += r
+                run[3] += z
+                run[4] += c * c
+                run[5] += c * r
+                run[6] += r * r
+                run[7] += c * z
+                run[8] += r * z
+            for k in range(9):
+                sums[k, r + 1, c + 1] = sums[k, r, c + 1] + run[k]
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def plane_around(sums: Sums, r: int, c: int, half: int) -> tuple[int, float, float, float, bool]:
+    """The plane through the used cells of the square of 2 half + 1 cells around a cell.
+
+    Returns
+    -------
+    cells : int
+        Used cells in the square.
+    level : float
+        Elevation of the plane at (r, c) in mm; where the cells carry no plane, their mean.
+    along_columns, along_rows : float
+        Rise in mm a cell; where the cells carry no plane, how far their centroid lies from (r, c) in cells.
+    carries : bool
+        At least `MIN_CELLS` cells that spread to both sides.
+    """
+    rows, columns = sums.shape[1] - 1, sums.shape[2] - 1
+    r0, r1 = max(r - half, 0), min(r + half, rows - 1) + 1
+    c0, c1 = max(c - half, 0), min(c + half, columns - 1) + 1
+    n = sums[0, r1, c1] - sums[0, r0, c1] - sums[0, r1, c0] + sums[0, r0, c0]
+    if n == 0:
+        return 0, 0.0, 0.0, 0.0, False
+    m = np.empty(9, np.int64)
+    for k in range(9):
+        m[k] = sums[k, r1, c1] - sums[k, r0, c1] - sums[k, r1, c0] + sums[k, r0, c0]
+    # moments about the cell (r, c), exact
+    sx = m[1] - n * c
+    sy = m[2] - n * r
+    mean = m[3] / n
+    if n >= MIN_CELLS:
+        xx = m[4] - 2 * c * m[1] + n * c * c
+        xy = m[5] - c * m[2] - r * m[1] + n * c * r
+        yy = m[6] - 2 * r * m[2] + n * r * r
+        vxx, vxy, vyy = xx - sx * sx / n, xy - sx * sy / n, yy - sy * sy / n
+        det = vxx * vyy - vxy * vxy
+        if det > MIN_SPREAD * (vxx + vyy) * (vxx + vyy):
+            # about the centroid; z about its mean to keep the float products small
+            vxz = (m[7] - c * m[3]) - sx * mean
+            vyz = (m[8] - r * m[3]) - sy * mean
+            a = (vxz * vyy - vyz * vxy) / det
+            b = (vyz * vxx - vxz * vxy) / det
+            return n, mean - (a * sx + b * sy) / n, a, b, True
+    return n, mean, sx / n, sy / n, False
+
+
+@njit(cache=True, nogil=True)
+def join_planes(
+    elevation: Elevations,
+    ground: BoolArray,
+    asked: BoolArray,
+    joined: BoolArray,
+    reach: int,
+    limits: tuple[float, float, float],
+) -> None:
+    """Mark in `joined` the asked cells that fit the plane through the ground within reach, or lie below it.
+
+    Parameters
+    ----------
+    elevation : (rows, columns) int32
+        Elevations in mm.
+    ground, asked : (rows, columns) bool
+        What the planes go through, and what is judged.
+    joined : (rows, columns) bool
+        Written.
+    reach : int
+        Half side of the squares in cells; nothing farther is looked at.
+    limits : tuple of float
+        Farthest perpendicular distance above a plane in mm; where the ground around carries no plane, highest step
+        above its mean in mm, and rise over run to its centroid.
+    """
+    max_distance, max_step, max_slope = limits
+    sums = plane_sums(elevation, ground)
+    rows, columns = elevation.shape
+    for r in range(rows):
+        for c in range(columns):
+            if not asked[r, c]:
+                continue
+            cells, level, across, along, carries = plane_around(sums, r, c, reach)
+            if cells == 0:
+                continue
+            above = elevation[r, c] - level
+            if carries:
+                joined[r, c] = above <= max_distance * math.sqrt(1.0 + (across * across + along * along) / CELL_MM**2)
+            else:
+                far = math.sqrt(across * across + along * along)
+                joined[r, c] = above <= max_step + max_slope * CELL_MM * far

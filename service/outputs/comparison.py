@@ -1,0 +1,156 @@
+"""Assembling the outputs of a finished comparison: those of each run as if it were alone, then those of all."""
+
+from __future__ import annotations
+
+import html
+import json
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from service.outputs.assemble import Progress, published_tiles, write_outputs
+from service.outputs.catalogue import NAME as CATALOGUE_NAME
+from service.outputs.catalogue import Catalogue, StoredOutput, read_catalogue, run_outputs
+from service.outputs.kinds import COMPARISON_OUTPUTS, chosen
+from service.outputs.meshes import zip_files, zip_text
+from service.outputs.report import cleaner
+
+RUNS = "runs"
+"""Folder of the run directories below the comparison's."""
+
+_TEXTS = frozenset({".json", ".html", ".md"})
+"""Endings of the files that tell where inputs lay; tables and models do not."""
+
+_KEPT_BACK = frozenset({"quarantine", "scratch"})
+"""Folders of a run that are no results."""
+
+
+def _nothing(done: int, total: int) -> None:
+    del done, total
+
+
+def write_comparison_outputs(
+    folder: Path,
+    labels: Sequence[str],
+    out_dir: Path,
+    wanted: Sequence[str] | None = None,
+    on_progress: Progress = _nothing,
+) -> None:
+    """Write the outputs of a finished comparison.
+
+    Each run gets all outputs of a run in a folder of its own, so that its buildings can be asked for like those of a
+    reconstruction. No output tells a folder of the server: of a path what remains is the file's name.
+
+    Parameters
+    ----------
+    folder : Path
+        The comparison's folder: `index.html`, `compare.json`, `buildings.parquet` and `runs/<label>/`.
+    labels : sequence of str
+        The runs, in the order in which they are told.
+    out_dir : Path
+        Folder to write into; made where it is missing.
+    wanted : sequence of str, optional
+        Ids of `COMPARISON_OUTPUTS`; all by default.
+    on_progress : callable
+        Gets what is done, tiles and files, and all of it; what it raises ends the work.
+
+    Raises
+    ------
+    NoSuchOutputError
+        `wanted` holds an unknown id.
+    RunError
+        A run did not end, or its files are damaged.
+    OSError
+        A file is missing, or the folder cannot be written.
+    """
+    from pipeline.io.storage import LocalStorage, sha256_of
+
+    kinds = chosen(wanted, COMPARISON_OUTPUTS)
+    files = sorted(_files(folder))
+    tiles = {label: len(published_tiles(folder / RUNS / label)[0]) for label in labels}
+    done, total = 0, sum(tiles.values()) + len(files)
+    for label in labels:
+        told = _after(done, total, on_progress)
+        write_outputs(folder / RUNS / label, run_outputs(out_dir, label), on_progress=told)
+        done += tiles[label]
+    clean = _cleaner(folder, labels)
+    storage = LocalStorage(root=out_dir)
+    for kind in kinds:
+        source = folder / kind.filename
+        if kind.output_id == "archive":
+            with storage.putting(kind.filename) as path, zipfile.ZipFile(path, "w") as archive:
+                for name in files:
+                    on_progress(done, total)
+                    done += 1
+                    _add(archive, folder, name, clean)
+        elif source.suffix in _TEXTS:
+            storage.put(kind.filename, _cleaned(source, clean).encode())
+        else:
+            storage.put(kind.filename, source.read_bytes())
+    stored = {}
+    for kind in kinds:
+        path = out_dir / kind.filename
+        stored[kind.output_id] = StoredOutput(size_bytes=path.stat().st_size, sha256=sha256_of(path))
+    first = read_catalogue(run_outputs(out_dir, labels[0]))
+    catalogue = Catalogue(outputs=stored, crs=first.crs, n_buildings=first.n_buildings, runs=tuple(labels))
+    storage.put(CATALOGUE_NAME, catalogue.to_json().encode())
+    on_progress(total, total)
+
+
+def _after(before: int, total: int, on_progress: Progress) -> Progress:
+    """Progress of a part as that of the whole."""
+
+    def told(done: int, _of: int) -> None:
+        on_progress(before + done, total)
+
+    return told
+
+
+def _files(folder: Path) -> Iterator[str]:
+    """What the archive holds, relative to the folder."""
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder)
+        hidden = any(part.startswith(".") or part in _KEPT_BACK for part in name.parts)
+        if path.is_file() and not hidden:
+            yield name.as_posix()
+
+
+def _add(archive: zipfile.ZipFile, folder: Path, name: str, clean: Callable[[str], str]) -> None:
+    if (folder / name).suffix in _TEXTS:
+        zip_text(archive, name, _cleaned(folder / name, clean))
+    else:
+        zip_files(archive, folder, [name])
+
+
+def _cleaner(folder: Path, labels: Sequence[str]) -> Callable[[str], str]:
+    """A function that takes the server's folders out of a text, also as a page writes them."""
+    manifests = [json.loads((folder / RUNS / label / "run.json").read_text(encoding="utf-8")) for label in labels]
+    paths = {entry["path"] for manifest in manifests for entry in manifest["inputs"]}
+    written = paths | {html.escape(path) for path in paths}
+    return cleaner(sorted(written), folder)
+
+
+def _cleaned(path: Path, clean: Callable[[str], str]) -> str:
+    """The text of a file without the server's folders and machines."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".json":
+        # by its values: a path may be written with escapes
+        document = _mapped(json.loads(text), clean)
+        if path.name == "run.json":
+            # by process, whose name has that of its machine
+            peaks = document["peak_memory_bytes"].values()
+            document["peak_memory_bytes"] = {f"process {n}": peak for n, peak in enumerate(peaks, start=1)}
+        return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+    return clean(text)
+
+
+def _mapped(value: Any, clean: Callable[[str], str]) -> Any:
+    """A JSON value with every text in it cleaned."""
+    if isinstance(value, str):
+        return clean(value)
+    if isinstance(value, list):
+        return [_mapped(item, clean) for item in value]
+    if isinstance(value, dict):
+        return {name: _mapped(item, clean) for name, item in value.items()}
+    return value

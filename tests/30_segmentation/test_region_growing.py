@@ -1,0 +1,99 @@
+"""Regions grown from the mean of clusters: they follow the plane, not the cluster's members."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.errors import SettingsError
+from pipeline.geometry import nearest_neighbours
+from pipeline.model import FloatArray, LabelArray
+from pipeline.segmentation.region_growing import RegionGrowingSettings, grow_regions
+
+
+def gable(seed: int = 0, noise: float = 0.03) -> tuple[FloatArray, LabelArray]:
+    """Points of a gable with 31 degrees, and their true side."""
+    random = np.random.default_rng(seed)
+    points = random.uniform(0, [14, 10, 0], (280, 3))
+    points[:, 2] = 8 - 0.6 * np.abs(points[:, 1] - 5) + random.normal(0, noise, 280)
+    return points, (points[:, 1] > 5).astype(np.int32)
+
+
+SIDES = np.array([[0.0, 0.6], [0.0, -0.6]])
+
+
+def grown(
+    points: FloatArray, clusters: LabelArray, gradients: FloatArray, fewest: int = 6
+) -> tuple[FloatArray, LabelArray]:
+    return grow_regions(
+        points,
+        nearest_neighbours(points, 9),
+        clusters,
+        gradients,
+        distance_m=0.15,
+        fewest_points=fewest,
+        settings=RegionGrowingSettings(),
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_few_members_are_enough_for_whole_faces(seed: int) -> None:
+    points, side = gable(seed)
+    member = np.random.default_rng(seed).random(280) < 0.3
+    planes, labels = grown(points, np.where(member, side, -1).astype(np.int32), SIDES)
+    assert len(planes) == 2
+    assert (labels >= 0).mean() > 0.95
+    away = np.abs(points[:, 1] - 5) > 0.6
+    renamed = labels if np.median(labels[side == 0]) == 0 else 1 - labels
+    assert (renamed[away] == side[away]).mean() > 0.97
+    np.testing.assert_allclose(np.sort(planes[:, 1]), [-0.6, 0.6], atol=0.03)
+
+
+def test_members_by_chance_do_not_bend_the_plane() -> None:
+    points, side = gable(1)
+    clusters = side.copy()
+    wrong = np.random.default_rng(0).choice(280, 40, replace=False)
+    clusters[wrong] = 1 - clusters[wrong]
+    planes, _ = grown(points, clusters, SIDES)
+    np.testing.assert_allclose(np.sort(planes[:2, 1]), [-0.6, 0.6], atol=0.03)
+
+
+def test_parallel_faces_of_one_cluster_become_two_regions() -> None:
+    random = np.random.default_rng(2)
+    points = random.uniform(0, [16, 8, 0], (300, 3))
+    upper = points[:, 0] > 8
+    points[:, 2] = 5 + 0.5 * points[:, 1] + 1.5 * upper + random.normal(0, 0.03, 300)
+    planes, labels = grown(points, np.zeros(300, np.int32), np.array([[0.0, 0.5]]))
+    assert len(planes) == 2
+    assert len(set(labels[upper & (labels >= 0)].tolist())) == 1
+    assert set(labels[upper].tolist()) & set(labels[~upper].tolist()) <= {-1}
+
+
+def test_points_far_from_every_plane_and_small_regions_have_no_label() -> None:
+    points, side = gable(3)
+    points[:4, 2] += 3.0
+    _, labels = grown(points, side, SIDES)
+    assert labels[:4].tolist() == [-1] * 4
+    planes, labels = grown(points, side, SIDES, fewest=400)
+    assert len(planes) == 0
+    assert (labels == -1).all()
+
+
+def test_without_members_nothing_grows() -> None:
+    points, _ = gable()
+    planes, labels = grown(points, np.full(280, -1, np.int32), SIDES)
+    assert planes.shape == (0, 3)
+    assert (labels == -1).all()
+
+
+def test_the_order_of_points_does_not_matter() -> None:
+    points, side = gable(5)
+    order = np.random.default_rng(1).permutation(280)
+    _, here = grown(points, side, SIDES)
+    _, there = grown(points[order], side[order], SIDES)
+    assert here[order].tolist() == there.tolist()
+
+
+def test_bounds_that_are_no_range_are_refused() -> None:
+    with pytest.raises(SettingsError, match=r"use at most growing_max_m, 0\.3"):
+        RegionGrowingSettings(growing_min_m=0.5)

@@ -1,0 +1,297 @@
+"""The whole recipe of Zeng et al.: exact gables come back, other roofs find their way, and what must not matter."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import shapely
+
+from pipeline.errors import BuildingError, SettingsError
+from pipeline.geometry import vertical_residuals_m
+from pipeline.methods import METHODS, ReconstructSettings
+from pipeline.methods.kmeans import KMeansSettings, building_top, cluster_facets, segment
+from pipeline.methods.local_frame import local_metres
+from pipeline.model import Candidate, FloatArray, Reason, RoofType, Segmentation, Status
+from pipeline.quality.validity import check_solid
+from pipeline.reconstruct import reconstruct_building
+
+FAITHFUL = KMeansSettings.faithful()
+ROBUST = KMeansSettings()
+PRESETS = pytest.mark.parametrize("settings", [ROBUST, FAITHFUL], ids=["robust", "faithful"])
+
+
+def candidate_of(points: FloatArray, footprint: shapely.Polygon | None = None) -> Candidate:
+    """Points in canonical order on level ground at z = 0."""
+    points = np.rint(points * 1000) / 1000
+    lattice = np.arange(-14.0, 15.0)
+    return Candidate(
+        building_id="roof",
+        origin=(0.0, 0.0, 0.0),
+        points=points[np.lexsort(points.T[::-1])],
+        ground=np.array([(x, y, 0.0) for x in lattice for y in lattice]),
+        ground_z_m=0.0,
+        footprint=footprint,
+    )
+
+
+def turn(uv: FloatArray, degrees: float) -> FloatArray:
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return uv @ np.array([[cos, sin], [-sin, cos]])
+
+
+def roof(
+    planes: Sequence[tuple[float, float, float]],
+    *,
+    length: float = 14.0,
+    width: float = 8.0,
+    density: float = 2.0,
+    noise: float = 0.03,
+    seed: int = 0,
+    turn_deg: float = 17.0,
+    footprint: shapely.Polygon | None = None,
+) -> Candidate:
+    """Points strewn on the lowest of some planes over a turned rectangle."""
+    random = np.random.default_rng(seed)
+    uv = random.uniform(-0.5, 0.5, (random.poisson(density * length * width), 2)) * [length, width]
+    z = (uv @ np.array(planes)[:, :2].T + np.array(planes)[:, 2]).min(axis=1) + random.normal(0, noise, len(uv))
+    return candidate_of(np.column_stack([turn(uv, turn_deg), z]), footprint)
+
+
+def gable_planes(pitch_deg: float = 35.0, other_deg: float | None = None) -> list[tuple[float, float, float]]:
+    rise = math.tan(math.radians(pitch_deg))
+    other = math.tan(math.radians(pitch_deg if other_deg is None else other_deg))
+    return [(0, rise, 8.0), (0, -other, 8.0)]
+
+
+def hip_planes() -> list[tuple[float, float, float]]:
+    rise = math.tan(math.radians(35.0))
+    return [*gable_planes(), (-rise, 0, 5 + 7 * rise), (rise, 0, 5 + 7 * rise)]
+
+
+def exact_gable(degrees: float, step: float = 0.5) -> Candidate:
+    u, v = np.arange(-7, 7 + step / 2, step), np.arange(-4, 4 + step / 2, step)
+    uv = np.array([(a, b) for a in u for b in v])
+    return candidate_of(np.column_stack([turn(uv, degrees), 8 - 0.7 * np.abs(uv[:, 1])]))
+
+
+def outline_of(found: Segmentation) -> shapely.Polygon:
+    assert found.faces is not None
+    united = shapely.union_all([face.polygon for face in found.faces], grid_size=1e-3)
+    assert isinstance(united, shapely.Polygon)
+    return united
+
+
+@pytest.mark.parametrize("degrees", [0.0, 17.0, 60.0, 90.0, 145.0])
+def test_a_gable_without_noise_comes_back_exactly(degrees: float) -> None:
+    candidate = exact_gable(degrees)
+    found = segment(candidate, FAITHFUL)
+    assert found.roof_type is RoofType.GABLE
+    corners = turn(np.array([(-7, -4), (7, -4), (7, 4), (-7, 4.0)]), degrees)
+    assert outline_of(found).symmetric_difference(shapely.Polygon(corners)).area < 0.25
+    for plane in found.planes:
+        assert plane.slope_deg == pytest.approx(math.degrees(math.atan(0.7)), abs=0.1)
+        assert plane.rmse_m < 0.01
+    residuals = [np.abs(vertical_residuals_m(candidate.points, plane.coefficients)) for plane in found.planes]
+    assert np.minimum(*residuals).max() < 0.02
+    assert (found.labels >= 0).all()
+    result = reconstruct_building(candidate, "kmeans", ReconstructSettings(method=FAITHFUL))
+    assert (result.status, result.lod, result.validity_codes) == (Status.OK, "2.2", ())
+    assert [len(solid.vertices) for solid in result.solids] == [10]
+    assert result.rmse_m < 0.01
+
+
+@pytest.mark.parametrize("pitch_deg", [12.0, 25.0, 45.0])
+@PRESETS
+def test_a_noisy_gable_becomes_the_model_of_ten_vertices(settings: KMeansSettings, pitch_deg: float) -> None:
+    for seed in range(5):
+        candidate = roof(gable_planes(pitch_deg), seed=seed)
+        result = reconstruct_building(candidate, "kmeans", ReconstructSettings(method=settings))
+        assert result.status is Status.OK
+        assert result.roof_type is RoofType.GABLE
+        assert [len(solid.vertices) for solid in result.solids] == [10]
+        assert check_solid(result.solids[0]) == ()
+        assert result.rmse_m < 0.08
+        assert result.footprint is not None
+        truth = shapely.Polygon(turn(np.array([(-7, -4), (7, -4), (7, 4), (-7, 4.0)]), 17.0))
+        assert result.footprint.intersection(truth).area > 0.95 * result.footprint.union(truth).area
+
+
+@pytest.mark.parametrize(
+    ("planes", "kind", "slope_deg"),
+    [
+        ([(0.0, 0.0, 6.0)], RoofType.FLAT, 0.0),
+        ([(0.0, 0.3, 6.0)], RoofType.PENT, 16.7),
+        ([(0.3, 0, 7)], RoofType.PENT, 16.7),
+    ],
+)
+@PRESETS
+def test_one_plane_becomes_the_box_of_eight_vertices(
+    settings: KMeansSettings, planes: list[tuple[float, float, float]], kind: RoofType, slope_deg: float
+) -> None:
+    for seed in range(5):
+        candidate = roof(planes, seed=seed)
+        result = reconstruct_building(candidate, "kmeans", ReconstructSettings(method=settings))
+        assert (result.status, result.roof_type) == (Status.OK, kind)
+        assert [len(solid.vertices) for solid in result.solids] == [8]
+        assert result.planes[0].slope_deg == pytest.approx(slope_deg, abs=1.0)
+        assert result.rmse_m < 0.1
+
+
+def test_unequal_pitches_give_the_faithful_model_two_equal_sides_and_a_residual() -> None:
+    candidate = roof(gable_planes(30.0, 45.0), noise=0.01)
+    faithful = segment(candidate, FAITHFUL)
+    first, second = (plane.slope_deg for plane in faithful.planes)
+    assert first == pytest.approx(second, abs=0.2)
+    result = reconstruct_building(candidate, "kmeans", ReconstructSettings(method=FAITHFUL))
+    assert result.rmse_m > 0.2, "the record tells how badly a symmetric model fits"
+    robust = segment(candidate, ROBUST)
+    assert robust.faces is None, "the symmetric model does not explain the building"
+    assert sorted(plane.slope_deg for plane in robust.planes) == pytest.approx([30, 45], abs=1)
+
+
+def test_a_hip_roof_is_more_than_the_model_and_is_drawn_from_its_labels() -> None:
+    for seed in range(4):
+        found = segment(roof(hip_planes(), seed=seed), ROBUST)
+        assert found.faces is None
+        assert found.roof_type is None
+        assert len(found.planes) == 4
+
+
+def test_with_k_2_a_hip_roof_is_a_gable_all_the_same() -> None:
+    found = segment(roof(hip_planes(), density=0.7), FAITHFUL)
+    assert found.roof_type is RoofType.GABLE
+
+
+def test_two_levels_of_one_direction_are_split_by_where_they_hang_together() -> None:
+    random = np.random.default_rng(4)
+    xy = random.uniform(-7, 7, (600, 2))
+    z = np.where(xy[:, 0] < 0, 9.0, 5.0) + random.normal(0, 0.03, 600)
+    found = segment(candidate_of(np.column_stack([xy, z])), ROBUST)
+    assert sorted(plane.c for plane in found.planes) == pytest.approx([5, 9], abs=0.1)
+    assert found.faces is None
+
+
+def test_nearly_parallel_planes_that_meet_beside_the_building_are_a_labelled_block_of_the_faithful_recipe() -> None:
+    random = np.random.default_rng(4)
+    xy = random.uniform(-7, 7, (600, 2))
+    z = np.where(xy[:, 0] < 0, 9.0, 6.0 - 0.15 * xy[:, 0]) + random.normal(0, 0.01, 600)
+    candidate = candidate_of(np.column_stack([xy, z]))
+    with pytest.raises(BuildingError, match=r"least_side_share is 0\.5") as error:
+        segment(candidate, FAITHFUL)
+    assert error.value.reason is Reason.NO_PARTITION
+    result = reconstruct_building(candidate, "kmeans", ReconstructSettings(method=FAITHFUL))
+    assert (result.status, result.reason, result.lod) == (Status.FALLBACK, Reason.NO_PARTITION, "1.2")
+
+
+def test_a_given_footprint_is_kept_by_the_robust_recipe_and_replaced_by_the_faithful_one() -> None:
+    footprint = shapely.Polygon(turn(np.array([(-7.2, -4.2), (7.2, -4.2), (7.2, 4.2), (-7.2, 4.2)]), 17.0))
+    candidate = roof(gable_planes(), footprint=footprint)
+    kept = reconstruct_building(candidate, "kmeans", ReconstructSettings(method=ROBUST))
+    assert kept.footprint is not None
+    assert kept.footprint.symmetric_difference(footprint).area < 0.05
+    drawn = segment(candidate, dataclasses.replace(ROBUST, outline="rectangle"))
+    assert drawn.faces is not None
+    assert segment(candidate, FAITHFUL).faces is not None
+
+
+@PRESETS
+def test_the_outcome_moves_with_the_building_by_whole_metres(settings: KMeansSettings) -> None:
+    candidate = roof(gable_planes(), noise=0.05)
+    shift = np.array([1203.0, -777.0, 41.0])
+    moved = dataclasses.replace(
+        candidate, points=np.rint((candidate.points + shift) * 1000) / 1000, ground_z_m=candidate.ground_z_m + 41.0
+    )
+    here, there = segment(candidate, settings), segment(moved, settings)
+    assert (here.labels == there.labels).all()
+    assert here.faces is not None
+    assert there.faces is not None
+    for p, q in zip(here.faces, there.faces, strict=True):
+        assert shapely.get_coordinates(p.polygon) + shift[:2] == pytest.approx(
+            shapely.get_coordinates(q.polygon), abs=1e-9
+        )
+
+
+@PRESETS
+def test_the_model_turns_with_the_building(settings: KMeansSettings) -> None:
+    one = segment(roof(gable_planes(), turn_deg=0.0), settings)
+    for degrees in (31.0, 90.0, 222.0):
+        other = segment(roof(gable_planes(), turn_deg=degrees), settings)
+        corners = turn(shapely.get_coordinates(outline_of(one)), degrees)
+        assert outline_of(other).symmetric_difference(shapely.Polygon(corners)).area < 0.5
+
+
+@PRESETS
+def test_the_order_of_the_points_does_not_matter(settings: KMeansSettings) -> None:
+    candidate = roof(gable_planes(), noise=0.04)
+    order = np.random.default_rng(1).permutation(len(candidate.points))
+    shuffled = dataclasses.replace(candidate, points=candidate.points[order])
+    one, other = segment(candidate, settings), segment(shuffled, settings)
+    assert outline_of(one).symmetric_difference(outline_of(other)).area < 1e-2
+    first, second = (np.array(sorted(plane.coefficients for plane in found.planes)) for found in (one, other))
+    assert first == pytest.approx(second, abs=1e-3)
+    sides = np.array([plane.b for plane in one.planes])[one.labels[order]]
+    assert (np.sign(sides) == np.sign(np.array([plane.b for plane in other.planes])[other.labels])).mean() > 0.99
+
+
+def test_the_two_clusters_of_a_gable_are_its_two_sides() -> None:
+    candidate = roof(gable_planes(), density=1.0, noise=0.05, turn_deg=0.0)
+    points, _ = local_metres(candidate.points)
+    top = building_top(points, FAITHFUL)
+    labels, clusters = cluster_facets(top, FAITHFUL)
+    north = top.points[top.tin.facets][:, :, 1] > top.points[:, 1].mean() + 1.0
+    south = top.points[top.tin.facets][:, :, 1] < top.points[:, 1].mean() - 1.0
+    sides = [np.bincount(labels[side.all(axis=1) & (labels >= 0)], minlength=2) for side in (north, south)]
+    assert sides[0].argmax() != sides[1].argmax()
+    assert all(side.max() > 0.95 * side.sum() for side in sides)
+    assert clusters.silhouette > 0.8
+
+
+def test_points_below_others_and_far_from_the_model_have_no_label() -> None:
+    candidate = roof(gable_planes(), turn_deg=0.0)
+    odd = np.array([[1.5, 2.0, 2.0], [-3.0, -2.0, 11.0]])
+    with_odd = candidate_of(np.concatenate([candidate.points, odd]))
+    found = segment(with_odd, FAITHFUL)
+    for point in odd:
+        index = np.flatnonzero((with_odd.points == point).all(axis=1))
+        assert found.labels[index].tolist() == [-1]
+    assert (found.labels >= 0).mean() > 0.95
+
+
+@PRESETS
+def test_too_few_points_are_refused_with_their_number(settings: KMeansSettings) -> None:
+    with pytest.raises(BuildingError, match="4 of 4 points are visible from above, least_points is 6") as error:
+        segment(candidate_of(np.array([(0, 0, 5.0), (4, 0, 5), (0, 4, 5), (4, 4, 5)])), settings)
+    assert error.value.reason is Reason.TOO_FEW_POINTS
+
+
+@PRESETS
+def test_points_on_one_line_have_no_facets(settings: KMeansSettings) -> None:
+    with pytest.raises(BuildingError, match="0 of 0 facets") as error:
+        segment(candidate_of(np.array([(x, 2 * x, 5.0 + x) for x in range(20)], np.float64)), settings)
+    assert error.value.reason is Reason.NO_PLANE
+
+
+@PRESETS
+def test_a_building_of_walls_alone_has_no_facet_to_cluster(settings: KMeansSettings) -> None:
+    random = np.random.default_rng(2)
+    x, y = random.uniform(-1, 1, (2, 40))
+    points = np.column_stack([4 * x, 4 * y, 60 + 16 * x])
+    with pytest.raises(BuildingError, match="not steeper than max_slope_deg, 70; clusters need 3") as error:
+        segment(candidate_of(points), dataclasses.replace(settings))
+    assert error.value.reason is Reason.NO_PLANE
+
+
+def test_the_presets_are_those_of_the_method() -> None:
+    method = METHODS["kmeans"]
+    assert method.preset("robust") == KMeansSettings()
+    assert method.preset("faithful") == FAITHFUL
+    assert (FAITHFUL.clusters, FAITHFUL.model, FAITHFUL.refine) == (2, "always", False)
+
+
+def test_a_distance_that_is_no_range_is_refused() -> None:
+    with pytest.raises(SettingsError, match=r"plane_distance_min_m is 0\.5: use at most plane_distance_max_m, 0\.3"):
+        KMeansSettings(plane_distance_min_m=0.5)
