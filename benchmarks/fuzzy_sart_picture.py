@@ -60,7 +60,7 @@ def draw_claims(found: Mapping[str, Sequence[Any]], path: Path) -> None:
 def _curve(axis: Any, places: Sequence[float], told: Sequence[Any], **style: Any) -> None:
     """A line through figures, with their intervals."""
     values = [one.value for one in told]
-    ends = [[one.value - one.low for one in told], [one.high - one.value for one in told]]
+    ends = [[max(0.0, one.value - one.low) for one in told], [max(0.0, one.high - one.value) for one in told]]
     axis.errorbar(places, values, yerr=ends, capsize=2.5, lw=1.4, elinewidth=0.7, **style)
 
 
@@ -87,12 +87,12 @@ def _translation(axis: Any, tables: Sequence[Any]) -> None:
     for kind, colour in (("footpoint", "#1f618d"), ("spherical_scaled", "#b9770e")):
         mine = [row for row in tables[2].rows if row[0] == kind]
         name = kind.replace("_", " ")
-        _curve(axis, range(6), [row[2] for row in mine], color=colour, marker="o", label=f"{name}: pairs of one plane")
-        _curve(axis, range(6), [row[3] for row in mine], color=colour, marker="v", ls="--", label="pairs of two planes")
+        _curve(axis, range(6), [row[2] for row in mine], color=colour, marker="o", label=f"{name}: one plane")
+        _curve(axis, range(6), [row[3] for row in mine], color=colour, marker="v", ls="--", label="two planes")
         _curve(axis, range(6), [row[6] for row in mine], color=colour, marker="s", ls=":", label="roofs all right")
     axis.set_xticks(range(6), places, fontsize=8)
-    axis.set(title="translation (faithful): pairs that match, roofs right, %")
-    axis.legend(frameon=False, fontsize=7)
+    axis.set(title="translation, faithful: pairs that match, %")
+    axis.legend(frameon=False, fontsize=7, ncols=2, loc="center", bbox_to_anchor=(0.5, 0.40))
 
 
 def _product(axis: Any, rows: Sequence[Sequence[Any]]) -> None:
@@ -104,6 +104,7 @@ def _product(axis: Any, rows: Sequence[Sequence[Any]]) -> None:
             _curve(axis, densities, [row[5] for row in mine], color=colour, ls=line, marker="o", label=name)
     axis.set_xscale("log")
     axis.set_xticks([0.7, 2.0, 8.0], ["0.7", "2", "8"])
+    axis.minorticks_off()
     axis.set(title="whole product: all planes right, %", xlabel="pulses a m2")
     axis.legend(frameon=False, loc="lower right")
 

@@ -162,6 +162,16 @@ def misprints(table: Mapping[str, PrintedRow]) -> list[str]:
     return found
 
 
+def contradictions() -> list[str]:
+    """Where table 4-2 has more buildings of an outcome than table 4-1, of which its buildings are a part."""
+    found = []
+    for kind, good in PAPER["4-2"].items():
+        for outcome, part, whole in zip(OUTCOMES, good.counts, PAPER["4-1"][kind].counts, strict=True):
+            if part > whole:
+                found.append(f"{kind}: {part} of the {good.number} good ones {outcome}, but {whole} of all")
+    return found
+
+
 def read_outcomes(variant: Variant, place: Workplace, split: str, draws: int) -> Outcomes | None:
     """The outcomes of a method; None where a draw was not measured."""
     entries = list(hofmann_entries(split, draws))
@@ -304,6 +314,7 @@ def document(found: Mapping[str, Outcomes], split: str, draws: int) -> str:
     parts.append(pattern_table(found) or "Not both parameter spaces were measured.\n")
     parts.append("### Misprints of the paper\n")
     parts += [f"- table {name}: {told}" for name, table in PAPER.items() for told in misprints(table)]
+    parts += [f"- table 4-2 against 4-1: {told}" for told in contradictions()]
     return "\n".join(parts) + "\n"
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.entries import Workplace, all_variants, markdown_table, measure_all, sweep_entries
-from benchmarks.ruler import sweep_qualities, sweep_table
+from benchmarks.ruler import sweep_qualities
 from pipeline.runtime.compare import Variant
 from pipeline.synthetic.sweep import CELLS
 
@@ -31,8 +31,8 @@ LEVELS = (0.8, 0.5)
 NOISE_COLOURS = ("#1b6ca8", "#2a9d55", "#d1495b")
 """One a noise, from clean to noisy."""
 DENSEST_FAITHFUL = 16.0
-"""Pulses a square metre up to which the papers' own settings are measured: the clustering of Fuzzy SART's grows with the
-facets times the clusters, and noise at many points makes many of both."""
+"""Pulses a square metre up to which the papers' own settings are measured: with noise at many points Fuzzy SART makes
+many clusters of many facets, and its time grows with the product."""
 
 Qualities = Mapping[tuple[float, float], float]
 """Quality by density and noise."""
@@ -163,6 +163,23 @@ def noise_table(found: Mapping[str, Qualities]) -> str:
     return markdown_table(["m of noise at which it holds", "level", *(f"{one:g} a m2" for one in densities)], rows)
 
 
+def quality_table(found: Mapping[str, Qualities]) -> str:
+    """A row a method, a column a density: the quality in percent at every noise, from clean to noisy."""
+    densities = sorted({density for qualities in found.values() for density, _ in qualities})
+    rows = [
+        [
+            label,
+            *(
+                " / ".join(f"{100 * value:.0f}" for value in along_noise(qualities, density)[1])
+                for density in densities
+            ),
+        ]
+        for label, qualities in found.items()
+    ]
+    noises = " / ".join(f"{noise:g}" for noise in _noises(found))
+    return markdown_table([f"percent at {noises} m of noise", *(f"{one:g} a m2" for one in densities)], rows)
+
+
 def _noises(found: Mapping[str, Qualities]) -> list[float]:
     return sorted({noise for qualities in found.values() for _, noise in qualities})
 
@@ -238,8 +255,8 @@ def _draw_limits(panel: Any, found: Mapping[str, Qualities]) -> None:
 def document(found: Mapping[str, Qualities], split: str) -> str:
     """All tables as Markdown."""
     parts = [f"`sweep`, {split} seeds: quality of the roof faces of at least 10 m2.\n", "### Down to what density\n"]
-    parts += [density_table(found), "### Up to what noise\n", noise_table(found), "### The qualities\n"]
-    parts += [f"{label}:\n\n{sweep_table(qualities)}" for label, qualities in found.items()]
+    parts += [density_table(found), "### Up to what noise\n", noise_table(found)]
+    parts += ["### The qualities\n", quality_table(found)]
     return "\n".join(parts)
 
 

@@ -203,8 +203,9 @@ def compare(
         from pipeline.evaluation.files import EvaluationRequest
         from pipeline.report.compare_files import compare_files, comparison_facts
         from pipeline.report.evaluation_page import headline
-        from pipeline.runtime.compare import CompareRequest, parse_variants
+        from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
         from pipeline.runtime.run import RunRequest
+        from pipeline.settings import read_table
 
         request = CompareRequest(
             run=RunRequest(
@@ -226,6 +227,7 @@ def compare(
                 building_memory_bytes=round(building_memory * 2**30),
             ),
             variants=parse_variants(methods),
+            tables=own_tables(read_table(settings)),
         )
         reference = None
         if truth is not None or points or as_surveyed:

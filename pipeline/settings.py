@@ -190,16 +190,28 @@ class RunSettings:
         SettingsError
             The file cannot be read or parsed, or holds faults.
         """
-        table: dict[str, Any] = {}
-        if path is not None:
-            try:
-                document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-            except OSError as error:
-                raise SettingsError([f"settings file {path} cannot be read: {error.strerror or error}"]) from error
-            except tomllib.TOMLDecodeError as error:
-                raise SettingsError([f"settings file {path} is no TOML: {error}"]) from error
-            table = dict(document.get("settings", {}))
-            if not table and document:
-                raise SettingsError([f"settings file {path} has no [settings] table; it has {', '.join(document)}"])
+        table = read_table(path)
         table.update(overrides)
         return cls.from_mapping(table)
+
+
+def read_table(path: str | None) -> dict[str, Any]:
+    """The `[settings]` table of a TOML file, as it stands there; empty for None.
+
+    Raises
+    ------
+    SettingsError
+        The file cannot be read or parsed, or has no such table.
+    """
+    if path is None:
+        return {}
+    try:
+        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError([f"settings file {path} cannot be read: {error.strerror or error}"]) from error
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError([f"settings file {path} is no TOML: {error}"]) from error
+    table = dict(document.get("settings", {}))
+    if not table and document:
+        raise SettingsError([f"settings file {path} has no [settings] table; it has {', '.join(document)}"])
+    return table

@@ -105,6 +105,12 @@ class KMeansSettings(NormalClusteringSettings, PlaneRefinementSettings):
         minimum=0.0,
         maximum=45.0,
     )
+    least_plane_share: float = parameter(
+        0.1,
+        "An unrefined cluster with a smaller share of the points is no roof plane.",
+        minimum=0.0,
+        maximum=0.5,
+    )
     flat_below_deg: float = parameter(
         3.0, "The model of one plane is level below this slope, pent above.", unit="deg", minimum=0.0, maximum=45.0
     )
@@ -348,6 +354,8 @@ def planes_of(top: BuildingTop, settings: KMeansSettings) -> tuple[FloatArray, L
     if settings.refine:
         return _refined_planes(top, clusters, settings)
     labels = labels_around(top.points, top.tin.facets, clusters)
+    shares = np.bincount(labels[labels >= 0], minlength=int(labels.max()) + 1) / len(labels)
+    labels = np.where((labels >= 0) & (shares[labels] < settings.least_plane_share), -1, labels).astype(np.int32)
     planes, labels = _best_fit_planes(top.points, labels)
     if len(planes) == 2 and _angle_deg(planes[0], planes[1]) < settings.one_plane_deg:
         # one plane on which the clusters told only noise apart
@@ -398,28 +406,10 @@ def model_of(
     BuildingError
         With `model: always`: reason ``no_partition`` where the planes make none.
     """
-    margin_m = settings.margin_spacings * top.spacing_m
+    if not 1 <= len(planes) <= 2:
+        return None
     try:
-        if len(planes) == 1:
-            model = fit_box(
-                top.points[labels == 0],
-                planes[0],
-                ground_z_m,
-                flat_below_deg=settings.flat_below_deg,
-                margin_m=margin_m,
-            )
-        elif len(planes) == 2:
-            fit = fit_gable(
-                top.points,
-                labels,
-                (planes[0], planes[1]),
-                ground_z_m,
-                least_side_share=settings.least_side_share,
-                margin_m=margin_m,
-            )
-            model = fit.model
-        else:
-            return None
+        model = _box_or_gable(top, planes, labels, ground_z_m, settings)
     except BuildingError:
         if settings.model == "always":
             raise
@@ -427,6 +417,32 @@ def model_of(
     if settings.model == "always" or _explains(model, top, settings):
         return model
     return None
+
+
+def _box_or_gable(
+    top: BuildingTop, planes: tuple[Plane, ...], labels: LabelArray, ground_z_m: float, settings: KMeansSettings
+) -> BuildingPrimitive:
+    """The model of one plane or of two."""
+    margin_m = settings.margin_spacings * top.spacing_m
+    if len(planes) == 1:
+        return fit_box(
+            top.points[labels == 0], planes[0], ground_z_m, flat_below_deg=settings.flat_below_deg, margin_m=margin_m
+        )
+    fit = fit_gable(
+        top.points,
+        labels,
+        (planes[0], planes[1]),
+        ground_z_m,
+        least_side_share=settings.least_side_share,
+        margin_m=margin_m,
+    )
+    if fit.is_valley:
+        raise BuildingError(
+            Reason.NO_PARTITION,
+            f"the two planes rise from the line in which they meet, {fit.model.top_z_m:.2f} m, to "
+            f"{max(fit.eave_z_m):.2f} m: no ridge",
+        )
+    return fit.model
 
 
 def sides_of(model: BuildingPrimitive, points: FloatArray, distance_m: float) -> LabelArray:
@@ -445,8 +461,6 @@ def sides_of(model: BuildingPrimitive, points: FloatArray, distance_m: float) ->
 
 def _explains(model: BuildingPrimitive, top: BuildingTop, settings: KMeansSettings) -> bool:
     """Whether a model is near the roof points, and has them near everywhere."""
-    if model.eave_z_m > model.top_z_m:
-        return False
     if float(np.mean(sides_of(model, top.points, top.distance_m) >= 0)) < settings.fitting_share:
         return False
     corners = np.array(model.corners[-4:])

@@ -39,6 +39,14 @@ _VOTING_PASSES = 4
 class ParameterSpaceSettings(RegionGrowingSettings, RoofTreeSettings):
     """What both methods share."""
 
+    tin_spacing_m: float = parameter(
+        1.0,
+        "The TIN takes one roof point a square of this size, since noise tilts the facets of a dense cloud most; "
+        "0 takes all.",
+        unit="m",
+        minimum=0.0,
+        maximum=10.0,
+    )
     surroundings_m: float = parameter(
         5.0, "Terrain takes part up to this distance from the roof's points.", unit="m", minimum=0.0, maximum=1000.0
     )
@@ -94,6 +102,7 @@ class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
     def faithful(cls) -> ParameterSpace2dSettings:
         """The paper's words: terrain is clustered too, at least 11 facets, points by membership, its own tree."""
         return cls(
+            tin_spacing_m=0.0,
             ground_clusters="keep",
             least_slope_deg=7.0,
             least_members=11,
@@ -110,6 +119,7 @@ class ParameterSpace3dSettings(ParameterSpaceSettings, ParameterBoxSettings, Clu
     def faithful(cls) -> ParameterSpace3dSettings:
         """The paper's words: terrain is clustered too, at least 11 facets, points by membership, its own tree."""
         return cls(
+            tin_spacing_m=0.0,
             ground_clusters="keep",
             dense_box_facets=5,
             least_members=11,
@@ -119,7 +129,7 @@ class ParameterSpace3dSettings(ParameterSpaceSettings, ParameterBoxSettings, Clu
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Facets:
+class BuildingFacets:
     """The TIN of a building with its surroundings, and the parameters of its facets."""
 
     roof: FloatArray
@@ -130,10 +140,10 @@ class _Facets:
     """(3,) that origin."""
     spacing_m: float
     """Mean point spacing of the roof."""
+    tin_spacing_m: float
+    """That of the TIN's vertices on it."""
     vertices: FloatArray
     """(v, 3) float64, roof points and terrain samples about their barycentre."""
-    vertex_point: LabelArray
-    """(v,) int32, roof point at every vertex, -1 for terrain."""
     vertex_of_point: LabelArray
     """(n,) int32, the vertex that stands for each roof point."""
     tin: Tin
@@ -164,20 +174,8 @@ def segment_2d(candidate: Candidate, settings: ParameterSpace2dSettings) -> Segm
     BuildingError
         Reason ``too_few_points`` where hardly any are visible; ``too_complex`` beyond a limit of work.
     """
-    facets = _facets_of(candidate, settings)
-    taken = _facets_to_cluster(facets, settings)
-
-    # 3.2: single linkage in slope and orientation; the distance shrinks while one cluster holds most of all facets.
-    labels = np.full(len(facets.tin), -1, np.int32)
-    if len(taken):
-        slopes, orientations, _ = facets.parameters[taken].T
-        labels[taken] = cluster_by_linkage(slopes, orientations, settings).labels
-    centres = cluster_means(facets.parameters, labels, int(labels.max(initial=-1)) + 1)
-
-    # 3.3: clusters with a plausible slope are faces; their arrangement is the type.
-    kept = plausible_slopes(centres, settings.least_slope_deg, settings.most_slope_deg)
-    kept &= _not_terrain(facets, labels, len(centres), settings)
-    labels, centres = _kept_clusters(labels, centres, kept)
+    facets = facets_of(candidate, settings)
+    labels, centres = roof_clusters_2d(facets, settings)
     return _primitive(candidate, facets, labels, centres, classify_2d(centres, settings).roof_type, settings)
 
 
@@ -201,23 +199,59 @@ def segment_3d(candidate: Candidate, settings: ParameterSpace3dSettings) -> Segm
     BuildingError
         Reason ``too_few_points`` where hardly any are visible; ``too_complex`` beyond a limit of work.
     """
-    facets = _facets_of(candidate, settings)
+    facets = facets_of(candidate, settings)
+    labels, centres = roof_clusters_3d(facets, settings)
+    return _primitive(candidate, facets, labels, centres, classify_3d(centres, settings).roof_type, settings)
+
+
+def roof_clusters_2d(facets: BuildingFacets, settings: ParameterSpace2dSettings) -> tuple[LabelArray, FloatArray]:
+    """Clusters of facets in slope and orientation that may be roof (sections 3.1 to 3.3).
+
+    Returns
+    -------
+    labels : (m,) int32
+        Cluster of every facet, -1 for none.
+    centres : (k, 3) float64
+        Mean slope, orientation and O-distance of the clusters.
+    """
+    taken = _facets_to_cluster(facets, settings)
+
+    # 3.2: single linkage in slope and orientation; the distance shrinks while one cluster holds most of all facets.
+    labels = np.full(len(facets.tin), -1, np.int32)
+    if len(taken):
+        slopes, orientations, _ = facets.parameters[taken].T
+        labels[taken] = cluster_by_linkage(slopes, orientations, settings).labels
+    centres = cluster_means(facets.parameters, labels, int(labels.max(initial=-1)) + 1)
+
+    # 3.3: clusters with a plausible slope are faces.
+    kept = plausible_slopes(centres, settings.least_slope_deg, settings.most_slope_deg)
+    return _kept_clusters(labels, centres, kept & _not_terrain(facets, labels, len(centres), settings))
+
+
+def roof_clusters_3d(facets: BuildingFacets, settings: ParameterSpace3dSettings) -> tuple[LabelArray, FloatArray]:
+    """Clusters of facets in all three parameters that may be roof (sections 4.1 and 4.2); as `roof_clusters_2d`."""
     taken = _facets_to_cluster(facets, settings)
 
     # 4.1: coarse clusters of dense boxes, then weighted centres and membership.
     parameters = facets.parameters[taken]
-    refined = refine_clusters(parameters, coarse_clusters(parameters, settings), facets.spacing_m, settings)
+    refined = refine_clusters(parameters, coarse_clusters(parameters, settings), facets.tin_spacing_m, settings)
     labels = np.full(len(facets.tin), -1, np.int32)
     labels[taken] = refined.labels
 
-    # 4.2: ground and walls are eliminated; the arrangement of the others is the type.
-    kept = may_be_roof(refined.centres, settings) & _not_terrain(facets, labels, len(refined.centres), settings)
-    labels, centres = _kept_clusters(labels, refined.centres, kept)
-    return _primitive(candidate, facets, labels, centres, classify_3d(centres, settings).roof_type, settings)
+    # 4.2: ground and walls are eliminated.
+    kept = may_be_roof(refined.centres, settings)
+    kept &= _not_terrain(facets, labels, len(refined.centres), settings)
+    return _kept_clusters(labels, refined.centres, kept)
 
 
-def _facets_of(candidate: Candidate, settings: ParameterSpaceSettings) -> _Facets:
-    """Section 2: the Delaunay TIN of the building with some surrounding ground, about its barycentre."""
+def facets_of(candidate: Candidate, settings: ParameterSpaceSettings) -> BuildingFacets:
+    """Section 2: the Delaunay TIN of the building with some surrounding ground, about its barycentre.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_few_points`` where hardly any are visible; ``too_complex`` where they extend too far.
+    """
     points, shift = local_metres(candidate.points)
     visible = np.flatnonzero(top_visible(points)).astype(np.int32)
     roof = points[visible]
@@ -229,35 +263,57 @@ def _facets_of(candidate: Candidate, settings: ParameterSpaceSettings) -> _Facet
     spacing_m = max(point_spacing_m(roof), 1e-3)
     gap_m = max(settings.ground_gap_spacings * spacing_m, 1e-3)
     ground = ground_around(candidate.ground, shift, roof, gap_m, settings.surroundings_m)
-    cloud = np.concatenate([roof, ground])
+    thinned, thinned_of_point = _one_a_square(roof, settings.tin_spacing_m)
+    cloud = np.concatenate([roof[thinned], ground])
     check_extent(cloud)
     millimetres = np.rint(cloud * 1000.0).astype(np.int64)
     kept, kept_of_point = unique_xy(millimetres[:, :2], millimetres[:, 2])
     tin = triangulate(millimetres[kept, :2])
     vertices, _ = about_barycentre(cloud[kept])
-    vertex_point = np.where(kept < len(roof), kept, -1).astype(np.int32)
-    return _Facets(
+    is_roof_vertex = kept < len(thinned)
+    return BuildingFacets(
         roof=roof,
         visible=visible,
         shift=shift,
         spacing_m=spacing_m,
+        tin_spacing_m=max(spacing_m, settings.tin_spacing_m),
         vertices=vertices,
-        vertex_point=vertex_point,
-        vertex_of_point=kept_of_point[: len(roof)],
+        vertex_of_point=kept_of_point[: len(thinned)][thinned_of_point],
         tin=tin,
         parameters=facet_parameters(vertices, tin.facets),
-        is_roof=np.asarray((vertex_point >= 0)[tin.facets].all(axis=1)),
+        is_roof=np.asarray(is_roof_vertex[tin.facets].all(axis=1)),
     )
 
 
-def _facets_to_cluster(facets: _Facets, settings: ParameterSpaceSettings) -> LabelArray:
+def _one_a_square(roof: FloatArray, size_m: float) -> tuple[LabelArray, LabelArray]:
+    """Indices of the points nearest to the middle of each square, ascending, and which of them stands for each point.
+
+    Of equally near ones the lower index; all points where the size is 0.
+    """
+    every = np.arange(len(roof), dtype=np.int32)
+    if size_m <= 0.0:
+        return every, every
+    squares = np.floor(roof[:, :2] / size_m)
+    away = ((roof[:, :2] - (squares + 0.5) * size_m) ** 2).sum(axis=1)
+    _, square = np.unique(squares, axis=0, return_inverse=True)
+    order = np.lexsort((away, square.ravel()))
+    first = np.ones(len(roof), np.bool_)
+    first[1:] = np.diff(square.ravel()[order]) > 0
+    chosen = order[first]
+    kept = np.sort(chosen).astype(np.int32)
+    return kept, np.searchsorted(kept, chosen).astype(np.int32)[square.ravel()]
+
+
+def _facets_to_cluster(facets: BuildingFacets, settings: ParameterSpaceSettings) -> LabelArray:
     """Indices of the facets whose parameters are clustered."""
     if settings.ground_clusters == "leave_out":
         return np.flatnonzero(facets.is_roof).astype(np.int32)
     return np.arange(len(facets.tin), dtype=np.int32)
 
 
-def _not_terrain(facets: _Facets, labels: LabelArray, n_clusters: int, settings: ParameterSpaceSettings) -> BoolArray:
+def _not_terrain(
+    facets: BuildingFacets, labels: LabelArray, n_clusters: int, settings: ParameterSpaceSettings
+) -> BoolArray:
     """Clusters that are not mostly facets of terrain and walls: (k,) bool; all where they are to be kept."""
     if settings.ground_clusters == "keep":
         return np.ones(n_clusters, np.bool_)
@@ -274,7 +330,7 @@ def _kept_clusters(labels: LabelArray, centres: FloatArray, kept: BoolArray) -> 
 
 def _primitive(
     candidate: Candidate,
-    facets: _Facets,
+    facets: BuildingFacets,
     labels: LabelArray,
     centres: FloatArray,
     roof_type: RoofType,
@@ -282,8 +338,9 @@ def _primitive(
 ) -> Segmentation:
     """Section 5, Figure 5-1: planes interpolated in the groups of points; the faces are closed by walls later."""
     areas_m2 = facet_areas_m2(facets.vertices, facets.tin.facets)
-    no_facet = np.full(len(facets.roof), -1, np.int32)
-    groups = labels_of_points(facets.tin.facets, labels, areas_m2, facets.vertex_point, no_facet)
+    every = np.arange(len(facets.vertices), dtype=np.int32)
+    of_vertices = labels_of_points(facets.tin.facets, labels, areas_m2, every, np.full_like(every, -1))
+    groups = of_vertices[facets.vertex_of_point]
     if settings.point_groups == "region_growing":
         planes, groups = _grown(facets, groups, centres, settings)
     else:
@@ -311,7 +368,7 @@ def _interpolated(
 
 
 def _grown(
-    facets: _Facets, groups: LabelArray, centres: FloatArray, settings: ParameterSpaceSettings
+    facets: BuildingFacets, groups: LabelArray, centres: FloatArray, settings: ParameterSpaceSettings
 ) -> tuple[FloatArray, LabelArray]:
     """Regions grown from the clusters' means; points between two of them go to the nearer plane."""
     roof = facets.roof

@@ -116,7 +116,7 @@ def comparison_facts(request: CompareRequest, summary: CompareSummary) -> dict[s
                 "method": variant.method,
                 "preset": variant.preset,
                 "run_dir": str(Path(run.run_dir).relative_to(summary.out)),
-                "settings_hash": settings_of(request.run.settings, variant).settings_hash,
+                "settings_hash": settings_of(request.run.settings, variant, request.tables).settings_hash,
                 "content_sha256": run.digest,
                 "statuses": run.statuses,
                 "reasons": run.reasons,

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from pipeline.evaluation.chapters import NOTHING
+from pipeline.evaluation.counts import OUTCOMES
 from pipeline.evaluation.markdown import markdown_cell, markdown_table
 from pipeline.evaluation.writing import INTERVALS, all_notes
 from pipeline.model import RoofType, Status
@@ -138,19 +140,19 @@ def _notes(comparison: Comparison) -> list[str]:
 
 def _stacks(comparison: Comparison) -> list[dict[str, Any]]:
     """Bars of statuses, and of outcomes where they were judged: title, and a row a run of (name, count, share)."""
-    stacks = []
-    statuses = [(status.value, _counts(comparison, lambda r, s=status: r.status is s)) for status in Status]
-    stacks.append(_stack("Candidates", statuses, comparison))
-    outcomes = [
-        (name, _counts(comparison, lambda r, n=name: r.outcome == n)) for name in ("correct", "passable", "false")
-    ]
+    stacks = [_stack("Candidates", _counts(comparison, list(Status), lambda record: record.status), comparison)]
+    outcomes = _counts(comparison, OUTCOMES, lambda record: record.outcome)
     if any(sum(counts) for _, counts in outcomes):
         stacks.append(_stack("Against the truth, of the candidates with a true building", outcomes, comparison))
     return stacks
 
 
-def _counts(comparison: Comparison, holds: Any) -> list[int]:
-    return [sum(holds(one.records[i]) for one in comparison.buildings) for i in range(len(comparison.runs))]
+def _counts(
+    comparison: Comparison, names: Sequence[str], of: Callable[[Record], str | None]
+) -> list[tuple[str, list[int]]]:
+    """How many records of each run are what, a name a row."""
+    found = [Counter(of(one.records[i]) for one in comparison.buildings) for i in range(len(comparison.runs))]
+    return [(str(name), [counts[name] for counts in found]) for name in names]
 
 
 def _stack(title: str, parts: Sequence[tuple[str, Sequence[int]]], comparison: Comparison) -> dict[str, Any]:
@@ -216,7 +218,7 @@ def _figures(record: Record) -> list[tuple[str, str]]:
     if found is not None:
         told.append(("faces found", f"{found} of {record.truth.get('faces_to_find')}"))
         told.append(("wrong faces", f"{record.truth.get('faces_wrong') or 0}"))
-    if record.truth.get("iou") is not None:
+    if record.truth.get("iou") and record.status is not Status.FAILED:
         told.append(("footprint IoU", f"{record.truth['iou']:.2f}"))
     return told
 

@@ -33,7 +33,7 @@ PLAN_POINTS, VIEW_POINTS = 8_000, 2_500
 BLOCK_COLOUR = "#b9bcc0"
 """Roofs of blocks, which are hatched too."""
 LOW_COLOUR = "#9aa0a6"
-HEIGHT_COLOURS = ("#5b02a3", "#9a179b", "#cb4678", "#eb7852", "#fbb32f", "#f0f921")
+HEIGHT_COLOURS = ("#8707a6", "#b12a90", "#d5546e", "#f0804e", "#fdb42f", "#f0f921")
 """Of points in plan, from low to high: matplotlib's plasma without its darkest, so that a dark page shows them all."""
 _HATCH = "//"
 _GOOD = 2

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from pipeline.errors import RunError, SettingsError
-from pipeline.methods import PRESETS, ReconstructSettings, method_named
+from pipeline.methods import METHODS, PRESETS, method_named
+from pipeline.parameters import build
 from pipeline.runtime.events import Listener, ignore, never
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.manifest import NAME as MANIFEST
@@ -92,10 +95,12 @@ class CompareRequest:
     """What is to be compared."""
 
     run: RunRequest
-    """Inputs and how to run; its `out` is the comparison's folder. Of its settings all that finds candidates counts,
-    roof and roof type, and the own table of the method that they name, for the variant of that method and preset."""
+    """Inputs and how to run; its `out` is the comparison's folder. Of its settings all counts but what is the method's
+    own."""
     variants: tuple[Variant, ...]
     """At least two, each once."""
+    tables: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    """What differs from a method's presets, by the method's name: counts for all its variants."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -140,7 +145,7 @@ def compare(
     out = _checked(request.run)
     variants = [
         RunVariant(
-            settings=settings_of(request.run.settings, variant),
+            settings=settings_of(request.run.settings, variant, request.tables),
             out=str(out / RUNS / variant.label),
             label=variant.label,
         )
@@ -159,21 +164,46 @@ def compare(
     )
 
 
-def settings_of(settings: RunSettings, variant: Variant) -> RunSettings:
-    """A run's settings with another method in the place of theirs.
+def settings_of(
+    settings: RunSettings, variant: Variant, tables: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
+) -> RunSettings:
+    """A run's settings with a variant's method in the place of theirs.
 
     Parameters
     ----------
     settings : RunSettings
-        Where they are of this very method and preset, they stay as they are.
+        All but the method's own count.
     variant : Variant
         The method and its preset.
+    tables : mapping
+        What differs from the presets, by the method's name.
+
+    Raises
+    ------
+    SettingsError
+        Values out of range, all at once.
     """
-    if (settings.general.method, settings.general.preset) == (variant.method, variant.preset):
-        return settings
+    entry = method_named(variant.method)
+    faults: list[str] = []
+    values = tables.get(variant.method, {})
+    own = build(entry.settings_type, variant.method, values, faults, entry.preset(variant.preset))
+    if faults:
+        raise SettingsError(faults)
     general = dataclasses.replace(settings.general, method=variant.method, preset=variant.preset)
-    building = ReconstructSettings(roof=settings.building.roof, roof_type=settings.building.roof_type)
-    return RunSettings(general=general, scene=settings.scene, building=building)
+    return RunSettings(
+        general=general, scene=settings.scene, building=dataclasses.replace(settings.building, method=own)
+    )
+
+
+def own_tables(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """The methods' own tables among those of a settings file.
+
+    Examples
+    --------
+    >>> own_tables({"classes": "trust", "roof": {"minimum_points": 9}, "kmeans": {"clusters": 3}})
+    {'kmeans': {'clusters': 3}}
+    """
+    return {name: table[name] for name in METHODS if name in table}
 
 
 def _checked(request: RunRequest) -> Path:

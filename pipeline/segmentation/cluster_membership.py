@@ -62,7 +62,7 @@ class ClusterMembershipSettings(Parameters):
         76.0, "Clusters with more slope are walls.", unit="deg", minimum=1.0, maximum=90.0
     )
     weight_sample: int = parameter(
-        2000, "Most facets of a cluster that weights are counted against.", unit="facets", minimum=10, maximum=100_000
+        500, "Most facets of a cluster that weights are counted against.", unit="facets", minimum=10, maximum=100_000
     )
     membership_work_limit: int = parameter(
         500_000_000, "Comparisons of facets with facets and centres after which a building is too complex.",

@@ -406,4 +406,4 @@ def _sine_in_plan(xyz: FloatArray, facets: LabelArray, t: int, k: int) -> float:
     uy = xyz[q, 1] - xyz[p, 1]
     vx = xyz[r, 0] - xyz[p, 0]
     vy = xyz[r, 1] - xyz[p, 1]
-    return abs(ux * vy - uy * vx) / math.sqrt((ux * ux + uy * uy) * (vx * vx + vy * vy))
+    return float(abs(ux * vy - uy * vx) / math.sqrt((ux * ux + uy * uy) * (vx * vx + vy * vy)))

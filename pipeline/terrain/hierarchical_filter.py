@@ -27,8 +27,8 @@ _CLUMP_MATES = 3
 _WHOLE_SHARE = 2 / 3
 """A cell of seeds whose points extend over less of its side than this is cut by the data's edge."""
 
-_CUT_SLOPE = 0.1
-"""Rise over run that a seed in a cut cell may have to any point around."""
+_WALL_CELLS = 2
+"""Cells over which a wall's step is taken."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,34 +139,47 @@ def _lowest_of_cells(lowest: Elevations, size: int, column0: int, row0: int) -> 
 
 
 @njit(cache=True, nogil=True)
-def _without_cut_off(lowest: Elevations, seeds: BoolArray, size: int, corner: tuple[int, int], step_mm: float) -> None:
-    """Clear seeds whose cells the data's edge cuts, so that a roof may fill what is left of them.
+def _is_cut(lowest: Elevations, r: int, c: int, size: int, corner: tuple[int, int]) -> bool:
+    """Whether the data of the cell of seeds that holds (r, c) extend over less than _WHOLE_SHARE of a side."""
+    rows, columns = lowest.shape
+    r0, c0 = r - (corner[1] + r) % size, c - (corner[0] + c) % size
+    low_r, high_r, low_c, high_c = r, r, c, c
+    for k in range(max(r0, 0), min(r0 + size, rows)):
+        for m in range(max(c0, 0), min(c0 + size, columns)):
+            if lowest[k, m] != NO_DATA:
+                low_r, high_r = min(low_r, k), max(high_r, k)
+                low_c, high_c = min(low_c, m), max(high_c, m)
+    return min(high_r - low_r, high_c - low_c) + 1 < _WHOLE_SHARE * size
 
-    Such a seed is kept only where nothing within one cell of seeds lies more than step_mm, and _CUT_SLOPE of the
-    distance, below it.
+
+@njit(cache=True, nogil=True)
+def _stands_on_a_wall(lowest: Elevations, r: int, c: int, reach: int, step_mm: float) -> bool:
+    """Whether within reach something at the level of (r, c) ends in a step down of more than step_mm."""
+    rows, columns = lowest.shape
+    near = reach - _WALL_CELLS
+    for k in range(max(r - near, 0), min(r + near + 1, rows)):
+        for m in range(max(c - near, 0), min(c + near + 1, columns)):
+            z = float(lowest[k, m])
+            if lowest[k, m] == NO_DATA or abs(z - lowest[r, c]) > step_mm:
+                continue
+            for kk in range(max(k - _WALL_CELLS, 0), min(k + _WALL_CELLS + 1, rows)):
+                for mm in range(max(m - _WALL_CELLS, 0), min(m + _WALL_CELLS + 1, columns)):
+                    if z - lowest[kk, mm] > step_mm:
+                        return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _without_cut_off(lowest: Elevations, seeds: BoolArray, size: int, corner: tuple[int, int], step_mm: float) -> None:
+    """Clear seeds on walls whose cells the data's edge cuts: what is left of such a cell may be all roof.
+
+    A wall is a step down of more than step_mm, at the seed's level, within one cell of seeds.
     """
     rows, columns = lowest.shape
     for r in range(rows):
         for c in range(columns):
-            if not seeds[r, c]:
-                continue
-            r0 = r - (corner[1] + r) % size
-            c0 = c - (corner[0] + c) % size
-            low_r, high_r, low_c, high_c = r, r, c, c
-            for k in range(max(r0, 0), min(r0 + size, rows)):
-                for m in range(max(c0, 0), min(c0 + size, columns)):
-                    if lowest[k, m] != NO_DATA:
-                        low_r, high_r = min(low_r, k), max(high_r, k)
-                        low_c, high_c = min(low_c, m), max(high_c, m)
-            if min(high_r - low_r, high_c - low_c) + 1 >= _WHOLE_SHARE * size:
-                continue
-            for k in range(max(r - size + 1, 0), min(r + size, rows)):
-                for m in range(max(c - size + 1, 0), min(c + size, columns)):
-                    if lowest[k, m] == NO_DATA:
-                        continue
-                    far = math.sqrt((k - r) * (k - r) + (m - c) * (m - c))
-                    if lowest[r, c] - float(lowest[k, m]) > step_mm + _CUT_SLOPE * CELL_MM * far:
-                        seeds[r, c] = False
+            if seeds[r, c] and _is_cut(lowest, r, c, size, corner):
+                seeds[r, c] = not _stands_on_a_wall(lowest, r, c, size - 1, step_mm)
 
 
 @njit(cache=True, nogil=True)

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from pipeline import __version__
 from pipeline.errors import RunCancelledError
-from pipeline.runtime.compare import CompareRequest, CompareSummary, parse_variants
+from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.events import Event, Listener
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.run import RunRequest, RunSummary, run
@@ -253,18 +253,16 @@ def compare_request(
 ) -> CompareRequest:
     """A job's request as a comparison's.
 
-    A method's own table in the settings is for the one variant of that method.
-
     Raises
     ------
     SettingsError
         Settings are out of range, or a method is not known.
     """
-    variants = parse_variants(request.methods)
-    meant = next((variant for variant in variants if variant.method in request.settings), variants[0])
-    chosen = {**request.settings, "method": meant.method, "preset": meant.preset}
-    one = dataclasses.replace(request, settings=chosen)
-    return CompareRequest(run=run_request(one, tiles, outlines, out, settings), variants=variants)
+    return CompareRequest(
+        run=run_request(request, tiles, outlines, out, settings),
+        variants=parse_variants(request.methods),
+        tables=own_tables(request.settings),
+    )
 
 
 def _check(held: HeldJob) -> None:

@@ -55,7 +55,11 @@ def draft_compare(given: Mapping[str, Any], outputs: Sequence[str] | None, setti
     for name in ("method", "preset"):
         if name in chosen:
             inputs.faults.append(f"settings.{name} is {shortened(chosen[name])}: name what is compared in methods")
-    _check_tables(inputs, chosen, methods, known)
+    for name in known.methods:
+        if name in chosen and methods and not any(word.partition(":")[0] == name for word in methods):
+            inputs.faults.append(
+                f"settings has the table {name}, which is not compared: leave it out, or compare {name}"
+            )
     values = {"settings": chosen, "methods": methods, "process_id": "compare"}
     return _draft(inputs, outputs, settings, COMPARISON_OUTPUTS, values)
 
@@ -91,21 +95,6 @@ def _methods(inputs: Inputs, known: catalogue.Catalogue) -> tuple[str, ...]:
     elif not 2 <= len(found) <= MOST_METHODS:
         inputs.faults.append(f"methods holds {len(found)}: give 2 to {MOST_METHODS}")
     return found
-
-
-def _check_tables(
-    inputs: Inputs, chosen: Mapping[str, Any], methods: Sequence[str], known: catalogue.Catalogue
-) -> None:
-    """A method's own table counts for one run: that it means exactly one must be clear."""
-    tables = [name for name in known.methods if name in chosen]
-    if len(tables) > 1:
-        inputs.faults.append(f"settings has the tables {', '.join(tables)}: a comparison takes one method's own table")
-        return
-    for table in tables:
-        runs = [word for word in methods if word.partition(":")[0] == table]
-        if methods and len(runs) != 1:
-            why = f"it can count for one only, and {' and '.join(runs)} are compared" if runs else "methods has it not"
-            inputs.faults.append(f"settings has the table {table}: {why}; leave it out")
 
 
 def _draft(

@@ -82,4 +82,4 @@ def test_the_barycentre_is_the_same_in_every_order_of_points() -> None:
 def test_the_mean_orientation_of_a_cluster_across_north_is_near_north() -> None:
     parameters = np.array([[30.0, 350, 1], [32, 20, 2], [10, 100, 5], [11, 101, 7]])
     means = cluster_means(parameters, np.array([0, 0, 1, -1], np.int32), 3)
-    np.testing.assert_allclose(means, [[31, 5, 1.5], [10, 100, 5], [0, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(means, np.array([[31.0, 5, 1.5], [10, 100, 5], [0, 0, 0]]), atol=1e-9)

@@ -114,10 +114,12 @@ def test_a_noisy_gable_becomes_the_model_of_ten_vertices(settings: KMeansSetting
         assert result.roof_type is RoofType.GABLE
         assert [len(solid.vertices) for solid in result.solids] == [10]
         assert check_solid(result.solids[0]) == ()
-        assert result.rmse_m < 0.08
+        # unrefined, the clusters hold points of the other side where noise turned small facets
+        assert result.rmse_m < (0.15 if settings is FAITHFUL else 0.08)
         assert result.footprint is not None
         truth = shapely.Polygon(turn(np.array([(-7, -4), (7, -4), (7, 4), (-7, 4.0)]), 17.0))
-        assert result.footprint.intersection(truth).area > 0.95 * result.footprint.union(truth).area
+        overlap = result.footprint.intersection(truth).area / result.footprint.union(truth).area
+        assert overlap > (0.9 if settings is FAITHFUL else 0.95)
 
 
 @pytest.mark.parametrize(

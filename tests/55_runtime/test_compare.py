@@ -9,7 +9,15 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import RunCancelledError, RunError, SettingsError
-from pipeline.runtime.compare import CompareRequest, CompareSummary, Variant, compare, parse_variants, settings_of
+from pipeline.runtime.compare import (
+    CompareRequest,
+    CompareSummary,
+    Variant,
+    compare,
+    own_tables,
+    parse_variants,
+    settings_of,
+)
 from pipeline.runtime.events import Event
 from pipeline.runtime.run import RunRequest, RunVariant, run, run_variants
 from pipeline.settings import RunSettings
@@ -133,12 +141,11 @@ def test_variants_that_make_no_sense_are_told(texts: list[str], told: str) -> No
         parse_variants(texts)
 
 
-def test_own_settings_of_a_method_hold_for_its_variant_alone() -> None:
-    own = RunSettings.from_mapping({"fuzzy-sart": {"vigilance": 0.8}, "roof": {"minimum_points": 12}})
-    kept, other = (settings_of(own, variant) for variant in BOTH)
-    assert kept is own
-    assert other.building.roof.minimum_points == 12
-    assert (
-        other.settings_hash
-        == RunSettings.from_mapping({"preset": "faithful", "roof": {"minimum_points": 12}}).settings_hash
-    )
+def test_a_methods_own_table_counts_for_all_its_variants() -> None:
+    table = {"fuzzy-sart": {"vigilance": 0.8}, "roof": {"minimum_points": 12}}
+    own = RunSettings.from_mapping(table)
+    for variant in BOTH:
+        chosen = settings_of(own, variant, own_tables(table))
+        assert chosen.settings_hash == RunSettings.from_mapping({"preset": variant.preset, **table}).settings_hash
+    with pytest.raises(SettingsError, match=r"\[fuzzy-sart\] vigilance is 9"):
+        settings_of(own, BOTH[0], {"fuzzy-sart": {"vigilance": 9.0}})

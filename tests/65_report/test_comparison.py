@@ -23,14 +23,14 @@ from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.models import RoofModel
 from pipeline.evaluation.reading import read_models
 from pipeline.evaluation.reference import Reference
-from pipeline.io import ReadOptions
+from pipeline.io import ReadOptions, Source, SourceInfo
 from pipeline.model import BuildingResult, Reason, RoofType, Status
-from pipeline.report import comparison_page
+from pipeline.report import comparison_page, comparison_points
 from pipeline.report.comparison import ComparedRun, PointFiles, write_comparison
 from pipeline.report.comparison_building import ComparedBuilding, Record, difference_of
 from pipeline.report.comparison_choice import CASES, DIFFERENT, Choice, chosen_buildings
 from pipeline.report.comparison_figures import seconds_text
-from pipeline.report.comparison_pictures import BLOCK_COLOUR, draw_building
+from pipeline.report.comparison_pictures import BLOCK_COLOUR, REACH_M, draw_building, place_of
 from pipeline.report.comparison_points import points_within
 from pipeline.report.render import ROOF_COLOURS
 from pipeline.report.section import RESIDUAL_CLASSES
@@ -270,17 +270,45 @@ def test_points_of_buildings_are_those_within_their_areas_each_once(tmp_path: Pa
         assert xyz == pytest.approx(same * scale, abs=1e-6)
 
 
-def test_a_file_without_a_wanted_building_is_opened_but_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "far.las"
-    import laspy
+def test_a_file_without_a_wanted_building_is_opened_but_not_read(
+    points: PointFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x, y, _ = small.ORIGIN
+    gable = shapely.box(x, y, x + 10.0, y + 8.0)
+    read = []
+    chunks = Source.chunks
+    monkeypatch.setattr(Source, "chunks", lambda source: read.append(source.info.path) or chunks(source))
+    assert [len(xyz) for xyz in points_within(points, [shapely.box(0.0, 0.0, 9.0, 9.0)])] == [0]
+    assert read == []
+    assert [len(xyz) for xyz in points_within(points, [gable])] == [20 * 16]
+    assert read == list(points.paths)
 
-    held = laspy.create(point_format=6, file_version="1.4")
-    held.x, held.y, held.z = (np.linspace(0.0, 100.0, 500) for _ in range(3))
-    held.write(path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) - 30 * 200] + b"\0" * 30 * 200)
-    far = points_within(PointFiles(paths=(str(path),)), [shapely.box(900.0, 900.0, 950.0, 950.0)])
-    assert [len(xyz) for xyz in far] == [0]
+
+def test_of_copc_a_window_a_building_is_read_and_gives_the_same_points(
+    points: PointFiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x, y, _ = small.ORIGIN
+    areas = [shapely.box(x + 40.0 * place, y, x + 40.0 * place + reach, y + 8.0) for place, reach in ((0, 10), (2, 4))]
+    wanted = points_within(points, areas)
+    windows = []
+
+    class Copc(Source):
+        """A source that says that it can be queried by windows."""
+
+        @property
+        def info(self) -> SourceInfo:
+            return dataclasses.replace(super().info, format="copc")
+
+    def opened(path: str, options: ReadOptions) -> Source:
+        if options.bbox is not None:
+            windows.append(options.bbox)
+        return Copc(Path(path), options)
+
+    monkeypatch.setattr(comparison_points, "open_source", opened)
+    found = points_within(points, areas)
+    assert [len(xyz) for xyz in found] == [320, 128]
+    assert all(np.array_equal(one, other) for one, other in zip(found, wanted, strict=True))
+    assert [(east - west, north - south) for west, south, east, north in windows] == [(12.0, 10.0), (6.0, 10.0)]
 
 
 def gable_model(runs: list[ComparedRun], place: int, name: str) -> RoofModel:
@@ -342,6 +370,24 @@ def test_points_in_a_view_have_the_colours_of_their_distances_to_that_model(runs
     assert drawn.plan is not None
     shown = np.flatnonzero((pixels(drawn.plan)[:, :, 3] > 0.5).any(axis=0))
     assert np.ptp(shown) / (drawn.width_px * drawn.scale_share / drawn.scale_m) == pytest.approx(10.0, abs=0.7)
+
+
+def test_points_are_those_of_half_the_runs_so_that_one_that_spreads_brings_no_neighbours_in(
+    runs: list[ComparedRun],
+) -> None:
+    model = gable_model(runs, 0, "agreed")
+    wide = dataclasses.replace(model, footprint=model.footprint.buffer(10.0), surfaces=())
+    missing = dataclasses.replace(model, footprint=shapely.Polygon(), surfaces=())
+    own = model.footprint.buffer(REACH_M, join_style="mitre")
+
+    def area(*models: RoofModel, truth: RoofModel | None = None) -> float:
+        return float(place_of(models, truth).area)
+
+    assert area(model, wide, model) == area(model, missing, missing) == pytest.approx(own.area)
+    assert area(model, wide) == pytest.approx(wide.footprint.buffer(REACH_M, join_style="mitre").area)
+    assert area(model, missing, truth=wide) == pytest.approx(own.area)  # an outline without roofs adds nothing
+    assert area(missing, truth=model) == pytest.approx(own.area)
+    assert place_of([missing], None).is_empty
 
 
 def test_a_block_is_grey_and_hatched_and_never_looks_like_a_model(runs: list[ComparedRun]) -> None:

@@ -114,7 +114,7 @@ def test_jobs_are_listed_by_their_process(local_service) -> None:
         ({"methods": TWO, "method": "fuzzy-sart"}, '"method" is no input'),
         ({"methods": TWO, "settings": {"preset": "faithful"}}, "settings.preset"),
         ({"methods": TWO, "settings": {"method": "fuzzy-sart"}}, "settings.method"),
-        ({"methods": TWO, "settings": {"fuzzy-sart": {}}}, "it can count for one only"),
+        ({"methods": TWO, "settings": {"kmeans": {}}}, "settings has the table kmeans, which is not compared"),
         ({"methods": TWO, "classes": "audit", "settings": {"classes": "trust"}}, "classes is audit"),
     ],
 )
@@ -217,20 +217,21 @@ def request_of(tmp_path: Path, *methods: str, **settings: Any) -> compare.Compar
     return compare_request(asked, [], None, tmp_path / "out", ServiceSettings(state=tmp_path))
 
 
-def test_shared_settings_count_for_all_methods_and_a_methods_own_table_for_its_run(tmp_path: Path) -> None:
-    request = request_of(tmp_path, *TWO, candidates={"min_area_m2": 17.0})
-    for variant in request.variants:
-        settings = compare.settings_of(request.run.settings, variant)
-        assert settings.scene.candidates.min_area_m2 == 17.0
-        assert settings.building.method == METHODS[variant.method].preset(variant.preset)
+def test_shared_settings_count_for_all_methods_and_a_methods_own_table_for_its_variants(tmp_path: Path) -> None:
     entry = METHODS["fuzzy-sart"]
     robust, faithful = (dataclasses.asdict(entry.preset(preset)) for preset in ("robust", "faithful"))
     name = next(name for name in robust if robust[name] != faithful[name])
-    other = next(method for method in METHODS if method != "fuzzy-sart")
-    request = request_of(tmp_path, other, TWO[1], **{"fuzzy-sart": {name: robust[name]}})
-    alone, meant = (compare.settings_of(request.run.settings, variant).building.method for variant in request.variants)
-    assert alone == METHODS[other].preset("robust")
-    assert dataclasses.asdict(meant) == {**faithful, name: robust[name]}
+    own = {"fuzzy-sart": {name: robust[name]}}
+    request = request_of(tmp_path, "kmeans", TWO[1], candidates={"min_area_m2": 17.0}, **own)
+    assert {variant.method for variant in request.variants} == {"kmeans", "fuzzy-sart"}
+    settings = {
+        variant: compare.settings_of(request.run.settings, variant, request.tables) for variant in request.variants
+    }
+    for variant, chosen in settings.items():
+        assert chosen.scene.candidates.min_area_m2 == 17.0
+        assert chosen.general.method == variant.method
+        wanted = dataclasses.asdict(METHODS[variant.method].preset(variant.preset))
+        assert dataclasses.asdict(chosen.building.method) == {**wanted, **own.get(variant.method, {})}
 
 
 def test_a_setting_out_of_range_is_found_before_anything_runs(tmp_path: Path) -> None:

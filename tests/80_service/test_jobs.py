@@ -138,7 +138,9 @@ def test_progress_grows_with_the_stages_and_within_them(steps: list[tuple[str, i
 
 def test_the_stages_make_up_the_whole_job() -> None:
     assert sum(WEIGHTS.values()) == 100
-    assert set(WORDS) == set(WEIGHTS)
+    # what a comparison does besides is short: progress stands still meanwhile
+    assert set(WORDS) - set(WEIGHTS) == {"records", "points", "pictures", "page"}
+    assert set(WEIGHTS) <= set(WORDS)
     assert percent("inputs", 0, 0) == 0
     assert percent("outputs", 5, 5) == 99
     assert percent("unheard of", 5, 5) == 0
