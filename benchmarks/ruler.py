@@ -60,7 +60,7 @@ def suites(split: str) -> Iterator[Entry]:
     """The suites, the largest first."""
     yield Entry(name="city", scene=SimulatedScene(suite="city", seed=seed_of(split, 0)))
     yield from sweep_entries(split)
-    yield from hofmann_entries(split, 1)
+    yield from (dataclasses.replace(entry, has_page=True) for entry in hofmann_entries(split, 1))
     for draw in range(CUBES):
         scene = SimulatedScene(suite="cube", seed=seed_of(split, draw))
         yield Entry(name=f"cube-{draw:02d}", scene=scene, has_page=False)

@@ -1,4 +1,6 @@
-"""Zeng's gable, step by step, on one building of a tile: `python -m benchmarks.zeng_gable TILE --out steps.png [--crs EPSG:n]`.
+"""Zeng's gable, step by step, on one building of a tile.
+
+    python -m benchmarks.zeng_gable TILE --out steps.png [--crs EPSG:n]
 
 The candidates of the tile are found as a run finds them. The building is picked by a rule, not by hand: of those that
 `kmeans` with its default settings calls a gable, with `--least-area` to `--most-area` m2 of footprint, a compact model
@@ -21,7 +23,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from pipeline.geometry import vertical_residuals_m
@@ -32,7 +33,8 @@ from pipeline.methods.kmeans import BuildingTop, KMeansSettings, building_top, p
 from pipeline.methods.local_frame import local_metres
 from pipeline.model import BuildingResult, Candidate, FloatArray, LabelArray, Plane, RoofType, Status
 from pipeline.reconstruct import reconstruct_building
-from pipeline.report.perspective import View, ViewedFace, draw_view, projected
+from pipeline.report.perspective import VIEW_SUN, View, ViewedFace, draw_view, projected
+from pipeline.report.pictures import png_of
 from pipeline.roof.primitives import GableFit, fit_gable
 from pipeline.runtime.events import ignore
 from pipeline.runtime.gather import gather
@@ -45,7 +47,7 @@ from pipeline.settings import RunSettings
 
 SIDES = ("#c2552d", "#2f6f9f")
 """Colours of the two planes."""
-VIEW_ALTITUDE_DEG = 33.0
+VIEW_ALTITUDE_DEG = 38.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -156,9 +158,11 @@ def report(steps: Steps, result: BuildingResult) -> str:
 def draw(steps: Steps) -> Figure:
     """The four steps."""
     figure = Figure(figsize=(10.5, 7.6), dpi=100, facecolor="white")
-    # the eye stands beside the ridge, so that both sides are seen
+    # the eye stands beside the ridge, so that both sides are seen, and on the side from which light comes
     u, v = steps.fit.line.direction
-    view = View(azimuth_deg=(math.degrees(math.atan2(u, v)) + 35.0) % 360.0, altitude_deg=VIEW_ALTITUDE_DEG)
+    azimuth = math.degrees(math.atan2(u, v)) + 30.0
+    away = abs((azimuth - VIEW_SUN[0] + 180.0) % 360.0 - 180.0) > 90.0
+    view = View(azimuth_deg=(azimuth + 180.0 * away) % 360.0, altitude_deg=VIEW_ALTITUDE_DEG)
     titles = (
         "k-means of the normals: two sets of points",
         "least squares: planes and convex hulls",
@@ -237,7 +241,7 @@ def _draw_model(axes: Axes, steps: Steps, view: View) -> None:
         ViewedFace(rings=(v[[7, 8, 4, 1, 3]],), colour="#e8e2d2"),
         ViewedFace(rings=(v[[9, 6, 2, 0, 5]],), colour="#e8e2d2"),
     ]
-    draw_view(axes, [faces], view)
+    draw_view(axes, [faces], view, shadows=False)
     xy = projected(steps.top.points, view)
     axes.scatter(xy[:, 0], xy[:, 1], s=4.0, color="#222222", linewidths=0.0, zorder=5)
     for number, (x, y) in enumerate(projected(v, view).tolist(), start=1):
@@ -262,7 +266,7 @@ def main() -> int:
         return 1
     print(report(*found))
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    FigureCanvasAgg(draw(found[0])).print_png(str(arguments.out))
+    arguments.out.write_bytes(png_of(draw(found[0])))
     return 0
 
 

@@ -40,7 +40,7 @@ class ParameterSpaceSettings(RegionGrowingSettings, RoofTreeSettings):
     """What both methods share."""
 
     tin_spacing_m: float = parameter(
-        1.0,
+        0.7,
         "The TIN takes one roof point a square of this size, since noise tilts the facets of a dense cloud most; "
         "0 takes all.",
         unit="m",

@@ -19,6 +19,8 @@ from pipeline.terrain.lattice import CELL_MM, NO_DATA, PIT_CELLS, Elevations, lo
 from pipeline.terrain.morphological import objects
 from pipeline.terrain.planar_fitting import MIN_CELLS, plane_around, plane_sums
 
+_MAX_SUPPORT_M = 500
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GroundSettings(HierarchicalFilterSettings):
@@ -60,6 +62,19 @@ class GroundSettings(HierarchicalFilterSettings):
     tolerance_m: float = parameter(
         0.5, "Points closer than this to the terrain are ground.", unit="m", minimum=0.05, maximum=3.0
     )
+
+    def cross_faults(self) -> list[str]:
+        """A hierarchy of so many passes that its tiles would be all halo."""
+        counts = (self.seed_cell_m, self.level_ratio, self.passes, self.min_reach_m, self.clump_m, self.bridge_m)
+        if self.filter != "hierarchical" or not all(isinstance(n, int) for n in counts) or self.level_ratio < 2:
+            return []
+        if self.support_m <= _MAX_SUPPORT_M:
+            return []
+        fault = (
+            f"filter looks {self.support_m:g} m far, by seed_cell_m {self.seed_cell_m}, level_ratio {self.level_ratio},"
+            f" passes {self.passes}: use fewer passes or smaller cells, for at most {_MAX_SUPPORT_M} m"
+        )
+        return [fault]
 
     @property
     def windows(self) -> tuple[int, ...]:

@@ -30,6 +30,9 @@ _WHOLE_SHARE = 2 / 3
 _WALL_CELLS = 2
 """Cells over which a wall's step is taken."""
 
+_CUT_SLOPE = 0.2
+"""Rise over run from the foot of a wall that is still no wall."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Level:
@@ -90,7 +93,7 @@ class HierarchicalFilterSettings(Parameters):
     )
     lone_slope: float = parameter(
         0.1,
-        "Steepest rise over run from the nearest ground to a point beyond it, where that ground carries no plane.",
+        "Steepest rise over run to a point from the mean of the ground within reach, where that carries no plane.",
         minimum=0.0,
         maximum=2.0,
     )
@@ -154,7 +157,10 @@ def _is_cut(lowest: Elevations, r: int, c: int, size: int, corner: tuple[int, in
 
 @njit(cache=True, nogil=True)
 def _stands_on_a_wall(lowest: Elevations, r: int, c: int, reach: int, step_mm: float) -> bool:
-    """Whether within reach something at the level of (r, c) ends in a step down of more than step_mm."""
+    """Whether within reach something at the level of (r, c) ends in a step down of more than step_mm.
+
+    The foot must also lie lower than a slope of _CUT_SLOPE from (r, c) leads.
+    """
     rows, columns = lowest.shape
     near = reach - _WALL_CELLS
     for k in range(max(r - near, 0), min(r + near + 1, rows)):
@@ -164,7 +170,9 @@ def _stands_on_a_wall(lowest: Elevations, r: int, c: int, reach: int, step_mm: f
                 continue
             for kk in range(max(k - _WALL_CELLS, 0), min(k + _WALL_CELLS + 1, rows)):
                 for mm in range(max(m - _WALL_CELLS, 0), min(m + _WALL_CELLS + 1, columns)):
-                    if z - lowest[kk, mm] > step_mm:
+                    fall = min(z, float(lowest[r, c])) - lowest[kk, mm]
+                    far = math.sqrt((kk - r) * (kk - r) + (mm - c) * (mm - c))
+                    if fall > step_mm + _CUT_SLOPE * CELL_MM * far:
                         return True
     return False
 

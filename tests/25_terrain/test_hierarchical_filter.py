@@ -282,3 +282,25 @@ def test_a_shift_by_whole_seed_cells_shifts_the_ground_bit_for_bit(shift: tuple[
 def test_an_unknown_filter_names_the_known_ones() -> None:
     with pytest.raises(SettingsError, match="filter is 'tin': use one of morphological, hierarchical"):
         GroundSettings(filter="tin")
+
+
+def test_a_filter_that_looks_too_far_is_refused() -> None:
+    with pytest.raises(
+        SettingsError, match=r"filter looks .* m far, by seed_cell_m 96, level_ratio 2, passes 8: use fewer"
+    ):
+        GroundSettings(filter="hierarchical", seed_cell_m=96, level_ratio=2, passes=8)
+    assert GroundSettings(seed_cell_m=96, level_ratio=2, passes=8).support_m == 69
+    with pytest.raises(SettingsError, match="level_ratio is 1: use 2 to 8"):
+        GroundSettings(filter="hierarchical", level_ratio=1)
+
+
+def test_a_roof_that_fills_a_cut_cell_is_no_seed() -> None:
+    grid = hills(110, 140, slope=0.05)
+    # the data end two metres into a cell of seeds of 48 m, within a roof
+    roofs = houses(grid, ((40, 84, 40, 14), (90, 10, 20, 30)), 5000)
+    grid, roofs = np.ascontiguousarray(grid[:, :98]), roofs[:, :98]
+    grid[:40, 96:] = NO_DATA
+    grid[80:, 96:] = NO_DATA
+    terrain = terrain_under(grid)
+    assert not terrain.measured[roofs].any()
+    assert terrain.measured[(grid != NO_DATA) & ~roofs].mean() > 0.99

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
+import tomllib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +22,7 @@ from pipeline.methods.parameter_space import (
     segment_3d,
 )
 from pipeline.model import Candidate, FloatArray, LabelArray, Reason, RoofType, Segmentation
+from pipeline.settings import RunSettings
 
 Height = Callable[[FloatArray, FloatArray], FloatArray]
 Segment = Callable[[Candidate], Segmentation]
@@ -304,6 +308,16 @@ def test_contradicting_settings_of_all_stages_are_named_at_once() -> None:
     with pytest.raises(SettingsError) as caught:
         ParameterSpace2dSettings(linkage_least_deg=12.0, growing_min_m=0.5, point_groups="chance", least_members=0)
     assert len(caught.value.faults) == 4
+
+
+def test_the_page_of_the_methods_tells_every_setting_and_the_literal_forms() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "methods" / "parameter_space.md").read_text()
+    for name in ("parameter-space-2d", "parameter-space-3d"):
+        fields = dataclasses.fields(METHODS[name].settings_type)
+        assert [field.name for field in fields if f"`{field.name}" not in page] == []
+    blocks = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    forms = [RunSettings.from_mapping(tomllib.loads(block)["settings"]).building.method for block in blocks]
+    assert forms == [ParameterSpace2dSettings.faithful(), ParameterSpace3dSettings.faithful()]
 
 
 @pytest.mark.slow
