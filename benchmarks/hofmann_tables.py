@@ -87,6 +87,8 @@ PAPER: Mapping[str, Mapping[str, PrintedRow]] = MappingProxyType(
     }
 )
 """The printed tables, misprints and all."""
+LEVEL_DEG = 7.0
+"""Slope from which terrain is a plausible roof to the paper's 2D tree."""
 SUBSETS = {"all 310 buildings": ("3-1", "4-1"), "the 197 that nothing makes hard": ("4-2",)}
 """The tables of each subset."""
 
@@ -103,6 +105,8 @@ class Outcomes:
     """(n,) bool, nothing makes it hard."""
     outcome: tuple[str, ...]
     """(n,) correct, passable or false."""
+    terrain_deg: FloatArray
+    """(n,) float64, slope of the terrain beneath."""
 
     def mask(self, kind: str, *, good_only: bool) -> BoolArray:
         """The buildings of a row; `kind` may be all."""
@@ -184,6 +188,7 @@ def read_outcomes(variant: Variant, place: Workplace, split: str, draws: int) ->
         kind=tuple(row["true_type"] for row in judged),
         good=np.array([bool(row["good"]) for row in judged], np.bool_),
         outcome=tuple(row["outcome"] for row in judged),
+        terrain_deg=np.array([row["terrain_slope_deg"] for row in judged], np.float64),
     )
 
 
@@ -299,6 +304,28 @@ def pattern_table(found: Mapping[str, Outcomes]) -> str:
     return "\n".join(parts)
 
 
+def terrain_table(found: Mapping[str, Outcomes]) -> str:
+    """Percent correct of pent and gable roofs on terrain of less and of more slope than the least of a roof in 2D."""
+    heads, masks = [], []
+    first = next(iter(found.values()))
+    for kind in ("pent", "gable"):
+        for name, is_steep in ((f"below {LEVEL_DEG:g} deg", False), (f"{LEVEL_DEG:g} deg and more", True)):
+            mask = first.mask(kind, good_only=False) & ((first.terrain_deg >= LEVEL_DEG) == is_steep)
+            heads.append(f"{kind}, {name} (n = {int(mask.sum())})")
+            masks.append(mask)
+    rows = []
+    for label, outcomes in found.items():
+        right = outcomes.is_outcome("correct").astype(np.float64)
+        estimates = [
+            bootstrap({"correct": right[mask], "n": np.ones(int(mask.sum()))}, share("correct", "n"))
+            if mask.any()
+            else None
+            for mask in masks
+        ]
+        rows.append([label, *("" if one is None else told_share(one) for one in estimates)])
+    return markdown_table(["percent correct by slope of the terrain", *heads], rows)
+
+
 def document(found: Mapping[str, Outcomes], split: str, draws: int) -> str:
     """All tables as Markdown."""
     parts = [f"`hofmann310`, {split} seeds, {draws} draws; counts are means a draw.\n"]
@@ -312,6 +339,8 @@ def document(found: Mapping[str, Outcomes], split: str, draws: int) -> str:
         ]
     parts.append("### Does the pattern of the paper show?\n")
     parts.append(pattern_table(found) or "Not both parameter spaces were measured.\n")
+    if found:
+        parts += ["### Terrain that could be a roof\n", terrain_table(found)]
     parts.append("### Misprints of the paper\n")
     parts += [f"- table {name}: {told}" for name, table in PAPER.items() for told in misprints(table)]
     parts += [f"- table 4-2 against 4-1: {told}" for told in contradictions()]

@@ -136,7 +136,9 @@ def _own_solids(
     codes: set[int] = set()
     for form in forms:
         try:
-            drawn, own_planes = level_unsupported_faces(form(), roof, planes, candidate.ground_z_m, settings)
+            drawn, own_planes = form(), list(planes)
+            if not is_primitive:  # a primitive is one form: with a side made level it would be another
+                drawn, own_planes = level_unsupported_faces(drawn, roof, planes, candidate.ground_z_m, settings)
             parts = large_parts(solid_parts(drawn, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
             if is_primitive:
                 parts = [unite_flush_walls(part) for part in parts]

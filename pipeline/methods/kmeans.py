@@ -235,7 +235,7 @@ def segment(candidate: Candidate, settings: KMeansSettings) -> Segmentation:
         if model is not None:
             labels = sides_of(model, top.points, settings.model_distance_m)
             described = describe_planes(top.points, np.array([plane.coefficients for plane in model.planes]), labels)
-            roof_type = model.roof_type
+            roof_type = model.roof_type if settings.model == "always" else None
             x, y, _ = shift.tolist()
             faces = tuple(_moved(face, x, y) for face in model.faces)
     all_labels = np.full(len(points), -1, np.int32)

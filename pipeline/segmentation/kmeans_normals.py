@@ -117,18 +117,23 @@ def cluster_normals(
     farthest = farthest_point_start(normals, weights, k + settings.starts - 1)
     k = min(k, len(farthest))
     starts = max(1, len(farthest) - k + 1)
-    most_rounds = min(settings.kmeans_rounds, settings.kmeans_work_limit // (len(normals) * k * starts))
-    if most_rounds == 0:
-        raise BuildingError(
-            Reason.TOO_COMPLEX,
-            f"{len(normals)} facets with {k} centres of {starts} starts, "
-            f"kmeans_work_limit is {settings.kmeans_work_limit}",
-        )
-    labels, centres, inertia, rounds = kmeans(normals, weights, farthest[:k], most_rounds)
-    for first in range(1, starts):
-        another = kmeans(normals, weights, farthest[first : first + k], most_rounds)
-        if another[2] < inertia * (1.0 - _EQUAL_INERTIA):
-            labels, centres, inertia, rounds = another
+    best: tuple[LabelArray, FloatArray, float, int] | None = None
+    products = 0
+    for first in range(starts):
+        allowed = (settings.kmeans_work_limit - products) // (len(normals) * k)
+        most_rounds = min(settings.kmeans_rounds, allowed)
+        found = kmeans(normals, weights, farthest[first : first + k], most_rounds) if most_rounds > 0 else None
+        if found is None or found[3] == allowed < settings.kmeans_rounds:
+            raise BuildingError(
+                Reason.TOO_COMPLEX,
+                f"k-means of {len(normals)} facets with {k} centres was not done after start {first + 1} of {starts}, "
+                f"kmeans_work_limit is {settings.kmeans_work_limit}",
+            )
+        products += found[3] * len(normals) * k
+        if best is None or found[2] < best[2] * (1.0 - _EQUAL_INERTIA):
+            best = found
+    assert best is not None
+    labels, centres, inertia, rounds = best
     return FacetClusters(
         labels=labels,
         centres=centres,

@@ -215,7 +215,7 @@ def test_a_given_k_is_kept() -> None:
 def test_too_much_work_is_refused_with_its_figure() -> None:
     normals, _ = directions(FOUR, 50, 0.05, 1)
     with pytest.raises(
-        BuildingError, match="200 facets with 4 centres of 8 starts, kmeans_work_limit is 1000"
+        BuildingError, match="200 facets with 4 centres was not done after start 1 of 8, kmeans_work_limit is 1000"
     ) as error:
         cluster_normals(normals, np.ones(200), 4, NormalClusteringSettings(kmeans_work_limit=1000))
     assert error.value.reason is Reason.TOO_COMPLEX

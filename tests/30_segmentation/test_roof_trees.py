@@ -68,7 +68,7 @@ def test_a_cluster_is_in_one_pair_at_most_and_the_best_pair_comes_first() -> Non
 
 
 def test_turning_the_scene_changes_no_leaf() -> None:
-    clusters = np.array([[30.0, 10, 3], [32, 185, 3], [28, 100, 3], [20, 300, 2]])
+    clusters = np.array([[30.0, 10, 3], [32, 185, 3], [28, 100, 3], [20, 320, 2]])
     types = set()
     for turn in range(0, 360, 15):
         turned = clusters.copy()

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
+import tomllib
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +22,7 @@ from pipeline.model import Candidate, FloatArray, Reason, RoofType, Segmentation
 from pipeline.quality.validity import check_solid
 from pipeline.reconstruct import reconstruct_building
 
+PAGE = Path(__file__).parents[2] / "docs" / "methods" / "kmeans.md"
 FAITHFUL = KMeansSettings.faithful()
 ROBUST = KMeansSettings()
 PRESETS = pytest.mark.parametrize("settings", [ROBUST, FAITHFUL], ids=["robust", "faithful"])
@@ -297,3 +301,11 @@ def test_the_presets_are_those_of_the_method() -> None:
 def test_a_distance_that_is_no_range_is_refused() -> None:
     with pytest.raises(SettingsError, match=r"plane_distance_min_m is 0\.5: use at most plane_distance_max_m, 0\.3"):
         KMeansSettings(plane_distance_min_m=0.5)
+
+
+def test_the_page_tells_every_setting_and_the_faithful_ones_exactly() -> None:
+    text = PAGE.read_text()
+    assert [f.name for f in dataclasses.fields(KMeansSettings) if f"`{f.name}" not in text] == []
+    block = re.search(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert block is not None
+    assert KMeansSettings(**tomllib.loads(block[1])["settings"]["kmeans"]) == FAITHFUL

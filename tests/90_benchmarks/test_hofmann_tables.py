@@ -22,6 +22,7 @@ from benchmarks.hofmann_tables import (
     pattern,
     pattern_table,
     percent_table,
+    terrain_table,
 )
 
 Counts = dict[str, tuple[int, int, int]]
@@ -42,7 +43,8 @@ def outcomes_of(counts: Counts, good: Counts | None = None, draws: int = 1) -> O
             kinds += [kind] * number
             outcomes += [outcome] * number
             is_good += [place < (good or PAPER_GOOD)[kind][k] for place in range(number)]
-    return Outcomes(draws=draws, kind=tuple(kinds), good=np.array(is_good), outcome=tuple(outcomes))
+    slopes = np.arange(len(kinds)) % 2 * 10.0
+    return Outcomes(draws=draws, kind=tuple(kinds), good=np.array(is_good), outcome=tuple(outcomes), terrain_deg=slopes)
 
 
 def test_the_papers_own_tables_show_the_papers_pattern() -> None:
@@ -107,6 +109,17 @@ def test_the_document_holds_both_subsets_and_all_misprints() -> None:
     assert "### Of the 197 that nothing makes hard" in told
     assert "Not both parameter spaces were measured" in told
     assert told.count("- table ") == sum(len(misprints(table)) for table in PAPER.values()) + len(contradictions())
+
+
+def test_buildings_are_told_by_the_slope_of_their_terrain() -> None:
+    outcomes = outcomes_of({**PAPER_3D, "pent": (8, 0, 9)})
+    outcomes = dataclasses.replace(
+        outcomes, terrain_deg=np.where(outcomes.is_outcome("correct"), 3.0, np.where(outcomes.good, 7.0, 6.9))
+    )
+    head, _, row = terrain_table({"one": outcomes}).splitlines()
+    assert "pent, below 7 deg (n = 12) | pent, 7 deg and more (n = 5)" in head
+    assert row.split(" | ")[1].startswith("67 (")
+    assert row.split(" | ")[2].startswith("0 (0 to ")
 
 
 def test_the_printed_tables_are_wrong_where_the_paper_is() -> None:
