@@ -5,7 +5,7 @@
 #   make slow      the slow tests: minutes, real processes, real data
 #   make viewer    build the web page (types, unit tests, bundle); brings its own Node
 #   make serve     the service on this machine, web page and all
-#   make ruler     every suite and real tile, reconstructed and measured: all tables of docs/results/ (half an hour)
+#   make ruler     every suite and real tile, reconstructed and measured: all tables of docs/results/ (an hour)
 #   make lock      resolve the dependencies anew (the locks name versions and hashes, no hosts)
 #   make docs      write docs/reference/ from the code
 #   make format    format the sources
@@ -118,6 +118,9 @@ serve: $(VENV)/.warm-stamp viewer
 ruler: $(VENV)/.warm-stamp
 	@mkdir -p $(RULER)
 	$(BIN)/python benchmarks/ruler.py --out $(RULER) --data $(DATA)
+	$(BIN)/python benchmarks/hofmann_tables.py --out $(RULER)
+	$(BIN)/python benchmarks/sweep_limits.py --out $(RULER)
+	$(BIN)/python benchmarks/method_times.py --out $(RULER) --data $(DATA)
 	$(BIN)/python benchmarks/hofmann_statistics.py > $(RULER)/hofmann_statistics.md
 	$(BIN)/python benchmarks/simulated_against_real.py --data $(DATA) > $(RULER)/simulated_against_real.md
 

@@ -205,7 +205,7 @@ def measure_entry(entry: Entry, variants: Sequence[Variant], place: Workplace) -
     lap("scene")
     to_run = [variant for variant in unmeasured if not place.is_run(variant, entry)]
     if to_run:
-        folder = place.root / "scratch" / entry.name
+        folder = place.root / "scratch" / f"{entry.name}-{os.getpid()}"  # another program may be at the same entry
         folder.mkdir(parents=True, exist_ok=True)
         request = run_request(entry, place, folder)
         ways = [

@@ -195,29 +195,32 @@ def draw(found: Mapping[str, Qualities], path: Path) -> None:
     rows = math.ceil((len(found) + 1) / columns)
     figure, axes = plt.subplots(rows, columns, figsize=(4.0 * columns, 3.0 * rows), layout="constrained", squeeze=False)
     panels = list(axes.flat)
+    densities = sorted({density for qualities in found.values() for density, _ in qualities})
     for panel, (label, qualities) in zip(panels, found.items(), strict=False):
-        _draw_method(panel, label, qualities)
-    _draw_limits(panels[len(found)], found)
+        _draw_method(panel, label, qualities, densities)
+    for panel in axes[:, 0]:
+        panel.set_ylabel("quality of faces ≥ 10 m², %", fontsize=9)
+    _draw_limits(panels[len(found)], found, densities)
     for panel in panels[len(found) + 1 :]:
         panel.set_visible(False)
     panels[0].legend(fontsize=8, loc="lower right", frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    figure.savefig(path, dpi=90)
     plt.close(figure)
 
 
-def _density_axis(panel: Any, found: Sequence[Qualities]) -> None:
-    densities = sorted({density for qualities in found for density, _ in qualities})
+def _density_axis(panel: Any, densities: Sequence[float]) -> None:
     panel.set_xscale("log")
     panel.set_xticks(densities, [f"{density:g}" for density in densities])
     panel.set_xticks([], minor=True)
+    panel.set_xlim(densities[0] / 1.2, densities[-1] * 1.2)
     panel.set_xlabel("pulses a m²", fontsize=9)
     panel.tick_params(labelsize=8)
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)
 
 
-def _draw_method(panel: Any, label: str, qualities: Qualities) -> None:
+def _draw_method(panel: Any, label: str, qualities: Qualities, densities: Sequence[float]) -> None:
     """Quality of one method over the density."""
     for level in LEVELS:
         panel.axhline(level, color="#999999", linewidth=0.8, linestyle="--")
@@ -228,14 +231,12 @@ def _draw_method(panel: Any, label: str, qualities: Qualities) -> None:
     panel.set_title(label, fontsize=10)
     panel.set_ylim(0.0, 1.0)
     panel.set_yticks([0.0, 0.2, *sorted(LEVELS), 1.0], ["0", "20", *(f"{100 * x:.0f}" for x in sorted(LEVELS)), "100"])
-    panel.set_ylabel("quality of faces ≥ 10 m², %", fontsize=9)
-    _density_axis(panel, [qualities])
+    _density_axis(panel, densities)
 
 
-def _draw_limits(panel: Any, found: Mapping[str, Qualities]) -> None:
+def _draw_limits(panel: Any, found: Mapping[str, Qualities], densities: Sequence[float]) -> None:
     """The lowest density at which each method holds 80 %, a dot a noise; methods that never do are at the right."""
-    densities = {density for qualities in found.values() for density, _ in qualities}
-    least, most = min(densities), max(densities)
+    least, most = densities[0], densities[-1]
     beyond = most * 2.0
     for row, qualities in enumerate(found.values()):
         for number, noise in enumerate(_noises(found)):
@@ -246,7 +247,8 @@ def _draw_limits(panel: Any, found: Mapping[str, Qualities]) -> None:
     panel.text(beyond, -0.75, "never", fontsize=8, ha="center", va="center")
     panel.set_title(f"lowest density with {100 * LEVELS[0]:.0f} %", fontsize=10)
     panel.set_ylim(len(found) - 0.5, -1.1)
-    _density_axis(panel, list(found.values()))
+    _density_axis(panel, densities)
+    panel.set_ylabel("")
     panel.set_yticks(range(len(found)), list(found), fontsize=7)
     panel.grid(axis="y", color="#eeeeee", linewidth=0.6)
     panel.set_xlim(least / 1.4, most * 3.0)

@@ -23,6 +23,7 @@ from pipeline.geometry import (
     top_visible,
 )
 from pipeline.methods.local_frame import check_extent, ground_around, local_metres, plane_over_origin
+from pipeline.methods.refinement import planes_of_clusters
 from pipeline.model import BoolArray, Candidate, FloatArray, Reason, Segmentation
 from pipeline.parameters import parameter
 from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
@@ -32,9 +33,7 @@ from pipeline.segmentation.fuzzy_sart import (
     cluster,
     facet_vectors,
 )
-from pipeline.segmentation.leftover_planes import cluster_leftovers
-from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes, refine_planes
-from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
+from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes
 from pipeline.terrain.height_rule import facets_above_z_avg
 from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily
 
@@ -206,23 +205,17 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     rough = labels_of_points(facets, clusters, areas_m2, greedy.vertex_point, greedy.facet_of_point)[: len(roof)]
 
     # 3.3: best-fit planes on the original elevations, merging, absorption of outliers, straight ridges.
-    fewest_points = settings.fewest_points(spacing_m)
-    planes, labels = refine_planes(
-        roof, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=settings
+    planes, labels = planes_of_clusters(
+        roof,
+        neighbours,
+        rough,
+        spacing_m=spacing_m,
+        distance_m=distance_m,
+        reach_m=settings.ridge_reach_spacings * spacing_m,
+        leftover_rounds=settings.leftover_rounds,
+        settings=settings,
     )
-    rough = cluster_leftovers(roof, neighbours, labels, distance_m, fewest_points)
-    if settings.leftover_rounds > 0 and (rough != labels).any():
-        again = dataclasses.replace(settings, rounds=settings.leftover_rounds)
-        planes, labels = refine_planes(
-            roof, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=again
-        )
-    reach_m = settings.ridge_reach_spacings * spacing_m
-    ridges = find_ridges(roof, planes, labels, neighbours, distance_m=distance_m, reach_m=reach_m)
-    labels = label_by_ridges(roof, planes, labels, ridges, distance_m=distance_m, reach_m=reach_m)
 
-    # A sliver along a ridge can lose all its points to the two sides: it is no plane any more.
-    kept = np.unique(labels[labels >= 0])
-    planes, labels = planes[kept], np.where(labels >= 0, np.searchsorted(kept, labels), -1)
     all_labels = np.full(len(points), -1, np.int32)
     all_labels[visible] = labels
     described = describe_planes(points, planes, all_labels)

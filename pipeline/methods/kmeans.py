@@ -28,6 +28,7 @@ from pipeline.geometry import (
     vertical_residuals_m,
 )
 from pipeline.methods.local_frame import check_extent, local_metres, plane_over_origin
+from pipeline.methods.refinement import planes_of_clusters
 from pipeline.model import Candidate, FloatArray, IntArray, LabelArray, Plane, PlanFace, Reason, Segmentation, Tin
 from pipeline.parameters import parameter
 from pipeline.roof.primitives import BuildingPrimitive, fit_box, fit_gable
@@ -39,10 +40,8 @@ from pipeline.segmentation.kmeans_normals import (
     choose_clusters,
     labels_around,
 )
-from pipeline.segmentation.leftover_planes import cluster_leftovers
-from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes, refine_planes
+from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
-from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
 from pipeline.segmentation.surrounding_ground import far_from
 from pipeline.tin.delaunay import triangulate, unique_xy
 
@@ -365,26 +364,17 @@ def planes_of(top: BuildingTop, settings: KMeansSettings) -> tuple[FloatArray, L
 
 def _refined_planes(top: BuildingTop, clusters: LabelArray, settings: KMeansSettings) -> tuple[FloatArray, LabelArray]:
     """Parts that hang together, best-fit planes, merging, assignment anew, straight ridges."""
-    points, spacing_m, distance_m = top.points, top.spacing_m, top.distance_m
     parts = connected_parts(clusters, top.tin.neighbours)
-    rough = labels_around(points, top.tin.facets, parts)
-    neighbours = nearest_neighbours(points, settings.neighbours)
-    fewest_points = settings.fewest_points(spacing_m)
-    planes, labels = refine_planes(
-        points, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=settings
+    return planes_of_clusters(
+        top.points,
+        nearest_neighbours(top.points, settings.neighbours),
+        labels_around(top.points, top.tin.facets, parts),
+        spacing_m=top.spacing_m,
+        distance_m=top.distance_m,
+        reach_m=settings.ridge_reach_spacings * top.spacing_m,
+        leftover_rounds=settings.leftover_rounds,
+        settings=settings,
     )
-    rough = cluster_leftovers(points, neighbours, labels, distance_m, fewest_points)
-    if settings.leftover_rounds > 0 and (rough != labels).any():
-        again = dataclasses.replace(settings, rounds=settings.leftover_rounds)
-        planes, labels = refine_planes(
-            points, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=again
-        )
-    reach_m = settings.ridge_reach_spacings * spacing_m
-    ridges = find_ridges(points, planes, labels, neighbours, distance_m=distance_m, reach_m=reach_m)
-    labels = label_by_ridges(points, planes, labels, ridges, distance_m=distance_m, reach_m=reach_m)
-    # A sliver along a ridge can lose all its points to the two sides: it is no plane any more.
-    kept = np.unique(labels[labels >= 0])
-    return planes[kept], np.where(labels >= 0, np.searchsorted(kept, labels), -1).astype(np.int32)
 
 
 def model_of(
@@ -466,6 +456,10 @@ def _explains(model: BuildingPrimitive, top: BuildingTop, settings: KMeansSettin
     corners = np.array(model.corners[-4:])
     along, up = corners[1] - corners[0], corners[3] - corners[0]
     columns, rows = (max(2, math.ceil(math.hypot(*side) / top.spacing_m)) for side in (along.tolist(), up.tolist()))
+    # a sample lies at least half a spacing from the next, so a point is near to no more than these of them
+    near_to_one = (4.0 * settings.fill_gap_spacings + 2.0) ** 2
+    if settings.fitting_fill * columns * rows > near_to_one * len(top.points):
+        return False
     s, t = (np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows
     samples = corners[0] + s[:, None, None] * along + t[None, :, None] * up
     flat = np.column_stack([samples.reshape(-1, 2), np.zeros(columns * rows)])

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import statistics
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pipeline import __version__
 from pipeline.errors import RunCancelledError
@@ -103,9 +104,9 @@ def comparison_facts(request: CompareRequest, summary: CompareSummary) -> dict[s
         seconds = sorted(summary.seconds[variant.label].values())
         spread = (
             {
-                "mean": statistics.fmean(seconds),
-                "median": statistics.median(seconds),
-                "p95": seconds[min(len(seconds) - 1, int(0.95 * len(seconds)))],
+                "mean": float(np.mean(seconds)),
+                "median": float(np.median(seconds)),
+                "p95": float(np.quantile(seconds, 0.95)),
             }
             if seconds
             else {}

@@ -17,16 +17,10 @@ from pipeline.report.comparison_page import Comparison, ComparisonCase, markdown
 from pipeline.report.comparison_pictures import draw_building, place_of
 from pipeline.report.comparison_points import PointFiles, points_within
 from pipeline.report.comparison_records import buildings_table, projjson_of, read_buildings
+from pipeline.runtime.compare import BUILDINGS, PAGE, REPORT
 from pipeline.runtime.manifest import read_manifest
 
 __all__ = ["BUILDINGS", "PAGE", "REPORT", "ComparedRun", "PointFiles", "write_comparison"]
-
-BUILDINGS = "buildings.parquet"
-"""One row a building and run."""
-REPORT = "compare.md"
-"""The figures as Markdown."""
-PAGE = "index.html"
-"""The figures, pictures side by side, and a table of the buildings."""
 
 
 def write_comparison(

@@ -124,7 +124,8 @@ def _notes(comparison: Comparison) -> list[str]:
     notes = []
     for run, manifest in zip(comparison.runs, comparison.manifests, strict=True):
         if manifest.failed_tiles:
-            notes.append(f"{run.label}: {len(manifest.failed_tiles)} tiles failed.")
+            count = len(manifest.failed_tiles)
+            notes.append(f"{run.label}: {count:,} {'tile' if count == 1 else 'tiles'} failed.")
         elif manifest.status is not RunStatus.FINISHED:
             notes.append(f"{run.label}: the run is {manifest.status.value}; not all of its buildings may be there.")
     if comparison.left_out:
@@ -203,7 +204,8 @@ def _told(record: Record) -> str:
     if record.status is Status.FAILED:
         return f"failed, {record.reason}"
     kind = "model" if record.is_model else f"block in place of a model, {record.reason}"
-    return f"{kind}, {record.roof_type} roof, {record.n_planes} planes, RMSE {figure(record.rmse_m, 'm', 3)}"
+    planes = f"{record.n_planes} {'plane' if record.n_planes == 1 else 'planes'}"
+    return f"{kind}, {record.roof_type} roof, {planes}, RMSE {figure(record.rmse_m, 'm', 3)}"
 
 
 def _figures(record: Record) -> list[tuple[str, str]]:
@@ -294,7 +296,8 @@ def markdown(comparison: Comparison) -> str:
         (c.choice.building.building_id, c.choice.why, *(_brief(record) for record in c.choice.building.records))
         for c in comparison.cases
     ]
-    parts.append(f"## Buildings side by side\n\n{RULE}\n\n{markdown_table(header, rows, texts=len(header))}")
+    if rows:
+        parts.append(f"## Buildings side by side\n\n{RULE}\n\n{markdown_table(header, rows, texts=len(header))}")
     made = _made(comparison)
     parts.append(f"## How it was made\n\n{markdown_table(made['header'], made['rows'], texts=6)}")
     parts.append("\n".join(f"- {name}: {markdown_cell(text)}" for name, text in made["facts"]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -257,8 +257,3 @@ def _view(
         axes.scatter(screen[at, 0], screen[at, 1], s=dot, c=RESIDUAL_CLASSES[place].colour, linewidths=0, zorder=3)
     _set_frame(axes, frame)
     return png_of(figure)
-
-
-def by_id(models: Sequence[RoofModel]) -> Mapping[str, RoofModel]:
-    """Models by building_id."""
-    return {model.building_id: model for model in models}

@@ -20,6 +20,7 @@ from pipeline.report.comparison_building import ComparedBuilding, ComparedRun, R
 from pipeline.runtime.manifest import RunManifest
 
 _COLUMNS = ("status", "reason", "reason_detail", "lod", "roof_type", "n_planes", "rmse_m", "p95_m", "coverage", "valid")
+_READ = ("building_id", *_COLUMNS, "footprint_area_m2", "touches_data_edge", "geometry")
 _TRUTH = ("true_type", "outcome", "faces_to_find", "faces_found", "faces_wrong", "iou")
 _SCHEMA = pa.schema(
     [
@@ -61,7 +62,7 @@ def read_buildings(runs: Sequence[ComparedRun], manifests: Sequence[RunManifest]
     RunError
         The runs have different buildings although none has failed tiles: they are of different candidates.
     """
-    tables = [{row["building_id"]: row for row in read_table(run.run_dir, "buildings").to_pylist()} for run in runs]
+    tables = [_rows_of(run) for run in runs]
     everywhere = set(tables[0]).intersection(*tables)
     anywhere = set(tables[0]).union(*tables)
     if everywhere != anywhere and not any(manifest.failed_tiles for manifest in manifests):
@@ -89,6 +90,12 @@ def read_buildings(runs: Sequence[ComparedRun], manifests: Sequence[RunManifest]
             )
         )
     return buildings, len(anywhere - everywhere)
+
+
+def _rows_of(run: ComparedRun) -> dict[str, Mapping[str, Any]]:
+    """What is looked at of a run's records, by building_id."""
+    table = read_table(run.run_dir, "buildings").select(list(_READ))
+    return {row["building_id"]: row for row in table.to_pylist()}
 
 
 def _record(row: Mapping[str, Any], run: ComparedRun, truth: Mapping[str, Any]) -> Record:
@@ -133,7 +140,7 @@ def _true_buildings(names: Sequence[str], runs: Sequence[ComparedRun]) -> dict[s
     some run made of it.
     """
     reference = next((run.evaluation.reference for run in runs if run.evaluation and run.evaluation.reference), None)
-    if reference is None:
+    if reference is None or not reference.buildings or not names:
         return {}
     footprints: dict[str, list[Any]] = {name: [] for name in names}
     for run in runs:

@@ -22,7 +22,19 @@ RUNS = "runs"
 """Folder of the run directories below the comparison's."""
 
 SUMMARY = "compare.json"
-"""The file that tells what was compared; the mark of a comparison's folder."""
+"""The file that tells what was compared, written last; the mark of a comparison's folder."""
+
+BUILDINGS = "buildings.parquet"
+"""One row a building and run."""
+
+REPORT = "compare.md"
+"""The figures as Markdown."""
+
+PAGE = "index.html"
+"""The figures, pictures side by side, and a table of the buildings."""
+
+_WRITTEN = (SUMMARY, BUILDINGS, REPORT, PAGE)
+_SCRATCH = "scratch"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -151,7 +163,9 @@ def compare(
         )
         for variant in request.variants
     ]
-    outcomes = run_variants(request.run, variants, str(out), on_event, executor, cancelled)
+    # a page of an earlier comparison would be taken for that of the new runs, should these never come to theirs
+    stale = [out / name for name in _WRITTEN]
+    outcomes = run_variants(request.run, variants, str(out), on_event, executor, cancelled, stale=stale)
     for run_dir in (out / RUNS).iterdir():
         # what an earlier comparison left of other methods would be taken for a part of this one
         if run_dir.name not in {variant.label for variant in variants} and (run_dir / MANIFEST).exists():
@@ -198,11 +212,20 @@ def settings_of(
 def own_tables(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """The methods' own tables among those of a settings file.
 
+    Raises
+    ------
+    SettingsError
+        The file names a method or a preset too.
+
     Examples
     --------
     >>> own_tables({"classes": "trust", "roof": {"minimum_points": 9}, "kmeans": {"clusters": 3}})
     {'kmeans': {'clusters': 3}}
     """
+    named = [name for name in ("method", "preset") if name in table]
+    if named:
+        told = "name what is compared in methods, as METHOD or METHOD:PRESET"
+        raise SettingsError([f"settings.{name} is {table[name]!r}: {told}" for name in named])
     return {name: table[name] for name in METHODS if name in table}
 
 
@@ -223,6 +246,8 @@ def _checked(request: RunRequest) -> Path:
         raise RunError(f"{out} cannot be read: {error.strerror or error}. Give another --out") from error
     if left and not request.overwrite:
         raise RunError(f"{out} is not empty ({left[0]} …): give another --out, or --overwrite")
-    if left and SUMMARY not in left and RUNS not in left:
-        raise RunError(f"{out} holds {left[0]} and is no comparison: give another --out")
+    # one that was broken off has no summary, and nothing but what a comparison writes
+    strange = [name for name in left if name not in (RUNS, _SCRATCH, *_WRITTEN) and not name.startswith(".")]
+    if left and SUMMARY not in left and (strange or RUNS not in left):
+        raise RunError(f"{out} holds {(strange or left)[0]} and is no comparison: give another --out")
     return out

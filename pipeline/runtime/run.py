@@ -26,7 +26,7 @@ from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import Joined
 from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, write_manifest
-from pipeline.runtime.modelling import Modelled
+from pipeline.runtime.modelling import Modelled, load
 from pipeline.runtime.plan import Plan, check_memory, make_plan
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.split import Split
@@ -183,6 +183,7 @@ def run_variants(
     on_event: Listener = ignore,
     executor: Executor | None = None,
     cancelled: Callable[[], bool] = never,
+    stale: Sequence[Path] = (),
 ) -> list[VariantOutcome]:
     """Model the same candidates in several ways: ingest, split and join run once, the rest once a variant.
 
@@ -196,6 +197,8 @@ def run_variants(
         Folder for the scratch.
     on_event, executor, cancelled
         As of `run`. Progress of a stage counts all variants together.
+    stale : sequence of Path
+        Files that tell of an earlier run: they go with its results.
 
     Returns
     -------
@@ -252,6 +255,8 @@ def run_variants(
             for run_dir, manifest in zip(run_dirs, manifests, strict=True):
                 _clear_results(run_dir)
                 write_manifest(run_dir, manifest, LocalStorage(root=run_dir).put)
+            for path in stale:
+                path.unlink(missing_ok=True)
             stages = Stages(
                 settings=settings,
                 meshes=request.meshes,
@@ -273,6 +278,8 @@ def run_variants(
                     )
                     for k, (v, own) in enumerate(zip(variants, progresses, strict=True))
                 ]
+                if len(variants) > 1 and request.isolation is None:
+                    load()  # or the first building of the first variant would be charged for what all need
                 modelled = [own.reconstruct(joined) for own in each]
                 published = [
                     own.publish(splits, joined, models, reference, str(run_dir))
@@ -446,10 +453,19 @@ def _checked(out: str, *, overwrite: bool) -> Path:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder of scratch: renamed first, so that no late task of an earlier run finds it and fills it again."""
+    """Remove a folder of scratch: renamed first, so that no late task of an earlier run finds it and fills it again.
+
+    Raises
+    ------
+    RunError
+        It cannot be renamed.
+    """
     if folder.exists():
         doomed = folder.with_name(f".{folder.name}.{uuid4().hex}")
-        folder.rename(doomed)
+        try:
+            folder.rename(doomed)
+        except OSError as error:
+            raise RunError(f"{folder} cannot be removed: {error.strerror or error}") from error
         shutil.rmtree(doomed, ignore_errors=True)
 
 

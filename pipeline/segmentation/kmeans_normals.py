@@ -384,20 +384,26 @@ def labels_around(xyz: FloatArray, facets: LabelArray, facet_labels: LabelArray)
             i = facets[t, k]
             corner[end[i]] = 3 * t + k
             end[i] += 1
+    most = -1
+    for label in facet_labels:
+        most = max(most, label)
+    together = np.zeros(most + 1)
     labels = np.full(n, -1, np.int32)
     for i in range(n):
+        for q in range(start[i], start[i + 1]):
+            label = facet_labels[corner[q] // 3]
+            if label >= 0:
+                together[label] += _sine_in_plan(xyz, facets, corner[q] // 3, corner[q] % 3)
         largest = -1.0
-        for first in range(start[i], start[i + 1]):
-            label = facet_labels[corner[first] // 3]
-            if label < 0:
-                continue
-            together = 0.0
-            for q in range(start[i], start[i + 1]):
-                if facet_labels[corner[q] // 3] == label:
-                    together += _sine_in_plan(xyz, facets, corner[q] // 3, corner[q] % 3)
-            if together > largest:
-                largest = together
+        for q in range(start[i], start[i + 1]):
+            label = facet_labels[corner[q] // 3]
+            if label >= 0 and together[label] > largest:
+                largest = together[label]
                 labels[i] = label
+        for q in range(start[i], start[i + 1]):
+            label = facet_labels[corner[q] // 3]
+            if label >= 0:
+                together[label] = 0.0
     return labels
 
 

@@ -12,9 +12,13 @@ import dataclasses
 import numpy as np
 from numba import njit
 
-from pipeline.model import FloatArray, LabelArray
+from pipeline.errors import BuildingError
+from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.parameters import Parameters, parameter
 from pipeline.segmentation.plane_regression import N_SUMS, add_point, best_fit_plane, cosine_of_slope
+
+WORK_LIMIT = 1_000_000_000
+"""Looks at neighbours after which a building is too complex: points that hold no region are grown over once a seed."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,6 +68,7 @@ def grow_regions(
     distance_m: float,
     fewest_points: int,
     settings: RegionGrowingSettings,
+    work_limit: int = WORK_LIMIT,
 ) -> tuple[FloatArray, LabelArray]:
     """Regions that start at points of clusters.
 
@@ -83,6 +88,8 @@ def grow_regions(
         Smaller regions are not kept.
     settings : RegionGrowingSettings
         All else.
+    work_limit : int
+        Most looks at neighbours.
 
     Returns
     -------
@@ -90,8 +97,13 @@ def grow_regions(
         (a, b, c) of the least-squares plane of each region.
     labels : (n,) int32
         Region of every point, -1 for none; numbered in the order in which they grew, from the best fitting seed on.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_complex`` beyond the limit of work.
     """
-    planes, labels = _grow_regions(
+    planes, labels, work = _grow_regions(
         np.ascontiguousarray(points),
         np.ascontiguousarray(neighbours, dtype=np.int32),
         clusters.astype(np.int32),
@@ -100,7 +112,13 @@ def grow_regions(
         max(fewest_points, 3),
         settings.agreeing_share,
         settings.free_plane_points,
+        work_limit,
     )
+    if work > work_limit:
+        raise BuildingError(
+            Reason.TOO_COMPLEX,
+            f"region growing stood at {work} looks at neighbours of {len(points)} points, the limit is {work_limit}",
+        )
     return planes, labels
 
 
@@ -144,9 +162,11 @@ def _grow_regions(
     fewest_points: int,
     agreeing_share: float,
     free_plane_points: int,
-) -> tuple[FloatArray, LabelArray]:
-    """Kernel of `grow_regions`."""
+    work_limit: int,
+) -> tuple[FloatArray, LabelArray, int]:
+    """Kernel of `grow_regions`; the looks at neighbours too, with which it gives up beyond the limit."""
     n = len(points)
+    work = 0
     labels = np.full(n, -1, np.int32)
     asked = np.full(n, -1, np.int64)
     queue = np.empty(n, np.int32)
@@ -158,6 +178,8 @@ def _grow_regions(
             break
         if labels[seed] >= 0:
             continue
+        if work > work_limit:
+            break
         a, b = gradients[clusters[seed]]
         c = points[seed, 2] - a * points[seed, 0] - b * points[seed, 1]
         reach = distance_m / cosine_of_slope(a, b)
@@ -170,6 +192,7 @@ def _grow_regions(
         while at < held:
             i = queue[at]
             at += 1
+            work += neighbours.shape[1]
             add_point(sums, points, i)
             if sums[0] >= refit:
                 own_a, own_b, own_c, fitted = best_fit_plane(sums)
@@ -186,6 +209,7 @@ def _grow_regions(
                     continue
                 known = 0
                 agreeing = 0
+                work += neighbours.shape[1]
                 for other in neighbours[j]:
                     if other >= 0:
                         known += 1
@@ -202,4 +226,4 @@ def _grow_regions(
             planes[count, 1] = b
             planes[count, 2] = c
             count += 1
-    return planes[:count].copy(), labels
+    return planes[:count].copy(), labels, work

@@ -182,7 +182,7 @@ def _link(slope: FloatArray, orientation: FloatArray, distance: float, work_limi
                     continue
                 if _root(parent, order[start[c]]) == _root(parent, order[start[other]]):
                     continue
-                joined, comparisons = _near(slope, orientation, order, start, c, other, distance)
+                joined, comparisons = _near(slope, orientation, order, start, c, other, distance, work_limit - work)
                 work += comparisons
                 if joined:
                     _join(parent, order[start[c]], order[start[other]])
@@ -202,9 +202,16 @@ def _link(slope: FloatArray, orientation: FloatArray, distance: float, work_limi
 
 @njit(cache=True, nogil=True)
 def _near(
-    slope: FloatArray, orientation: FloatArray, order: IntArray, start: IntArray, a: int, b: int, distance: float
+    slope: FloatArray,
+    orientation: FloatArray,
+    order: IntArray,
+    start: IntArray,
+    a: int,
+    b: int,
+    distance: float,
+    work_limit: int,
 ) -> tuple[bool, int]:
-    """Whether two cells hold points that are linked, and the comparisons that took."""
+    """Whether two cells hold points that are linked, and the comparisons; beyond the limit it ends with no answer."""
     work = 0
     for p in range(start[a], start[a + 1]):
         i = order[p]
@@ -216,4 +223,6 @@ def _near(
             steeper = slope[i] - slope[j]
             if turn * turn + steeper * steeper <= distance * distance:
                 return True, work
+        if work > work_limit:
+            break
     return False, work

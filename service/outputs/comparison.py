@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import html
 import json
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from markupsafe import escape
+
+from pipeline.evaluation.markdown import markdown_cell
 from service.outputs.assemble import Progress, published_tiles, write_outputs
 from service.outputs.catalogue import NAME as CATALOGUE_NAME
 from service.outputs.catalogue import Catalogue, StoredOutput, read_catalogue, run_outputs
@@ -127,7 +129,7 @@ def _cleaner(folder: Path, labels: Sequence[str]) -> Callable[[str], str]:
     """A function that takes the server's folders out of a text, also as a page writes them."""
     manifests = [json.loads((folder / RUNS / label / "run.json").read_text(encoding="utf-8")) for label in labels]
     paths = {entry["path"] for manifest in manifests for entry in manifest["inputs"]}
-    written = paths | {html.escape(path) for path in paths}
+    written = paths | {str(escape(path)) for path in paths} | {markdown_cell(path) for path in paths}
     return cleaner(sorted(written), folder)
 
 

@@ -22,6 +22,7 @@ from pipeline.segmentation.kmeans_normals import (
     labels_around,
     silhouette,
 )
+from pipeline.tin.delaunay import triangulate
 
 SETTINGS = NormalClusteringSettings()
 
@@ -233,6 +234,26 @@ def test_a_point_takes_the_cluster_of_most_facets_around_it() -> None:
     assert labels[0] == 7
     labels = labels_around(FAN, FAN_FACETS, np.array([7, 3, 3, 7], np.int32))
     assert labels.tolist() == [3, 7, 7, 3, 7]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_clusters_of_points_agree_with_a_plain_sum_of_sines(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    xyz = np.column_stack([random.permutation(900)[:120] // 30, random.permutation(900)[:120] % 30, np.zeros(120)])
+    xyz = np.unique(np.vstack([xyz, [[14.5, 14.5, 0.0]]]), axis=0)
+    facets = triangulate(np.rint(xyz[:, :2] * 1000).astype(np.int64)).facets
+    labels = random.integers(-1, 5, len(facets)).astype(np.int32)
+    expected = []
+    for i in range(len(xyz)):
+        sines: dict[int, float] = {}
+        for t in np.flatnonzero((facets == i).any(axis=1) & (labels >= 0)):
+            (ux, uy), (vx, vy) = (xyz[j, :2] - xyz[i, :2] for j in facets[t] if j != i)
+            sine = abs(ux * vy - uy * vx) / math.hypot(ux, uy) / math.hypot(vx, vy)
+            sines[int(labels[t])] = sines.get(int(labels[t]), 0.0) + sine
+        expected.append(sines)
+    for found, sines in zip(labels_around(xyz, facets, labels).tolist(), expected, strict=True):
+        assert sines.get(found, 0.0) == pytest.approx(max(sines.values(), default=0.0))
+        assert (found == -1) == (not sines)
 
 
 def test_a_point_without_a_labelled_facet_has_no_cluster() -> None:

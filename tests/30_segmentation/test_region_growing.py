@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.errors import SettingsError
+from pipeline.errors import BuildingError, SettingsError
 from pipeline.geometry import nearest_neighbours
-from pipeline.model import FloatArray, LabelArray
+from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.segmentation.region_growing import RegionGrowingSettings, grow_regions
 
 
@@ -92,6 +92,25 @@ def test_the_order_of_points_does_not_matter() -> None:
     _, here = grown(points, side, SIDES)
     _, there = grown(points[order], side[order], SIDES)
     assert here[order].tolist() == there.tolist()
+
+
+def test_points_on_a_line_are_grown_over_from_every_seed_until_the_work_is_too_much() -> None:
+    line = np.column_stack([np.arange(400) * 0.1, np.zeros(400), np.full(400, 5.0)])
+    members, level = np.zeros(400, np.int32), np.zeros((1, 2))
+    planes, _ = grown(line, members, level)
+    assert len(planes) == 0
+    with pytest.raises(BuildingError, match="of 400 points, the limit is 100000") as caught:
+        grow_regions(
+            line,
+            nearest_neighbours(line, 9),
+            members,
+            level,
+            distance_m=0.15,
+            fewest_points=6,
+            settings=RegionGrowingSettings(),
+            work_limit=100_000,
+        )
+    assert caught.value.reason is Reason.TOO_COMPLEX
 
 
 def test_bounds_that_are_no_range_are_refused() -> None:

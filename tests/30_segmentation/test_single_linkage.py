@@ -103,6 +103,16 @@ def test_beyond_the_limit_of_work_a_building_is_too_complex() -> None:
     assert caught.value.reason is Reason.TOO_COMPLEX
 
 
+@pytest.mark.parametrize("steeper_deg", [10.01, 13.0])
+def test_two_dense_directions_that_do_not_link_end_at_the_limit_and_not_after_all_their_pairs(
+    steeper_deg: float,
+) -> None:
+    slope = np.repeat([30.0, 30.0 + steeper_deg], 3000)
+    settings = SingleLinkageSettings(linkage_work_limit=1000)
+    with pytest.raises(BuildingError, match=r"stood at \d{4} comparisons for 6000 facets"):
+        cluster_by_linkage(slope, np.full(6000, 90.0), settings)
+
+
 def test_a_least_distance_above_the_first_is_refused() -> None:
     with pytest.raises(SettingsError, match="use at most linkage_start_deg, 10"):
         SingleLinkageSettings(linkage_least_deg=12.0)

@@ -298,6 +298,30 @@ def test_the_presets_are_those_of_the_method() -> None:
     assert (FAITHFUL.clusters, FAITHFUL.model, FAITHFUL.refine) == (2, "always", False)
 
 
+def test_without_noise_or_a_least_distance_a_building_is_modelled_all_the_same() -> None:
+    settings = KMeansSettings(plane_distance_min_m=0.0, noise_factor=0.0)
+    found = segment(exact_gable(0.0), settings)
+    assert len(found.planes) == 2
+    assert (found.labels >= 0).all()
+
+
+def test_a_rectangle_that_the_points_cannot_fill_is_refused_before_it_is_sampled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    arm = np.arange(0.0, 120.0, 0.5)
+    wide = np.concatenate([[(a, b) for a in arm for b in (0.0, 0.5)], [(a, b) for a in (0.0, 0.5) for b in arm[2:]]])
+    candidate = candidate_of(np.column_stack([wide, np.full(len(wide), 5.0)]))
+    assert segment(candidate, ROBUST).faces is None
+
+    def sampled(*_: object) -> None:
+        raise AssertionError("sampled")
+
+    monkeypatch.setattr("pipeline.methods.kmeans.far_from", sampled)
+    assert segment(candidate, ROBUST).faces is None
+    with pytest.raises(AssertionError, match="sampled"):
+        segment(exact_gable(0.0), ROBUST)
+
+
 def test_a_distance_that_is_no_range_is_refused() -> None:
     with pytest.raises(SettingsError, match=r"plane_distance_min_m is 0\.5: use at most plane_distance_max_m, 0\.3"):
         KMeansSettings(plane_distance_min_m=0.5)

@@ -21,7 +21,7 @@ from pipeline.methods.parameter_space import (
     segment_2d,
     segment_3d,
 )
-from pipeline.model import Candidate, FloatArray, LabelArray, Reason, RoofType, Segmentation
+from pipeline.model import Candidate, FloatArray, Reason, RoofType, Segmentation
 from pipeline.settings import RunSettings
 
 Height = Callable[[FloatArray, FloatArray], FloatArray]
@@ -90,11 +90,6 @@ def hip(**options: Any) -> Candidate:
 def two_gables(**options: Any) -> Candidate:
     """Two parallel ridges 12 m apart: their faces are alike in slope and orientation."""
     return roof(lambda u, v: 9 - 0.7 * np.abs(np.abs(v) - 6) + 0 * u, width=24.0, **options)
-
-
-def same_partition(a: LabelArray, b: LabelArray) -> bool:
-    pairs = set(zip(a.tolist(), b.tolist(), strict=True))
-    return len(pairs) == len(set(a.tolist())) == len(set(b.tolist()))
 
 
 @pytest.mark.parametrize("recipe", ["3d faithful", *ROBUST])

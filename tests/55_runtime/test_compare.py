@@ -8,8 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import RunCancelledError, RunError, SettingsError
+from pipeline.errors import InputError, RunCancelledError, RunError, SettingsError
 from pipeline.runtime.compare import (
+    BUILDINGS,
+    PAGE,
+    REPORT,
+    SUMMARY,
     CompareRequest,
     CompareSummary,
     Variant,
@@ -116,6 +120,46 @@ def test_a_folder_of_something_else_is_never_replaced(suburb: Path, tmp_path: Pa
     assert (tmp_path / "thesis.docx").exists()
 
 
+def test_what_only_looks_like_a_broken_comparison_is_never_replaced(suburb: Path, tmp_path: Path) -> None:
+    (tmp_path / "runs" / "of-mine").mkdir(parents=True)
+    (tmp_path / "runs" / "of-mine" / "run.json").write_text("{}")
+    (tmp_path / "thesis.docx").write_text("years of work")
+    with pytest.raises(RunError, match=r"holds thesis\.docx and is no comparison"):
+        compare(request(suburb, tmp_path, overwrite=True))
+    assert (tmp_path / "runs" / "of-mine" / "run.json").exists()
+
+
+def test_no_page_of_an_earlier_comparison_stands_beside_runs_that_were_called_off(suburb: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "runs").mkdir(parents=True)
+    for name in (SUMMARY, BUILDINGS, REPORT, PAGE):
+        (out / name).write_text("of an earlier comparison")
+
+    def listen(event: Event) -> None:
+        if event.stage == "split":
+            raise RunCancelledError("the listener calls it off")
+
+    nowhere = request(tmp_path / "nowhere.laz", out, overwrite=True)
+    with pytest.raises(InputError):
+        compare(nowhere)
+    assert (out / PAGE).exists()
+    with pytest.raises(RunCancelledError):
+        compare(request(suburb, out, overwrite=True), listen)
+    assert [entry.name for entry in out.iterdir()] == ["runs"]
+    with pytest.raises(RunCancelledError):
+        compare(request(suburb, out, overwrite=True), listen)
+
+
+def test_no_method_is_charged_for_loading_what_all_of_them_need(
+    suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr("pipeline.runtime.run.load", lambda: told.append("loaded"))
+    compare(request(suburb, tmp_path / "out"), lambda event: told.append(event.stage))
+    assert told.index("loaded") < told.index("reconstruct")
+    assert told.count("loaded") == 1
+
+
 def test_variants_that_would_find_other_candidates_are_refused(suburb: Path, tmp_path: Path) -> None:
     given = RunRequest(inputs=(str(suburb),), out=str(tmp_path), workers=0)
     ways = [
@@ -149,3 +193,10 @@ def test_a_methods_own_table_counts_for_all_its_variants() -> None:
         assert chosen.settings_hash == RunSettings.from_mapping({"preset": variant.preset, **table}).settings_hash
     with pytest.raises(SettingsError, match=r"\[fuzzy-sart\] vigilance is 9"):
         settings_of(own, BOTH[0], {"fuzzy-sart": {"vigilance": 9.0}})
+
+
+def test_settings_that_name_a_method_or_a_preset_are_refused_and_not_passed_over() -> None:
+    with pytest.raises(SettingsError, match=r"settings\.preset is 'faithful': name what is compared in methods"):
+        own_tables({"preset": "faithful", "kmeans": {}})
+    with pytest.raises(SettingsError, match=r"settings\.method is 'kmeans'"):
+        own_tables({"method": "kmeans"})

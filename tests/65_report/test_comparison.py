@@ -153,6 +153,21 @@ def test_with_a_truth_every_building_has_its_outcome_and_one_true_building_whate
     assert sum((image["alt"] or "").startswith("The true model") for image in Reader(page.read_text()).all("img")) == 4
 
 
+def test_runs_without_a_building_have_a_page_that_says_so_with_and_without_a_truth(
+    runs: list[ComparedRun], make_run: MakeRun, tmp_path: Path
+) -> None:
+    empty = [dataclasses.replace(run, run_dir=str(make_run([], f"no-{run.label}"))) for run in runs]
+    reference = evaluated(runs)[0].evaluation.reference
+    against = [dataclasses.replace(run, evaluation=evaluate(read_models(run.run_dir), reference)) for run in empty]
+    for number, given in enumerate((empty, against)):
+        path, report, page = write_comparison(tmp_path / f"out{number}", given)
+        table = pq.read_table(path)
+        assert table.num_rows == 0
+        assert ("outcome" in table.column_names) == (given is against)
+        assert "0 buildings" in page.read_text()
+        assert "side by side\n" not in report.read_text()
+
+
 def test_runs_of_different_candidates_are_refused_unless_tiles_of_one_failed(
     runs: list[ComparedRun], make_run: MakeRun, tmp_path: Path
 ) -> None:
@@ -165,7 +180,7 @@ def test_runs_of_different_candidates_are_refused_unless_tiles_of_one_failed(
     path, report, _ = write_comparison(tmp_path / "out", [*runs, other])
     assert {row["building_id"] for row in pq.read_table(path).to_pylist()} == {"agreed"}
     assert "4 buildings that not all runs have are left out" in report.read_text()
-    assert "other: 1 tiles failed" in report.read_text()
+    assert "other: 1 tile failed" in report.read_text()
 
 
 def test_no_run_and_two_of_one_label_are_refused(runs: list[ComparedRun], tmp_path: Path) -> None:

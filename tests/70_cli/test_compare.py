@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
@@ -59,6 +60,10 @@ def test_the_document_is_what_compare_json_holds(compared: tuple[Path, dict[str,
         assert sum(told["statuses"].values()) == candidates.copy().pop()
         assert json.loads((out / told["run_dir"] / "run.json").read_text())["content_sha256"] == told["content_sha256"]
         assert told["seconds_a_building"]["median"] > 0.0
+        table = pq.read_table(out / "buildings.parquet", columns=["label", "seconds"])
+        seconds = [row["seconds"] for row in table.to_pylist() if row["label"] == told["label"]]
+        expected = {"mean": np.mean(seconds), "median": np.median(seconds), "p95": np.quantile(seconds, 0.95)}
+        assert told["seconds_a_building"] == pytest.approx(expected, abs=1e-6)
 
 
 def test_every_building_has_a_row_a_method(compared: tuple[Path, dict[str, Any]]) -> None:

@@ -385,6 +385,7 @@ def test_the_archive_holds_the_whole_comparison_and_no_folder_of_the_server(
     told = {f"/jobs/{job_id}/results/{name}" for name in ("page", "summary")}
     for text in [*texts.values(), *(client.get(path).text for path in told)]:
         assert runs.SERVER_FOLDER not in text
+        assert "uploads/0f0f" not in text
         assert "node-7" not in text
         assert str(service.folder.root) not in text
     manifest = json.loads(texts["runs/fuzzy-sart/run.json"])

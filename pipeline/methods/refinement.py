@@ -1,0 +1,81 @@
+"""From rough clusters of points to roof planes: the end that Fuzzy SART and the robust form of k-means have in common.
+
+Best-fit planes, merging and assignment anew; then once more with clusters that grow among the points that no plane
+explains; at last straight ridges (Shorter and Kasparis, section 3.3).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pipeline.model import FloatArray, LabelArray
+from pipeline.segmentation.leftover_planes import cluster_leftovers
+from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, refine_planes
+from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
+
+_LEAST_DISTANCE_M = 1e-3
+"""The grid of the points: no distance to a plane is less, also where settings and noise are 0."""
+
+
+def planes_of_clusters(
+    points: FloatArray,
+    neighbours: LabelArray,
+    rough: LabelArray,
+    *,
+    spacing_m: float,
+    distance_m: float,
+    reach_m: float,
+    leftover_rounds: int,
+    settings: PlaneRefinementSettings,
+) -> tuple[FloatArray, LabelArray]:
+    """Roof planes of rough clusters, and the plane of every point.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Points that are visible from above, original elevations, metres.
+    neighbours : (n, k) int32
+        Nearest neighbours of every point, -1 where there are fewer.
+    rough : (n,) int32
+        Cluster of every point, -1 for none.
+    spacing_m : float
+        Mean point spacing in plan, from which the fewest points of a plane follow.
+    distance_m : float
+        Up to which a point belongs to a plane; at least 1 mm is taken.
+    reach_m : float
+        Distance in plan up to which points are near a ridge.
+    leftover_rounds : int
+        Rounds of refinement with clusters among the points left over; 0 for none.
+    settings : PlaneRefinementSettings
+        All else.
+
+    Returns
+    -------
+    planes : (k, 3) float64
+        (a, b, c); every one has points.
+    labels : (n,) int32
+        Plane of every point, -1 for none.
+
+    Raises
+    ------
+    BuildingError
+        Reason ``too_complex`` beyond ``refinement_work_limit``.
+    """
+    distance_m = max(distance_m, _LEAST_DISTANCE_M)
+    fewest_points = settings.fewest_points(spacing_m)
+    planes, labels = refine_planes(
+        points, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=settings
+    )
+    rough = cluster_leftovers(points, neighbours, labels, distance_m, fewest_points)
+    if leftover_rounds > 0 and (rough != labels).any():
+        again = dataclasses.replace(settings, rounds=leftover_rounds)
+        planes, labels = refine_planes(
+            points, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=again
+        )
+    ridges = find_ridges(points, planes, labels, neighbours, distance_m=distance_m, reach_m=reach_m)
+    labels = label_by_ridges(points, planes, labels, ridges, distance_m=distance_m, reach_m=reach_m)
+    # a sliver along a ridge can lose all its points to the two sides: it is no plane any more
+    kept = np.unique(labels[labels >= 0])
+    return planes[kept], np.where(labels >= 0, np.searchsorted(kept, labels), -1).astype(np.int32)
