@@ -97,13 +97,9 @@ def cell(rows: Sequence[Mapping[str, Any]], name: str) -> str:
     return figure(next((row for row in rows if row["name"] == name and row["subset"] == "all"), None))
 
 
-def run_facts(manifest: Mapping[str, Any]) -> list[str]:
-    """Candidates by status, and milliseconds a candidate of the stage that models them."""
-    counts = manifest["counts"]
-    statuses = "/".join(str(counts[name]) for name in ("ok", "fallback", "failed"))
-    if not counts["candidates"]:
-        return [statuses, ""]
-    return [statuses, f"{1000.0 * manifest['timings_s']['reconstruct'] / counts['candidates']:.1f}"]
+def statuses(manifest: Mapping[str, Any]) -> str:
+    """Candidates by status; how long they take is the business of `method_times.py`."""
+    return "/".join(str(manifest["counts"][name]) for name in ("ok", "fallback", "failed"))
 
 
 def _reading_order(entry: Entry) -> tuple[bool, bool, float, float]:
@@ -123,23 +119,19 @@ def methods_table(entries: Sequence[Entry], variants: Sequence[Variant], place: 
                 if place.is_measured(variant, entry):
                     rows = place.table(variant, entry, "measures")
                     shown = [cell(rows, name) for name, _ in SHOWN]
-                    lines.append([entry.name, variant.label, *run_facts(place.manifest(variant, entry)), *shown])
+                    lines.append([entry.name, variant.label, statuses(place.manifest(variant, entry)), *shown])
     for variant in variants:
         measured = [entry for entry in cubes if place.is_measured(variant, entry)]
         if measured:
             tables = [place.table(variant, entry, "measures") for entry in measured]
             facts = [place.manifest(variant, entry) for entry in measured]
-            lines.append([f"cube, {len(measured)} draws", variant.label, *run_facts(_summed(facts)), *_means(tables)])
-    return markdown_table(["entry", "method", "ok/block/failed", "ms a building", *(head for _, head in SHOWN)], lines)
+            lines.append([f"cube, {len(measured)} draws", variant.label, statuses(_summed(facts)), *_means(tables)])
+    return markdown_table(["entry", "method", "ok/block/failed", *(head for _, head in SHOWN)], lines)
 
 
 def _summed(manifests: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What `run_facts` looks at, of several runs together."""
-    names = ("ok", "fallback", "failed", "candidates")
-    return {
-        "counts": {name: sum(one["counts"][name] for one in manifests) for name in names},
-        "timings_s": {"reconstruct": sum(one["timings_s"]["reconstruct"] for one in manifests)},
-    }
+    """What `statuses` looks at, of several runs together."""
+    return {"counts": {name: sum(one["counts"][name] for one in manifests) for name in ("ok", "fallback", "failed")}}
 
 
 def _means(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[str]:

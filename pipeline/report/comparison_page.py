@@ -129,7 +129,8 @@ def _notes(comparison: Comparison) -> list[str]:
         elif manifest.status is not RunStatus.FINISHED:
             notes.append(f"{run.label}: the run is {manifest.status.value}; not all of its buildings may be there.")
     if comparison.left_out:
-        notes.append(f"{comparison.left_out:,} buildings that not all runs have are left out of all that follows.")
+        but = ", but for the figures of the evaluation, which are of each run" if _has_intervals(comparison) else ""
+        notes.append(f"{comparison.left_out:,} buildings that not all runs have are left out of all that follows{but}.")
     if not comparison.has_points:
         notes.append("No points were at hand: the pictures show models alone.")
     evaluations = [run.evaluation for run in comparison.runs if run.evaluation is not None]

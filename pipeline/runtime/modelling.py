@@ -306,18 +306,18 @@ def model_bundle(bundle: Bundle) -> BuildingResult:
 
 
 def load() -> None:
-    """Load all that modelling needs, by modelling a small gable: libraries, and the compiled kernels."""
+    """Load all that modelling needs, by modelling a gable and a flat roof: libraries, and the compiled kernels."""
     spacing = np.arange(0.25, 10.0, 0.5)
     x, y = (axis.ravel() for axis in np.meshgrid(spacing, spacing, indexing="ij"))
-    z = 9.0 - 0.6 * np.abs(y - 5.0)
     lattice = np.arange(-4.5, 15.0)
     east, north = (axis.ravel() for axis in np.meshgrid(lattice, lattice, indexing="ij"))
-    gable = Candidate(
-        building_id="",
-        origin=(0.0, 0.0, 0.0),
-        points=np.rint(np.column_stack((x, y, z)) * 1e3) / 1e3,
-        ground=np.column_stack((east, north, np.zeros(len(east)))),
-        ground_z_m=0.0,
-    )
-    for method in METHODS:
-        reconstruct_building(gable, method, ReconstructSettings())
+    for z in (9.0 - 0.6 * np.abs(y - 5.0), np.full(len(y), 6.0)):
+        candidate = Candidate(
+            building_id="",
+            origin=(0.0, 0.0, 0.0),
+            points=np.rint(np.column_stack((x, y, z)) * 1e3) / 1e3,
+            ground=np.column_stack((east, north, np.zeros(len(east)))),
+            ground_z_m=0.0,
+        )
+        for method in METHODS:
+            reconstruct_building(candidate, method, ReconstructSettings())

@@ -308,7 +308,7 @@ def test_without_noise_or_a_least_distance_a_building_is_modelled_all_the_same()
 def test_a_rectangle_that_the_points_cannot_fill_is_refused_before_it_is_sampled(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    arm = np.arange(0.0, 120.0, 0.5)
+    arm = np.arange(0.0, 400.0, 0.5)
     wide = np.concatenate([[(a, b) for a in arm for b in (0.0, 0.5)], [(a, b) for a in (0.0, 0.5) for b in arm[2:]]])
     candidate = candidate_of(np.column_stack([wide, np.full(len(wide), 5.0)]))
     assert segment(candidate, ROBUST).faces is None
