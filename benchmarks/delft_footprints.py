@@ -1,6 +1,6 @@
 """Fuzzy SART over Delft's old town with the footprints and classes given: how good, how valid, how fast.
 
-    python benchmarks/delft_footprints.py --data ../shared/data [--literal]
+    python benchmarks/delft_footprints.py --data ../shared/data [--faithful]
 
 Scored as the methods' page defines it: vertical distance of all building points (class 6) inside the reference
 footprint to the delivered top surface; a point without a roof is a miss. *Top-visible* points have no other of the
@@ -120,12 +120,12 @@ def main() -> int:
     """Run and print; exit code 1 where a required figure is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder with ahn3/delft_west.laz and so on")
-    parser.add_argument("--literal", action="store_true", help="the paper to the letter")
+    parser.add_argument("--faithful", action="store_true", help="the paper to the letter")
     parser.add_argument("--without-footprints", action="store_true", help="footprints choose and score the points only")
     arguments = parser.parse_args()
     candidates = load_candidates(arguments.data)
     modelled = [Candidate(**{**vars(c), "footprint": None}) if arguments.without_footprints else c for c in candidates]
-    settings = ReconstructSettings(method=FuzzySartSettings.faithful() if arguments.literal else FuzzySartSettings())
+    settings = ReconstructSettings(method=FuzzySartSettings.faithful() if arguments.faithful else FuzzySartSettings())
     reconstruct_building(modelled[0], "fuzzy-sart", settings)
     results, seconds = [], []
     for candidate in modelled:
@@ -144,7 +144,7 @@ def main() -> int:
         int(str(table["roof_faces"])) <= 850,
         float(str(table["valid_share"])) == 1.0,
     )
-    return 0 if arguments.literal or arguments.without_footprints or all(required) else 1
+    return 0 if arguments.faithful or arguments.without_footprints or all(required) else 1
 
 
 if __name__ == "__main__":

@@ -146,7 +146,7 @@ def variants() -> dict[str, FuzzySartSettings]:
         "footpoint V .7": FuzzySartSettings(vectors="footpoint", vigilance=0.7),
         "spherical_scaled V .7": FuzzySartSettings(vectors="spherical_scaled", vigilance=0.7),
         "unit_normal V .9": FuzzySartSettings(vigilance=0.9),
-        "literal": FuzzySartSettings.faithful(),
+        "faithful": FuzzySartSettings.faithful(),
     }
 
 

@@ -114,8 +114,8 @@ def picked(candidates: Iterator[Candidate], arguments: argparse.Namespace) -> tu
             continue
         if not arguments.least_area <= robust.footprint.area <= arguments.most_area:
             continue
-        literal = ReconstructSettings(method=METHODS["kmeans"].preset("faithful"))
-        result = reconstruct_building(candidate, "kmeans", literal)
+        faithful = ReconstructSettings(method=METHODS["kmeans"].preset("faithful"))
+        result = reconstruct_building(candidate, "kmeans", faithful)
         if result.status is not Status.OK or result.roof_type is not RoofType.GABLE:
             continue
         if min(plane.slope_deg for plane in result.planes) < arguments.least_slope:
