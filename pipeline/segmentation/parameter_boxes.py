@@ -94,7 +94,9 @@ def _dense_groups(parameters: FloatArray, shift: float, settings: ParameterBoxSe
     key = ((layer - layer.min()) * _ROWS + row + 1) * _ROWS + column
     boxes, box_of_facet, counts = np.unique(key, return_inverse=True, return_counts=True)
     # single standing boxes above average are groups as well: the threshold is never below the average
-    dense = counts > max(float(counts.mean()), settings.dense_box_facets)
+    # one box that holds all facets (a roof without any noise) is not to be measured by itself
+    mean = float(counts.mean()) if len(counts) > 1 else 0.0
+    dense = counts > max(mean, settings.dense_box_facets)
     return np.asarray(_grow(boxes, dense, columns)[box_of_facet])
 
 

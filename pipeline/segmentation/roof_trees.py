@@ -47,7 +47,7 @@ class TreeVerdict:
 
 def plausible_slopes(centres: FloatArray, least_deg: float, most_deg: float) -> BoolArray:
     """Clusters whose mean slope may be a roof's (section 3.3): (k,) bool."""
-    return np.asarray((centres[:, 0] > least_deg) & (centres[:, 0] < most_deg))
+    return np.asarray((centres[:, 0] >= least_deg) & (centres[:, 0] <= most_deg))
 
 
 def classify_2d(centres: FloatArray, settings: RoofTreeSettings) -> TreeVerdict:

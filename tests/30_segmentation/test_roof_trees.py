@@ -78,5 +78,5 @@ def test_turning_the_scene_changes_no_leaf() -> None:
 
 
 def test_slopes_are_plausible_between_both_bounds() -> None:
-    centres = np.array([[7.0, 0, 0], [7.1, 0, 0], [74.9, 0, 0], [75.0, 0, 0]])
+    centres = np.array([[6.9, 0, 0], [7.0, 0, 0], [75.0, 0, 0], [75.1, 0, 0]])
     assert plausible_slopes(centres, 7.0, 75.0).tolist() == [False, True, True, False]

@@ -324,3 +324,25 @@ def test_a_city_block_of_100_000_points_is_segmented_whole() -> None:
         found = RECIPES[recipe](block)
         assert len(found.labels) > 90_000
         assert (found.labels >= 0).mean() > 0.8
+
+
+@pytest.mark.parametrize(
+    ("segment", "settings"), [(segment_2d, ParameterSpace2dSettings()), (segment_3d, ParameterSpace3dSettings())]
+)
+@pytest.mark.parametrize("rise", [0.0, 0.05, 0.5])
+def test_a_roof_without_any_noise_is_one_plane(segment: Any, settings: Any, rise: float) -> None:
+    steps = np.arange(0.25, 10.0, 0.5)
+    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
+    found = segment(
+        Candidate(
+            building_id="b",
+            origin=(0.0, 0.0, 0.0),
+            points=np.rint(np.column_stack((x, y, 6.0 + rise * x)) * 1e3) / 1e3,
+            ground=np.zeros((0, 3)),
+            ground_z_m=0.0,
+        ),
+        settings,
+    )
+    assert len(found.planes) == 1
+    assert found.planes[0].a == pytest.approx(rise, abs=1e-3)
+    assert (found.labels == 0).all()
