@@ -127,8 +127,15 @@ def _absorb_small(pieces: list[Polygon], labels: list[int], minimum_area_mm2: fl
 
 
 def outline(partition: RoofPartition) -> MultiPolygon:
-    """The area of a partition in integer millimetres."""
-    return MultiPolygon(polygons_of(shapely.coverage_union_all(np.array(partition.polygons, dtype=object))))
+    """The area of a partition in integer millimetres.
+
+    Also of one in which rounding to millimetres let a border cross itself: such a partition makes no solid, but has an
+    outline all the same.
+    """
+    polygons = np.array(partition.polygons, dtype=object)
+    if shapely.is_valid(polygons).all():
+        return MultiPolygon(polygons_of(shapely.coverage_union_all(polygons)))
+    return MultiPolygon(polygons_of(shapely.union_all(shapely.make_valid(polygons), grid_size=1.0)))
 
 
 def hull_of_points(points: FloatArray) -> Polygon | None:

@@ -14,7 +14,7 @@ from pipeline.errors import BuildingError
 from pipeline.model import FaceKind, Reason
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_parts, block_plane
-from pipeline.roof.footprint import clip_partition, footprint_in_mm, hull_of_points
+from pipeline.roof.footprint import clip_partition, footprint_in_mm, hull_of_points, outline
 from pipeline.roof.partition import RoofPartition
 
 SQUARE = RoofPartition(polygons=(shapely.box(0, 0, 10_000, 10_000),), labels=np.array([0], np.int32))
@@ -101,3 +101,16 @@ def test_a_block_is_valid_over_any_footprint(seed: int, tolerance_m: float) -> N
     parts = block_parts(footprint_in_mm(shape), plane, 0.0, tolerance_m, 1.0)
     assert parts
     assert all(check_solid(part.solid) == () for part in parts)
+
+
+def test_a_partition_with_a_border_that_crosses_itself_has_an_outline_all_the_same() -> None:
+    knot = shapely.Polygon([(0, 0), (4_000, 0), (4_000, 3_000), (2_000, 3_100), (2_010, 2_900), (0, 3_000)])
+    crossed = shapely.Polygon([(0, 3_000), (2_010, 2_900), (2_000, 3_100), (4_000, 3_000), (4_000, 6_000), (0, 6_000)])
+    bow = shapely.Polygon([(4_000, 0), (8_000, 0), (8_000, 6_000), (3_990, 3_050), (4_010, 3_040), (4_000, 6_000)])
+    partition = RoofPartition(polygons=(knot, crossed, bow), labels=np.arange(3, dtype=np.int32))
+    assert not shapely.is_valid(np.array(partition.polygons, dtype=object)).all()
+    found = outline(partition)
+    assert found.is_valid
+    assert found.area == pytest.approx(
+        shapely.union_all(shapely.make_valid(np.array(partition.polygons))).area, rel=1e-3
+    )
