@@ -61,7 +61,7 @@ class NormalClusteringSettings(Parameters):
     )
     kmeans_work_limit: int = parameter(
         2_000_000_000,
-        "Products of facets with centres after which a building is too complex.",
+        "Products of facets with centres, for each number of clusters tried, after which a building is too complex.",
         minimum=1,
         maximum=10**15,
     )

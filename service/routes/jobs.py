@@ -118,7 +118,8 @@ async def _read(
         elif name == "outputs":
             outputs = [*(outputs or ()), *_words(text)]
         elif name == "methods":
-            inputs.setdefault(name, []).extend(_words(text))
+            if words := _words(text):  # like any other field, left empty it was not given
+                inputs.setdefault(name, []).extend(words)
         elif name in inputs:
             faults.append(f"{shortened(name)} is given twice: give it once")
         elif text.strip():

@@ -140,9 +140,11 @@ def test_one_call_with_several_methods_compares_them(local_service, methods: lis
     assert '"preset" is no input' in faults_of(refused)
 
 
-def test_one_call_takes_a_preset(local_service) -> None:
+@pytest.mark.parametrize("left_empty", ["", " , "])
+def test_one_call_takes_a_preset_and_no_methods_for_none(local_service, left_empty: str) -> None:
     files = {"tile": ("a.xyz", b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(9) for y in range(9)))}
-    answer = local_service.client.post("/jobs", files=files, data={"crs": "EPSG:28992", "preset": "faithful"})
+    form = {"crs": "EPSG:28992", "preset": "faithful", "methods": left_empty}
+    answer = local_service.client.post("/jobs", files=files, data=form)
     assert answer.status_code == 201, answer.text
     asked = local_service.store.get(answer.json()["jobID"]).request
     assert (asked.process_id, asked.settings) == ("reconstruct", {"preset": "faithful"})
