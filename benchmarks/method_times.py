@@ -19,28 +19,20 @@ import argparse
 import dataclasses
 import os
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks.candidates import candidates_of
 from benchmarks.entries import Entry, Workplace, all_variants, hofmann_entries, markdown_table, run_settings, tiles_of
-from pipeline.io import ReadOptions
-from pipeline.io.gps_time import GpsTimeKind
 from pipeline.methods import Method, ReconstructSettings
 from pipeline.model import Candidate, FloatArray, Segmentation
 from pipeline.reconstruct import reconstruct_building
 from pipeline.runtime.compare import Variant, settings_of
-from pipeline.runtime.events import ignore
-from pipeline.runtime.gather import gather
-from pipeline.runtime.plan import make_plan
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.serial import SerialExecutor
-from pipeline.runtime.stages import Progress, Stages
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,28 +66,6 @@ class Times:
     """(n,) float64, all that follows."""
     statuses: tuple[str, ...]
     """(n,) what became of them."""
-
-
-def candidates_of(entry: Entry, place: Workplace) -> Iterator[Candidate]:
-    """The candidates of an entry, as a run finds them."""
-    settings = run_settings(entry)
-    plan = make_plan(tiles_of(entry, place), ReadOptions(crs=entry.crs), settings)
-    kinds = {info.gps_time_kind for info in plan.sources}
-    kind = kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
-    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
-        scratch = Scratch(str(Path(folder, "scratch")))
-        scratch.create()
-        stages = Stages(
-            settings=settings,
-            meshes="none",
-            plan=plan,
-            progress=Progress(ignore),
-            executor=SerialExecutor(),
-            scratch=scratch,
-        )
-        splits = stages.split(stages.ingest(tiles_of(entry, place)), None)
-        for site in stages.join(splits, None, plan.sources[0].reference).candidates:
-            yield gather(scratch, plan.grid, site, kind)[0]
 
 
 def clock(candidates: Sequence[Candidate], variants: Sequence[Variant], entry: Entry, repeat: int) -> dict[str, Times]:
@@ -184,7 +154,7 @@ def main() -> int:
     variants = [Variant.parse(text) for text in arguments.methods or ()] or all_variants(with_faithful=True)
     parts = []
     for entry in entries(arguments.data, arguments.split):
-        found = list(candidates_of(entry, place))
+        found = list(candidates_of(tiles_of(entry, place), entry.crs, run_settings(entry)))
         chosen = found[:: -(-len(found) // arguments.most)]
         sizes = np.quantile([len(candidate.points) for candidate in chosen], [0.5, 0.95])
         head = f"{entry.name}: {len(chosen)} candidates of {sizes[0]:.0f} points in the median, {sizes[1]:.0f} at 95 %."

@@ -17,7 +17,6 @@ import argparse
 import dataclasses
 import math
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,9 +24,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.candidates import candidates_of
 from pipeline.geometry import vertical_residuals_m
-from pipeline.io import ReadOptions
-from pipeline.io.gps_time import GpsTimeKind
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.methods.kmeans import BuildingTop, KMeansSettings, building_top, planes_of, sides_of
 from pipeline.methods.local_frame import local_metres
@@ -36,12 +34,6 @@ from pipeline.reconstruct import reconstruct_building
 from pipeline.report.perspective import VIEW_SUN, View, ViewedFace, draw_view, projected
 from pipeline.report.pictures import png_of
 from pipeline.roof.primitives import GableFit, fit_gable
-from pipeline.runtime.events import ignore
-from pipeline.runtime.gather import gather
-from pipeline.runtime.plan import make_plan
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.serial import SerialExecutor
-from pipeline.runtime.stages import Progress, Stages
 from pipeline.segmentation.plane_refinement import describe_planes
 from pipeline.settings import RunSettings
 
@@ -66,29 +58,6 @@ class Steps:
     """The two best-fit planes."""
     fit: GableFit
     """From them to the model."""
-
-
-def candidates_of(tile: Path, crs: str | None) -> Iterator[Candidate]:
-    """The candidates of a tile, as a run finds them."""
-    settings = RunSettings()
-    tiles = (str(tile),)
-    plan = make_plan(tiles, ReadOptions(crs=crs), settings)
-    kinds = {info.gps_time_kind for info in plan.sources}
-    kind = kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
-    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
-        scratch = Scratch(str(Path(folder, "scratch")))
-        scratch.create()
-        stages = Stages(
-            settings=settings,
-            meshes="none",
-            plan=plan,
-            progress=Progress(ignore),
-            executor=SerialExecutor(),
-            scratch=scratch,
-        )
-        splits = stages.split(stages.ingest(tiles), None)
-        for site in stages.join(splits, None, plan.sources[0].reference).candidates:
-            yield gather(scratch, plan.grid, site, kind)[0]
 
 
 def steps_of(candidate: Candidate) -> Steps:
@@ -260,7 +229,7 @@ def main() -> int:
     parser.add_argument("--most-elongated", type=float, default=2.5)
     parser.add_argument("--least-slope", type=float, default=15.0)
     arguments = parser.parse_args()
-    found = picked(candidates_of(arguments.tile, arguments.crs), arguments)
+    found = picked(candidates_of((str(arguments.tile),), arguments.crs, RunSettings()), arguments)
     if found is None:
         print(f"no building of {arguments.tile} meets the rule", file=sys.stderr)
         return 1

@@ -23,7 +23,7 @@ from pipeline.geometry import (
     top_visible,
 )
 from pipeline.methods.local_frame import check_extent, ground_around, local_metres, plane_over_origin
-from pipeline.methods.refinement import planes_of_clusters
+from pipeline.methods.refinement import RefinementSettings, planes_of_clusters
 from pipeline.model import BoolArray, Candidate, FloatArray, Reason, Segmentation
 from pipeline.parameters import parameter
 from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
@@ -33,13 +33,13 @@ from pipeline.segmentation.fuzzy_sart import (
     cluster,
     facet_vectors,
 )
-from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes
+from pipeline.segmentation.plane_refinement import describe_planes
 from pipeline.terrain.height_rule import facets_above_z_avg
 from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FuzzySartSettings(FuzzySartClusteringSettings, PlaneRefinementSettings):
+class FuzzySartSettings(FuzzySartClusteringSettings, RefinementSettings):
     """Settings of the recipe; those of the clustering and of the refinement are among them."""
 
     absorption: str = parameter(
@@ -53,16 +53,6 @@ class FuzzySartSettings(FuzzySartClusteringSettings, PlaneRefinementSettings):
     absorption_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
     absorption_max_slope_deg: float = parameter(
         60.0, "Facets that are steeper absorb nothing (Eq. 2) and are no roof.", unit="deg", minimum=1.0, maximum=89.0
-    )
-    plane_distance_min_m: float = parameter(
-        0.15, "Least distance up to which a point is merged with a plane.", unit="m", minimum=0.0, maximum=10.0
-    )
-    plane_distance_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
-    noise_factor: float = parameter(
-        3.0,
-        "Both distances are this many standard deviations of the noise, within their bounds.",
-        minimum=0.0,
-        maximum=100.0,
     )
     ground_gap_spacings: float = parameter(
         1.3,
@@ -83,19 +73,6 @@ class FuzzySartSettings(FuzzySartClusteringSettings, PlaneRefinementSettings):
     )
     split_by_connectivity: bool = parameter(
         True, "Whether a cluster is cut into the parts that hang together in the TIN."
-    )
-    neighbours: int = parameter(
-        9, "Nearest points whose planes a point chooses among.", unit="points", minimum=3, maximum=64
-    )
-    leftover_rounds: int = parameter(
-        2,
-        "Rounds of refinement with clusters that grow among the points no plane explains; 0 for none (as the paper).",
-        unit="rounds",
-        minimum=0,
-        maximum=50,
-    )
-    ridge_reach_spacings: float = parameter(
-        1.5, "Distance in plan up to which points are near a ridge, in mean point spacings.", minimum=0.0, maximum=10.0
     )
 
     @classmethod
@@ -118,20 +95,11 @@ class FuzzySartSettings(FuzzySartClusteringSettings, PlaneRefinementSettings):
 
     def cross_faults(self) -> list[str]:
         """Bounds must be ranges."""
-        faults = super().cross_faults()
-        for name in ("absorption", "plane_distance"):
-            low, high = getattr(self, f"{name}_min_m"), getattr(self, f"{name}_max_m")
-            if low > high:
-                faults.append(f"{name}_min_m is {low:g}: use at most {name}_max_m, {high:g}")
-        return faults
+        return [*super().cross_faults(), *self.range_faults("absorption")]
 
     def absorption_distance_m(self, sigma_m: float) -> float:
         """Distance of Eq. 1 for a noise."""
         return min(max(self.noise_factor * sigma_m, self.absorption_min_m), self.absorption_max_m)
-
-    def plane_distance_m(self, sigma_m: float) -> float:
-        """Distance of a point from its plane for a noise."""
-        return min(max(self.noise_factor * sigma_m, self.plane_distance_min_m), self.plane_distance_max_m)
 
     def insertion(self, sigma_m: float) -> GreedyInsertionSettings:
         """Settings of the TIN for a noise."""
@@ -211,8 +179,6 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
         rough,
         spacing_m=spacing_m,
         distance_m=distance_m,
-        reach_m=settings.ridge_reach_spacings * spacing_m,
-        leftover_rounds=settings.leftover_rounds,
         settings=settings,
     )
 

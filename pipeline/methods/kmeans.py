@@ -28,7 +28,7 @@ from pipeline.geometry import (
     vertical_residuals_m,
 )
 from pipeline.methods.local_frame import check_extent, local_metres, plane_over_origin
-from pipeline.methods.refinement import planes_of_clusters
+from pipeline.methods.refinement import RefinementSettings, planes_of_clusters
 from pipeline.model import Candidate, FloatArray, IntArray, LabelArray, Plane, PlanFace, Reason, Segmentation, Tin
 from pipeline.parameters import parameter
 from pipeline.roof.primitives import BuildingPrimitive, fit_box, fit_gable
@@ -40,7 +40,7 @@ from pipeline.segmentation.kmeans_normals import (
     choose_clusters,
     labels_around,
 )
-from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes
+from pipeline.segmentation.plane_refinement import describe_planes
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
 from pipeline.segmentation.surrounding_ground import far_from
 from pipeline.tin.delaunay import triangulate, unique_xy
@@ -50,7 +50,7 @@ _LEAST_FACETS = 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class KMeansSettings(NormalClusteringSettings, PlaneRefinementSettings):
+class KMeansSettings(NormalClusteringSettings, RefinementSettings):
     """Settings of the recipe; those of the clustering and of the refinement are among them."""
 
     longest_edge_spacings: float = parameter(
@@ -73,29 +73,6 @@ class KMeansSettings(NormalClusteringSettings, PlaneRefinementSettings):
         True,
         "Whether clusters are split where they do not hang together, merged where they are one plane, and their points "
         "assigned anew; without it there is one least-squares fit a cluster (as the paper).",
-    )
-    plane_distance_min_m: float = parameter(
-        0.15, "Least distance up to which a point belongs to a plane.", unit="m", minimum=0.0, maximum=10.0
-    )
-    plane_distance_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
-    noise_factor: float = parameter(
-        3.0,
-        "That distance is this many standard deviations of the noise, within its bounds.",
-        minimum=0.0,
-        maximum=100.0,
-    )
-    neighbours: int = parameter(
-        9, "Nearest points whose planes a point chooses among.", unit="points", minimum=3, maximum=64
-    )
-    leftover_rounds: int = parameter(
-        2,
-        "Rounds of refinement with clusters that grow among the points no plane explains; 0 for none.",
-        unit="rounds",
-        minimum=0,
-        maximum=50,
-    )
-    ridge_reach_spacings: float = parameter(
-        1.5, "Distance in plan up to which points are near a ridge, in mean point spacings.", minimum=0.0, maximum=10.0
     )
     one_plane_deg: float = parameter(
         6.0,
@@ -170,14 +147,6 @@ class KMeansSettings(NormalClusteringSettings, PlaneRefinementSettings):
             outline="rectangle",
             margin_spacings=0.0,
         )
-
-    def cross_faults(self) -> list[str]:
-        """The distance must be a range."""
-        faults = super().cross_faults()
-        low, high = self.plane_distance_min_m, self.plane_distance_max_m
-        if low > high:
-            faults.append(f"plane_distance_min_m is {low:g}: use at most plane_distance_max_m, {high:g}")
-        return faults
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -283,9 +252,7 @@ def building_top(points: FloatArray, settings: KMeansSettings) -> BuildingTop:
         index=index,
         spacing_m=point_spacing_m(top),
         sigma_m=sigma_m,
-        distance_m=min(
-            max(settings.noise_factor * sigma_m, settings.plane_distance_min_m), settings.plane_distance_max_m
-        ),
+        distance_m=settings.plane_distance_m(sigma_m),
         tin=triangulate(grid[kept, :2]),
     )
 
@@ -371,8 +338,6 @@ def _refined_planes(top: BuildingTop, clusters: LabelArray, settings: KMeansSett
         labels_around(top.points, top.tin.facets, parts),
         spacing_m=top.spacing_m,
         distance_m=top.distance_m,
-        reach_m=settings.ridge_reach_spacings * top.spacing_m,
-        leftover_rounds=settings.leftover_rounds,
         settings=settings,
     )
 

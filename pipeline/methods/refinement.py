@@ -11,12 +11,56 @@ import dataclasses
 import numpy as np
 
 from pipeline.model import FloatArray, LabelArray
+from pipeline.parameters import parameter
 from pipeline.segmentation.leftover_planes import cluster_leftovers
 from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, refine_planes
 from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
 
 _LEAST_DISTANCE_M = 1e-3
 """The grid of the points: no distance to a plane is less, also where settings and noise are 0."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RefinementSettings(PlaneRefinementSettings):
+    """Settings of the common end; those of its stages are among them."""
+
+    plane_distance_min_m: float = parameter(
+        0.15, "Least distance up to which a point belongs to a plane.", unit="m", minimum=0.0, maximum=10.0
+    )
+    plane_distance_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
+    noise_factor: float = parameter(
+        3.0,
+        "Distances that follow the noise are this many standard deviations of it, within their bounds.",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    neighbours: int = parameter(
+        9, "Nearest points whose planes a point chooses among.", unit="points", minimum=3, maximum=64
+    )
+    leftover_rounds: int = parameter(
+        2,
+        "Rounds of refinement with clusters that grow among the points no plane explains; 0 for none (as the papers).",
+        unit="rounds",
+        minimum=0,
+        maximum=50,
+    )
+    ridge_reach_spacings: float = parameter(
+        1.5, "Distance in plan up to which points are near a ridge, in mean point spacings.", minimum=0.0, maximum=10.0
+    )
+
+    def cross_faults(self) -> list[str]:
+        """The distance must be a range."""
+        return [*super().cross_faults(), *self.range_faults("plane_distance")]
+
+    def range_faults(self, name: str) -> list[str]:
+        """What is wrong with a pair of bounds, `name` without its ending."""
+        low, high = getattr(self, f"{name}_min_m"), getattr(self, f"{name}_max_m")
+        return [f"{name}_min_m is {low:g}: use at most {name}_max_m, {high:g}"] if low > high else []
+
+    def plane_distance_m(self, sigma_m: float) -> float:
+        """Distance of a point from its plane for a noise; 1 mm, the grid of the points, is the least."""
+        bounded = min(max(self.noise_factor * sigma_m, self.plane_distance_min_m), self.plane_distance_max_m)
+        return max(bounded, _LEAST_DISTANCE_M)
 
 
 def planes_of_clusters(
@@ -26,9 +70,7 @@ def planes_of_clusters(
     *,
     spacing_m: float,
     distance_m: float,
-    reach_m: float,
-    leftover_rounds: int,
-    settings: PlaneRefinementSettings,
+    settings: RefinementSettings,
 ) -> tuple[FloatArray, LabelArray]:
     """Roof planes of rough clusters, and the plane of every point.
 
@@ -41,14 +83,10 @@ def planes_of_clusters(
     rough : (n,) int32
         Cluster of every point, -1 for none.
     spacing_m : float
-        Mean point spacing in plan, from which the fewest points of a plane follow.
+        Mean point spacing in plan.
     distance_m : float
-        Up to which a point belongs to a plane; at least 1 mm is taken.
-    reach_m : float
-        Distance in plan up to which points are near a ridge.
-    leftover_rounds : int
-        Rounds of refinement with clusters among the points left over; 0 for none.
-    settings : PlaneRefinementSettings
+        Up to which a point belongs to a plane: `settings.plane_distance_m` of the noise.
+    settings : RefinementSettings
         All else.
 
     Returns
@@ -63,17 +101,17 @@ def planes_of_clusters(
     BuildingError
         Reason ``too_complex`` beyond ``refinement_work_limit``.
     """
-    distance_m = max(distance_m, _LEAST_DISTANCE_M)
     fewest_points = settings.fewest_points(spacing_m)
     planes, labels = refine_planes(
         points, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=settings
     )
     rough = cluster_leftovers(points, neighbours, labels, distance_m, fewest_points)
-    if leftover_rounds > 0 and (rough != labels).any():
-        again = dataclasses.replace(settings, rounds=leftover_rounds)
+    if settings.leftover_rounds > 0 and (rough != labels).any():
+        again = dataclasses.replace(settings, rounds=settings.leftover_rounds)
         planes, labels = refine_planes(
             points, neighbours, rough, distance_m=distance_m, fewest_points=fewest_points, settings=again
         )
+    reach_m = settings.ridge_reach_spacings * spacing_m
     ridges = find_ridges(points, planes, labels, neighbours, distance_m=distance_m, reach_m=reach_m)
     labels = label_by_ridges(points, planes, labels, ridges, distance_m=distance_m, reach_m=reach_m)
     # a sliver along a ridge can lose all its points to the two sides: it is no plane any more
