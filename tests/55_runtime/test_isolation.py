@@ -276,7 +276,8 @@ def test_bytes_that_are_no_message_are_noticed() -> None:
 # --- nobody outlives whom they work for -------------------------------------------------------------------------------
 
 WORKER = """
-import sys, time
+import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started us with SIGINT ignored
 sys.path.insert(0, sys.argv[1])
 from pipeline.runtime import children
 from pipeline.runtime.isolation import IsolationLimits, supervise

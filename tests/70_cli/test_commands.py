@@ -14,7 +14,9 @@ from typer.testing import CliRunner
 from pipeline import __version__
 from pipeline.cli import app
 
-COMMANDS = ("reconstruct", "inspect", "simulate", "digest", "evaluate", "warm-up", "demo", "replay", "worker")
+COMMANDS = (
+    *("reconstruct", "compare", "inspect", "simulate", "digest", "evaluate", "warm-up", "demo", "replay", "worker"),
+)
 
 
 def invoke(*words: str) -> tuple[int, str, str]:
