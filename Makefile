@@ -28,7 +28,7 @@ KERNELS = $(shell cat $(KERNEL_SOURCES) | cksum | tr ' ' '-')
 TEST_ENV = NUMBA_CACHE_DIR="$(CURDIR)/.cache/numba/$(KERNELS)" OPENBLAS_NUM_THREADS=1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check unit slow slow-pipeline slow-service viewer serve ruler lock docs format clean
+.PHONY: help demo test check unit slow viewer serve ruler lock docs format clean
 .DELETE_ON_ERROR:
 
 help:
@@ -100,15 +100,8 @@ unit: $(VENV)/.test-stamp
 	@mkdir -p .cache/numba && find .cache/numba -mindepth 1 -maxdepth 1 ! -name '$(KERNELS)' -exec rm -rf {} +
 	$(TEST_ENV) $(BIN)/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile --durations=15
 
-# Two processes side by side: the pipeline's tests compute, the service's mostly wait for processes of their own.
 slow: $(VENV)/.test-stamp viewer
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target slow-service slow-pipeline
-
-slow-pipeline: $(VENV)/.test-stamp
-	$(TEST_ENV) $(BIN)/python -m pytest -m slow --durations=15 $(filter-out tests/8%,$(wildcard tests/[0-9]*))
-
-slow-service: $(VENV)/.test-stamp
-	$(TEST_ENV) $(BIN)/python -m pytest -m slow --durations=15 $(wildcard tests/8*)
+	$(TEST_ENV) $(BIN)/python -m pytest -m slow --durations=15
 
 viewer: service/viewer/dist/index.html
 
