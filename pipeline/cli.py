@@ -205,13 +205,17 @@ def compare(
         from pipeline.report.evaluation_page import headline
         from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
         from pipeline.runtime.run import RunRequest
-        from pipeline.settings import read_table
+        from pipeline.settings import RunSettings, read_table
 
+        table = read_table(settings)
+        tables = own_tables(table)
+        if classes is not None:
+            table["classes"] = classes
         request = CompareRequest(
             run=RunRequest(
                 inputs=tuple(tiles),
                 out=out,
-                settings=_run_settings(settings, classes=classes),
+                settings=RunSettings.from_mapping(table),
                 footprints=footprints,
                 crs=crs,
                 vertical_unit=vertical_unit,
@@ -227,7 +231,7 @@ def compare(
                 building_memory_bytes=round(building_memory * 2**30),
             ),
             variants=parse_variants(methods),
-            tables=own_tables(read_table(settings)),
+            tables=tables,
         )
         reference = None
         if truth is not None or points or as_surveyed:

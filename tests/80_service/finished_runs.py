@@ -225,3 +225,13 @@ def service(state: Path) -> Iterator[Service]:
     settings = ServiceSettings(state=state)
     with JobStore(settings.database) as store, TestClient(create_app(settings, store), "http://127.0.0.1") as client:
         yield Service(client=client, store=store, folder=StateFolder(state))
+
+
+def problem(response: Any, status: int, word: str) -> str:
+    """The detail of an answer that must be this problem."""
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    told = response.json()
+    assert told["status"] == status
+    assert told["type"].endswith(word), told
+    return str(told["detail"])

@@ -261,12 +261,6 @@ def job_id(service: runs.Service) -> str:
     return service.compared()
 
 
-def problem(response: Any, status: int, word: str) -> str:
-    assert response.status_code == status, response.text
-    assert response.json()["type"].endswith(word), response.json()
-    return str(response.json()["detail"])
-
-
 def test_the_runs_lie_where_the_pipeline_puts_them() -> None:
     assert RUNS == compare.RUNS
     assert COMPARISON_OUTPUTS["summary"].filename == compare.SUMMARY
@@ -323,7 +317,7 @@ def test_one_building_is_told_by_every_method(client: TestClient, job_id: str) -
         assert client.get(place, params={"method": label, "f": "cityjson"}).json()["CityObjects"]
     other = f"/jobs/{job_id}/buildings/{runs.ident('pent')}"
     assert client.get(other).status_code == 200
-    problem(client.get(other, params={"method": FAITHFUL}), 404, "no-such-building")
+    runs.problem(client.get(other, params={"method": FAITHFUL}), 404, "no-such-building")
 
 
 def test_a_method_that_was_not_compared_is_told_with_those_that_were(
@@ -331,17 +325,17 @@ def test_a_method_that_was_not_compared_is_told_with_those_that_were(
 ) -> None:
     alone = service.finished()
     for path in ("results", "results/report", "buildings", f"buildings/{runs.ident('gable')}"):
-        told = problem(client.get(f"/jobs/{job_id}/{path}?method=../x"), 400, "invalid-request")
+        told = runs.problem(client.get(f"/jobs/{job_id}/{path}?method=../x"), 400, "invalid-request")
         assert f"use one of {ROBUST}, {FAITHFUL}" in told
-        told = problem(client.get(f"/jobs/{alone}/{path}?method={ROBUST}"), 400, "invalid-request")
+        told = runs.problem(client.get(f"/jobs/{alone}/{path}?method={ROBUST}"), 400, "invalid-request")
         assert "this job ran one method" in told
 
 
 def test_an_output_of_a_run_says_how_to_ask_for_it(client: TestClient, job_id: str) -> None:
     for path in ("results/cityjson", "results?outputs=cityjson"):
-        told = problem(client.get(f"/jobs/{job_id}/{path}"), 404, "no-such-output")
+        told = runs.problem(client.get(f"/jobs/{job_id}/{path}"), 404, "no-such-output")
         assert f"ask with ?method= and one of {ROBUST}, {FAITHFUL}" in told
-    problem(client.get(f"/jobs/{job_id}/results/page?method={ROBUST}"), 404, "no-such-output")
+    runs.problem(client.get(f"/jobs/{job_id}/results/page?method={ROBUST}"), 404, "no-such-output")
 
 
 def test_the_status_leads_to_the_page(service: runs.Service, client: TestClient, job_id: str) -> None:
@@ -401,4 +395,4 @@ def test_the_archive_holds_the_whole_comparison_and_no_folder_of_the_server(
 def test_a_comparison_that_is_not_over_has_no_results(service: runs.Service, client: TestClient) -> None:
     job = service.running(**COMPARISON)
     for path in ("results", "results?method=fuzzy-sart", "results/page", "buildings", "buildings?method=x"):
-        problem(client.get(f"/jobs/{job.job_id}/{path}"), 404, f"{OGC}result-not-ready")
+        runs.problem(client.get(f"/jobs/{job.job_id}/{path}"), 404, f"{OGC}result-not-ready")

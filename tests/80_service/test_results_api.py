@@ -44,16 +44,6 @@ def job_id(service: runs.Service) -> str:
     return service.finished()
 
 
-def problem(response: object, status: int, word: str) -> str:
-    """The detail of an answer that must be this problem."""
-    assert response.status_code == status, response.text
-    assert response.headers["content-type"] == "application/problem+json"
-    told = response.json()
-    assert told["status"] == status
-    assert told["type"].endswith(word), told
-    return str(told["detail"])
-
-
 # --- the document ----------------------------------------------------------------------------------------------------
 
 
@@ -79,14 +69,14 @@ def test_outputs_can_be_chosen(client: TestClient, job_id: str) -> None:
 
 def test_an_unknown_output_in_the_choice_is_told_with_the_known_ones(client: TestClient, job_id: str) -> None:
     answer = client.get(f"/jobs/{job_id}/results", params={"outputs": "report,colours"})
-    assert "'colours': use buildings, planes" in problem(answer, 400, "invalid-request")
+    assert "'colours': use buildings, planes" in runs.problem(answer, 400, "invalid-request")
 
 
 def test_an_output_that_was_not_asked_for_is_told_with_those_that_are_there(service: runs.Service) -> None:
     job_id = service.finished(outputs=("report", "meshes"))
     assert list(service.client.get(f"/jobs/{job_id}/results").json()) == ["meshes", "report"]
     for path in (f"/jobs/{job_id}/results?outputs=planes", f"/jobs/{job_id}/results/planes"):
-        assert "it has: meshes, report" in problem(service.client.get(path), 404, "no-such-output")
+        assert "it has: meshes, report" in runs.problem(service.client.get(path), 404, "no-such-output")
 
 
 @pytest.mark.parametrize("name", ["colours", "outputs.json", "index.sqlite", "..%2f..%2fservice.db", "%00"])
@@ -150,7 +140,7 @@ def test_a_range_behind_the_end_is_refused_with_the_size(client: TestClient, job
     path = f"/jobs/{job_id}/results/buildings"
     size = client.head(path).headers["content-length"]
     answer = client.get(path, headers={"Range": asked})
-    assert f"there are {size} bytes" in problem(answer, 416, "about:blank")
+    assert f"there are {size} bytes" in runs.problem(answer, 416, "about:blank")
     assert answer.headers["content-range"] == f"bytes */{size}"
 
 
@@ -209,7 +199,7 @@ def test_a_client_that_takes_the_type_gets_it(client: TestClient, job_id: str, a
 @pytest.mark.parametrize("accept", ["text/html", "application/json", "application/vnd.apache.parquet;q=0, image/*"])
 def test_a_client_that_does_not_is_told_what_there_is(client: TestClient, job_id: str, accept: str) -> None:
     answer = client.get(f"/jobs/{job_id}/results/buildings", headers={"Accept": accept})
-    assert "application/vnd.apache.parquet" in problem(answer, 406, "about:blank")
+    assert "application/vnd.apache.parquet" in runs.problem(answer, 406, "about:blank")
 
 
 # --- jobs without results --------------------------------------------------------------------------------------------
@@ -225,7 +215,7 @@ def paths(job_id: str) -> list[str]:
 def test_a_running_job_is_not_ready(service: runs.Service) -> None:
     job_id = service.running().job_id
     for path in paths(job_id):
-        detail = problem(service.client.get(path), 404, f"{OGC}result-not-ready")
+        detail = runs.problem(service.client.get(path), 404, f"{OGC}result-not-ready")
         assert "is running (0 %)" in detail
 
 
@@ -234,37 +224,37 @@ def test_a_dismissed_job_has_no_results(service: runs.Service) -> None:
     service.store.dismiss(job.job_id)
     service.store.dismissed(job)
     for path in paths(job.job_id):
-        assert "was dismissed" in problem(service.client.get(path), 404, f"{OGC}result-not-ready")
+        assert "was dismissed" in runs.problem(service.client.get(path), 404, f"{OGC}result-not-ready")
 
 
 @pytest.mark.parametrize(("fault", "status"), [(Fault.INPUT, 422), (Fault.SETTINGS, 422), (Fault.CLUSTER, 503)])
 def test_a_failed_job_answers_with_its_cause(service: runs.Service, fault: Fault, status: int) -> None:
     job_id = service.failed(JobFailure(fault=fault, detail="tile.laz has no points: send another"))
     for path in paths(job_id):
-        detail = problem(service.client.get(path), status, f"job-failed-{fault.value}")
+        detail = runs.problem(service.client.get(path), status, f"job-failed-{fault.value}")
         assert detail == "tile.laz has no points: send another"
 
 
 def test_no_job_is_no_job(client: TestClient) -> None:
     for path in paths("0" * 32) + paths("x"):
-        problem(client.get(path), 404, f"{OGC}no-such-job")
+        runs.problem(client.get(path), 404, f"{OGC}no-such-job")
 
 
 def test_results_whose_files_are_gone_are_told_so(service: runs.Service) -> None:
     job_id = service.finished()
     shutil.rmtree(service.folder.job(job_id))
     for path in paths(job_id):
-        assert "no longer in the state folder" in problem(service.client.get(path), 404, "no-such-output")
+        assert "no longer in the state folder" in runs.problem(service.client.get(path), 404, "no-such-output")
 
 
 def test_a_building_whose_job_is_being_removed_is_told_so(service: runs.Service) -> None:
     job_id = service.finished()
     (service.folder.outputs(job_id, 1) / "buildings.geojson").unlink()
     answer = service.client.get(f"/jobs/{job_id}/buildings/{runs.ident('gable')}")
-    assert "no longer in the state folder" in problem(answer, 404, "no-such-output")
+    assert "no longer in the state folder" in runs.problem(answer, 404, "no-such-output")
     (service.folder.outputs(job_id, 1) / "index.sqlite").unlink()
     answer = service.client.get(f"/jobs/{job_id}/buildings")
-    assert "no longer in the state folder" in problem(answer, 404, "no-such-output")
+    assert "no longer in the state folder" in runs.problem(answer, 404, "no-such-output")
 
 
 def test_results_of_another_key_are_no_results(tmp_path: Path) -> None:
@@ -279,8 +269,8 @@ def test_results_of_another_key_are_no_results(tmp_path: Path) -> None:
             mine = service.client.get(path, headers={"Authorization": f"Bearer {tokens['owner']}"})
             assert mine.status_code == 200
             foreign = service.client.get(path, headers={"Authorization": f"Bearer {tokens['other']}"})
-            problem(foreign, 404, f"{OGC}no-such-job")
-            problem(service.client.get(path), 401, "unauthorized")
+            runs.problem(foreign, 404, f"{OGC}no-such-job")
+            runs.problem(service.client.get(path), 401, "unauthorized")
 
 
 # --- the description -------------------------------------------------------------------------------------------------
