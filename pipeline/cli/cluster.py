@@ -1,0 +1,46 @@
+"""The worker of a cluster."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from pipeline.console import Console
+
+
+def worker(
+    scheduler: Annotated[str, typer.Option(metavar="ADDRESS", help="The Dask scheduler, as tcp://host:8786.")],
+    threads: Annotated[int, typer.Option(min=1, help="Tasks at once.")] = 1,
+    memory_limit: Annotated[
+        str, typer.Option(metavar="BYTES", help="Memory of the process, such as 4GiB; auto, or 0 for none.")
+    ] = "auto",
+    local_directory: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Where the worker keeps its own files; default temporary.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name in the scheduler's lists; default its address.")] = None,
+    host: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="To listen on; default what leads to the scheduler.")
+    ] = None,
+    drain_timeout: Annotated[
+        float | None, typer.Option(metavar="S", min=0, help="Longest wait for running tasks at the end; default none.")
+    ] = None,
+    give_up_after: Annotated[
+        float | None, typer.Option(metavar="S", min=0, help="End when the scheduler was away so long; default never.")
+    ] = None,
+) -> None:
+    """Work for a Dask scheduler; on SIGTERM finish what runs, then leave."""
+    with Console() as console:
+        from pipeline.runtime.worker import WorkerOptions, serve_worker
+
+        options = WorkerOptions(
+            scheduler=scheduler,
+            threads=threads,
+            memory_limit=memory_limit,
+            local_directory=local_directory,
+            name=name,
+            host=host,
+            drain_timeout_s=drain_timeout,
+            give_up_after_s=give_up_after,
+        )
+        serve_worker(options, console.say)

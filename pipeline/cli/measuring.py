@@ -1,0 +1,153 @@
+"""Commands that look at tiles, runs and models."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pipeline.cli.options import (
+    AsJson,
+    AsSurveyed,
+    Crs,
+    Points,
+    Quiet,
+    Truth,
+    VerticalUnit,
+)
+from pipeline.console import Console
+
+if TYPE_CHECKING:
+    from pipeline.evaluation.evaluate import Evaluation
+
+
+def inspect(
+    tile: Annotated[str, typer.Argument(metavar="TILE", help="A LAS, LAZ, COPC, PLY or ASCII file.")],
+    crs: Crs = None,
+    vertical_unit: VerticalUnit = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Tell what a tile holds and roughly what it takes; reads it once, streamed."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.inspection import inspect as inspect_tile
+        from pipeline.io.source import ReadOptions
+        from pipeline.runtime.events import Event
+
+        def on_progress(done: int, total: int) -> None:
+            console.on_event(Event(kind="progress", stage="read", done=done, total=total))
+
+        found = inspect_tile(tile, ReadOptions(crs=crs, vertical_unit=vertical_unit), on_progress)
+        for warning in found.warnings:
+            console.warn(warning)
+        console.table(tile, ["fact", "value"], found.rows())
+        shares = [[n, count, f"{100.0 * count / found.used_points:.1f} %"] for n, count in found.classes.items()]
+        console.table("Classes", ["class", "points", "share"], shares)
+        console.document(dataclasses.asdict(found))
+
+
+def digest(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="A run directory.")],
+    as_json: AsJson = False,
+) -> None:
+    """Print the sha256 of a run's content, the same for all workers and tilings."""
+    with Console(as_json=as_json) as console:
+        from pipeline.runtime.digest import run_digest
+
+        content = run_digest(run)
+        console.say(content)
+        console.document({"run": run, "content_sha256": content})
+
+
+def evaluate(
+    models: Annotated[
+        str, typer.Argument(metavar="MODELS", help="A run directory; CityJSON, CityJSONSeq or OBJ of any program.")
+    ],
+    truth: Truth = None,
+    points: Points = None,
+    footprints: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Building outlines that go with the points.")
+    ] = None,
+    ground: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FILE", help="The same points as some program classified them: judge its ground."),
+    ] = None,
+    crs: Crs = None,
+    vertical_unit: VerticalUnit = None,
+    as_surveyed: AsSurveyed = False,
+    blocks: Annotated[
+        bool | None,
+        typer.Option(
+            "--blocks/--no-blocks", help="Join true buildings that touch; default: for models without footprints."
+        ),
+    ] = None,
+    out: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Write the report here: a page, Markdown, Parquet tables.")
+    ] = None,
+    picture: Annotated[str | None, typer.Option(metavar="FILE", help="Draw the run to this PNG file.")] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Measure models: against simulated truth, against classified points, or by themselves."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.evaluation.files import EvaluationRequest, evaluate_files
+        from pipeline.runtime.events import Event
+
+        request = EvaluationRequest(
+            models=models,
+            truth=truth,
+            points=tuple(points or ()),
+            footprints=footprints,
+            ground=tuple(ground or ()),
+            crs=crs,
+            vertical_unit=vertical_unit,
+            as_surveyed=as_surveyed,
+            blocks=blocks,
+        )
+
+        def on_step(name: str) -> None:
+            console.on_event(Event(kind="stage", stage=name))
+
+        evaluation = evaluate_files(request, on_step)
+        document = show_evaluation(console, evaluation)
+        if out is not None:
+            from pipeline.evaluation.writing import write_tables
+            from pipeline.report.evaluation_page import write_page
+
+            on_step("page")
+            written = [*write_tables(evaluation, out), write_page(evaluation, out)]
+            console.say(f"the report is {written[-1]}")
+            document["written"] = [str(path) for path in written]
+        if picture is not None:
+            from pipeline.report.render import render_run
+
+            render_run(models, picture, truth=truth)
+            console.say(f"the picture is {picture}")
+            document["picture"] = picture
+        console.document(document)
+
+
+def show_evaluation(console: Console, evaluation: Evaluation) -> dict[str, Any]:
+    """An evaluation as tables; returns it as plain JSON values."""
+    from pipeline.evaluation.chapters import chapters
+    from pipeline.evaluation.writing import all_notes, measures_table
+
+    document: dict[str, Any] = {"models": evaluation.models.path, "notes": list(all_notes(evaluation))}
+    if evaluation.models.kind == "run":
+        from pipeline.report.table import run_statistics, statistics_tables
+
+        document["statistics"] = run_statistics(evaluation.models.path)
+        for table in statistics_tables(document["statistics"]):
+            console.show(table)
+    for chapter in chapters(evaluation):
+        rows = [
+            (line.label, line.value, line.interval, line.n) for line in chapter.lines if line.measure.subset == "all"
+        ]
+        console.table(chapter.title, ["measure", "value", "95 % interval", "n"], rows)
+        for counts in chapter.tables:
+            console.table(counts.title, list(counts.header), list(counts.rows))
+    for note in all_notes(evaluation):
+        console.say(note)
+    document["measures"] = measures_table(evaluation).to_pylist()
+    return document

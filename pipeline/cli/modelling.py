@@ -1,0 +1,263 @@
+"""Commands that model buildings."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from pipeline.cli.options import (
+    BUILDING_MEMORY_GIB,
+    BUILDING_TIMEOUT_S,
+    Aoi,
+    AsJson,
+    AsSurveyed,
+    Bbox,
+    BuildingMemory,
+    BuildingTimeout,
+    Classes,
+    Crs,
+    Footprints,
+    Isolate,
+    Licence,
+    Meshes,
+    Method,
+    Overwrite,
+    Points,
+    Quiet,
+    Scheduler,
+    SettingsFile,
+    Truth,
+    VerticalUnit,
+    Workers,
+)
+from pipeline.console import Console, ExitCode
+
+if TYPE_CHECKING:
+    from pipeline.runtime.run import RunSummary
+    from pipeline.settings import RunSettings
+
+
+def reconstruct(
+    tiles: Annotated[
+        list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
+    ],
+    out: Annotated[str, typer.Option(metavar="RUN", help="The run directory to write.")],
+    method: Method = None,
+    preset: Annotated[
+        Literal["robust", "faithful"] | None,
+        typer.Option(help="Settings of the method that measured better, or that keep to its paper."),
+    ] = None,
+    footprints: Footprints = None,
+    crs: Crs = None,
+    vertical_unit: VerticalUnit = None,
+    bbox: Bbox = None,
+    aoi: Aoi = None,
+    classes: Classes = None,
+    settings: SettingsFile = None,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    meshes: Meshes = "building",
+    licence: Licence = None,
+    overwrite: Overwrite = False,
+    isolate: Annotated[bool | None, Isolate] = None,
+    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
+    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Reconstruct buildings from tiles into a run directory."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.runtime.run import RunRequest, run
+
+        request = RunRequest(
+            inputs=tuple(tiles),
+            out=out,
+            settings=_run_settings(settings, method=method, preset=preset, classes=classes),
+            footprints=footprints,
+            crs=crs,
+            vertical_unit=vertical_unit,
+            bbox=bbox,
+            aoi=aoi,
+            workers=workers,
+            scheduler=scheduler,
+            meshes=meshes,
+            licence=licence,
+            overwrite=overwrite,
+            isolate=isolate,
+            building_timeout_s=building_timeout,
+            building_memory_bytes=round(building_memory * 2**30),
+        )
+        summary = run(request, console.on_event)
+        show_summary(console, summary)
+        console.document(dataclasses.asdict(summary))
+        if summary.failed_tiles:
+            raise typer.Exit(ExitCode.TILES_FAILED)
+
+
+def compare(
+    tiles: Annotated[
+        list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
+    ],
+    methods: Annotated[
+        list[str],
+        typer.Option(metavar="M1,M2,…", help="METHOD or METHOD:PRESET, two or more; preset robust or faithful."),
+    ],
+    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: a run a method, and the page.")],
+    footprints: Footprints = None,
+    crs: Crs = None,
+    vertical_unit: VerticalUnit = None,
+    bbox: Bbox = None,
+    aoi: Aoi = None,
+    classes: Classes = None,
+    settings: SettingsFile = None,
+    truth: Truth = None,
+    points: Points = None,
+    as_surveyed: AsSurveyed = False,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    meshes: Meshes = "none",
+    licence: Licence = None,
+    overwrite: Overwrite = False,
+    isolate: Annotated[bool | None, Isolate] = None,
+    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
+    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Model the same candidates by several methods and write one page on what came out."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.evaluation.chapters import chapters
+        from pipeline.evaluation.files import EvaluationRequest
+        from pipeline.report.compare_files import compare_files, comparison_facts
+        from pipeline.report.evaluation_page import headline
+        from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
+        from pipeline.runtime.run import RunRequest
+        from pipeline.settings import RunSettings, read_table
+
+        table = read_table(settings)
+        tables = own_tables(table)
+        if classes is not None:
+            table["classes"] = classes
+        request = CompareRequest(
+            run=RunRequest(
+                inputs=tuple(tiles),
+                out=out,
+                settings=RunSettings.from_mapping(table),
+                footprints=footprints,
+                crs=crs,
+                vertical_unit=vertical_unit,
+                bbox=bbox,
+                aoi=aoi,
+                workers=workers,
+                scheduler=scheduler,
+                meshes=meshes,
+                licence=licence,
+                overwrite=overwrite,
+                isolate=isolate,
+                building_timeout_s=building_timeout,
+                building_memory_bytes=round(building_memory * 2**30),
+            ),
+            variants=parse_variants(methods),
+            tables=tables,
+        )
+        reference = None
+        if truth is not None or points or as_surveyed:
+            reference = EvaluationRequest(
+                models=out,
+                truth=truth,
+                points=tuple(points or ()),
+                footprints=footprints if points else None,
+                crs=crs,
+                vertical_unit=vertical_unit,
+                as_surveyed=as_surveyed,
+            )
+        made = compare_files(request, reference, console.on_event)
+        facts = comparison_facts(request, made.summary)
+        names = ("ok", "fallback", "failed")
+        rows = [
+            (
+                told["label"],
+                *(told["statuses"].get(name, 0) for name in names),
+                told["counts"]["roof_faces"],
+                f"{1e3 * told['seconds_a_building'].get('median', 0.0):.1f} ms",
+            )
+            for told in facts["variants"]
+        ]
+        console.table("Methods", ["method", *names, "roof faces", "a building (median)"], rows)
+        found = {label: headline(chapters(evaluation)) for label, evaluation in made.evaluations.items()}
+        if found:
+            values = {label: {line.label: line.value for _, line in lines} for label, lines in found.items()}
+            measures = [line.label for _, line in next(iter(found.values()))]
+            compared = [(name, *(values[label].get(name, "") for label in values)) for name in measures]
+            console.table("Against the reference", ["measure", *values], compared)
+        for path in made.written:
+            console.say(f"wrote {path}")
+        console.document(facts | {"out": made.summary.out, "written": [str(path) for path in made.written]})
+        if any(run.failed_tiles for run in made.summary.runs.values()):
+            raise typer.Exit(ExitCode.TILES_FAILED)
+
+
+def replay(
+    bundle: Annotated[str, typer.Argument(metavar="BUNDLE", help="A file of a run's quarantine folder.")],
+    isolate: Annotated[bool, Isolate] = True,
+    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
+    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
+    out: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Write the record, and the model as OBJ and CityJSON, here.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Model one quarantined building again, from its bundle alone."""
+    with Console(as_json=as_json) as console:
+        from pipeline import __version__
+        from pipeline.runtime.bundle import read_bundle
+        from pipeline.runtime.isolation import IsolationLimits
+        from pipeline.runtime.replay import replay as replay_building
+        from pipeline.runtime.replay import replay_row, write_replay
+
+        limits = IsolationLimits(timeout_s=building_timeout, memory_bytes=round(building_memory * 2**30))
+        found = read_bundle(bundle)
+        if found.incident.engine_version != __version__:
+            console.warn(f"it happened to gablework {found.incident.engine_version}; this is {__version__}")
+        console.say(f"{found.candidate.building_id} in its run: {found.incident.reason}, {found.incident.detail}")
+        replayed = replay_building(found, limits if isolate else None)
+        row = replay_row(found, replayed)
+        console.table("This time", ["column", "value"], [(name, value) for name, value in row.items() if value != []])
+        if replayed.loss is not None and replayed.loss.stderr:
+            console.say(f"its process said last:\n{replayed.loss.stderr}")
+        written = [str(path) for path in write_replay(out, found, replayed)] if out is not None else []
+        for path in written:
+            console.say(f"wrote {path}")
+        incident = dataclasses.asdict(found.incident)
+        stderr = "" if replayed.loss is None else replayed.loss.stderr
+        console.document({"incident": incident, "record": dict(row), "stderr": stderr, "written": written})
+        if row["status"] == "failed":
+            raise typer.Exit(ExitCode.TILES_FAILED)
+
+
+def _run_settings(path: str | None, **overrides: str | None) -> RunSettings:
+    """The settings of a file, or the defaults, under the options of the command line."""
+    from pipeline.settings import RunSettings
+
+    given = {name: value for name, value in overrides.items() if value is not None}
+    return RunSettings.from_toml(path, given)
+
+
+def show_summary(console: Console, summary: RunSummary) -> None:
+    """What a run found, as tables or as the JSON document."""
+    from pipeline.report.table import run_statistics, statistics_tables
+
+    for table in statistics_tables(run_statistics(summary.run_dir)):
+        console.show(table)
+    console.table(
+        "Time", ["stage", "wall clock"], [(k, f"{seconds:.1f} s") for k, seconds in summary.timings_s.items()]
+    )
+    points, tiles = summary.counts["points"], summary.counts["tiles"]
+    largest = max(summary.peak_memory_bytes.values(), default=0) / 2**30
+    console.say(f"{points} points, tiles: {tiles}, peak memory of a process: {largest:.2f} GiB")
+    for tile in summary.failed_tiles:
+        console.warn(f"tile {tile} failed")
+    console.say(f"content sha256 {summary.digest}")
+    console.say(f"results are in {summary.run_dir}")

@@ -1,0 +1,72 @@
+"""The options that several commands share."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import typer
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document; events as JSON lines on stderr.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress; warnings and errors only.")]
+Crs = Annotated[
+    str | None, typer.Option(metavar="EPSG:n", help="The inputs' CRS, where their header has none or a wrong one.")
+]
+VerticalUnit = Annotated[
+    str | None, typer.Option(metavar="UNIT", help="Unit of elevations: m, ft or us-ft; default as the header says.")
+]
+Workers = Annotated[
+    int, typer.Option(min=0, help="Processes of the embedded cluster; 0 runs serially in this process.")
+]
+Method = Annotated[
+    str | None,
+    typer.Option(
+        metavar="METHOD",
+        help="fuzzy-sart, parameter-space-2d, parameter-space-3d or kmeans; default as the settings say.",
+    ),
+]
+Footprints = Annotated[
+    str | None, typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, Shapefile) to model.")
+]
+Bbox = Annotated[
+    tuple[float, float, float, float] | None,
+    typer.Option(metavar="XMIN YMIN XMAX YMAX", help="Only this rectangle, in the CRS's units."),
+]
+Aoi = Annotated[
+    str | None, typer.Option(metavar="FILE", help="Only what lies inside the polygons of this vector file.")
+]
+Classes = Annotated[
+    Literal["trust", "audit", "ignore"] | None,
+    typer.Option(help="What the file's own classes are worth; default as the settings say."),
+]
+SettingsFile = Annotated[str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
+]
+Meshes = Annotated[Literal["building", "tile", "none"], typer.Option(help="One OBJ a building, one a tile, or none.")]
+Licence = Annotated[
+    str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
+]
+Truth = Annotated[
+    str | None, typer.Option(metavar="DIR", help="The truth that simulate wrote: measure the models against it.")
+]
+Points = Annotated[
+    list[str] | None,
+    typer.Option(metavar="TILE", help="A classified tile to measure against; several by several --points."),
+]
+AsSurveyed = Annotated[
+    bool, typer.Option("--as-surveyed", help="Move each true building by the shift of the strips that saw it.")
+]
+Isolate = typer.Option(
+    "--isolate/--no-isolate",
+    help="Model buildings in a supervised child process, so that a bad one costs only itself.",
+)
+BuildingTimeout = Annotated[
+    float, typer.Option(metavar="S", help="Seconds that a building may take in its child process.")
+]
+BuildingMemory = Annotated[
+    float, typer.Option(metavar="GIB", help="Memory that a building's child process may take, in GiB.")
+]
+BUILDING_TIMEOUT_S, BUILDING_MEMORY_GIB = 600.0, 4.0
+"""Defaults of `pipeline.runtime.isolation.IsolationLimits`, which is too slow to import for `--help`."""
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already there.")]

@@ -1,0 +1,129 @@
+"""Commands that simulate scenes."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.modelling import show_summary
+from pipeline.cli.options import (
+    AsJson,
+    Overwrite,
+    Quiet,
+    Workers,
+)
+from pipeline.console import Console
+
+
+def simulate(
+    suite: Annotated[
+        str,
+        typer.Argument(metavar="SUITE", help="suburb, town, cube, hofmann310, sweep, city or one of the roof shapes."),
+    ],
+    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: LAZ tiles and the truth beside them.")],
+    seed: Annotated[
+        int | None, typer.Option(metavar="N", help="Of layout and scanner; default the suite's own.")
+    ] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(metavar="dev|test", help="In place of --seed: methods are tuned on dev and reported on test."),
+    ] = None,
+    draw: Annotated[int, typer.Option(metavar="N", help="Which scene of the split, counted from 0.")] = 0,
+    size: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="EAST NORTH", help="Extent in metres; default the suite's own."),
+    ] = None,
+    density: Annotated[
+        float | None, typer.Option(metavar="D", help="Pulses a square metre; of sweep, which cells.")
+    ] = None,
+    noise: Annotated[
+        float | None, typer.Option(metavar="M", help="Range noise in metres; of sweep, which cells.")
+    ] = None,
+    with_classes: Annotated[bool, typer.Option("--with-classes", help="Write the true classes into the tile.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a scene as LAZ tiles, with the exact truth beside them."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.errors import SettingsError
+        from pipeline.runtime.events import Event
+        from pipeline.synthetic.dataset import simulate as simulate_scene
+        from pipeline.synthetic.seeds import seed_of
+
+        if split is None and draw != 0:
+            raise SettingsError([f"draw is {draw} of no split: give --split dev or --split test with it"])
+        if split is not None and seed is not None:
+            raise SettingsError([f"both --seed {seed} and --split {split} are given: use one of them"])
+        paths = simulate_scene(
+            suite,
+            out,
+            seed if split is None else seed_of(split, draw),
+            size_m=size,
+            density_per_m2=density,
+            noise_m=noise,
+            with_classes=with_classes,
+            on_points=lambda n: console.on_event(Event(kind="progress", stage="scan", done=n)),
+        )
+        console.say(f"{paths.points} points of {paths.buildings} buildings in {paths.laz}, the truth in {paths.truth}")
+        console.document(dataclasses.asdict(paths))
+
+
+def demo(
+    out: Annotated[str, typer.Option(metavar="DIR", help="The folder of everything the demo makes.")] = "demo",
+    size: Annotated[
+        tuple[float, float] | None, typer.Option(metavar="EAST NORTH", help="Extent of the suburb in metres.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Of the suburb; default its own.")] = None,
+    workers: Workers = 2,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a small suburb, reconstruct it, measure it against the truth, draw it."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.demo import demonstrate
+        from pipeline.evaluation.chapters import chapters
+        from pipeline.evaluation.writing import measures_table
+        from pipeline.report.evaluation_page import headline
+
+        made = demonstrate(out, console.on_event, workers=workers, overwrite=overwrite, size_m=size, seed=seed)
+        show_summary(console, made.summary)
+        decisive = headline(chapters(made.evaluation))
+        rows = [(line.label, line.value, line.interval, line.n) for _, line in decisive]
+        console.table("Against the truth", ["measure", "value", "95 % interval", "n"], rows)
+        console.say("Where to look:")
+        places = [
+            ("picture", made.picture),
+            ("report", made.page),
+            ("run directory", made.summary.run_dir),
+            ("meshes (OBJ)", f"{made.summary.run_dir}/meshes"),
+            ("tables (GeoParquet)", f"{made.summary.run_dir}/buildings"),
+            ("the tile", made.scene.laz),
+            ("the truth", made.scene.truth),
+        ]
+        console.table("", ["what", "where"], places)
+        told = {"measures": measures_table(made.evaluation).to_pylist(), "picture": str(made.picture)}
+        console.document(dataclasses.asdict(made.summary) | told)
+
+
+def warm_up(as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """Compile the numba kernels, by a small simulated run in this process."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from tempfile import TemporaryDirectory
+
+        from pipeline.runtime.modelling import load
+        from pipeline.runtime.run import RunRequest, run
+        from pipeline.synthetic.dataset import simulate as simulate_scene
+
+        with TemporaryDirectory(prefix="gablework-") as folder:
+            started = time.perf_counter()
+            scene = simulate_scene("gable", f"{folder}/scene")
+            request = RunRequest(inputs=(str(scene.laz),), out=f"{folder}/run", workers=0)
+            summary = run(request, console.on_event)
+            load()  # the other methods, too
+            seconds = time.perf_counter() - started
+        console.say(f"kernels compiled and one building modelled in {seconds:.1f} s")
+        console.document({"seconds": seconds, "statuses": summary.statuses})
