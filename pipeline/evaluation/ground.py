@@ -3,7 +3,7 @@
 Judged are last returns, the ones that a ground filter decides on; noise and water are left out, and where a file tells
 objects by their classes also what it leaves unclassified: nobody looked whether that is ground. What was found comes
 from a classified file that any program wrote, or from the ground stage of a run: its filter over the same points, with
-its settings, where a point closer than `tolerance_m` to the terrain is ground.
+its settings and its rule for the points near the terrain (`ground_points`).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pipeline.evaluation.subsets import Subset, measured
 from pipeline.io import ReadOptions, open_source
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.scene import GROUND_CLASS, SceneSettings
-from pipeline.terrain.ground import ground_of
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, height_above, lowest_per_cell
+from pipeline.terrain.ground import Terrain, ground_of, ground_points
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_cell
 from pipeline.terrain.outliers import OutlierSettings, dense_enough
 
 NOT_JUDGED = (7, 9, 18)
@@ -280,14 +280,12 @@ class GroundOfRun:
         self._terrain = {place: self._drawn(*place) for place in sorted(self._lowest)}
 
     def __call__(self, points: ReferencePoints) -> BoolArray:
-        """Ground of a tile: closer than `tolerance_m` to the terrain, or below it; outliers are none."""
+        """Ground of a tile: near the terrain or below it; outliers are none."""
         x, y, z = _millimetres(points.xyz)
         found = np.zeros(len(x), np.bool_)
-        limit = round(self._settings.ground.tolerance_m * MM)
         for (row, column), index in _by_window(x, y):
-            corner = column * WINDOW_CELLS - 1, row * WINDOW_CELLS - 1
-            height = height_above(x[index], y[index], z[index], self._terrain[row, column], *corner)
-            found[index] = (height != NO_DATA) & (height < limit)
+            terrain = self._terrain[row, column]
+            found[index] = ground_points(x[index], y[index], z[index], terrain, self._settings.ground)
         return found & kept_points(x, y, z, self._settings.outliers)
 
     def _add(self, points: ReferencePoints) -> None:
@@ -312,7 +310,7 @@ class GroundOfRun:
         cut = slice(side - margin, 2 * side + margin)
         return np.ascontiguousarray(whole[cut, cut])
 
-    def _drawn(self, row: int, column: int) -> Elevations:
+    def _drawn(self, row: int, column: int) -> Terrain:
         """The terrain of a window and of one cell around it, by the run's filter over the lowest points around."""
         settings = self._settings.ground
         margin = math.ceil(settings.support_m) + 1
@@ -331,7 +329,14 @@ class GroundOfRun:
             settings,
             trusted=False,
         )
-        return np.ascontiguousarray(terrain.elevation_mm[margin - 1 : 1 - margin, margin - 1 : 1 - margin])
+        inner = slice(margin - 1, 1 - margin)
+        return Terrain(
+            elevation_mm=np.ascontiguousarray(terrain.elevation_mm[inner, inner]),
+            slope_mm=np.ascontiguousarray(terrain.slope_mm[inner, inner]),
+            measured=np.ascontiguousarray(terrain.measured[inner, inner]),
+            column0=corner[0] + margin - 1,
+            row0=corner[1] + margin - 1,
+        )
 
 
 def kept_points(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: OutlierSettings) -> BoolArray:

@@ -1,13 +1,14 @@
 """Ground and terrain on a lattice of lowest last returns.
 
 The lattice has cells of 1 m, anchored at the CRS's origin, and holds integer millimetres. A filter tells the cells that
-hold ground, the progressive morphological one or the hierarchical one; the terrain is then drawn through them by local
-planes. Everything looks a bounded distance far: no statistic of a whole tile decides.
+hold ground, the morphological one or the hierarchical one; the terrain is then drawn through them by local planes, and
+the points near it are the ground points. Everything looks a bounded distance far: no statistic of a whole tile decides.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from numba import njit
@@ -15,15 +16,15 @@ from numba import njit
 from pipeline.model import BoolArray, IntArray
 from pipeline.parameters import parameter
 from pipeline.terrain.hierarchical_filter import HierarchicalFilterSettings, hierarchical_ground
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, PIT_CELLS, Elevations, lowest_per_cell, without_pits
-from pipeline.terrain.morphological import objects
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_cell, without_pits
+from pipeline.terrain.morphological import MorphologicalFilterSettings, morphological_ground
 from pipeline.terrain.planar_fitting import MIN_CELLS, plane_around, plane_sums
 
 _MAX_SUPPORT_M = 500
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class GroundSettings(HierarchicalFilterSettings):
+class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
     """How ground is told from objects."""
 
     filter: str = parameter(
@@ -32,19 +33,6 @@ class GroundSettings(HierarchicalFilterSettings):
         choices=("morphological", "hierarchical"),
     )
 
-    max_window_m: int = parameter(
-        20,
-        "Largest half side of the opening: buildings up to twice as wide are cut off the ground.",
-        unit="m",
-        minimum=2,
-        maximum=60,
-    )
-    max_slope: float = parameter(
-        0.25, "Steepest terrain, as rise over run, that the opening does not cut off.", minimum=0.01, maximum=2.0
-    )
-    min_step_m: float = parameter(
-        0.35, "Least height of an object above what the opening leaves.", unit="m", minimum=0.05, maximum=3.0
-    )
     pit_depth_m: float = parameter(
         1.0,
         "A cell that lies deeper than this below all but two of its 24 neighbours is a low outlier.",
@@ -54,49 +42,60 @@ class GroundSettings(HierarchicalFilterSettings):
     )
     bridge_m: int = parameter(
         24,
-        "Farthest that the terrain is drawn under objects, where max_window_m asks for no more.",
+        "Farthest that the terrain is drawn under objects, where the filter asks for no more.",
         unit="m",
         minimum=4,
         maximum=80,
     )
+    max_slope: float = parameter(
+        1.0,
+        "Steepest that the terrain is drawn from the middle of the ground around a place to that place, rise over run.",
+        minimum=0.01,
+        maximum=2.0,
+    )
     tolerance_m: float = parameter(
-        0.5, "Points closer than this to the terrain are ground.", unit="m", minimum=0.05, maximum=3.0
+        0.5, "Points closer than this to level terrain are ground.", unit="m", minimum=0.05, maximum=3.0
+    )
+    tolerance_slope: float = parameter(
+        1.0,
+        "What that distance grows by, in metres, where the terrain rises by 45 degrees, and in proportion elsewhere; "
+        "0 with the hierarchical filter.",
+        minimum=0.0,
+        maximum=3.0,
     )
 
     def cross_faults(self) -> list[str]:
-        """A hierarchy of so many passes that its tiles would be all halo."""
-        counts = (self.seed_cell_m, self.level_ratio, self.passes, self.min_reach_m, self.clump_m, self.bridge_m)
-        if self.filter != "hierarchical" or not all(isinstance(n, int) for n in counts) or self.level_ratio < 2:
+        """A hierarchy of so many passes, or openings so large, that its tiles would be all halo."""
+        if self.filter == "hierarchical":
+            counts = [self.seed_cell_m, self.level_ratio, self.passes, self.min_reach_m, self.clump_m]
+            told = (
+                f"seed_cell_m {self.seed_cell_m}, level_ratio {self.level_ratio}, passes {self.passes}",
+                "use fewer passes or smaller cells",
+            )
+        else:
+            counts = [self.max_window_m, self.trend_m, self.widest_m, self.regrowth_passes, self.regrowth_m]
+            told = (
+                f"max_window_m {self.max_window_m}, trend_m {self.trend_m}, widest_m {self.widest_m}",
+                "use smaller ones",
+            )
+        whole = all(isinstance(n, int) for n in (*counts, self.bridge_m))
+        if not whole or self.level_ratio < 2 or self.support_m <= _MAX_SUPPORT_M:
             return []
-        if self.support_m <= _MAX_SUPPORT_M:
-            return []
-        fault = (
-            f"filter looks {self.support_m:g} m far, by seed_cell_m {self.seed_cell_m}, level_ratio {self.level_ratio},"
-            f" passes {self.passes}: use fewer passes or smaller cells, for at most {_MAX_SUPPORT_M} m"
-        )
-        return [fault]
-
-    @property
-    def windows(self) -> tuple[int, ...]:
-        """Half sides of the openings in cells, growing to the largest."""
-        sizes = [1]
-        while sizes[-1] < self.max_window_m:
-            sizes.append(min(self.max_window_m, sizes[-1] + max(1, sizes[-1] // 2)))
-        return tuple(sizes)
+        return [f"filter looks {self.support_m:g} m far, by {told[0]}: {told[1]}, for at most {_MAX_SUPPORT_M} m"]
 
     @property
     def reach_m(self) -> int:
         """Farthest that the terrain is drawn under objects: at least to the middle of the widest that are cut off."""
         if self.filter == "hierarchical":
             return max(self.bridge_m, 2 * self.seed_cell_m // 3)
-        return max(self.bridge_m, self.max_window_m + 1)
+        return max(self.bridge_m, self.max_window_m + 1, self.widest_m // 2 + 2 if self.looks_for_wide else 0)
 
     @property
     def support_m(self) -> float:
-        """How far a terrain elevation looks: the pit tests, the filter, the local planes, cell sizes."""
+        """How far a terrain elevation looks: the pit tests, the filter, the local planes, cell sizes, slopes."""
         if self.filter == "hierarchical":
-            return self.hierarchical_support_m + self.reach_m + 3
-        return float(PIT_CELLS + 2 * self.max_window_m + self.reach_m + 3)
+            return self.hierarchical_support_m + self.reach_m + 4
+        return self.morphological_support_m + self.reach_m + 4
 
 
 @njit(cache=True, nogil=True)
@@ -117,17 +116,38 @@ def _terrain(lowest: Elevations, is_ground: BoolArray, bridge: int, max_slope: f
             if n == 0:
                 continue
             if carries:
-                # a plane is trusted as far as the terrain may rise within the box, not farther
-                low, high = 1e12, -1e12
-                for rr in range(max(r - half, 0), min(r + half, rows - 1) + 1):
-                    for cc in range(max(c - half, 0), min(c + half, columns - 1) + 1):
-                        if is_ground[rr, cc]:
-                            low = min(low, float(lowest[rr, cc]))
-                            high = max(high, float(lowest[rr, cc]))
-                slack = max_slope * CELL_MM * half
-                level = min(max(level, low - slack), high + slack)
+                # a plane is trusted no steeper from the middle of its cells than terrain may be
+                r0, r1 = max(r - half, 0), min(r + half, rows - 1) + 1
+                c0, c1 = max(c - half, 0), min(c + half, columns - 1) + 1
+                # about the cell itself, in whole numbers: the same wherever the window begins
+                east = (sums[1, r1, c1] - sums[1, r0, c1] - sums[1, r1, c0] + sums[1, r0, c0] - n * c) / n
+                north = (sums[2, r1, c1] - sums[2, r0, c1] - sums[2, r1, c0] + sums[2, r0, c0] - n * r) / n
+                mean = (sums[3, r1, c1] - sums[3, r0, c1] - sums[3, r1, c0] + sums[3, r0, c0]) / n
+                slack = max_slope * CELL_MM * math.sqrt(east * east + north * north)
+                level = min(max(level, mean - slack), mean + slack)
             terrain[r, c] = np.int32(round(level))
     return terrain
+
+
+@njit(cache=True, nogil=True)
+def slopes_of(terrain: Elevations) -> Elevations:
+    """Steepest rise in mm over a metre: by central differences, one-sided beside the unknown."""
+    rows, columns = terrain.shape
+    out = np.zeros((rows, columns), np.int32)
+    for r in range(rows):
+        for c in range(columns):
+            if terrain[r, c] == NO_DATA:
+                continue
+            north, south = min(r + 1, rows - 1), max(r - 1, 0)
+            east, west = min(c + 1, columns - 1), max(c - 1, 0)
+            north = north if terrain[north, c] != NO_DATA else r
+            south = south if terrain[south, c] != NO_DATA else r
+            east = east if terrain[r, east] != NO_DATA else c
+            west = west if terrain[r, west] != NO_DATA else c
+            along = (terrain[north, c] - terrain[south, c]) / max(north - south, 1)
+            across = (terrain[r, east] - terrain[r, west]) / max(east - west, 1)
+            out[r, c] = round(math.sqrt(along * along + across * across))
+    return out
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -136,6 +156,8 @@ class Terrain:
 
     elevation_mm: Elevations
     """(rows, columns) int32, terrain elevation at the cells' centres; NO_DATA where unknown."""
+    slope_mm: Elevations
+    """(rows, columns) int32, steepest rise of the terrain in mm over a metre; 0 where unknown."""
     measured: BoolArray
     """(rows, columns), True where a ground point lies in the cell."""
     column0: int
@@ -176,20 +198,102 @@ def ground_of(
     """
     column0, row0, columns, rows = window
     lowest = lowest_per_cell(x_mm, y_mm, z_mm, usable, column0, row0, columns, rows)
-    if trusted:
-        is_ground = lowest != NO_DATA
-    else:
-        pit_depth_mm = round(settings.pit_depth_m * 1000)
-        lowest = without_pits(lowest, pit_depth_mm)
-        if settings.filter == "hierarchical":
-            is_ground = hierarchical_ground(lowest, (column0, row0), settings, pit_depth_mm)
-        else:
-            windows = np.array(settings.windows, np.int64)
-            flagged = objects(lowest, windows, settings.max_slope, settings.min_step_m * 1000.0)
-            is_ground = (lowest != NO_DATA) & ~flagged
-    return Terrain(
-        elevation_mm=_terrain(lowest, is_ground, settings.reach_m, settings.max_slope),
-        measured=is_ground,
-        column0=column0,
-        row0=row0,
+    elevation = np.full((rows, columns), NO_DATA, np.int32)
+    slope = np.zeros((rows, columns), np.int32)
+    measured = np.zeros((rows, columns), np.bool_)
+    seen = _part_with_data(lowest, settings.reach_m + 1)
+    part = np.ascontiguousarray(lowest[seen])
+    if part.size:
+        is_ground = part != NO_DATA
+        if not trusted:
+            pit_depth_mm = round(settings.pit_depth_m * 1000)
+            part = without_pits(part, pit_depth_mm)
+            corner = (column0 + seen[1].start, row0 + seen[0].start)
+            if settings.filter == "hierarchical":
+                is_ground = hierarchical_ground(part, corner, settings, pit_depth_mm)
+            else:
+                is_ground = morphological_ground(part, corner, settings)
+        elevation[seen] = _terrain(part, is_ground, settings.reach_m, settings.max_slope)
+        slope[seen] = slopes_of(elevation[seen])
+        measured[seen] = is_ground
+    return Terrain(elevation_mm=elevation, slope_mm=slope, measured=measured, column0=column0, row0=row0)
+
+
+def _part_with_data(lowest: Elevations, margin: int) -> tuple[slice, slice]:
+    """Rows and columns with data, and a margin around them: nothing else gets terrain."""
+    filled = lowest != NO_DATA
+    rows, columns = np.flatnonzero(filled.any(axis=1)), np.flatnonzero(filled.any(axis=0))
+    if len(rows) == 0:
+        return slice(0, 0), slice(0, 0)
+    return (
+        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + 1 + margin),
+        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + 1 + margin),
     )
+
+
+@njit(cache=True, nogil=True)
+def _near_terrain(
+    x_mm: IntArray,
+    y_mm: IntArray,
+    z_mm: IntArray,
+    lattices: tuple[Elevations, Elevations],
+    corner: tuple[int, int],
+    limits: tuple[int, float],
+) -> BoolArray:
+    """Mask of the points lower than a base and a share of the slope above the terrain, both bilinear."""
+    terrain, slope_mm = lattices
+    base_mm, rise = limits
+    rows, columns = terrain.shape
+    out = np.zeros(x_mm.size, np.bool_)
+    half = CELL_MM // 2
+    for i in range(x_mm.size):
+        gx, gy = x_mm[i] - half, y_mm[i] - half
+        c, r = gx // CELL_MM, gy // CELL_MM
+        fx, fy = (gx - c * CELL_MM) / CELL_MM, (gy - r * CELL_MM) / CELL_MM
+        c -= corner[0]
+        r -= corner[1]
+        weight, limit = 0.0, 0.0
+        for dr in range(2):
+            for dc in range(2):
+                if 0 <= r + dr < rows and 0 <= c + dc < columns and terrain[r + dr, c + dc] != NO_DATA:
+                    w = (fx if dc == 1 else 1.0 - fx) * (fy if dr == 1 else 1.0 - fy)
+                    weight += w
+                    limit += w * (terrain[r + dr, c + dc] + rise * slope_mm[r + dr, c + dc])
+        out[i] = weight > 1e-9 and z_mm[i] < base_mm + limit / weight
+    return out
+
+
+def ground_points(
+    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, terrain: Terrain, settings: GroundSettings
+) -> BoolArray:
+    """Which points lie on the ground.
+
+    A point is ground where it lies less than `tolerance_m`, and `tolerance_slope` times the terrain's rise over a
+    metre, above the terrain (the rule of SMRF: Pingel, Clarke and McBride 2013), or anywhere below it: the lattice
+    follows the lowest points, and steep ground within a cell rises far above them. Neither returns nor outliers are
+    looked at; points without terrain are no ground.
+
+    Parameters
+    ----------
+    x_mm, y_mm, z_mm : (n,) int64
+        Absolute coordinates in millimetres.
+    terrain : Terrain
+        The ground of a window that holds the points.
+    settings : GroundSettings
+        Tolerances.
+
+    Returns
+    -------
+    (n,) bool
+        True for ground.
+    """
+    rise = 0.0 if settings.filter == "hierarchical" else settings.tolerance_slope
+    found: BoolArray = _near_terrain(
+        x_mm,
+        y_mm,
+        z_mm,
+        (terrain.elevation_mm, terrain.slope_mm),
+        (terrain.column0, terrain.row0),
+        (round(settings.tolerance_m * 1000), rise),
+    )
+    return found

@@ -3,8 +3,9 @@
 All sums are integers, and the moments are taken about the place in question: a plane does not depend on where the
 lattice's window begins, nor on the order of anything.
 
-Two stages stand on it: the terrain is drawn by such planes, and the hierarchical filter judges by them the points that
-no facet of its TIN holds (`join_planes`): beyond the hull of the ground found so far, and where facets are too wide.
+Three stages stand on it: the terrain is drawn by such planes, they are the trend of the morphological filter
+(`leaning_planes`), and the hierarchical filter judges by them the points that no facet of its TIN holds
+(`join_planes`): beyond the hull of the ground found so far, and where facets are too wide.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from numba import njit
 
 from pipeline.model import BoolArray
-from pipeline.terrain.lattice import CELL_MM, Elevations
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 
 Sums = npt.NDArray[np.int64]
 """(9, rows + 1, columns + 1) integral images of 1, x, y, z, xx, xy, yy, xz, yz; x and y are cell indices, z in mm."""
@@ -26,6 +27,9 @@ MIN_CELLS = 5
 
 MIN_SPREAD = 0.05
 """A plane needs det(scatter) above this times trace(scatter)^2: cells in a row carry none."""
+
+MAX_LEAN = 0.6
+"""Farthest that the centroid of a trend's square may lie from its middle, in half sides: 0.5 at a straight edge."""
 
 
 @njit(cache=True, nogil=True)
@@ -137,3 +141,51 @@ def join_planes(
             else:
                 far = math.sqrt(across * across + along * along)
                 joined[r, c] = above <= max_step + max_slope * CELL_MM * far
+
+
+@njit(cache=True, nogil=True)
+def leaning_planes(elevation: Elevations, used: BoolArray, half: int, widest: int) -> tuple[Elevations, Elevations]:
+    """The trend at every cell: level and rise of the plane through the used cells of a square around it.
+
+    A square that holds few used cells, or all of them to one side, would carry its plane too far: there the square
+    grows, up to `widest`.
+
+    Parameters
+    ----------
+    elevation : (rows, columns) int32
+        Elevations in mm.
+    used : (rows, columns) bool
+        What the planes go through.
+    half, widest : int
+        Half sides of the smallest and the largest square, in cells; a square needs as many used cells as `half`.
+
+    Returns
+    -------
+    level : (rows, columns) int32
+        Elevation of the plane at the cell in mm; NO_DATA where the largest square holds nothing.
+    slope_mm : (rows, columns) int32
+        Steepest rise in mm a cell; 0 where there is no plane.
+    """
+    rows, columns = elevation.shape
+    sums = plane_sums(elevation, used)
+    level = np.full((rows, columns), NO_DATA, np.int32)
+    slope_mm = np.zeros((rows, columns), np.int32)
+    for r in range(rows):
+        for c in range(columns):
+            side = half
+            while side < widest:
+                r0, r1 = max(r - side, 0), min(r + side, rows - 1) + 1
+                c0, c1 = max(c - side, 0), min(c + side, columns - 1) + 1
+                n = sums[0, r1, c1] - sums[0, r0, c1] - sums[0, r1, c0] + sums[0, r0, c0]
+                if n >= half:
+                    east = sums[1, r1, c1] - sums[1, r0, c1] - sums[1, r1, c0] + sums[1, r0, c0] - n * c
+                    north = sums[2, r1, c1] - sums[2, r0, c1] - sums[2, r1, c0] + sums[2, r0, c0] - n * r
+                    if max(abs(east), abs(north)) <= MAX_LEAN * side * n:
+                        break
+                side = min(2 * side, widest)
+            n, at, across, along, carries = plane_around(sums, r, c, side)
+            if n > 0:
+                level[r, c] = round(at)
+                if carries:
+                    slope_mm[r, c] = round(math.sqrt(across * across + along * along))
+    return level, slope_mm

@@ -1,4 +1,4 @@
-"""The ground filter: openings, pits, local planes, heights; nothing depends on where the window ends."""
+"""The ground stage: pits, local planes, heights, ground points; nothing depends on where the window ends."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy.ndimage import grey_opening, map_coordinates
+from scipy.ndimage import map_coordinates
 
 from pipeline.terrain import ground
-from pipeline.terrain.ground import GroundSettings, Terrain, ground_of
+from pipeline.terrain.ground import GroundSettings, Terrain, ground_of, ground_points, slopes_of
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above, lowest_per_cell, without_pits
-from pipeline.terrain.morphological import objects, opened
 
 Grid = npt.NDArray[np.int32]
 Points = npt.NDArray[np.int64]
 
-SMALL = GroundSettings(max_window_m=4, bridge_m=6)
+SMALL = GroundSettings(max_window_m=3, trend_m=4, widest_m=12, regrowth_passes=1, regrowth_m=1, bridge_m=6)
+"""Looks 57 m far."""
 
 elevations = st.integers(-3000, 3000)
 grids = arrays(np.int32, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=elevations)
@@ -114,67 +114,6 @@ def test_pits_agree_with_a_plain_loop(grid: Grid, seed: int) -> None:
     np.testing.assert_array_equal(without_pits(lowest, 1000), expected)
 
 
-# -- openings ----------------------------------------------------------------------------------------------------------
-
-
-@settings(deadline=None)
-@given(grid=grids, half=st.integers(1, 11))
-def test_an_opening_of_full_data_is_that_of_scipy(grid: Grid, half: int) -> None:
-    np.testing.assert_array_equal(opened(grid, half), grey_opening(grid, size=2 * half + 1))
-
-
-@settings(deadline=None)
-@given(grid=grids, half=st.integers(1, 4), seed=st.integers(0, 100))
-def test_cells_without_data_are_skipped(grid: Grid, half: int, seed: int) -> None:
-    def extreme(values: Grid, pick: str) -> Grid:
-        out = np.full(values.shape, NO_DATA, np.int32)
-        for r, c in np.ndindex(values.shape):
-            block = values[max(r - half, 0) : r + half + 1, max(c - half, 0) : c + half + 1]
-            data = block[block != NO_DATA]
-            if len(data):
-                out[r, c] = getattr(data, pick)()
-        return out
-
-    values = with_gaps(grid, seed, 0.7)
-    np.testing.assert_array_equal(opened(values, half), extreme(extreme(values, "min"), "max"))
-
-
-@settings(deadline=None)
-@given(grid=grids, half=st.integers(1, 5), seed=st.integers(0, 100))
-def test_an_opening_lies_below_its_data_and_opening_again_changes_nothing(grid: Grid, half: int, seed: int) -> None:
-    values = with_gaps(grid, seed)
-    once = opened(values, half)
-    data = values != NO_DATA
-    assert (once[data] <= values[data]).all()
-    again = opened(once, half)
-    np.testing.assert_array_equal(again[data], once[data])
-
-
-def test_objects_are_what_a_step_of_the_openings_of_scipy_cuts_off() -> None:
-    random = np.random.default_rng(7)
-    lowest = random.integers(0, 500, (60, 50)).astype(np.int32)
-    lowest[20:32, 10:30] += 6000
-    lowest[40:43, 40:43] += 900
-    windows = GroundSettings().windows
-    expected = np.zeros(lowest.shape, np.bool_)
-    before, half_before = lowest, 0
-    for half in windows:
-        after = grey_opening(lowest, size=2 * half + 1)
-        expected |= before - after > 350.0 + 250.0 * (half - half_before)
-        before, half_before = after, half
-    flagged = objects(lowest, np.array(windows, np.int64), 0.25, 350.0)
-    np.testing.assert_array_equal(flagged, expected)
-    assert flagged[20:32, 10:30].all()
-
-
-@pytest.mark.parametrize("max_window_m", [2, 3, 20, 60])
-def test_windows_grow_to_the_largest(max_window_m: int) -> None:
-    windows = GroundSettings(max_window_m=max_window_m).windows
-    assert windows[0] == 1
-    assert windows[-1] == max_window_m
-    assert list(windows) == sorted(set(windows))
-
-
 # -- terrain -----------------------------------------------------------------------------------------------------------
 
 
@@ -239,8 +178,8 @@ def test_local_planes_agree_with_least_squares_of_numpy() -> None:
         expected = z.mean()
         if carries:
             design = np.column_stack((dx, dy, np.ones(len(z))))
-            slack = slope * 1000 * half
-            expected = np.clip(np.linalg.lstsq(design, z, rcond=None)[0][2], z.min() - slack, z.max() + slack)
+            slack = slope * 1000 * math.hypot(dx.mean(), dy.mean())
+            expected = np.clip(np.linalg.lstsq(design, z, rcond=None)[0][2], z.mean() - slack, z.mean() + slack)
             fitted += 1
         assert terrain[r, c] == pytest.approx(expected, abs=0.51)
     assert fitted > 500
@@ -250,7 +189,7 @@ def test_terrain_ends_at_the_bridge() -> None:
     z = np.full((60, 60), 1000)
     points = one_point_a_cell(60, 60, z)
     points = points[points[:, 0] < 10_000]
-    terrain = terrain_under(points, (0, 0, 60, 60), GroundSettings(bridge_m=8, max_window_m=5))
+    terrain = terrain_under(points, (0, 0, 60, 60), GroundSettings(bridge_m=8, max_window_m=5, widest_m=0))
     assert (terrain.elevation_mm[:, :18] == 1000).all()
     assert (terrain.elevation_mm[:, 18:] == NO_DATA).all()
 
@@ -294,9 +233,9 @@ def test_where_classes_are_trusted_the_filter_only_interpolates() -> None:
 def test_the_terrain_does_not_depend_on_the_window_beyond_its_support(
     seed: int, per_cell: float, trusted: bool
 ) -> None:
-    points = wild_points(np.random.default_rng(seed), 100, 90, per_cell=per_cell)
-    whole = terrain_under(points, (0, 0, 100, 90), SMALL, trusted=trusted)
-    column0, row0, columns, rows = 23 + seed, 19, 62, 60
+    points = wild_points(np.random.default_rng(seed), 200, 190, per_cell=per_cell)
+    whole = terrain_under(points, (0, 0, 200, 190), SMALL, trusted=trusted)
+    column0, row0, columns, rows = 23 + seed, 19, 150, 148
     inside = (points[:, 0] // 1000 >= column0) & (points[:, 0] // 1000 < column0 + columns)
     inside &= (points[:, 1] // 1000 >= row0) & (points[:, 1] // 1000 < row0 + rows)
     part = terrain_under(points[inside], (column0, row0, columns, rows), SMALL, trusted=trusted)
@@ -306,18 +245,21 @@ def test_the_terrain_does_not_depend_on_the_window_beyond_its_support(
     assert part.elevation_mm[inner].size > 300
     np.testing.assert_array_equal(part.elevation_mm[inner], whole.elevation_mm[same])
     np.testing.assert_array_equal(part.measured[inner], whole.measured[same])
+    np.testing.assert_array_equal(part.slope_mm[inner], whole.slope_mm[same])
     if not trusted:
         assert 0.02 < part.measured[inner].mean() < 0.9
 
 
-def test_the_support_covers_pits_erosion_and_dilation_and_the_bridge() -> None:
-    for window_m, bridge_m in ((2, 4), (20, 24), (60, 80)):
-        ground_settings = GroundSettings(max_window_m=window_m, bridge_m=bridge_m)
-        assert ground_settings.support_m >= 2 + 2 * ground_settings.windows[-1] + bridge_m + 2
+def test_the_support_covers_both_openings_the_trend_between_them_and_the_bridge() -> None:
+    for window_m, trend_m, bridge_m in ((2, 4, 4), (20, 12, 24), (40, 20, 80)):
+        chosen = GroundSettings(max_window_m=window_m, trend_m=trend_m, bridge_m=bridge_m, widest_m=0)
+        assert chosen.support_m >= 2 + 4 * window_m + 2 * trend_m + bridge_m + 2
+    wide = GroundSettings(widest_m=160)
+    assert wide.support_m >= 2 + 160 + 80 + 2
 
 
-@pytest.mark.parametrize("shift", [(-7, 4), (84_000, 447_000), (-1000, -2000)])
-def test_a_shift_by_whole_metres_shifts_the_terrain_bit_for_bit(shift: tuple[int, int]) -> None:
+@pytest.mark.parametrize("shift", [(-8, 4), (84_000, 447_000), (-1000, -2000)])
+def test_a_shift_by_whole_coarse_cells_shifts_the_terrain_bit_for_bit(shift: tuple[int, int]) -> None:
     points = wild_points(np.random.default_rng(21), 50, 45)
     before = terrain_under(points, (0, 0, 50, 45), SMALL)
     moved = points + np.array([shift[0] * 1000, shift[1] * 1000, 0])
@@ -382,3 +324,53 @@ def test_a_point_at_the_centre_of_a_cell_stands_on_that_cell() -> None:
     terrain = np.array([[100, 900], [NO_DATA, 400]], np.int32)
     x, y = np.array([500, 1500, 500, 1500]), np.array([500, 500, 1500, 1500])
     assert height_above(x, y, np.full(4, 1000), terrain, 0, 0).tolist() == [900, 100, NO_DATA, 600]
+
+
+# -- ground points -----------------------------------------------------------------------------------------------------
+
+
+def test_slopes_are_central_differences_and_one_sided_at_the_edge_of_what_is_known() -> None:
+    random = np.random.default_rng(15)
+    terrain = with_gaps(random.integers(-2000, 2000, (12, 10)).astype(np.int32), 3, 0.2)
+    known = np.where(terrain == NO_DATA, np.nan, terrain.astype(np.float64))
+
+    def rise(line: npt.NDArray[np.float64], k: int) -> float:
+        near = [j for j in (k - 1, k + 1) if 0 <= j < len(line) and not np.isnan(line[j])]
+        low, high = (min((*near, k)), max((*near, k)))
+        return float(line[high] - line[low]) / max(high - low, 1)
+
+    slopes = slopes_of(terrain)
+    for r, c in np.ndindex(terrain.shape):
+        expected = 0.0 if terrain[r, c] == NO_DATA else math.hypot(rise(known[:, c], r), rise(known[r], c))
+        assert slopes[r, c] == pytest.approx(expected, abs=0.51)
+
+
+@pytest.mark.parametrize("slope_deg", [0.0, 20.0, 45.0])
+def test_the_tolerance_grows_with_the_slope(slope_deg: float) -> None:
+    fall = math.tan(math.radians(slope_deg))
+    c, _ = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
+    terrain = terrain_under(one_point_a_cell(40, 40, np.rint(1000 * fall * c)), (0, 0, 40, 40), trusted=True)
+    chosen = GroundSettings(tolerance_m=0.5, tolerance_slope=1.0)
+    x, y = np.full(3, 20_000), np.full(3, 20_000)
+    limit = 500 + 1000 * fall
+    z = np.rint(20_000 * fall + np.array([-9000, limit - 5, limit + 5])).astype(np.int64)
+    assert ground_points(x, y, z, terrain, chosen).tolist() == [True, True, False]
+
+
+def test_with_the_hierarchical_filter_the_tolerance_is_the_same_everywhere() -> None:
+    c, _ = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
+    terrain = terrain_under(one_point_a_cell(40, 40, np.rint(1000 * c)), (0, 0, 40, 40), trusted=True)
+    place = np.full(2, 20_000)
+    z = np.array([20_495, 20_505])
+    assert ground_points(place, place, z, terrain, GroundSettings(filter="hierarchical")).tolist() == [True, False]
+
+
+def test_points_without_terrain_are_no_ground() -> None:
+    z = np.full((10, 10), 1000)
+    terrain = terrain_under(one_point_a_cell(10, 10, z), (0, 0, 200, 10))
+    assert (terrain.elevation_mm[:, 90:] == NO_DATA).all()
+    place = np.array([5_000, 150_000])
+    assert ground_points(place, np.full(2, 5_000), np.full(2, 1000), terrain, GroundSettings()).tolist() == [
+        True,
+        False,
+    ]

@@ -30,7 +30,7 @@ from pipeline.evaluation.reference_points import read_points_reference
 from pipeline.evaluation.subsets import subsets
 from pipeline.model import BoolArray, FloatArray
 from pipeline.scene import ClassesInUse, SceneSettings, WindowPoints, terrain_of
-from pipeline.terrain.lattice import NO_DATA, height_above
+from pipeline.terrain.ground import ground_points
 from pipeline.tiling import Window
 
 SETTINGS = SceneSettings()
@@ -245,13 +245,12 @@ def ground_of_a_window(xyz: FloatArray, last: BoolArray) -> BoolArray:
         classification=np.zeros(n, np.uint8),
     )
     window = Window(x0_mm=int(x.min()), y0_mm=int(y.min()), x1_mm=int(x.max()) + 1, y1_mm=int(y.max()) + 1)
-    terrain, kept, _ = terrain_of(points, window.grown(100_000), SETTINGS, ClassesInUse())
-    height = height_above(x, y, z, terrain.elevation_mm, terrain.column0, terrain.row0)
-    found: BoolArray = kept & (height != NO_DATA) & (height < 500)
+    terrain, kept, _ = terrain_of(points, window.grown(200_000), SETTINGS, ClassesInUse())
+    found: BoolArray = kept & ground_points(x, y, z, terrain, SETTINGS.ground)
     return found
 
 
-@pytest.mark.parametrize("window_cells", [512, 90])
+@pytest.mark.parametrize("window_cells", [512, 230])
 def test_the_ground_of_a_run_is_that_of_its_ground_stage(window_cells: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In windows of any size, over window borders too."""
     monkeypatch.setattr(ground, "WINDOW_CELLS", window_cells)
@@ -287,7 +286,7 @@ def test_outliers_are_the_same_window_by_window(monkeypatch: pytest.MonkeyPatch)
 
 def test_samples_of_the_benchmark_stay_within_what_was_measured(shared_data: Path) -> None:
     """The samples of the filter test, without tuning."""
-    limits = {"samp21": 0.02, "samp31": 0.02, "samp51": 0.04}
+    limits = {"samp21": 0.02, "samp23": 0.05, "samp31": 0.03, "samp41": 0.04, "samp51": 0.035}
     for name, limit in limits.items():
         reference = read_points_reference([shared_data / "isprs" / f"{name}-utm.laz"])
         (figures,) = tile_figures(ground_blocks(reference, GroundOfRun(reference, SETTINGS)))

@@ -1,0 +1,225 @@
+"""Ground filters on the ISPRS samples and on scenes with exact ground: type I, type II, total error, kappa, speed.
+
+    python -m benchmarks.ground [--data ../shared/data] [--filter morphological | MODULE:FUNCTION] [--only samp quarry]
+                                [--densities 0.2 1 5] [--draw 0] [--out DIR]
+
+A filter is the name of one in the settings, all other settings default, or a function of this environment that takes
+x, y, z (n,) int64 in mm, `usable` (n,) bool and the window (column0, row0, columns, rows) and gives (n,) bool. Judged
+are all points, as the benchmark of Sithole and Vosselman (2003) does. `--out` writes a map of the errors of each scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.ground_scenes import KINDS
+from pipeline.io import open_source
+from pipeline.scene import GROUND_CLASS
+from pipeline.terrain.ground import GroundSettings, ground_of, ground_points
+from pipeline.terrain.lattice import CELL_MM
+from pipeline.terrain.outliers import OutlierSettings, dense_enough
+
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+Window = tuple[int, int, int, int]
+GroundFilter = Callable[[Ints, Ints, Ints, Bools, Window], Bools]
+
+DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
+DENSITIES = (0.2, 1.0, 5.0)
+MARGIN_M = 130
+"""Empty cells around the points: no less than any filter looks."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Points whose ground is known."""
+
+    name: str
+    """Of the sample, or kind and density."""
+    x_mm: Ints
+    """(n,) easting."""
+    y_mm: Ints
+    """(n,) northing."""
+    z_mm: Ints
+    """(n,) elevation."""
+    is_ground: Bools
+    """(n,) the truth."""
+
+    @property
+    def window(self) -> Window:
+        """column0, row0, columns, rows of the 1 m lattice around the points, with a margin as a tile has its halo."""
+        c0, r0 = (int(v.min() // CELL_MM) - MARGIN_M for v in (self.x_mm, self.y_mm))
+        c1, r1 = (int(v.max() // CELL_MM) + MARGIN_M for v in (self.x_mm, self.y_mm))
+        return c0, r0, c1 - c0 + 1, r1 - r0 + 1
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Figures:
+    """The figures of a scene, in percent."""
+
+    name: str
+    """Of the scene."""
+    type_1: float
+    """Ground taken for object."""
+    type_2: float
+    """Object taken for ground; nan without objects."""
+    total: float
+    """Points on the wrong side."""
+    kappa: float
+    """Cohen's kappa."""
+    points: int
+    """Judged points."""
+    seconds: float
+    """Of the filter."""
+
+
+def samples(data: Path) -> Iterator[Scene]:
+    """The reference samples of the ISPRS filter test that are there."""
+    for path in sorted((data / "isprs").glob("samp*.la[sz]")):
+        clouds = list(open_source(path).chunks())
+        x, y, z = np.rint(np.concatenate([cloud.xyz for cloud in clouds]).T * 1000).astype(np.int64)
+        is_ground = np.concatenate([cloud.classification for cloud in clouds]) == GROUND_CLASS
+        yield Scene(name=path.name.split("-")[0].split(".")[0], x_mm=x, y_mm=y, z_mm=z, is_ground=is_ground)
+
+
+def drawn_scenes(densities: Sequence[float] = DENSITIES, draw: int = 0) -> Iterator[Scene]:
+    """The scenes with exact ground, at some densities in points a square metre."""
+    for number, (name, kind) in enumerate(KINDS.items()):
+        for density in densities:
+            x, y, z, is_ground = kind(np.random.default_rng([draw, number, round(100 * density)]), density)
+            mm = [np.rint(v * 1000).astype(np.int64) for v in (x + 1000.0, y + 2000.0, z + 100.0)]
+            yield Scene(name=f"{name} {density:g}", x_mm=mm[0], y_mm=mm[1], z_mm=mm[2], is_ground=is_ground)
+
+
+def product_filter(settings: GroundSettings) -> GroundFilter:
+    """The ground stage of the product."""
+
+    def found(x: Ints, y: Ints, z: Ints, usable: Bools, window: Window) -> Bools:
+        terrain = ground_of(x, y, z, usable, window, settings, trusted=False)
+        result: Bools = usable & ground_points(x, y, z, terrain, settings)
+        return result
+
+    return found
+
+
+def filter_of(name: str) -> GroundFilter:
+    """A filter by its name in the settings, or as MODULE:FUNCTION."""
+    if ":" in name:
+        module, function = name.split(":")
+        found: GroundFilter = getattr(importlib.import_module(module), function)
+        return found
+    return product_filter(GroundSettings(filter=name))
+
+
+def labels_of(scene: Scene, ground_filter: GroundFilter) -> Bools:
+    """What a filter finds in a scene, gross outliers taken off first."""
+    usable = dense_enough(scene.x_mm, scene.y_mm, scene.z_mm, OutlierSettings())
+    return ground_filter(scene.x_mm, scene.y_mm, scene.z_mm, usable, scene.window)
+
+
+def figures_of(scene: Scene, found: Bools, seconds: float = 0.0) -> Figures:
+    """Type I, type II, total error and kappa."""
+    truth, n = scene.is_ground, len(scene.is_ground)
+    missed, taken = int((truth & ~found).sum()), int((~truth & found).sum())
+    ground, said = int(truth.sum()), int(found.sum())
+    chance = (ground * said + (n - ground) * (n - said)) / n**2
+    return Figures(
+        name=scene.name,
+        type_1=100.0 * missed / max(ground, 1),
+        type_2=100.0 * taken / (n - ground) if ground < n else float("nan"),
+        total=100.0 * (missed + taken) / n,
+        kappa=100.0 * (1.0 - (missed + taken) / n - chance) / (1.0 - chance) if chance < 1.0 else 100.0,
+        points=n,
+        seconds=seconds,
+    )
+
+
+def measured(scenes: Sequence[Scene], ground_filter: GroundFilter) -> list[Figures]:
+    """The figures of each scene; everything is compiled before the clock starts."""
+    if scenes:
+        labels_of(scenes[0], ground_filter)
+    rows = []
+    for scene in scenes:
+        start = time.perf_counter()
+        found = labels_of(scene, ground_filter)
+        rows.append(figures_of(scene, found, time.perf_counter() - start))
+    return rows
+
+
+def table(rows: Sequence[Figures], mean: str) -> str:
+    """Rows and their mean as a Markdown table."""
+    lines = ["| scene | type I | type II | total | kappa | points | points/s |", "|---|--:|--:|--:|--:|--:|--:|"]
+    lines += [
+        f"| {row.name} | {row.type_1:.2f} | {row.type_2:.2f} | {row.total:.2f} | {row.kappa:.1f} | {row.points} |"
+        f" {row.points / max(row.seconds, 1e-9):.2g} |"
+        for row in rows
+    ]
+    means = [statistics.fmean(getattr(row, name) for row in rows) for name in ("type_1", "type_2", "total", "kappa")]
+    speed = sum(row.points for row in rows) / max(sum(row.seconds for row in rows), 1e-9)
+    one, two, total, kappa = means
+    lines.append(f"| {mean} | {one:.2f} | {two:.2f} | {total:.2f} | {kappa:.1f} | | {speed:.2g} |")
+    return "\n".join(lines)
+
+
+def error_map(scene: Scene, found: Bools, path: Path) -> None:
+    """Draw relief of the lowest points with both kinds of error."""
+    from matplotlib.figure import Figure
+
+    x, y, z = scene.x_mm / 1000, scene.y_mm / 1000, scene.z_mm / 1000
+    width, depth = float(np.ptp(x)), float(np.ptp(y))
+    figure = Figure(figsize=(20, 2.0 + 9.0 * depth / width), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    size = 12000.0 / len(x) * 4
+    low, high = np.percentile(z, [1, 99])
+    shown = left.scatter(x, y, c=z, s=size, cmap="terrain", vmin=low, vmax=high)
+    figure.colorbar(shown, ax=left, shrink=0.6)
+    left.set_title(f"{scene.name}: elevation")
+    for mask, colour, label in (
+        (scene.is_ground & found, "#d8d8d8", "ground"),
+        (~scene.is_ground & ~found, "#9ab0c8", "object"),
+        (scene.is_ground & ~found, "red", "type I: ground missed"),
+        (~scene.is_ground & found, "blue", "type II: object taken"),
+    ):
+        right.scatter(x[mask], y[mask], c=colour, s=size, label=f"{label} {int(mask.sum())}")
+    right.legend(loc="upper right")
+    for axes in (left, right):
+        axes.set_aspect("equal")
+    figure.savefig(path, dpi=70)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--filter", default=GroundSettings().filter)
+    parser.add_argument("--only", nargs="*", default=())
+    parser.add_argument("--densities", type=float, nargs="*", default=DENSITIES)
+    parser.add_argument("--draw", type=int, default=0)
+    parser.add_argument("--out", type=Path)
+    given = parser.parse_args(arguments)
+    ground_filter = filter_of(given.filter)
+    for scenes, mean in (
+        (list(samples(given.data)), "mean of samples"),
+        (list(drawn_scenes(given.densities, given.draw)), "mean of drawn scenes"),
+    ):
+        wanted = [scene for scene in scenes if not given.only or any(part in scene.name for part in given.only)]
+        if not wanted:
+            continue
+        print(table(measured(wanted, ground_filter), mean), end="\n\n", flush=True)
+        if given.out is not None:
+            given.out.mkdir(parents=True, exist_ok=True)
+            for scene in wanted:
+                error_map(scene, labels_of(scene, ground_filter), given.out / f"{scene.name.replace(' ', '_')}.png")
+
+
+if __name__ == "__main__":
+    main()

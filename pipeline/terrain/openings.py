@@ -1,0 +1,155 @@
+"""Openings of growing size by octagons, on surfaces with holes.
+
+An opening takes off a surface what is narrower than its structuring element. The elements here are sums of crosses and
+squares of three cells in the ratio that makes a regular octagon, and each is the one before with one piece more, so
+that an erosion goes on from the last.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import ByteArray
+from pipeline.terrain.lattice import NO_DATA, Elevations
+
+_HIGH = np.int32(2**30)
+_LOW = np.int32(-(2**30))
+
+
+@njit(cache=True, nogil=True)
+def _is_square(number: int) -> bool:
+    """Whether the n-th piece of an octagon is a square: 29 of 70 are, as sqrt(2) - 1 asks; the others are crosses."""
+    return number * 29 // 70 > (number - 1) * 29 // 70
+
+
+@njit(cache=True, nogil=True)
+def _widened(values: Elevations, across: Elevations, is_square: bool, want_low: bool) -> None:
+    """Replace values, but for their frame of one cell, by the extreme over a square or cross of three cells."""
+    rows, columns = values.shape
+    row = np.empty(columns, np.int32)
+    for r in range(1, rows - 1):
+        above, here, below, out = values[r - 1], values[r], values[r + 1], across[r]
+        if want_low:
+            for c in range(columns):
+                v = min(here[c], above[c])
+                out[c] = min(below[c], v)
+        else:
+            for c in range(columns):
+                v = max(here[c], above[c])
+                out[c] = max(below[c], v)
+    for r in range(1, rows - 1):
+        # a square takes the neighbours of the column's extremes, a cross those of the row itself
+        row[:] = across[r] if is_square else values[r]
+        west, middle, east, out = row[:-2], across[r, 1:-1], row[2:], values[r, 1:-1]
+        if want_low:
+            for c in range(columns - 2):
+                v = min(middle[c], west[c])
+                out[c] = min(east[c], v)
+        else:
+            for c in range(columns - 2):
+                v = max(middle[c], west[c])
+                out[c] = max(east[c], v)
+
+
+@njit(cache=True, nogil=True)
+def framed(surface: Elevations) -> Elevations:
+    """The surface within a frame of one cell, what has no data above everything: ready to be eroded."""
+    rows, columns = surface.shape
+    out = np.full((rows + 2, columns + 2), _HIGH, np.int32)
+    for r in range(rows):
+        for c in range(columns):
+            if surface[r, c] != NO_DATA:
+                out[r + 1, c + 1] = surface[r, c]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def erode_once(eroded: Elevations, scratch: Elevations, radius: int) -> None:
+    """From the erosion by the octagon of radius - 1 to that of radius, in place; both arrays are framed."""
+    _widened(eroded, scratch, _is_square(radius), True)
+
+
+@njit(cache=True, nogil=True)
+def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, scratch: Elevations, radius: int) -> None:
+    """From an erosion to the opening, written to the framed array `opened`.
+
+    Elements are centred on cells with data only: beyond the data's edge an element would see nothing but the roof that
+    the edge cuts.
+
+    Parameters
+    ----------
+    surface : (rows, columns) int32
+        What is opened; tells where there is data.
+    eroded, opened, scratch : (rows + 2, columns + 2) int32
+        The erosion by the octagon of `radius`, the outcome, and room.
+    radius : int
+        Of the octagon, in cells.
+    """
+    rows, columns = surface.shape
+    opened[:] = _LOW
+    scratch[:] = _LOW
+    for r in range(rows):
+        for c in range(columns):
+            if surface[r, c] != NO_DATA:
+                opened[r + 1, c + 1] = eroded[r + 1, c + 1]
+    for number in range(radius, 0, -1):
+        _widened(opened, scratch, _is_square(number), False)
+
+
+@njit(cache=True, nogil=True)
+def opened_by(surface: Elevations, radius: int) -> Elevations:
+    """Opening of a surface by an octagon of a radius in cells; NO_DATA where the surface has none."""
+    eroded = framed(surface)
+    opened, scratch = eroded.copy(), eroded.copy()
+    for number in range(1, radius + 1):
+        erode_once(eroded, scratch, number)
+    dilate_back(surface, eroded, opened, scratch, radius)
+    out = surface.copy()
+    for r in range(surface.shape[0]):
+        for c in range(surface.shape[1]):
+            if surface[r, c] != NO_DATA:
+                out[r, c] = opened[r + 1, c + 1]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def cut_off(surface: Elevations, base_mm: Elevations, rise_mm: float, largest: int) -> ByteArray:
+    """The first radius of a growing opening that takes more off a cell than it may.
+
+    Parameters
+    ----------
+    surface : (rows, columns) int32
+        Elevations or heights in mm, NO_DATA in holes.
+    base_mm : (rows, columns) int32
+        What the step to any radius may take of each cell.
+    rise_mm : float
+        What it may take more for each cell of its radius.
+    largest : int
+        Largest radius in cells; every radius from 1 on is tried.
+
+    Returns
+    -------
+    (rows, columns) uint8
+        The radius; 0 where no step takes more, and in holes.
+
+    Notes
+    -----
+    A planar slope loses nothing to an opening. A hilltop, crest or brow loses by each cell of radius no more than its
+    slope rises over a cell, an object all of its height at once when the element no longer fits into it.
+    """
+    rows, columns = surface.shape
+    found = np.zeros((rows, columns), np.uint8)
+    eroded = framed(surface)
+    before, after, high, low = eroded.copy(), eroded.copy(), eroded.copy(), eroded.copy()
+    for radius in range(1, largest + 1):
+        erode_once(eroded, high, radius)
+        dilate_back(surface, eroded, after, low, radius)
+        for r in range(rows):
+            for c in range(columns):
+                if surface[r, c] != NO_DATA and found[r, c] == 0:
+                    taken = before[r + 1, c + 1] - after[r + 1, c + 1]
+                    if taken > base_mm[r, c] + rise_mm * radius:
+                        found[r, c] = radius
+        before, after = after, before
+    return found

@@ -1,0 +1,132 @@
+"""Wide objects: halls and blocks too wide for the openings that tell the smaller objects.
+
+On a coarse lattice, openings go on to grow. A step of one coarse cell takes off a hill no more than the hill rises over
+that cell, and of a flat roof the whole height: so a limit in metres a step tells halls from hills.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray
+from pipeline.terrain.lattice import NO_DATA, Elevations
+from pipeline.terrain.openings import dilate_back, erode_once, framed
+
+COARSE = 2
+"""Side of a coarse cell in cells of the terrain lattice, which are metres."""
+
+_FILL = 2
+"""Coarse cells by which the gaps between sparse points are closed."""
+
+_NARROW = 2
+"""Half the width, in coarse cells, of the courtyards, trenches and clumps of low outliers that are filled first."""
+
+
+@njit(cache=True, nogil=True)
+def _coarse(lowest: Elevations, column0: int, row0: int) -> Elevations:
+    """Lowest elevation of each coarse cell, anchored at the CRS's origin."""
+    rows, columns = lowest.shape
+    corner_r, corner_c = row0 // COARSE, column0 // COARSE
+    shape = ((row0 + rows - 1) // COARSE - corner_r + 1, (column0 + columns - 1) // COARSE - corner_c + 1)
+    out = np.full(shape, NO_DATA, np.int32)
+    for r in range(rows):
+        for c in range(columns):
+            i, j = (row0 + r) // COARSE - corner_r, (column0 + c) // COARSE - corner_c
+            out[i, j] = min(out[i, j], lowest[r, c])
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _extreme_of_nine(values: Elevations, want_low: bool, into_gaps: bool) -> Elevations:
+    """Extreme of the nine cells around each cell with data, or only around each one without."""
+    rows, columns = values.shape
+    out = values.copy()
+    for r in range(rows):
+        for c in range(columns):
+            if (values[r, c] == NO_DATA) != into_gaps:
+                continue
+            found = False
+            best = np.int32(0)
+            for i in range(max(r - 1, 0), min(r + 2, rows)):
+                for j in range(max(c - 1, 0), min(c + 2, columns)):
+                    v = values[i, j]
+                    if v != NO_DATA and (not found or (v < best if want_low else v > best)):
+                        best, found = v, True
+            if found:
+                out[r, c] = best
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _floors(surface: Elevations, first: int, last: int, rise_mm: float) -> Elevations:
+    """The opening's level where a step of its growing radius takes more than rise_mm a cell of it, else NO_DATA."""
+    rows, columns = surface.shape
+    out = np.full((rows, columns), NO_DATA, np.int32)
+    eroded = framed(surface)
+    before, after, high, low = eroded.copy(), eroded.copy(), eroded.copy(), eroded.copy()
+    for radius in range(1, last + 1):
+        erode_once(eroded, high, radius)
+        if radius < first - 1:
+            continue
+        dilate_back(surface, eroded, after, low, radius)
+        if radius >= first:
+            for r in range(rows):
+                for c in range(columns):
+                    if surface[r, c] != NO_DATA and before[r + 1, c + 1] - after[r + 1, c + 1] > rise_mm * radius:
+                        out[r, c] = after[r + 1, c + 1]
+        before, after = after, before
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _on_fine(lowest: Elevations, floors: Elevations, column0: int, row0: int, above_mm: int) -> BoolArray:
+    """Mask of the cells that stand so far above the floor of a coarse cell beside them."""
+    rows, columns = lowest.shape
+    coarse_rows, coarse_columns = floors.shape
+    corner_r, corner_c = row0 // COARSE, column0 // COARSE
+    out = np.zeros((rows, columns), np.bool_)
+    for r in range(rows):
+        for c in range(columns):
+            if lowest[r, c] == NO_DATA:
+                continue
+            i, j = (row0 + r) // COARSE - corner_r, (column0 + c) // COARSE - corner_c
+            for a in range(max(i - 1, 0), min(i + 2, coarse_rows)):
+                for b in range(max(j - 1, 0), min(j + 2, coarse_columns)):
+                    if floors[a, b] != NO_DATA and lowest[r, c] - floors[a, b] > above_mm:
+                        out[r, c] = True
+    return out
+
+
+def wide_objects(lowest: Elevations, corner: tuple[int, int], narrower: int, radius: int, rise_mm: float) -> BoolArray:
+    """Mask of the cells of wide objects.
+
+    Parameters
+    ----------
+    lowest : (rows, columns) int32
+        Elevation in mm of the lowest point of each cell; NO_DATA where there is none.
+    corner : tuple of int
+        Absolute column and row of the first cell.
+    narrower, radius : int
+        Radii of the first and the last opening, in cells.
+    rise_mm : float
+        What a step may take, for each cell of the radius: wider objects must be higher.
+
+    Returns
+    -------
+    (rows, columns) bool
+        Objects; none where there is no data.
+    """
+    surface = _coarse(lowest, *corner)
+    for _ in range(_FILL):  # the higher side wins: an outlier must not grow
+        surface = _extreme_of_nine(surface, False, True)
+    for want_low in (False, True):
+        for _ in range(_NARROW):
+            surface = _extreme_of_nine(surface, want_low, False)
+    floors = _floors(surface, narrower // COARSE, -(-radius // COARSE), rise_mm * COARSE)
+    return _on_fine(lowest, floors, *corner, round(rise_mm * narrower / 2))
+
+
+def wide_support_m(radius: int) -> float:
+    """How far it looks: alignment of the coarse cells, gaps, closing, erosion and dilation, the neighbours."""
+    return float(COARSE * (_FILL + 2 * _NARROW + 2 * -(-radius // COARSE) + 1) + COARSE)
