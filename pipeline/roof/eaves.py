@@ -1,8 +1,8 @@
 """Straight eaves: the outline around roof points as few straight lines, square to one another where the data allow.
 
 The raw outline zigzags between outermost roof points. It is cut into runs; the line through each is fitted to all of
-it, so that the zigzag averages out; lines near the building's dominant direction or square to it take that direction
-exactly; corners are where lines meet.
+it, so that the zigzag averages out; lines near a dominant direction of the building or square to it take that direction
+exactly; each line is moved to where the points along it put the edge; corners are where lines meet.
 """
 
 from __future__ import annotations
@@ -13,20 +13,27 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
+from shapely.geometry.polygon import orient
 
 from pipeline.model import FloatArray
+from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm, outward_shift_mm
 from pipeline.roof.footprint import polygons_of
-from pipeline.roof.lines import Point, corners, dominant_direction, merge, split, square
+from pipeline.roof.lines import Point, Run, corners, merge, split
 from pipeline.roof.settings import RoofSettings
 
 _FACTORS = (1.0, 0.6, 0.35)
 """Times the tolerance: what cannot be drawn with few lines is tried with more."""
 
+_FIRST_SHARE = 0.4
+_OTHER_SHARE = 0.2
+_SURELY_SQUARE = math.radians(2.0)
 _MOVED = 0.4
 """Most area between the raw outline and the lines: this part of the tolerance times the outline's length."""
 
 
-def straighten(outline_mm: MultiPolygon, spacing_m: float, settings: RoofSettings) -> MultiPolygon:
+def straighten(
+    outline_mm: MultiPolygon, spacing_m: float, settings: RoofSettings, points: EdgePoints | None = None
+) -> MultiPolygon:
     """Draw an outline with straight lines.
 
     Parameters
@@ -37,22 +44,30 @@ def straighten(outline_mm: MultiPolygon, spacing_m: float, settings: RoofSetting
         Point spacing; the tolerances are multiples of it.
     settings : RoofSettings
         `eave_tolerance_spacings`, `square_within_deg`.
+    points : EdgePoints, optional
+        The roof points. With them every line long enough is put where they tell that the edge is, and the outline is
+        drawn back by what mixed pulses add; without them lines stay amid the raw zigzag.
 
     Returns
     -------
     MultiPolygon
         Integer millimetres, valid. A ring that would move too much area stays raw.
     """
+    reach_mm = 0.0
+    if points is not None:
+        reach_mm = mixed_pulse_reach_mm(outline_mm, points)
+        outline_mm = _drawn_back(outline_mm, reach_mm)
     straightened: list[Polygon] = []
-    for polygon in outline_mm.geoms:
-        outer, *holes = _straight_rings(polygon, spacing_m, settings)
+    for part in outline_mm.geoms:
+        polygon = orient(part)
+        outer, *holes = _straight_rings(polygon, spacing_m, settings, points, reach_mm)
         drawn = Polygon(outer, holes)
         if not drawn.is_valid:
             # a hole that crosses the outside cuts into it
             cut = shapely.difference(
                 Polygon(outer), shapely.union_all([Polygon(hole) for hole in holes]), grid_size=1.0
             )
-            drawn = max(polygons_of(cut), key=lambda part: part.area, default=polygon)
+            drawn = max(polygons_of(cut), key=lambda piece: piece.area, default=polygon)
         straightened.append(drawn)
     result = MultiPolygon(straightened)
     if not result.is_valid:
@@ -60,7 +75,21 @@ def straighten(outline_mm: MultiPolygon, spacing_m: float, settings: RoofSetting
     return result if result.is_valid and not result.is_empty else outline_mm
 
 
-def _straight_rings(polygon: Polygon, spacing_m: float, settings: RoofSettings) -> list[FloatArray]:
+def _drawn_back(outline_mm: MultiPolygon, reach_mm: float) -> MultiPolygon:
+    """Every part smaller by a distance all around; one that would vanish or fall apart stays."""
+    if reach_mm <= 0.0:
+        return outline_mm
+    parts: list[Polygon] = []
+    for polygon in outline_mm.geoms:
+        smaller = polygons_of(shapely.set_precision(shapely.buffer(polygon, -reach_mm, join_style="mitre"), 1.0))
+        parts.append(smaller[0] if len(smaller) == 1 else polygon)
+    drawn = MultiPolygon(parts)
+    return drawn if drawn.is_valid else outline_mm
+
+
+def _straight_rings(
+    polygon: Polygon, spacing_m: float, settings: RoofSettings, points: EdgePoints | None, reach_mm: float
+) -> list[FloatArray]:
     """The rings of one part with straight lines; a ring that will not be drawn so stays raw."""
     borders = _rings(polygon)
     rings: list[FloatArray | None] = [None] * len(borders)
@@ -68,14 +97,79 @@ def _straight_rings(polygon: Polygon, spacing_m: float, settings: RoofSettings) 
     for factor in _FACTORS:
         tolerance = max(factor * settings.eave_tolerance_spacings * spacing_m, 0.2) * 1e3
         runs_of = [merge(ring, split(ring, tolerance, closed=True), tolerance, closed=True) for ring in borders]
-        dominant = dominant_direction([run for runs in runs_of for run in runs])
+        dominant = dominant_directions([run for runs in runs_of for run in runs], within)
         for k, (ring, runs) in enumerate(zip(borders, runs_of, strict=True)):
             if rings[k] is None and runs:
-                square(runs, dominant, within, tolerance)
-                rings[k] = _accepted(ring, corners(ring, runs, 3.0 * tolerance, closed=True), tolerance)
+                _take_directions(runs, dominant, within, tolerance)
+                if points is not None:
+                    _take_positions(ring, runs, points, reach_mm)
+                rings[k] = _accepted(ring, corners(ring, runs, 1.5 * tolerance, closed=True), tolerance)
         if all(ring is not None for ring in rings):
             break
     return [raw if ring is None else ring for raw, ring in zip(borders, rings, strict=True)]
+
+
+def dominant_directions(runs: Sequence[Run], within: float) -> list[float]:
+    """The directions, modulo a right angle, that the walls of a building follow, the one with most walls first.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        Of all rings.
+    within : float
+        Radians; lines closer than this to a direction, or to the one square to it, follow it.
+
+    Returns
+    -------
+    list of float
+        Radians. A direction counts with the squared lengths of the lines that follow it: the first holds at least
+        40 % of them all, more than a round outline gives any direction (2 / 7.5 at 12 degrees), each other one 20 %.
+    """
+    left = list(runs)
+    whole = math.fsum(run.length**2 for run in runs)
+    found: list[float] = []
+    while left and whole > 0.0:
+        best, members = 0.0, []
+        for run in left:
+            near = [other for other in left if abs(off_square(other.direction, run.direction)) <= within]
+            weight = math.fsum(other.length**2 for other in near)
+            if weight > best * (1.0 + 1e-9):
+                best, members, about = weight, near, run.direction
+        if best < (_OTHER_SHARE if found else _FIRST_SHARE) * whole:
+            break
+        off = math.fsum(run.length**2 * off_square(run.direction, about) for run in members)
+        found.append(about + off / best)
+        left = [run for run in left if all(run is not member for member in members)]
+    return found
+
+
+def off_square(direction: float, dominant: float) -> float:
+    """By how much a direction differs from the nearest one along or square to another, radians."""
+    return math.remainder(direction - dominant, 0.5 * math.pi)
+
+
+def _take_directions(runs: Sequence[Run], dominant: Sequence[float], within: float, tolerance: float) -> None:
+    """Give runs near a dominant direction, or square to it, that direction.
+
+    A short run is less certain: it may be off by the tolerance over its length. A long one is more certain: turned into
+    the direction it must stay within the tolerance at its ends, or be off by no more than 2 degrees.
+    """
+    for run in runs:
+        offs = [off_square(run.direction, direction) for direction in dominant]
+        off = min(offs, key=abs, default=math.inf)
+        most = max(within, math.atan2(tolerance, run.length))
+        if abs(off) <= min(most, max(_SURELY_SQUARE, math.atan2(2.0 * tolerance, run.length))):
+            run.direction -= off
+
+
+def _take_positions(ring: FloatArray, runs: Sequence[Run], points: EdgePoints, reach_mm: float) -> None:
+    """Move runs to where the points along them put the edge; those too short to tell stay."""
+    for run in runs:
+        shift = outward_shift_mm(ring, run, points, reach_mm)
+        if shift is not None:
+            shift = min(max(shift, -points.spacing_mm), points.spacing_mm)
+            run.x += shift * math.sin(run.direction)
+            run.y -= shift * math.cos(run.direction)
 
 
 def _rings(polygon: Polygon) -> list[FloatArray]:

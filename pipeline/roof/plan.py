@@ -13,9 +13,10 @@ from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
 from pipeline.geometry import point_spacing_m, top_visible
-from pipeline.model import Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
+from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
+from pipeline.roof.edge_position import EdgePoints
 from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
 from pipeline.roof.partition import (
@@ -48,6 +49,8 @@ class RoofPoints:
     """(n,) int64, which of the candidate's points they are."""
     labels: LabelArray
     """(n,) int32, plane of every point; -1 where the segmentation gave none."""
+    split: BoolArray
+    """(n,) bool, True where the pulse went on to a lower return."""
     spacing_m: float
     """Typical distance of neighbours in plan."""
     footprint_mm: MultiPolygon | None
@@ -100,9 +103,17 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
         xy_mm=grid[kept, :2],
         index=index,
         labels=np.full(len(index), -1, np.int32),
+        split=_are_among(grid[kept, :2], np.rint(candidate.split_returns[:, :2] * 1e3).astype(np.int64)),
         spacing_m=min(max(point_spacing_m(points[index]), 0.1), 3.0),
         footprint_mm=footprint,
     )
+
+
+def _are_among(xy_mm: IntArray, others_mm: IntArray) -> BoolArray:
+    """Which of the positions, (n, 2), are rows of others."""
+    keys = [(xy[:, 0] << 32) + xy[:, 1] for xy in (xy_mm, others_mm)]
+    among: BoolArray = np.isin(keys[0], keys[1])
+    return among
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -194,7 +205,7 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     return RoofPlan(
         planes=tuple(planes),
         faces=continued_faces,
-        outline_mm=straighten(around, roof.spacing_m, settings),
+        outline_mm=straighten(around, roof.spacing_m, settings, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m)),
         raw=partition,
     )
 

@@ -24,7 +24,7 @@ class RoofSettings(Parameters):
         maximum=5.0,
     )
     outside_fraction: float = parameter(
-        0.27,
+        0.21,
         "Where on the way from a roof point to the nearest empty place the eave lies, without a footprint.",
         minimum=0.05,
         maximum=0.95,

@@ -1,7 +1,7 @@
 """Quarantine bundles: one building with all that modelling it needs, in one small file that can be mailed.
 
-A zip of `bundle.json` (names, settings, what happened), `points.npy`, `ground.npy` and `stderr.txt`. Reading one
-executes nothing of it: no pickles, sizes are checked before anything is unpacked.
+A zip of `bundle.json` (names, settings, what happened), `points.npy`, `ground.npy`, `split_returns.npy` and
+`stderr.txt`. Reading one executes nothing of it: no pickles, sizes are checked before anything is unpacked.
 """
 
 from __future__ import annotations
@@ -107,7 +107,8 @@ def write_bundle(folder: str, bundle: Bundle) -> Path:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("bundle.json", json.dumps(document, indent=1, allow_nan=False))
             archive.writestr("stderr.txt", stderr)
-            for name, array in (("points", candidate.points), ("ground", candidate.ground)):
+            arrays = {"points": candidate.points, "ground": candidate.ground, "split_returns": candidate.split_returns}
+            for name, array in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, np.ascontiguousarray(array), (1, 0), allow_pickle=False)
         temporary.replace(target)
@@ -132,9 +133,10 @@ def read_bundle(path: str) -> Bundle:
             stderr = _member(archive, path, "stderr.txt", _LARGEST_TEXT_BYTES).decode("utf-8", errors="replace")
             points = _array(_member(archive, path, "points.npy", _LARGEST_BYTES))
             ground = _array(_member(archive, path, "ground.npy", _LARGEST_BYTES))
+            split_returns = _array(_member(archive, path, "split_returns.npy", _LARGEST_BYTES))
         if document["format"] != _FORMAT:
             raise UnreadableInputError(path, f"its format is {document['format']!r}, not {_FORMAT!r}", _FIX)
-        return _bundle(document, points, ground, stderr)
+        return _bundle(document, points, ground, split_returns, stderr)
     except OSError as error:
         raise UnreadableInputError(path, f"it cannot be read: {error.strerror or error}", _FIX) from error
     except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
@@ -168,7 +170,9 @@ def _array(content: bytes) -> FloatArray:
     return coordinates
 
 
-def _bundle(document: Mapping[str, Any], points: FloatArray, ground: FloatArray, stderr: str) -> Bundle:
+def _bundle(
+    document: Mapping[str, Any], points: FloatArray, ground: FloatArray, split_returns: FloatArray, stderr: str
+) -> Bundle:
     """The bundle that a document and arrays describe."""
     east, north, up = (float(value) for value in document["origin"])
     footprint = None if document["footprint"] is None else shapely.from_wkb(document["footprint"])
@@ -182,6 +186,7 @@ def _bundle(document: Mapping[str, Any], points: FloatArray, ground: FloatArray,
         origin=(east, north, up),
         points=points,
         ground=ground,
+        split_returns=split_returns,
         ground_z_m=math.nan if document["ground_z_m"] is None else float(document["ground_z_m"]),
         footprint=footprint,
         source_id=None if source_id is None else str(source_id),

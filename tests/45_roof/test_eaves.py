@@ -12,7 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon
 
-from pipeline.roof.eaves import straighten
+from pipeline.roof.eaves import dominant_directions, straighten
+from pipeline.roof.edge_position import EdgePoints
+from pipeline.roof.lines import Run, fitted_run
 from pipeline.roof.settings import RoofSettings
 
 SETTINGS = RoofSettings()
@@ -76,4 +78,74 @@ def test_any_outline_stays_valid_and_near(seed: int, spacing_m: float) -> None:
     assert drawn.is_valid
     tolerance = max(SETTINGS.eave_tolerance_spacings * spacing_m, 0.2) * 1e3
     assert shapely.symmetric_difference(drawn, raw).area <= 0.41 * tolerance * raw.length + raw.length
+    assert np.array_equal(shapely.get_coordinates(drawn), np.rint(shapely.get_coordinates(drawn)))
+
+
+def test_every_wing_takes_its_own_direction() -> None:
+    wing = shapely.affinity.rotate(shapely.box(0, -7, 22, 0), 32.0, origin=(0, 0))
+    truth = shapely.union_all([shapely.box(-20, -7, 1, 0), wing, shapely.Point(0, -3.5).buffer(3.5)])
+    drawn = straighten(ragged(shapely.simplify(truth, 0.2), 0.4, np.random.default_rng(7)), 0.4, SETTINGS)
+    (polygon,) = drawn.geoms
+    sides = np.diff(np.array(polygon.exterior.coords), axis=0)
+    long = sides[np.hypot(*sides.T) > 5000.0]
+    off = sorted({round(math.degrees(math.atan2(y, x)) % 90.0, 3) for x, y in long.tolist()})
+    # two exact directions, not one for each wall
+    assert len(long) >= 5
+    clusters = [group for group in (0.0, 32.0) if any(abs(math.remainder(a - group, 90.0)) < 1.5 for a in off)]
+    assert clusters == [0.0, 32.0]
+    assert all(min(abs(math.remainder(a - group, 90.0)) for group in clusters) < 1.5 for a in off)
+    for group in clusters:
+        own = [a for a in off if abs(math.remainder(a - group, 90.0)) < 1.5]
+        assert max(own) - min(own) < 0.05 or max(own) - min(own) > 89.9
+
+
+def test_a_long_wall_that_is_surely_not_square_stays_so() -> None:
+    truth = shapely.Polygon([(0, 0), (40, 0), (40, 14), (0, 9)])
+    drawn = straighten(ragged(truth, 0.4, np.random.default_rng(4)), 0.4, SETTINGS)
+    metres = shapely.transform(drawn, lambda xy: xy * 1e-3)
+    assert shapely.intersection(metres, truth).area / shapely.union(metres, truth).area > 0.98
+
+
+def test_a_circle_has_no_dominant_direction_and_a_rectangle_has_one() -> None:
+    def runs(polygon: Polygon) -> list[Run]:
+        ring = shapely.get_coordinates(polygon.exterior)[:-1]
+        return [fitted_run(ring, k, k + 1) for k in range(len(ring))]
+
+    assert dominant_directions(runs(shapely.Point(0, 0).buffer(8.0)), math.radians(12.0)) == []
+    turned = shapely.affinity.rotate(shapely.box(0, 0, 12, 8), 20.0)
+    (found,) = dominant_directions(runs(turned), math.radians(12.0))
+    assert math.remainder(found - math.radians(20.0), math.pi / 2) == pytest.approx(0.0, abs=1e-9)
+    assert dominant_directions([], 0.2) == []
+
+
+def test_a_courtyard_stays_a_hole_and_is_as_square_as_the_outside() -> None:
+    truth = shapely.affinity.rotate(shapely.box(0, 0, 24, 20).difference(shapely.box(7, 6, 17, 13)), 25.0)
+    rng = np.random.default_rng(11)
+    outer, inner = (ragged(Polygon(ring), 0.4, rng).geoms[0] for ring in (truth.exterior, *truth.interiors))
+    drawn = straighten(MultiPolygon([Polygon(outer.exterior, [inner.exterior])]), 0.4, SETTINGS)
+    (polygon,) = drawn.geoms
+    assert [len(ring.coords) - 1 for ring in (polygon.exterior, *polygon.interiors)] == [4, 4]
+    metres = shapely.transform(drawn, lambda xy: xy * 1e-3)
+    assert shapely.intersection(metres, truth).area / shapely.union(metres, truth).area > 0.96
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.2, 1.5), st.floats(0.0, 0.6))
+@settings(max_examples=60, deadline=None)
+def test_any_outline_stays_valid_with_any_points(seed: int, spacing_m: float, split_share: float) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(3, 30))
+    angle = np.sort(rng.uniform(0, math.tau, n))
+    radius = rng.uniform(1.0, 15.0, n) * 1e3
+    raw = Polygon(np.rint(np.column_stack((radius * np.cos(angle), radius * np.sin(angle)))))
+    if not raw.is_valid or raw.area < 1e6:
+        return
+    hole = shapely.Point(0, 0).buffer(300.0)
+    body = raw.difference(hole) if raw.contains(hole) else raw
+    if not isinstance(body, Polygon):
+        return
+    xy = np.rint(rng.uniform(-16e3, 16e3, (400, 2))).astype(np.int64)
+    points = EdgePoints.of(xy, rng.uniform(size=len(xy)) < split_share, spacing_m)
+    drawn = straighten(shapely.set_precision(MultiPolygon([body]), 1.0), spacing_m, SETTINGS, points)
+    assert drawn.is_valid
+    assert not drawn.is_empty
     assert np.array_equal(shapely.get_coordinates(drawn), np.rint(shapely.get_coordinates(drawn)))

@@ -1,0 +1,230 @@
+"""Where the edge of a roof lies, from the points along it.
+
+The outermost points of a sampled edge lie within it. In strips square to the edge the way from the outermost point of a
+strip to the edge is distributed as the way from any line within the roof to the next point inwards: an edge knows
+nothing of the points. That way follows from the distances V of successive points in the strips, as the age of a renewal
+process does: its mean is E[V^2] / (2 E[V]) (Cox 1962), half a distance where the points are regular, a whole one where
+they are strewn at random. So the correction follows the density, the pattern and its direction, measured at the edge
+itself.
+
+What is sampled so is the roof as the scanner sees it: larger than the roof, since a pulse that meets it with a part of
+its beam gives a point of the roof too. Such a pulse goes on and comes back from below as well, and that tells it: split
+pulses lie on a band along the edge as wide to the outside as to the inside. Their number over the length of the edge
+and the density of the points is the width of the band; half of it is the reach of the mixed pulses, by which the edge
+is drawn back. Where the returns are not told, nothing is drawn back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import shapely
+
+from pipeline.model import BoolArray, FloatArray, IntArray
+from pipeline.roof.lines import Run
+
+_STRIP_SPACINGS = 2.0
+"""Width of a strip along the edge."""
+_MARGIN_SPACINGS = 0.6
+"""Left out at either end of the edge: corners are round in the raw outline, and at inner ones another wing begins."""
+_DEPTH_SPACINGS = 6.0
+"""How far into the roof the distances of points are taken."""
+_REACH_SPACINGS = 1.5
+"""How far outside the raw line points are looked for: the raw outline keeps within this of roof points."""
+_GAP_SPACINGS = 2.5
+"""A longer distance is a gap in the roof, not sampling."""
+_PRIOR_COUNT = 8.0
+_PRIOR_AGE = 0.75
+"""What is expected of a few distances, in mean distances: between a lattice (0.5) and strewn points (1)."""
+_LONGEST_REACH_M = 0.5
+_BAND_SPACINGS = 0.25
+"""Split pulses are taken for an edge's own up to twice the longest reach within what is seen of the roof, and what the
+line may be off by."""
+_PRIOR_SPLITS = 4.0
+"""So many split pulses must be expected on an edge before its own count stands above the whole building's."""
+_STRAY_AGES = 4.0
+"""A strip whose outermost point lies this many mean ways off the median strip is not of this edge."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EdgePoints:
+    """Roof points in cells, to be found along lines."""
+
+    xy_mm: IntArray
+    """(n, 2) int64, cell after cell."""
+    split: BoolArray
+    """(n,) bool, True where the pulse went on to a lower return."""
+    starts: IntArray
+    """(columns * rows + 1,) where each cell's points start, row after row."""
+    low_mm: tuple[int, int]
+    """Lower left corner of the first cell."""
+    columns: int
+    rows: int
+    cell_mm: int
+    """Side of a cell."""
+    spacing_mm: float
+    """Typical distance of neighbours."""
+
+    @classmethod
+    def of(cls, xy_mm: IntArray, split: BoolArray, spacing_m: float) -> EdgePoints:
+        """Sort points into cells of some point spacings.
+
+        Parameters
+        ----------
+        xy_mm : (n, 2) int64
+            At least one point, millimetres.
+        split : (n,) bool
+            True where the pulse went on to a lower return; all False where the file does not tell.
+        spacing_m : float
+            Typical distance of neighbours.
+        """
+        cell = max(1000, math.ceil(_DEPTH_SPACINGS * spacing_m * 1e3))
+        low = xy_mm.min(axis=0)
+        columns, rows = ((xy_mm.max(axis=0) - low) // cell + 1).tolist()
+        place = (xy_mm[:, 1] - low[1]) // cell * columns + (xy_mm[:, 0] - low[0]) // cell
+        order = np.argsort(place, kind="stable")
+        starts = np.concatenate(([0], np.cumsum(np.bincount(place, minlength=columns * rows)))).astype(np.int64)
+        return cls(
+            xy_mm=xy_mm[order],
+            split=split[order],
+            starts=starts,
+            low_mm=(int(low[0]), int(low[1])),
+            columns=columns,
+            rows=rows,
+            cell_mm=cell,
+            spacing_mm=spacing_m * 1e3,
+        )
+
+    @property
+    def band_mm(self) -> float:
+        """How far within a line split pulses are taken for those of its edge."""
+        return 2e3 * _LONGEST_REACH_M + _BAND_SPACINGS * self.spacing_mm
+
+    def along(self, run: Run, first_mm: float, last_mm: float) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Points by a line: ways along it from `first_mm` to `last_mm`, how far to its right, and which are split."""
+        ux, uy = math.cos(run.direction), math.sin(run.direction)
+        out, depth = _REACH_SPACINGS * self.spacing_mm, max(_DEPTH_SPACINGS * self.spacing_mm, 3.0 * self.band_mm)
+        corners_x = [run.x + t * ux + d * uy for t in (first_mm, last_mm) for d in (out, -depth)]
+        corners_y = [run.y + t * uy - d * ux for t in (first_mm, last_mm) for d in (out, -depth)]
+        first_row = max(0, math.floor((min(corners_y) - self.low_mm[1]) / self.cell_mm))
+        last_row = min(self.rows - 1, math.floor((max(corners_y) - self.low_mm[1]) / self.cell_mm))
+        first_column = max(0, math.floor((min(corners_x) - self.low_mm[0]) / self.cell_mm))
+        last_column = min(self.columns - 1, math.floor((max(corners_x) - self.low_mm[0]) / self.cell_mm))
+        if first_column > last_column or first_row > last_row:
+            return np.empty(0), np.empty(0), np.empty(0, np.bool_)
+        pieces = []
+        for row in range(first_row, last_row + 1):
+            start = self.starts[row * self.columns + first_column]
+            pieces.append(np.arange(start, self.starts[row * self.columns + last_column + 1]))
+        index = np.concatenate(pieces)
+        x, y = self.xy_mm[index, 0] - run.x, self.xy_mm[index, 1] - run.y
+        way, off = x * ux + y * uy, x * uy - y * ux
+        near = (way >= first_mm) & (way < last_mm) & (off <= out) & (off >= -depth)
+        return way[near], off[near], self.split[index[near]]
+
+
+def mixed_pulse_reach_mm(outline_mm: shapely.Geometry, points: EdgePoints) -> float:
+    """How far beyond its edge a roof gives points, all around.
+
+    Parameters
+    ----------
+    outline_mm : geometry
+        Around the roof points, near to their edge.
+    points : EdgePoints
+        The roof points.
+
+    Returns
+    -------
+    float
+        Millimetres, at most 500; 0 where no pulse is split.
+    """
+    if not points.split.any():
+        return 0.0
+    simple = shapely.simplify(outline_mm, 0.6 * points.spacing_mm, preserve_topology=True)
+    border = simple.boundary
+    shapely.prepare(border)
+    near = shapely.dwithin(border, shapely.points(points.xy_mm[points.split].astype(np.float64)), points.band_mm)
+    # split pulses are also those at chimneys and skylights: as many an area along the edge as amid the roof
+    middle_mm2 = shapely.buffer(simple, -points.band_mm).area
+    usual = int((~near).sum()) / middle_mm2 if middle_mm2 > 0.0 else 0.0
+    count = int(near.sum()) - usual * (simple.area - middle_mm2)
+    length = float(border.length)
+    reach: float = 0.5 * count * points.spacing_mm**2 / length if length > 0.0 else 0.0
+    return min(max(reach, 0.0), 1e3 * _LONGEST_REACH_M)
+
+
+def outward_shift_mm(border: FloatArray, run: Run, points: EdgePoints, reach_mm: float) -> float | None:
+    """How far a line along the border of a roof must be moved to its right to lie on the edge.
+
+    Parameters
+    ----------
+    border : (n, 2) float64
+        Vertices of the raw ring, the roof on its left, millimetres.
+    run : Run
+        A stretch of it, its line in its final direction.
+    points : EdgePoints
+        The roof points.
+    reach_mm : float
+        Reach of the mixed pulses, over the whole building: an edge with few of them has this.
+
+    Returns
+    -------
+    float or None
+        Millimetres, negative inwards: the mean over the strips of the outermost point's place, plus the mean way from
+        there to the edge, less the reach of the mixed pulses. None where the stretch is too short to tell, or has too
+        few points.
+    """
+    spacing = points.spacing_mm
+    ux, uy = math.cos(run.direction), math.sin(run.direction)
+    ends = border[[run.first % len(border), run.last % len(border)]] - (run.x, run.y)
+    first, last = sorted((ends[:, 0] * ux + ends[:, 1] * uy).tolist())
+    first, last = first + _MARGIN_SPACINGS * spacing, last - _MARGIN_SPACINGS * spacing
+    if last - first < _STRIP_SPACINGS * spacing:
+        return None
+    strips = math.floor((last - first) / (_STRIP_SPACINGS * spacing))
+    width = (last - first) / strips
+    way, off, split = points.along(run, first, last)
+    if len(off) < 3:
+        return None
+    strip = np.minimum(((way - first) / width).astype(np.int64), strips - 1)
+    order = np.lexsort((-off, strip))
+    strip, sorted_off = strip[order], off[order]
+    outermost = np.concatenate(([True], strip[1:] != strip[:-1]))
+    distances = sorted_off[:-1] - sorted_off[1:]
+    distances = distances[_before_gaps(outermost, distances, _GAP_SPACINGS * spacing)]
+    prior = spacing * spacing / width
+    total = math.fsum(distances.tolist()) + _PRIOR_COUNT * prior
+    squares = math.fsum((distances**2).tolist()) + 2.0 * _PRIOR_AGE * _PRIOR_COUNT * prior * prior
+    age = squares / (2.0 * total)
+    places = sorted_off[outermost]
+    middle = np.sort(places)[len(places) // 2]
+    near = np.abs(places - middle) <= max(_STRAY_AGES * age, spacing)
+    edge: float = math.fsum(places[near].tolist()) / int(near.sum()) + age
+    density = (len(distances) + _PRIOR_COUNT) / (total * width)
+    return edge - _own_reach(off - edge, split, density * (last - first), points.band_mm, reach_mm)
+
+
+def _own_reach(off: FloatArray, split: BoolArray, points_a_mm: float, band_mm: float, reach_mm: float) -> float:
+    """The reach of mixed pulses at one edge, from its split pulses and those expected of the whole building's reach."""
+    if reach_mm <= 0.0:
+        return 0.0
+    near = np.abs(off) <= band_mm
+    within = off < -band_mm
+    usual = int((split & within).sum()) / max(1, int(within.sum()))
+    count = max(0.0, int((split & near).sum()) - usual * int(near.sum()))
+    # gamma prior about the building's reach, as heavy as so many split pulses
+    reach = (count + _PRIOR_SPLITS) / (2.0 * points_a_mm + _PRIOR_SPLITS / reach_mm)
+    return min(reach, 1e3 * _LONGEST_REACH_M)
+
+
+def _before_gaps(outermost: BoolArray, distances: FloatArray, gap: float) -> BoolArray:
+    """Which of the distances to the next point lie in one strip, before its first gap."""
+    gaps = distances > gap
+    gaps[outermost[1:]] = False
+    passed = np.concatenate(([0], np.cumsum(gaps)))
+    # gaps passed within the strip so far
+    at_start = np.maximum.accumulate(np.where(outermost, passed, 0))
+    counted: BoolArray = (passed[1:] == at_start[1:]) & ~outermost[1:]
+    return counted
