@@ -109,12 +109,18 @@ def _feature(
 
 
 def _attributes(row: Mapping[str, Any]) -> dict[str, Any]:
-    """The record as attributes: without geometry and id, without what is unknown, times as ISO 8601."""
+    """The record as attributes: without geometry and id, without what is unknown, times as ISO 8601.
+
+    The columns of the given footprint are an object of their own, so that no name of theirs meets one of ours.
+    """
     attributes: dict[str, Any] = {}
     for name, value in row.items():
         if value is None or name in _NOT_ATTRIBUTES:
             continue
-        attributes[name] = value.isoformat() if isinstance(value, dt.datetime) else value
+        if name == "source_attributes":
+            attributes[name] = json.loads(value)
+        else:
+            attributes[name] = value.isoformat() if isinstance(value, dt.datetime) else value
     return attributes
 
 

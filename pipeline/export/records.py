@@ -23,9 +23,11 @@ BUILDINGS = pa.schema(
     [
         pa.field("building_id", pa.string(), nullable=False),
         pa.field("source_id", pa.string()),
+        pa.field("source_attributes", pa.string()),
         pa.field("status", pa.string(), nullable=False),
         pa.field("reason", pa.string()),
         pa.field("reason_detail", pa.string(), nullable=False),
+        pa.field("overridden", pa.string()),
         pa.field("method", pa.string(), nullable=False),
         pa.field("roof_type", pa.string(), nullable=False),
         pa.field("geometry", pa.binary()),
@@ -119,6 +121,12 @@ class CandidateFacts:
     """Time of the candidate's earliest point, with a time zone; None where the file tells no absolute time."""
     acquired_to: dt.datetime | None = None
     """Time of the candidate's latest point."""
+    source_attributes: str | None = None
+    """The given footprint's columns as the text of a JSON object; None without one."""
+    overridden: str | None = None
+    """What the user's overrides did to this building, such as `accept, method`; None where they did nothing."""
+    settings_hash: str | None = None
+    """Of the settings of this building alone; None where they are the run's."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -190,9 +198,11 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
     return {
         "building_id": result.building_id,
         "source_id": result.source_id,
+        "source_attributes": facts.source_attributes,
         "status": result.status.value,
         "reason": None if result.reason is None else result.reason.value,
         "reason_detail": result.reason_detail,
+        "overridden": facts.overridden,
         "method": result.method,
         "roof_type": result.roof_type.value,
         "geometry": _geometry(shapely.force_2d(footprint), result.origin, context.reference),
@@ -215,7 +225,7 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         "acquired_to": facts.acquired_to,
         "mesh_path": mesh_path,
         "input_hash": facts.input_hash,
-        "settings_hash": context.settings_hash,
+        "settings_hash": facts.settings_hash or context.settings_hash,
         "engine_version": context.engine_version,
     }
 

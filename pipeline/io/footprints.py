@@ -1,9 +1,13 @@
-"""Building footprints from GeoPackage, GeoJSON or Shapefile, in metres of the run's CRS."""
+"""Building footprints from GeoPackage, GeoJSON, Shapefile or GeoParquet, in metres of the run's CRS."""
 
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
+import decimal
 import math
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +18,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import CrsError, EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.crs import SpatialReference, horizontal_part, horizontal_unit_of, parse_crs
-from pipeline.io.formats import first_bytes
+from pipeline.io.vector_layer import VectorLayer, read_layer
 
 if TYPE_CHECKING:
     import pyproj
@@ -37,12 +41,41 @@ ID_COLUMNS = (
 )
 """Columns that hold a building's own id, in this order; one with gaps or repeats is passed over."""
 
-VALID = "Valid are GeoPackage (.gpkg), GeoJSON (.geojson, .json) and Shapefile (.shp with .shx and .dbf)"
-DRIVERS = {b"SQLi": "GPKG:", b"\0\0\x27\x0a": ""}
-"""How GDAL is told the format, by a file's first bytes; text in braces is GeoJSON. Left to itself GDAL goes by content,
-and there are formats that name other files and servers to read. Shapefiles have no such prefix and no such twins."""
+PROBLEMS = {
+    "no_geometry": "without a geometry",
+    "unreadable": "with a geometry that cannot be read",
+    "not_polygon": "no polygons",
+    "empty": "empty",
+    "not_finite": "with coordinates that are NaN or infinite",
+    "outside_crs": "outside the run's CRS",
+    "no_area": "invalid and without area",
+    "invalid": "invalid",
+}
+"""What can be wrong with a footprint, and how several of them are told."""
 ACCURACY_LIMIT_M = 0.5
 """A coarser reprojection is told."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FootprintIssue:
+    """What was wrong with one feature, and what was done."""
+
+    feature: int
+    """The file's own number of the feature."""
+    source_id: str
+    """Its own id."""
+    problem: str
+    """One of `PROBLEMS`."""
+    detail: str
+    """The fault in words, with its place in metres of the run's CRS."""
+    action: str
+    """`left out`, or to what it was repaired."""
+    bounds_m: tuple[float, ...] | None = None
+    """xmin, ymin, xmax, ymax in metres of the run's CRS; None where it has no such place."""
+
+    def __str__(self) -> str:
+        """The issue as a sentence."""
+        return f"footprint {self.source_id}: {self.detail}: {self.action}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,9 +87,11 @@ class Footprints:
     polygons: tuple[Polygon | MultiPolygon, ...]
     """2D, valid, in metres of the run's CRS."""
     attributes: tuple[dict[str, Any], ...]
-    """All columns by name, plain Python values, dates as ISO 8601; None where empty."""
+    """All columns by name, as JSON knows values, dates as ISO 8601; None where empty."""
     warnings: tuple[str, ...] = ()
     """What was repaired, left out or assumed, one sentence each."""
+    issues: tuple[FootprintIssue, ...] = ()
+    """Every feature that was repaired or left out, in the file's order."""
 
     def __len__(self) -> int:
         """Number of footprints."""
@@ -73,14 +108,16 @@ def read_footprints(
 ) -> Footprints:
     """Footprints of a vector file, reprojected where its CRS is not the run's.
 
+    A feature that cannot be used stops nothing: it is left out, or repaired, and told among the issues.
+
     Parameters
     ----------
     path : str or Path
-        GeoPackage, GeoJSON (WGS 84 unless it says otherwise) or Shapefile.
+        GeoPackage, GeoJSON (WGS 84 unless it says otherwise), Shapefile or GeoParquet.
     reference : SpatialReference
         The run's CRS and units.
     layer : str, optional
-        The layer; needed where a file has several with polygons.
+        The layer; needed where a file has several with polygons. Of GeoParquet the geometry column.
     id_column : str, optional
         The column of ids; None to look for the common names, then for the file's own feature id.
     crs : str, optional
@@ -91,92 +128,88 @@ def read_footprints(
     UnreadableInputError
         If the file cannot be read as vector data, or the layer or column is not there.
     InconsistentInputError
-        If the ids of a named column are empty or not unique, or coordinates are not finite.
+        If the ids of a named column are empty or not unique.
     EmptyInputError
-        If it has no polygons.
+        If it has no polygons that can be used.
     CrsError
         If its coordinates are degrees and the run's CRS is unknown, or a CRS is not understood.
     """
     name = str(path)
     told: list[str] = []
-    meta, fids, wkb, columns = _read_layer(Path(path), layer)
-    geometries = _polygons_only(name, wkb, told)
-    kept = np.flatnonzero([geometry is not None for geometry in geometries])
+    found = read_layer(Path(path), layer)
+    problems: dict[int, tuple[str, str]] = {}
+    repairs: dict[int, str] = {}
+    geometries = _polygons_only(found, problems)
+    kept = np.flatnonzero(~shapely.is_missing(geometries))
     if len(kept) == 0:
-        raise EmptyInputError(name, f"none of the {len(wkb)} features is a polygon", "Give polygons of buildings")
+        lost = f"none of the {len(found.geometries)} features is a polygon"
+        raise EmptyInputError(name, lost, "Give polygons of buildings")
     polygons = shapely.force_2d(geometries[kept])
-    polygons = _in_metres(name, polygons, meta["crs"] if crs is None else crs, reference, told)
-    polygons = _repaired(polygons, told)
+    polygons = _in_metres(name, polygons, found.crs if crs is None else crs, reference, told)
+    whole = np.isfinite(shapely.bounds(polygons)).all(axis=1)
+    for row in kept[~whole].tolist():
+        problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
+    polygons, kept = polygons[whole], kept[whole]
+    places = {int(row): tuple(bounds) for row, bounds in zip(kept, shapely.bounds(polygons).tolist(), strict=True)}
+    polygons = _repaired(polygons, kept, problems, repairs)
     solid = ~shapely.is_empty(polygons)
     polygons, kept = polygons[solid], kept[solid]
     if len(kept) == 0:
         raise EmptyInputError(name, "no polygon has an area", "Give polygons of buildings")
-    fields = [str(field) for field in meta["fields"]]
-    table = {field: [_plain(value) for value in column[kept]] for field, column in zip(fields, columns, strict=True)}
+    table = {field: [_plain(value) for value in column] for field, column in found.columns.items()}
+    ids, ids_of_all = _ids(name, table, found.feature_ids, kept, id_column)
+    issues = tuple(
+        FootprintIssue(
+            feature=int(found.feature_ids[row]),
+            source_id=ids_of_all[row],
+            problem=problem,
+            detail=detail,
+            action=repairs.get(row, "left out"),
+            bounds_m=places.get(row),
+        )
+        for row, (problem, detail) in sorted(problems.items())
+    )
     return Footprints(
-        ids=_ids(name, table, fids[kept], id_column),
+        ids=ids,
         polygons=tuple(polygons.tolist()),
-        attributes=tuple({field: table[field][row] for field in fields} for row in range(len(kept))),
-        warnings=tuple(told),
+        attributes=tuple({field: table[field][row] for field in table} for row in kept.tolist()),
+        warnings=(*told, *_summary(issues)),
+        issues=issues,
     )
 
 
-def _read_layer(path: Path, layer: str | None) -> tuple[dict[str, Any], npt.NDArray[Any], npt.NDArray[Any], list[Any]]:
-    """Facts, feature ids, WKB and columns of the one layer with polygons, or of the named one."""
-    import pyogrio
-    from pyogrio.errors import DataLayerError, DataSourceError, FieldError, GeometryError
-
-    source = _told_apart(path)
-    try:
-        layers = {str(name): kind for name, kind in pyogrio.list_layers(source)}
-        if layer is None:
-            # The kind is None for tables without geometry and "Unknown" where a layer does not say.
-            found = [name for name, kind in layers.items() if kind and ("Polygon" in kind or "Unknown" in kind)]
-            found = found or [name for name, kind in layers.items() if kind]
-        else:
-            found = [name for name in layers if name == layer]
-        if len(found) != 1:
-            raise UnreadableInputError(
-                str(path),
-                f"layer {layer!r} is not there" if layer else f"{len(found)} layers could be the footprints",
-                f"Name one of the layers {', '.join(sorted(layers)) or '(there are none)'}",
-            )
-        meta, fids, wkb, columns = pyogrio.raw.read(source, layer=found[0], return_fids=True)
-    except (DataSourceError, DataLayerError, FieldError, GeometryError, OSError) as fault:
-        raise UnreadableInputError(str(path), f"cannot be read as vector data ({str(fault)[:160]})", VALID) from fault
-    return meta, fids, wkb, columns
-
-
-def _told_apart(path: Path) -> str:
-    """The path as GDAL is given it: with the one format that it may be.
-
-    Raises
-    ------
-    UnreadableInputError
-        If it is none of the three.
-    """
-    head = first_bytes(path)
-    where = path.resolve().as_posix()
-    if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
-        return f"GeoJSON:{where}"
-    driver = next((name for magic, name in DRIVERS.items() if head.startswith(magic)), None)
-    if driver is None:
-        raise UnreadableInputError(str(path), f"cannot be read as vector data: it begins with {head[:8]!r}", VALID)
-    return f"{driver}{where}"
-
-
-def _polygons_only(name: str, wkb: npt.NDArray[Any], told: list[str]) -> npt.NDArray[np.object_]:
-    """Geometries, None where a feature is no polygon."""
-    geometries: npt.NDArray[np.object_] = shapely.from_wkb(wkb)
+def _polygons_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> npt.NDArray[np.object_]:
+    """Geometries, None where a feature is no polygon; why goes to the problems, by row."""
+    geometries = layer.geometries.copy()
     kinds = shapely.get_type_id(geometries)
     polygonal = np.isin(kinds, (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON))
-    polygonal &= ~shapely.is_empty(geometries)
-    if not polygonal.all():
-        told.append(f"{int((~polygonal).sum())} features are no polygons and are left out")
-    if not np.isfinite(shapely.bounds(geometries[polygonal])).all():
-        raise InconsistentInputError(name, "a footprint has coordinates that are NaN or infinite", "Repair the file")
-    geometries[~polygonal] = None
+    for row in np.flatnonzero(~polygonal).tolist():
+        if layer.unreadable[row]:
+            problems[row] = ("unreadable", "its geometry cannot be read")
+        elif kinds[row] < 0:
+            problems[row] = ("no_geometry", "it has no geometry")
+        else:
+            problems[row] = ("not_polygon", f"it is a {geometries[row].geom_type}")
+    for row in np.flatnonzero(polygonal & shapely.is_empty(geometries)).tolist():
+        problems[row] = ("empty", "its polygon is empty")
+    finite = np.isfinite(shapely.bounds(geometries)).all(axis=-1)
+    for row in np.flatnonzero(polygonal & ~finite).tolist():
+        problems.setdefault(row, ("not_finite", "it has coordinates that are NaN or infinite"))
+    geometries[list(problems)] = None
     return geometries
+
+
+def _summary(issues: Sequence[FootprintIssue]) -> list[str]:
+    """What was left out and repaired, in one sentence each."""
+    left_out = Counter(issue.problem for issue in issues if issue.action == "left out")
+    told = []
+    if left_out:
+        reasons = ", ".join(f"{count} {PROBLEMS[problem]}" for problem, count in left_out.items())
+        told.append(f"{left_out.total()} features are left out: {reasons}")
+    n_repaired = len(issues) - left_out.total()
+    if n_repaired:
+        told.append(f"{n_repaired} footprints are invalid and were repaired")
+    return told
 
 
 def _in_metres(
@@ -215,7 +248,7 @@ def _reprojected(
         return np.column_stack(transformer.transform(xy[:, 0], xy[:, 1]))
 
     moved: npt.NDArray[np.object_] = shapely.transform(polygons, project)
-    if not np.isfinite(shapely.bounds(moved)).all():
+    if not np.isfinite(shapely.bounds(moved)).any():
         raise CrsError(
             name,
             f"the footprints cannot be reprojected from {own.name!r} to {target.name!r}: they lie outside its area",
@@ -233,38 +266,60 @@ def _reprojected(
     return moved
 
 
-def _repaired(polygons: npt.NDArray[np.object_], told: list[str]) -> npt.NDArray[np.object_]:
+def _repaired(
+    polygons: npt.NDArray[np.object_],
+    rows: npt.NDArray[np.int64],
+    problems: dict[int, tuple[str, str]],
+    repairs: dict[int, str],
+) -> npt.NDArray[np.object_]:
     """Valid polygons; what a repair leaves of lines and points is left out, and what has no area is empty."""
-    invalid = np.flatnonzero(~shapely.is_valid(polygons))
     repaired = polygons.copy()
-    for at in invalid.tolist():
+    for at in np.flatnonzero(~shapely.is_valid(polygons)).tolist():
         parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(polygons[at])))
         areas = [part for part in parts if isinstance(part, Polygon) and part.area > 0.0]
         repaired[at] = areas[0] if len(areas) == 1 else MultiPolygon(areas)
-    if len(invalid):
-        n_lost = int(shapely.is_empty(repaired[invalid]).sum())
-        told.append(f"{len(invalid)} footprints are invalid: {n_lost} without area are left out, the others repaired")
+        row = int(rows[at])
+        fault = str(shapely.is_valid_reason(polygons[at]))
+        if areas:
+            problems[row] = ("invalid", fault)
+            shape = "one polygon" if len(areas) == 1 else f"{len(areas)} polygons"
+            repairs[row] = f"repaired to {shape} of {repaired[at].area:.1f} m2"
+        else:
+            problems[row] = ("no_area", f"{fault}; no area is left of it")
     return repaired
 
 
-def _ids(name: str, table: dict[str, list[Any]], fids: npt.NDArray[Any], id_column: str | None) -> tuple[str, ...]:
-    """The ids, of a column or the file's own feature ids."""
+def _ids(
+    name: str,
+    table: dict[str, list[Any]],
+    feature_ids: npt.NDArray[np.int64],
+    kept: npt.NDArray[np.int64],
+    id_column: str | None,
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The ids of the rows that are kept, and of all rows; of a column, or the file's own feature ids."""
+    by_lower = {field.lower(): field for field in reversed(list(table))}
     if id_column is not None:
         if id_column not in table:
             raise UnreadableInputError(
                 name, f"column {id_column!r} is not there", f"Name one of the columns {', '.join(table) or '(none)'}"
             )
-        if not _identifies(table[id_column]):
+        if not _identifies([table[id_column][row] for row in kept]):
             raise InconsistentInputError(
                 name, f"the ids in column {id_column!r} are empty or not unique", "Name another column, or none"
             )
-        return tuple(str(value) for value in table[id_column])
-    by_lower = {field.lower(): field for field in reversed(list(table))}
-    for common in ID_COLUMNS:
-        field = by_lower.get(common)
-        if field is not None and _identifies(table[field]):
-            return tuple(str(value) for value in table[field])
-    return tuple(str(int(fid)) for fid in fids)
+    chosen = id_column or next(
+        (
+            by_lower[common]
+            for common in ID_COLUMNS
+            if common in by_lower and _identifies([table[by_lower[common]][row] for row in kept])
+        ),
+        None,
+    )
+    own = [None] * len(feature_ids) if chosen is None else table[chosen]
+    of_all = tuple(
+        str(int(number)) if value in (None, "") else str(value) for value, number in zip(own, feature_ids, strict=True)
+    )
+    return tuple(of_all[row] for row in kept), of_all
 
 
 def _identifies(values: list[Any]) -> bool:
@@ -275,16 +330,22 @@ def _identifies(values: list[Any]) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """A plain Python value: None for what is empty, ISO 8601 for dates."""
+    """A value as JSON knows it: None for what is empty or no value there, ISO 8601 for dates."""
     if isinstance(value, np.datetime64):
         return None if np.isnat(value) else str(value)
     if isinstance(value, np.generic):
         value = value.item()
-    if isinstance(value, float) and math.isnan(value):
-        return None
-    if isinstance(value, np.ndarray):
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, np.ndarray | list | tuple):
         return [_plain(item) for item in value]
-    return value
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, dt.date | dt.time):
+        return value.isoformat()
+    if isinstance(value, decimal.Decimal):
+        return float(value) if value.is_finite() else None
+    return value if value is None or isinstance(value, bool | int | str) else None
 
 
 def read_area(path: str | Path, reference: SpatialReference) -> Polygon | MultiPolygon:

@@ -92,11 +92,27 @@ class LasFile:
         if window is not None and self._copc is not None:
             yield from self._octree_records(chunk_size, window)
             return
+        for raw in self._raw(chunk_size, USED_FIELDS):
+            yield self._to_records(raw)
+
+    def whole_records(self, chunk_size: int) -> Iterator[tuple[npt.NDArray[np.uint8], PointRecords]]:
+        """The records in file order, each piece as its bytes with every field, and as `records` has it.
+
+        Raises
+        ------
+        UnreadableInputError
+            If the data end or break before the promised count.
+        """
+        for raw in self._raw(chunk_size, lazrs.SELECTIVE_DECOMPRESS_ALL):
+            yield raw, self._to_records(raw)
+
+    def _raw(self, chunk_size: int, fields: int) -> Iterator[npt.NDArray[np.uint8]]:
+        """The bytes of the records in file order; of compressed files with some of the fields only."""
         with self._path.open("rb") as stream:
-            decoder = self._decoder(stream)
+            decoder = self._decoder(stream, fields)
             for begin in range(0, self._block.point_count, chunk_size):
                 count = min(chunk_size, self._block.point_count - begin)
-                yield self._to_records(self._decode(decoder, count, begin))
+                yield self._decode(decoder, count, begin)
 
     def _octree_records(self, chunk_size: int, window: Window) -> Iterator[PointRecords]:
         """Records of the octree nodes that meet the window, small nodes together and large ones in pieces."""
@@ -168,11 +184,7 @@ class LasFile:
         if spare:
             self._warnings.append(f"{spare} bytes follow the points and are not read")
 
-    def _selection(self) -> Any:
-        """What lazrs shall decompress."""
-        return lazrs.DecompressionSelection(USED_FIELDS)
-
-    def _decoder(self, stream: io.BufferedReader) -> Any:
+    def _decoder(self, stream: io.BufferedReader, fields: int) -> Any:
         """The thing that gives the next records: lazrs where compressed, else the stream itself."""
         stream.seek(self._block.offset_to_points)
         if self._chunks is None:
@@ -181,7 +193,7 @@ class LasFile:
         parallel = self._chunks.largest <= CHUNK_SIZE_LIMIT
         make = lazrs.ParLasZipDecompressor if parallel else lazrs.LasZipDecompressor
         try:
-            return make(stream, self._laszip_record, self._selection())
+            return make(stream, self._laszip_record, lazrs.DecompressionSelection(fields))
         except DECODING_ERRORS as fault:
             raise self._broken(fault, "at the start") from fault
 
@@ -202,8 +214,9 @@ class LasFile:
         stream.seek(offset)
         raw = np.empty(count * self._block.point_size, dtype=np.uint8)
         try:
+            fields = lazrs.DecompressionSelection(USED_FIELDS)
             lazrs.decompress_points_with_chunk_table(
-                stream.read(size), self._laszip_record, raw, [(count, size)], self._selection()
+                stream.read(size), self._laszip_record, raw, [(count, size)], fields
             )
         except DECODING_ERRORS as fault:
             raise self._broken(fault, f"in the chunk at byte {offset}") from fault

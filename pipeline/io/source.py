@@ -45,6 +45,8 @@ class ReadOptions:
     """Use points that the producer withheld."""
     drop_classes: tuple[int, ...] = NOISE_CLASSES
     """ASPRS classes that are left out."""
+    class_table: tuple[int, ...] | None = None
+    """The ASPRS class of each of the 256 codes of the file; None where its codes are those of ASPRS."""
     ascii_columns: str | None = None
     """Names of the columns of ASCII files, see `pipeline.io.ascii`; None to find out."""
 
@@ -68,6 +70,8 @@ class ReadOptions:
         wrong = [c for c in self.drop_classes if not 0 <= c <= 255]
         if wrong:
             faults.append(f"drop_classes has {wrong}: use ASPRS classes 0 to 255")
+        if self.class_table is not None and len(self.class_table) != 256:
+            faults.append(f"class_table has {len(self.class_table)} entries: use 256, one a code")
         if faults:
             raise SettingsError(faults)
 
@@ -211,19 +215,54 @@ class Source:
         if window is not None and (window.x_min > window.x_max or window.y_min > window.y_max):
             self._dropped["outside"] = self._info.point_count
             return
-        reference = self._info.reference
-        factors = np.array([reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m])
-        n_read = 0
+        factors, n_read = self._factors, 0
         for records in self._file.records(chunk_size, window):
             n_read += len(records)
             n_beyond += self._count_beyond_bounds(records)
-            kept = _select(records, self._wanted(records, window))
+            classed = self._classed(records)
+            kept = _select(classed, self._wanted(classed, window))
             if len(kept):
                 yield _to_cloud(kept, factors)
         # A window of COPC leaves whole nodes unread.
         self._dropped["outside"] += self._info.point_count - n_read
         if n_beyond:
             self._warnings.append(f"{n_beyond} points lie outside the bounds in the header")
+
+    @property
+    def file(self) -> PointFile:
+        """The reader of the file's format."""
+        return self._file
+
+    @property
+    def crs_given(self) -> bool:
+        """Whether the user's CRS stands in place of another one in the header, or of none."""
+        own, used = self._file.facts.crs, self._info.reference.crs
+        return self._options.crs is not None and (own is None or own != used)
+
+    def select(self, records: PointRecords) -> tuple[BoolArray, PointCloud]:
+        """Which of some records `chunks` keeps, (m,) bool, and these in metres, as `chunks` gives them.
+
+        Parameters
+        ----------
+        records : PointRecords
+            Of this file.
+        """
+        classed = self._classed(records)
+        keep = self._wanted(classed, self._options.window)
+        return keep, _to_cloud(_select(classed, keep), self._factors)
+
+    @property
+    def _factors(self) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        """Metres a unit of easting, northing and elevation."""
+        reference = self._info.reference
+        return np.array([reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m])
+
+    def _classed(self, records: PointRecords) -> PointRecords:
+        """The records with ASPRS classes."""
+        table = self._options.class_table
+        if table is None or records.classification is None:
+            return records
+        return dataclasses.replace(records, classification=np.array(table, dtype=np.uint8)[records.classification])
 
     def _wanted(self, records: PointRecords, window: Window | None) -> BoolArray:
         """(n,) bool, True for the points to keep; counts the others."""

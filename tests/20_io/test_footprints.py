@@ -103,7 +103,29 @@ def test_invalid_polygons_are_repaired_and_told(tmp_path):
     assert all(polygon.is_valid and polygon.area > 0 for polygon in found.polygons)
     assert isinstance(found.polygons[0], MultiPolygon)
     assert found.polygons[1].equals(box(0, 0, 10, 10))
-    assert any("3 footprints are invalid: 1 without area" in warning for warning in found.warnings)
+    assert "2 footprints are invalid and were repaired" in found.warnings
+    assert "1 features are left out: 1 invalid and without area" in found.warnings
+    told = [(issue.source_id, issue.problem, issue.action) for issue in found.issues]
+    assert told == [
+        ("1", "invalid", "repaired to 2 polygons of 50.0 m2"),
+        ("2", "invalid", "repaired to one polygon of 100.0 m2"),
+        ("3", "no_area", "left out"),
+    ]
+    assert found.issues[0].detail == "Self-intersection[5 5]"
+    assert found.issues[0].bounds_m == (0.0, 0.0, 10.0, 10.0)
+    assert str(found.issues[2]) == "footprint 3: Self-intersection[5 5]; no area is left of it: left out"
+
+
+def test_a_footprint_that_is_not_finite_or_off_the_map_stops_nothing(tmp_path):
+    broken = Polygon([(0, 0), (10, 0), (10, np.inf), (0, 10)])
+    path = write(tmp_path / "a.gpkg", [broken, HOUSES[0]], id=["inf", "good"])
+    found = read_footprints(path, reference())
+    assert found.ids == ("good",)
+    assert [(issue.source_id, issue.problem) for issue in found.issues] == [("inf", "not_finite")]
+    far = write(tmp_path / "b.gpkg", [box(4.3, 52.0, 4.4, 52.1), box(4.3, 95.0, 4.4, 96.0)], crs="EPSG:4326", id=[1, 2])
+    found = read_footprints(far, reference())
+    assert found.ids == ("1",)
+    assert [(issue.source_id, issue.problem) for issue in found.issues] == [("2", "outside_crs")]
 
 
 def test_elevations_holes_and_several_parts_are_kept_in_plan(tmp_path):
@@ -118,7 +140,13 @@ def test_other_geometries_are_left_out_and_told(tmp_path):
     mixed = [Point(0, 0), LineString([(0, 0), (1, 1)]), HOUSES[0], None, Polygon()]
     found = read_footprints(write(tmp_path / "a.geojson", mixed, crs="EPSG:28992", id=[1, 2, 3, 4, 5]), reference())
     assert found.ids == ("3",)
-    assert any("4 features are no polygons" in warning for warning in found.warnings)
+    assert "4 features are left out: 2 no polygons, 1 without a geometry, 1 empty" in found.warnings
+    assert [(issue.source_id, issue.problem) for issue in found.issues] == [
+        ("1", "not_polygon"),
+        ("2", "not_polygon"),
+        ("4", "no_geometry"),
+        ("5", "empty"),
+    ]
     lines = write(tmp_path / "b.gpkg", [LineString([(0, 0), (1, 1)])])
     with pytest.raises(EmptyInputError, match="none of the 1 features is a polygon"):
         read_footprints(lines, reference())

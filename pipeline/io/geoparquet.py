@@ -1,0 +1,145 @@
+"""GeoParquet as input: what its `geo` metadata say of a geometry column, and the column as WKB.
+
+Read are versions 1.0 and 1.1 (https://geoparquet.org/releases/v1.1.0/) with WKB, and 1.1's own encodings of polygons.
+A missing `crs` means OGC:CRS84, longitude and latitude; `null` means that nobody knows.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from pipeline.errors import UnreadableInputError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+DEFAULT_CRS = "OGC:CRS84"
+"""What a geometry column without `crs` is in."""
+DEPTHS = {"polygon": 2, "multipolygon": 3}
+"""Levels of lists above the coordinates, by the encodings of polygons beside WKB."""
+
+
+def read_geoparquet(
+    path: Path, column: str | None
+) -> tuple[str | None, npt.NDArray[np.object_], dict[str, Sequence[Any]]]:
+    """CRS, geometries and attributes of a file.
+
+    Parameters
+    ----------
+    path : Path
+        A GeoParquet file.
+    column : str, optional
+        The geometry column; None for the primary one.
+
+    Returns
+    -------
+    str or None
+        CRS as a code or PROJJSON; None where the file says that it is unknown.
+    (n,) array of bytes
+        ISO WKB, None where there is no geometry.
+    dict
+        All other columns as plain Python values; other geometries and columns that only cover one are left out.
+
+    Raises
+    ------
+    UnreadableInputError
+        It is no Parquet, says nothing of geometry, or encodes it in a way that is not read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            geo = _geo_of(path, file.schema_arrow.metadata or {})
+            columns = geo["columns"]
+            name = geo["primary_column"] if column is None else column
+            if name not in columns or name not in file.schema_arrow.names:
+                raise UnreadableInputError(
+                    str(path), f"geometry column {name!r} is not there", f"Name one of {', '.join(columns) or '(none)'}"
+                )
+            idle = set(columns) | _covering(columns)
+            wanted = [field for field in file.schema_arrow.names if field == name or field not in idle]
+            table = file.read(columns=wanted)
+    except (pa.ArrowException, OSError) as fault:
+        raise UnreadableInputError(str(path), f"cannot be read as Parquet ({str(fault)[:160]})", "Write it anew") from (
+            fault
+        )
+    about = columns[name]
+    crs = about.get("crs", DEFAULT_CRS)
+    geometries = _wkb_of(path, table.column(name).combine_chunks(), str(about.get("encoding")))
+    attributes = {field: table.column(field).to_pylist() for field in table.column_names if field != name}
+    return crs if crs is None or isinstance(crs, str) else json.dumps(crs), geometries, attributes
+
+
+def _geo_of(path: Path, metadata: Mapping[bytes, bytes]) -> dict[str, Any]:
+    """The `geo` entry of the file's metadata."""
+    fix = "Write it as GeoParquet, as GDAL, DuckDB or geopandas do"
+    if b"geo" not in metadata:
+        raise UnreadableInputError(str(path), "this Parquet file has no `geo` metadata: it says of no geometry", fix)
+    try:
+        geo = json.loads(metadata[b"geo"])
+        sane = isinstance(geo["primary_column"], str) and all(isinstance(c, dict) for c in geo["columns"].values())
+    except (ValueError, KeyError, TypeError, AttributeError):
+        sane = False
+    if not sane:
+        raise UnreadableInputError(str(path), "its `geo` metadata name no geometry column", fix)
+    return dict(geo)
+
+
+def _covering(columns: Mapping[str, Mapping[str, Any]]) -> set[str]:
+    """Columns that only hold the geometries' bounds."""
+    found = set()
+    for about in columns.values():
+        box = about.get("covering", {}).get("bbox", {}) if isinstance(about.get("covering", {}), dict) else {}
+        found |= {place[0] for place in box.values() if isinstance(place, list) and place}
+    return found
+
+
+def _wkb_of(path: Path, column: pa.Array, encoding: str) -> npt.NDArray[np.object_]:
+    """A geometry column as WKB."""
+    import pyarrow as pa
+
+    if isinstance(column, pa.ExtensionArray):
+        column = column.storage
+    if encoding == "WKB":
+        if not (pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type)):
+            raise UnreadableInputError(str(path), f"its WKB column is of type {column.type}", "Write it as bytes")
+        found: npt.NDArray[np.object_] = np.array([*column.to_pylist(), None], dtype=object)[:-1]
+        return found
+    if encoding not in DEPTHS:
+        raise UnreadableInputError(
+            str(path),
+            f"its geometries are encoded as {encoding!r}",
+            f"Write them as WKB; {' and '.join(DEPTHS)} are read, too",
+        )
+    return _native(path, column, encoding)
+
+
+def _native(path: Path, column: pa.Array, encoding: str) -> npt.NDArray[np.object_]:
+    """Polygons of nested lists of coordinates."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    missing = np.asarray(column.is_null())
+    offsets = []
+    for _ in range(DEPTHS[encoding]):
+        if not (pa.types.is_list(column.type) or pa.types.is_large_list(column.type)):
+            raise UnreadableInputError(str(path), f"its {encoding} column is not of nested lists", "Write it as WKB")
+        lengths = np.asarray(pc.fill_null(pc.list_value_length(column), 0), dtype=np.int64)
+        offsets.append(np.concatenate(([0], np.cumsum(lengths))))
+        column = column.flatten()
+    if not pa.types.is_struct(column.type) or not {"x", "y"} <= {field.name for field in column.type}:
+        raise UnreadableInputError(str(path), f"its {encoding} coordinates have no x and y", "Write it as WKB")
+    xy = np.column_stack([np.asarray(column.field(axis), dtype=np.float64) for axis in "xy"])
+    kind = shapely.GeometryType.POLYGON if encoding == "polygon" else shapely.GeometryType.MULTIPOLYGON
+    geometries = shapely.from_ragged_array(kind, xy, tuple(reversed(offsets)))
+    wkb: npt.NDArray[np.object_] = np.asarray(shapely.to_wkb(geometries), dtype=object)
+    wkb[missing] = None
+    return wkb

@@ -1,0 +1,119 @@
+"""One layer of a vector file as it stands there: GeoPackage, GeoJSON, Shapefile or GeoParquet."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from pipeline.errors import UnreadableInputError
+from pipeline.io.formats import first_bytes
+
+VALID = (
+    "Valid are GeoPackage (.gpkg), GeoJSON (.geojson, .json), Shapefile (.shp with .shx and .dbf) "
+    "and GeoParquet (.parquet)"
+)
+DRIVERS = {b"SQLi": "GPKG:", b"\0\0\x27\x0a": ""}
+"""How GDAL is told the format, by a file's first bytes; text in braces is GeoJSON. Left to itself GDAL goes by content,
+and there are formats that name other files and servers to read. Shapefiles have no such prefix and no such twins."""
+PARQUET_MAGIC = b"PAR1"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VectorLayer:
+    """The features of a layer. All arrays have one length n."""
+
+    crs: str | None
+    """As the file has it: a code, WKT or PROJJSON; None where it is unknown."""
+    feature_ids: npt.NDArray[np.int64]
+    """(n,) int64, the file's own numbers of the features."""
+    geometries: npt.NDArray[np.object_]
+    """(n,) shapely geometries; None where there is none, or where it cannot be read."""
+    unreadable: npt.NDArray[np.bool_]
+    """(n,) bool, True where there is a geometry that cannot be read."""
+    columns: Mapping[str, Sequence[Any]]
+    """All columns but the geometry, by name."""
+
+
+def read_layer(path: Path, layer: str | None) -> VectorLayer:
+    """The one layer of a file that can hold polygons, or the named one.
+
+    Parameters
+    ----------
+    path : Path
+        The file; its first bytes tell its format.
+    layer : str, optional
+        The layer; of GeoParquet the geometry column.
+
+    Raises
+    ------
+    UnreadableInputError
+        The file cannot be read as vector data, or the layer is not there.
+    """
+    head = first_bytes(path)
+    if head.startswith(PARQUET_MAGIC):
+        from pipeline.io.geoparquet import read_geoparquet
+
+        crs, geometry_bytes, columns = read_geoparquet(path, layer)
+        feature_ids = np.arange(len(geometry_bytes), dtype=np.int64)
+    else:
+        crs, feature_ids, geometry_bytes, columns = _by_gdal(path, _told_apart(path, head), layer)
+    geometries: npt.NDArray[np.object_] = np.asarray(shapely.from_wkb(geometry_bytes, on_invalid="ignore"), object)
+    there = np.array([data is not None for data in geometry_bytes], np.bool_)
+    return VectorLayer(
+        crs=crs,
+        feature_ids=feature_ids,
+        geometries=geometries,
+        unreadable=there & shapely.is_missing(geometries),
+        columns=columns,
+    )
+
+
+def _told_apart(path: Path, head: bytes) -> str:
+    """The path as GDAL is given it: with the one format that it may be.
+
+    Raises
+    ------
+    UnreadableInputError
+        If it is none of the three.
+    """
+    where = path.resolve().as_posix()
+    if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
+        return f"GeoJSON:{where}"
+    driver = next((name for magic, name in DRIVERS.items() if head.startswith(magic)), None)
+    if driver is None:
+        raise UnreadableInputError(str(path), f"cannot be read as vector data: it begins with {head[:8]!r}", VALID)
+    return f"{driver}{where}"
+
+
+def _by_gdal(
+    path: Path, source: str, layer: str | None
+) -> tuple[str | None, npt.NDArray[np.int64], npt.NDArray[np.object_], dict[str, Sequence[Any]]]:
+    """CRS, feature ids, WKB and columns of a layer."""
+    import pyogrio
+    from pyogrio.errors import DataLayerError, DataSourceError, FieldError, GeometryError
+
+    try:
+        layers = {str(name): kind for name, kind in pyogrio.list_layers(source)}
+        if layer is None:
+            # The kind is None for tables without geometry and "Unknown" where a layer does not say.
+            found = [name for name, kind in layers.items() if kind and ("Polygon" in kind or "Unknown" in kind)]
+            found = found or [name for name, kind in layers.items() if kind]
+        else:
+            found = [name for name in layers if name == layer]
+        if len(found) != 1:
+            raise UnreadableInputError(
+                str(path),
+                f"layer {layer!r} is not there" if layer else f"{len(found)} layers could be the footprints",
+                f"Name one of the layers {', '.join(sorted(layers)) or '(there are none)'}",
+            )
+        meta, feature_ids, geometry_bytes, columns = pyogrio.raw.read(source, layer=found[0], return_fids=True)
+    except (DataSourceError, DataLayerError, FieldError, GeometryError, OSError) as fault:
+        raise UnreadableInputError(str(path), f"cannot be read as vector data ({str(fault)[:160]})", VALID) from fault
+    named = {str(field): column for field, column in zip(meta["fields"], columns, strict=True)}
+    return meta["crs"], feature_ids.astype(np.int64), geometry_bytes, named

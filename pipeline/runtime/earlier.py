@@ -1,0 +1,151 @@
+"""The run that a rerun changes: what its directory tells of it, and whether its inputs are still the same."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+
+from pipeline import __version__
+from pipeline.errors import RunError
+from pipeline.export.geoparquet import table_dataset
+from pipeline.export.records import KEYS
+from pipeline.io.storage import sha256_of
+from pipeline.runtime.ingest import Ingested
+from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
+from pipeline.runtime.run import OVERRIDES, RunRequest
+from pipeline.settings import RunSettings
+
+REJECTED = "rejected"
+"""In the place of a status, of what is no building."""
+
+_AGAIN = "Run the whole again"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Record:
+    """What the tables of a run tell of one building or rejected object."""
+
+    points: int
+    box: tuple[float, float, float, float] | None
+    """xmin, ymin, xmax, ymax in the CRS's units; None where it has no geometry."""
+    source_id: str | None
+    status: str
+    """As in the table of buildings, or `rejected`."""
+    input_hash: str | None
+    """None of rejected objects."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Earlier:
+    """What the run directory tells before the rerun."""
+
+    run_dir: Path
+    manifest: RunManifest
+    fingerprints: Mapping[str, str]
+    """What overrides did, by building_id."""
+    redrawn: frozenset[str]
+    """Buildings that overrides gave another footprint."""
+
+    def records(self, names: Collection[str], source_ids: Collection[str] = ()) -> dict[str, Record]:
+        """What the tables tell of some buildings and rejected objects, by id; those that are none are not there."""
+        found: dict[str, Record] = {}
+        of_buildings = _is_one_of("building_id", names) | _is_one_of("source_id", source_ids)
+        chosen = {"buildings": of_buildings, "rejected": _is_one_of("object_id", names)}
+        for table, condition in chosen.items():
+            (key,) = KEYS[table]
+            columns = [key, "n_points", "bbox"]
+            if table == "buildings":
+                columns += ["source_id", "status", "input_hash"]
+            rows = table_dataset(str(self.run_dir), table).to_table(columns=columns, filter=condition).to_pylist()
+            for row in rows:
+                bbox = row["bbox"]
+                found[row[key]] = Record(
+                    points=row["n_points"],
+                    box=None if bbox is None else (bbox["xmin"], bbox["ymin"], bbox["xmax"], bbox["ymax"]),
+                    source_id=row.get("source_id"),
+                    status=row.get("status", REJECTED),
+                    input_hash=row.get("input_hash"),
+                )
+        return found
+
+    def faces(self, names: Collection[str]) -> int:
+        """Roof faces of some buildings."""
+        condition = _is_one_of("building_id", names)
+        planes = table_dataset(str(self.run_dir), "planes").to_table(columns=["geometry"], filter=condition)
+        geometries = shapely.from_wkb(planes.column("geometry").to_pylist())
+        return int(np.sum(shapely.get_num_geometries(geometries)))
+
+
+def _is_one_of(column: str, values: Collection[str]) -> pc.Expression:
+    return pc.field(column).isin(pa.array(sorted(values), pa.string()))
+
+
+def earlier_run(run_dir: str) -> Earlier:
+    """What a run directory tells of its run.
+
+    Raises
+    ------
+    RunError
+        It holds no finished run of this version that tells how it was asked for.
+    """
+    root = Path(run_dir).resolve()
+    manifest = read_manifest(root)
+    if manifest.status is not RunStatus.FINISHED:
+        raise RunError(f"the run in {root} is {manifest.status}, not finished. {_AGAIN}")
+    if manifest.engine_version != __version__:
+        made = f"was made by gablework {manifest.engine_version}; this is {__version__}"
+        raise RunError(f"the run in {root} {made}: its other buildings could differ. {_AGAIN}")
+    if not manifest.request:
+        raise RunError(f"run.json in {root} does not tell how the run was asked for. {_AGAIN}")
+    told = json.loads((root / OVERRIDES).read_text(encoding="utf-8")) if (root / OVERRIDES).is_file() else []
+    effective = [entry for entry in told if entry["fingerprint"] is not None]
+    return Earlier(
+        run_dir=root,
+        manifest=manifest,
+        fingerprints={entry["building_id"]: entry["fingerprint"] for entry in effective},
+        redrawn=frozenset(entry["building_id"] for entry in effective if entry["footprint"] is not None),
+    )
+
+
+def request_of(manifest: RunManifest) -> RunRequest:
+    """The request of a run, from its manifest."""
+    sections = {str(name): dict(values) for name, values in manifest.settings.items()}
+    settings = RunSettings.from_mapping({**sections.pop("general"), **sections})
+    if settings.settings_hash != manifest.settings_hash:
+        raise RunError("the settings in run.json are not those of its settings_hash: it was changed by hand")
+    told = manifest.request
+    return RunRequest(
+        inputs=tuple(entry.path for entry in manifest.inputs if entry.n_points is not None),
+        out="",
+        settings=settings,
+        footprints=told["footprints"],
+        crs=told["crs"],
+        vertical_unit=told["vertical_unit"],
+        bbox=None if told["bbox"] is None else tuple(told["bbox"]),
+        aoi=told["aoi"],
+        meshes=told["meshes"],
+    )
+
+
+def check_points(manifest: RunManifest, paths: Sequence[str], ingested: Sequence[Ingested]) -> None:
+    """Refuse points that are not those of the run."""
+    known = {entry.path: entry.sha256 for entry in manifest.inputs}
+    for path, found in zip(paths, ingested, strict=True):
+        if known[path] != found.sha256:
+            raise RunError(f"{path} is not the file that the run read: its content changed. {_AGAIN}")
+
+
+def check_footprints(manifest: RunManifest, request: RunRequest) -> None:
+    """Refuse footprints that are not those of the run."""
+    if request.footprints is None:
+        return
+    known = {Path(entry.path).name: entry.sha256 for entry in manifest.inputs if entry.n_points is None}
+    if known.get(Path(request.footprints).name) != sha256_of(request.footprints):
+        raise RunError(f"{request.footprints} is not the file that the run read. {_AGAIN}")

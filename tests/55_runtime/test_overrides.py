@@ -1,0 +1,492 @@
+"""What the user says of single buildings is done, told, and done to them alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow.dataset as ds
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pipeline.runtime.modelling
+from pipeline.errors import RunCancelledError, RunError, SettingsError
+from pipeline.io import SpatialReference
+from pipeline.io.storage import sha256_of
+from pipeline.runtime.overrides import overrides_of, own_modelling, read_overrides
+from pipeline.runtime.rerun import RerunRequest, rerun
+from pipeline.settings import RunSettings
+from pipeline.synthetic.dataset import simulate
+
+TILES = {"tile_size_m": 40.0, "candidates": {"min_area_m2": 88.0}}
+"""Small tiles, so that houses cross their borders; and small houses are rejected, so that there is what to accept."""
+METRES = SpatialReference()
+
+
+def rows(run_dir: str, table: str) -> dict[str, dict[str, Any]]:
+    found = ds.dataset(f"{run_dir}/{table}", partitioning="hive").to_table().to_pylist()
+    return {row["object_id" if table == "rejected" else "building_id"]: row for row in found}
+
+
+def others(found: dict[str, dict[str, Any]], *names: str) -> dict[str, dict[str, Any]]:
+    return {name: row for name, row in found.items() if name not in names}
+
+
+def files(run_dir: str) -> dict[str, bytes]:
+    paths = [path for path in Path(run_dir).rglob("*") if path.is_file() and path.name != "run.json"]
+    return {path.relative_to(run_dir).as_posix(): path.read_bytes() for path in paths}
+
+
+def outline(row: dict[str, Any]) -> Any:
+    return shapely.from_wkb(row["geometry"])
+
+
+@pytest.fixture(scope="module")
+def suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tile with a dozen houses: a little more than the other tests of runs need."""
+    folder = tmp_path_factory.mktemp("suburb")
+    simulate("suburb", folder, 3, size_m=(120.0, 100.0), density_per_m2=2.5)
+    return folder / "suburb.laz"
+
+
+def write_outlines(path: Path, outlines: dict[str, Any], **attributes: str) -> Path:
+    """Footprints by their ids, as GeoJSON in the suburb's CRS."""
+    features = [
+        {"type": "Feature", "properties": {"id": name, **attributes}, "geometry": shapely.geometry.mapping(polygon)}
+        for name, polygon in outlines.items()
+    ]
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
+    path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": features}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def plain(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The run without overrides."""
+    from pipeline.runtime.run import RunRequest, run
+
+    out = str(tmp_path_factory.mktemp("plain") / "run")
+    return run(RunRequest(inputs=(str(suburb),), out=out, settings=RunSettings.from_mapping(TILES), workers=0))
+
+
+@pytest.fixture
+def overridden(suburb: Path, reconstruct: Any, tmp_path: Path) -> Any:
+    """A run with overrides: `overridden(text)`."""
+
+    def go(text: str, **fields: Any) -> Any:
+        path = tmp_path / "overrides.toml"
+        path.write_text(text)
+        return reconstruct(suburb, overrides=str(path), settings=fields.pop("settings", TILES), **fields)
+
+    return go
+
+
+@pytest.fixture
+def everything(plain: Any) -> str:
+    """Overrides of every kind, of buildings in several tiles."""
+    buildings, rejected = rows(plain.run_dir, "buildings"), rows(plain.run_dir, "rejected")
+    gone, redrawn, other = sorted(buildings, key=lambda name: -buildings[name]["n_points"])[:3]
+    found = max(rejected, key=lambda name: rejected[name]["n_points"])
+    box = outline(buildings[redrawn]).envelope
+    return f"""
+        [[building]]
+        building_id = "{gone}"
+        action = "reject"
+        note = "a tent of the fair"
+
+        [[building]]
+        point = [{box.centroid.x}, {box.centroid.y}]
+        footprint = "{box.wkt}"
+
+        [[building]]
+        building_id = "{found}"
+        action = "accept"
+
+        [[building]]
+        building_id = "{other}"
+        method = "kmeans"
+        preset = "faithful"
+        settings.roof-type.flat_below_deg = 5.0
+    """
+
+
+def test_a_rejected_building_is_listed_among_the_rejected_with_the_user_s_note(plain: Any, overridden: Any) -> None:
+    before = rows(plain.run_dir, "buildings")
+    name = max(before)
+    summary = overridden(f'[[building]]\nbuilding_id = "{name}"\naction = "reject"\nnote = "a tent"')
+    assert rows(summary.run_dir, "buildings") == others(before, name)
+    after = rows(summary.run_dir, "rejected")
+    assert others(after, name) == rows(plain.run_dir, "rejected")
+    assert (after[name]["reason"], after[name]["reason_detail"]) == ("overridden", "a tent")
+    assert after[name]["n_points"] == before[name]["n_points"]
+    assert outline(after[name]).buffer(0.5).contains(outline(before[name]).centroid)
+    assert not list(Path(summary.run_dir).glob(f"meshes/*/{name}.obj"))
+    assert summary.rejected["overridden"] == 1
+
+
+def test_an_accepted_object_is_modelled_under_its_own_id(plain: Any, overridden: Any) -> None:
+    before = rows(plain.run_dir, "rejected")
+    name = max(before, key=lambda name: before[name]["n_points"])
+    summary = overridden(f'[[building]]\nbuilding_id = "{name}"\naction = "accept"')
+    after = rows(summary.run_dir, "buildings")
+    assert rows(summary.run_dir, "rejected") == others(before, name)
+    assert others(after, name) == rows(plain.run_dir, "buildings")
+    assert (after[name]["status"], after[name]["overridden"]) == ("ok", "accept")
+    assert after[name]["n_points"] == before[name]["n_points"]
+    around = outline(before[name]).buffer(1.0)
+    assert outline(after[name]).intersection(around).area > 0.8 * outline(after[name]).area
+
+
+def test_another_footprint_is_modelled_with_the_points_inside_it(plain: Any, overridden: Any) -> None:
+    before = rows(plain.run_dir, "buildings")
+    name = min(before)
+    west, south, east, north = outline(before[name]).bounds
+    half = shapely.box(west, south, (west + east) / 2, north)
+    summary = overridden(f'[[building]]\nbuilding_id = "{name}"\nfootprint = "{half.wkt}"')
+    after = rows(summary.run_dir, "buildings")
+    assert others(after, name) == others(before, name)
+    assert after[name]["overridden"] == "footprint"
+    assert outline(after[name]).symmetric_difference(half).area < 0.02 * half.area
+    assert 0.3 * before[name]["n_points"] < after[name]["n_points"] < 0.7 * before[name]["n_points"]
+
+
+def test_overlapping_footprints_of_two_buildings_have_all_their_points_each(plain: Any, overridden: Any) -> None:
+    before = rows(plain.run_dir, "buildings")
+    one, other = sorted(before)[:2]
+    box = outline(before[one]).envelope
+    entries = {name: f'[[building]]\nbuilding_id = "{name}"\nfootprint = "{box.wkt}"\n' for name in (one, other)}
+    alone, both = overridden(entries[one]), overridden(entries[one] + entries[other])
+    first = rows(alone.run_dir, "buildings")[one]
+    found = rows(both.run_dir, "buildings")
+    assert found[one] == first
+    assert found[other]["n_points"] == first["n_points"]
+
+
+def test_another_method_and_its_settings_are_those_of_one_building(plain: Any, overridden: Any) -> None:
+    before = rows(plain.run_dir, "buildings")
+    name = min(before)
+    text = f'[[building]]\nbuilding_id = "{name}"\nmethod = "kmeans"\npreset = "faithful"\n'
+    after = rows(overridden(text).run_dir, "buildings")
+    assert others(after, name) == others(before, name)
+    assert (after[name]["method"], after[name]["overridden"]) == ("kmeans", "method")
+    assert after[name]["input_hash"] == before[name]["input_hash"]
+    whole = RunSettings.from_mapping({**TILES, "method": "kmeans", "preset": "faithful"})
+    assert after[name]["settings_hash"] == whole.settings_hash != before[name]["settings_hash"]
+    assert after[name]["roof_type"] in {"gable", "unknown", "none", "flat", "pent"}
+
+
+def test_a_building_with_another_method_is_as_in_a_run_of_that_method(
+    plain: Any, overridden: Any, suburb: Path, reconstruct: Any
+) -> None:
+    name = min(rows(plain.run_dir, "buildings"))
+    text = f'[[building]]\nbuilding_id = "{name}"\nmethod = "parameter-space-3d"\n'
+    whole = rows(reconstruct(suburb, settings={**TILES, "method": "parameter-space-3d"}).run_dir, "buildings")
+    alone = rows(overridden(text).run_dir, "buildings")
+    assert {**alone[name], "overridden": None} == whole[name]
+
+
+def test_a_point_names_the_building_around_it_and_far_ones_name_the_nearest(plain: Any, overridden: Any) -> None:
+    before = rows(plain.run_dir, "buildings")
+    name = min(before)
+    place = outline(before[name]).representative_point()
+    west = min(outline(row).bounds[0] for row in before.values())
+    text = f"""
+        [[building]]
+        point = [{place.x}, {place.y}]
+        action = "reject"
+        [[building]]
+        point = [{west - 20.0}, {place.y}]
+        action = "reject"
+        [[building]]
+        point = [0.0, 0.0]
+        action = "accept"
+    """
+    summary = overridden(text)
+    assert set(before) - set(rows(summary.run_dir, "buildings")) == {name}
+    told = [warning for warning in summary.warnings if warning.startswith("overrides: ")]
+    assert "it is in no building; the nearest is" in told[0]
+    assert "there is no rejected object within 50 m" in told[1]
+    outcomes = json.loads((Path(summary.run_dir) / "overrides.json").read_text())
+    assert [entry["building_id"] for entry in outcomes] == [name, None, None]
+    assert [entry["effects"] for entry in outcomes] == ["reject", "", ""]
+
+
+def test_ids_that_are_none_are_warned_of_with_the_nearest(plain: Any, overridden: Any) -> None:
+    name = min(rows(plain.run_dir, "buildings"))
+    summary = overridden(f'[[building]]\nbuilding_id = "{name[:-1]}"\naction = "reject"')
+    assert summary.digest == plain.digest
+    assert any(f"the nearest is {name}" in warning for warning in summary.warnings)
+
+
+def test_what_changes_nothing_is_told(plain: Any, overridden: Any) -> None:
+    building, thing = min(rows(plain.run_dir, "buildings")), min(rows(plain.run_dir, "rejected"))
+    text = f"""
+        [[building]]
+        building_id = "{building}"
+        action = "accept"
+        [[building]]
+        building_id = "{thing}"
+        action = "reject"
+    """
+    summary = overridden(text)
+    assert summary.digest == plain.digest
+    told = " ".join(summary.warnings)
+    assert f"{building} is a building already" in told
+    assert f"{thing} is rejected already" in told
+    summary = overridden(f'[[building]]\nbuilding_id = "{thing}"\nmethod = "kmeans"')
+    assert any('give action = "accept", too' in warning for warning in summary.warnings)
+
+
+def test_overrides_do_the_same_whatever_the_tiles(everything: str, overridden: Any) -> None:
+    digests = {overridden(everything, settings={**TILES, "tile_size_m": size}).digest for size in (0.0, 47.0)}
+    assert len(digests) == 1
+
+
+def test_given_footprints_are_overridden_by_their_own_id(plain: Any, overridden: Any, tmp_path: Path) -> None:
+    known = [outline(row) for _, row in sorted(rows(plain.run_dir, "buildings").items())][:3]
+    write_outlines(tmp_path / "given.geojson", dict(zip("abc", known, strict=True)), use="flat")
+    write_outlines(tmp_path / "better.geojson", {"better": known[2].envelope})
+    text = """
+        [[building]]
+        source_id = "a"
+        action = "reject"
+        [[building]]
+        source_id = "c"
+        footprint = { file = "better.geojson", id = "better" }
+        [[building]]
+        source_id = "d"
+        action = "reject"
+    """
+    summary = overridden(text, footprints=str(tmp_path / "given.geojson"))
+    found = {row["source_id"]: row for row in rows(summary.run_dir, "buildings").values()}
+    assert set(found) == {"b", "c"}
+    assert (found["b"]["overridden"], found["c"]["overridden"]) == (None, "footprint")
+    assert json.loads(found["c"]["source_attributes"]) == {"id": "c", "use": "flat"}
+    assert outline(found["c"]).symmetric_difference(known[2].envelope).area < 0.02 * known[2].area
+    assert [row["reason"] for row in rows(summary.run_dir, "rejected").values()] == ["overridden"]
+    assert any("source_id 'd'" in warning and "source_id of this run" in warning for warning in summary.warnings)
+
+
+# faults
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("buildings = 1", r"buildings is no table of overrides: use \[\[building\]\]"),
+        ("[building]\nbuilding_id = 'a'", r"building is no array of tables"),
+        ("[[building]]\nbuilding_id = 'a'", "entry 1: does nothing: give one of action"),
+        ("[[building]]\naction = 'accept'", "gives no building: give one of building_id, source_id, point"),
+        ("[[building]]\nbuilding_id = 'a'\npoint = [1, 2]\naction = 'accept'", "gives building_id and point"),
+        ("[[building]]\nbuilding_id = 'a'\naction = 'drop'", "action is 'drop': use one of accept, reject"),
+        ("[[building]]\nbuilding_id = 'a'\nactoin = 'accept'", "actoin is no key: use building_id"),
+        ("[[building]]\nbuilding_id = 7\naction = 'accept'", "building_id is 7: use text"),
+        ("[[building]]\npoint = [1, nan]\naction = 'accept'", "use .easting, northing"),
+        ("[[building]]\npoint = 3\naction = 'accept'", "use .easting, northing"),
+        ("[[building]]\nsource_id = 1.5\naction = 'accept'", "source_id is 1.5: use text or a whole number"),
+        ("[[building]]\nbuilding_id = 'a'\naction = 'reject'\nmethod = 'kmeans'", "rejects and gives method"),
+        ("[[building]]\nbuilding_id = 'a'\nmethod = 'magic'", "method is 'magic': use one of"),
+        ("[[building]]\nbuilding_id = 'a'\nsettings = 3", "settings are no tables"),
+        ("[[building]]\nbuilding_id = 'a'\nsettings.ground.filter = 'none'", r"\[ground\] cannot differ by building"),
+        (
+            "[[building]]\nbuilding_id = 'a'\nsettings.kmeans.k = 2",
+            r"\[kmeans\] cannot .* use roof, roof-type, fuzzy",
+        ),
+        ("[[building]]\nbuilding_id = 'a'\nsettings.roof.colour = 1", r"\[roof\] colour is no setting"),
+        ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGO ((0 0))'", "is no WKT"),
+        ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POINT (0 0)'", "is no polygon: use POLYGON"),
+        ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGON ((0 0, 1 1, 1 0, 0 1, 0 0))'", "Self-intersection"),
+        ("[[building]]\nbuilding_id = 'a'\nfootprint = 5", "footprint is neither WKT nor a table"),
+        ("[[building]]\nbuilding_id = 'a'\nfootprint = {file = 'none.gpkg', id = 1}", "no such file"),
+        (2 * "[[building]]\nbuilding_id = 'a'\naction = 'accept'\n", "entry 2: names the same building as entry 1"),
+    ],
+)
+def test_faults_of_an_entry_are_told_with_the_fix(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "o.toml").write_text(text)
+    with pytest.raises(SettingsError, match=told):
+        read_overrides(tmp_path / "o.toml", METRES, RunSettings())
+
+
+def test_all_faults_are_told_at_once_and_before_anything_is_touched(
+    plain: Any, suburb: Path, reconstruct: Any, tmp_path: Path
+) -> None:
+    (tmp_path / "o.toml").write_text("[[building]]\naction = 'x'\n[[building]]\nbuilding_id = 'a'\nmethod = 'y'")
+    with pytest.raises(SettingsError) as caught:
+        reconstruct(suburb, overrides=str(tmp_path / "o.toml"), out=str(tmp_path / "run"))
+    assert len(caught.value.faults) == 3
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(SettingsError, match="cannot be read"):
+        read_overrides(tmp_path / "none.toml", METRES, RunSettings())
+    (tmp_path / "bad.toml").write_text("[[building")
+    with pytest.raises(SettingsError, match="is no TOML"):
+        read_overrides(tmp_path / "bad.toml", METRES, RunSettings())
+
+
+KEYS = st.sampled_from(["point", "action", "footprint", "settings", "x"])
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.dictionaries(KEYS, ANYTHING, max_size=5))
+def test_no_entry_breaks_the_reader(entry: dict[str, Any]) -> None:
+    # none of these is a valid entry: what is drawn at random is no action and no polygon
+    with pytest.raises(SettingsError, match="entry 1: "):
+        overrides_of({"building": [{**entry, "action": entry.get("action")}]}, METRES, RunSettings())
+
+
+def test_points_and_outlines_are_in_the_units_of_the_crs() -> None:
+    feet = SpatialReference(horizontal_unit_m=0.3048)
+    entry = {"point": [100, 200], "footprint": "POLYGON ((0 0, 10 0, 10 10, 0 10, 0 0))"}
+    (found,) = overrides_of({"building": [entry]}, feet, RunSettings())
+    assert found.point_m == pytest.approx((30.48, 60.96))
+    assert found.footprint is not None
+    assert found.footprint.area == pytest.approx(100 * 0.3048**2)
+
+
+def test_settings_of_one_building_start_where_the_run_s_are_unless_method_or_preset_is_another() -> None:
+    own: dict[str, Any] = {"method": "kmeans", "kmeans": {"outline": "rectangle"}, "roof-type": {"flat_below_deg": 4.0}}
+    base = RunSettings.from_mapping(own)
+    entry = {"building_id": "a", "settings": {"roof-type": {"flat_below_deg": 3.0}}}
+    (found,) = overrides_of({"building": [entry]}, METRES, base)
+    kept = own_modelling(found, base)
+    assert kept.settings.method == base.building.method
+    assert kept.settings.roof_type.flat_below_deg == 3.0
+    (found,) = overrides_of({"building": [{"building_id": "a", "preset": "faithful"}]}, METRES, base)
+    faithful = RunSettings.from_mapping(
+        {"method": "kmeans", "preset": "faithful", "roof-type": {"flat_below_deg": 4.0}}
+    )
+    assert own_modelling(found, base).settings == faithful.building
+    assert own_modelling(found, base).settings_hash == faithful.settings_hash
+
+
+# rerun
+
+
+@pytest.fixture
+def copied(suburb: Path, reconstruct: Any) -> Any:
+    """A run of its own, to be changed: `copied(**request fields)`."""
+    return lambda **fields: reconstruct(suburb, settings=TILES, **fields)
+
+
+def again(run_dir: str, **fields: Any) -> Any:
+    return rerun(RerunRequest(run_dir=run_dir, workers=0, **fields))
+
+
+@pytest.mark.parametrize(
+    "meshes", ["building", pytest.param("tile", marks=pytest.mark.slow), pytest.param("none", marks=pytest.mark.slow)]
+)
+def test_a_rerun_leaves_what_a_whole_run_with_these_overrides_writes(
+    everything: str, overridden: Any, copied: Any, tmp_path: Path, meshes: str
+) -> None:
+    whole = overridden(everything, meshes=meshes)
+    first = copied(meshes=meshes)
+    before = files(first.run_dir)
+    done = again(first.run_dir, overrides=str(tmp_path / "overrides.toml"))
+    assert done.digest == whole.digest != first.digest
+    assert files(first.run_dir) == files(whole.run_dir)
+    told, expected = (json.loads((Path(run) / "run.json").read_text()) for run in (first.run_dir, whole.run_dir))
+    times = ("started_at", "finished_at", "timings_s", "peak_memory_bytes")
+    assert {k: v for k, v in told.items() if k not in times} == {k: v for k, v in expected.items() if k not in times}
+    assert len(done.buildings) == 4
+    for path in (Path(first.run_dir) / "state").glob("*.json"):
+        for name, digest in json.loads(path.read_text())["files"].items():
+            assert sha256_of(Path(first.run_dir) / name) == digest
+    # and back again, by an empty file
+    (tmp_path / "overrides.toml").write_text("")
+    assert again(first.run_dir).digest == first.digest
+    assert {**files(first.run_dir), "overrides.json": b""} == {**before, "overrides.json": b""}
+
+
+def test_a_rerun_models_no_other_building_and_splits_only_the_tiles_around(
+    plain: Any, copied: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    modelled = []
+    real = pipeline.runtime.modelling.reconstruct_building
+
+    def watched(candidate: Any, *rest: Any) -> Any:
+        modelled.append(candidate.building_id)
+        return real(candidate, *rest)
+
+    first = copied()
+    monkeypatch.setattr(pipeline.runtime.modelling, "reconstruct_building", watched)
+    name = max(rows(first.run_dir, "buildings"))
+    (tmp_path / "o.toml").write_text(f'[[building]]\nbuilding_id = "{name}"\nmethod = "kmeans"')
+    done = again(first.run_dir, overrides=str(tmp_path / "o.toml"))
+    assert modelled == [name]
+    assert done.buildings.keys() == {name}
+    assert done.tiles_split < first.counts["tiles"]
+    assert len(done.tiles) == 1
+    # an entry that did not change is not done twice
+    assert again(first.run_dir).buildings == {}
+    assert modelled == [name]
+
+
+def test_a_named_building_is_modelled_again_and_comes_out_the_same(plain: Any, copied: Any) -> None:
+    first = copied()
+    before = files(first.run_dir)
+    name = min(rows(first.run_dir, "buildings"))
+    done = again(first.run_dir, only=(name,))
+    assert done.buildings == {name: rows(first.run_dir, "buildings")[name]["status"]}
+    assert done.digest == first.digest == plain.digest
+    assert files(first.run_dir) == before
+
+
+def test_a_rerun_with_given_footprints_is_a_whole_run_too(
+    plain: Any, overridden: Any, suburb: Path, reconstruct: Any, tmp_path: Path
+) -> None:
+    known = [outline(row) for _, row in sorted(rows(plain.run_dir, "buildings").items())]
+    given = write_outlines(tmp_path / "given.geojson", {str(k): polygon for k, polygon in enumerate(known)})
+    text = "[[building]]\nsource_id = '3'\naction = 'reject'\n[[building]]\nsource_id = '5'\nmethod = 'kmeans'"
+    whole = overridden(text, footprints=str(given))
+    first = reconstruct(suburb, settings=TILES, footprints=str(given))
+    done = again(first.run_dir, overrides=str(tmp_path / "overrides.toml"))
+    assert done.digest == whole.digest
+    assert files(first.run_dir) == files(whole.run_dir)
+    given.write_text(given.read_text() + " ")
+    with pytest.raises(RunError, match="is not the file that the run read"):
+        again(first.run_dir)
+
+
+def test_a_rerun_that_is_called_off_leaves_the_run_as_it_was(plain: Any, copied: Any, tmp_path: Path) -> None:
+    first = copied()
+    before = files(first.run_dir) | {"run.json": (Path(first.run_dir) / "run.json").read_bytes()}
+    name = min(rows(first.run_dir, "buildings"))
+    with pytest.raises(RunCancelledError):
+        rerun(RerunRequest(run_dir=first.run_dir, only=(name,), workers=0), cancelled=lambda: True)
+    assert files(first.run_dir) | {"run.json": (Path(first.run_dir) / "run.json").read_bytes()} == before
+
+
+def test_runs_that_cannot_be_continued_are_refused_with_the_reason(
+    suburb: Path, reconstruct: Any, tmp_path: Path
+) -> None:
+    tile = tmp_path / "tile.laz"
+    tile.write_bytes(suburb.read_bytes())
+    first = reconstruct(tile, settings=TILES)
+    name = min(rows(first.run_dir, "buildings"))
+    manifest = Path(first.run_dir) / "run.json"
+    text = manifest.read_text()
+    told = json.loads(text)
+    for change, message in (
+        ({"status": "running"}, "is running, not finished"),
+        ({"engine_version": "0.0.0"}, r"made by gablework 0\.0\.0"),
+        ({"request": {}}, "does not tell how the run was asked for"),
+        ({"settings_hash": "ab"}, "changed by hand"),
+    ):
+        manifest.write_text(json.dumps({**told, **change}))
+        with pytest.raises(RunError, match=message):
+            again(first.run_dir, only=(name,))
+    manifest.write_text(text)
+    with pytest.raises(RunError, match="abc: no building of"):
+        again(first.run_dir, only=("abc",))
+    with pytest.raises(RunError, match=r"run\.json does not exist"):
+        again(str(tmp_path))
+    tile.write_bytes(suburb.read_bytes() + b"\0")
+    with pytest.raises(RunError, match="its content changed"):
+        again(first.run_dir, only=(name,))
