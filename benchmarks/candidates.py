@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.io import ReadOptions
@@ -11,6 +12,7 @@ from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import Candidate
 from pipeline.runtime.events import ignore
 from pipeline.runtime.gather import gather
+from pipeline.runtime.join import RejectedSite
 from pipeline.runtime.plan import make_plan
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.serial import SerialExecutor
@@ -18,11 +20,28 @@ from pipeline.runtime.stages import Progress, Stages
 from pipeline.settings import RunSettings
 
 
-def candidates_of(tiles: Sequence[str], crs: str | None, settings: RunSettings) -> Iterator[Candidate]:
-    """The candidates of point files, as a run finds them, largest first."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FoundScene:
+    """What ingest, split and join make of point files."""
+
+    candidates: tuple[Candidate, ...]
+    """Largest first."""
+    rejected: tuple[RejectedSite, ...]
+    """Objects that were judged to be no building."""
+    small_fragments: int
+    """Surfaces below the size of an object."""
+    points: int
+    """Points without duplicates."""
+    seconds: Mapping[str, float]
+    """Wall-clock time by stage: ingest, split, join."""
+
+
+def found_scene(tiles: Sequence[str], crs: str | None, settings: RunSettings) -> FoundScene:
+    """Ingest, split and join point files, serially and in this process."""
     plan = make_plan(tiles, ReadOptions(crs=crs), settings)
     kinds = {info.gps_time_kind for info in plan.sources}
     kind = kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
+    progress = Progress(ignore)
     with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
         scratch = Scratch(str(Path(folder, "scratch")))
         scratch.create()
@@ -30,10 +49,21 @@ def candidates_of(tiles: Sequence[str], crs: str | None, settings: RunSettings) 
             settings=settings,
             meshes="none",
             plan=plan,
-            progress=Progress(ignore),
+            progress=progress,
             executor=SerialExecutor(),
             scratch=scratch,
         )
         splits = stages.split(stages.ingest(tiles), None)
-        for site in stages.join(splits, None, plan.sources[0].reference).candidates:
-            yield gather(scratch, plan.grid, site, kind)[0]
+        joined = stages.join(splits, None, plan.sources[0].reference)
+        return FoundScene(
+            candidates=tuple(gather(scratch, plan.grid, site, kind)[0] for site in joined.candidates),
+            rejected=joined.rejected,
+            small_fragments=joined.small_fragments,
+            points=sum(split.points for split in splits),
+            seconds=progress.timings,
+        )
+
+
+def candidates_of(tiles: Sequence[str], crs: str | None, settings: RunSettings) -> Iterator[Candidate]:
+    """The candidates of point files, as a run finds them, largest first."""
+    yield from found_scene(tiles, crs, settings).candidates

@@ -101,6 +101,8 @@ def allowed(field: dataclasses.Field[Any]) -> str:
 
 def toml(value: object) -> str:
     """A default as TOML writes it."""
+    if isinstance(value, tuple):
+        value = list(value)
     return f"`{str(value).lower()}`" if isinstance(value, bool) else f"`{value!r}`".replace("'", '"')
 
 

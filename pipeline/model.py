@@ -46,6 +46,7 @@ class Reason(StrEnum):
     NO_WALLS = "no_walls"
     VEGETATION = "vegetation"
     TOO_NARROW = "too_narrow"
+    OVERRIDDEN = "overridden"
 
 
 class RoofType(StrEnum):
@@ -176,6 +177,9 @@ class Candidate:
     """(m, 3) float64, local metres: samples of the terrain around and beneath, on a 1 m lattice."""
     ground_z_m: float
     """Local elevation of the lowest terrain at the outline: where the walls end."""
+    split_returns: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """(k, 3) float64, those of the points whose pulse went on to a lower return: it met them with a part of its beam.
+    Empty where the file tells no returns."""
     footprint: Polygon | MultiPolygon | None = None
     """Given footprint in local metres; None where none was given."""
     source_id: str | None = None

@@ -29,14 +29,14 @@ def parameter(
 
     Parameters
     ----------
-    default : bool, int, float, str or None
+    default : bool, int, float, str, tuple of int or None
         The default; its type is the field's type.
     doc : str
         One sentence for the reference docs.
     unit : str
         Unit of a number, empty where it has none.
     minimum, maximum : float, optional
-        Inclusive bounds of a number.
+        Inclusive bounds of a number, or of each number of a tuple.
     choices : tuple of str, optional
         The valid words of a string.
     changes_geometry : bool
@@ -61,6 +61,11 @@ def _fault(name: str, value: Any, field: dataclasses.Field[Any]) -> str | None:
     default, choices = field.default, meta["choices"]
     if choices is not None:
         return None if value in choices else f"{name} is {value!r}: use one of {', '.join(choices)}"
+    if isinstance(default, tuple):
+        low, high = meta["minimum"], meta["maximum"]
+        if isinstance(value, tuple) and all(type(v) is int and low <= v <= high for v in value):
+            return None
+        return f"{name} is {value!r}: use a list of whole numbers from {low:g} to {high:g}"
     if isinstance(default, bool):
         return None if isinstance(value, bool) else f"{name} is {value!r}: use true or false"
     if isinstance(default, int | float):
@@ -123,6 +128,8 @@ def build(
             # TOML writes 2 where a float is meant
             wants_float = isinstance(names[name].default, float) and isinstance(value, int)
             given[name] = float(value) if wants_float and not isinstance(value, bool) else value
+            if isinstance(names[name].default, tuple) and isinstance(value, list):
+                given[name] = tuple(value)
     try:
         return kind(**given) if base is None else dataclasses.replace(base, **given)
     except SettingsError as error:

@@ -14,12 +14,13 @@ import numpy as np
 from pipeline.model import BoolArray, ByteArray, IntArray, LabelArray
 from pipeline.terrain.candidates import CandidateSettings
 from pipeline.terrain.facets import VertexKind
-from pipeline.terrain.ground import GroundSettings, Terrain, ground_of
+from pipeline.terrain.ground import GroundSettings, Terrain, ground_of, ground_points
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above
 from pipeline.terrain.outliers import OutlierSettings, dense_enough
 from pipeline.terrain.surfaces import Fragments, ScenePoints, SceneVertices, SurfaceSettings, fragments_of
 from pipeline.terrain.thinning import highest_per_cell
-from pipeline.terrain.vegetation import VegetationSettings, planarity
+from pipeline.terrain.units import UnitSettings
+from pipeline.terrain.vegetation import VegetationSettings, crowns, planarity
 from pipeline.tiling import Window
 from pipeline.tin.delaunay import triangulate
 
@@ -38,6 +39,7 @@ class SceneSettings:
     vegetation: VegetationSettings = dataclasses.field(default_factory=VegetationSettings)
     surfaces: SurfaceSettings = dataclasses.field(default_factory=SurfaceSettings)
     candidates: CandidateSettings = dataclasses.field(default_factory=CandidateSettings)
+    units: UnitSettings = dataclasses.field(default_factory=UnitSettings)
 
     @property
     def support_m(self) -> float:
@@ -186,10 +188,12 @@ def split_tile(
     kind = np.full(len(chosen), VertexKind.OBJECT, np.int8)
     chosen_class = points.classification[chosen]
     kind[excluded[chosen]] = VertexKind.EXCLUDED
-    kind[height[chosen] < round(settings.ground.tolerance_m * 1000)] = VertexKind.GROUND
+    kind[ground_points(x, y, z, terrain, settings.ground)] = VertexKind.GROUND
     if classes.ground:
         kind[chosen_class == GROUND_CLASS] = VertexKind.GROUND
     kind[building[chosen]] = VertexKind.BUILDING
+    planar = planarity(x, y, z, kind == VertexKind.OBJECT, settings.vegetation)
+    kind[crowns(x, y, z, planar, points.return_count[chosen] > 1, settings.vegetation)] = VertexKind.CROWN
     tin = triangulate(np.column_stack((x, y)))
     vertices = SceneVertices(
         x_mm=x,
@@ -197,7 +201,7 @@ def split_tile(
         z_mm=z,
         height_mm=height[chosen],
         kind=kind,
-        planar=planarity(x, y, z, kind == VertexKind.OBJECT, settings.vegetation),
+        planar=planar,
     )
     in_core = core.contains(points.x_mm, points.y_mm)
     core_index = np.flatnonzero(in_core & known)

@@ -17,9 +17,11 @@ from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings
 from pipeline.scene import SceneSettings
 from pipeline.terrain.candidates import CandidateSettings
+from pipeline.terrain.class_codes import ClassCodeSettings
 from pipeline.terrain.ground import GroundSettings
 from pipeline.terrain.outliers import OutlierSettings
 from pipeline.terrain.surfaces import SurfaceSettings
+from pipeline.terrain.units import UnitSettings
 from pipeline.terrain.vegetation import VegetationSettings
 
 
@@ -62,11 +64,13 @@ class GeneralSettings(Parameters):
 
 
 SECTIONS: Mapping[str, type[Parameters]] = {
+    "class-codes": ClassCodeSettings,
     "outliers": OutlierSettings,
     "ground": GroundSettings,
     "vegetation": VegetationSettings,
     "surfaces": SurfaceSettings,
     "candidates": CandidateSettings,
+    "units": UnitSettings,
     "roof": RoofSettings,
     "roof-type": RoofTypeSettings,
 }
@@ -79,6 +83,8 @@ class RunSettings:
 
     general: GeneralSettings = dataclasses.field(default_factory=GeneralSettings)
     """The run as a whole."""
+    class_codes: ClassCodeSettings = dataclasses.field(default_factory=ClassCodeSettings)
+    """What the codes of the file's classes mean."""
     scene: SceneSettings = dataclasses.field(default_factory=SceneSettings)
     """From a tile's points to candidates."""
     building: ReconstructSettings = dataclasses.field(default_factory=ReconstructSettings)
@@ -106,11 +112,13 @@ class RunSettings:
             raise AssertionError("filled in at construction")
         return {
             "general": self.general,
+            "class-codes": self.class_codes,
             "outliers": self.scene.outliers,
             "ground": self.scene.ground,
             "vegetation": self.scene.vegetation,
             "surfaces": self.scene.surfaces,
             "candidates": self.scene.candidates,
+            "units": self.scene.units,
             "roof": self.building.roof,
             "roof-type": self.building.roof_type,
             self.general.method: method,
@@ -172,7 +180,12 @@ class RunSettings:
             roof=built.get("roof", RoofSettings()),
             roof_type=built.get("roof-type", RoofTypeSettings()),
         )
-        return cls(general=general or GeneralSettings(), scene=scene, building=building)
+        return cls(
+            general=general or GeneralSettings(),
+            class_codes=built.get("class-codes", ClassCodeSettings()),
+            scene=scene,
+            building=building,
+        )
 
     @classmethod
     def from_toml(cls, path: str | None, overrides: Mapping[str, Any]) -> RunSettings:

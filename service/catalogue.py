@@ -90,7 +90,8 @@ def _sane(values: Mapping[str, Any], prefix: str, faults: list[str]) -> dict[str
     """What may be looked at further: JSON knows nulls and integers without end, settings do not."""
     kept = {}
     for name, value in values.items():
-        if value is None or isinstance(value, list):
+        whole = isinstance(value, list) and all(type(item) is int and abs(item) <= LARGEST_INTEGER for item in value)
+        if value is None or (isinstance(value, list) and not whole):
             faults.append(f"{prefix}{name} is {json.dumps(value)[:80]}: use a value, or leave it out")
         elif isinstance(value, int) and abs(value) > LARGEST_INTEGER:
             faults.append(f"{prefix}{name} has {len(str(value))} digits: use a smaller number")
@@ -108,6 +109,9 @@ def _properties(kind: type[Parameters]) -> dict[str, Any]:
         found: dict[str, Any] = {"description": f"{meta['doc']}{unit}", "default": default}
         if meta["choices"] is not None:
             found |= {"type": "string", "enum": list(meta["choices"])}
+        elif isinstance(default, tuple):
+            limits = {name: meta[name] for name in ("minimum", "maximum") if meta[name] is not None}
+            found |= {"type": "array", "items": {"type": "integer", **limits}, "default": list(default)}
         elif isinstance(default, bool):
             found["type"] = "boolean"
         elif isinstance(default, int | float):
@@ -153,6 +157,8 @@ def _kind(name: str, fields: Mapping[str, Mapping[str, Any]]) -> type[Parameters
         values = dict(facts)
         choices = values.pop("choices")
         default = values.pop("default")
+        if isinstance(default, list):
+            default = tuple(default)
         described = parameter(default, values.pop("doc"), choices=None if choices is None else tuple(choices), **values)
         made.append((field, type(default), described))
     return dataclasses.make_dataclass(name, made, bases=(Parameters,), frozen=True, kw_only=True)

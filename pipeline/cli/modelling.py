@@ -50,6 +50,10 @@ def reconstruct(
         typer.Option(help="Settings of the method that measured better, or that keep to its paper."),
     ] = None,
     footprints: Footprints = None,
+    overrides: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="What to do with single buildings, as TOML; docs/how_to/overrides.md."),
+    ] = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
     bbox: Bbox = None,
@@ -76,6 +80,7 @@ def reconstruct(
             out=out,
             settings=_run_settings(settings, method=method, preset=preset, classes=classes),
             footprints=footprints,
+            overrides=overrides,
             crs=crs,
             vertical_unit=vertical_unit,
             bbox=bbox,
@@ -94,6 +99,47 @@ def reconstruct(
         console.document(dataclasses.asdict(summary))
         if summary.failed_tiles:
             raise typer.Exit(ExitCode.TILES_FAILED)
+
+
+def rerun(
+    run_dir: Annotated[str, typer.Argument(metavar="RUN", help="The directory of a finished run.")],
+    overrides: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="The overrides that take the place of the run's; default its own file."),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID", help="A building to model again in any case; several by several --only."),
+    ] = None,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    isolate: Annotated[bool | None, Isolate] = None,
+    building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
+    building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Model single buildings of a run again, after other overrides; all others stay untouched."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.runtime.isolation import IsolationLimits
+        from pipeline.runtime.rerun import RerunRequest
+        from pipeline.runtime.rerun import rerun as rerun_buildings
+
+        serial = workers == 0 and scheduler is None
+        limits = IsolationLimits(timeout_s=building_timeout, memory_bytes=round(building_memory * 2**30))
+        request = RerunRequest(
+            run_dir=run_dir,
+            overrides=overrides,
+            only=tuple(only or ()),
+            workers=workers,
+            scheduler=scheduler,
+            isolation=limits if (not serial if isolate is None else isolate) else None,
+        )
+        summary = rerun_buildings(request, console.on_event)
+        console.table("Made again", ["building", "status"], list(summary.buildings.items()))
+        console.say(f"{len(summary.buildings)} buildings, {len(summary.tiles)} tiles written, {summary.seconds:.1f} s")
+        console.say(f"content sha256 {summary.digest}")
+        console.document(dataclasses.asdict(summary))
 
 
 def compare(

@@ -25,7 +25,8 @@ Method = Annotated[
     ),
 ]
 Footprints = Annotated[
-    str | None, typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, Shapefile) to model.")
+    str | None,
+    typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, Shapefile, GeoParquet) to model."),
 ]
 Bbox = Annotated[
     tuple[float, float, float, float] | None,

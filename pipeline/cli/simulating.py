@@ -114,6 +114,7 @@ def warm_up(as_json: AsJson = False, quiet: Quiet = False) -> None:
     with Console(as_json=as_json, quiet=quiet) as console:
         from tempfile import TemporaryDirectory
 
+        from pipeline.runtime.classify import ClassifyRequest, classify
         from pipeline.runtime.modelling import load
         from pipeline.runtime.run import RunRequest, run
         from pipeline.synthetic.dataset import simulate as simulate_scene
@@ -124,6 +125,8 @@ def warm_up(as_json: AsJson = False, quiet: Quiet = False) -> None:
             request = RunRequest(inputs=(str(scene.laz),), out=f"{folder}/run", workers=0)
             summary = run(request, console.on_event)
             load()  # the other methods, too
+            classified = ClassifyRequest(inputs=(str(scene.laz),), out=f"{folder}/classified", rasters=True, workers=0)
+            classify(classified, console.on_event)
             seconds = time.perf_counter() - started
         console.say(f"kernels compiled and one building modelled in {seconds:.1f} s")
         console.document({"seconds": seconds, "statuses": summary.statuses})

@@ -6,7 +6,6 @@ import dataclasses
 import datetime as dt
 import hashlib
 import math
-from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -86,7 +85,7 @@ def points_of(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
     """A candidate's points in canonical order: X, Y, Z, return, GPS time, source."""
     pieces = []
     for part in site.ranges:
-        stored = scratch.array(f"tiles/{part.tile.key}", "points", mapped=True).view(POINT)
+        stored = scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
         pieces.append(np.array(stored[part.start : part.stop]))
     points = np.concatenate(pieces) if pieces else np.empty(0, POINT)
     order = np.lexsort(
@@ -158,6 +157,7 @@ def gather(
         origin=(float(origin_mm[0] // MM), float(origin_mm[1] // MM), float(origin_mm[2] // MM)),
         points=(xyz - origin_mm) / MM,
         ground=(ground_mm - origin_mm) / MM,
+        split_returns=(xyz[(points["return_number"] == 1) & (points["return_count"] > 1)] - origin_mm) / MM,
         ground_z_m=math.nan if ground_z is None else (ground_z - int(origin_mm[2])) / MM,
         footprint=None
         if footprint is None
@@ -165,14 +165,12 @@ def gather(
         source_id=site.source_id,
         touches_data_edge=_touches_data_edge(roof, around.occupied),
     )
-    return candidate, CandidateFacts(input_hash=digest.hexdigest(), **_acquired(points, gps_kind))
+    first, last = _acquired(points, gps_kind)
+    return candidate, CandidateFacts(input_hash=digest.hexdigest(), acquired_from=first, acquired_to=last)
 
 
-def _acquired(points: npt.NDArray[np.void], kind: GpsTimeKind) -> Mapping[str, dt.datetime | None]:
+def _acquired(points: npt.NDArray[np.void], kind: GpsTimeKind) -> tuple[dt.datetime | None, dt.datetime | None]:
     """First and last time of the points where GPS times tell dates."""
     if kind is not GpsTimeKind.ADJUSTED or len(points) == 0:
-        return {"acquired_from": None, "acquired_to": None}
-    return {
-        "acquired_from": utc_of(float(points["gps_time"].min())),
-        "acquired_to": utc_of(float(points["gps_time"].max())),
-    }
+        return None, None
+    return utc_of(float(points["gps_time"].min())), utc_of(float(points["gps_time"].max()))

@@ -17,12 +17,13 @@ import numpy.typing as npt
 from pipeline.errors import InconsistentInputError
 from pipeline.io import ReadOptions, open_source
 from pipeline.io.storage import sha256_of
-from pipeline.model import PointCloud
+from pipeline.model import IntArray, PointCloud
 from pipeline.runtime.scratch import POINT, Scratch
 from pipeline.tiling import MM, Tile, TileGrid
 
 _CHUNK_POINTS = 1_000_000
 _MAX_MM = 2**31 - 2
+_TWO_BYTES = 2**16
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -119,10 +120,10 @@ def ingest(task: IngestTask) -> Ingested:
     for cloud in source.chunks(_CHUNK_POINTS):
         task.scratch.check_cancelled()
         records = to_records(cloud, task.path)
-        x, y = records["x"], records["y"]
-        for axis, name in enumerate("xyz"):
-            low[axis] = min(low[axis], int(records[name].min()))
-            high[axis] = max(high[axis], int(records[name].max()))
+        x, y, z = (np.ascontiguousarray(records[name]) for name in "xyz")
+        for axis, values in enumerate((x, y, z)):
+            low[axis] = min(low[axis], int(values.min()))
+            high[axis] = max(high[axis], int(values.max()))
         if first is None:
             first = int(x[0]), int(y[0])
         dx, dy = (x - first[0]) / MM, (y - first[1]) / MM
@@ -130,7 +131,7 @@ def ingest(task: IngestTask) -> Ingested:
         histogram = np.bincount(records["classification"])
         classes.update({int(c): int(histogram[c]) for c in np.flatnonzero(histogram)})
         multiple = multiple or bool((records["return_count"] > 1).any())
-        counts.update(_append_by_tile(records, task, suffix))
+        counts.update(_append_by_tile(records, x, y, task, suffix))
     for tile in counts:
         part = task.scratch.path("points", tile.key, f"{task.index}{suffix}")
         part.replace(task.scratch.path("points", tile.key, f"{task.index}.bin"))
@@ -148,15 +149,23 @@ def ingest(task: IngestTask) -> Ingested:
     )
 
 
-def _append_by_tile(records: npt.NDArray[np.void], task: IngestTask, suffix: str) -> Counter[Tile]:
+def _append_by_tile(
+    records: npt.NDArray[np.void], x_mm: IntArray, y_mm: IntArray, task: IngestTask, suffix: str
+) -> Counter[Tile]:
     """Append a chunk to the parts of its tiles; points of each tile."""
-    columns, rows = task.grid.columns_rows(records["x"], records["y"])
-    order = np.lexsort((rows, columns))
-    columns, rows, ordered = columns[order], rows[order], records[order]
-    starts = np.flatnonzero(np.diff(columns, prepend=columns[0] - 1) | np.diff(rows, prepend=rows[0] - 1))
+    columns, rows = task.grid.columns_rows(x_mm, y_mm)
+    west, south = int(columns.min()), int(rows.min())
+    height = int(rows.max()) - south + 1
+    number = (columns - west) * height + (rows - south)
+    n_tiles = (int(columns.max()) - west + 1) * height
+    # a stable sort of two bytes is a radix sort
+    order = np.argsort(number.astype(np.uint16) if n_tiles <= _TWO_BYTES else number, kind="stable")
+    ordered, number = np.take(records, order), number[order]
+    starts = np.flatnonzero(np.diff(number, prepend=-1))
     counts: Counter[Tile] = Counter()
     for start, stop in zip(starts, [*starts[1:], len(ordered)], strict=True):
-        tile = Tile(int(columns[start]), int(rows[start]))
+        column, row = divmod(int(number[start]), height)
+        tile = Tile(west + column, south + row)
         with task.scratch.path("points", tile.key, f"{task.index}{suffix}").open("ab") as part:
             ordered[start:stop].tofile(part)
         counts[tile] += int(stop - start)

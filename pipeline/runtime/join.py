@@ -13,6 +13,7 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.model import IntArray, Reason
+from pipeline.runtime.overrides import Override
 from pipeline.runtime.split import Split
 from pipeline.terrain.candidates import (
     CandidateSettings,
@@ -39,6 +40,8 @@ class PointRange:
     tile: Tile
     start: int
     stop: int
+    folder: str = "tiles"
+    """Folder of the scratch that holds the tile's points."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -57,6 +60,10 @@ class CandidateSite:
     """Given footprint in metres; None where none was given."""
     source_id: str | None = None
     """Its own id."""
+    source_attributes: str | None = None
+    """The given footprint's columns as the text of a JSON object; None where none was given."""
+    override: Override | None = None
+    """What the user said of this building, as far as it took effect; None where nothing was."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,6 +84,8 @@ class RejectedSite:
     """Mean height above the terrain."""
     points: int
     """Its points."""
+    ranges: tuple[PointRange, ...] = ()
+    """They in scratch, for whoever wants them modelled after all."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -241,18 +250,21 @@ def join(splits: Sequence[Split], grid: TileGrid, settings: CandidateSettings, c
     verdicts: list[Verdict | None] = []
     for k in range(count):
         kind = int(surfaces.kind[k])
-        judged = kind in {FacetKind.OBJECT, FacetKind.BUILDING}
+        judged = kind in {FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN}
         verdict = judge_surface(kind, surfaces.sums[k], settings) if judged else _NOT_JUDGED
         if verdict is None and surfaces.lowest_point_mm[k, 0] == NOWHERE:
             verdict = _NOT_JUDGED
         verdicts.append(verdict)
     leader = unite_levels(surfaces, verdicts, settings)
     group: dict[tuple[int, int], int] = {}
+    # those that are rejected keep their points, too: the user may know better
+    listed = [is_object(int(surfaces.kind[k]), surfaces.sums[k], settings) for k in range(count)]
     for t in range(len(splits)):
         for local, fragment in enumerate(range(int(offsets[t]), int(offsets[t + 1]))):
-            lead = int(leader[surface_of_fragment[fragment]])
-            if lead >= 0:
-                group[t, local] = lead
+            surface = int(surface_of_fragment[fragment])
+            lead = int(leader[surface])
+            if lead >= 0 or listed[surface]:
+                group[t, local] = lead if lead >= 0 else surface
     ranges = _ranges_by_key(splits, group)
     lowest: dict[int, tuple[int, ...]] = {}
     for k in np.flatnonzero(leader >= 0).tolist():
@@ -267,6 +279,7 @@ def join(splits: Sequence[Split], grid: TileGrid, settings: CandidateSettings, c
             points=sum(r.stop - r.start for r in found),
         )
         for lead, found in ranges.items()
+        if lead in lowest
     ]
     rejected, small = [], 0
     for k, verdict in enumerate(verdicts):
@@ -274,7 +287,7 @@ def join(splits: Sequence[Split], grid: TileGrid, settings: CandidateSettings, c
         if verdict is None or int(leader[k]) >= 0 or kind in {FacetKind.STEP, FacetKind.GROUND}:
             continue
         point = tuple(int(v) for v in surfaces.lowest_point_mm[k])
-        if not is_object(kind, surfaces.sums[k], settings) or point[0] == NOWHERE:
+        if not listed[k] or point[0] == NOWHERE:
             small += 1
             continue
         sums = surfaces.sums[k]
@@ -287,6 +300,7 @@ def join(splits: Sequence[Split], grid: TileGrid, settings: CandidateSettings, c
                 area_m2=float(sums[Sum.AREA2]) / 2e6,
                 height_m=float(sums[Sum.HEIGHT]) / max(1, int(sums[Sum.VERTICES])) / 1000.0,
                 points=int(sums[Sum.POINTS]),
+                ranges=tuple(ranges.get(k, ())),
             )
         )
     return Joined(
@@ -302,6 +316,7 @@ def join_footprints(
     footprints: Sequence[Polygon | MultiPolygon],
     source_ids: Sequence[str],
     crs_name: str,
+    attributes: Sequence[str | None] | None = None,
 ) -> Joined:
     """The candidates where footprints were given: one a footprint, also where it holds no point.
 
@@ -315,6 +330,8 @@ def join_footprints(
         The given outlines in metres, in the order of their numbers, and their own ids.
     crs_name : str
         Goes into the ids. A footprint without points is named by its smallest corner and its own id.
+    attributes : sequence of str or None, optional
+        Their columns, each as the text of a JSON object.
     """
     splits = sorted(splits, key=lambda s: s.tile)
     numbers = {(t, key): key for t, s in enumerate(splits) for key in s.keys.tolist()}
@@ -338,6 +355,7 @@ def join_footprints(
                 points=sum(r.stop - r.start for r in found),
                 footprint=footprint,
                 source_id=source_id,
+                source_attributes=None if attributes is None else attributes[number],
             )
         )
     return Joined(

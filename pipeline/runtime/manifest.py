@@ -77,6 +77,8 @@ class RunManifest:
     """epsg, name, wkt, horizontal_unit_m, vertical_unit_m of the outputs; wkt is None where it is unknown."""
     inputs: tuple[InputFile, ...] = ()
     """Point clouds and footprints."""
+    request: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """How the inputs were to be read and the outputs written, beside the settings: what `gablework rerun` goes by."""
     source_licence: str | None = None
     """Licence of the source data in the user's words; None where none was given."""
     tiles: tuple[str, ...] = ()

@@ -7,7 +7,7 @@ import functools
 import math
 import pickle
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from pipeline.runtime.bundle import Bundle, Incident, write_bundle
 from pipeline.runtime.gather import gather
 from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
 from pipeline.runtime.join import CandidateSite
+from pipeline.runtime.overrides import OwnModelling
 from pipeline.runtime.scratch import Scratch
 from pipeline.tiling import Tile, TileGrid
 
@@ -53,6 +54,13 @@ class BatchTask:
     """Folder for the bundles of buildings that cost their process, or met a fault of ours; empty keeps none."""
     reference: SpatialReference = dataclasses.field(default_factory=SpatialReference)
     """Of the run, for its bundles."""
+    own: Mapping[str, OwnModelling] = dataclasses.field(default_factory=dict)
+    """Method and settings of the buildings that have their own, by building_id."""
+
+    def way_of(self, site: CandidateSite) -> BatchTask:
+        """The task with the method and the settings of one site."""
+        own = self.own.get(site.building_id)
+        return self if own is None else dataclasses.replace(self, method=own.method, settings=own.settings)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -143,7 +151,9 @@ class Packed:
     """A pickled `StoredResult`."""
 
 
-def _packed(site: CandidateSite, result: BuildingResult, facts: CandidateFacts, seconds: float) -> Packed:
+def _packed(
+    task: BatchTask, site: CandidateSite, result: BuildingResult, facts: CandidateFacts, seconds: float
+) -> Packed:
     told = Modelled(
         building_id=result.building_id,
         owner=site.owner,
@@ -153,6 +163,13 @@ def _packed(site: CandidateSite, result: BuildingResult, facts: CandidateFacts, 
         faces=len(result.faces),
         points=result.n_points,
         seconds=seconds,
+    )
+    own = task.own.get(site.building_id)
+    facts = dataclasses.replace(
+        facts,
+        source_attributes=site.source_attributes,
+        overridden=None if site.override is None else site.override.effects,
+        settings_hash=None if own is None else own.settings_hash,
     )
     stored = StoredResult(result=result, facts=facts)
     return Packed(told=told, stored=pickle.dumps(stored, protocol=pickle.HIGHEST_PROTOCOL))
@@ -166,8 +183,8 @@ def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:
             packed = model_site(task, site)
         except MemoryError as error:
             detail = f"memory ran out: {error}".removesuffix(": ")
-            result = failed_site(site, task.method, Reason.OUT_OF_MEMORY, detail)
-            packed = _packed(site, result, CandidateFacts(), 0.0)
+            result = failed_site(site, task.way_of(site).method, Reason.OUT_OF_MEMORY, detail)
+            packed = _packed(task, site, result, CandidateFacts(), 0.0)
         yield index, packed
 
 
@@ -197,6 +214,7 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
         Scratch cannot be read, the settings are none: that is the run's fault, not the candidate's.
     """
     started = time.perf_counter()
+    task = task.way_of(site)
     candidate: Candidate | None = None
     facts = CandidateFacts()
     try:
@@ -210,7 +228,7 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     if result.reason is Reason.INTERNAL_ERROR:
         incident = Incident(reason=result.reason.value, detail=result.reason_detail, seconds=seconds)
         result = _kept(task, candidate, result, incident)
-    return _packed(site, result, facts, seconds)
+    return _packed(task, site, result, facts, seconds)
 
 
 def _lost(
@@ -223,7 +241,8 @@ def _lost(
     if not isinstance(described, Loss):
         return described
     detail = f"{loss.detail}; {_NO_BUNDLE}: {described.detail}"
-    return _packed(site, failed_site(site, task.method, loss.reason, detail), CandidateFacts(), loss.seconds)
+    result = failed_site(site, task.way_of(site).method, loss.reason, detail)
+    return _packed(task, site, result, CandidateFacts(), loss.seconds)
 
 
 def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
@@ -234,6 +253,7 @@ def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
     MemoryError, OSError
         Its points cannot be put together.
     """
+    task = task.way_of(site)
     candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind)
     result = failed_building(candidate, task.method, loss.reason, loss.detail)
     incident = Incident(
@@ -243,7 +263,7 @@ def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
         memory_bytes=loss.memory_bytes,
         stderr=loss.stderr,
     )
-    return _packed(site, _kept(task, candidate, result, incident), facts, loss.seconds)
+    return _packed(task, site, _kept(task, candidate, result, incident), facts, loss.seconds)
 
 
 def _kept(task: BatchTask, candidate: Candidate | None, result: BuildingResult, incident: Incident) -> BuildingResult:

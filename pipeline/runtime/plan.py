@@ -13,8 +13,8 @@ from pipeline.tiling import MM, Tile, TileGrid
 
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
 _POINTS_PER_WINDOW = 12_000_000
-_BYTES_PER_POINT = 60
-"""Measured peak of a split, bytes a point of the window."""
+_BYTES_PER_POINT = 220
+"""Measured peak of a split above the size of its process, bytes a point of the window, at 3 and 5 million points."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -45,7 +45,7 @@ class Published:
     """Why the tile failed; empty where it did not."""
 
 
-def _rejected_object(site: RejectedSite) -> RejectedObject:
+def rejected_object(site: RejectedSite) -> RejectedObject:
     """The record of a rejected object; its outline is the box around its facets."""
     x0, y0, x1, y1 = site.box_mm
     origin = (x0 // MM, y0 // MM)
@@ -110,7 +110,7 @@ def _write(task: PublishTask, put: Put) -> TileFiles:
         task.run_dir,
         task.tile.key,
         [entry.result for entry in stored],
-        [_rejected_object(site) for site in task.rejected],
+        [rejected_object(site) for site in task.rejected],
         context,
         meshes=task.meshes,
         put=put,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime as dt
+import json
 import shutil
 import threading
 import time
@@ -27,15 +28,21 @@ from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import Joined
 from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, write_manifest
 from pipeline.runtime.modelling import Modelled, load
+from pipeline.runtime.overrides import read_overrides
 from pipeline.runtime.plan import Plan, check_memory, make_plan
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.split import Split
 from pipeline.runtime.stages import Progress, Stages, given_footprints
 from pipeline.settings import RunSettings
 
-_RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state", "quarantine")
-_SCRATCH = "scratch"
-_QUARANTINE = "quarantine"
+FOOTPRINTS = "footprints.json"
+"""What was wrong with the given footprints, one by one; there where footprints were given."""
+OVERRIDES = "overrides.json"
+"""What became of each entry of the overrides; there where overrides were given."""
+SCRATCH = "scratch"
+QUARANTINE = "quarantine"
+
+_RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state", QUARANTINE)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,6 +57,8 @@ class RunRequest:
     """All settings."""
     footprints: str | None = None
     """A vector file of building outlines to be modelled."""
+    overrides: str | None = None
+    """A TOML file that says of single buildings what is to be done; `pipeline.runtime.overrides`."""
     crs: str | None = None
     """Stands above the headers' CRS."""
     vertical_unit: str | None = None
@@ -217,15 +226,16 @@ def run_variants(
     began = time.perf_counter()
     settings = _common_settings(variants)
     shared.tell("run", "plan", f"run into {work_dir}")
-    plan, paths = _plan(request, settings, shared)
+    plan, paths = plan_inputs(request, settings, shared)
     footprints = None if request.footprints is None else given_footprints(request.footprints, plan)
     for warning in () if footprints is None else footprints.warnings:
         shared.warn("plan", warning)
-    run_dirs = [_checked(variant.out, overwrite=request.overwrite) for variant in variants]
-    scratch_dir = Path(work_dir).resolve() / _SCRATCH
-    _remove(scratch_dir)
-    scratch = Scratch(str(scratch_dir / uuid4().hex))
     reference = plan.sources[0].reference
+    overrides = () if request.overrides is None else read_overrides(request.overrides, reference, settings)
+    run_dirs = [_checked(variant.out, overwrite=request.overwrite) for variant in variants]
+    scratch_dir = Path(work_dir).resolve() / SCRATCH
+    remove_folder(scratch_dir)
+    scratch = Scratch(str(scratch_dir / uuid4().hex))
     manifests = [
         RunManifest(
             status=RunStatus.RUNNING,
@@ -235,6 +245,7 @@ def run_variants(
             settings_hash=variant.settings.settings_hash,
             started_at=started_at,
             crs=_crs_facts(reference),
+            request=told_request(request),
             source_licence=request.licence,
         )
         for variant in variants
@@ -246,7 +257,7 @@ def run_variants(
     scratch.create()
     try:
         starting = time.perf_counter()
-        with _calling_off(scratch, cancelled) as called_off, engine:
+        with calling_off(scratch, cancelled) as called_off, engine:
             shared.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)
             engine.prepare("plan", shared.watch)
             shared.timings["start workers"] = time.perf_counter() - starting
@@ -255,6 +266,8 @@ def run_variants(
             for run_dir, manifest in zip(run_dirs, manifests, strict=True):
                 _clear_results(run_dir)
                 write_manifest(run_dir, manifest, LocalStorage(root=run_dir).put)
+                if footprints is not None:
+                    put_json(run_dir, FOOTPRINTS, footprints.report)
             for path in stale:
                 path.unlink(missing_ok=True)
             stages = Stages(
@@ -271,10 +284,17 @@ def run_variants(
                 ingested = stages.ingest(paths)
                 splits = stages.split(ingested, footprints)
                 joined = stages.join(splits, footprints, reference)
+                if request.overrides is not None:
+                    joined, outcomes_of_entries = stages.override(joined, overrides, ingested)
+                    for outcome in outcomes_of_entries:
+                        if outcome.warning:
+                            shared.warn("join", outcome.warning)
+                    for run_dir in run_dirs:
+                        put_json(run_dir, OVERRIDES, [outcome.as_dict() for outcome in outcomes_of_entries])
                 progresses.extend(shared.part(k, len(variants), v.label) for k, v in enumerate(variants))
                 each = [
                     dataclasses.replace(
-                        stages, settings=v.settings, progress=own, variant=k, quarantine=str(run_dirs[k] / _QUARANTINE)
+                        stages, settings=v.settings, progress=own, variant=k, quarantine=str(run_dirs[k] / QUARANTINE)
                     )
                     for k, (v, own) in enumerate(zip(variants, progresses, strict=True))
                 ]
@@ -296,7 +316,7 @@ def run_variants(
                     write_manifest(run_dir, broken, LocalStorage(root=run_dir).put)
                 raise
     finally:
-        _remove(scratch_dir)
+        remove_folder(scratch_dir)
     inputs = _inputs_told(request, paths, ingested)
     driver, peak_bytes = peak_of_process()
     outcomes = []
@@ -374,14 +394,38 @@ def _inputs_told(request: RunRequest, paths: Sequence[str], ingested: Sequence[I
         )
         for path, found in zip(paths, ingested, strict=True)
     ]
-    if request.footprints is not None:
-        path = Path(request.footprints)
-        inputs.append(InputFile(path=str(path), sha256=sha256_of(path), size_bytes=path.stat().st_size))
+    for name in (request.footprints, request.overrides):
+        if name is not None:
+            path = Path(name)
+            inputs.append(InputFile(path=str(path), sha256=sha256_of(path), size_bytes=path.stat().st_size))
     return tuple(inputs)
 
 
+def told_request(request: RunRequest) -> dict[str, object]:
+    """What of a request `run.json` keeps, so that single buildings of the run can be modelled again."""
+
+    def whole(path: str | None) -> str | None:
+        return None if path is None else str(Path(path).resolve())
+
+    return {
+        "footprints": whole(request.footprints),
+        "overrides": whole(request.overrides),
+        "crs": request.crs,
+        "vertical_unit": request.vertical_unit,
+        "bbox": None if request.bbox is None else list(request.bbox),
+        "aoi": whole(request.aoi),
+        "meshes": request.meshes,
+    }
+
+
+def put_json(run_dir: Path, name: str, content: object) -> None:
+    """Write a document of a run directory, whole or not at all."""
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    LocalStorage(root=run_dir).put(name, text.encode())
+
+
 @contextlib.contextmanager
-def _calling_off(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
+def calling_off(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
     """Watch for the end of a run from a thread of its own, so that a task in this very process learns of it, too.
 
     Yields
@@ -413,11 +457,16 @@ def _calling_off(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Ca
         asking.join()
 
 
-def _plan(request: RunRequest, settings: RunSettings, progress: Progress) -> tuple[Plan, list[str]]:
+def plan_inputs(request: RunRequest, settings: RunSettings, progress: Progress) -> tuple[Plan, list[str]]:
     """The plan and the input files in order."""
     # workers elsewhere do not share this process's folder
     paths = sorted(str(path.resolve()) for path in find_inputs(request.inputs))
-    options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit, bbox=request.bbox)
+    options = ReadOptions(
+        crs=request.crs,
+        vertical_unit=request.vertical_unit,
+        bbox=request.bbox,
+        class_table=settings.class_codes.table,
+    )
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
         options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
@@ -452,7 +501,7 @@ def _checked(out: str, *, overwrite: bool) -> Path:
     return run_dir
 
 
-def _remove(folder: Path) -> None:
+def remove_folder(folder: Path) -> None:
     """Remove a folder of scratch: renamed first, so that no late task of an earlier run finds it and fills it again.
 
     Raises
@@ -477,9 +526,11 @@ def _clear_results(run_dir: Path) -> None:
     RunError
         Something cannot be removed.
     """
-    for name in _RESULTS:
+    for name in (*_RESULTS, FOOTPRINTS, OVERRIDES):
         try:
-            if (run_dir / name).exists():
+            if (run_dir / name).is_file():
+                (run_dir / name).unlink()
+            elif (run_dir / name).exists():
                 shutil.rmtree(run_dir / name)
         except OSError as error:
             raise RunError(f"{run_dir / name} cannot be removed: {error.strerror or error}") from error

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import shapely
+from numba import njit
 from shapely import MultiPolygon, Polygon
 
-from pipeline.model import BoolArray
+from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 from pipeline.runtime.scratch import POINT, Scratch
 from pipeline.scene import (
     BUILDING_CLASS,
@@ -23,11 +26,12 @@ from pipeline.scene import (
     terrain_of,
 )
 from pipeline.spatial_hash import first_of_each
-from pipeline.terrain.ground import Terrain
-from pipeline.terrain.lattice import NO_DATA, height_above
+from pipeline.terrain.ground import Terrain, ground_points
 from pipeline.terrain.surfaces import Fragments
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
+_PLACE_BITS = 20
+"""Bits of a coordinate in a sort key: 1,048 m in millimetres."""
 APRON_MM = 6 * MM
 """Width of the terrain that a tile stores beyond its core; less than the halo's own margin."""
 
@@ -48,6 +52,8 @@ class SplitTask:
     """Points in, fragments out."""
     footprints: tuple[tuple[int, Polygon | MultiPolygon], ...] | None
     """Numbers and outlines in metres of the given footprints that meet the tile; None where none were given."""
+    folder: str = "tiles"
+    """Folder of the scratch for the outcome."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,22 +92,47 @@ class LoadedWindow:
     """Exact duplicates that were dropped from the core."""
 
 
-_WINDOW_COLUMNS = ("x", "y", "z", "return_number", "return_count", "classification")
+Columns: TypeAlias = tuple[
+    IntArray,
+    IntArray,
+    IntArray,
+    ByteArray,
+    FloatArray,
+    npt.NDArray[np.uint16],
+    ByteArray,
+    ByteArray,
+]
+"""x, y, z in mm, return number, GPS time, source, class, return count: as `first_of_each` takes them."""
 
 
-def _without_duplicates(records: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
-    """One of each set of equal points."""
-    kept = first_of_each(
-        np.ascontiguousarray(records["x"]),
-        np.ascontiguousarray(records["y"]),
-        records["z"].astype(np.int64),
-        np.ascontiguousarray(records["return_number"]),
-        np.ascontiguousarray(records["gps_time"]),
-        np.ascontiguousarray(records["source"]),
-        np.ascontiguousarray(records["classification"]),
-        np.ascontiguousarray(records["return_count"]),
-    )
-    return records if kept.all() else records[kept]
+@njit(cache=True, nogil=True)
+def _columns_inside(records: npt.NDArray[np.void], x0: int, y0: int, x1: int, y1: int) -> Columns:
+    """Kernel: the columns of the records with x0 <= x < x1 and y0 <= y < y1, in their order."""
+    n = 0
+    for i in range(records.size):
+        n += x0 <= records[i].x < x1 and y0 <= records[i].y < y1
+    x, y, z = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    return_number, return_count = np.empty(n, np.uint8), np.empty(n, np.uint8)
+    classification, source, gps_time = np.empty(n, np.uint8), np.empty(n, np.uint16), np.empty(n, np.float64)
+    k = 0
+    for i in range(records.size):
+        point = records[i]
+        if x0 <= point.x < x1 and y0 <= point.y < y1:
+            x[k], y[k], z[k] = point.x, point.y, point.z
+            return_number[k], return_count[k] = point.return_number, point.return_count
+            classification[k], source[k], gps_time[k] = point.classification, point.source, point.gps_time
+            k += 1
+    return x, y, z, return_number, gps_time, source, classification, return_count
+
+
+def _columns_of(parts: Sequence[npt.NDArray[np.void]], window: Window) -> tuple[Columns, BoolArray]:
+    """The points in a window of the buckets of one tile, one of each set of equal points; and which of them stayed."""
+    found = [_columns_inside(part, window.x0_mm, window.y0_mm, window.x1_mm, window.y1_mm) for part in parts]
+    columns: Columns = found[0] if len(found) == 1 else tuple(map(np.concatenate, zip(*found, strict=True)))  # type: ignore[assignment]
+    kept = first_of_each(*columns)
+    if not kept.all():
+        columns = tuple(column[kept] for column in columns)  # type: ignore[assignment]
+    return columns, kept
 
 
 def load_window(scratch: Scratch, grid: TileGrid, tile: Tile) -> LoadedWindow:
@@ -111,40 +142,24 @@ def load_window(scratch: Scratch, grid: TileGrid, tile: Tile) -> LoadedWindow:
     needed columns are held, since it can be many times its core.
     """
     window = grid.window(tile)
-    own = [np.fromfile(part, POINT) for part in _parts(scratch, tile)]
-    records = np.concatenate(own) if own else np.empty(0, POINT)
-    core = _without_duplicates(records)
+    own = [np.fromfile(path, POINT) for path in bucket_paths(scratch, tile)] or [np.empty(0, POINT)]
+    columns, kept = _columns_of(own, grid.core(tile))
+    records = own[0] if len(own) == 1 else np.concatenate(own)
+    core = records if kept.all() else records[kept]
     duplicates = len(records) - len(core)
     del own, records
-    columns = {name: [np.ascontiguousarray(core[name])] for name in _WINDOW_COLUMNS}
-    for other in grid.tiles_over(window):
-        if other == tile:
-            continue
-        seen = [_inside(np.fromfile(part, POINT), window) for part in _parts(scratch, other)]
-        if seen:
-            records = _without_duplicates(np.concatenate(seen))
-            for name, pieces in columns.items():
-                pieces.append(np.ascontiguousarray(records[name]))
-    whole = {}
-    for name in _WINDOW_COLUMNS:
-        whole[name] = np.concatenate(columns.pop(name))
+    around = [bucket_paths(scratch, other) for other in grid.tiles_over(window) if other != tile]
+    halo = [_columns_of([np.fromfile(path, POINT) for path in paths], window)[0] for paths in around if paths]
+    x, y, z, return_number, _, _, classification, return_count = (
+        column[0] if len(column) == 1 else np.concatenate(column) for column in zip(columns, *halo, strict=True)
+    )
     points = WindowPoints(
-        x_mm=whole["x"],
-        y_mm=whole["y"],
-        z_mm=whole["z"].astype(np.int64),
-        return_number=whole["return_number"],
-        return_count=whole["return_count"],
-        classification=whole["classification"],
+        x_mm=x, y_mm=y, z_mm=z, return_number=return_number, return_count=return_count, classification=classification
     )
     return LoadedWindow(points=points, core=core, duplicates=duplicates)
 
 
-def _inside(records: npt.NDArray[np.void], window: Window) -> npt.NDArray[np.void]:
-    """The records of a window."""
-    return records[window.contains(records["x"], records["y"])]
-
-
-def _parts(scratch: Scratch, tile: Tile) -> list[Path]:
+def bucket_paths(scratch: Scratch, tile: Tile) -> list[Path]:
     """The buckets of a tile, in the order of the inputs."""
     return sorted(Path(scratch.root, "points", tile.key).glob("*.bin"))
 
@@ -155,7 +170,7 @@ def split(task: SplitTask) -> Split:
     Returns
     -------
     Split
-        Descriptors; arrays are in scratch under `tiles/<tile>/`.
+        Descriptors; arrays are in scratch under `<folder>/<tile>/`.
 
     Raises
     ------
@@ -203,12 +218,33 @@ def _store(
     task: SplitTask, records: npt.NDArray[np.void], owner: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Store points sorted by owner; the owners, where each one's points start, and their smallest points."""
-    order = np.lexsort((records["z"], records["y"], records["x"], owner))
-    records, owner = records[order], owner[order]
-    task.scratch.put_arrays(f"tiles/{task.tile.key}", {"points": records.view(np.uint8)})
+    order = _order_by_owner(records, owner)
+    records, owner = np.take(records, order), owner[order]
+    task.scratch.put_arrays(f"{task.folder}/{task.tile.key}", {"points": records.view(np.uint8)})
     keys, starts = np.unique(owner, return_index=True)
     lowest = np.column_stack([records[name][starts] for name in "xyz"]).astype(np.int64)
     return keys, np.append(starts, len(owner)).astype(np.int64), lowest
+
+
+def _order_by_owner(records: npt.NDArray[np.void], owner: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Indices that sort points by owner, then x, y and z.
+
+    Owner, x and y are packed into one key where a tile is small enough for it: one sort of integers in place of four.
+    """
+    if len(records) == 0:
+        return np.empty(0, np.int64)
+    x, y = records["x"] - records["x"].min(), records["y"] - records["y"].min()
+    if max(int(x.max()), int(y.max())) >> _PLACE_BITS or int(owner.max()) >> (63 - 2 * _PLACE_BITS):
+        return np.lexsort((records["z"], y, x, owner)).astype(np.int64)
+    key = (owner << 2 * _PLACE_BITS) | (x << _PLACE_BITS) | y
+    order = np.argsort(key)
+    key = key[order]
+    tied = np.flatnonzero(key[1:] == key[:-1])
+    if len(tied):
+        rows = np.unique(np.concatenate((tied, tied + 1)))
+        points = order[rows]
+        order[rows] = points[np.lexsort((points, records["z"][points], key[rows]))]
+    return order.astype(np.int64)
 
 
 def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core: Window) -> None:
@@ -222,7 +258,7 @@ def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core:
     rows = slice(row0 - terrain.row0, row0 - terrain.row0 + n_rows)
     columns = slice(column0 - terrain.column0, column0 - terrain.column0 + n_columns)
     task.scratch.put_arrays(
-        f"tiles/{task.tile.key}",
+        f"{task.folder}/{task.tile.key}",
         {
             "terrain": np.ascontiguousarray(terrain.elevation_mm[rows, columns]),
             "occupied": np.ascontiguousarray(occupied[rows, columns]),
@@ -241,8 +277,7 @@ def _inside_footprints(
     index = np.flatnonzero(usable)
     owner = np.full(len(index), -1, np.int64)
     x, y = points.x_mm[index], points.y_mm[index]
-    height = height_above(x, y, points.z_mm[index], terrain.elevation_mm, terrain.column0, terrain.row0)
-    above = (height == NO_DATA) | (height >= round(task.settings.ground.tolerance_m * MM))
+    above = ~ground_points(x, y, points.z_mm[index], terrain, task.settings.ground)
     if task.classes.building:
         above = points.classification[index] == BUILDING_CLASS
     elif task.classes.ground:

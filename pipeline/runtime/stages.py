@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, TypeVar
 
 import shapely
 from shapely import MultiPolygon, Polygon
@@ -22,12 +23,15 @@ from pipeline.runtime.events import Event, EventKind, Listener, Watch
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.ingest import Ingested, IngestTask, ingest, spread_m
 from pipeline.runtime.isolation import IsolationLimits
-from pipeline.runtime.join import CandidateSite, Joined, RejectedSite, join, join_footprints
-from pipeline.runtime.modelling import BatchTask, Modelled, batches, model_batch
+from pipeline.runtime.join import CandidateSite, Joined, PointRange, RejectedSite, join, join_footprints
+from pipeline.runtime.modelling import BatchTask, Modelled, StoredResult, batches, model_batch, stored_results
+from pipeline.runtime.overrides import Override, own_modelling
+from pipeline.runtime.overriding import EntryOutcome, accepts, layers_of, outcomes_of, overridden
 from pipeline.runtime.plan import Plan, check_windows
 from pipeline.runtime.publish import PublishTask, publish
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.split import Split, SplitTask, split
+from pipeline.runtime.units import divide, unit_tasks
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile
@@ -36,6 +40,8 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _LINE_SPREAD_M = 0.05
+_ISSUES_TOLD = 10
+"""Unusable or repaired footprints that are warned of one by one; the run directory lists them all."""
 _CLASSIFIED_SHARE = 0.05
 """Least share of ground points (class 2) from which a file counts as classified."""
 
@@ -48,8 +54,12 @@ class GivenFootprints:
     """In metres of the CRS."""
     ids: tuple[str, ...]
     """Their own ids."""
+    attributes: tuple[str, ...]
+    """Their columns, each as the text of a JSON object."""
     warnings: tuple[str, ...]
     """What is odd but usable."""
+    report: dict[str, Any]
+    """How many were read, used, repaired and left out, and every fault one by one, as `footprints.json` has them."""
 
 
 def given_footprints(path: str, plan: Plan) -> GivenFootprints:
@@ -75,7 +85,11 @@ def given_footprints(path: str, plan: Plan) -> GivenFootprints:
     if plan.options.aoi is not None:
         area &= shapely.transform(plan.options.aoi, lambda xy: xy * unit)
     inside = [k for k, polygon in enumerate(found.polygons) if polygon.intersects(area)]
-    warnings = list(found.warnings)
+    # a fault far from the data is none of this run's; one without a place may be
+    issues = [i for i in found.issues if i.bounds_m is None or shapely.box(*i.bounds_m).intersects(area)]
+    warnings = [*found.warnings, *(str(issue) for issue in issues[:_ISSUES_TOLD])]
+    if len(issues) > _ISSUES_TOLD:
+        warnings.append(f"{len(issues) - _ISSUES_TOLD} more faults of footprints: footprints.json lists them all")
     if len(inside) < len(found.polygons):
         warnings.append(f"{len(found.polygons) - len(inside)} of {len(found.polygons)} footprints lie off the data")
     # overlaps are decided by this order
@@ -83,8 +97,25 @@ def given_footprints(path: str, plan: Plan) -> GivenFootprints:
     return GivenFootprints(
         polygons=tuple(found.polygons[k] for k in inside),
         ids=tuple(found.ids[k] for k in inside),
+        attributes=tuple(json.dumps(found.attributes[k], ensure_ascii=False) for k in inside),
         warnings=tuple(warnings),
+        report={
+            "path": path,
+            "used": len(inside),
+            "off_the_data": len(found.polygons) - len(inside),
+            "repaired": sum(issue.action != "left out" for issue in issues),
+            "left_out": sum(issue.action == "left out" for issue in issues),
+            "issues": [dataclasses.asdict(issue) for issue in issues],
+        },
     )
+
+
+def points_by_tile(ingested: Sequence[Ingested]) -> Counter[Tile]:
+    """Points of each tile over all inputs."""
+    tiles: Counter[Tile] = Counter()
+    for found in ingested:
+        tiles.update(found.points_by_tile)
+    return tiles
 
 
 def classes_in_use(ingested: Sequence[Ingested], *, trust: bool) -> tuple[ClassesInUse, str]:
@@ -229,22 +260,18 @@ class Stages:
             )
         return ingested
 
-    def split(self, ingested: Sequence[Ingested], footprints: GivenFootprints | None) -> list[Split]:
-        """Fragments of all tiles."""
-        tiles: Counter[Tile] = Counter()
-        for found in ingested:
-            tiles.update(found.points_by_tile)
+    def split(
+        self, ingested: Sequence[Ingested], footprints: GivenFootprints | None, only: Collection[Tile] | None = None
+    ) -> list[Split]:
+        """Fragments of all tiles, or of some only."""
+        tiles = points_by_tile(ingested)
         check_windows(self.plan, tiles, self.executor.memory_limit_bytes)
+        if only is not None:
+            tiles = Counter({tile: points for tile, points in tiles.items() if tile in only})
         classes, told = classes_in_use(ingested, trust=self.settings.general.classes == "trust")
         if told:
             self.progress.warn("split", told)
-        numbers_of: dict[Tile, list[int]] = {}
-        if footprints is not None:
-            tree = shapely.STRtree(footprints.polygons)
-            for tile in tiles:
-                core = self.plan.grid.core(tile)
-                box = shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM)
-                numbers_of[tile] = sorted(int(k) for k in tree.query(box))
+        numbers_of = {} if footprints is None else self._numbers_of(tiles, footprints.polygons)
         tasks = [
             SplitTask(
                 tile=tile,
@@ -265,23 +292,92 @@ class Stages:
             self.progress.warn("split", f"{outliers} gross outliers were left out")
         return splits
 
+    def _numbers_of(self, tiles: Collection[Tile], polygons: Sequence[Polygon | MultiPolygon]) -> dict[Tile, list[int]]:
+        """The polygons, by number, that meet each tile."""
+        tree = shapely.STRtree(polygons)
+        numbers: dict[Tile, list[int]] = {}
+        for tile in tiles:
+            core = self.plan.grid.core(tile)
+            box = shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM)
+            numbers[tile] = sorted(int(k) for k in tree.query(box))
+        return numbers
+
+    def override(
+        self, joined: Joined, overrides: Sequence[Override], ingested: Sequence[Ingested]
+    ) -> tuple[Joined, tuple[EntryOutcome, ...]]:
+        """The candidates after the user's overrides, and what became of each entry."""
+        started = time.perf_counter()
+        outcomes = outcomes_of(overrides, joined, self.scratch, self.plan.grid)
+        redrawn: dict[str, tuple[PointRange, ...]] = {}
+        for number, layer in enumerate(layers_of(outcomes)):
+            redrawn |= self._redrawn(layer, ingested, f"redrawn-{number}")
+        changed = overridden(joined, outcomes, redrawn, self.scratch)
+        timings = self.progress.timings
+        timings["join"] = timings.get("join", 0.0) + time.perf_counter() - started - timings.get("redraw", 0.0)
+        return changed, outcomes
+
+    def _redrawn(
+        self, layer: Sequence[EntryOutcome], ingested: Sequence[Ingested], folder: str
+    ) -> dict[str, tuple[PointRange, ...]]:
+        """The points inside the other footprints of some buildings, by building_id; kept in a folder of the scratch."""
+        named = [(str(o.building_id), o.effective.footprint) for o in layer if o.effective and o.effective.footprint]
+        classes, _ = classes_in_use(ingested, trust=self.settings.general.classes == "trust")
+        if accepts(layer):
+            # the user knows better than the classes, which say that there is no building
+            classes = dataclasses.replace(classes, building=False)
+        polygons = [polygon for _, polygon in named]
+        numbers_of = self._numbers_of(points_by_tile(ingested), polygons)
+        tasks = [
+            SplitTask(
+                tile=tile,
+                grid=self.plan.grid,
+                settings=self.settings.scene,
+                classes=classes,
+                scratch=self.scratch,
+                footprints=tuple((k, polygons[k]) for k in numbers),
+                folder=folder,
+            )
+            for tile, numbers in sorted(numbers_of.items())
+            if numbers
+        ]
+        splits = self.progress.stage(self.executor, "redraw", split, tasks)
+        sites = join_footprints(splits, self.plan.grid, polygons, [name for name, _ in named], "").candidates
+        return {
+            str(site.source_id): tuple(dataclasses.replace(part, folder=folder) for part in site.ranges)
+            for site in sites
+        }
+
     def join(self, splits: Sequence[Split], footprints: GivenFootprints | None, reference: SpatialReference) -> Joined:
         """Whole surfaces, judged."""
         started = time.perf_counter()
         self.progress.tell("stage", "join", total=1)
         crs_name = f"EPSG:{reference.epsg}" if reference.epsg is not None else reference.name
         if footprints is None:
-            joined = join(splits, self.plan.grid, self.settings.scene.candidates, crs_name)
+            joined = self._divided(join(splits, self.plan.grid, self.settings.scene.candidates, crs_name), crs_name)
         else:
-            joined = join_footprints(splits, self.plan.grid, footprints.polygons, footprints.ids, crs_name)
+            joined = join_footprints(
+                splits, self.plan.grid, footprints.polygons, footprints.ids, crs_name, footprints.attributes
+            )
         self.progress.timings["join"] = time.perf_counter() - started
         self.progress.tell("progress", "join", done=1, total=1, message=f"{len(joined.candidates)} candidates")
         return joined
 
+    def _divided(self, joined: Joined, crs_name: str) -> Joined:
+        """The candidates with their units told apart; part of the join, so no stage of its own."""
+        settings = self.settings.scene.units
+        if settings.split == "nothing":
+            return joined
+        tasks = unit_tasks(joined.candidates, settings, self.plan.grid, self.scratch, crs_name)
+        sites: list[CandidateSite] = []
+        with contextlib.closing(self.executor.map("join", divide, tasks, self.progress.watch)) as running:
+            for measured in running:
+                sites.extend(measured.result)
+                peaks = self.progress.peaks
+                peaks[measured.process] = max(peaks.get(measured.process, 0), measured.peak_bytes)
+        return dataclasses.replace(joined, candidates=tuple(sorted(sites, key=lambda c: (-c.points, c.building_id))))
+
     def reconstruct(self, joined: Joined) -> list[Modelled]:
         """All candidates, largest first."""
-        kinds = {info.gps_time_kind for info in self.plan.sources}
-        kind = kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
         tasks = [
             BatchTask(
                 number=number,
@@ -290,10 +386,15 @@ class Stages:
                 settings=self.settings.building,
                 grid=self.plan.grid,
                 scratch=self.scratch,
-                gps_kind=kind,
+                gps_kind=self.gps_kind,
                 isolation=self.isolation,
                 quarantine=self.quarantine,
                 reference=self.plan.sources[0].reference,
+                own={
+                    site.building_id: own_modelling(site.override, self.settings)
+                    for site in sites
+                    if site.override is not None and site.override.remodels
+                },
             )
             for number, sites in self._numbered(joined)
         ]
@@ -306,6 +407,32 @@ class Stages:
         """The batches of this variant, by numbers that no other variant uses."""
         groups = batches(joined.candidates)
         return list(enumerate(groups, start=self.variant * len(groups)))
+
+    def record_context(self, reference: SpatialReference) -> RecordContext:
+        """Facts of the run for its records."""
+        times = [(i.acquired_from, i.acquired_to) for i in self.plan.sources]
+        known = [(a, b) for a, b in times if a is not None and b is not None]
+        return RecordContext(
+            reference=reference,
+            settings_hash=self.settings.settings_hash,
+            engine_version=__version__,
+            acquired_from=min((a for a, _ in known), default=None),
+            acquired_to=max((b for _, b in known), default=None),
+        )
+
+    def stored(self, joined: Joined) -> list[StoredResult]:
+        """The models of all candidates, after `reconstruct`."""
+        found = []
+        for number, sites in self._numbered(joined):
+            for tile in sorted({site.owner for site in sites}):
+                found.extend(stored_results(self.scratch, tile, number))
+        return found
+
+    @property
+    def gps_kind(self) -> GpsTimeKind:
+        """Whether the GPS times of all inputs tell dates."""
+        kinds = {info.gps_time_kind for info in self.plan.sources}
+        return kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
 
     def publish(
         self,
@@ -324,15 +451,7 @@ class Stages:
         for site in joined.rejected:
             rejected.setdefault(site.owner, []).append(site)
         owners = sorted({*numbers, *rejected, *(s.tile for s in splits)})
-        times = [(i.acquired_from, i.acquired_to) for i in self.plan.sources]
-        known = [(a, b) for a, b in times if a is not None and b is not None]
-        context = RecordContext(
-            reference=reference,
-            settings_hash=self.settings.settings_hash,
-            engine_version=__version__,
-            acquired_from=min((a for a, _ in known), default=None),
-            acquired_to=max((b for _, b in known), default=None),
-        )
+        context = self.record_context(reference)
         tasks = [
             PublishTask(
                 tile=tile,

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.model import FloatArray
 from pipeline.synthetic.city_blocks import BLOCK_M, CITY_AZIMUTH_DEG, STREET_M, TALLEST_M, Block
-from pipeline.synthetic.scene import Scene, Terrain, turned
+from pipeline.synthetic.scene import Scene, Terrain, turned, undulating_terrain
 from pipeline.synthetic.strips import ScannerSettings, reach_m
 
 Extent = tuple[float, float, float, float]
@@ -22,6 +22,7 @@ STEEPEST_DEG = 29.0
 """Of the hillside; the gentle waves over it add less than a degree."""
 _HILL_LENGTH_M, _HILL_MIDDLE_M, _HILL_AZIMUTH_DEG = 3200.0, 1000.0, 80.0
 _BASE_Z_M = 260.0
+_WAVE_M, _WAVE_LENGTH_M = 0.3, 190.0
 _BLOCK_REACH_M = math.hypot(BLOCK_M[0] + STREET_M, BLOCK_M[1] + STREET_M) / 2 + 5.0
 _BLOCKS_KEPT = 600
 
@@ -60,6 +61,21 @@ def city_terrain(seed: int) -> Terrain:
     return Terrain(base_z_m=_BASE_Z_M, waves=waves)
 
 
+def hillside(seed: int, slope_deg: float) -> Terrain:
+    """A plane of one slope all over, its aspect drawn, with waves over it that add less than a degree.
+
+    Parameters
+    ----------
+    seed : int
+        Of the aspect and the waves; not negative.
+    slope_deg : float
+        0 to `STEEPEST_DEG` + 1; 0 is level ground with the waves alone.
+    """
+    random = np.random.default_rng([seed, 0xC2])
+    aspect_deg = float(random.uniform(0.0, 360.0))
+    return undulating_terrain(_BASE_Z_M, slope_deg, aspect_deg, _WAVE_M, _WAVE_LENGTH_M, random)
+
+
 class CityPlan:
     """A city that is made where it is looked at.
 
@@ -73,16 +89,23 @@ class CityPlan:
         The survey: says how far a tile can see.
     name : str
         Name of the scene, and of its buildings.
+    terrain : Terrain, optional
+        The ground; `city_terrain` by default.
     """
 
     def __init__(
-        self, seed: int, size_m: tuple[float, float], settings: ScannerSettings = CITY_SCANNER, name: str = "city"
+        self,
+        seed: int,
+        size_m: tuple[float, float],
+        settings: ScannerSettings = CITY_SCANNER,
+        name: str = "city",
+        terrain: Terrain | None = None,
     ) -> None:
         self.seed = seed
         self.size_m = size_m
         self.settings = settings
         self.name = name
-        self.terrain = city_terrain(seed)
+        self.terrain = city_terrain(seed) if terrain is None else terrain
         self._blocks: OrderedDict[tuple[int, int], Block] = OrderedDict()
 
     @property

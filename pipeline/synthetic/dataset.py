@@ -41,6 +41,9 @@ _TRUTH_FOLDERS = ("labels", "buildings", "planes", "rejected", "meshes", "cityjs
 _TILED_CHUNK_POINTS = 250_000
 """The scanner goes on while a chunk is compressed; small ones keep it busy."""
 
+_STEEPEST_DEG = 30.0
+"""Of the ground that a city can be put on."""
+
 OnPoints = Callable[[int], None]
 Extent = tuple[float, float, float, float]
 """Smallest x, smallest y, largest x, largest y in the scene frame."""
@@ -76,6 +79,7 @@ def simulate(
     density_per_m2: float | None = None,
     noise_m: float | None = None,
     scanner: ScannerSettings | None = None,
+    slope_deg: float | None = None,
     with_classes: bool = False,
     chunk_points: int = 1_000_000,
     on_points: OnPoints | None = None,
@@ -96,6 +100,8 @@ def simulate(
         Pulse density and range noise in place of the suite's; of a suite of several surveys, which of its cells.
     scanner : ScannerSettings, optional
         A whole survey in place of the suite's.
+    slope_deg : float, optional
+        Put a city on ground of this slope all over, 0 to 30 deg, in place of its plain and hillside.
     with_classes : bool
         Write the true classes into the LAZ too; by default all points are class 1 (unclassified).
     chunk_points : int
@@ -118,10 +124,16 @@ def simulate(
     plan = suite_named(suite)
     seed = plan.seed if seed is None else seed
     faults = _faults(plan, seed, size_m)
+    if slope_deg is not None and plan.on_slope is None:
+        faults.append(f"{plan.name} has ground of its own: leave out slope_deg")
+    elif slope_deg is not None and not 0.0 <= slope_deg <= _STEEPEST_DEG:
+        faults.append(f"slope_deg is {slope_deg:g}: use 0 to {_STEEPEST_DEG:g}")
     if "://" in str(out_dir):
         faults.append(f"out is {out_dir}: simulate writes to a folder of this machine")
     if faults:
         raise SettingsError(faults)
+    if slope_deg is not None:
+        plan = _sloped(plan, slope_deg)
     writing = _Writing(
         plan=plan,
         seed=seed,
@@ -141,6 +153,14 @@ def simulate(
     if plan.part is not None:
         return _simulate_tiles(writing, settings, out)
     return _simulate_one(writing, settings, plan.make(seed, writing.size_m), out)
+
+
+def _sloped(plan: Suite, slope_deg: float) -> Suite:
+    """The suite on ground of one slope."""
+    on_slope = plan.on_slope
+    if on_slope is None:
+        raise TypeError(f"{plan.name} has ground of its own")
+    return dataclasses.replace(plan, part=lambda seed, size_m, settings: on_slope(seed, size_m, settings, slope_deg))
 
 
 def _faults(plan: Suite, seed: int, size_m: tuple[float, float] | None) -> list[str]:

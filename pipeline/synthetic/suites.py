@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.errors import SettingsError
 from pipeline.synthetic.als import ScannerSettings
-from pipeline.synthetic.city import CITY_SCANNER, TILE_M, CityPlan, Extent, city
+from pipeline.synthetic.city import CITY_SCANNER, TILE_M, CityPlan, Extent, city, hillside
 from pipeline.synthetic.hofmann310 import SCANNER as HOFMANN_SCANNER
 from pipeline.synthetic.hofmann310 import hofmann310
 from pipeline.synthetic.roofs import FlatPart, RoofDimensions, RoofShape
@@ -47,6 +47,8 @@ class Suite:
     scene is made as a whole."""
     tile_m: float = 0.0
     """Edge of the tiles of a suite that is made in parts."""
+    on_slope: Callable[[int, tuple[float, float], ScannerSettings, float], Callable[[Extent], Scene]] | None = None
+    """As `part`, on ground of one slope in degrees all over; None where the suite has ground of its own alone."""
 
 
 def _suburb(seed: int, size_m: tuple[float, float]) -> Scene:
@@ -73,6 +75,12 @@ def _city(seed: int, size_m: tuple[float, float]) -> Scene:
 
 def _city_part(seed: int, size_m: tuple[float, float], settings: ScannerSettings) -> Callable[[Extent], Scene]:
     return CityPlan(seed, size_m, settings).part
+
+
+def _city_on_slope(
+    seed: int, size_m: tuple[float, float], settings: ScannerSettings, slope_deg: float
+) -> Callable[[Extent], Scene]:
+    return CityPlan(seed, size_m, settings, terrain=hillside(seed, slope_deg)).part
 
 
 def _cube(seed: int, size_m: tuple[float, float]) -> Scene:
@@ -252,6 +260,7 @@ SUITES: dict[str, Suite] = {
             seed=1,
             part=_city_part,
             tile_m=TILE_M,
+            on_slope=_city_on_slope,
         ),
         *(_single_suite(shape) for shape in RoofShape),
     )

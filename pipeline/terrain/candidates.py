@@ -9,6 +9,7 @@ cannot outvote the roof's own eaves.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -30,11 +31,30 @@ class CandidateSettings(Parameters):
         maximum=100.0,
     )
     min_area_m2: float = parameter(
-        10.0, "Least plan area of a building's surface.", unit="m2", minimum=1.0, maximum=1000.0
+        5.0, "Least plan area of a surface that is surely a roof.", unit="m2", minimum=1.0, maximum=1000.0
+    )
+    sure_planar_share: float = parameter(
+        0.75,
+        "Share of vertices with planar surroundings from which a surface is surely a roof.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    max_slenderness: float = parameter(
+        3.0,
+        "Largest height over mean width of a small surface that is surely a roof.",
+        minimum=0.5,
+        maximum=100.0,
+    )
+    doubtful_area_m2: float = parameter(
+        20.0, "Least plan area of a building's surface that is not.", unit="m2", minimum=1.0, maximum=1000.0
     )
     min_height_m: float = parameter(2.0, "Least mean height above the terrain.", unit="m", minimum=0.5, maximum=20.0)
     min_width_m: float = parameter(
-        1.5, "Least mean width, twice the area over the outline.", unit="m", minimum=0.0, maximum=20.0
+        2.0,
+        "Least mean width, twice the area over the outline; half of it for what is surely a roof.",
+        unit="m",
+        minimum=0.0,
+        maximum=20.0,
     )
     min_planar_share: float = parameter(
         0.5, "Least share of vertices with planar surroundings.", minimum=0.0, maximum=1.0
@@ -88,13 +108,17 @@ class Verdict:
 
 def _figures(sums: IntArray) -> dict[str, float]:
     """The measures of one surface in metres and shares."""
-    area_m2 = float(sums[Sum.AREA2]) / 2e6
+    facets_mm2 = float(sums[Sum.AREA2]) / 2.0
     outline_mm = max(1, int(sums[Sum.BOUNDARY]))
+    # the facets end at the outermost points, half a spacing inside the edges: grown by that (Steiner's formula)
+    half_mm = 0.5 * math.sqrt(2.0 * facets_mm2 / max(1, int(sums[Sum.FACETS])))
+    area_mm2 = facets_mm2 + half_mm * outline_mm + math.pi * half_mm * half_mm
+    grown_outline_mm = outline_mm + 2.0 * math.pi * half_mm
     judged = max(1, int(sums[Sum.PLANAR] + sums[Sum.ROUGH]))
     return {
-        "area_m2": area_m2,
+        "area_m2": area_mm2 / 1e6,
         "height_m": float(sums[Sum.HEIGHT]) / max(1, int(sums[Sum.VERTICES])) / 1000.0,
-        "width_m": 2000.0 * area_m2 / (outline_mm / 1000.0) / 1000.0,
+        "width_m": 2.0 * area_mm2 / grown_outline_mm / 1000.0,
         "planar_share": float(sums[Sum.PLANAR]) / judged,
         "judged": float(sums[Sum.PLANAR] + sums[Sum.ROUGH]),
         "canopy_share": float(sums[Sum.CANOPY]) / max(1, int(sums[Sum.CANOPY] + sums[Sum.POINTS])),
@@ -117,15 +141,22 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
         The thresholds.
     """
     f = _figures(sums)
-    if f["area_m2"] < settings.min_area_m2:
-        return Verdict(reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {settings.min_area_m2:g}")
+    sure = f["judged"] > 0 and f["planar_share"] >= settings.sure_planar_share
+    sure = sure and f["canopy_share"] <= settings.max_canopy_share
+    slender = f["height_m"] > settings.max_slenderness * f["width_m"]
+    sure = sure and (f["area_m2"] >= settings.doubtful_area_m2 or not slender)
+    least_m2 = settings.min_area_m2
+    if kind != FacetKind.BUILDING and not sure:
+        least_m2 = max(least_m2, settings.doubtful_area_m2)
+    if f["area_m2"] < least_m2:
+        return Verdict(reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {least_m2:g}")
     if kind == FacetKind.BUILDING:
         return None
     if f["height_m"] < settings.min_height_m:
         return Verdict(
             reason=Reason.TOO_LOW, detail=f"mean height {f['height_m']:.2f} m, at least {settings.min_height_m:g}"
         )
-    if f["judged"] > 0 and f["planar_share"] < settings.min_planar_share:
+    if kind == FacetKind.CROWN or (f["judged"] > 0 and f["planar_share"] < settings.min_planar_share):
         return Verdict(
             reason=Reason.VEGETATION,
             detail=f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}",
@@ -135,16 +166,15 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
             reason=Reason.VEGETATION,
             detail=f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}",
         )
-    if f["width_m"] < settings.min_width_m:
-        return Verdict(
-            reason=Reason.TOO_NARROW, detail=f"mean width {f['width_m']:.2f} m, at least {settings.min_width_m:g}"
-        )
+    width_m = settings.min_width_m * (0.5 if sure else 1.0)
+    if f["width_m"] < width_m:
+        return Verdict(reason=Reason.TOO_NARROW, detail=f"mean width {f['width_m']:.2f} m, at least {width_m:g}")
     if f["wall_share"] < settings.min_wall_share:
         return Verdict(
             reason=Reason.NO_WALLS,
             detail=f"walls along {f['wall_share']:.2f} of the outline, at least {settings.min_wall_share:g}",
         )
-    if f["top_share"] < settings.min_top_share:
+    if not sure and f["top_share"] < settings.min_top_share:
         z_avg = float(sums[Sum.WALLS_Z_MX]) / max(1, int(sums[Sum.WALLS])) / 1000.0
         own = float(sums[Sum.WALLS_OWN_Z]) / max(1, int(sums[Sum.WALLS])) / 1000.0
         return Verdict(
@@ -158,7 +188,7 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
 def is_object(kind: int, sums: IntArray, settings: CandidateSettings) -> bool:
     """Whether a surface is large enough to be listed at all, as candidate or rejected."""
     large_enough = bool(sums[Sum.AREA2] >= 2e6 * settings.min_object_area_m2)
-    return kind in {FacetKind.OBJECT, FacetKind.BUILDING} and large_enough
+    return kind in {FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN} and large_enough
 
 
 def _joins(kind: int, sums: IntArray, verdict: Verdict | None, settings: CandidateSettings) -> bool:

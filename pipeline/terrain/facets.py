@@ -30,6 +30,8 @@ class FacetKind(IntEnum):
     """All vertices are building by the file's trusted classes."""
     STEP = 5
     """A wall between two levels that both stand well above the ground."""
+    CROWN = 6
+    """Some vertex has rough surroundings, as crowns of trees have; no vertex is ground."""
 
 
 class VertexKind(IntEnum):
@@ -40,6 +42,8 @@ class VertexKind(IntEnum):
     BUILDING = 2
     EXCLUDED = 3
     """Vegetation, water or a bridge by the file's trusted classes."""
+    CROWN = 4
+    """Stands above the ground among rough surroundings."""
 
 
 @njit(cache=True, nogil=True)
@@ -91,8 +95,10 @@ def classify_facets(
         if cuts:
             high = min(height[a], height[b], height[c]) >= step_mm
             out[f] = FacetKind.STEP if high else FacetKind.BORDER
-        elif kind[a] == kind[b] and kind[b] == kind[c]:
+        elif kind[a] == kind[b] and kind[b] == kind[c] and kind[a] != 4:
             out[f] = FacetKind.BUILDING if kind[a] == 2 else FacetKind.OBJECT
+        elif kind[a] != 2 and kind[b] != 2 and kind[c] != 2:
+            out[f] = FacetKind.CROWN
         else:
             out[f] = FacetKind.BORDER
     return out
@@ -166,18 +172,20 @@ def label_fragments(kinds: KindArray, neighbours: LabelArray, considered: BoolAr
 
 @njit(cache=True, nogil=True)
 def label_vertices(x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArray, label: LabelArray) -> LabelArray:
-    """Fragment of every vertex: that of its largest object or building facet; -1 where there is none.
+    """Fragment of every vertex: that of its largest object or building facet, else crown; -1 where there is none.
 
     Equal areas are decided by the smallest centroid, so that all tiles agree.
     """
     n = x.size
     out = np.full(n, -1, np.int32)
+    on_solid = np.zeros(n, np.bool_)
     best_area = np.zeros(n, np.int64)
     best_x = np.zeros(n, np.int64)
     best_y = np.zeros(n, np.int64)
     for f in range(facets.shape[0]):
-        if label[f] < 0 or (kinds[f] != 3 and kinds[f] != 4):
+        if label[f] < 0 or (kinds[f] != 3 and kinds[f] != 4 and kinds[f] != 6):
             continue
+        solid = kinds[f] != 6
         a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
         area2 = (x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a])
         cx, cy = x[a] + x[b] + x[c], y[a] + y[b] + y[c]
@@ -186,8 +194,11 @@ def label_vertices(x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArra
             better = out[v] < 0 or area2 > best_area[v]
             if not better and area2 == best_area[v]:
                 better = cx < best_x[v] or (cx == best_x[v] and cy < best_y[v])
+            if out[v] >= 0 and solid != on_solid[v]:
+                better = solid
             if better:
                 out[v] = label[f]
+                on_solid[v] = solid
                 best_area[v] = area2
                 best_x[v] = cx
                 best_y[v] = cy

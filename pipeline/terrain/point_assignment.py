@@ -171,7 +171,9 @@ def assign_points(
                     fragment = vertex_label[v]
             if best > reach_mm:
                 fragment = -1
-        if fragment < 0 or (fragment_kind[fragment] != 3 and fragment_kind[fragment] != 4):
+        if fragment < 0 or (
+            fragment_kind[fragment] != 3 and fragment_kind[fragment] != 4 and fragment_kind[fragment] != 6
+        ):
             continue
         if fragment_kind[fragment] == 4 and allowed[i] != 2:
             continue

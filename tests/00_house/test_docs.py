@@ -13,10 +13,12 @@ from types import ModuleType
 import pytest
 
 from pipeline.export.records import SCHEMAS
+from pipeline.io import SpatialReference
 from pipeline.methods.fuzzy_sart import FuzzySartSettings
 from pipeline.model import Reason, RoofType, Status
 from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings
+from pipeline.runtime.overrides import overrides_of
 from pipeline.settings import RunSettings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -103,11 +105,26 @@ def toml_blocks() -> list[tuple[str, str]]:
     ]
 
 
-@pytest.mark.parametrize(("page", "block"), toml_blocks())
+def is_overrides(block: str) -> bool:
+    return "[[building]]" in block
+
+
+@pytest.mark.parametrize(("page", "block"), [(page, block) for page, block in toml_blocks() if not is_overrides(block)])
 def test_a_settings_file_of_the_docs_is_valid(page: str, block: str) -> None:
     settings = RunSettings.from_mapping(tomllib.loads(block)["settings"])
     if page == "docs/methods/fuzzy_sart.md":
         assert settings.building.method == FuzzySartSettings.faithful()
+
+
+def test_the_overrides_files_of_the_docs_are_valid() -> None:
+    reference = SpatialReference()
+    outlines = re.compile(r"footprint = \{[^}]*\}")
+    found = []
+    for _, block in toml_blocks():
+        if is_overrides(block):
+            document = tomllib.loads(outlines.sub('footprint = "POLYGON ((0 0, 1 0, 1 1, 0 0))"', block))
+            found += overrides_of(document, reference, RunSettings())
+    assert {entry.action for entry in found} == {None, "accept", "reject"}
 
 
 @pytest.mark.parametrize("table", list(SCHEMAS))
@@ -183,6 +200,9 @@ def test_a_command_of_the_docs_is_one_that_exists(generator: ModuleType, page: s
     if words[0] == "make":
         targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert [word for word in words[1:] if "=" not in word and word not in targets] == []
+        return
+    if words[:2] == [".venv/bin/python", "-m"]:
+        assert (ROOT / (words[2].replace(".", "/") + ".py")).is_file(), f"{page}: {line}"
         return
     assert words[0] == ".venv/bin/gablework", f"{page}: {line}"
     known = generator.commands()

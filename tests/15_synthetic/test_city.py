@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 
+from pipeline.errors import SettingsError
 from pipeline.evaluation.reading import read_models
 from pipeline.model import FloatArray
 from pipeline.synthetic import suites
@@ -222,3 +223,24 @@ def test_a_city_is_written_in_bounded_memory(tmp_path: Path) -> None:
     assert many > 3.6 * few
     assert large_kb - small_kb < 150_000
     assert large_kb < 1_500_000
+
+
+@pytest.mark.parametrize("slope_deg", [0.0, 20.0, 30.0])
+def test_a_city_on_a_hillside_has_one_slope_all_over(tmp_path: Path, slope_deg: float) -> None:
+    made = simulate("city", tmp_path, 9, size_m=(90.0, 80.0), scanner=SPARSE, slope_deg=slope_deg)
+    table = pq.read_table(made.truth / "conditions.parquet")
+    slopes = np.array(table["terrain_slope_deg"].to_pylist())
+    assert len(slopes) > 2
+    assert np.abs(slopes - slope_deg).max() < 1.0
+    truth = read_truth(made.truth)
+    ground = laspy.read(made.laz / "city_x0_y0.laz").xyz[truth.classification == 2]
+    fitted = np.linalg.lstsq(np.column_stack((ground[:, :2] - ground[0, :2], np.ones(len(ground)))), ground[:, 2])[0]
+    assert np.degrees(np.arctan(np.hypot(*fitted[:2]))) == pytest.approx(slope_deg, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("suite", "slope_deg", "told"), [("suburb", 10.0, "ground of its own"), ("city", 31.0, "slope_deg is 31")]
+)
+def test_a_slope_that_cannot_be_is_refused(tmp_path: Path, suite: str, slope_deg: float, told: str) -> None:
+    with pytest.raises(SettingsError, match=told):
+        simulate(suite, tmp_path, slope_deg=slope_deg)

@@ -37,7 +37,20 @@ ROOF: dict[Sum, int] = {
     Sum.WALLS_OWN_Z: 80 * 8100,
     Sum.POINTS: 1600,
 }
-"""A flat roof of 100 m2, 5 m above the ground, walls all around."""
+"""A flat roof of 100 m2, 5 m above the ground, walls all around; its edges lie 0.25 m beyond its outermost points."""
+
+DOUBTFUL: dict[Sum, int] = {Sum.PLANAR: 240, Sum.ROUGH: 160}
+"""Planar enough for a building, not enough to be sure of it."""
+
+SHED: dict[Sum, int] = {
+    Sum.FACETS: 24,
+    Sum.AREA2: 6_100_000,
+    Sum.HEIGHT: 400 * 3000,
+    Sum.BOUNDARY: 7000,
+    Sum.WALL: 7000,
+    Sum.WALL_TOP: 7000,
+}
+"""Facets of 3.05 m2 whose edges enclose 5.01 m2, 3 m above the ground and 1.17 m wide in the mean."""
 
 
 def sums_of(changes: dict[Sum, int] | None = None) -> IntArray:
@@ -59,14 +72,24 @@ def test_a_roof_with_walls_around_it_is_a_candidate() -> None:
 @pytest.mark.parametrize(
     ("changes", "reason", "detail"),
     [
-        ({Sum.AREA2: 19_800_000}, Reason.TOO_SMALL, "area 9.9 m2, at least 10"),
+        ({**SHED, Sum.AREA2: 6_000_000}, Reason.TOO_SMALL, "area 4.9 m2, at least 5"),
+        (
+            {**DOUBTFUL, Sum.FACETS: 80, Sum.AREA2: 20_000_000, Sum.BOUNDARY: 30_000},
+            Reason.TOO_SMALL,
+            "area 17.7 m2, at least 20",
+        ),
         ({Sum.HEIGHT: 400 * 1500}, Reason.TOO_LOW, "mean height 1.50 m, at least 2"),
         ({Sum.PLANAR: 40, Sum.ROUGH: 60}, Reason.VEGETATION, "planar share 0.40, at least 0.5"),
         ({Sum.CANOPY: 1600}, Reason.VEGETATION, "canopy share 0.50, at most 0.35"),
-        ({Sum.BOUNDARY: 200_000, Sum.WALL: 200_000}, Reason.TOO_NARROW, "mean width 1.00 m, at least 1.5"),
+        (
+            {**DOUBTFUL, Sum.BOUNDARY: 200_000, Sum.WALL: 200_000},
+            Reason.TOO_NARROW,
+            "mean width 1.49 m, at least 2",
+        ),
+        ({Sum.BOUNDARY: 600_000, Sum.WALL: 600_000}, Reason.TOO_NARROW, "mean width 0.83 m, at least 1"),
         ({Sum.WALL: 4000, Sum.WALL_TOP: 4000}, Reason.NO_WALLS, "walls along 0.10 of the outline, at least 0.15"),
         (
-            {Sum.WALL_TOP: 8000},
+            {**DOUBTFUL, Sum.WALL_TOP: 8000},
             Reason.BELOW_Z_AVG,
             "at the top of 0.20 of its walls, at least 0.3 (own 8.10 m, Z_avg 8.20 m)",
         ),
@@ -79,15 +102,16 @@ def test_each_reason_names_its_figure_and_threshold(changes: dict[Sum, int], rea
 @pytest.mark.parametrize(
     ("at_limit", "beyond"),
     [
-        (
-            {Sum.AREA2: 20_000_000, Sum.BOUNDARY: 13_000, Sum.WALL: 13_000, Sum.WALL_TOP: 13_000},
-            {Sum.AREA2: 19_999_999, Sum.BOUNDARY: 13_000, Sum.WALL: 13_000, Sum.WALL_TOP: 13_000},
-        ),
+        (SHED, {**SHED, Sum.AREA2: 6_000_000}),
+        # a small surface is no sure roof where it stands high and narrow
+        ({**SHED, Sum.HEIGHT: 400 * 3450}, {**SHED, Sum.HEIGHT: 400 * 3550}),
+        # a sure roof may lie at the foot of its walls, as annexes do
+        ({Sum.PLANAR: 300, Sum.ROUGH: 100, Sum.WALL_TOP: 0}, {Sum.PLANAR: 299, Sum.ROUGH: 101, Sum.WALL_TOP: 0}),
         ({Sum.HEIGHT: 400 * 2000}, {Sum.HEIGHT: 400 * 2000 - 1}),
         ({Sum.PLANAR: 50, Sum.ROUGH: 50}, {Sum.PLANAR: 49, Sum.ROUGH: 51}),
         ({Sum.POINTS: 65, Sum.CANOPY: 35}, {Sum.POINTS: 64, Sum.CANOPY: 36}),
         ({Sum.WALL: 6000, Sum.WALL_TOP: 6000}, {Sum.WALL: 5999, Sum.WALL_TOP: 5999}),
-        ({Sum.WALL_TOP: 12_000}, {Sum.WALL_TOP: 11_999}),
+        ({**DOUBTFUL, Sum.WALL_TOP: 12_000}, {**DOUBTFUL, Sum.WALL_TOP: 11_999}),
     ],
 )
 def test_a_figure_at_its_threshold_passes_and_one_beyond_fails(
@@ -97,14 +121,20 @@ def test_a_figure_at_its_threshold_passes_and_one_beyond_fails(
     assert judged(beyond) is not None
 
 
+def test_a_crown_is_vegetation_whatever_its_figures() -> None:
+    verdict = judged({}, FacetKind.CROWN)
+    assert verdict is not None
+    assert verdict.reason == Reason.VEGETATION
+
+
 def test_what_nothing_tells_about_planarity_is_not_called_vegetation() -> None:
     assert judged({Sum.PLANAR: 0, Sum.ROUGH: 0}) is None
 
 
 def test_building_by_trusted_classes_needs_only_its_area() -> None:
-    bare: dict[Sum, int] = {column: 0 for column in ROOF if column not in {Sum.AREA2, Sum.POINTS}}
+    bare: dict[Sum, int] = {column: 0 for column in ROOF if column not in {Sum.FACETS, Sum.AREA2, Sum.POINTS}}
     assert judged(bare, FacetKind.BUILDING) is None
-    small = judged({**bare, Sum.AREA2: 10_000_000}, FacetKind.BUILDING)
+    small = judged({**bare, Sum.AREA2: 8_000_000}, FacetKind.BUILDING)
     assert small is not None
     assert small.reason == Reason.TOO_SMALL
 
@@ -115,6 +145,7 @@ def test_building_by_trusted_classes_needs_only_its_area() -> None:
         (FacetKind.OBJECT, 4.0, True),
         (FacetKind.OBJECT, 3.9, False),
         (FacetKind.BUILDING, 4.0, True),
+        (FacetKind.CROWN, 4.0, True),
         (FacetKind.STEP, 100.0, False),
         (FacetKind.GROUND, 100.0, False),
         (FacetKind.GROUND, 500.0, False),

@@ -152,7 +152,9 @@ def slow_kind(scene: Scene, facet: npt.NDArray[np.int32]) -> FacetKind:
         return FacetKind.STEP if v.height_mm[facet].min() >= 2000 else FacetKind.BORDER
     if (kinds == VertexKind.OBJECT).all():
         return FacetKind.OBJECT
-    return FacetKind.BUILDING if (kinds == VertexKind.BUILDING).all() else FacetKind.BORDER
+    if (kinds == VertexKind.BUILDING).any():
+        return FacetKind.BUILDING if (kinds == VertexKind.BUILDING).all() else FacetKind.BORDER
+    return FacetKind.CROWN
 
 
 def test_facet_kinds_agree_with_a_slow_twin() -> None:
@@ -162,6 +164,7 @@ def test_facet_kinds_agree_with_a_slow_twin() -> None:
     x = scene.vertices.x_mm
     kind[(x > 20_000) & (kind == VertexKind.OBJECT)] = VertexKind.BUILDING
     kind[(random.random(len(kind)) < 0.02) & (kind != VertexKind.GROUND)] = VertexKind.EXCLUDED
+    kind[(random.random(len(kind)) < 0.05) & (kind == VertexKind.OBJECT)] = VertexKind.CROWN
     gap = in_box(x / 1000, scene.vertices.y_mm / 1000, 22, 26, 39, 32)
     kept = np.flatnonzero(~gap | (random.random(len(x)) < 0.02))
     v = SceneVertices(

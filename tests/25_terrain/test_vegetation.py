@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.model import KindArray
-from pipeline.terrain.vegetation import VegetationSettings, planarity, smallest_eigenvalue
+from pipeline.terrain.vegetation import VegetationSettings, crowns, planarity, smallest_eigenvalue
 
 Points = npt.NDArray[np.int64]
 
@@ -41,6 +41,7 @@ def slow_twin(points: Points, index: int, vegetation: VegetationSettings) -> int
         radius = round(vegetation.radius_m * 1000) * 2**scale
         shift, diagonal = 4 * radius // 5, 566 * radius // 1000
         offset = points - points[index]
+        offset = offset[np.abs(offset[:, 2]) <= vegetation.level_m * 1000]
         eigenvalues = []
         for k, (u, v) in enumerate([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)]):
             step = diagonal if k > 4 else shift
@@ -172,3 +173,42 @@ def test_the_judgement_looks_no_further_than_its_support() -> None:
     cut = verdicts(points[near])
     np.testing.assert_array_equal(cut[inner[near]], verdicts(points)[inner])
     assert len(set(cut[inner[near]].tolist())) >= 2
+
+
+def test_crowns_are_those_of_a_slow_twin() -> None:
+    random = np.random.default_rng(11)
+    points = np.concatenate((flat(random, 3.0), crown(random, 250)))
+    planar = random.choice(np.array([-1, 0, 0, 1, 1], np.int8), len(points))
+    several = random.random(len(points)) < 0.12
+    settings = VegetationSettings()
+    found = crowns(*points.T.copy(), planar, several, settings)
+    expected = []
+    for k, point in enumerate(points):
+        near = (((points - point) ** 2).sum(axis=1) <= 2000**2) & (planar >= 0)
+        rough, pierced = (planar[near] == 0).sum(), several[near].sum()
+        expected.append(planar[k] >= 0 and rough > 0.5 * near.sum() and pierced > 0.1 * near.sum())
+    assert found.tolist() == expected
+    assert 0 < found.sum() < (planar >= 0).sum()
+
+
+def test_a_tree_of_several_returns_is_a_crown_and_a_chimney_is_not() -> None:
+    random = np.random.default_rng(12)
+    roof = flat(random, 4.0)
+    chimney = np.hypot(roof[:, 0] - 6000, roof[:, 1] - 6000) < 500
+    roof[chimney, 2] += 1200
+    tree = crown(random, 340) + np.array([40_000, 0, 0])
+    points = np.concatenate((roof, tree))
+    several = np.append(np.zeros(len(roof), np.bool_), random.random(len(tree)) < 0.4)
+    found = crowns(*points.T.copy(), verdicts(points), several, VegetationSettings())
+    assert not found[: len(roof)].any()
+    assert found[len(roof) :].mean() > 0.8
+    # single returns say nothing of crowns
+    assert not crowns(*points.T.copy(), verdicts(points), np.zeros(len(points), np.bool_), VegetationSettings()).any()
+
+
+def test_points_across_a_wall_do_not_make_a_narrow_roof_rough() -> None:
+    random = np.random.default_rng(13)
+    xy = scattered(random, 14.0, 4.0)
+    roof = np.abs(xy[:, 0] - 7.0) < 1.0
+    points = in_mm(xy[:, 0], xy[:, 1], np.where(roof, 3.0, 0.0) + random.normal(0, 0.02, len(xy)))
+    assert (verdicts(points)[roof] == 1).mean() > 0.95

@@ -35,11 +35,11 @@ WHOLE = Window(x0_mm=0, y0_mm=0, x1_mm=110_000, y1_mm=110_000)
 
 NARROW = SceneSettings(
     outliers=OutlierSettings(cube_m=1.0),
-    ground=GroundSettings(max_window_m=6, bridge_m=8),
+    ground=GroundSettings(max_window_m=4, trend_m=4, widest_m=10, regrowth_passes=1, regrowth_m=1, bridge_m=6),
     vegetation=VegetationSettings(radius_m=0.5),
     surfaces=SurfaceSettings(max_circumradius_m=4.0),
 )
-"""Settings that look 48 m far, so that the windows of a small town's tiles do not all see the whole town."""
+"""Settings that look less far than the town is wide, so that the windows of its tiles do not all see the whole town."""
 
 
 def taken(points: WindowPoints, index: npt.NDArray[Any]) -> WindowPoints:
@@ -302,7 +302,9 @@ def test_every_stage_widens_the_support() -> None:
     wider = [
         SceneSettings(outliers=OutlierSettings(cube_m=6.0)),
         SceneSettings(ground=GroundSettings(max_window_m=21)),
-        SceneSettings(ground=GroundSettings(bridge_m=25)),
+        SceneSettings(ground=GroundSettings(bridge_m=60)),
+        SceneSettings(ground=GroundSettings(trend_m=13)),
+        SceneSettings(ground=GroundSettings(widest_m=120)),
         SceneSettings(surfaces=SurfaceSettings(max_circumradius_m=7.0)),
         SceneSettings(vegetation=VegetationSettings(radius_m=1.2)),
     ]

@@ -84,3 +84,14 @@ def test_an_elevation_beyond_32_bits_of_millimetres_is_refused() -> None:
     )
     with pytest.raises(InconsistentInputError, match="elevation 3e\\+06 m"):
         to_records(cloud, "tile.las")
+
+
+def test_many_tiles_in_a_chunk_are_sorted_apart_as_few_are(
+    suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = ingest(task(suburb, tmp_path / "few"))
+    monkeypatch.setattr("pipeline.runtime.ingest._TWO_BYTES", 1)
+    many = ingest(task(suburb, tmp_path / "many"))
+    assert many == few
+    for key, bucket in stored(tmp_path / "few").items():
+        assert (stored(tmp_path / "many")[key] == bucket).all()

@@ -15,7 +15,8 @@ from pipeline import __version__
 from pipeline.cli import app
 
 COMMANDS = (
-    *("reconstruct", "compare", "inspect", "simulate", "digest", "evaluate", "warm-up", "demo", "replay", "worker"),
+    *("reconstruct", "rerun", "compare", "classify", "inspect", "simulate", "digest"),
+    *("evaluate", "warm-up", "demo", "replay", "worker"),
 )
 
 

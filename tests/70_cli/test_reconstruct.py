@@ -59,6 +59,30 @@ def test_the_stages_are_told_in_order(run: tuple[Path, Any, list[dict[str, Any]]
     assert stages == ["ingest", "split", "join", "reconstruct", "publish"]
 
 
+def test_a_building_is_overridden_and_the_run_brought_in_line(
+    scene: Path, run: tuple[Path, dict[str, Any], Any], tmp_path: Path
+) -> None:
+    folder, summary, _ = run
+    name = next(folder.glob("meshes/*/*.obj")).stem
+    overrides = tmp_path / "overrides.toml"
+    overrides.write_text(f'[[building]]\nbuilding_id = "{name}"\naction = "reject"\n')
+    out = str(tmp_path / "run")
+    tile = str(scene / "gable.laz")
+    whole = ("reconstruct", tile, "--out", out, "--overrides", str(overrides), "--workers", "0", "--json")
+    code, said, _ = invoke(*whole)
+    assert code == 0
+    rejected = json.loads(said)
+    assert (rejected["statuses"], rejected["rejected"]["overridden"]) == ({}, 1)
+    overrides.write_text("")
+    code, said, _ = invoke("rerun", out, "--workers", "0", "--json")
+    assert code == 0
+    assert json.loads(said)["buildings"] == {name: "ok"}
+    assert json.loads(said)["digest"] == summary["digest"]
+    assert invoke("rerun", out, "--only", "abc", "--workers", "0")[0] == 4
+    overrides.write_text("[[building]]\naction = 'drop'")
+    assert invoke("rerun", out, "--workers", "0")[0] == invoke(*whole, "--overwrite")[0] == 2
+
+
 def test_digest_prints_what_the_run_told(run: tuple[Path, dict[str, Any], Any]) -> None:
     folder, summary, _ = run
     assert invoke("digest", str(folder)) == (0, f"{summary['digest']}\n", "")

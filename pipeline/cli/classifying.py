@@ -1,0 +1,87 @@
+"""The command that classifies points."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipeline.cli.options import (
+    AsJson,
+    Classes,
+    Crs,
+    Footprints,
+    Quiet,
+    Scheduler,
+    SettingsFile,
+    VerticalUnit,
+    Workers,
+)
+from pipeline.console import Console
+
+if TYPE_CHECKING:
+    from pipeline.runtime.classify import ClassifySummary
+
+
+def classify(
+    tiles: Annotated[
+        list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
+    ],
+    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: a LAZ file an input.")],
+    rasters: Annotated[
+        bool, typer.Option("--rasters", help="Write terrain.tif, surface.tif and height.tif, too.")
+    ] = False,
+    raster_cell: Annotated[
+        float | None,
+        typer.Option(metavar="SIDE", help="Side of the rasters' cells in the CRS's units; default 0.5 m or 2 ft."),
+    ] = None,
+    footprints: Footprints = None,
+    crs: Crs = None,
+    vertical_unit: VerticalUnit = None,
+    classes: Classes = None,
+    settings: SettingsFile = None,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are already there.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Classify points as ground, building and vegetation, and write them back as LAZ."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.runtime.classify import ClassifyRequest
+        from pipeline.runtime.classify import classify as classify_files
+        from pipeline.settings import RunSettings
+
+        request = ClassifyRequest(
+            inputs=tuple(tiles),
+            out=out,
+            settings=RunSettings.from_toml(settings, {} if classes is None else {"classes": classes}),
+            footprints=footprints,
+            crs=crs,
+            vertical_unit=vertical_unit,
+            rasters=rasters,
+            raster_cell=raster_cell,
+            workers=workers,
+            scheduler=scheduler,
+            overwrite=overwrite,
+        )
+        summary = classify_files(request, console.on_event)
+        show_classes(console, summary)
+        console.document(dataclasses.asdict(summary))
+
+
+def show_classes(console: Console, summary: ClassifySummary) -> None:
+    """What was written, as tables."""
+    names = {1: "other", 2: "ground", 5: "vegetation", 6: "building", 7: "noise"}
+    total = max(1, sum(summary.classes.values()))
+    rows = [
+        (f"{code} {names.get(code, 'as in the file')}", count, f"{100.0 * count / total:.1f} %")
+        for code, count in summary.classes.items()
+    ]
+    console.table("Classes", ["class", "points", "share"], rows)
+    console.table("Files", ["file", "points"], [(file.path, file.points) for file in summary.files])
+    for path in summary.rasters:
+        console.say(path)
+    for name, seconds in summary.timings_s.items():
+        console.say(f"{name} {seconds:.1f} s")

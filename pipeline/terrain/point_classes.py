@@ -1,0 +1,330 @@
+"""The class of every point, once it is known which points are buildings: ground, building, vegetation, noise, other.
+
+Decided by what lies within a few metres, on integer millimetres, so that tiles agree. Codes are those of ASPRS, LAS
+Specification 1.4 R15, table 17.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from enum import IntEnum
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray, ByteArray, IntArray, KindArray
+from pipeline.spatial_hash import slot_of_key
+from pipeline.terrain.lattice import NO_DATA, PIT_MATES
+from pipeline.terrain.thinning import highest_per_cell
+from pipeline.terrain.vegetation import VegetationSettings, planarity
+
+
+class PointClass(IntEnum):
+    """The classes that are given."""
+
+    OTHER = 1
+    """Cars, poles, wires, walls in gardens, bridges: nothing of the below."""
+    GROUND = 2
+    VEGETATION = 5
+    BUILDING = 6
+    """Roofs, walls and what stands on roofs."""
+    NOISE = 7
+    """Points nearly alone in space, and some few far below the terrain."""
+
+
+WALL_REACH_MM = 1000
+"""A point so near to a building in plan, and no higher than it there, is its wall where it is not leafy."""
+UNDER_ROOF_MM = 500
+"""So near, it is wall or what lies under the roof whatever it looks like: eaves scatter pulses as leaves do."""
+ON_ROOF_MM = 2500
+"""Chimneys, antennas and parapets stand at most so high above the roof."""
+TALL_MM = 2000
+"""Higher than cars and fences: what is no building and not smooth is taken for vegetation."""
+CELL_M = 0.5
+"""Side of the cells of which one point each is judged for smoothness."""
+UNKNOWN, SMOOTH, LEAFY = -1, 0, 1
+AROUND_MM = 1000
+"""Side of the cells over 3 x 3 of which the evidence of vegetation is summed."""
+DEEP_MM = 2000
+"""Points deeper than this below level terrain are noise where they are few: the lattice is drawn to half of it."""
+PIT_REACH_MM = 2000
+"""Half side of the box in which points far below the terrain are counted."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PointEvidence:
+    """What is known of the points of a window; arrays of one length n."""
+
+    x_mm: IntArray
+    y_mm: IntArray
+    z_mm: IntArray
+    height_mm: IntArray
+    """Height above the terrain; NO_DATA where there is none."""
+    rise_mm: IntArray
+    """Rise of the terrain over a metre."""
+    ground: BoolArray
+    """Close enough to the terrain to be ground."""
+    building: BoolArray
+    """In a building's points."""
+    outlier: BoolArray
+    """Nearly alone in a wide neighbourhood of space."""
+    echoes: BoolArray
+    """The pulse has more than one return."""
+
+
+def support_m(vegetation: VegetationSettings) -> float:
+    """How far the classes look, beside the outliers' own search."""
+    return vegetation.support_m + CELL_M + (2 * AROUND_MM + PIT_REACH_MM) / 1000.0
+
+
+@njit(cache=True, nogil=True)
+def _cells(x: IntArray, y: IntArray, used: BoolArray, cell: int) -> tuple[IntArray, IntArray, int, int, int, int]:
+    """Used points sorted by square cells: where each cell's begin, the points, first column and row, columns, rows."""
+    n = x.size
+    column0, row0 = x.min() // cell, y.min() // cell
+    columns, rows = x.max() // cell - column0 + 1, y.max() // cell - row0 + 1
+    start = np.zeros(columns * rows + 1, np.int64)
+    for i in range(n):
+        if used[i]:
+            start[(y[i] // cell - row0) * columns + x[i] // cell - column0 + 1] += 1
+    for k in range(columns * rows):
+        start[k + 1] += start[k]
+    position = start[:-1].copy()
+    members = np.empty(start[-1], np.int64)
+    for i in range(n):
+        if used[i]:
+            k = (y[i] // cell - row0) * columns + x[i] // cell - column0
+            members[position[k]] = i
+            position[k] += 1
+    return start, members, column0, row0, columns, rows
+
+
+@njit(cache=True, nogil=True)
+def tops_nearby(x: IntArray, y: IntArray, z: IntArray, used: BoolArray, wanted: BoolArray, reach: int) -> IntArray:
+    """Elevation of the highest used point within a distance in plan of each wanted one, int64 (n,).
+
+    Returns
+    -------
+    (n,) int64
+        NO_DATA where it was not wanted or there is none.
+    """
+    n = x.size
+    out = np.full(n, np.int64(NO_DATA), np.int64)
+    if n == 0:
+        return out
+    start, members, column0, row0, columns, rows = _cells(x, y, used, reach)
+    for i in range(n):
+        if not wanted[i]:
+            continue
+        c, r = x[i] // reach - column0, y[i] // reach - row0
+        top = np.int64(-(2**62))
+        for rr in range(max(r - 1, 0), min(r + 2, rows)):
+            for cc in range(max(c - 1, 0), min(c + 2, columns)):
+                for m in range(start[rr * columns + cc], start[rr * columns + cc + 1]):
+                    j = members[m]
+                    if z[j] > top and (x[j] - x[i]) ** 2 + (y[j] - y[i]) ** 2 <= reach * reach:
+                        top = z[j]
+        if top > -(2**62):
+            out[i] = top
+    return out
+
+
+@njit(cache=True, nogil=True)
+def counts_nearby(x: IntArray, y: IntArray, used: BoolArray, reach: int) -> IntArray:
+    """How many used points, itself included, lie within `reach` in x and in y of each used point; 0 for others."""
+    n = x.size
+    out = np.zeros(n, np.int64)
+    if n == 0:
+        return out
+    start, members, column0, row0, columns, rows = _cells(x, y, used, reach)
+    for i in range(n):
+        if not used[i]:
+            continue
+        c, r = x[i] // reach - column0, y[i] // reach - row0
+        for rr in range(max(r - 1, 0), min(r + 2, rows)):
+            for cc in range(max(c - 1, 0), min(c + 2, columns)):
+                for m in range(start[rr * columns + cc], start[rr * columns + cc + 1]):
+                    j = members[m]
+                    if abs(x[j] - x[i]) <= reach and abs(y[j] - y[i]) <= reach:
+                        out[i] += 1
+    return out
+
+
+@njit(cache=True, nogil=True)
+def sums_around(x: IntArray, y: IntArray, used: BoolArray, values: IntArray, cell: int) -> IntArray:
+    """Sums of some values over the used points in the 3 x 3 cells around each used point.
+
+    Parameters
+    ----------
+    x, y : (n,) int64
+        Places in mm; the cells are anchored at the CRS's origin.
+    used : (n,) bool
+        The points.
+    values : (n, k) int64
+        What is summed.
+    cell : int
+        Side of a cell in mm.
+
+    Returns
+    -------
+    (n, k) int64
+        Zeros for points that are not used.
+    """
+    n, k = values.shape
+    out = np.zeros((n, k), np.int64)
+    if n == 0:
+        return out
+    column0, row0 = x.min() // cell - 1, y.min() // cell - 1
+    columns, rows = x.max() // cell - column0 + 2, y.max() // cell - row0 + 2
+    sums = np.zeros((rows, columns, k), np.int64)
+    for i in range(n):
+        if used[i]:
+            sums[y[i] // cell - row0, x[i] // cell - column0] += values[i]
+    for i in range(n):
+        if used[i]:
+            r, c = y[i] // cell - row0, x[i] // cell - column0
+            for rr in range(r - 1, r + 2):
+                for cc in range(c - 1, c + 2):
+                    out[i] += sums[rr, cc]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def index_of_each(
+    x: IntArray, y: IntArray, z: IntArray, number: ByteArray, of_x: IntArray, of_y: IntArray, of_z: IntArray,
+    of_number: ByteArray,
+) -> IntArray:  # fmt: skip
+    """For each point the first of the others that has its coordinates and return number, int64 (n,); -1 where none."""
+    m = of_x.size
+    size = 2
+    while size < 2 * m:
+        size *= 2
+    mask = size - 1
+    holder = np.full(size, -1, np.int64)
+    for j in range(m):
+        s = slot_of_key((of_x[j] * 73856093) ^ (of_y[j] * 19349663) ^ (of_z[j] * 83492791) ^ of_number[j], mask)
+        while True:
+            k = holder[s]
+            if k < 0:
+                holder[s] = j
+                break
+            if of_x[k] == of_x[j] and of_y[k] == of_y[j] and of_z[k] == of_z[j] and of_number[k] == of_number[j]:
+                break
+            s = (s + 1) & mask
+    out = np.full(x.size, -1, np.int64)
+    for i in range(x.size):
+        s = slot_of_key((x[i] * 73856093) ^ (y[i] * 19349663) ^ (z[i] * 83492791) ^ number[i], mask)
+        while holder[s] >= 0:
+            k = holder[s]
+            if of_x[k] == x[i] and of_y[k] == y[i] and of_z[k] == z[i] and of_number[k] == number[i]:
+                out[i] = k
+                break
+            s = (s + 1) & mask
+    return out
+
+
+def classes_of(evidence: PointEvidence, wanted: BoolArray, vegetation: VegetationSettings) -> ByteArray:
+    """Class of every wanted point.
+
+    Parameters
+    ----------
+    evidence : PointEvidence
+        Of the points of a window, which reaches `support_m` beyond the wanted ones.
+    wanted : (n,) bool
+        The points to be classified.
+    vegetation : VegetationSettings
+        How smoothness is judged.
+
+    Returns
+    -------
+    (n,) uint8
+        `PointClass`; 0 for points that are not wanted.
+    """
+    e = evidence
+    x, y, z = e.x_mm, e.y_mm, e.z_mm
+    known = e.height_mm != NO_DATA
+    noise = noise_of(x, y, e.height_mm, e.rise_mm, e.outlier)
+    # a lonely point on the terrain is ground: sparse surveys are full of them
+    noise &= ~(e.outlier & e.ground & (e.height_mm >= -DEEP_MM))
+    ground = e.ground & ~noise
+    building = e.building & ~noise
+    open_ = ~(noise | ground | building)
+    top = tops_nearby(x, y, z, building, open_ & wanted, WALL_REACH_MM)
+    beside = (top != NO_DATA) & (z <= top)
+    close = tops_nearby(x, y, z, building, beside, UNDER_ROOF_MM)
+    # where points lie farther apart than that, the roof's edge is known no better than to their spacing
+    crowd = sums_around(x, y, np.ones(len(x), np.bool_), np.ones((len(x), 1), np.int64), AROUND_MM)[:, 0]
+    sparse = crowd * UNDER_ROOF_MM**2 < 9 * AROUND_MM**2
+    under = beside & (sparse | ((close != NO_DATA) & (z <= close)))
+    over = (top != NO_DATA) & ~beside & (z <= top + ON_ROOF_MM)
+    tall = ~known | (e.height_mm >= TALL_MM)
+    leafy = leafiness(e, open_, tall, vegetation)
+    # what stands alone on a roof is part of it; in the open it is not known to be anything smooth
+    unknown = leafy == UNKNOWN
+    out = np.full(len(x), PointClass.OTHER, np.uint8)
+    out[open_ & ((leafy == LEAFY) | (unknown & tall))] = PointClass.VEGETATION
+    out[open_ & (under | ((beside | over) & (leafy != LEAFY)))] = PointClass.BUILDING
+    out[building] = PointClass.BUILDING
+    out[ground] = PointClass.GROUND
+    out[noise] = PointClass.NOISE
+    out[~wanted] = 0
+    return out
+
+
+def noise_of(x_mm: IntArray, y_mm: IntArray, height_mm: IntArray, rise_mm: IntArray, outlier: BoolArray) -> BoolArray:
+    """Mask of the noise: gross outliers, and points far below the terrain where they are few.
+
+    Parameters
+    ----------
+    x_mm, y_mm, height_mm : (n,) int64
+        Places and heights above the terrain, NO_DATA where there is none.
+    rise_mm : (n,) int64
+        Rise of the terrain over a metre: on a slope a point may lie lower by what the terrain rises over the box.
+    outlier : (n,) bool
+        Points nearly alone in space.
+    """
+    limit = DEEP_MM + rise_mm * PIT_REACH_MM // 1000
+    deep = (height_mm != NO_DATA) & (height_mm < -limit)
+    noise: BoolArray = outlier | (deep & (counts_nearby(x_mm, y_mm, deep, PIT_REACH_MM) <= 1 + PIT_MATES))
+    return noise
+
+
+def leafiness(evidence: PointEvidence, among: BoolArray, tall: BoolArray, vegetation: VegetationSettings) -> KindArray:
+    """Whether points are vegetation by what lies around them: pulses that go on, or a surface that is not smooth.
+
+    Of tall points either is enough, of low ones both are needed: cars and fences scatter pulses, too.
+
+    Parameters
+    ----------
+    evidence : PointEvidence
+        The points.
+    among : (n,) bool
+        The points that are looked at, and judged: neither ground nor building.
+    tall : (n,) bool
+        Higher than cars and fences.
+    vegetation : VegetationSettings
+        Radius and largest roughness; fewest points for a judgement.
+
+    Returns
+    -------
+    (n,) int8
+        `LEAFY`, `SMOOTH`, or `UNKNOWN` where there are too few points to tell or the point is not looked at.
+    """
+    # most points are ground or building: the sums are held for the others only
+    index = np.flatnonzero(among)
+    x, y, z = evidence.x_mm[index], evidence.y_mm[index], evidence.z_mm[index]
+    all_of_them = np.ones(len(index), np.bool_)
+    chosen = highest_per_cell(x, y, z, np.zeros(len(index), np.int8), all_of_them, CELL_M)
+    flat = planarity(x[chosen], y[chosen], z[chosen], np.ones(len(chosen), np.bool_), vegetation)
+    values = np.zeros((len(index), 4), np.int64)
+    values[:, 0] = 1
+    values[:, 1] = evidence.echoes[index]
+    values[chosen, 2] = flat == 1
+    values[chosen, 3] = flat == 0
+    points, echoes, smooth, rough = sums_around(x, y, all_of_them, values, AROUND_MM).T
+    often, uneven = 2 * echoes >= points, rough >= smooth
+    leafy = np.where(tall[index], often | uneven, often & uneven)
+    found = np.full(len(among), UNKNOWN, np.int8)
+    unknown = (points < vegetation.min_neighbours) | (~often & (smooth + rough == 0))
+    found[index] = np.where(unknown, UNKNOWN, np.where(leafy, LEAFY, SMOOTH))
+    return found

@@ -1,0 +1,504 @@
+"""Planar patches of one candidate's roof, and the borders between them: what its units are told apart by.
+
+Patches grow over a TIN of thinned points from the most planar places. What lies along the border of two patches is read
+off their planes, so a step is as sharp in sparse data as in dense data: a facet that is one point spacing wide is not.
+All sums are of whole millimetres or in one fixed order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import FloatArray, IntArray, LabelArray, Tin
+from pipeline.terrain.vegetation import smallest_eigenvalue
+
+_SCALES = 3
+_UNKNOWN = 1e30
+_TYPICAL_RADII = 3.0
+"""A facet with a circumradius this many times the median of the roof bridges a gap."""
+MAX_BESIDE_MM = 750.0
+"""A fold's border is drawn no farther than this beside the line in which its planes intersect."""
+FOLD_SINE = 0.5
+"""Sine of 30 deg: a fold's border is no farther than this from that line's direction."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Patches:
+    """The planar patches of a roof; k of them over n vertices."""
+
+    of_vertex: LabelArray
+    """(n,) int32, patch of each vertex; all vertices have one."""
+    slopes: FloatArray
+    """(k, 2) rise over run along easting and northing; nan where a patch has no plane."""
+    levels_mm: FloatArray
+    """(k,) elevation of each plane at the origin of x and y; nan where a patch has no plane."""
+    areas_m2: FloatArray
+    """(k,) plan area: a third of each facet belongs to each of its vertices."""
+    centres_m: FloatArray
+    """(k, 3) mean of the vertices."""
+    tops_m: FloatArray
+    """(k,) elevation below which nine tenths of the vertices lie."""
+    outlines_m: FloatArray
+    """(k,) length of the outline in plan, against other patches and against nothing."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Borders:
+    """Borders between patches, one row a pair that touches; arrays of one length."""
+
+    first: LabelArray
+    """The patch with the smaller number."""
+    second: LabelArray
+    """The other."""
+    length_m: FloatArray
+    """Length in plan."""
+    level_m: FloatArray
+    """Length along which both planes meet: closer in elevation than the least step."""
+    direction: FloatArray
+    """(b, 2) unit vector along the border: main axis of its pieces."""
+    gap_pairs: IntArray
+    """(g, 2) pairs of patches that see each other across gaps, those with the longest sight first."""
+
+
+@njit(cache=True, nogil=True)
+def solve_plane(s: FloatArray) -> tuple[float, float, float, bool]:
+    """Slopes and level at the sums' origin, from sums of 1, x, y, z, xx, xy, yy, xz, yz; False where there is none."""
+    n = s[0]
+    if n < 3:
+        return 0.0, 0.0, 0.0, False
+    mx, my, mz = s[1] / n, s[2] / n, s[3] / n
+    xx, xy, yy = s[4] / n - mx * mx, s[5] / n - mx * my, s[6] / n - my * my
+    xz, yz = s[7] / n - mx * mz, s[8] / n - my * mz
+    det = xx * yy - xy * xy
+    if det <= 1e-3 * (xx + yy) * (xx + yy) or det <= 0.0:
+        return 0.0, 0.0, 0.0, False
+    a, b = (xz * yy - yz * xy) / det, (yz * xx - xz * xy) / det
+    return a, b, mz - a * mx - b * my, True
+
+
+@njit(cache=True, nogil=True)
+def local_planes(x: IntArray, y: IntArray, z: IntArray, radius_mm: int, min_points: int) -> FloatArray:
+    """Slopes along x and y and orthogonal deviation in mm of the plane around every vertex, (n, 3).
+
+    The window is a circle, doubled up to twice where it holds too few points; what still has no plane has the
+    deviation 1e30.
+    """
+    n = x.size
+    out = np.zeros((n, 3))
+    out[:, 2] = _UNKNOWN
+    if n == 0:
+        return out
+    for scale in range(_SCALES):
+        radius = radius_mm * 2**scale
+        limit = radius * radius
+        column0, row0 = x.min() // radius, y.min() // radius
+        columns, rows = x.max() // radius - column0 + 1, y.max() // radius - row0 + 1
+        start = np.zeros(columns * rows + 1, np.int64)
+        for i in range(n):
+            start[(y[i] // radius - row0) * columns + x[i] // radius - column0 + 1] += 1
+        for k in range(columns * rows):
+            start[k + 1] += start[k]
+        position = start[:-1].copy()
+        members = np.empty(n, np.int64)
+        for i in range(n):
+            k = (y[i] // radius - row0) * columns + x[i] // radius - column0
+            members[position[k]] = i
+            position[k] += 1
+        s = np.empty(10)
+        for i in range(n):
+            if out[i, 2] < _UNKNOWN:
+                continue
+            c, r = x[i] // radius - column0, y[i] // radius - row0
+            s[:] = 0.0
+            for rr in range(max(r - 1, 0), min(r + 2, rows)):
+                low, high = start[rr * columns + max(c - 1, 0)], start[rr * columns + min(c + 1, columns - 1) + 1]
+                for m in range(low, high):
+                    j = members[m]
+                    dx, dy, dz = float(x[j] - x[i]), float(y[j] - y[i]), float(z[j] - z[i])
+                    if dx * dx + dy * dy > limit:
+                        continue
+                    s[0] += 1
+                    s[1] += dx
+                    s[2] += dy
+                    s[3] += dz
+                    s[4] += dx * dx
+                    s[5] += dx * dy
+                    s[6] += dy * dy
+                    s[7] += dx * dz
+                    s[8] += dy * dz
+                    s[9] += dz * dz
+            if s[0] < min_points:
+                continue
+            a, b, _, found = solve_plane(s[:9])
+            if not found:
+                continue
+            mx, my, mz = s[1] / s[0], s[2] / s[0], s[3] / s[0]
+            out[i, 0], out[i, 1] = a, b
+            out[i, 2] = math.sqrt(
+                smallest_eigenvalue(
+                    s[4] / s[0] - mx * mx,
+                    s[5] / s[0] - mx * my,
+                    s[7] / s[0] - mx * mz,
+                    s[6] / s[0] - my * my,
+                    s[8] / s[0] - my * mz,
+                    s[9] / s[0] - mz * mz,
+                )
+            )
+    return out
+
+
+@njit(cache=True, nogil=True)
+def circumradii(x: IntArray, y: IntArray, facets: LabelArray) -> FloatArray:
+    """Circumradius of every facet, (m,), in the unit of the vertices."""
+    out = np.empty(facets.shape[0])
+    for f in range(facets.shape[0]):
+        a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
+        ux, uy, vx, vy = float(x[b] - x[a]), float(y[b] - y[a]), float(x[c] - x[a]), float(y[c] - y[a])
+        wx, wy = vx - ux, vy - uy
+        product = math.sqrt(ux * ux + uy * uy) * math.sqrt(vx * vx + vy * vy) * math.sqrt(wx * wx + wy * wy)
+        out[f] = product / (2.0 * (ux * vy - uy * vx))
+    return out
+
+
+@njit(cache=True, nogil=True)
+def vertex_neighbours(n: int, facets: LabelArray, sound: LabelArray) -> tuple[IntArray, LabelArray]:
+    """Compressed rows: the vertices that share a sound facet with each; some twice."""
+    start = np.zeros(n + 1, np.int64)
+    for k in range(sound.size):
+        for q in range(3):
+            start[facets[sound[k], q] + 1] += 2
+    for v in range(n):
+        start[v + 1] += start[v]
+    position = start[:-1].copy()
+    others = np.empty(start[n], np.int32)
+    for k in range(sound.size):
+        for q in range(3):
+            v = facets[sound[k], q]
+            others[position[v]] = facets[sound[k], (q + 1) % 3]
+            others[position[v] + 1] = facets[sound[k], (q + 2) % 3]
+            position[v] += 2
+    return start, others
+
+
+@njit(cache=True, nogil=True)
+def grow_patches(
+    x: IntArray,
+    y: IntArray,
+    z: IntArray,
+    start: IntArray,
+    others: LabelArray,
+    local: FloatArray,
+    order: IntArray,
+    roughness_mm: float,
+    distance_mm: float,
+    min_cosine: float,
+    min_points: int,
+) -> tuple[LabelArray, FloatArray]:
+    """Patch of every vertex, -1 where none took it; slopes and level at the origin of every patch (k, 3).
+
+    Seeds come in the given order, the most planar first. A vertex joins where it lies within distance_mm of the plane
+    and its own surroundings, if they are planar at all, face the same way.
+    """
+    n = x.size
+    label = np.full(n, -1, np.int32)
+    tried = np.zeros(n, np.bool_)
+    planes = np.zeros((n, 3))
+    queue = np.empty(n, np.int32)
+    count = 0
+    s = np.empty(9)
+    for o in range(n):
+        seed = order[o]
+        if label[seed] >= 0 or tried[seed] or local[seed, 2] > roughness_mm:
+            continue
+        a, b, level = local[seed, 0], local[seed, 1], 0.0
+        s[:] = 0.0
+        s[0] = 1.0
+        label[seed] = count
+        queue[0] = seed
+        head, tail, fitted = 0, 1, 4
+        while head < tail:
+            v = queue[head]
+            head += 1
+            for e in range(start[v], start[v + 1]):
+                w = others[e]
+                if label[w] >= 0:
+                    continue
+                dx, dy, dz = float(x[w] - x[seed]), float(y[w] - y[seed]), float(z[w] - z[seed])
+                steepness = math.sqrt(1.0 + a * a + b * b)
+                if abs(dz - level - a * dx - b * dy) > distance_mm * steepness:
+                    continue
+                if local[w, 2] <= roughness_mm:
+                    p, q = local[w, 0], local[w, 1]
+                    if a * p + b * q + 1.0 < min_cosine * steepness * math.sqrt(1.0 + p * p + q * q):
+                        continue
+                label[w] = count
+                queue[tail] = w
+                tail += 1
+                s[0] += 1
+                s[1] += dx
+                s[2] += dy
+                s[3] += dz
+                s[4] += dx * dx
+                s[5] += dx * dy
+                s[6] += dy * dy
+                s[7] += dx * dz
+                s[8] += dy * dz
+                if tail >= 2 * fitted:
+                    na, nb, nl, found = solve_plane(s)
+                    if found:
+                        a, b, level = na, nb, nl
+                    fitted = tail
+        na, nb, nl, found = solve_plane(s)
+        if tail < min_points or not found:
+            for k in range(tail):
+                label[queue[k]] = -1
+            tried[seed] = True
+            continue
+        planes[count, 0], planes[count, 1] = na, nb
+        planes[count, 2] = z[seed] + nl - na * x[seed] - nb * y[seed]
+        count += 1
+    return label, planes[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def fill_patches(
+    x: IntArray, y: IntArray, z: IntArray, start: IntArray, others: LabelArray, label: LabelArray, planes: FloatArray
+) -> int:
+    """Give the vertices that no patch took to the patch beside them whose plane is nearest; the number of patches.
+
+    Round by round, all vertices of a round at once. What touches no patch becomes patches of its own, without a plane.
+    """
+    n = x.size
+    wanted = np.empty(n, np.int32)
+    while True:
+        found = 0
+        for v in range(n):
+            wanted[v] = -1
+            if label[v] >= 0:
+                continue
+            best = 0.0
+            for e in range(start[v], start[v + 1]):
+                p = label[others[e]]
+                if p < 0:
+                    continue
+                away = abs(z[v] - planes[p, 2] - planes[p, 0] * x[v] - planes[p, 1] * y[v])
+                if wanted[v] < 0 or away < best or (away == best and p < wanted[v]):
+                    wanted[v] = p
+                    best = away
+                    found += 1
+        if found == 0:
+            break
+        for v in range(n):
+            if wanted[v] >= 0:
+                label[v] = wanted[v]
+    count = int(planes.shape[0])
+    stack = np.empty(n, np.int32)
+    for v in range(n):
+        if label[v] >= 0:
+            continue
+        label[v] = count
+        stack[0] = v
+        top = 1
+        while top > 0:
+            top -= 1
+            u = stack[top]
+            for e in range(start[u], start[u + 1]):
+                if label[others[e]] < 0:
+                    label[others[e]] = count
+                    stack[top] = others[e]
+                    top += 1
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def border_pieces(
+    x: IntArray, y: IntArray, facets: LabelArray, neighbours: LabelArray, sound: LabelArray, label: LabelArray, k: int
+) -> tuple[LabelArray, FloatArray, FloatArray, FloatArray]:
+    """Pieces of border: patches (b, 2), ends in mm (b, 4); and area in mm2 and open outline in mm of each patch.
+
+    In a facet between two patches the border joins the middles of two edges; between three it is a star about the
+    centroid.
+    """
+    is_sound = np.zeros(facets.shape[0], np.bool_)
+    is_sound[sound] = True
+    pairs = np.empty((3 * sound.size, 2), np.int32)
+    ends = np.empty((3 * sound.size, 4))
+    area = np.zeros(k)
+    outline = np.zeros(k)
+    count = 0
+    for i in range(sound.size):
+        f = sound[i]
+        a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
+        twice = float((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]))
+        cut = 0
+        for q in range(3):
+            v, w = facets[f, (q + 1) % 3], facets[f, (q + 2) % 3]
+            area[label[facets[f, q]]] += twice / 6.0
+            cut += label[v] != label[w]
+            g = neighbours[f, q]
+            if g < 0 or not is_sound[g]:
+                half = 0.5 * math.sqrt(float((x[v] - x[w]) ** 2 + (y[v] - y[w]) ** 2))
+                outline[label[v]] += half
+                outline[label[w]] += half
+        if cut == 0:
+            continue
+        mx, my = (x[a] + x[b] + x[c]) / 3.0, (y[a] + y[b] + y[c]) / 3.0
+        if cut == 2:
+            # the middles of the two edges that are cut; their common vertex stands alone
+            for q in range(3):
+                u, v, w = facets[f, q], facets[f, (q + 1) % 3], facets[f, (q + 2) % 3]
+                if label[v] == label[w]:
+                    pairs[count, 0], pairs[count, 1] = min(label[u], label[v]), max(label[u], label[v])
+                    ends[count, 0], ends[count, 1] = (x[u] + x[v]) / 2.0, (y[u] + y[v]) / 2.0
+                    ends[count, 2], ends[count, 3] = (x[u] + x[w]) / 2.0, (y[u] + y[w]) / 2.0
+                    count += 1
+        else:
+            for q in range(3):
+                v, w = facets[f, (q + 1) % 3], facets[f, (q + 2) % 3]
+                pairs[count, 0], pairs[count, 1] = min(label[v], label[w]), max(label[v], label[w])
+                ends[count, 0], ends[count, 1] = (x[v] + x[w]) / 2.0, (y[v] + y[w]) / 2.0
+                ends[count, 2], ends[count, 3] = mx, my
+                count += 1
+    return pairs[:count].copy(), ends[:count].copy(), area, outline
+
+
+def patches_of(
+    x: IntArray,
+    y: IntArray,
+    z: IntArray,
+    tin: Tin,
+    *,
+    max_radius_m: float,
+    window_m: float,
+    min_points: int,
+    roughness_m: float,
+    distance_m: float,
+    max_angle_deg: float,
+    least_step_m: float,
+) -> tuple[Patches, Borders, IntArray, LabelArray]:
+    """Planar patches of a roof, the borders between them, and which vertices are neighbours (compressed rows).
+
+    Parameters
+    ----------
+    x, y, z : (n,) int64
+        Vertices in millimetres from a place near by, sorted by (x, y).
+    tin : Tin
+        Their Delaunay TIN.
+    max_radius_m : float
+        Facets with a wider circumcircle bridge a gap: nothing touches across them. Where the typical facet is small,
+        as in dense data, the limit is three times its circumradius, but no less than half of this.
+    window_m, min_points : float, int
+        Radius of the windows around the vertices, and fewest points of a window and of a patch.
+    roughness_m : float
+        Largest orthogonal deviation of a planar window.
+    distance_m : float
+        Largest orthogonal distance of a vertex to its patch's plane.
+    max_angle_deg : float
+        Largest angle between a patch and the surroundings of its vertices.
+    least_step_m : float
+        Planes closer than this in elevation meet.
+    """
+    radii = circumradii(x, y, tin.facets)
+    limit = _TYPICAL_RADII * float(np.median(radii))
+    sound = np.flatnonzero(radii <= 1000.0 * min(max(limit / 1000.0, max_radius_m / 2.0), max_radius_m)).astype(
+        np.int32
+    )
+    start, others = vertex_neighbours(len(x), tin.facets, sound)
+    local = local_planes(x, y, z, round(window_m * 1000), min_points)
+    order = np.argsort(local[:, 2], kind="stable")
+    label, planes = grow_patches(
+        x, y, z, start, others, local, order,
+        roughness_m * 1000.0, distance_m * 1000.0, math.cos(math.radians(max_angle_deg)), min_points,
+    )  # fmt: skip
+    count = int(fill_patches(x, y, z, start, others, label, planes))
+    pairs, ends, area, outline = border_pieces(x, y, tin.facets, tin.neighbours, sound, label, count)
+    without = np.full((count - len(planes), 3), np.nan)
+    planes = np.concatenate((planes, without))
+    centres = np.zeros((count, 3))
+    for k, values in enumerate((x, y, z)):
+        np.add.at(centres[:, k], label, values / 1000.0)
+    centres /= np.maximum(np.bincount(label, minlength=count), 1)[:, None]
+    across = np.flatnonzero(radii > limit).astype(np.int32)
+    gaps, sights, _, _ = border_pieces(x, y, tin.facets, tin.neighbours, across, label, count)
+    borders = _borders(pairs, ends, planes, least_step_m, _longest_first(gaps, sights, count))
+    outlines = outline / 1000.0
+    np.add.at(outlines, borders.first, borders.length_m)
+    np.add.at(outlines, borders.second, borders.length_m)
+    return (
+        Patches(
+            of_vertex=label,
+            slopes=planes[:, :2],
+            levels_mm=planes[:, 2],
+            areas_m2=area / 1e6,
+            centres_m=centres,
+            tops_m=_tops(z, label, count),
+            outlines_m=outlines,
+        ),
+        borders,
+        start,
+        others,
+    )
+
+
+def _tops(z: IntArray, label: LabelArray, count: int) -> FloatArray:
+    """Of each patch the elevation in metres below which nine tenths of its vertices lie."""
+    order = np.lexsort((z, label))
+    ends = np.cumsum(np.bincount(label, minlength=count))
+    starts = np.concatenate(([0], ends[:-1]))
+    return z[order[starts + (9 * (ends - 1 - starts)) // 10]] / 1000.0
+
+
+def _longest_first(pairs: LabelArray, ends: FloatArray, count: int) -> IntArray:
+    """Different pairs of patches, the greatest summed length first; equal ones by their numbers."""
+    keys, row = np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1], return_inverse=True)
+    lengths = np.zeros(len(keys))
+    np.add.at(lengths, row, np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1]))
+    keys = keys[np.argsort(-lengths, kind="stable")]
+    return np.column_stack((keys // count, keys % count))
+
+
+def _borders(
+    pairs: LabelArray, ends: FloatArray, planes: FloatArray, least_step_m: float, gap_pairs: IntArray
+) -> Borders:
+    """Sum up the pieces of each pair."""
+    count = len(planes)
+    middle = (ends[:, :2] + ends[:, 2:]) / 2.0
+    length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
+    difference = planes[pairs[:, 0]] - planes[pairs[:, 1]]
+    step = np.abs(difference[:, 0] * middle[:, 0] + difference[:, 1] * middle[:, 1] + difference[:, 2])
+    level = np.where(step < least_step_m * 1000.0, length, 0.0)
+    across = np.hypot(difference[:, 0], difference[:, 1])
+    beside = np.where(step < MAX_BESIDE_MM * across, length, 0.0)
+    keys, row = np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1], return_inverse=True)
+    sums = np.zeros((len(keys), 8))
+    columns = (
+        length, level, length * middle[:, 0], length * middle[:, 1],
+        length * middle[:, 0] ** 2, length * middle[:, 0] * middle[:, 1], length * middle[:, 1] ** 2,
+        beside,
+    )  # fmt: skip
+    for k, values in enumerate(columns):
+        np.add.at(sums[:, k], row, values)
+    whole = np.maximum(sums[:, 0], 1e-9)
+    mx, my = sums[:, 2] / whole, sums[:, 3] / whole
+    xx, xy, yy = sums[:, 4] / whole - mx * mx, sums[:, 5] / whole - mx * my, sums[:, 6] / whole - my * my
+    # main axis of a 2 x 2 scatter: half the angle of (xx - yy, 2 xy)
+    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    direction = np.column_stack((np.cos(angle), np.sin(angle)))
+    first, second = (keys // count).astype(np.int32), (keys % count).astype(np.int32)
+    # a fold runs along the line in which both planes intersect, square to the difference of their slopes; drawn half
+    # a point spacing beside it, a border of steep planes shows a step that is none
+    turn = planes[first, :2] - planes[second, :2]
+    along = np.abs((turn * direction).sum(axis=1)) <= FOLD_SINE * np.hypot(turn[:, 0], turn[:, 1])
+    return Borders(
+        first=first,
+        second=second,
+        length_m=sums[:, 0] / 1000.0,
+        level_m=np.where(along, np.maximum(sums[:, 1], sums[:, 7]), sums[:, 1]) / 1000.0,
+        direction=direction,
+        gap_pairs=gap_pairs,
+    )

@@ -1,0 +1,360 @@
+"""Units: touching buildings that stand in one candidate are told apart by their roofs.
+
+A candidate is all that hangs together above the ground, so a row of houses comes as one. Its roof is taken apart into
+planar patches (`terrain.roof_patches`). Patches whose planes meet along their border (ridges, hips, valleys of L-shaped
+houses, dormers) are of one unit; those with a step between them are not. What is small, enclosed by one other part as
+dormers and towers are, or a lower annex of one, joins that part again. Two exceptions follow from how houses are built:
+
+- a step along the contour lines of the roof, as in offset pent roofs and saw-tooth halls, lies within a house: party
+  walls run up the slope;
+- a valley between two parallel ridges is the gutter between two houses.
+
+Where nothing of this can be seen, as under one ridge over houses of one height, they stay one unit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import FloatArray, IntArray, LabelArray
+from pipeline.parameters import Parameters, parameter
+from pipeline.terrain.roof_patches import Borders, Patches, patches_of
+from pipeline.terrain.thinning import highest_per_cell
+from pipeline.tin.delaunay import MAX_WINDOW_MM, triangulate
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class UnitSettings(Parameters):
+    """How touching buildings are told apart."""
+
+    split: str = parameter(
+        "ridges",
+        "What separates units within a candidate: nothing, steps, or steps and valleys between parallel ridges.",
+        choices=("nothing", "steps", "ridges"),
+    )
+    least_step_m: float = parameter(
+        0.3, "Least step between the roofs of two units.", unit="m", minimum=0.1, maximum=5.0
+    )
+    min_area_m2: float = parameter(
+        25.0, "Least plan area of a unit; what is smaller joins its neighbour.", unit="m2", minimum=1.0, maximum=1000.0
+    )
+    enclosed_share: float = parameter(
+        0.5,
+        "A unit with at least this share of its outline against one other joins it, as towers do.",
+        minimum=0.1,
+        maximum=1.0,
+    )
+    annex_share: float = parameter(
+        0.5,
+        "A unit below this share of the area of its only neighbour joins it if its top lies below that one's middle.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+
+
+THINNING_M = 0.5
+"""Side of the cells of which one point each enters the TIN, as in the split of a scene."""
+_MAX_RADIUS_M = 3.0
+"""Facets with a wider circumcircle bridge a gap in the roof."""
+_WINDOW_M = 1.2
+_MIN_POINTS = 7
+_ROUGHNESS_M = 0.12
+_DISTANCE_M = 0.15
+"""A patch takes what lies this near to its plane: three times the noise of a good survey."""
+_MAX_ANGLE_DEG = 18.0
+_PART_M2 = 6.0
+"""Smaller patches, as chimneys and dormers, connect nothing."""
+_LEVEL_SHARE = 0.5
+"""Share of a border along which planes that meet are level."""
+_SHORTEST_BORDER_M = 2.0
+"""Shorter borders join nothing: at a step, opposite slopes of two houses touch over a metre or so."""
+_SHORTEST_GUTTER_M = 3.0
+"""Shorter valleys lie between dormers."""
+_SLOPED = math.tan(math.radians(10.0))
+_ALONG = 0.5
+"""Sine of 30 deg: a border closer than this to a contour line runs along it."""
+_OPPOSITE = -0.87
+"""Cosine of 150 deg: slopes that face each other."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Facing:
+    """How two sloped patches face their common border."""
+
+    along_contours: bool
+    """The border runs along the contour lines of both."""
+    opposite: bool
+    """They slope in opposite directions."""
+    ridge: bool
+    """Both rise towards the border."""
+    valley: bool
+    """Both fall towards the border."""
+
+
+def _facing(patches: Patches, borders: Borders, row: int) -> _Facing | None:
+    """How the patches of a border face it; None where one of them is flat or no plane."""
+    p, q = int(borders.first[row]), int(borders.second[row])
+    (ax, ay), (bx, by) = patches.slopes[p].tolist(), patches.slopes[q].tolist()
+    steep_p, steep_q = math.hypot(ax, ay), math.hypot(bx, by)
+    if not (steep_p >= _SLOPED and steep_q >= _SLOPED):
+        return None
+    dx, dy = borders.direction[row].tolist()
+    # across the border, from the first to the second
+    nx, ny = -dy, dx
+    cx, cy, _ = (patches.centres_m[q] - patches.centres_m[p]).tolist()
+    if nx * cx + ny * cy < 0.0:
+        nx, ny = -nx, -ny
+    rise_p, rise_q = (ax * nx + ay * ny) / steep_p, (bx * nx + by * ny) / steep_q
+    along = abs(ax * dx + ay * dy) <= _ALONG * steep_p and abs(bx * dx + by * dy) <= _ALONG * steep_q
+    opposite = (ax * bx + ay * by) / (steep_p * steep_q) <= _OPPOSITE
+    return _Facing(along, opposite, along and rise_p > 0.0 > rise_q, along and rise_p < 0.0 < rise_q)
+
+
+def units_of_patches(patches: Patches, borders: Borders, settings: UnitSettings) -> LabelArray:
+    """The unit of every patch, (k,) int32; numbers are those of patches.
+
+    Parameters
+    ----------
+    patches, borders : Patches, Borders
+        The roof of one candidate.
+    settings : UnitSettings
+        What separates units.
+    """
+    count = len(patches.areas_m2)
+    parent = list(range(count))
+
+    def root(k: int) -> int:
+        while parent[k] != k:
+            parent[k] = parent[parent[k]]
+            k = parent[k]
+        return k
+
+    large = (patches.areas_m2 >= _PART_M2) & ~np.isnan(patches.levels_mm)
+    rows = [
+        row
+        for row in range(len(borders.first))
+        if large[borders.first[row]] and large[borders.second[row]] and borders.length_m[row] >= _SHORTEST_BORDER_M
+    ]
+    meets = borders.level_m >= _LEVEL_SHARE * borders.length_m
+    facing = {row: _facing(patches, borders, row) for row in rows}
+    has_ridge = set()
+    for row in rows:
+        seen = facing[row]
+        if seen is not None and seen.ridge and seen.opposite:
+            has_ridge |= {int(borders.first[row]), int(borders.second[row])}
+    apart: dict[int, set[int]] = {k: set() for k in range(count)}
+    joining = []
+    for row in rows:
+        p, q = int(borders.first[row]), int(borders.second[row])
+        seen = facing[row]
+        if (
+            settings.split == "ridges"
+            and seen is not None
+            and seen.valley
+            and seen.opposite
+            and p in has_ridge
+            and q in has_ridge
+            and borders.length_m[row] >= _SHORTEST_GUTTER_M
+        ):
+            apart[p].add(q)
+            apart[q].add(p)
+        elif meets[row] or (seen is not None and seen.along_contours):
+            joining.append(row)
+    # the longest first, so that what runs along several houses does not unite them across their gutters
+    for row in sorted(joining, key=lambda row: (-borders.length_m[row], row)):
+        p, q = sorted((root(int(borders.first[row])), root(int(borders.second[row]))))
+        if p == q or q in apart[p]:
+            continue
+        parent[q] = p
+        apart[p] |= apart[q]
+        for other in apart.pop(q):
+            apart[other].discard(q)
+            apart[other].add(p)
+    return _absorbed(np.array([root(k) for k in range(count)], np.int64), patches, borders, settings)
+
+
+def _absorbed(unit: IntArray, patches: Patches, borders: Borders, settings: UnitSettings) -> LabelArray:
+    """Join to its neighbour what is too small, enclosed by one other unit, or its annex; the smallest first."""
+    beside: dict[int, dict[int, float]] = {int(k): {} for k in unit}
+    area = dict.fromkeys(beside, 0.0)
+    outline = dict.fromkeys(beside, 0.0)
+    volume = dict.fromkeys(beside, 0.0)  # area times elevation
+    top = dict.fromkeys(beside, -math.inf)
+    for k, own in enumerate(unit.tolist()):
+        area[own] += float(patches.areas_m2[k])
+        outline[own] += float(patches.outlines_m[k])
+        volume[own] += float(patches.areas_m2[k] * patches.centres_m[k, 2])
+        top[own] = max(top[own], float(patches.tops_m[k]))
+    for p, q, length in zip(borders.first.tolist(), borders.second.tolist(), borders.length_m.tolist(), strict=True):
+        a, b = int(unit[p]), int(unit[q])
+        if a == b:
+            outline[a] -= 2.0 * length
+        else:
+            beside[a][b] = beside[a].get(b, 0.0) + length
+            beside[b][a] = beside[b].get(a, 0.0) + length
+    into = {k: k for k in beside}
+    waiting = sorted(beside, key=lambda k: (area[k], k))
+    while waiting:
+        again = []
+        for k in waiting:
+            if into[k] != k or not beside[k]:
+                continue
+            other = max(beside[k], key=lambda o: (beside[k][o], -o))
+            enclosed = beside[k][other] >= settings.enclosed_share * outline[k] and area[k] < area[other]
+            annex = (
+                len(beside[k]) == 1
+                and area[k] < settings.annex_share * area[other]
+                and top[k] * area[other] < volume[other]
+            )
+            if area[k] >= settings.min_area_m2 and not enclosed and not annex:
+                continue
+            into[k] = other
+            area[other] += area[k]
+            volume[other] += volume[k]
+            top[other] = max(top[other], top[k])
+            outline[other] += outline[k] - 2.0 * beside[k][other]
+            for o, length in beside[k].items():
+                del beside[o][k]
+                if o != other:
+                    beside[other][o] = beside[other].get(o, 0.0) + length
+                    beside[o][other] = beside[o].get(other, 0.0) + length
+            again.append(other)
+        # what has grown, and all beside it, may have become enclosed or enclosing
+        touched = {t for k in again if into[k] == k for t in (k, *beside[k])}
+        waiting = sorted(touched, key=lambda k: (area[k], k))
+
+    def last(k: int) -> int:
+        while into[k] != k:
+            k = into[k]
+        return k
+
+    return _across_gaps(np.array([last(k) for k in unit.tolist()], np.int32), borders)
+
+
+def _across_gaps(unit: LabelArray, borders: Borders) -> LabelArray:
+    """Join what hangs together across gaps in the data only: a gap tells nothing of buildings."""
+    part, whole = list(range(len(unit))), unit.tolist()
+
+    def root(parent: list[int], k: int) -> int:
+        while parent[k] != k:
+            k = parent[k]
+        return k
+
+    for p, q in zip(borders.first.tolist(), borders.second.tolist(), strict=True):
+        a, b = root(part, p), root(part, q)
+        part[max(a, b)] = min(a, b)
+    for p, q in borders.gap_pairs.tolist():
+        a, b = root(part, p), root(part, q)
+        if a != b:
+            part[max(a, b)] = min(a, b)
+            a, b = root(whole, p), root(whole, q)
+            whole[max(a, b)] = min(a, b)
+    return np.array([root(whole, k) for k in range(len(whole))], np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _unit_of_points(
+    x: IntArray,
+    y: IntArray,
+    z: IntArray,
+    vx: IntArray,
+    vy: IntArray,
+    vz: IntArray,
+    cell_mm: int,
+    unit: LabelArray,
+    patch: LabelArray,
+    planes: FloatArray,
+    start: IntArray,
+    others: LabelArray,
+) -> LabelArray:
+    """Unit of every point: that of its cell's vertex, or beside a border that of the nearest plane around it."""
+    n = x.size
+    out = np.empty(n, np.int32)
+    column0, row0 = vx.min() // cell_mm, vy.min() // cell_mm
+    columns = vx.max() // cell_mm - column0 + 1
+    rows = vy.max() // cell_mm - row0 + 1
+    holder = np.full(columns * rows, -1, np.int32)
+    at_border = np.zeros(vx.size, np.bool_)
+    for v in range(vx.size):
+        holder[(vy[v] // cell_mm - row0) * columns + vx[v] // cell_mm - column0] = v
+        for e in range(start[v], start[v + 1]):
+            at_border[v] |= unit[others[e]] != unit[v]
+    for i in range(n):
+        v = holder[(y[i] // cell_mm - row0) * columns + x[i] // cell_mm - column0]
+        out[i] = unit[v]
+        if not at_border[v]:
+            continue
+        best = -1.0
+        for e in range(start[v] - 1, start[v + 1]):
+            w = others[e] if e >= start[v] else v
+            p = patch[w]
+            if np.isnan(planes[p, 2]):
+                away = float(abs(z[i] - vz[w]))
+            else:
+                away = abs(z[i] - planes[p, 2] - planes[p, 0] * x[i] - planes[p, 1] * y[i])
+            if best < 0.0 or away < best:
+                best = away
+                out[i] = unit[w]
+    return out
+
+
+def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSettings) -> LabelArray:
+    """Tell apart the units of one candidate.
+
+    Parameters
+    ----------
+    x_mm, y_mm, z_mm : (n,) int64
+        All points of the candidate in absolute millimetres, in any order.
+    settings : UnitSettings
+        What separates units.
+
+    Returns
+    -------
+    (n,) int32
+        Unit of every point; numbered from 0 in the order of their lexicographically smallest points.
+    """
+    n = len(x_mm)
+    one = np.zeros(n, np.int32)
+    if settings.split == "nothing" or n < 2 * _MIN_POINTS:
+        return one
+    if max(int(np.ptp(x_mm)), int(np.ptp(y_mm))) >= MAX_WINDOW_MM:
+        return one
+    chosen = highest_per_cell(x_mm, y_mm, z_mm, np.zeros(n, np.int8), np.ones(n, np.bool_), THINNING_M)
+    cell_mm = round(THINNING_M * 1000)
+    # whole cells are left out, so that the lattice keeps its place
+    x0, y0 = int(x_mm.min()) // cell_mm * cell_mm, int(y_mm.min()) // cell_mm * cell_mm
+    x, y, z = x_mm - x0, y_mm - y0, z_mm - int(z_mm.min())
+    vx, vy, vz = x[chosen], y[chosen], z[chosen]
+    tin = triangulate(np.column_stack((vx, vy)))
+    if len(tin) == 0:
+        return one
+    patches, borders, start, others = patches_of(
+        vx,
+        vy,
+        vz,
+        tin,
+        max_radius_m=_MAX_RADIUS_M,
+        window_m=_WINDOW_M,
+        min_points=_MIN_POINTS,
+        roughness_m=_ROUGHNESS_M,
+        distance_m=_DISTANCE_M,
+        max_angle_deg=_MAX_ANGLE_DEG,
+        least_step_m=settings.least_step_m,
+    )
+    unit_of_patch = units_of_patches(patches, borders, settings)
+    if (unit_of_patch == unit_of_patch[0]).all():
+        return one
+    planes = np.column_stack((patches.slopes, patches.levels_mm))
+    label = _unit_of_points(
+        x, y, z, vx, vy, vz, cell_mm, unit_of_patch[patches.of_vertex], patches.of_vertex, planes, start, others
+    )
+    order = np.lexsort((z, y, x))
+    _, first, number = np.unique(label[order], return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int32)
+    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
+    one[order] = rank[number.ravel()]
+    return one

@@ -1,0 +1,131 @@
+"""Units over tile borders: a row of houses in one candidate becomes the same candidates whatever the lattice."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipeline.runtime.gather import points_of
+from pipeline.runtime.join import CandidateSite, PointRange, object_id
+from pipeline.runtime.scratch import POINT, Scratch
+from pipeline.runtime.units import divide, unit_tasks
+from pipeline.terrain.units import UnitSettings
+from pipeline.tiling import TileGrid
+
+CRS = "EPSG:28992"
+EAVES_M = (6.0, 7.0, 5.5, 6.4)
+
+
+@pytest.fixture(scope="module")
+def row() -> npt.NDArray[np.void]:
+    """Points of four touching gable houses of 8 m by 10 m with steps between them, turned by 23 deg."""
+    random = np.random.default_rng(4)
+    along, across = random.uniform(0, 8 * len(EAVES_M), 2000), random.uniform(0, 10, 2000)
+    z = np.array(EAVES_M)[(along // 8).astype(int)] + 0.8 * (5 - np.abs(across - 5)) + random.normal(0, 0.02, 2000)
+    c, s = math.cos(math.radians(23.0)), math.sin(math.radians(23.0))
+    points = np.zeros(2000, POINT)
+    points["x"] = np.rint(1000 * (85_000 + c * along - s * across))
+    points["y"] = np.rint(1000 * (447_500 + s * along + c * across))
+    points["z"] = np.rint(1000 * z)
+    points["gps_time"] = random.uniform(0, 1, 2000)
+    points["return_number"] = points["return_count"] = 1
+    return points
+
+
+def stored(points: npt.NDArray[np.void], grid: TileGrid, root: Path, fragments: int) -> tuple[CandidateSite, Scratch]:
+    """The points as one candidate, in some fragments a tile, as a split stores them."""
+    scratch = Scratch(str(root))
+    scratch.create()
+    column, line = grid.columns_rows(points["x"], points["y"])
+    tiles = sorted({grid.tile_of(x, y) for x, y in zip(points["x"].tolist(), points["y"].tolist(), strict=True)})
+    ranges = []
+    for tile in tiles:
+        own = points[(column == tile.column) & (line == tile.row)]
+        scratch.put_arrays(f"tiles/{tile.key}", {"points": own.view(np.uint8)})
+        cuts = np.linspace(0, len(own), fragments + 1).astype(int).tolist()
+        ranges += [PointRange(tile=tile, start=a, stop=b) for a, b in itertools.pairwise(cuts)]
+    lowest = min(zip(points["x"].tolist(), points["y"].tolist(), points["z"].tolist(), strict=True))
+    site = CandidateSite(
+        building_id=object_id(CRS, lowest),
+        owner=grid.tile_of(lowest[0], lowest[1]),
+        ranges=tuple(ranges),
+        points=len(points),
+    )
+    return site, scratch
+
+
+def divided(site: CandidateSite, grid: TileGrid, scratch: Scratch, own: UnitSettings) -> list[CandidateSite]:
+    return [unit for task in unit_tasks([site], own, grid, scratch, CRS) for unit in divide(task)]
+
+
+ONE_TILE = TileGrid(size_mm=1_000_000, halo_mm=0)
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    size_mm=st.integers(3_000, 40_000),
+    shift_x_mm=st.integers(0, 20_000),
+    shift_y_mm=st.integers(0, 20_000),
+    fragments=st.integers(1, 3),
+    seed=st.integers(0, 99),
+)
+def test_units_do_not_depend_on_tiles_fragments_and_order(
+    size_mm: int,
+    shift_x_mm: int,
+    shift_y_mm: int,
+    fragments: int,
+    seed: int,
+    row: npt.NDArray[np.void],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    whole, scratch = stored(row, ONE_TILE, tmp_path_factory.mktemp("whole"), 1)
+    expected = {u.building_id: points_of(scratch, u) for u in divided(whole, ONE_TILE, scratch, UnitSettings())}
+    assert len(expected) == len(EAVES_M)
+    grid = TileGrid(size_mm=size_mm, halo_mm=0, origin_x_mm=shift_x_mm, origin_y_mm=shift_y_mm)
+    mixed = row[np.random.default_rng(seed).permutation(len(row))]
+    site, scratch = stored(mixed, grid, tmp_path_factory.mktemp("cut"), fragments)
+    units = divided(site, grid, scratch, UnitSettings())
+    assert {u.building_id for u in units} == set(expected)
+    for unit in units:
+        assert np.array_equal(points_of(scratch, unit), expected[unit.building_id])
+
+
+def test_units_keep_every_point_once_in_the_tile_that_holds_it(row: npt.NDArray[np.void], tmp_path: Path) -> None:
+    grid = TileGrid(size_mm=7_000, halo_mm=0)
+    site, scratch = stored(row, grid, tmp_path, 2)
+    units = divided(site, grid, scratch, UnitSettings())
+    assert sum(unit.points for unit in units) == len(row)
+    for unit in units:
+        points = points_of(scratch, unit)
+        lowest = min(zip(points["x"].tolist(), points["y"].tolist(), points["z"].tolist(), strict=True))
+        assert unit.points == len(points)
+        assert unit.building_id == object_id(CRS, lowest)
+        assert unit.owner == grid.tile_of(lowest[0], lowest[1])
+        for part in unit.ranges:
+            held = scratch.array(f"{part.folder}/{part.tile.key}", "points").view(POINT)[part.start : part.stop]
+            assert len(held)
+            assert grid.core(part.tile).contains(held["x"], held["y"]).all()
+
+
+def test_a_candidate_of_one_unit_stays_as_it_is(row: npt.NDArray[np.void], tmp_path: Path) -> None:
+    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
+    assert divided(site, ONE_TILE, scratch, UnitSettings(split="nothing")) == [site]
+    empty = CandidateSite(building_id="a", owner=site.owner, ranges=(), points=0)
+    assert divided(empty, ONE_TILE, scratch, UnitSettings()) == [empty]
+
+
+def test_large_candidates_get_tasks_of_their_own() -> None:
+    def site(points: int) -> CandidateSite:
+        return CandidateSite(building_id=str(points), owner=ONE_TILE.tile_of(0, 0), ranges=(), points=points)
+
+    sites = [site(n) for n in (900_000, 150_000, 40_000, 20_000, 5)]
+    tasks = unit_tasks(sites, UnitSettings(), ONE_TILE, Scratch("nowhere"), CRS)
+    assert [[s.points for s in task.sites] for task in tasks] == [[900_000], [150_000, 40_000], [20_000, 5]]
+    assert unit_tasks([], UnitSettings(), ONE_TILE, Scratch("nowhere"), CRS) == []

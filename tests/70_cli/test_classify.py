@@ -1,0 +1,71 @@
+"""`classify` as a user meets it: files, tables, machine output, errors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from pipeline.cli.classifying import classify
+
+
+def invoke(*words: str) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of the command."""
+    app = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
+    app.command()(classify)
+    result = CliRunner().invoke(app, list(words))
+    return result.exit_code, result.stdout, result.stderr
+
+
+@pytest.fixture(scope="module")
+def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A LAZ file of a flat house of 12 x 10 m and 6 m height on level ground, classes 0."""
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(0, 50, (2, 15_000))
+    roof = (np.abs(x - 25) < 6) & (np.abs(y - 25) < 5)
+    las = laspy.LasData(laspy.LasHeader(version="1.2", point_format=1))
+    las.header.scales = np.full(3, 0.001)
+    las.x, las.y, las.z = x, y, np.where(roof, 6.0, 0.0) + rng.normal(0, 0.01, len(x))
+    las.return_number = las.number_of_returns = np.ones(len(x), np.uint8)
+    path = tmp_path_factory.mktemp("house") / "house.laz"
+    las.write(path)
+    return path
+
+
+def test_a_file_comes_back_with_classes_and_rasters(house: Path, tmp_path: Path) -> None:
+    words = (str(house), "--out", str(tmp_path / "out"), "--workers", "0", "--rasters", "--json")
+    code, out, _ = invoke(*words, "--crs", "EPSG:7415", "--raster-cell", "1")
+    assert code == 0
+    told = json.loads(out)
+    las = laspy.read(told["files"][0]["path"])
+    roof = (np.abs(las.x - 25) < 6) & (np.abs(las.y - 25) < 5)
+    assert (np.asarray(las.classification) == np.where(roof, 6, 2)).mean() > 0.999
+    assert told["classes"].keys() == {"2", "6"}
+    assert told["buildings"] == 1
+    names = {"house.laz", "terrain.tif", "surface.tif", "height.tif"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+
+
+def test_people_see_a_table_of_classes(house: Path, tmp_path: Path) -> None:
+    code, out, _ = invoke(str(house), "--out", str(tmp_path / "out"), "--workers", "0", "--quiet")
+    assert code == 0
+    assert "2 ground" in out
+    assert "6 building" in out
+
+
+def test_a_file_that_is_there_and_a_cell_without_extent_end_with_their_codes(house: Path, tmp_path: Path) -> None:
+    (tmp_path / "house.laz").touch()
+    code, _, err = invoke(str(house), "--out", str(tmp_path), "--workers", "0")
+    assert code == 4
+    assert "--overwrite" in err
+    code, _, err = invoke(str(house), "--out", str(tmp_path / "b"), "--workers", "0", "--rasters", "--raster-cell", "0")
+    assert code == 2
+    assert "raster cell is 0" in err
+    code, _, err = invoke(str(tmp_path / "no.laz"), "--out", str(tmp_path / "c"), "--workers", "0")
+    assert code == 3
+    assert "no.laz" in err
