@@ -436,6 +436,10 @@ def calling_off(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Cal
     if cancelled is never:
         yield never
         return
+    if cancelled():  # before it began: a short run could else be over before it is asked again
+        scratch.cancel()
+        yield lambda: True
+        return
     over, off = threading.Event(), threading.Event()
 
     def ask() -> None:

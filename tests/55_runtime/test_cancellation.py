@@ -21,6 +21,7 @@ from pipeline.runtime.publish import publish
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.split import split
+from pipeline.runtime.units import divide
 from pipeline.settings import RunSettings
 
 STAGES = ("ingest", "split", "reconstruct", "publish")
@@ -189,7 +190,7 @@ def late(start: Callable[..., RunSummary]) -> dict[str, list[Any]]:
 
 def test_no_late_task_changes_a_run_that_is_over(late: dict[str, list[Any]], tmp_path: Path) -> None:
     before = files_below(tmp_path / "run")
-    functions = {"ingest": ingest, "split": split, "reconstruct": model_batch, "publish": publish}
+    functions = {"ingest": ingest, "split": split, "join": divide, "reconstruct": model_batch, "publish": publish}
     for stage, tasks in late.items():
         for task in tasks:
             with pytest.raises((RunCancelledError, FileNotFoundError)):
