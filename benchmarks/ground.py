@@ -36,7 +36,7 @@ GroundFilter = Callable[[Ints, Ints, Ints, Bools, Window], Bools]
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 DENSITIES = (0.2, 1.0, 5.0)
 MARGIN_M = 130
-"""Empty cells around the points: no less than any filter looks."""
+"""Empty cells around the points: no less than the terrain is drawn beyond them."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

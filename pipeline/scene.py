@@ -183,7 +183,16 @@ def split_tile(
     if classes.building or classes.ground:
         preferred = np.where(building, 3, np.where(points.classification == GROUND_CLASS, 1, 2)).astype(np.int8)
         preferred[excluded] = 0
-    chosen = highest_per_cell(points.x_mm, points.y_mm, points.z_mm, preferred, used, settings.surfaces.thinning_m)
+    several = points.return_count > 1
+    chosen = highest_per_cell(
+        points.x_mm,
+        points.y_mm,
+        points.z_mm,
+        preferred,
+        used,
+        settings.surfaces.thinning_m,
+        several.view(np.int8),
+    )
     x, y, z = points.x_mm[chosen], points.y_mm[chosen], points.z_mm[chosen]
     kind = np.full(len(chosen), VertexKind.OBJECT, np.int8)
     chosen_class = points.classification[chosen]
@@ -193,7 +202,7 @@ def split_tile(
         kind[chosen_class == GROUND_CLASS] = VertexKind.GROUND
     kind[building[chosen]] = VertexKind.BUILDING
     planar = planarity(x, y, z, kind == VertexKind.OBJECT, settings.vegetation)
-    kind[crowns(x, y, z, planar, points.return_count[chosen] > 1, settings.vegetation)] = VertexKind.CROWN
+    kind[crowns(x, y, z, planar, several[chosen], settings.vegetation)] = VertexKind.CROWN
     tin = triangulate(np.column_stack((x, y)))
     vertices = SceneVertices(
         x_mm=x,

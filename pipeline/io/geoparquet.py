@@ -60,7 +60,7 @@ def read_geoparquet(
             geo = _geo_of(path, file.schema_arrow.metadata or {})
             columns = geo["columns"]
             name = geo["primary_column"] if column is None else column
-            if name not in columns or name not in file.schema_arrow.names:
+            if name not in columns or file.schema_arrow.names.count(name) != 1:
                 raise UnreadableInputError(
                     str(path), f"geometry column {name!r} is not there", f"Name one of {', '.join(columns) or '(none)'}"
                 )
@@ -74,8 +74,27 @@ def read_geoparquet(
     about = columns[name]
     crs = about.get("crs", DEFAULT_CRS)
     geometries = _wkb_of(path, table.column(name).combine_chunks(), str(about.get("encoding")))
-    attributes = {field: table.column(field).to_pylist() for field in table.column_names if field != name}
+    attributes: dict[str, Sequence[Any]] = {}
+    for field, values in zip(table.column_names, table.columns, strict=True):
+        if field != name and field not in attributes:  # of two columns of one name the first
+            attributes[field] = _values(values)
     return crs if crs is None or isinstance(crs, str) else json.dumps(crs), geometries, attributes
+
+
+def _values(column: pa.ChunkedArray) -> list[Any]:
+    """A column as Python values; None for those that Python cannot hold, such as years beyond 9999."""
+    import pyarrow as pa
+
+    def value(scalar: pa.Scalar) -> Any:
+        try:
+            return scalar.as_py()
+        except (pa.ArrowException, ValueError, OverflowError):
+            return None
+
+    try:
+        return list(column.to_pylist())
+    except (pa.ArrowException, ValueError, OverflowError):
+        return [value(scalar) for scalar in column]
 
 
 def _geo_of(path: Path, metadata: Mapping[bytes, bytes]) -> dict[str, Any]:
@@ -97,8 +116,10 @@ def _covering(columns: Mapping[str, Mapping[str, Any]]) -> set[str]:
     """Columns that only hold the geometries' bounds."""
     found = set()
     for about in columns.values():
-        box = about.get("covering", {}).get("bbox", {}) if isinstance(about.get("covering", {}), dict) else {}
-        found |= {place[0] for place in box.values() if isinstance(place, list) and place}
+        covering = about.get("covering")
+        box = covering.get("bbox") if isinstance(covering, dict) else None
+        places = box.values() if isinstance(box, dict) else ()
+        found |= {place[0] for place in places if isinstance(place, list) and place and isinstance(place[0], str)}
     return found
 
 

@@ -31,7 +31,7 @@ from pipeline.settings import RunSettings
 
 SUFFIX = ".bundle"
 
-_FORMAT = "gablework bundle 1"
+_FORMAT = "gablework bundle 2"
 _LARGEST_BYTES = 2 * 2**30
 _LARGEST_TEXT_BYTES = 64 * 2**20
 _FIX = "Use a file of a run's quarantine folder, whole and unchanged"
@@ -130,12 +130,12 @@ def read_bundle(path: str) -> Bundle:
     try:
         with zipfile.ZipFile(path) as archive:
             document = json.loads(_member(archive, path, "bundle.json", _LARGEST_TEXT_BYTES))
+            if document["format"] != _FORMAT:
+                raise UnreadableInputError(path, f"its format is {document['format']!r}, not {_FORMAT!r}", _FIX)
             stderr = _member(archive, path, "stderr.txt", _LARGEST_TEXT_BYTES).decode("utf-8", errors="replace")
             points = _array(_member(archive, path, "points.npy", _LARGEST_BYTES))
             ground = _array(_member(archive, path, "ground.npy", _LARGEST_BYTES))
             split_returns = _array(_member(archive, path, "split_returns.npy", _LARGEST_BYTES))
-        if document["format"] != _FORMAT:
-            raise UnreadableInputError(path, f"its format is {document['format']!r}, not {_FORMAT!r}", _FIX)
         return _bundle(document, points, ground, split_returns, stderr)
     except OSError as error:
         raise UnreadableInputError(path, f"it cannot be read: {error.strerror or error}", _FIX) from error

@@ -43,6 +43,7 @@ PROJECTION = b"LASF_Projection"
 GEOTIFF_RECORDS = (34735, 34736, 34737)
 SOFTWARE = f"gablework {__version__}"
 _LAS_FORMATS = ("las", "laz", "copc")
+_FIX = "Leave the inputs alone until the command has ended"
 _SCALE = 0.001
 """Units of the CRS in which points of files without integer coordinates are written."""
 
@@ -55,6 +56,8 @@ class ClassifiedTask:
     """As ingest numbered it."""
     path: str
     """The file."""
+    used: int
+    """Points that ingest took from it."""
     name: str
     """File name of the outcome."""
     out: str
@@ -147,10 +150,24 @@ class _Labels:
             raise InconsistentInputError(
                 self._task.path,
                 f"it has more points in tile {tile.key} than when it was first read",
-                "Leave the inputs alone until the command has ended",
+                _FIX,
             )
         self._done[tile] += count
         return found
+
+    def check_all_given(self) -> None:
+        """Refuse a file that ended early.
+
+        Raises
+        ------
+        InconsistentInputError
+            It holds fewer points than when ingest read it.
+        """
+        given = self._done.total()
+        if given < self._task.used:
+            raise InconsistentInputError(
+                self._task.path, f"{given} of {self._task.used} points are left since it was first read", _FIX
+            )
 
 
 def write_classified(task: ClassifiedTask) -> ClassifiedFile:
@@ -182,6 +199,7 @@ def write_classified(task: ClassifiedTask) -> ClassifiedFile:
             points += len(written)
             kept_own += int((found == KEEP).sum())
             writer.write(written)
+        labels.check_all_given()
         writer.close(_copied(Path(task.path), plan.extended))
     return ClassifiedFile(
         source=task.path,

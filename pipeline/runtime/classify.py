@@ -178,7 +178,7 @@ def classify(
                 joined = stages.join(splits, footprints, reference)
                 tiles = sorted(s.tile for s in splits)
                 _label_all(stages, tiles, joined, ingested)
-                files = _write_all(stages, paths, out)
+                files = _write_all(stages, paths, ingested, out)
                 rasters = _draw_all(stages, tiles, ingested, cell, reference, out) if request.rasters else []
             except BaseException:
                 scratch.cancel()
@@ -234,12 +234,13 @@ def _label_all(stages: Stages, tiles: Sequence[Tile], joined: Joined, ingested: 
     stages.progress.stage(stages.executor, "classify", label, tasks)
 
 
-def _write_all(stages: Stages, paths: Sequence[str], out: Path) -> list[ClassifiedFile]:
+def _write_all(stages: Stages, paths: Sequence[str], ingested: Sequence[Ingested], out: Path) -> list[ClassifiedFile]:
     """All files, in the inputs' order."""
     tasks = [
         ClassifiedTask(
             index=k,
             path=path,
+            used=sum(ingested[k].points_by_tile.values()),
             name=output_name(path),
             out=str(out),
             options=stages.plan.options,
@@ -305,7 +306,8 @@ def _checked_folder(request: ClassifyRequest, paths: Sequence[str]) -> Path:
     Raises
     ------
     RunError
-        Two inputs would get one name, an input would be replaced, a file is there already, or it cannot be written.
+        Two inputs would get one name, an input would be replaced, a file is there already, something stands in the
+        way, or it cannot be written.
     """
     if "://" in request.out:
         raise RunError(f"{request.out} is no local path: this version writes local folders only")
@@ -319,6 +321,10 @@ def _checked_folder(request: ClassifyRequest, paths: Sequence[str]) -> Path:
         if (out / name).resolve() == Path(path).resolve():
             raise RunError(f"{path} would be replaced by its own outcome: give another --out")
     names = [*sources, *(f"{name}.tif" for name in RASTERS if request.rasters)]
+    odd = [name for name in names if (out / name).is_dir()]
+    odd.extend(name for name in (_SCRATCH,) if (out / name).exists() and not (out / name).is_dir())
+    if odd:
+        raise RunError(f"{out / odd[0]} stands in the way: remove it, or give another --out")
     there = [name for name in names if (out / name).exists()]
     if there and not request.overwrite:
         raise RunError(f"{out} holds {there[0]} already: give another --out, or --overwrite")

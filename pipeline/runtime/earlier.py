@@ -138,7 +138,7 @@ def check_points(manifest: RunManifest, paths: Sequence[str], ingested: Sequence
     """Refuse points that are not those of the run."""
     known = {entry.path: entry.sha256 for entry in manifest.inputs}
     for path, found in zip(paths, ingested, strict=True):
-        if known[path] != found.sha256:
+        if known.get(path) != found.sha256:
             raise RunError(f"{path} is not the file that the run read: its content changed. {_AGAIN}")
 
 

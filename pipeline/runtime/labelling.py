@@ -10,6 +10,7 @@ import dataclasses
 import math
 from collections import Counter
 from pathlib import Path
+from uuid import uuid4
 
 import numpy as np
 import numpy.typing as npt
@@ -104,7 +105,7 @@ def label(task: LabelTask) -> Labelled:
         histogram = np.bincount(labels)
         counts.update({int(code): int(histogram[code]) for code in np.flatnonzero(histogram)})
         target = class_path(task.scratch, task.tile, path.name)
-        temporary = target.with_name(f".{target.name}.part")
+        temporary = target.with_name(f".{target.name}.{uuid4().hex}.part")
         labels.tofile(temporary)
         temporary.replace(target)
     return Labelled(tile=task.tile, points=dict(counts))

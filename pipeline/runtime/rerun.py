@@ -7,6 +7,7 @@ the first file of the run directory is touched.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime as dt
 import json
@@ -174,7 +175,7 @@ def rerun(
                 executor=engine,
                 scratch=scratch,
                 isolation=request.isolation,
-                quarantine=str(earlier.run_dir / QUARANTINE),
+                quarantine=str(Path(scratch.root, QUARANTINE)),  # put in place with the other files
             )
             try:
                 ingested = stages.ingest(paths)
@@ -189,7 +190,7 @@ def rerun(
                 scratch.cancel()
                 raise
             scratch.check_cancelled()
-            digest = _written(earlier, wanted, found, modelled, updates, began)
+            digest = _written(earlier, wanted, found, modelled, updates, scratch, began)
     finally:
         remove_folder(scratch_dir)
     status = {**{m.building_id: m.status for m in modelled}, **{s.object_id: "rejected" for s in found.again.rejected}}
@@ -320,8 +321,9 @@ def _as_in_the_run(stages: Stages, earlier: Earlier, found: _Found) -> bool:
     rejected = {site.object_id: site for site in found.judged.rejected}
     records = earlier.records(found.changed)
     for name in found.changed:
-        site = candidates.get(name) or rejected.get(name)
-        if site is None or name in earlier.redrawn or not _same(stages, records[name], site):
+        # of a building that is cut off where the split tiles end, neither points nor id are those of the run
+        site, record = candidates.get(name) or rejected.get(name), records.get(name)
+        if site is None or record is None or name in earlier.redrawn or not _same(stages, record, site):
             return False
     return True
 
@@ -363,6 +365,7 @@ def _written(
     found: _Found,
     modelled: Sequence[Modelled],
     updates: Mapping[Tile, TileUpdate],
+    scratch: Scratch,
     began: float,
 ) -> str:
     """Put the new files in place, each whole, and the manifest last; the digest."""
@@ -370,25 +373,43 @@ def _written(
     storage = LocalStorage(root=root)
     manifest = _manifest(earlier, request, found, modelled)
     # whoever reads now, or after a power cut, sees that the directory is being changed
-    write_manifest(root, dataclasses.replace(earlier.manifest, status=RunStatus.RUNNING), storage.put)
-    for tile, update in updates.items():
-        for path, data in update.files.items():
-            storage.put(path, data)
-        _put_state(storage, tile, update)
-        for path in update.gone:
-            (root / path).unlink(missing_ok=True)
-    told = {m.building_id: m.reason for m in modelled}
-    for name in found.changed:
-        if told.get(name) not in _QUARANTINED:
-            (root / QUARANTINE / f"{name}{SUFFIX}").unlink(missing_ok=True)
-    if request.overrides is not None:
-        put_json(root, OVERRIDES, [outcome.as_dict() for outcome in found.outcomes])
-    digest = run_digest(str(root))
+    changing = dataclasses.replace(earlier.manifest, status=RunStatus.RUNNING, content_sha256=None)
+    write_manifest(root, changing, storage.put)
+    try:
+        for tile, update in updates.items():
+            for path, data in update.files.items():
+                storage.put(path, data)
+            _put_state(storage, tile, update)
+            for path in update.gone:
+                (root / path).unlink(missing_ok=True)
+        _put_bundles(storage, scratch, found.changed, modelled)
+        if request.overrides is not None:
+            put_json(root, OVERRIDES, [outcome.as_dict() for outcome in found.outcomes])
+        digest = run_digest(str(root))
+    except BaseException as error:
+        told = (*changing.warnings, f"{type(error).__name__}: {error}".removesuffix(": "))
+        with contextlib.suppress(OSError):  # a full disk takes no manifest either: then it says running
+            write_manifest(root, dataclasses.replace(changing, status=RunStatus.FAILED, warnings=told), storage.put)
+        raise
     seconds = {**earlier.manifest.timings_s, "rerun": round(time.perf_counter() - began, 3)}
     finished = dt.datetime.now(tz=dt.UTC)
     whole = dataclasses.replace(manifest, content_sha256=digest, timings_s=seconds, finished_at=finished)
     write_manifest(root, whole, storage.put)
     return digest
+
+
+def _put_bundles(
+    storage: LocalStorage, scratch: Scratch, changed: Collection[str], modelled: Sequence[Modelled]
+) -> None:
+    """The bundles of the buildings that met a fault this time, in place of those of an earlier one."""
+    told = {m.building_id: m.reason for m in modelled}
+    for name in sorted(changed):
+        key = f"{QUARANTINE}/{name}{SUFFIX}"
+        made = Path(scratch.root, key)
+        if told.get(name) in _QUARANTINED and made.is_file():
+            storage.put(key, made.read_bytes())
+        else:
+            storage.path(key).unlink(missing_ok=True)
 
 
 def _put_state(storage: LocalStorage, tile: Tile, update: TileUpdate) -> None:

@@ -84,7 +84,8 @@ def given_footprints(path: str, plan: Plan) -> GivenFootprints:
         area &= shapely.box(*(v * unit for v in plan.options.bbox))
     if plan.options.aoi is not None:
         area &= shapely.transform(plan.options.aoi, lambda xy: xy * unit)
-    inside = [k for k, polygon in enumerate(found.polygons) if polygon.intersects(area)]
+    shapely.prepare(area)  # of many inputs it has many corners, and is asked once a footprint
+    inside = [k for k, polygon in enumerate(found.polygons) if area.intersects(polygon)]
     # a fault far from the data is none of this run's; one without a place may be
     issues = [i for i in found.issues if i.bounds_m is None or shapely.box(*i.bounds_m).intersects(area)]
     warnings = [*found.warnings, *(str(issue) for issue in issues[:_ISSUES_TOLD])]

@@ -134,7 +134,7 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
     Parameters
     ----------
     kind : int
-        FacetKind of the surface: OBJECT or BUILDING.
+        FacetKind of the surface: OBJECT, BUILDING or CROWN.
     sums : (N_SUMS,) int64
         Its sums.
     settings : CandidateSettings
@@ -156,7 +156,12 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
         return Verdict(
             reason=Reason.TOO_LOW, detail=f"mean height {f['height_m']:.2f} m, at least {settings.min_height_m:g}"
         )
-    if kind == FacetKind.CROWN or (f["judged"] > 0 and f["planar_share"] < settings.min_planar_share):
+    if kind == FacetKind.CROWN:
+        return Verdict(
+            reason=Reason.VEGETATION,
+            detail=f"a crown: most of what surrounds its vertices is rough, planar share {f['planar_share']:.2f}",
+        )
+    if f["judged"] > 0 and f["planar_share"] < settings.min_planar_share:
         return Verdict(
             reason=Reason.VEGETATION,
             detail=f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}",

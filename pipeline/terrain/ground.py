@@ -75,7 +75,10 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
         else:
             counts = [self.max_window_m, self.trend_m, self.widest_m, self.regrowth_passes, self.regrowth_m]
             told = (
-                f"max_window_m {self.max_window_m}, trend_m {self.trend_m}, widest_m {self.widest_m}",
+                (
+                    f"max_window_m {self.max_window_m}, trend_m {self.trend_m}, widest_m {self.widest_m}, regrowth_m"
+                    f" {self.regrowth_m} in {self.regrowth_passes} passes, bridge_m {self.bridge_m}"
+                ),
                 "use smaller ones",
             )
         whole = all(isinstance(n, int) for n in (*counts, self.bridge_m))

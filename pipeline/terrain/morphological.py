@@ -46,7 +46,7 @@ class MorphologicalFilterSettings(Parameters):
 
     max_window_m: int = parameter(
         20,
-        "Largest radius of the openings on the terrain lattice: smaller objects are cut off whatever their height.",
+        "Largest radius of the openings on the terrain lattice; wider objects are looked for on a coarse one.",
         unit="m",
         minimum=2,
         maximum=60,

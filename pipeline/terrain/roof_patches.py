@@ -405,9 +405,8 @@ def patches_of(
     """
     radii = circumradii(x, y, tin.facets)
     limit = _TYPICAL_RADII * float(np.median(radii))
-    sound = np.flatnonzero(radii <= 1000.0 * min(max(limit / 1000.0, max_radius_m / 2.0), max_radius_m)).astype(
-        np.int32
-    )
+    is_sound = radii <= 1000.0 * min(max(limit / 1000.0, max_radius_m / 2.0), max_radius_m)
+    sound = np.flatnonzero(is_sound).astype(np.int32)
     start, others = vertex_neighbours(len(x), tin.facets, sound)
     local = local_planes(x, y, z, round(window_m * 1000), min_points)
     order = np.argsort(local[:, 2], kind="stable")
@@ -423,7 +422,7 @@ def patches_of(
     for k, values in enumerate((x, y, z)):
         np.add.at(centres[:, k], label, values / 1000.0)
     centres /= np.maximum(np.bincount(label, minlength=count), 1)[:, None]
-    across = np.flatnonzero(radii > limit).astype(np.int32)
+    across = np.flatnonzero(~is_sound).astype(np.int32)
     gaps, sights, _, _ = border_pieces(x, y, tin.facets, tin.neighbours, across, label, count)
     borders = _borders(pairs, ends, planes, least_step_m, _longest_first(gaps, sights, count))
     outlines = outline / 1000.0

@@ -18,9 +18,15 @@ _BITS = 31
 
 @njit(cache=True, nogil=True)
 def _highest_per_cell(
-    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, preferred: KindArray, used: BoolArray, cell_mm: int
+    x_mm: IntArray,
+    y_mm: IntArray,
+    z_mm: IntArray,
+    preferred: KindArray,
+    used: BoolArray,
+    cell_mm: int,
+    among_equals: KindArray,
 ) -> IntArray:
-    """Kernel: of each cell the point that is preferred most, highest, then southernmost, then westernmost."""
+    """Kernel: of each cell the point preferred most, highest, southernmost, westernmost, then first among equals."""
     n = x_mm.size
     size = 2
     while size < 2 * n:
@@ -53,8 +59,10 @@ def _highest_per_cell(
             better = z_mm[i] > z_mm[j]
         elif y_mm[i] != y_mm[j]:
             better = y_mm[i] < y_mm[j]
-        else:
+        elif x_mm[i] != x_mm[j]:
             better = x_mm[i] < x_mm[j]
+        else:
+            better = among_equals[i] > among_equals[j]
         if better:
             holder[s] = i
     chosen = np.empty(count, np.int64)
@@ -64,7 +72,13 @@ def _highest_per_cell(
 
 
 def highest_per_cell(
-    x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, preferred: KindArray, used: BoolArray, cell_m: float
+    x_mm: IntArray,
+    y_mm: IntArray,
+    z_mm: IntArray,
+    preferred: KindArray,
+    used: BoolArray,
+    cell_m: float,
+    among_equals: KindArray | None = None,
 ) -> IntArray:
     """Indices of one point a cell, ordered by (x, y).
 
@@ -78,13 +92,17 @@ def highest_per_cell(
         Points that may be chosen at all.
     cell_m : float
         Side of a cell in metres.
+    among_equals : (n,) int8, optional
+        Of points at one place in space the one with the greater number wins: whatever else is read of the chosen
+        points must not hang on the order of the points.
 
     Returns
     -------
     (m,) int64
         At most one index a cell, so all (x, y) differ; the order does not depend on that of the points.
     """
-    chosen = _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, round(cell_m * 1000))
+    tie = preferred if among_equals is None else among_equals
+    chosen = _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, round(cell_m * 1000), tie)
     order = np.lexsort((y_mm[chosen], x_mm[chosen]))
     result: IntArray = chosen[order]
     return result

@@ -52,11 +52,11 @@ class VegetationSettings(Parameters):
         maximum=5.0,
     )
     crown_share: float = parameter(
-        0.5, "Share of rough vertices in that sphere from which a vertex belongs to a crown.", minimum=0.1, maximum=1.0
+        0.5, "Share of rough vertices in that sphere above which a vertex belongs to a crown.", minimum=0.1, maximum=1.0
     )
     pierced_share: float = parameter(
         0.1,
-        "Least share of vertices from pulses of several returns in the sphere around a vertex of a crown.",
+        "Share of vertices from pulses of several returns in that sphere, above which it may be a crown's.",
         minimum=0.0,
         maximum=1.0,
     )

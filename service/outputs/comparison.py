@@ -129,6 +129,10 @@ def _cleaner(folder: Path, labels: Sequence[str]) -> Callable[[str], str]:
     """A function that takes the server's folders out of a text, also as a page writes them."""
     manifests = [json.loads((folder / RUNS / label / "run.json").read_text(encoding="utf-8")) for label in labels]
     paths = {entry["path"] for manifest in manifests for entry in manifest["inputs"]}
+    # the request tells them again, links followed
+    requests = [manifest.get("request", {}) for manifest in manifests]
+    asked = {request.get(name) for request in requests for name in ("footprints", "overrides", "aoi")}
+    paths |= {path for path in asked if path is not None}
     written = paths | {str(escape(path)) for path in paths} | {markdown_cell(path) for path in paths}
     return cleaner(sorted(written), folder)
 

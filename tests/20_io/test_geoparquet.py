@@ -131,6 +131,23 @@ def test_attributes_become_what_json_knows(tmp_path):
     json.dumps([first, second], allow_nan=False)
 
 
+def test_attributes_that_python_cannot_hold_stop_nothing(tmp_path):
+    columns = {
+        "geometry": wkb(),
+        "late": pa.array([2**62, 0], pa.timestamp("us")),
+        "somewhere": pa.array([0, None], pa.timestamp("us", tz="Nowhere/Land")),
+        "name": pa.array([b"\xff", b"Dam"]).view(pa.string()),
+    }
+    path = by_hand(tmp_path / "a.parquet", columns, encoding="WKB", crs=None)
+    assert read_footprints(path, reference()).attributes == (
+        {"late": None, "somewhere": None, "name": None},
+        {"late": "1970-01-01T00:00:00", "somewhere": None, "name": "Dam"},
+    )
+    table = pa.Table.from_arrays([wkb(), pa.array([1, 2]), pa.array([3, 4])], names=["geometry", "year", "year"])
+    pq.write_table(table.replace_schema_metadata(pq.read_schema(path).metadata), path)
+    assert [row["year"] for row in read_footprints(path, reference()).attributes] == [1, 2]
+
+
 def test_rows_without_geometry_are_told_one_by_one(tmp_path):
     broken = pa.array([shapely.to_wkb(HOUSES[0]), None, b"\x01\x02", shapely.to_wkb(shapely.Point(1, 2))], pa.binary())
     path = by_hand(tmp_path / "a.parquet", {"id": ["a", "b", "c", "d"], "geometry": broken}, encoding="WKB", crs=None)
@@ -166,6 +183,12 @@ def test_parquet_that_says_nothing_of_geometry_is_refused_and_the_fix_named(tmp_
         pq.write_table(pa.table({"geometry": wkb()}).replace_schema_metadata({"geo": geo}), path)
         with pytest.raises(UnreadableInputError, match="name no geometry column"):
             read_footprints(path, reference())
+
+
+@pytest.mark.parametrize("covering", [None, 1, [], {}, {"bbox": []}, {"bbox": {"xmin": [{}, 1], "ymin": 3}}])
+def test_a_covering_that_is_none_is_passed_over(tmp_path, covering):
+    path = by_hand(tmp_path / "a.parquet", {"geometry": wkb()}, encoding="WKB", crs=None, covering=covering)
+    assert len(read_footprints(path, reference())) == 2
 
 
 @pytest.mark.parametrize("kept", [8, 100, -8])

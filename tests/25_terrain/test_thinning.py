@@ -81,6 +81,17 @@ def test_equal_heights_are_decided_south_then_west() -> None:
     assert thinned(points, nothing, everything).tolist() == [2]
 
 
+def test_of_points_at_one_place_the_greater_among_equals_is_chosen_whatever_their_order() -> None:
+    points = np.array([[40, 100, 7], [40, 100, 7], [40, 100, 7], [300, 300, 9], [300, 300, 2]])
+    nothing, everything = np.zeros(5, np.int8), np.ones(5, np.bool_)
+    rank = np.array([0, 1, 0, 0, 1], np.int8)
+    for used, expected in ((np.array([True, True, True, False, False]), (7, 1)), (everything, (9, 0))):
+        for order in (np.arange(5), np.array([1, 0, 2, 4, 3]), np.array([2, 4, 0, 3, 1])):
+            x, y, z = (np.ascontiguousarray(points[order, k]) for k in range(3))
+            (chosen,) = highest_per_cell(x, y, z, nothing, used[order], 0.5, rank[order])
+            assert (z[chosen], rank[order][chosen]) == expected
+
+
 def test_cells_are_half_open_and_anchored_at_the_origin_of_the_crs() -> None:
     points = np.array([[-1, 0, 1], [0, 0, 2], [499, 499, 3], [500, 0, 4]])
     nothing, everything = np.zeros(4, np.bool_), np.ones(4, np.bool_)

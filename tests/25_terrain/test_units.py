@@ -273,6 +273,13 @@ def test_a_gap_in_the_data_parts_nothing() -> None:
     assert agreement(found, cloud.house[there] // 2) > 0.97
 
 
+def test_a_gap_in_sparse_data_parts_nothing_though_it_is_hardly_wider_than_the_points_lie_apart() -> None:
+    # points 2.2 m apart, a gap of 6 m: its facets have circumradii of 3.2 m, three typical ones are 4.7 m
+    x, y = (v.ravel() for v in np.meshgrid(2200 * np.arange(14, dtype=np.int64), 2200 * np.arange(9, dtype=np.int64)))
+    x[x > 14_000] += 3800
+    assert units_of(x, y, np.full(len(x), 8000), SETTINGS).max() == 0
+
+
 def test_an_annex_is_a_unit_of_its_own_where_asked() -> None:
     assert cloud_of(_lower_wing).units(UnitSettings(annex_share=0.0)).max() == 1
 

@@ -283,6 +283,28 @@ def test_the_order_of_the_points_does_not_matter(town: Any, classes: ClassesInUs
     np.testing.assert_array_equal(fragment[here.core_index], here.point_fragment)
 
 
+def test_the_order_of_points_at_one_place_from_different_pulses_does_not_matter() -> None:
+    random = np.random.default_rng(3)
+    n = 24_000
+    x, y = 1000 * random.integers(20, 80, (2, n)) + 500
+    tree = np.hypot(x - 50_000, y - 50_000) < 9000
+    count = np.where(tree, random.integers(1, 3, n), 1).astype(np.uint8)
+    points = WindowPoints(
+        x_mm=x,
+        y_mm=y,
+        z_mm=np.where(tree, 1000 * random.integers(6, 9, n), 0),
+        return_number=count,
+        return_count=count,
+        classification=np.zeros(n, np.uint8),
+    )
+    halved = SceneSettings(vegetation=VegetationSettings(pierced_share=0.5))
+    here = split_whole(points, settings=halved)
+    for order in (np.arange(n)[::-1], random.permutation(n)):
+        there = split_whole(taken(points, order), settings=halved)
+        np.testing.assert_array_equal(there.fragments.kind, here.fragments.kind)
+        np.testing.assert_array_equal(there.fragments.sums, here.fragments.sums)
+
+
 @given(
     x0=st.integers(-(10**9), 10**9),
     y0=st.integers(-(10**9), 10**9),

@@ -16,6 +16,7 @@ from pipeline.errors import InconsistentInputError, RunCancelledError, RunError,
 from pipeline.io import open_source
 from pipeline.io.las_frame import read_frame
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
+from pipeline.runtime.events import Event
 from pipeline.settings import RunSettings
 
 Classify = Callable[..., ClassifySummary]
@@ -190,6 +191,18 @@ def test_two_inputs_of_one_name_are_refused(true_suburb: Path, run_classify: Cla
         run_classify(true_suburb, tmp_path / "suburb.las")
 
 
+def test_what_stands_in_the_way_is_named_before_any_work(
+    true_suburb: Path, run_classify: Classify, tmp_path: Path
+) -> None:
+    (tmp_path / "a" / "suburb.laz").mkdir(parents=True)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "scratch").touch()
+    for folder, name in (("a", "suburb.laz"), ("b", "scratch")):
+        with pytest.raises(RunError, match=rf"{name} stands in the way"):
+            run_classify(true_suburb, out=str(tmp_path / folder), overwrite=True)
+        assert [path.name for path in (tmp_path / folder).iterdir()] == [name]
+
+
 def test_waveforms_are_refused_by_format(true_suburb: Path, run_classify: Classify, tmp_path: Path) -> None:
     las = laspy.convert(laspy.read(true_suburb), point_format_id=4, file_version="1.4")
     las.write(tmp_path / "waves.las")
@@ -242,8 +255,11 @@ def test_the_classes_of_the_file_stand_where_they_are_trusted(true_suburb: Path,
     assert (found[truth == 6] == 6).all()
 
 
+@pytest.mark.parametrize(
+    ("change", "told"), [(1000, r"more points in tile .* than when it was first read"), (-1000, r"points are left")]
+)
 def test_a_file_that_changes_meanwhile_is_told(
-    true_suburb: Path, run_classify: Classify, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    change: int, told: str, true_suburb: Path, run_classify: Classify, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "changing.laz"
     las = laspy.read(true_suburb)
@@ -254,12 +270,13 @@ def test_a_file_that_changes_meanwhile_is_told(
 
     def then_change(*arguments: Any) -> None:
         label_all(*arguments)
-        doubled = laspy.LasData(las.header)
-        doubled.points = las.points[np.r_[: len(las.points), :1000]]
-        doubled.write(path)
+        other = laspy.LasData(las.header)
+        n = len(las.points)
+        other.points = las.points[np.arange(n + change) % n]
+        other.write(path)
 
     monkeypatch.setattr(module, "_label_all", then_change)
-    with pytest.raises(InconsistentInputError, match=r"more points in tile .* than when it was first read"):
+    with pytest.raises(InconsistentInputError, match=told):
         run_classify(path, out=str(tmp_path / "out"))
     assert list((tmp_path / "out").iterdir()) == []
 
@@ -269,6 +286,20 @@ def test_a_classification_that_is_called_off_leaves_no_file(true_suburb: Path, t
     with pytest.raises(RunCancelledError):
         classify(request, cancelled=lambda: True)
     assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize(("stage", "left"), [("classify", []), ("write", []), ("mosaics", ["suburb.laz"])])
+def test_an_interruption_leaves_whole_files_and_no_scratch(
+    stage: str, left: list[str], true_suburb: Path, tmp_path: Path
+) -> None:
+    def interrupt(event: Event) -> None:
+        if (event.kind, event.stage) == ("stage", stage):
+            raise KeyboardInterrupt
+
+    request = ClassifyRequest(inputs=(str(true_suburb),), out=str(tmp_path / "out"), workers=0, rasters=True)
+    with pytest.raises(KeyboardInterrupt):
+        classify(request, interrupt)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == left
 
 
 def test_a_copc_file_becomes_plain_laz(

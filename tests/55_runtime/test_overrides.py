@@ -463,6 +463,68 @@ def test_a_rerun_that_is_called_off_leaves_the_run_as_it_was(plain: Any, copied:
     assert files(first.run_dir) | {"run.json": (Path(first.run_dir) / "run.json").read_bytes()} == before
 
 
+def test_a_building_that_the_split_tiles_cut_off_is_sought_in_all_of_them(
+    suburb: Path, reconstruct: Any, overridden: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.runtime.rerun.AROUND_M", 0.0)
+    size_m = 60.0
+    first = reconstruct(suburb, settings={"tile_size_m": size_m})
+    outlines = [outline(row) for row in rows(first.run_dir, "buildings").values()]
+    across = [o for o in outlines if o.bounds[0] // size_m != o.bounds[2] // size_m]
+    house = max(across, key=lambda o: o.bounds[2] % size_m)
+    _, south, east, north = house.bounds
+    text = f'[[building]]\npoint = [{east - 1.0}, {(south + north) / 2}]\naction = "reject"'
+    whole = overridden(text, settings={"tile_size_m": size_m})
+    done = again(first.run_dir, overrides=str(tmp_path / "overrides.toml"))
+    assert done.tiles_split == first.counts["tiles"]
+    assert done.digest == whole.digest != first.digest
+    assert files(first.run_dir) == files(whole.run_dir)
+
+
+def test_the_bundle_of_a_building_that_meets_a_fault_comes_with_the_other_files_or_not_at_all(
+    copied: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = copied()
+    before = files(first.run_dir)
+    name = min(rows(first.run_dir, "buildings"))
+
+    def faulty(*_: Any) -> Any:
+        raise ZeroDivisionError
+
+    def called_off(*_: Any) -> Any:
+        raise RunCancelledError("called off")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline.runtime.modelling, "reconstruct_building", faulty)
+        with monkeypatch.context() as late:
+            late.setattr("pipeline.runtime.rerun._updates", called_off)
+            with pytest.raises(RunCancelledError):
+                again(first.run_dir, only=(name,))
+        assert files(first.run_dir) == before
+        assert again(first.run_dir, only=(name,)).buildings == {name: "failed"}
+        assert set(files(first.run_dir)) - set(before) == {f"quarantine/{name}.bundle"}
+    again(first.run_dir, only=(name,))
+    assert files(first.run_dir) == before
+
+
+def test_a_rerun_that_fails_among_the_files_says_so(copied: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = copied()
+    name = min(rows(first.run_dir, "buildings"))
+
+    def full(*_: Any) -> None:
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.runtime.rerun._put_state", full)
+        with pytest.raises(OSError, match="no space left"):
+            again(first.run_dir, only=(name,))
+    told = json.loads((Path(first.run_dir) / "run.json").read_text())
+    assert (told["status"], told["content_sha256"]) == ("failed", None)
+    assert told["warnings"][-1] == "OSError: no space left"
+    with pytest.raises(RunError, match="is failed, not finished"):
+        again(first.run_dir, only=(name,))
+
+
 def test_runs_that_cannot_be_continued_are_refused_with_the_reason(
     suburb: Path, reconstruct: Any, tmp_path: Path
 ) -> None:

@@ -167,7 +167,7 @@ def test_an_array_that_promises_more_than_it_holds_is_refused(path: Path) -> Non
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"format": "gablework bundle 2"}, "gablework bundle 2"),
+        ({"format": "gablework bundle 1"}, "gablework bundle 1"),
         ({"building_id": "../../etc/passwd"}, "building_id"),
         ({"origin": [1.0, 2.0]}, "odd"),
         ({"origin": None}, "odd"),

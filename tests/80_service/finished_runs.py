@@ -36,6 +36,8 @@ from service.store import JobStore
 TILE_M = 100.0
 SERVER_FOLDER = "/srv/the city's/uploads/0f0f"
 """Where the inputs of the runs lay: no answer may tell it. A page writes its apostrophe another way."""
+LINKED_FOLDER = "/mnt/disk7/0f0f"
+"""Where a link to the footprints led: no answer may tell that either."""
 
 Tiles = Mapping[str, Sequence[BuildingResult]]
 
@@ -140,6 +142,7 @@ def write_run(
             InputFile(path=f"{SERVER_FOLDER}/tile.laz", sha256="ab" * 32, size_bytes=1000, n_points=640),
             InputFile(path=f"{SERVER_FOLDER}/outlines.gpkg", sha256="cd" * 32, size_bytes=20),
         ),
+        request={"footprints": f"{LINKED_FOLDER}/outlines.gpkg", "overrides": None, "aoi": None},
         source_licence="CC0",
         tiles=tuple(sorted(tiles)),
         failed_tiles=() if failed_tile is None else (failed_tile,),

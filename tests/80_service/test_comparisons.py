@@ -382,10 +382,12 @@ def test_the_archive_holds_the_whole_comparison_and_no_folder_of_the_server(
     for text in [*texts.values(), *(client.get(path).text for path in told)]:
         assert runs.SERVER_FOLDER not in text
         assert "uploads/0f0f" not in text
+        assert runs.LINKED_FOLDER not in text
         assert "node-7" not in text
         assert str(service.folder.root) not in text
     manifest = json.loads(texts["runs/fuzzy-sart/run.json"])
     assert manifest["inputs"][0]["path"] == "tile.laz"
+    assert manifest["request"]["footprints"] == "outlines.gpkg"
     assert sorted(manifest["peak_memory_bytes"].values()) == [3_000_000, 5_000_000]
     assert json.loads(texts["compare.json"])["share"] == 0.1
     again = service.compared()
