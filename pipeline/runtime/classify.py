@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from uuid import uuid4
 
-from pipeline.errors import RunError
+from pipeline.errors import RunError, SettingsError
 from pipeline.export.raster import RasterLattice
 from pipeline.io import SpatialReference
 from pipeline.runtime.classified_files import (
@@ -130,6 +130,10 @@ def classify(
     ClusterError
         The scheduler does not answer or was lost.
     """
+    if request.raster_cell is not None and not request.rasters:
+        raise SettingsError(
+            [f"raster_cell is {request.raster_cell:g} where no rasters are asked for: give --rasters too"]
+        )
     began = time.perf_counter()
     progress = Progress(on_event)
     progress.tell("run", "plan", f"classify into {request.out}")

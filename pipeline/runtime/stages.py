@@ -90,7 +90,7 @@ def given_footprints(path: str, plan: Plan) -> GivenFootprints:
     issues = [i for i in found.issues if i.bounds_m is None or shapely.box(*i.bounds_m).intersects(area)]
     warnings = [*found.warnings, *(str(issue) for issue in issues[:_ISSUES_TOLD])]
     if len(issues) > _ISSUES_TOLD:
-        warnings.append(f"{len(issues) - _ISSUES_TOLD} more faults of footprints: footprints.json lists them all")
+        warnings.append(f"{len(issues) - _ISSUES_TOLD} more faults of footprints, each in footprints.json of a run")
     if len(inside) < len(found.polygons):
         warnings.append(f"{len(found.polygons) - len(inside)} of {len(found.polygons)} footprints lie off the data")
     # overlaps are decided by this order

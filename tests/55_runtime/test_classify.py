@@ -12,7 +12,13 @@ import numpy as np
 import pyproj
 import pytest
 
-from pipeline.errors import InconsistentInputError, RunCancelledError, RunError, UnreadableInputError
+from pipeline.errors import (
+    InconsistentInputError,
+    RunCancelledError,
+    RunError,
+    SettingsError,
+    UnreadableInputError,
+)
 from pipeline.io import open_source
 from pipeline.io.las_frame import read_frame
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
@@ -279,6 +285,13 @@ def test_a_file_that_changes_meanwhile_is_told(
     with pytest.raises(InconsistentInputError, match=told):
         run_classify(path, out=str(tmp_path / "out"))
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_cell_of_rasters_that_nobody_asked_for_is_an_error(true_suburb: Path, tmp_path: Path) -> None:
+    request = ClassifyRequest(inputs=(str(true_suburb),), out=str(tmp_path / "out"), raster_cell=2.0, workers=0)
+    with pytest.raises(SettingsError, match=r"raster_cell is 2 where no rasters are asked for: give --rasters too"):
+        classify(request)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_classification_that_is_called_off_leaves_no_file(true_suburb: Path, tmp_path: Path) -> None:

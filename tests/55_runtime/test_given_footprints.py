@@ -117,7 +117,7 @@ def test_many_faults_are_warned_of_ten_by_ten_and_listed_whole(
     frame.to_parquet(tmp_path / "a.parquet")
     summary = reconstruct(suburb, footprints=str(tmp_path / "a.parquet"))
     assert sum(warning.startswith("footprint ") for warning in summary.warnings) == 10
-    assert "20 more faults of footprints: footprints.json lists them all" in summary.warnings
+    assert "20 more faults of footprints, each in footprints.json of a run" in summary.warnings
     assert len(json.loads((Path(summary.run_dir) / "footprints.json").read_text())["issues"]) == 30
 
 
