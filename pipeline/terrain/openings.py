@@ -98,22 +98,6 @@ def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, scr
 
 
 @njit(cache=True, nogil=True)
-def opened_by(surface: Elevations, radius: int) -> Elevations:
-    """Opening of a surface by an octagon of a radius in cells; NO_DATA where the surface has none."""
-    eroded = framed(surface)
-    opened, scratch = eroded.copy(), eroded.copy()
-    for number in range(1, radius + 1):
-        erode_once(eroded, scratch, number)
-    dilate_back(surface, eroded, opened, scratch, radius)
-    out = surface.copy()
-    for r in range(surface.shape[0]):
-        for c in range(surface.shape[1]):
-            if surface[r, c] != NO_DATA:
-                out[r, c] = opened[r + 1, c + 1]
-    return out
-
-
-@njit(cache=True, nogil=True)
 def cut_off(surface: Elevations, base_mm: Elevations, rise_mm: float, largest: int) -> ByteArray:
     """The first radius of a growing opening that takes more off a cell than it may.
 

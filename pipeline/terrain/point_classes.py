@@ -14,6 +14,7 @@ from numba import njit
 
 from pipeline.model import BoolArray, ByteArray, IntArray, KindArray
 from pipeline.spatial_hash import slot_of_key
+from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.lattice import NO_DATA, PIT_MATES
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.terrain.vegetation import VegetationSettings, planarity
@@ -78,28 +79,6 @@ def support_m(vegetation: VegetationSettings) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _cells(x: IntArray, y: IntArray, used: BoolArray, cell: int) -> tuple[IntArray, IntArray, int, int, int, int]:
-    """Used points sorted by square cells: where each cell's begin, the points, first column and row, columns, rows."""
-    n = x.size
-    column0, row0 = x.min() // cell, y.min() // cell
-    columns, rows = x.max() // cell - column0 + 1, y.max() // cell - row0 + 1
-    start = np.zeros(columns * rows + 1, np.int64)
-    for i in range(n):
-        if used[i]:
-            start[(y[i] // cell - row0) * columns + x[i] // cell - column0 + 1] += 1
-    for k in range(columns * rows):
-        start[k + 1] += start[k]
-    position = start[:-1].copy()
-    members = np.empty(start[-1], np.int64)
-    for i in range(n):
-        if used[i]:
-            k = (y[i] // cell - row0) * columns + x[i] // cell - column0
-            members[position[k]] = i
-            position[k] += 1
-    return start, members, column0, row0, columns, rows
-
-
-@njit(cache=True, nogil=True)
 def tops_nearby(x: IntArray, y: IntArray, z: IntArray, used: BoolArray, wanted: BoolArray, reach: int) -> IntArray:
     """Elevation of the highest used point within a distance in plan of each wanted one, int64 (n,).
 
@@ -112,7 +91,7 @@ def tops_nearby(x: IntArray, y: IntArray, z: IntArray, used: BoolArray, wanted: 
     out = np.full(n, np.int64(NO_DATA), np.int64)
     if n == 0:
         return out
-    start, members, column0, row0, columns, rows = _cells(x, y, used, reach)
+    start, members, column0, row0, columns, rows = points_by_cell(x, y, used, reach)
     for i in range(n):
         if not wanted[i]:
             continue
@@ -136,7 +115,7 @@ def counts_nearby(x: IntArray, y: IntArray, used: BoolArray, reach: int) -> IntA
     out = np.zeros(n, np.int64)
     if n == 0:
         return out
-    start, members, column0, row0, columns, rows = _cells(x, y, used, reach)
+    start, members, column0, row0, columns, rows = points_by_cell(x, y, used, reach)
     for i in range(n):
         if not used[i]:
             continue

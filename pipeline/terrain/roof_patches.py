@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from pipeline.model import FloatArray, IntArray, LabelArray, Tin
+from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.vegetation import smallest_eigenvalue
 
 _SCALES = 3
@@ -95,19 +96,7 @@ def local_planes(x: IntArray, y: IntArray, z: IntArray, radius_mm: int, min_poin
     for scale in range(_SCALES):
         radius = radius_mm * 2**scale
         limit = radius * radius
-        column0, row0 = x.min() // radius, y.min() // radius
-        columns, rows = x.max() // radius - column0 + 1, y.max() // radius - row0 + 1
-        start = np.zeros(columns * rows + 1, np.int64)
-        for i in range(n):
-            start[(y[i] // radius - row0) * columns + x[i] // radius - column0 + 1] += 1
-        for k in range(columns * rows):
-            start[k + 1] += start[k]
-        position = start[:-1].copy()
-        members = np.empty(n, np.int64)
-        for i in range(n):
-            k = (y[i] // radius - row0) * columns + x[i] // radius - column0
-            members[position[k]] = i
-            position[k] += 1
+        start, members, column0, row0, columns, rows = points_by_cell(x, y, np.ones(n, np.bool_), radius)
         s = np.empty(10)
         for i in range(n):
             if out[i, 2] < _UNKNOWN:

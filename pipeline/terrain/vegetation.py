@@ -14,6 +14,7 @@ from numba import njit
 
 from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.parameters import Parameters, parameter
+from pipeline.terrain.binning import points_by_cell
 
 _SCALES = 3
 
@@ -138,20 +139,9 @@ def _planar(
     shift_y = np.array([0, 0, diagonal, shift, diagonal, 0, -diagonal, -shift, -diagonal])
     limit = radius_mm * radius_mm
     cell = 2 * radius_mm
-    column0, row0 = x_mm.min() // cell, y_mm.min() // cell
-    columns, rows = x_mm.max() // cell - column0 + 1, y_mm.max() // cell - row0 + 1
-    start = np.zeros(columns * rows + 1, np.int64)
-    for i in range(n):
-        start[(y_mm[i] // cell - row0) * columns + x_mm[i] // cell - column0 + 1] += 1
-    for k in range(columns * rows):
-        start[k + 1] += start[k]
+    start, members, column0, row0, columns, rows = points_by_cell(x_mm, y_mm, np.ones(n, np.bool_), cell)
     # copies in the order of the cells: three neighbouring cells of a row are one run of memory
-    position = start[:-1].copy()
-    px, py, pz = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    for i in range(n):
-        k = (y_mm[i] // cell - row0) * columns + x_mm[i] // cell - column0
-        px[position[k]], py[position[k]], pz[position[k]] = x_mm[i], y_mm[i], z_mm[i]
-        position[k] += 1
+    px, py, pz = x_mm[members], y_mm[members], z_mm[members]
     sums = np.empty((9, 10), np.int64)
     planar_mm2 = roughness_mm * roughness_mm
     for i in range(n):
@@ -243,21 +233,9 @@ def _crowns(
     n = x_mm.size
     out = np.zeros(n, np.bool_)
     limit = radius_mm * radius_mm
-    column0 = x_mm.min() // radius_mm if n else 0
-    columns = (x_mm.max() // radius_mm - column0 + 1) if n else 0
-    row0 = y_mm.min() // radius_mm if n else 0
-    rows = (y_mm.max() // radius_mm - row0 + 1) if n else 0
-    start = np.zeros(columns * rows + 1, np.int64)
-    for i in range(n):
-        start[(y_mm[i] // radius_mm - row0) * columns + x_mm[i] // radius_mm - column0 + 1] += 1
-    for k in range(columns * rows):
-        start[k + 1] += start[k]
-    position = start[:-1].copy()
-    members = np.empty(n, np.int64)
-    for i in range(n):
-        k = (y_mm[i] // radius_mm - row0) * columns + x_mm[i] // radius_mm - column0
-        members[position[k]] = i
-        position[k] += 1
+    if n == 0:
+        return out
+    start, members, column0, row0, columns, rows = points_by_cell(x_mm, y_mm, np.ones(n, np.bool_), radius_mm)
     for i in range(n):
         if planar[i] < 0:
             continue

@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation, generate_binary_structure, grey_dilat
 from pipeline.terrain.ground import GroundSettings
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.morphological import closed_gaps, morphological_ground, regrown, without_clumps
-from pipeline.terrain.openings import cut_off, opened_by
+from pipeline.terrain.openings import cut_off, dilate_back, erode_once, framed
 from pipeline.terrain.planar_fitting import leaning_planes
 from pipeline.terrain.wide_objects import wide_objects
 
@@ -66,6 +66,19 @@ def test_the_elements_are_octagons_that_grow_by_a_cell_and_are_nearly_round() ->
         assert mask.sum() == pytest.approx(math.pi * (radius + 0.5) ** 2, rel=0.12)
         np.testing.assert_array_equal(mask, mask[::-1])
         np.testing.assert_array_equal(mask, mask.T)
+
+
+def opened_by(surface: Grid, radius: int) -> Grid:
+    """Opening of a surface by an octagon of a radius in cells; NO_DATA where the surface has none."""
+    eroded = framed(surface)
+    opened, scratch = eroded.copy(), eroded.copy()
+    for number in range(1, radius + 1):
+        erode_once(eroded, scratch, number)
+    dilate_back(surface, eroded, opened, scratch, radius)
+    out = surface.copy()
+    known = surface != NO_DATA
+    out[known] = opened[1:-1, 1:-1][known]
+    return out
 
 
 @settings(deadline=None)
