@@ -184,6 +184,8 @@ class Candidate:
     """Given footprint in local metres; None where none was given."""
     source_id: str | None = None
     """The given footprint's own id."""
+    outline: MultiPolygon | None = None
+    """Its part of the outline that it was drawn with the units it touches, local metres; None where it stands alone."""
     touches_data_edge: bool = False
     """True where the data end at the candidate: it may be cut."""
 

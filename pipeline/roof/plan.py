@@ -55,6 +55,8 @@ class RoofPoints:
     """Typical distance of neighbours in plan."""
     footprint_mm: MultiPolygon | None
     """The given footprint in integer millimetres."""
+    outline_mm: MultiPolygon | None = None
+    """The outline that was drawn together with touching units; integer millimetres."""
 
 
 def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
@@ -106,6 +108,7 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
         split=_are_among(grid[kept, :2], np.rint(candidate.split_returns[:, :2] * 1e3).astype(np.int64)),
         spacing_m=min(max(point_spacing_m(points[index]), 0.1), 3.0),
         footprint_mm=footprint,
+        outline_mm=None if candidate.outline is None else footprint_in_mm(candidate.outline),
     )
 
 
@@ -202,12 +205,10 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     labels[n + outside] = labels[nearest[outside]]
     labels = continue_crossings(x, y, tin.facets, labels, known, coefficients)
     continued_faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
-    return RoofPlan(
-        planes=tuple(planes),
-        faces=continued_faces,
-        outline_mm=straighten(around, roof.spacing_m, settings, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m)),
-        raw=partition,
-    )
+    drawn = roof.outline_mm
+    if drawn is None:
+        drawn = straighten(around, roof.spacing_m, settings, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m))
+    return RoofPlan(planes=tuple(planes), faces=continued_faces, outline_mm=drawn, raw=partition)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

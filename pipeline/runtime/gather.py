@@ -6,18 +6,23 @@ import dataclasses
 import datetime as dt
 import hashlib
 import math
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import shapely
+from shapely import MultiPolygon, Polygon
 from shapely.affinity import translate
 
 from pipeline.export.records import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
-from pipeline.model import BoolArray, Candidate
+from pipeline.model import BoolArray, Candidate, IntArray
 from pipeline.runtime.join import CandidateSite
 from pipeline.runtime.scratch import POINT, Scratch
 from pipeline.terrain.lattice import CELL_MM, NO_DATA
 from pipeline.tiling import MM, TileGrid, Window
+
+Area = TypeVar("Area", Polygon, MultiPolygon, Polygon | MultiPolygon)
 
 _GROUND_MARGIN_M = 4
 _VIEW_MARGIN_M = 14
@@ -88,11 +93,15 @@ def points_of(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
         stored = scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
         pieces.append(np.array(stored[part.start : part.stop]))
     points = np.concatenate(pieces) if pieces else np.empty(0, POINT)
-    order = np.lexsort(
+    sorted_points: npt.NDArray[np.void] = points[canonical_order(points)]
+    return sorted_points
+
+
+def canonical_order(points: npt.NDArray[np.void]) -> IntArray:
+    """The order of points that does not depend on files and tiles: X, Y, Z, return, GPS time, source; (n,) int64."""
+    return np.lexsort(
         (points["source"], points["gps_time"], points["return_number"], points["z"], points["y"], points["x"])
     )
-    sorted_points: npt.NDArray[np.void] = points[order]
-    return sorted_points
 
 
 def gather(
@@ -152,6 +161,8 @@ def gather(
         ground_z = None
     digest = hashlib.sha256(points.tobytes())
     digest.update(np.ascontiguousarray(ground_mm).tobytes())
+    if site.outline is not None:
+        digest.update(np.rint(shapely.get_coordinates(site.outline) * MM).astype(np.int64).tobytes())
     candidate = Candidate(
         building_id=site.building_id,
         origin=(float(origin_mm[0] // MM), float(origin_mm[1] // MM), float(origin_mm[2] // MM)),
@@ -159,14 +170,19 @@ def gather(
         ground=(ground_mm - origin_mm) / MM,
         split_returns=(xyz[(points["return_number"] == 1) & (points["return_count"] > 1)] - origin_mm) / MM,
         ground_z_m=math.nan if ground_z is None else (ground_z - int(origin_mm[2])) / MM,
-        footprint=None
-        if footprint is None
-        else translate(footprint, -float(origin_mm[0] // MM), -float(origin_mm[1] // MM)),
+        footprint=None if footprint is None else _moved(footprint, origin_mm),
         source_id=site.source_id,
+        outline=None if site.outline is None else _moved(site.outline, origin_mm),
         touches_data_edge=_touches_data_edge(roof, around.occupied),
     )
     first, last = _acquired(points, gps_kind)
     return candidate, CandidateFacts(input_hash=digest.hexdigest(), acquired_from=first, acquired_to=last)
+
+
+def _moved(area: Area, origin_mm: IntArray) -> Area:
+    """An area in metres, from the CRS into a local frame."""
+    moved: Area = translate(area, -float(origin_mm[0] // MM), -float(origin_mm[1] // MM))
+    return moved
 
 
 def _acquired(points: npt.NDArray[np.void], kind: GpsTimeKind) -> tuple[dt.datetime | None, dt.datetime | None]:

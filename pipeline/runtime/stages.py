@@ -368,7 +368,8 @@ class Stages:
         settings = self.settings.scene.units
         if settings.split == "nothing":
             return joined
-        tasks = unit_tasks(joined.candidates, settings, self.plan.grid, self.scratch, crs_name)
+        roof = self.settings.building.roof
+        tasks = unit_tasks(joined.candidates, settings, roof, self.plan.grid, self.scratch, crs_name)
         sites: list[CandidateSite] = []
         with contextlib.closing(self.executor.map("join", divide, tasks, self.progress.watch)) as running:
             for measured in running:

@@ -1,0 +1,56 @@
+"""Outlines of touching units: without slits and overlaps, the border amid the points of both."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+
+from pipeline.model import Candidate, FloatArray, LabelArray
+from pipeline.roof.settings import RoofSettings
+from pipeline.roof.unit_outlines import unit_outlines
+
+
+def candidate_of(points: FloatArray) -> Candidate:
+    return Candidate(building_id="a", origin=(0.0, 0.0, 0.0), points=points, ground=np.zeros((0, 3)), ground_z_m=0.0)
+
+
+@pytest.fixture
+def halves() -> tuple[Candidate, LabelArray]:
+    """A flat roof of 20 m by 10 m, its right half 3 m higher, 1.6 points a m2."""
+    random = np.random.default_rng(8)
+    xy = random.uniform((0, 0), (20, 10), (320, 2)).round(3)
+    unit = (xy[:, 0] > 10.0).astype(np.int32)
+    return candidate_of(np.column_stack((xy, 6.0 + 3.0 * unit))), unit
+
+
+def test_the_shared_border_is_one_straight_line(halves: tuple[Candidate, LabelArray]) -> None:
+    left, right = unit_outlines(*halves, RoofSettings())
+    assert left is not None
+    assert right is not None
+    shared = shapely.intersection(left, right, grid_size=0.001)
+    assert shared.length == pytest.approx(10.0, abs=0.6)
+    assert shapely.intersection(left, right).area < 1e-6
+    x = shapely.get_coordinates(shared)[:, 0]
+    assert np.ptp(x) < 0.3
+    assert np.abs(x - 10.0).max() < 0.4
+
+
+def test_together_they_are_the_outline_of_the_whole(halves: tuple[Candidate, LabelArray]) -> None:
+    candidate, unit = halves
+    both = shapely.union_all(unit_outlines(candidate, unit, RoofSettings()))
+    (whole,) = unit_outlines(candidate, np.zeros_like(unit), RoofSettings())
+    assert whole is not None
+    assert shapely.symmetric_difference(both, whole).area < 0.005 * whole.length
+
+
+def test_swapped_numbers_swap_the_outlines(halves: tuple[Candidate, LabelArray]) -> None:
+    candidate, unit = halves
+    drawn = unit_outlines(candidate, unit, RoofSettings())
+    swapped = unit_outlines(candidate, 1 - unit, RoofSettings())
+    assert [outline.equals(other) for outline, other in zip(drawn, swapped[::-1], strict=True)] == [True, True]  # type: ignore[union-attr]
+
+
+def test_without_a_plan_no_unit_has_an_outline() -> None:
+    three = candidate_of(np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0], [0.0, 1.0, 5.0]]))
+    assert unit_outlines(three, np.array([0, 0, 1], np.int32), RoofSettings()) == [None, None]
