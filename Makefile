@@ -21,11 +21,7 @@ UV := $(BIN)/uv --no-progress
 COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra postgres
 
-# numba keeps compiled kernels per source file and does not notice when a kernel in another file changed:
-# tests therefore use a cache named after the content of all kernels.
 KERNEL_SOURCES := $(shell grep -rl --include='*.py' njit pipeline | LC_ALL=C sort)
-KERNELS = $(shell cat $(KERNEL_SOURCES) | cksum | tr ' ' '-')
-TEST_ENV = NUMBA_CACHE_DIR="$(CURDIR)/.cache/numba/$(KERNELS)" OPENBLAS_NUM_THREADS=1
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test check unit slow viewer serve ruler lock docs format clean
@@ -60,8 +56,10 @@ $(VENV)/.test-stamp: requirements-test.lock $(VENV)/.build-stamp pyproject.toml
 	$(INSTALL_SELF)
 	@touch $@ $(VENV)/.run-stamp
 
-# The kernels, compiled once by one process: two workers that meet a cold cache would both compile all of them.
-$(VENV)/.warm-stamp: $(VENV)/.run-stamp $(KERNEL_SOURCES)
+# The kernels, compiled once by one process: two workers that meet a cold cache would both compile all of them. numba
+# keeps them per source file and does not notice that a kernel in another file changed: all are compiled anew then.
+$(VENV)/.warm-stamp: requirements.lock $(KERNEL_SOURCES) | $(VENV)/.run-stamp
+	@find pipeline -name '*.nb[ci]' -delete
 	@echo "compiling the kernels, once: about a minute"
 	@$(BIN)/gablework warm-up --quiet
 	@touch $@
@@ -96,12 +94,11 @@ check: $(VENV)/.test-stamp
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-unit: $(VENV)/.test-stamp
-	@mkdir -p .cache/numba && find .cache/numba -mindepth 1 -maxdepth 1 ! -name '$(KERNELS)' -exec rm -rf {} +
-	$(TEST_ENV) $(BIN)/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile --durations=15
+unit: $(VENV)/.test-stamp $(VENV)/.warm-stamp
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile --durations=15
 
-slow: $(VENV)/.test-stamp viewer
-	$(TEST_ENV) $(BIN)/python -m pytest -m slow --durations=15
+slow: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m slow --durations=15
 
 viewer: service/viewer/dist/index.html
 

@@ -3,7 +3,7 @@
 Importing the settings classes themselves would bring numba and the kernels of every stage into a process that only
 answers requests (78 MB and a second). So their fields are kept as data beside this module; `make docs` writes the file
 and a test holds it against the classes. Values are checked by the same code as in a run; what concerns several
-settings at once is checked by the driver.
+settings at once is checked by the driver, but for the tables of `WHOLE`, whose classes are light enough.
 """
 
 from __future__ import annotations
@@ -16,9 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.parameters import Parameters, build, parameter
+from pipeline.terrain.class_codes import ClassCodeSettings
 
 PATH = Path(__file__).with_name("catalogue.json")
 """The written fields."""
+
+WHOLE: Mapping[str, type[Parameters]] = {"class-codes": ClassCodeSettings}
+"""Tables whose own classes are used, with all that they check: they bring nothing else along."""
 
 LARGEST_INTEGER = 2**53
 """Beyond it JSON's numbers are not exact everywhere."""
@@ -146,7 +150,7 @@ def load() -> Catalogue:
     written = json.loads(PATH.read_text(encoding="utf-8"))
     return Catalogue(
         general=_kind("general", written["general"]),
-        tables={name: _kind(name, fields) for name, fields in written["tables"].items()},
+        tables={name: WHOLE.get(name) or _kind(name, fields) for name, fields in written["tables"].items()},
     )
 
 

@@ -35,6 +35,9 @@ LAS, LAZ, PLY, TEXT, CSV = "application/vnd.las", "application/vnd.laszip", "app
 ENDINGS: Mapping[str, str] = {LAZ: ".laz", LAS: ".las", PLY: ".ply", TEXT: ".xyz", CSV: ".csv"}
 """Media types of point clouds sent by value, and how their files are called."""
 
+_OUTLINES = {b"SQLite format 3": ".gpkg", b"PAR1": ".parquet"}
+"""How footprints that are sent by value are called, by their first bytes; others are GeoJSON."""
+
 _UPLOAD = re.compile(r"(?:.*/)?uploads/([0-9a-f]{32})/?")
 
 
@@ -208,9 +211,10 @@ class Inputs:
         if isinstance(value, Mapping) and "value" in value:
             if value.get("encoding") == "base64":
                 content = self._decoded(name, value["value"])
-                gpkg = content is not None and content.startswith(b"SQLite format 3")
-                ending = ".gpkg" if gpkg else ".geojson"
-                return None if content is None else Inline(content=content, filename=f"footprints{ending}")
+                if content is None:
+                    return None
+                ending = next((end for magic, end in _OUTLINES.items() if content.startswith(magic)), ".geojson")
+                return Inline(content=content, filename=f"footprints{ending}")
             value = value["value"]
         if not isinstance(value, Mapping) or value.get("type") != "FeatureCollection":
             self._fault(name, value, "use an href, or a GeoJSON FeatureCollection")

@@ -10,7 +10,9 @@ from service.errors import RequestError
 
 GEOJSON_SUFFIXES = (".geojson", ".json")
 """Endings of GeoJSON."""
-FOOTPRINT_SUFFIXES = (".gpkg", *GEOJSON_SUFFIXES)
+PARQUET_SUFFIXES = (".parquet", ".geoparquet")
+"""Endings of GeoParquet."""
+FOOTPRINT_SUFFIXES = (".gpkg", *GEOJSON_SUFFIXES, *PARQUET_SUFFIXES)
 """Endings of footprints in one file; a Shapefile is several, and is taken by path only."""
 SUFFIXES = (*POINT_SUFFIXES, *FOOTPRINT_SUFFIXES)
 """Endings of the files that are taken."""

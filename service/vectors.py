@@ -1,7 +1,8 @@
 """Footprints from strangers: what a GeoPackage or GeoJSON is, without the library that will read it.
 
 A GeoPackage is a database, which can hold views that never end and columns that are computed; GeoJSON can be nested
-without measure. Both are refused here. Shapefiles are several files and are taken by path only.
+without measure; GeoParquet can hold more than its bytes let guess. All are refused here. Shapefiles are several files
+and are taken by path only.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ import numpy as np
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
 from service.errors import TooLargeError
-from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES
+from service.filenames import FOOTPRINT_SUFFIXES, GEOJSON_SUFFIXES, PARQUET_SUFFIXES
 
 VECTOR_SUFFIXES = (*FOOTPRINT_SUFFIXES, ".shp")
 """Endings of footprints."""
 GEOPACKAGE_LIMIT = 2**30
-"""Bytes; footprints are held in memory as a whole."""
+"""Bytes of a GeoPackage or GeoParquet; where all of it lies on the data, all is held in memory."""
 GEOJSON_LIMIT = 2**28
 """Bytes."""
 DEPTH_LIMIT = 64
@@ -35,7 +36,7 @@ VALUE_LIMIT = 2**24
 HEAD_BYTES = 65_536
 BLOCK_BYTES = 1 << 20
 
-FIX = "Give a GeoPackage (.gpkg) or GeoJSON (.geojson, .json) with polygons of buildings in plain tables"
+FIX = "Give a GeoPackage (.gpkg), GeoJSON (.geojson, .json) or GeoParquet (.parquet) with polygons of buildings"
 SQLITE_MAGIC = b"SQLite format 3\0"
 SHAPE_MAGIC = b"\0\0\x27\x0a"
 APPLICATION_IDS = (b"GPKG", b"GP10", b"GP11")
@@ -77,6 +78,11 @@ def examine_vector(path: Path) -> dict[str, Any]:
         if not head.startswith(SQLITE_MAGIC) or head[68:72] not in APPLICATION_IDS:
             raise UnreadableInputError(str(path), f"not a GeoPackage: it begins with {head[:16]!r}", FIX)
         return _geopackage(path)
+    if suffix in PARQUET_SUFFIXES:
+        from service.parquet import parquet_facts
+
+        rows, column, crs = parquet_facts(path)
+        return _told("geoparquet", rows, [column], crs, [])
     return _geojson(path, head)
 
 

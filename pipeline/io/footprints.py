@@ -54,6 +54,8 @@ PROBLEMS = {
 """What can be wrong with a footprint, and how several of them are told."""
 ACCURACY_LIMIT_M = 0.5
 """A coarser reprojection is told."""
+AROUND_M = 100.0
+"""How far off an area footprints are still read: more than its edges bend, and operations differ, between two CRS."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -92,6 +94,8 @@ class Footprints:
     """What was repaired, left out or assumed, one sentence each."""
     issues: tuple[FootprintIssue, ...] = ()
     """Every feature that was repaired or left out, in the file's order."""
+    elsewhere: int = 0
+    """Polygons of the file that were passed over, since they lie off the area that was asked for."""
 
     def __len__(self) -> int:
         """Number of footprints."""
@@ -105,6 +109,7 @@ def read_footprints(
     layer: str | None = None,
     id_column: str | None = None,
     crs: str | None = None,
+    area: shapely.Geometry | None = None,
 ) -> Footprints:
     """Footprints of a vector file, reprojected where its CRS is not the run's.
 
@@ -122,6 +127,10 @@ def read_footprints(
         The column of ids; None to look for the common names, then for the file's own feature id.
     crs : str, optional
         Stands above the file's CRS.
+    area : Geometry, optional
+        Where footprints are wanted, in metres of the run's CRS. Of a file that covers a country all others are passed
+        over unread, but for features whose place is not known. The boxes around its parts decide, 100 m wider: who
+        needs its very border cuts there. Whether a column of ids serves is told from what was read.
 
     Raises
     ------
@@ -130,18 +139,22 @@ def read_footprints(
     InconsistentInputError
         If the ids of a named column are empty or not unique.
     EmptyInputError
-        If it has no polygons that can be used.
+        If it has no polygons that can be used, wherever they lie.
     CrsError
         If its coordinates are degrees and the run's CRS is unknown, or a CRS is not understood.
     """
     name = str(path)
     told: list[str] = []
-    found = read_layer(Path(path), layer)
+
+    def boxes(own: str | None) -> npt.NDArray[np.float64] | None:
+        return None if area is None else _boxes(area, own if crs is None else crs, reference, name)
+
+    found = read_layer(Path(path), layer, None if area is None else boxes)
     problems: dict[int, tuple[str, str]] = {}
     repairs: dict[int, str] = {}
     geometries = _polygons_only(found, problems)
     kept = np.flatnonzero(~shapely.is_missing(geometries))
-    if len(kept) == 0:
+    if len(kept) == 0 and not found.elsewhere:
         lost = f"none of the {len(found.geometries)} features is a polygon"
         raise EmptyInputError(name, lost, "Give polygons of buildings")
     polygons = shapely.force_2d(geometries[kept])
@@ -154,7 +167,7 @@ def read_footprints(
     polygons = _repaired(polygons, kept, problems, repairs)
     solid = ~shapely.is_empty(polygons)
     polygons, kept = polygons[solid], kept[solid]
-    if len(kept) == 0:
+    if len(kept) == 0 and not found.elsewhere:
         raise EmptyInputError(name, "no polygon has an area", "Give polygons of buildings")
     table = {field: [_plain(value) for value in column] for field, column in found.columns.items()}
     ids, ids_of_all = _ids(name, table, found.feature_ids, kept, id_column)
@@ -175,7 +188,26 @@ def read_footprints(
         attributes=tuple({field: table[field][row] for field in table} for row in kept.tolist()),
         warnings=(*told, *_summary(issues)),
         issues=issues,
+        elsewhere=found.elsewhere,
     )
+
+
+def _boxes(
+    area: shapely.Geometry, crs: str | None, reference: SpatialReference, name: str
+) -> npt.NDArray[np.float64] | None:
+    """Boxes around the parts of an area in a layer's CRS, (k, 4); None where they cannot be told there."""
+    own, target = None if crs is None else horizontal_part(parse_crs(crs, path=name)), reference.horizontal_crs
+    around = shapely.bounds(shapely.get_parts(area)) + AROUND_M * np.array([-1.0, -1.0, 1.0, 1.0])
+    boxes: npt.NDArray[np.float64] = around / reference.horizontal_unit_m
+    if own is not None and target is not None and not own.equals(target, ignore_axis_order=True):
+        import pyproj
+
+        project = pyproj.Transformer.from_crs(target, own, always_xy=True).transform_bounds
+        boxes = np.array([project(x0, y0, x1, y1, 21) for x0, y0, x1, y1 in boxes.tolist()]).reshape(-1, 4)
+        # a box across the antimeridian comes with its sides swapped
+        if not np.isfinite(boxes).all() or (boxes[:, :2] > boxes[:, 2:]).any():
+            return None
+    return boxes
 
 
 def _polygons_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> npt.NDArray[np.object_]:
@@ -228,7 +260,7 @@ def _in_metres(
                 "Give --crs for the points",
             )
         told.append(f"the points' CRS is unknown: that of the footprints, {own.name!r}, is assumed to be the same")
-    elif not own.equals(target, ignore_axis_order=True):
+    elif len(polygons) and not own.equals(target, ignore_axis_order=True):
         polygons = _reprojected(name, polygons, own, target, told)
     if reference.horizontal_unit_m == 1.0:
         return polygons

@@ -6,6 +6,7 @@ A missing `crs` means OGC:CRS84, longitude and latitude; `null` means that nobod
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy.typing as npt
 import shapely
 
 from pipeline.errors import UnreadableInputError
+from pipeline.io.nearby import BATCH, Boxes, Nearby
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,10 +28,49 @@ DEPTHS = {"polygon": 2, "multipolygon": 3}
 """Levels of lists above the coordinates, by the encodings of polygons beside WKB."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GeometryColumn:
+    """What a file says of its geometries."""
+
+    name: str
+    """Of the column."""
+    crs: str | None
+    """As a code or PROJJSON; None where the file says that it is unknown."""
+    encoding: str
+    """`WKB`, or one of `DEPTHS`; others are not read."""
+    wanted: list[str]
+    """This column and those of attributes: all but other geometries and what only covers one."""
+
+
+def geometry_column(path: Path, schema: pa.Schema, column: str | None = None) -> GeometryColumn:
+    """What a file's schema tells of a geometry column; None for the primary one.
+
+    Raises
+    ------
+    UnreadableInputError
+        It says nothing of geometry, or the column is not there.
+    """
+    geo = _geo_of(path, schema.metadata or {})
+    columns = geo["columns"]
+    name = geo["primary_column"] if column is None else column
+    if name not in columns or schema.names.count(name) != 1:
+        raise UnreadableInputError(
+            str(path), f"geometry column {name!r} is not there", f"Name one of {', '.join(columns) or '(none)'}"
+        )
+    idle = set(columns) | _covering(columns)
+    crs = columns[name].get("crs", DEFAULT_CRS)
+    return GeometryColumn(
+        name=name,
+        crs=crs if crs is None or isinstance(crs, str) else json.dumps(crs),
+        encoding=str(columns[name].get("encoding")),
+        wanted=[field for field in schema.names if field == name or field not in idle],
+    )
+
+
 def read_geoparquet(
-    path: Path, column: str | None
-) -> tuple[str | None, npt.NDArray[np.object_], dict[str, Sequence[Any]]]:
-    """CRS, geometries and attributes of a file.
+    path: Path, column: str | None, boxes: Boxes | None = None
+) -> tuple[str | None, npt.NDArray[np.int64], npt.NDArray[np.object_], dict[str, Sequence[Any]], int]:
+    """CRS, row numbers, geometries and attributes of a file, and how many of its polygons were passed over.
 
     Parameters
     ----------
@@ -37,15 +78,21 @@ def read_geoparquet(
         A GeoParquet file.
     column : str, optional
         The geometry column; None for the primary one.
+    boxes : callable, optional
+        Where features are wanted: as of `pipeline.io.vector_layer.read_layer`.
 
     Returns
     -------
     str or None
         CRS as a code or PROJJSON; None where the file says that it is unknown.
+    (n,) array of int64
+        The rows' numbers in the file.
     (n,) array of bytes
         ISO WKB, None where there is no geometry.
     dict
         All other columns as plain Python values; other geometries and columns that only cover one are left out.
+    int
+        Polygons off the boxes.
 
     Raises
     ------
@@ -57,28 +104,29 @@ def read_geoparquet(
 
     try:
         with pq.ParquetFile(path) as file:
-            geo = _geo_of(path, file.schema_arrow.metadata or {})
-            columns = geo["columns"]
-            name = geo["primary_column"] if column is None else column
-            if name not in columns or file.schema_arrow.names.count(name) != 1:
-                raise UnreadableInputError(
-                    str(path), f"geometry column {name!r} is not there", f"Name one of {', '.join(columns) or '(none)'}"
-                )
-            idle = set(columns) | _covering(columns)
-            wanted = [field for field in file.schema_arrow.names if field == name or field not in idle]
-            table = file.read(columns=wanted)
+            about = geometry_column(path, file.schema_arrow, column)
+            name = about.name
+            nearby = Nearby(None if boxes is None else boxes(about.crs))
+            rows, batches, geometries = [np.empty(0, np.int64)], [], [np.empty(0, object)]
+            first = 0
+            for batch in file.iter_batches(BATCH, columns=about.wanted):
+                wkb = _wkb_of(path, batch.column(batch.schema.names.index(name)), about.encoding)
+                near = nearby.of(wkb)
+                rows.append(first + np.flatnonzero(near))
+                geometries.append(wkb[near])
+                # a filter copies: of what is passed over nothing is held
+                batches.append(batch if near.all() else batch.filter(pa.array(near)))
+                first += len(near)
+            table = pa.Table.from_batches(batches) if batches else file.read_row_groups([], columns=about.wanted)
     except (pa.ArrowException, OSError) as fault:
         raise UnreadableInputError(str(path), f"cannot be read as Parquet ({str(fault)[:160]})", "Write it anew") from (
             fault
         )
-    about = columns[name]
-    crs = about.get("crs", DEFAULT_CRS)
-    geometries = _wkb_of(path, table.column(name).combine_chunks(), str(about.get("encoding")))
     attributes: dict[str, Sequence[Any]] = {}
     for field, values in zip(table.column_names, table.columns, strict=True):
         if field != name and field not in attributes:  # of two columns of one name the first
             attributes[field] = _values(values)
-    return crs if crs is None or isinstance(crs, str) else json.dumps(crs), geometries, attributes
+    return about.crs, np.concatenate(rows), np.concatenate(geometries), attributes, nearby.elsewhere
 
 
 def _values(column: pa.ChunkedArray) -> list[Any]:

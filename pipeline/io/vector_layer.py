@@ -1,4 +1,8 @@
-"""One layer of a vector file as it stands there: GeoPackage, GeoJSON, Shapefile or GeoParquet."""
+"""One layer of a vector file as it stands there: GeoPackage, GeoJSON, Shapefile or GeoParquet.
+
+Of a file that covers a country, only what lies near the data is kept: its geometries go by in batches, and the columns
+of the others are never read (GDAL), or let go batch by batch (GeoParquet).
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,7 @@ import shapely
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io.formats import first_bytes
+from pipeline.io.nearby import BATCH, Boxes, Nearby
 
 VALID = (
     "Valid are GeoPackage (.gpkg), GeoJSON (.geojson, .json), Shapefile (.shp with .shx and .dbf) "
@@ -38,9 +43,11 @@ class VectorLayer:
     """(n,) bool, True where there is a geometry that cannot be read."""
     columns: Mapping[str, Sequence[Any]]
     """All columns but the geometry, by name."""
+    elsewhere: int = 0
+    """Polygons of the file that were passed over, since they lie off the boxes."""
 
 
-def read_layer(path: Path, layer: str | None) -> VectorLayer:
+def read_layer(path: Path, layer: str | None, boxes: Boxes | None = None) -> VectorLayer:
     """The one layer of a file that can hold polygons, or the named one.
 
     Parameters
@@ -49,6 +56,8 @@ def read_layer(path: Path, layer: str | None) -> VectorLayer:
         The file; its first bytes tell its format.
     layer : str, optional
         The layer; of GeoParquet the geometry column.
+    boxes : callable, optional
+        Where features are wanted; those whose bounds meet none of its boxes are passed over. None reads all.
 
     Raises
     ------
@@ -59,10 +68,9 @@ def read_layer(path: Path, layer: str | None) -> VectorLayer:
     if head.startswith(PARQUET_MAGIC):
         from pipeline.io.geoparquet import read_geoparquet
 
-        crs, geometry_bytes, columns = read_geoparquet(path, layer)
-        feature_ids = np.arange(len(geometry_bytes), dtype=np.int64)
+        crs, feature_ids, geometry_bytes, columns, elsewhere = read_geoparquet(path, layer, boxes)
     else:
-        crs, feature_ids, geometry_bytes, columns = _by_gdal(path, _told_apart(path, head), layer)
+        crs, feature_ids, geometry_bytes, columns, elsewhere = _by_gdal(path, _told_apart(path, head), layer, boxes)
     geometries: npt.NDArray[np.object_] = np.asarray(shapely.from_wkb(geometry_bytes, on_invalid="ignore"), object)
     there = np.array([data is not None for data in geometry_bytes], np.bool_)
     return VectorLayer(
@@ -71,6 +79,7 @@ def read_layer(path: Path, layer: str | None) -> VectorLayer:
         geometries=geometries,
         unreadable=there & shapely.is_missing(geometries),
         columns=columns,
+        elsewhere=elsewhere,
     )
 
 
@@ -92,11 +101,11 @@ def _told_apart(path: Path, head: bytes) -> str:
 
 
 def _by_gdal(
-    path: Path, source: str, layer: str | None
-) -> tuple[str | None, npt.NDArray[np.int64], npt.NDArray[np.object_], dict[str, Sequence[Any]]]:
-    """CRS, feature ids, WKB and columns of a layer."""
+    path: Path, source: str, layer: str | None, boxes: Boxes | None
+) -> tuple[str | None, npt.NDArray[np.int64], npt.NDArray[np.object_], dict[str, Sequence[Any]], int]:
+    """CRS, feature ids, WKB and columns of a layer, and how many of its polygons were passed over."""
     import pyogrio
-    from pyogrio.errors import DataLayerError, DataSourceError, FieldError, GeometryError
+    from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
 
     try:
         layers = {str(name): kind for name, kind in pyogrio.list_layers(source)}
@@ -112,8 +121,38 @@ def _by_gdal(
                 f"layer {layer!r} is not there" if layer else f"{len(found)} layers could be the footprints",
                 f"Name one of the layers {', '.join(sorted(layers)) or '(there are none)'}",
             )
-        meta, feature_ids, geometry_bytes, columns = pyogrio.raw.read(source, layer=found[0], return_fids=True)
-    except (DataSourceError, DataLayerError, FieldError, GeometryError, OSError) as fault:
+        near, elsewhere = (None, 0) if boxes is None else _near(source, found[0], boxes)
+        none = near is not None and len(near) == 0
+        meta, feature_ids, geometry_bytes, columns = pyogrio.raw.read(
+            source,
+            layer=found[0],
+            return_fids=True,
+            fids=None if none else near,
+            max_features=1 if none else None,  # of no feature at all GDAL tells no columns
+        )
+    except (DataSourceError, DataLayerError, FeatureError, FieldError, GeometryError, OSError) as fault:
         raise UnreadableInputError(str(path), f"cannot be read as vector data ({str(fault)[:160]})", VALID) from fault
-    named = {str(field): column for field, column in zip(meta["fields"], columns, strict=True)}
-    return meta["crs"], feature_ids.astype(np.int64), geometry_bytes, named
+    kept = slice(0, 0) if none else slice(None)
+    named = {str(field): column[kept] for field, column in zip(meta["fields"], columns, strict=True)}
+    return meta["crs"], feature_ids[kept].astype(np.int64), geometry_bytes[kept], named, elsewhere
+
+
+def _near(source: str, layer: str, boxes: Boxes) -> tuple[npt.NDArray[np.int64] | None, int]:
+    """The ids of the features near the boxes, None where all are; and how many polygons are not."""
+    import pyogrio
+
+    with pyogrio.raw.open_arrow(
+        source, layer=layer, columns=[], batch_size=BATCH, return_fids=True, use_pyarrow=True
+    ) as (meta, reader):
+        nearby = Nearby(boxes(meta["crs"]))
+        if nearby.all:
+            return None, 0
+        geometry = meta["geometry_name"] or "wkb_geometry"
+        number = next(name for name in reader.schema.names if name != geometry)
+        kept = [np.empty(0, np.int64)]
+        passed_over = 0
+        for batch in reader:
+            near = nearby.of(np.array([*batch.column(geometry).to_pylist(), None], dtype=object)[:-1])
+            kept.append(np.asarray(batch.column(number), dtype=np.int64)[near])
+            passed_over += int(np.count_nonzero(~near))
+    return (np.concatenate(kept) if passed_over else None), nearby.elsewhere

@@ -21,6 +21,7 @@ from pipeline.runtime.classified_files import (
 )
 from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.executors import Executor, executor_for, peak_of_process
+from pipeline.runtime.held_folder import held_folder, remove_abandoned
 from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.join import Joined, PointRange
 from pipeline.runtime.labelling import LabelTask, label, neighbourhood
@@ -34,7 +35,7 @@ from pipeline.runtime.rasters import (
     with_neighbours,
     write_mosaic,
 )
-from pipeline.runtime.run import RunRequest, calling_off, plan_inputs, remove_folder
+from pipeline.runtime.run import RunRequest, calling_off, plan_inputs
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.stages import Progress, Stages, classes_in_use, given_footprints
 from pipeline.settings import RunSettings
@@ -156,14 +157,14 @@ def classify(
     boxes = [info.bounds_m for info in plan.sources]
     RasterLattice.over(_bounds_of_boxes(boxes), cell, reference.horizontal_unit_m)  # refused early
     out = _checked_folder(request, paths)
-    scratch_dir = out / _SCRATCH / uuid4().hex
-    scratch = Scratch(str(scratch_dir))
+    for name in remove_abandoned(out / _SCRATCH):
+        progress.warn("plan", f"removed {out / _SCRATCH / name}: an earlier command was cut off and left it")
     progress.timings["plan"] = time.perf_counter() - began
-    engine = executor or executor_for(
-        workers=request.workers, scheduler=request.scheduler, local_directory=str(scratch_dir / "dask")
-    )
-    scratch.create()
-    try:
+    with held_folder(out / _SCRATCH) as scratch_dir:
+        scratch = Scratch(str(scratch_dir))
+        engine = executor or executor_for(
+            workers=request.workers, scheduler=request.scheduler, local_directory=str(scratch_dir / "dask")
+        )
         with calling_off(scratch, cancelled) as called_off, engine:
             progress.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)
             engine.prepare("plan", progress.watch)
@@ -187,9 +188,6 @@ def classify(
             except BaseException:
                 scratch.cancel()
                 raise
-    finally:
-        remove_folder(scratch_dir)
-        _remove_if_empty(scratch_dir.parent)
     for file in files:
         for warning in file.warnings:
             progress.warn("write", f"{file.source}: {warning}")
@@ -340,11 +338,3 @@ def _checked_folder(request: ClassifyRequest, paths: Sequence[str]) -> Path:
     except OSError as error:
         raise RunError(f"{out} cannot be written: {error.strerror or error}. Give another --out") from error
     return out
-
-
-def _remove_if_empty(folder: Path) -> None:
-    """Remove a folder that nothing else uses."""
-    try:
-        folder.rmdir()
-    except OSError:
-        return

@@ -142,10 +142,9 @@ def check_points(manifest: RunManifest, paths: Sequence[str], ingested: Sequence
             raise RunError(f"{path} is not the file that the run read: its content changed. {_AGAIN}")
 
 
-def check_footprints(manifest: RunManifest, request: RunRequest) -> None:
-    """Refuse footprints that are not those of the run."""
-    if request.footprints is None:
-        return
-    known = {Path(entry.path).name: entry.sha256 for entry in manifest.inputs if entry.n_points is None}
-    if known.get(Path(request.footprints).name) != sha256_of(request.footprints):
-        raise RunError(f"{request.footprints} is not the file that the run read. {_AGAIN}")
+def check_outlines(manifest: RunManifest, request: RunRequest) -> None:
+    """Refuse footprints, or an area of interest, that are not those of the run."""
+    known = {entry.path: entry.sha256 for entry in manifest.inputs if entry.n_points is None}
+    for path in (request.footprints, request.aoi):
+        if path is not None and known.get(path) != sha256_of(path):
+            raise RunError(f"{path} is not the file that the run read. {_AGAIN}")

@@ -11,7 +11,8 @@ WEIGHTS = MappingProxyType(
         "ingest": 10,
         "split": 28,
         "join": 2,
-        "reconstruct": 43,
+        "outline": 4,
+        "reconstruct": 39,
         "publish": 4,
         "outputs": 8,
     }
@@ -25,6 +26,7 @@ WORDS = MappingProxyType(
         "ingest": "points are read",
         "split": "surfaces are found in the tiles",
         "join": "surfaces are united over the borders of tiles",
+        "outline": "touching buildings are drawn together",
         "reconstruct": "buildings are modelled",
         "publish": "tiles are written",
         "records": "the runs are put side by side",

@@ -109,7 +109,7 @@ def _inputs(
         "tiles": _input("Tiles", f"Point clouds. {_given_by()}", _file(tuple(ENDINGS)), (1, settings.max_inputs)),
         "footprints": _input(
             "Footprints",
-            f"Building outlines to be modelled, as GeoJSON or GeoPackage. {_given_by()}",
+            f"Building outlines to be modelled, as GeoJSON, GeoPackage or GeoParquet. {_given_by()}",
             {
                 "oneOf": [
                     outlines,

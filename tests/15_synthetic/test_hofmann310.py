@@ -1,4 +1,4 @@
-"""The 310 buildings hold what the paper tells of them, whatever the seed."""
+"""The 310 buildings hold what the paper tells of them, whatever the seed: the slow tests draw two more."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ from pipeline.synthetic.scene import Defect, FaultKind, Scene
 SURVEY_DEFECTS = {Defect.STRIP_SHIFT, Defect.WRONG_ROWS}
 
 
-@pytest.fixture(scope="module", params=[1_000, 90_000, 5])
+@pytest.fixture(
+    scope="module",
+    params=[1_000, pytest.param(90_000, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)],
+)
 def scene(request: pytest.FixtureRequest) -> Scene:
     return hofmann310(request.param)
 

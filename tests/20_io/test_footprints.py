@@ -10,6 +10,7 @@ import geopandas
 import numpy as np
 import pandas as pd
 import pytest
+import shapely
 from shapely import LineString, MultiPolygon, Point, Polygon, box
 from shapely.affinity import scale
 
@@ -213,3 +214,88 @@ def test_importing_the_reader_needs_neither_pandas_nor_the_format_libraries():
     code = f"import sys, pipeline.io; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+# --- files that cover more than the data ------------------------------------------------------------------------------
+
+TOWN = [box(x, 447_000, x + 10, 447_008) for x in range(85_000, 95_000, 250)]
+FORMATS = [".gpkg", ".shp", ".geojson", ".parquet"]
+
+
+def write_town(path, geometries=TOWN, crs="EPSG:28992"):
+    frame = geopandas.GeoDataFrame(
+        {"id": [f"h{k}" for k in range(len(geometries))], "year": range(1900, 1900 + len(geometries))},
+        geometry=list(geometries),
+        crs="EPSG:28992",
+    ).to_crs(crs)
+    frame.to_parquet(path) if path.suffix == ".parquet" else frame.to_file(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_near_an_area_the_same_is_read_as_of_the_whole_file(tmp_path, suffix):
+    path = write_town(tmp_path / f"a{suffix}")
+    area = box(86_000, 446_990, 86_600, 447_100)
+    whole, near = read_footprints(path, reference()), read_footprints(path, reference(), area=area)
+    inside = [k for k, polygon in enumerate(whole.polygons) if area.intersects(polygon)]
+    assert near.ids == tuple(whole.ids[k] for k in inside) == ("h4", "h5", "h6")
+    assert near.attributes == tuple(whole.attributes[k] for k in inside)
+    assert all(a.equals(whole.polygons[k]) for a, k in zip(near.polygons, inside, strict=True))
+    assert (len(near) + near.elsewhere, whole.elsewhere) == (len(TOWN), 0)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_an_area_in_another_crs_finds_its_footprints(tmp_path, suffix):
+    path = write_town(tmp_path / f"a{suffix}", crs="EPSG:4326")
+    parts = MultiPolygon([box(86_000, 446_990, 86_020, 447_100), box(93_990, 446_900, 94_020, 447_005)])
+    found = read_footprints(path, reference(), area=parts)
+    assert found.ids == ("h4", "h36")
+    assert found.elsewhere == len(TOWN) - 2
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_off_all_footprints_none_are_read_and_they_are_counted(tmp_path, suffix):
+    found = read_footprints(write_town(tmp_path / f"a{suffix}"), reference(), area=box(0, 0, 10, 10))
+    assert (found.ids, found.polygons, found.issues, found.elsewhere) == ((), (), (), len(TOWN))
+    assert not any("left out" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("suffix", [".gpkg", ".parquet", ".geojson"])
+def test_faults_without_a_place_are_told_wherever_the_area_is(tmp_path, suffix):
+    path = write_town(tmp_path / f"a{suffix}", [*TOWN[:3], None, Polygon(), Point(85_000, 447_000), Point(0, 0)])
+    found = read_footprints(path, reference(), area=box(85_000, 447_000, 85_001, 447_001))
+    assert (found.ids, found.elsewhere) == (("h0",), 2)
+    assert {issue.source_id: issue.problem for issue in found.issues} == {
+        "h3": "no_geometry",
+        "h4": "empty",
+        "h5": "not_polygon",
+    }
+
+
+@pytest.mark.parametrize("suffix", [".gpkg", ".parquet"])
+def test_of_a_file_of_a_whole_country_only_a_little_is_held(tmp_path, suffix):
+    at = np.arange(100_000)
+    country = shapely.box(
+        80_000 + at % 400 * 20.0, 4e5 + at // 400 * 20.0, 80_010 + at % 400 * 20.0, 400_010 + at // 400 * 20.0
+    )
+    path = write_town(tmp_path / f"a{suffix}", country)
+    code = (
+        "import re, sys, pyarrow.parquet, pyogrio, pyproj, shapely; "
+        "from pipeline.io import SpatialReference, read_footprints; "
+        "peak = lambda: int(re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read())[1]) >> 10; "
+        "before = peak(); "
+        "area = shapely.box(81_000, 401_000, 81_100, 401_100) if sys.argv[2] == 'near' else None; "
+        "found = read_footprints(sys.argv[1], SpatialReference(), area=area); "
+        "print(len(found), found.elsewhere, peak() - before)"
+    )
+
+    def read(what):
+        command = [sys.executable, "-c", code, str(path), what]
+        return [
+            int(word) for word in subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+        ]
+
+    near, whole = read("near"), read("all")
+    assert (near[0] + near[1], whole[0], whole[1]) == (100_000, 100_000, 0)
+    assert 25 <= near[0] <= 400
+    assert near[2] < whole[2] / 2

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,7 @@ from pipeline.io import open_source
 from pipeline.io.las_frame import read_frame
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.events import Event
+from pipeline.runtime.held_folder import held_folder, remove_abandoned
 from pipeline.settings import RunSettings
 
 Classify = Callable[..., ClassifySummary]
@@ -167,6 +171,7 @@ def test_delft_in_two_grids_gets_the_same_classes(shared_data: Path, run_classif
         assert (truth[one == 6] == 6).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_two_dask_workers_write_the_bytes_of_a_serial_run(true_suburb: Path, run_classify: Classify) -> None:
     tiles = {"classes": "ignore", "tile_size_m": 40.0}
     serial, cluster = run_classify(true_suburb, settings=tiles), run_classify(true_suburb, settings=tiles, workers=2)
@@ -350,3 +355,31 @@ def shared_copc() -> Callable[[Path, Path], Path]:
         return target
 
     return make
+
+
+def test_what_a_killed_command_left_is_removed_and_told_by_the_next_into_the_same_folder(
+    true_suburb: Path, run_classify: Classify, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    code = (
+        "import os, signal, sys; from pathlib import Path; from pipeline.runtime.classify import *; "
+        "told = lambda event: event.stage == 'ingest' and os.kill(os.getpid(), signal.SIGKILL); "
+        "classify(ClassifyRequest(inputs=(sys.argv[1],), out=sys.argv[2], workers=0), told)"
+    )
+    killed = subprocess.run([sys.executable, "-c", code, str(true_suburb), str(out)], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    (left,) = (out / "scratch").iterdir()
+    (out / "scratch" / "notes").mkdir()
+    with held_folder(out / "scratch") as in_use:
+        summary = run_classify(true_suburb, out=str(out))
+        assert {path.name for path in (out / "scratch").iterdir()} == {"notes", in_use.name}
+    assert summary.warnings[-1] == f"removed {left}: an earlier command was cut off and left it"
+    assert [path.name for path in (out / "scratch").iterdir()] == ["notes"]
+
+
+def test_a_folder_that_is_held_no_more_is_removed_and_an_empty_parent_with_it(tmp_path: Path) -> None:
+    with held_folder(tmp_path / "scratch") as folder:
+        assert remove_abandoned(tmp_path / "scratch") == []
+        (folder / "points").mkdir()
+    assert not (tmp_path / "scratch").exists()
+    assert remove_abandoned(tmp_path / "scratch") == []

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import re
+import shutil
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pipeline.runtime.modelling
+import pipeline.runtime.rerun
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.io import SpatialReference
 from pipeline.io.storage import sha256_of
@@ -370,9 +375,16 @@ def test_settings_of_one_building_start_where_the_run_s_are_unless_method_or_pre
 
 
 @pytest.fixture
-def copied(suburb: Path, reconstruct: Any) -> Any:
-    """A run of its own, to be changed: `copied(**request fields)`."""
-    return lambda **fields: reconstruct(suburb, settings=TILES, **fields)
+def copied(suburb: Path, plain: Any, reconstruct: Any, tmp_path: Path) -> Any:
+    """A run of its own, to be changed: `copied(meshes="building")`; that one a copy of the plain run."""
+
+    def go(meshes: str = "building") -> Any:
+        if meshes != "building":
+            return reconstruct(suburb, settings=TILES, meshes=meshes)
+        copy = shutil.copytree(plain.run_dir, tmp_path / "copied")
+        return dataclasses.replace(plain, run_dir=str(copy))
+
+    return go
 
 
 def again(run_dir: str, **fields: Any) -> Any:
@@ -438,20 +450,53 @@ def test_a_named_building_is_modelled_again_and_comes_out_the_same(plain: Any, c
     assert files(first.run_dir) == before
 
 
+def test_a_rerun_holds_the_new_files_of_one_tile_at_a_time_and_touches_the_run_when_all_are_written(
+    copied: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = copied(meshes="tile")
+    before = files(first.run_dir)
+    real_update, real_written = pipeline.runtime.rerun.updated_tile, pipeline.runtime.rerun._written
+    made: list[Any] = []
+    prepared: list[str] = []
+
+    def watched(*args: Any) -> Any:
+        assert [update() for update in made] == [None] * len(made)
+        update = real_update(*args)
+        made.append(weakref.ref(update))
+        return update
+
+    def written(*args: Any) -> Any:
+        assert {path: data for path, data in files(first.run_dir).items() if not path.startswith("scratch/")} == before
+        prepared.extend(path for path in files(first.run_dir) if "/new/" in path)
+        return real_written(*args)
+
+    monkeypatch.setattr("pipeline.runtime.rerun.updated_tile", watched)
+    monkeypatch.setattr("pipeline.runtime.rerun._written", written)
+    done = again(first.run_dir, only=tuple(rows(first.run_dir, "buildings")))
+    assert len(made) == len(done.tiles) > 1
+    assert sum(path.endswith(".city.jsonl") for path in prepared) == len(done.tiles)
+    assert files(first.run_dir) == before
+
+
 def test_a_rerun_with_given_footprints_is_a_whole_run_too(
     plain: Any, overridden: Any, suburb: Path, reconstruct: Any, tmp_path: Path
 ) -> None:
     known = [outline(row) for _, row in sorted(rows(plain.run_dir, "buildings").items())]
     given = write_outlines(tmp_path / "given.geojson", {str(k): polygon for k, polygon in enumerate(known)})
     text = "[[building]]\nsource_id = '3'\naction = 'reject'\n[[building]]\nsource_id = '5'\nmethod = 'kmeans'"
-    whole = overridden(text, footprints=str(given))
-    first = reconstruct(suburb, settings=TILES, footprints=str(given))
+    (tmp_path / "area").mkdir()  # of the same name, to be told apart by the whole path
+    area = write_outlines(tmp_path / "area" / given.name, {"area": shapely.union_all(known).envelope.buffer(20.0)})
+    whole = overridden(text, footprints=str(given), aoi=str(area))
+    first = reconstruct(suburb, settings=TILES, footprints=str(given), aoi=str(area))
     done = again(first.run_dir, overrides=str(tmp_path / "overrides.toml"))
     assert done.digest == whole.digest
     assert files(first.run_dir) == files(whole.run_dir)
-    given.write_text(given.read_text() + " ")
-    with pytest.raises(RunError, match="is not the file that the run read"):
-        again(first.run_dir)
+    for path in (given, area):
+        text = path.read_text()
+        path.write_text(text + " ")
+        with pytest.raises(RunError, match=f"^{re.escape(str(path))} is not the file that the run read"):
+            again(first.run_dir)
+        path.write_text(text)
 
 
 def test_a_rerun_that_is_called_off_leaves_the_run_as_it_was(plain: Any, copied: Any, tmp_path: Path) -> None:
@@ -497,7 +542,7 @@ def test_the_bundle_of_a_building_that_meets_a_fault_comes_with_the_other_files_
     with monkeypatch.context() as patch:
         patch.setattr(pipeline.runtime.modelling, "reconstruct_building", faulty)
         with monkeypatch.context() as late:
-            late.setattr("pipeline.runtime.rerun._updates", called_off)
+            late.setattr("pipeline.runtime.rerun._prepared", called_off)
             with pytest.raises(RunCancelledError):
                 again(first.run_dir, only=(name,))
         assert files(first.run_dir) == before

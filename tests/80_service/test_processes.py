@@ -40,6 +40,8 @@ def test_the_catalogue_of_settings_is_that_of_the_code() -> None:
         {"roof": {"no_such": 1}, "candidates": {"min_area_m2": "wide"}},
         {"no-such-table": {}},
         {"candidates": {"min_area_m2": 15}, "method": "fuzzy-sart"},
+        {"class-codes": {"building": [6, 2], "noise": [7, 6, 300]}},
+        {"class-codes": {"ground": [2, 6]}, "candidates": {"min_area_m2": -1}},
     ],
 )
 def test_the_service_finds_the_faults_of_settings_that_a_run_finds(settings: dict) -> None:

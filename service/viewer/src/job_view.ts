@@ -31,6 +31,7 @@ const STAGES: [string, string, string][] = [
   ["ingest", "Read the points", "files"],
   ["split", "Find ground and walls", "tiles"],
   ["join", "Join surfaces over borders", ""],
+  ["outline", "Draw touching buildings", ""],
   ["reconstruct", "Model the buildings", "buildings"],
   ["publish", "Write the results", "tiles"],
   ["outputs", "Assemble the downloads", ""],

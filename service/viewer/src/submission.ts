@@ -5,7 +5,7 @@ import { announce, asProblem, problemNotice, warningNotice } from "./notices";
 import { bytes, count, measure } from "./numbers";
 
 const TILE_ENDINGS = ".las,.laz,.ply,.xyz,.txt,.csv,.asc,.pts";
-const FOOTPRINT_ENDINGS = ".gpkg,.geojson,.json";
+const FOOTPRINT_ENDINGS = ".gpkg,.geojson,.json,.parquet,.geoparquet";
 const VERTICAL_UNITS = { "": "as in the file", m: "metres", ft: "feet", "us-ft": "US survey feet" };
 
 interface Sent {
@@ -72,7 +72,7 @@ export class Submission {
       field("Preset", this.preset, "What measured better, or what keeps to the method's paper."),
       el("fieldset", { class: "field" }, el("legend", {}, "Compare with"), this.others),
       field("Classes of the file", this.classes, "Trusted, only compared with what is found, or not looked at."),
-      field("Footprints", footprintPicker, "GeoPackage or GeoJSON: one model a polygon."),
+      field("Footprints", footprintPicker, "GeoPackage, GeoJSON or GeoParquet: one model a polygon."),
       this.footprintRow,
       field("Title", this.title),
     );

@@ -1,0 +1,49 @@
+"""Which features of a large vector file lie near the data, told batch by batch from their bounds alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+BATCH = 16_384
+"""Features that are looked at together."""
+
+Boxes = Callable[[str | None], npt.NDArray[np.float64] | None]
+"""From a layer's CRS, as the file has it, to boxes in that CRS, (k, 4) float64: xmin, ymin, xmax, ymax. None where
+they cannot be told there."""
+
+
+class Nearby:
+    """Which features of a layer lie near some boxes; counts the others.
+
+    Parameters
+    ----------
+    boxes : array, optional
+        (k, 4) float64: xmin, ymin, xmax, ymax in the layer's CRS; None takes all features for near.
+    """
+
+    def __init__(self, boxes: npt.NDArray[np.float64] | None) -> None:
+        self._tree = None if boxes is None else shapely.STRtree(shapely.box(*np.reshape(boxes, (-1, 4)).T))
+        self.elsewhere = 0
+        """Polygons that were passed over."""
+
+    @property
+    def all(self) -> bool:
+        """Whether every feature counts as near."""
+        return self._tree is None
+
+    def of(self, geometry_bytes: npt.NDArray[np.object_]) -> npt.NDArray[np.bool_]:
+        """Which of some features, (n,) WKB, are near by their bounds; so is what has no bounds: it may be anywhere."""
+        near = np.ones(len(geometry_bytes), np.bool_)
+        if self._tree is None or len(near) == 0:
+            return near
+        geometries = np.asarray(shapely.from_wkb(geometry_bytes, on_invalid="ignore"), object)
+        placed = np.isfinite(shapely.bounds(geometries)).all(axis=-1)
+        near[placed] = False
+        near[np.flatnonzero(placed)[np.unique(self._tree.query(geometries[placed])[0])]] = True
+        kinds = shapely.get_type_id(geometries[~near])
+        self.elsewhere += int(np.isin(kinds, (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)).sum())
+        return near

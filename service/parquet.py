@@ -1,0 +1,114 @@
+"""GeoParquet from strangers: what a file holds, told by decoding it once, piece by piece, and keeping nothing.
+
+A few bytes of Parquet can stand for millions of rows, and one long text for as many copies of itself: sizes in the
+footer do not tell. So the columns that will be read are decoded here, by the child with little memory and little time
+that `service.preflight` starts, until they end or are too much.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import EmptyInputError, UnreadableInputError
+from pipeline.io.geoparquet import DEPTHS, geometry_column
+from service.errors import TooLargeError
+from service.input_policy import checked_crs
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+ROWS_LIMIT = 20_000_000
+"""Rows; a GeoPackage of the bytes that are taken holds fewer."""
+DECODED_LIMIT = 2**30
+"""Bytes of all columns decoded: as many as a GeoPackage may have."""
+FOOTER_LIMIT = 2**24
+"""Bytes of the footer, which is read at once."""
+ROWS_AT_ONCE = 1024
+MAGIC = b"PAR1"
+FIX = "Write it anew as GeoParquet with WKB, as GDAL, DuckDB or geopandas do"
+CODE = re.compile(r"(?:urn:ogc:def:crs:)?EPSG:(?:[\d.]*:)?(\d{4,6})")
+
+
+def parquet_facts(path: Path) -> tuple[int, str, dict[str, Any] | None]:
+    """Rows, geometry column and CRS (name and EPSG code; None where the file says that it is unknown).
+
+    Raises
+    ------
+    UnreadableInputError
+        No Parquet, damaged, cut off, without geometry, or in an encoding that is not read.
+    EmptyInputError
+        No rows.
+    TooLargeError
+        More rows or bytes than are taken.
+    CrsError
+        Its CRS is none that PROJ may be asked about.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    _check_footer(path)
+    try:
+        with pq.ParquetFile(path) as file:
+            about = geometry_column(path, file.schema_arrow)
+            if about.encoding != "WKB" and about.encoding not in DEPTHS:
+                raise UnreadableInputError(str(path), f"its geometries are encoded as {about.encoding[:40]!r}", FIX)
+            crs = None if about.crs is None else _told_crs(path, about.crs)
+            rows = file.metadata.num_rows
+            if rows == 0:
+                raise EmptyInputError(str(path), "it has no rows", "Give polygons of buildings")
+            if rows > ROWS_LIMIT:
+                raise TooLargeError(f"{path.name} has {rows} rows, footprints may have {ROWS_LIMIT}: cut out the area")
+            decoded, found = 0, 0
+            for batch in file.iter_batches(ROWS_AT_ONCE, columns=about.wanted, use_threads=False):
+                found += batch.num_rows
+                decoded += sum(_plain(path, column).nbytes for column in batch.columns)
+                if decoded > DECODED_LIMIT:
+                    raise TooLargeError(
+                        f"{path.name} holds more than {DECODED_LIMIT} bytes once it is decoded: cut out the area of "
+                        "the points, or leave columns out"
+                    )
+    except (pa.ArrowException, OSError, OverflowError, ValueError) as fault:
+        raise UnreadableInputError(str(path), f"cannot be read as Parquet ({str(fault)[:160]})", FIX) from fault
+    if found != rows:
+        raise UnreadableInputError(str(path), f"its footer promises {rows} rows, it holds {found}", FIX)
+    return rows, about.name, crs
+
+
+def _check_footer(path: Path) -> None:
+    """Refuse what does not begin and end as Parquet does, or whose footer is larger than any true one."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        head = stream.read(len(MAGIC))
+        stream.seek(max(size - 8, 0))
+        tail = stream.read(8)
+    if head != MAGIC:
+        raise UnreadableInputError(str(path), f"not Parquet: it begins with {head!r}", FIX)
+    if len(tail) < 8 or tail[4:] != MAGIC:
+        raise UnreadableInputError(str(path), "truncated: a Parquet file ends with PAR1", FIX)
+    footer = int.from_bytes(tail[:4], "little")
+    if footer > min(size, FOOTER_LIMIT):
+        raise UnreadableInputError(str(path), f"its footer claims {footer} of {size} bytes", FIX)
+
+
+def _plain(path: Path, column: pa.Array) -> pa.Array:
+    """The values of a column, each spelt out as its reader will have it."""
+    import pyarrow as pa
+
+    if pa.types.is_dictionary(column.type):
+        return column.dictionary_decode()
+    if "dictionary<" in str(column.type) or "run_end_encoded<" in str(column.type):
+        raise UnreadableInputError(str(path), f"a column is of type {str(column.type)[:60]}", FIX)
+    return column
+
+
+def _told_crs(path: Path, text: str) -> dict[str, Any]:
+    """Name and code of a CRS, from its text alone where that tells them."""
+    crs = checked_crs(text, path=str(path))
+    code = CODE.fullmatch(text.strip())
+    identity = json.loads(text).get("id") if text.lstrip().startswith("{") else None
+    if isinstance(identity, dict) and identity.get("authority") == "EPSG":
+        code = CODE.fullmatch(f"EPSG:{identity.get('code')}")
+    return {"name": str(crs.name)[:200], "epsg": int(code[1]) if code else None}
