@@ -33,7 +33,7 @@ class FoundScene:
     points: int
     """Points without duplicates."""
     seconds: Mapping[str, float]
-    """Wall-clock time by stage: ingest, split, join."""
+    """Wall-clock time by stage: ingest, split, join, outline."""
 
 
 def found_scene(tiles: Sequence[str], crs: str | None, settings: RunSettings) -> FoundScene:
@@ -54,9 +54,12 @@ def found_scene(tiles: Sequence[str], crs: str | None, settings: RunSettings) ->
             scratch=scratch,
         )
         splits = stages.split(stages.ingest(tiles), None)
-        joined = stages.join(splits, None, plan.sources[0].reference)
+        joined = stages.outline(stages.join(splits, None, plan.sources[0].reference))
         return FoundScene(
-            candidates=tuple(gather(scratch, plan.grid, site, kind)[0] for site in joined.candidates),
+            candidates=tuple(
+                gather(scratch, plan.grid, site, kind, beside=settings.building.roof.at_walls)[0]
+                for site in joined.candidates
+            ),
             rejected=joined.rejected,
             small_fragments=joined.small_fragments,
             points=sum(split.points for split in splits),

@@ -1,8 +1,8 @@
 """Outlines without given footprints against the truth, and on Delft against surveyed facades and the eaves themselves.
 
-    python -m benchmarks.outlines sweep --out DIR [--split dev|test]
-    python -m benchmarks.outlines beams --out DIR [--split dev|test]
-    python -m benchmarks.outlines delft [--data ../shared/data]
+    python -m benchmarks.outlines sweep --out DIR [--split dev|test] [--outline eaves|walls]
+    python -m benchmarks.outlines beams --out DIR [--split dev|test] [--outline eaves|walls]
+    python -m benchmarks.outlines delft [--data ../shared/data] [--outline eaves|walls]
 
 `sweep` draws the outlines of the sweep's scenes over densities and noises, `beams` those of a city of 200 m by 200 m
 surveyed with beams of several radii, along and across the streets. The classes of the points are believed, so that
@@ -10,7 +10,8 @@ little but the outlines is judged. Compared are blocks of true buildings that to
 
 `delft` compares walls: along every straight facade of the given footprints of 5 m or more, how far outside it the
 outline lies, and where the split pulses lie: those that met a roof and came back from below as well lie on a band
-about the edge of the roof, so their mean is where the eave is, however the outline was drawn.
+about the edge of the roof, so their mean is where the eave is, however the outline was drawn. With `--outline walls` it
+tells, too, of how much of the outlines facade points show the wall.
 """
 
 from __future__ import annotations
@@ -32,12 +33,17 @@ import shapely
 from benchmarks.candidates import found_scene
 from benchmarks.entries import markdown_table
 from benchmarks.scene_scores import OBJECT_M2, footprint_score, outlined_models
+from pipeline.errors import BuildingError
 from pipeline.evaluation.blocks import joined_reference
 from pipeline.evaluation.models import RoofModel
 from pipeline.evaluation.reference_truth import read_truth_reference
 from pipeline.geometry import top_visible
 from pipeline.model import BoolArray, FloatArray
+from pipeline.roof.block import block_plane
+from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
+from pipeline.roof.facades import eave_of
 from pipeline.roof.footprint import polygons_of
+from pipeline.roof.plan import partition_roof, roof_points
 from pipeline.scene import BUILDING_CLASS
 from pipeline.settings import RunSettings
 from pipeline.synthetic.city import CITY_SCANNER
@@ -59,18 +65,18 @@ _BAND_M = 0.35
 _FEWEST_SPLIT = 6
 
 
-def drawn(tiles: list[str], crs: str | None = None, classes: str = "trust") -> list[RoofModel]:
-    """The outlines of the candidates of some tiles."""
-    settings = RunSettings.from_mapping({"classes": classes})
+def drawn(tiles: list[str], outline: str, crs: str | None = None) -> list[RoofModel]:
+    """The outlines of the candidates of some tiles, at the eaves or at the walls."""
+    settings = RunSettings.from_mapping({"classes": "trust", "roof": {"outline": outline}})
     return outlined_models(found_scene(tiles, crs, settings).candidates, settings.building.roof)
 
 
-def compared(folder: Path) -> list[str]:
+def compared(folder: Path, outline: str) -> list[str]:
     """Figures of one simulated scene, as cells of a table."""
     tiles = sorted(str(path) for path in folder.rglob("*.laz"))
     blocks = joined_reference(read_truth_reference(folder / "truth", as_surveyed=True))
     counted = [b.footprint.area >= OBJECT_M2 and not b.touches_data_edge for b in blocks.buildings]
-    score, _ = footprint_score(drawn(tiles), blocks, counted)
+    score, _ = footprint_score(drawn(tiles, outline), blocks, counted)
     return [
         str(score.blocks),
         f"{score.iou:.3f}",
@@ -83,7 +89,7 @@ def compared(folder: Path) -> list[str]:
 FIGURES = ["blocks", "IoU median", "area bias median", "of the sum", "offset median"]
 
 
-def sweep_rows(out: Path, split: str) -> Iterator[list[str]]:
+def sweep_rows(out: Path, split: str, outline: str) -> Iterator[list[str]]:
     """A row a density and noise."""
     for density in DENSITIES_PER_M2:
         for noise in NOISES_M:
@@ -97,10 +103,10 @@ def sweep_rows(out: Path, split: str) -> Iterator[list[str]]:
                     noise_m=noise,
                     with_classes=True,
                 )
-            yield [f"{density:g}", f"{noise:.2f}", *compared(folder / cell_name(density, noise))]
+            yield [f"{density:g}", f"{noise:.2f}", *compared(folder / cell_name(density, noise), outline)]
 
 
-def beam_rows(out: Path, split: str) -> Iterator[list[str]]:
+def beam_rows(out: Path, split: str, outline: str) -> Iterator[list[str]]:
     """A row a beam radius, flight direction and density."""
     for radius in BEAM_RADII_M:
         for azimuth in AZIMUTHS_DEG:
@@ -115,7 +121,7 @@ def beam_rows(out: Path, split: str) -> Iterator[list[str]]:
                         strip_shift_m=0.0,
                     )
                     simulate("city", folder, seed_of(split, 0), size_m=CITY_SIZE_M, scanner=survey, with_classes=True)
-                yield [f"{radius:g}", f"{azimuth:g}", f"{density:g}", *compared(folder)]
+                yield [f"{radius:g}", f"{azimuth:g}", f"{density:g}", *compared(folder, outline)]
 
 
 # ------------------------------------------------------------------------------------------------------------ delft
@@ -197,14 +203,14 @@ def _wall(
     return Wall(length_m=length, outline_m=outline, eave_m=eave)
 
 
-def delft_lines(data: Path) -> list[str]:
+def delft_lines(data: Path, outline_at: str) -> list[str]:
     """What the walls of Delft say."""
     tiles = [str(data / "ahn3" / f"delft_{side}.laz") for side in ("west", "east")]
     given = shapely.force_2d(shapely.from_wkb(pyogrio.raw.read(data / "ahn3" / "footprints.gpkg")[2]))
     half = _TOUCH_M / 2
     united = shapely.union_all(shapely.buffer(given, half, join_style="mitre")).buffer(-half, join_style="mitre")
     blocks = [block for block in polygons_of(united) if block.area >= OBJECT_M2]
-    outline = shapely.union_all([model.footprint for model in drawn(tiles, "EPSG:7415")])
+    outline = shapely.union_all([model.footprint for model in drawn(tiles, outline_at, "EPSG:7415")])
     closed = outline.buffer(half, join_style="mitre").buffer(-half, join_style="mitre")
     walls, asked, met = walls_of(blocks, closed, roof_pulses(tiles))
     weights = np.array([wall.length_m for wall in walls])
@@ -227,22 +233,57 @@ def delft_lines(data: Path) -> list[str]:
     ]
 
 
+def seen_lines(tiles: list[str]) -> list[str]:
+    """How much of the outlines has walls that facade points show; the file's classes are not used."""
+    table = {"classes": "ignore", "units": {"split": "nothing"}, "roof": {"outline": "walls"}}
+    settings = RunSettings.from_mapping(table)
+    roof, eaves = settings.building.roof, []
+    for candidate in found_scene(tiles, "EPSG:7415", settings).candidates:
+        try:
+            bare = roof_points(candidate, roof)
+            plane = block_plane(bare.points, candidate.ground_z_m, roof.block_height_percentile)
+            at_eaves = dataclasses.replace(bare, facades=None, labels=np.zeros(len(bare.points), np.int32))
+            outline_mm = partition_roof(at_eaves, [plane], roof).outline_mm
+        except BuildingError:
+            continue
+        edge_points = EdgePoints.of(bare.xy_mm, bare.split, bare.spacing_m)
+        reach_m = 1e-3 * mixed_pulse_reach_mm(outline_mm, edge_points)
+        for polygon in map(shapely.geometry.polygon.orient, outline_mm.geoms):
+            for ring in (polygon.exterior, *polygon.interiors):
+                corners = shapely.get_coordinates(ring) * 1e-3
+                if bare.facades is not None:
+                    eaves += [eave_of(start, end, bare.facades, reach_m) for start, end in itertools.pairwise(corners)]
+    whole = sum(eave.length_m for eave in eaves)
+    is_open = sum(eave.length_m for eave in eaves if eave.is_open)
+    seen = [(eave.length_m, eave.overhang_m) for eave in eaves if eave.overhang_m is not None]
+    length = sum(length for length, _ in seen)
+    mean = sum(length * overhang for length, overhang in seen) / length
+    return [
+        f"{whole:.0f} m of outlines, {100 * is_open / whole:.0f} % with open ground before them",
+        f"walls shown by facade points: {len(seen)} lines, {length:.0f} m, {100 * length / whole:.0f} %",
+        f"their overhang: mean {mean:.3f} m, median {np.median([overhang for _, overhang in seen]):.3f} m",
+    ]
+
+
 def main() -> int:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("sweep", "beams", "delft"))
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()) / "gablework-outlines")
     parser.add_argument("--split", choices=("dev", "test"), default="dev")
+    parser.add_argument("--outline", choices=("eaves", "walls"), default="eaves", help="where outlines are drawn")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     given = parser.parse_args()
     if given.what == "delft":
-        lines = delft_lines(given.data)
+        lines = delft_lines(given.data, given.outline)
+        if given.outline == "walls":
+            lines += seen_lines([str(given.data / "ahn3" / f"delft_{side}.laz") for side in ("west", "east")])
         sys.stdout.write("\n".join(lines) + "\n")
     elif given.what == "sweep":
-        rows = sweep_rows(given.out, given.split)
+        rows = sweep_rows(given.out, given.split, given.outline)
         sys.stdout.write(markdown_table(["pulses/m2", "noise, m", *FIGURES], rows))
     else:
-        rows = beam_rows(given.out, given.split)
+        rows = beam_rows(given.out, given.split, given.outline)
         sys.stdout.write(markdown_table(["beam radius, m", "flight, deg", "pulses/m2", *FIGURES], rows))
     return 0
 

@@ -186,6 +186,11 @@ class Candidate:
     """The given footprint's own id."""
     outline: MultiPolygon | None = None
     """Its part of the outline that it was drawn with the units it touches, local metres; None where it stands alone."""
+    beside: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """(j, 3) float64, other points within about 2 m around and beneath, of pulses with one return: facades and ground.
+    Empty unless outlines are asked for at the walls."""
+    beside_later: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """(i, 3) float64, the same of pulses with several returns, the last of each."""
     touches_data_edge: bool = False
     """True where the data end at the candidate: it may be cut."""
 

@@ -35,34 +35,66 @@ def _bucket(x: IntArray, y: IntArray, cell: int) -> tuple[LabelArray, LabelArray
 
 
 @njit(cache=True, nogil=True)
+def _filled_beside(starts: LabelArray, columns: int, rows: int) -> tuple[LabelArray, LabelArray]:
+    """Of every cell the first column from it on, to the west and to the east, whose cell holds points; -1 for none."""
+    west, east = np.full(columns * rows, -1, np.int32), np.full(columns * rows, -1, np.int32)
+    for r in range(rows):
+        before, after = -1, -1
+        for k in range(columns):
+            c = columns - 1 - k
+            if starts[r * columns + k + 1] > starts[r * columns + k]:
+                before = k
+            if starts[r * columns + c + 1] > starts[r * columns + c]:
+                after = c
+            west[r * columns + k] = before
+            east[r * columns + c] = after
+    return west, east
+
+
+@njit(cache=True, nogil=True)
 def _nearest(x: IntArray, y: IntArray, query_x: IntArray, query_y: IntArray, cell: int) -> tuple[LabelArray, IntArray]:
     """The nearest point of every query and its squared distance; ties by index."""
     starts, order, columns, rows, low_x, low_y = _bucket(x, y, cell)
+    west, east = _filled_beside(starts, columns, rows)
     n = len(query_x)
     found = np.full(n, -1, np.int32)
     squared = np.full(n, np.iinfo(np.int64).max, np.int64)
     for q in range(n):
-        column = (query_x[q] - low_x) // cell
-        row = (query_y[q] - low_y) // cell
+        px, py = query_x[q] - low_x, query_y[q] - low_y
+        column, row = px // cell, py // cell
         best = squared[q]
         index = -1
-        # rings of cells around the query's own; those before the grid begins are skipped
-        first = max(0, -column, column - columns + 1, -row, row - rows + 1)
-        last = max(column, columns - 1 - column, row, rows - 1 - row)
-        for ring in range(first, last + 1):
-            if ring > 0 and best <= ((ring - 1) * cell) ** 2:
+        # rows of cells to both sides, the nearest first; in each the cells that hold points, from the query's column on
+        for away in range(max(abs(row), abs(rows - 1 - row)) + 1):
+            beyond = max(0, (away - 1) * cell + 1)
+            if index >= 0 and beyond * beyond > best:
                 break
-            for r in range(max(0, row - ring), min(rows - 1, row + ring) + 1):
-                step = 1 if ring == 0 or r in (row - ring, row + ring) else 2 * ring
-                for c in range(column - ring, column + ring + 1, step):
-                    if c < 0 or c >= columns:
-                        continue
-                    for s in range(starts[r * columns + c], starts[r * columns + c + 1]):
-                        i = order[s]
-                        d = (x[i] - query_x[q]) ** 2 + (y[i] - query_y[q]) ** 2
-                        if d < best or (d == best and i < index):
-                            best = d
-                            index = i
+            for side in range(2 if away > 0 else 1):
+                r = row + away if side == 0 else row - away
+                if r < 0 or r >= rows:
+                    continue
+                dy = max(0, r * cell - py, py - (r + 1) * cell + 1)
+                if index >= 0 and dy * dy > best:
+                    continue
+                for eastward in range(2):
+                    if eastward:
+                        c = east[r * columns + max(column, 0)] if column < columns else -1
+                    else:
+                        c = west[r * columns + min(column - 1, columns - 1)] if column > 0 else -1
+                    while c >= 0:
+                        dx = max(0, c * cell - px, px - (c + 1) * cell + 1)
+                        if index >= 0 and dx * dx + dy * dy > best:
+                            break
+                        for s in range(starts[r * columns + c], starts[r * columns + c + 1]):
+                            i = order[s]
+                            d = (x[i] - query_x[q]) ** 2 + (y[i] - query_y[q]) ** 2
+                            if d < best or (d == best and i < index):
+                                best = d
+                                index = i
+                        if eastward:
+                            c = east[r * columns + c + 1] if c + 1 < columns else -1
+                        else:
+                            c = west[r * columns + c - 1] if c > 0 else -1
         found[q] = index
         squared[q] = best
     return found, squared

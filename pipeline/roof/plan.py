@@ -16,7 +16,8 @@ from pipeline.geometry import point_spacing_m, top_visible
 from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
-from pipeline.roof.edge_position import EdgePoints
+from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
+from pipeline.roof.facades import FacadePoints, at_walls
 from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprint, outline, polygons_of
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
 from pipeline.roof.partition import (
@@ -57,6 +58,8 @@ class RoofPoints:
     """The given footprint in integer millimetres."""
     outline_mm: MultiPolygon | None = None
     """The outline that was drawn together with touching units; integer millimetres."""
+    facades: FacadePoints | None = None
+    """What tells of the walls beneath; None where the outline is to be drawn at the eaves."""
 
 
 def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
@@ -109,6 +112,11 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
         spacing_m=min(max(point_spacing_m(points[index]), 0.1), 3.0),
         footprint_mm=footprint,
         outline_mm=None if candidate.outline is None else footprint_in_mm(candidate.outline),
+        facades=FacadePoints.of(
+            candidate.beside, candidate.beside_later, points[index], candidate.ground, candidate.ground_z_m
+        )
+        if settings.at_walls
+        else None,
     )
 
 
@@ -207,7 +215,11 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     continued_faces = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     drawn = roof.outline_mm
     if drawn is None:
-        drawn = straighten(around, roof.spacing_m, settings, EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m))
+        edge_points = EdgePoints.of(roof.xy_mm, roof.split, roof.spacing_m)
+        drawn = straighten(around, roof.spacing_m, settings, edge_points)
+        if roof.facades is not None:
+            reach_m = 1e-3 * mixed_pulse_reach_mm(around, edge_points)
+            drawn = at_walls(drawn, roof.facades, reach_m, settings.usual_overhang_m)
     return RoofPlan(planes=tuple(planes), faces=continued_faces, outline_mm=drawn, raw=partition)
 
 

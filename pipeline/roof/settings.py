@@ -36,6 +36,18 @@ class RoofSettings(Parameters):
         minimum=0.0,
         maximum=2.0,
     )
+    outline: str = parameter(
+        "eaves",
+        "Where the outline lies without a footprint: at the eaves, or at the walls that points beneath the eaves show.",
+        choices=("eaves", "walls"),
+    )
+    usual_overhang_m: float = parameter(
+        0.0,
+        "With outline = walls: how far eaves hang over where no point tells of any wall of a building.",
+        unit="m",
+        minimum=0.0,
+        maximum=1.0,
+    )
     straight_eaves: bool = parameter(
         True, "Whether the outline is drawn with straight lines where no footprint is given."
     )
@@ -108,3 +120,8 @@ class RoofSettings(Parameters):
     block_height_percentile: float = parameter(
         70.0, "Height of a fallback block: this percentile of the roof points.", unit="%", minimum=1.0, maximum=100.0
     )
+
+    @property
+    def at_walls(self) -> bool:
+        """Whether outlines are drawn back to the walls; that takes straight lines."""
+        return self.outline == "walls" and self.straight_eaves

@@ -1,7 +1,8 @@
 """Quarantine bundles: one building with all that modelling it needs, in one small file that can be mailed.
 
-A zip of `bundle.json` (names, settings, what happened), `points.npy`, `ground.npy`, `split_returns.npy` and
-`stderr.txt`. Reading one executes nothing of it: no pickles, sizes are checked before anything is unpacked.
+A zip of `bundle.json` (names, settings, what happened), `points.npy`, `ground.npy`, `split_returns.npy`,
+`beside.npy` and `beside_later.npy` (for outlines at the walls) and `stderr.txt`. Reading one executes nothing of it: no
+pickles, sizes are checked before anything is unpacked.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from pipeline.settings import RunSettings
 SUFFIX = ".bundle"
 
 _FORMAT = "gablework bundle 2"
+_OPTIONAL = ("beside", "beside_later")
+"""Points of a candidate that a bundle holds where there are any."""
 _LARGEST_BYTES = 2 * 2**30
 _LARGEST_TEXT_BYTES = 64 * 2**20
 _FIX = "Use a file of a run's quarantine folder, whole and unchanged"
@@ -90,6 +93,7 @@ def write_bundle(folder: str, bundle: Bundle) -> Path:
         "origin": list(candidate.origin),
         "ground_z_m": candidate.ground_z_m if math.isfinite(candidate.ground_z_m) else None,
         "footprint": None if footprint is None else shapely.to_wkb(footprint, hex=True),
+        "outline": None if candidate.outline is None else shapely.to_wkb(candidate.outline, hex=True),
         "touches_data_edge": candidate.touches_data_edge,
         "method": bundle.method,
         "settings": {
@@ -108,6 +112,9 @@ def write_bundle(folder: str, bundle: Bundle) -> Path:
             archive.writestr("bundle.json", json.dumps(document, indent=1, allow_nan=False))
             archive.writestr("stderr.txt", stderr)
             arrays = {"points": candidate.points, "ground": candidate.ground, "split_returns": candidate.split_returns}
+            for name in _OPTIONAL:
+                if len(getattr(candidate, name)):
+                    arrays[name] = getattr(candidate, name)
             for name, array in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, np.ascontiguousarray(array), (1, 0), allow_pickle=False)
@@ -136,7 +143,15 @@ def read_bundle(path: str) -> Bundle:
             points = _array(_member(archive, path, "points.npy", _LARGEST_BYTES))
             ground = _array(_member(archive, path, "ground.npy", _LARGEST_BYTES))
             split_returns = _array(_member(archive, path, "split_returns.npy", _LARGEST_BYTES))
-        return _bundle(document, points, ground, split_returns, stderr)
+            beside, beside_later = (
+                _array(_member(archive, path, f"{name}.npy", _LARGEST_BYTES))
+                if f"{name}.npy" in archive.namelist()
+                else np.zeros((0, 3))
+                for name in _OPTIONAL
+            )
+        bundle = _bundle(document, points, ground, split_returns, stderr)
+        candidate = dataclasses.replace(bundle.candidate, beside=beside, beside_later=beside_later)
+        return dataclasses.replace(bundle, candidate=candidate)
     except OSError as error:
         raise UnreadableInputError(path, f"it cannot be read: {error.strerror or error}", _FIX) from error
     except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
@@ -178,6 +193,9 @@ def _bundle(
     footprint = None if document["footprint"] is None else shapely.from_wkb(document["footprint"])
     if not isinstance(footprint, Polygon | MultiPolygon | None):
         raise TypeError(f"its footprint is a {footprint.geom_type}")
+    outline = None if document.get("outline") is None else shapely.from_wkb(document["outline"])
+    if not isinstance(outline, MultiPolygon | None):
+        raise TypeError(f"its outline is a {outline.geom_type}")
     building_id, method, source_id = document["building_id"], document["method"], document["source_id"]
     if not (isinstance(building_id, str) and building_id.isalnum()):
         raise ValueError(f"its building_id is {building_id!r}")
@@ -190,6 +208,7 @@ def _bundle(
         ground_z_m=math.nan if document["ground_z_m"] is None else float(document["ground_z_m"]),
         footprint=footprint,
         source_id=None if source_id is None else str(source_id),
+        outline=outline,
         touches_data_edge=bool(document["touches_data_edge"]),
     )
     return Bundle(

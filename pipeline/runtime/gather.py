@@ -6,6 +6,7 @@ import dataclasses
 import datetime as dt
 import hashlib
 import math
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -19,6 +20,7 @@ from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.model import BoolArray, Candidate, IntArray
 from pipeline.runtime.join import CandidateSite
 from pipeline.runtime.scratch import POINT, Scratch
+from pipeline.runtime.split import bucket_paths
 from pipeline.terrain.lattice import CELL_MM, NO_DATA
 from pipeline.tiling import MM, TileGrid, Window
 
@@ -29,6 +31,7 @@ _VIEW_MARGIN_M = 14
 _OUTLINE_CELLS = 2
 _EMPTY_CELLS = 4
 _EDGE_CELLS = 5
+_BESIDE_CELLS = 2
 _HEIGHT_WITHOUT_TERRAIN_MM = 2500
 
 
@@ -88,13 +91,18 @@ def _touches_data_edge(roof: BoolArray, occupied: BoolArray) -> bool:
 
 def points_of(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
     """A candidate's points in canonical order: X, Y, Z, return, GPS time, source."""
+    points = stored_points(scratch, site)
+    sorted_points: npt.NDArray[np.void] = points[canonical_order(points)]
+    return sorted_points
+
+
+def stored_points(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
+    """A candidate's points, range after range."""
     pieces = []
     for part in site.ranges:
         stored = scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
         pieces.append(np.array(stored[part.start : part.stop]))
-    points = np.concatenate(pieces) if pieces else np.empty(0, POINT)
-    sorted_points: npt.NDArray[np.void] = points[canonical_order(points)]
-    return sorted_points
+    return np.concatenate(pieces) if pieces else np.empty(0, POINT)
 
 
 def canonical_order(points: npt.NDArray[np.void]) -> IntArray:
@@ -109,6 +117,8 @@ def gather(
     grid: TileGrid,
     site: CandidateSite,
     gps_kind: GpsTimeKind,
+    *,
+    beside: bool = False,
 ) -> tuple[Candidate, CandidateFacts]:
     """One candidate with the terrain around it.
 
@@ -120,6 +130,8 @@ def gather(
         Which points.
     gps_kind : GpsTimeKind
         Whether GPS times tell dates.
+    beside : bool
+        Whether the points around and beneath are wanted too; a candidate whose outline is known has none.
     """
     points = points_of(scratch, site)
     footprint = site.footprint
@@ -161,6 +173,11 @@ def gather(
         ground_z = None
     digest = hashlib.sha256(points.tobytes())
     digest.update(np.ascontiguousarray(ground_mm).tobytes())
+    beside_mm = later_mm = np.empty((0, 3), np.int64)
+    if beside and footprint is None and site.outline is None:
+        beside_mm, later_mm = _beside(scratch, grid, xyz, _grown(roof, _BESIDE_CELLS), around)
+        digest.update(beside_mm.tobytes())
+        digest.update(later_mm.tobytes())
     if site.outline is not None:
         digest.update(np.rint(shapely.get_coordinates(site.outline) * MM).astype(np.int64).tobytes())
     candidate = Candidate(
@@ -173,10 +190,47 @@ def gather(
         footprint=None if footprint is None else _moved(footprint, origin_mm),
         source_id=site.source_id,
         outline=None if site.outline is None else _moved(site.outline, origin_mm),
+        beside=(beside_mm - origin_mm) / MM,
+        beside_later=(later_mm - origin_mm) / MM,
         touches_data_edge=_touches_data_edge(roof, around.occupied),
     )
     first, last = _acquired(points, gps_kind)
     return candidate, CandidateFacts(input_hash=digest.hexdigest(), acquired_from=first, acquired_to=last)
+
+
+def _beside(
+    scratch: Scratch, grid: TileGrid, own_mm: IntArray, cells: BoolArray, around: Surroundings
+) -> tuple[IntArray, IntArray]:
+    """Points in some cells of the surroundings that are none of a candidate's: each (n, 3) int64, sorted.
+
+    The first are of pulses with one return, the second the last of several.
+    """
+    rows, columns = np.nonzero(cells)
+    single, later = [own_mm], [own_mm]
+    if len(rows):
+        view = Window(
+            x0_mm=(around.column0 + int(columns.min())) * CELL_MM,
+            y0_mm=(around.row0 + int(rows.min())) * CELL_MM,
+            x1_mm=(around.column0 + int(columns.max()) + 1) * CELL_MM,
+            y1_mm=(around.row0 + int(rows.max()) + 1) * CELL_MM,
+        )
+        for path in (path for tile in grid.tiles_over(view) for path in bucket_paths(scratch, tile)):
+            if path.stat().st_size == 0:
+                continue
+            stored = np.memmap(path, POINT, mode="r")
+            near = np.array(stored[view.contains(stored["x"], stored["y"])])
+            near = near[cells[near["y"] // CELL_MM - around.row0, near["x"] // CELL_MM - around.column0]]
+            xyz = np.column_stack((near["x"], near["y"], near["z"].astype(np.int64)))
+            single.append(xyz[near["return_count"] <= 1])
+            later.append(xyz[(near["return_count"] > 1) & (near["return_number"] >= near["return_count"])])
+    return _others(single, len(own_mm)), _others(later, len(own_mm))
+
+
+def _others(pieces: Sequence[IntArray], own: int) -> IntArray:
+    """Places of the pieces, one of each, without those of the first `own` rows: (n, 3) int64, sorted."""
+    places, index = np.unique(np.concatenate(pieces), axis=0, return_index=True)
+    others: IntArray = places[index >= own]
+    return others
 
 
 def _moved(area: Area, origin_mm: IntArray) -> Area:

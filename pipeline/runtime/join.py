@@ -62,6 +62,8 @@ class CandidateSite:
     """Its own id."""
     source_attributes: str | None = None
     """The given footprint's columns as the text of a JSON object; None where none was given."""
+    block: str | None = None
+    """Of a unit: the id of the candidate that it was divided from."""
     outline: MultiPolygon | None = None
     """What it has of the outline drawn around touching units, in metres; None where it stands alone."""
     override: Override | None = None

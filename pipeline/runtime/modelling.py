@@ -218,7 +218,7 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     candidate: Candidate | None = None
     facts = CandidateFacts()
     try:
-        candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind)
+        candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, beside=task.settings.roof.at_walls)
         result = reconstruct_building(candidate, task.method, task.settings)
     except (MemoryError, OSError, GableworkError):
         raise
@@ -254,7 +254,7 @@ def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
         Its points cannot be put together.
     """
     task = task.way_of(site)
-    candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind)
+    candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, beside=task.settings.roof.at_walls)
     result = failed_building(candidate, task.method, loss.reason, loss.detail)
     incident = Incident(
         reason=loss.reason.value,

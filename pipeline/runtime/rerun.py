@@ -1,8 +1,8 @@
 """Rerun: single buildings of a finished run again, after other overrides or on request; all others stay untouched.
 
 The inputs are read again and only the tiles around these buildings are split. What is found there is held against the
-records of the run: where a building is not the one that the run had, all tiles are split. All results are made before
-the first file of the run directory is touched.
+records of the run: where a building is not the one that the run had, all tiles are split. All files are written, tile
+by tile, beside the run before the first of its own is touched; then each is renamed into its place.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime as dt
+import itertools
 import json
 import time
 from collections import Counter
@@ -20,9 +21,8 @@ from uuid import uuid4
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.tile_update import TileUpdate, updated_tile
+from pipeline.export.tile_update import updated_tile
 from pipeline.io import LocalStorage
-from pipeline.io.storage import sha256_of
 from pipeline.model import Reason
 from pipeline.runtime.bundle import SUFFIX
 from pipeline.runtime.digest import run_digest
@@ -30,7 +30,7 @@ from pipeline.runtime.earlier import (
     REJECTED,
     Earlier,
     Record,
-    check_footprints,
+    check_outlines,
     check_points,
     earlier_run,
     request_of,
@@ -41,8 +41,8 @@ from pipeline.runtime.gather import gather
 from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import CandidateSite, Joined, RejectedSite
-from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_manifest
-from pipeline.runtime.modelling import Modelled
+from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
+from pipeline.runtime.modelling import Modelled, StoredResult
 from pipeline.runtime.overrides import Override, read_overrides
 from pipeline.runtime.overriding import WARNING, EntryOutcome
 from pipeline.runtime.plan import check_memory
@@ -56,6 +56,7 @@ from pipeline.runtime.run import (
     plan_inputs,
     put_json,
     remove_folder,
+    told_file,
     told_request,
 )
 from pipeline.runtime.scratch import Scratch
@@ -65,6 +66,8 @@ from pipeline.tiling import MM, Tile
 
 AROUND_M = 30.0
 """Tiles that come nearer than this to a building are split: it sees terrain up to 15 m away."""
+_NEW = "new"
+"""In scratch, the files that will take the place of the run's."""
 _QUARANTINED = (Reason.INTERNAL_ERROR, Reason.CRASHED, Reason.TIMED_OUT, Reason.OUT_OF_MEMORY)
 
 
@@ -154,7 +157,7 @@ def rerun(
     footprints = None if wanted.footprints is None else given_footprints(wanted.footprints, plan)
     reference = plan.sources[0].reference
     overrides = () if wanted.overrides is None else read_overrides(wanted.overrides, reference, wanted.settings)
-    check_footprints(earlier.manifest, wanted)
+    check_outlines(earlier.manifest, wanted)
     scratch_dir = earlier.run_dir / SCRATCH
     remove_folder(scratch_dir)
     scratch = Scratch(str(scratch_dir / uuid4().hex))
@@ -185,12 +188,13 @@ def rerun(
                     if outcome.warning:
                         progress.warn("join", outcome.warning)
                 modelled = stages.reconstruct(found.again)
-                updates = _updates(stages, earlier, found, wanted.meshes)
+                new = LocalStorage(root=Path(scratch.root, _NEW))
+                prepared = _prepared(stages, earlier, found, wanted.meshes, new)
             except BaseException:
                 scratch.cancel()
                 raise
             scratch.check_cancelled()
-            digest = _written(earlier, wanted, found, modelled, updates, scratch, began)
+            digest = _written(earlier, wanted, found, modelled, prepared, new, scratch, began)
     finally:
         remove_folder(scratch_dir)
     status = {**{m.building_id: m.status for m in modelled}, **{s.object_id: "rejected" for s in found.again.rejected}}
@@ -200,7 +204,7 @@ def rerun(
         run_dir=str(earlier.run_dir),
         digest=digest,
         buildings=dict(sorted(status.items())),
-        tiles=tuple(sorted(tile.key for tile in updates)),
+        tiles=tuple(sorted(tile.key for tile in prepared)),
         tiles_split=len(found.splits),
         warnings=tuple(outcome.warning for outcome in found.outcomes if outcome.warning),
         seconds=seconds,
@@ -260,7 +264,7 @@ def _join(
 ) -> _Found:
     reference = stages.plan.sources[0].reference
     splits = stages.split(ingested, footprints, tiles)
-    judged = stages.join(splits, footprints, reference)
+    judged = stages.outline(stages.join(splits, footprints, reference))
     joined, outcomes = stages.override(judged, overrides, ingested)
     now = {o.building_id: o.effective.fingerprint for o in outcomes if o.building_id and o.effective is not None}
     names = {*now, *earlier.fingerprints}
@@ -334,29 +338,46 @@ def _same(stages: Stages, record: Record, site: CandidateSite | RejectedSite) ->
         return False
     if isinstance(site, RejectedSite) or record.input_hash is None:
         return True
-    _, facts = gather(stages.scratch, stages.plan.grid, site, stages.gps_kind)
+    at_walls = stages.settings.building.roof.at_walls
+    _, facts = gather(stages.scratch, stages.plan.grid, site, stages.gps_kind, beside=at_walls)
     return facts.input_hash == record.input_hash
 
 
-def _updates(stages: Stages, earlier: Earlier, found: _Found, meshes: str) -> dict[Tile, TileUpdate]:
-    """The new files of the tiles that own what was made again."""
-    stored = stages.stored(found.again)
-    facts = {entry.result.building_id: entry.facts for entry in stored}
-    context = dataclasses.replace(stages.record_context(stages.plan.sources[0].reference), facts=facts)
-    owner = {site.building_id: site.owner for site in found.again.candidates}
-    owner |= {site.object_id: site.owner for site in found.again.rejected}
-    return {
-        tile: updated_tile(
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Prepared:
+    """The new files of a tile, whole, in scratch: only their digests are held."""
+
+    digests: Mapping[str, str]
+    """sha256 by path relative to the run directory, hexadecimal."""
+    gone: tuple[str, ...]
+    """Paths of meshes that no row names any more."""
+
+
+def _prepared(stages: Stages, earlier: Earlier, found: _Found, meshes: str, new: LocalStorage) -> dict[Tile, _Prepared]:
+    """Write the new files of the tiles that own what was made again, one tile at a time, beside the run's."""
+    context = stages.record_context(stages.plan.sources[0].reference)
+    rejected: dict[Tile, list[RejectedSite]] = {}
+    for site in found.again.rejected:
+        rejected.setdefault(site.owner, []).append(site)
+    owners = {site.owner for site in found.again.candidates}
+    without = ((tile, list[StoredResult]()) for tile in sorted(rejected.keys() - owners))
+
+    def prepare(tile: Tile, stored: Sequence[StoredResult]) -> _Prepared:
+        update = updated_tile(
             earlier.run_dir,
             tile.key,
             found.changed,
-            [entry.result for entry in stored if owner[entry.result.building_id] == tile],
-            [rejected_object(site) for site in found.again.rejected if site.owner == tile],
-            context,
+            [entry.result for entry in stored],
+            [rejected_object(site) for site in rejected.get(tile, ())],
+            dataclasses.replace(context, facts={entry.result.building_id: entry.facts for entry in stored}),
             meshes,
         )
-        for tile in sorted(set(owner.values()))
-    }
+        for path, data in update.files.items():
+            new.put(path, data)
+        return _Prepared(digests=update.digests, gone=update.gone)
+
+    prepared = {tile: prepare(tile, stored) for tile, stored in itertools.chain(stages.stored(found.again), without)}
+    return dict(sorted(prepared.items()))
 
 
 def _written(
@@ -364,7 +385,8 @@ def _written(
     request: RunRequest,
     found: _Found,
     modelled: Sequence[Modelled],
-    updates: Mapping[Tile, TileUpdate],
+    prepared: Mapping[Tile, _Prepared],
+    new: LocalStorage,
     scratch: Scratch,
     began: float,
 ) -> str:
@@ -376,9 +398,10 @@ def _written(
     changing = dataclasses.replace(earlier.manifest, status=RunStatus.RUNNING, content_sha256=None)
     write_manifest(root, changing, storage.put)
     try:
-        for tile, update in updates.items():
-            for path, data in update.files.items():
-                storage.put(path, data)
+        for tile, update in prepared.items():
+            for path in update.digests:
+                with storage.putting(path) as temporary:
+                    new.path(path).rename(temporary)
             _put_state(storage, tile, update)
             for path in update.gone:
                 (root / path).unlink(missing_ok=True)
@@ -412,7 +435,7 @@ def _put_bundles(
             storage.path(key).unlink(missing_ok=True)
 
 
-def _put_state(storage: LocalStorage, tile: Tile, update: TileUpdate) -> None:
+def _put_state(storage: LocalStorage, tile: Tile, update: _Prepared) -> None:
     """The tile's state with the digests of its new files."""
     key = f"state/{tile.key}.json"
     state = json.loads(storage.get(key))
@@ -431,11 +454,10 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
         counts["candidates"] += after[status] - before[status]
     counts[REJECTED] += len(found.again.rejected) - before[REJECTED]
     counts["roof_faces"] += sum(m.faces for m in modelled) - earlier.faces(found.changed)
-    old = Path(earlier.manifest.request["overrides"] or "").name
-    inputs = [entry for entry in earlier.manifest.inputs if entry.n_points is not None or Path(entry.path).name != old]
+    old = earlier.manifest.request["overrides"]
+    inputs = [entry for entry in earlier.manifest.inputs if entry.n_points is not None or entry.path != old]
     if request.overrides is not None:
-        path = Path(request.overrides).resolve()
-        inputs.append(InputFile(path=str(path), sha256=sha256_of(path), size_bytes=path.stat().st_size))
+        inputs.append(told_file(request.overrides))
     warnings = [text for text in earlier.manifest.warnings if not text.startswith(WARNING)]
     warnings.extend(outcome.warning for outcome in found.outcomes if outcome.warning)
     return dataclasses.replace(

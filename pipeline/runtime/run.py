@@ -1,4 +1,4 @@
-"""A run from inputs to a run directory: plan, ingest, split, join, reconstruct, publish."""
+"""A run from inputs to a run directory: plan, ingest, split, join, outline, reconstruct, publish."""
 
 from __future__ import annotations
 
@@ -283,7 +283,7 @@ def run_variants(
             try:
                 ingested = stages.ingest(paths)
                 splits = stages.split(ingested, footprints)
-                joined = stages.join(splits, footprints, reference)
+                joined = stages.outline(stages.join(splits, footprints, reference))
                 if request.overrides is not None:
                     joined, outcomes_of_entries = stages.override(joined, overrides, ingested)
                     for outcome in outcomes_of_entries:
@@ -394,11 +394,14 @@ def _inputs_told(request: RunRequest, paths: Sequence[str], ingested: Sequence[I
         )
         for path, found in zip(paths, ingested, strict=True)
     ]
-    for name in (request.footprints, request.overrides):
-        if name is not None:
-            path = Path(name)
-            inputs.append(InputFile(path=str(path), sha256=sha256_of(path), size_bytes=path.stat().st_size))
+    inputs.extend(told_file(name) for name in (request.footprints, request.aoi, request.overrides) if name is not None)
     return tuple(inputs)
+
+
+def told_file(name: str) -> InputFile:
+    """A file beside the point clouds as the manifest tells it."""
+    path = Path(name).resolve()
+    return InputFile(path=str(path), sha256=sha256_of(path), size_bytes=path.stat().st_size)
 
 
 def told_request(request: RunRequest) -> dict[str, object]:

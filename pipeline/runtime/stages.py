@@ -7,7 +7,7 @@ import dataclasses
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, TypeVar
 
 import shapely
@@ -25,6 +25,7 @@ from pipeline.runtime.ingest import Ingested, IngestTask, ingest, spread_m
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import CandidateSite, Joined, PointRange, RejectedSite, join, join_footprints
 from pipeline.runtime.modelling import BatchTask, Modelled, StoredResult, batches, model_batch, stored_results
+from pipeline.runtime.outlines import draw_outlines, outline_tasks
 from pipeline.runtime.overrides import Override, own_modelling
 from pipeline.runtime.overriding import EntryOutcome, accepts, layers_of, outcomes_of, overridden
 from pipeline.runtime.plan import Plan, check_windows
@@ -77,13 +78,13 @@ def given_footprints(path: str, plan: Plan) -> GivenFootprints:
     InputError
         The file cannot be used.
     """
-    found = read_footprints(path, plan.sources[0].reference)
     area = shapely.union_all([shapely.box(*i.bounds_m[:2], *i.bounds_m[3:5]) for i in plan.sources])
     unit = plan.sources[0].reference.horizontal_unit_m
     if plan.options.bbox is not None:
         area &= shapely.box(*(v * unit for v in plan.options.bbox))
     if plan.options.aoi is not None:
         area &= shapely.transform(plan.options.aoi, lambda xy: xy * unit)
+    found = read_footprints(path, plan.sources[0].reference, area=area)
     shapely.prepare(area)  # of many inputs it has many corners, and is asked once a footprint
     inside = [k for k, polygon in enumerate(found.polygons) if area.intersects(polygon)]
     # a fault far from the data is none of this run's; one without a place may be
@@ -91,8 +92,9 @@ def given_footprints(path: str, plan: Plan) -> GivenFootprints:
     warnings = [*found.warnings, *(str(issue) for issue in issues[:_ISSUES_TOLD])]
     if len(issues) > _ISSUES_TOLD:
         warnings.append(f"{len(issues) - _ISSUES_TOLD} more faults of footprints, each in footprints.json of a run")
-    if len(inside) < len(found.polygons):
-        warnings.append(f"{len(found.polygons) - len(inside)} of {len(found.polygons)} footprints lie off the data")
+    polygons = len(found.polygons) + found.elsewhere
+    if len(inside) < polygons:
+        warnings.append(f"{polygons - len(inside)} of {polygons} footprints lie off the data")
     # overlaps are decided by this order
     inside.sort(key=lambda k: (found.polygons[k].bounds, found.ids[k]))
     return GivenFootprints(
@@ -103,7 +105,7 @@ def given_footprints(path: str, plan: Plan) -> GivenFootprints:
         report={
             "path": path,
             "used": len(inside),
-            "off_the_data": len(found.polygons) - len(inside),
+            "off_the_data": polygons - len(inside),
             "repaired": sum(issue.action != "left out" for issue in issues),
             "left_out": sum(issue.action == "left out" for issue in issues),
             "issues": [dataclasses.asdict(issue) for issue in issues],
@@ -368,8 +370,7 @@ class Stages:
         settings = self.settings.scene.units
         if settings.split == "nothing":
             return joined
-        roof = self.settings.building.roof
-        tasks = unit_tasks(joined.candidates, settings, roof, self.plan.grid, self.scratch, crs_name)
+        tasks = unit_tasks(joined.candidates, settings, self.plan.grid, self.scratch, crs_name)
         sites: list[CandidateSite] = []
         with contextlib.closing(self.executor.map("join", divide, tasks, self.progress.watch)) as running:
             for measured in running:
@@ -377,6 +378,18 @@ class Stages:
                 peaks = self.progress.peaks
                 peaks[measured.process] = max(peaks.get(measured.process, 0), measured.peak_bytes)
         return dataclasses.replace(joined, candidates=tuple(sorted(sites, key=lambda c: (-c.points, c.building_id))))
+
+    def outline(self, joined: Joined) -> Joined:
+        """The candidates with the outlines of touching units, drawn together."""
+        tasks = outline_tasks(joined.candidates, self.settings.building.roof, self.plan.grid, self.scratch)
+        outlines: dict[str, MultiPolygon] = {}
+        for drawn in self.progress.stage(self.executor, "outline", draw_outlines, tasks):
+            outlines |= drawn
+        sites = (
+            dataclasses.replace(site, outline=outlines.get(site.building_id)) if site.block is not None else site
+            for site in joined.candidates
+        )
+        return dataclasses.replace(joined, candidates=tuple(sites))
 
     def reconstruct(self, joined: Joined) -> list[Modelled]:
         """All candidates, largest first."""
@@ -422,13 +435,14 @@ class Stages:
             acquired_to=max((b for _, b in known), default=None),
         )
 
-    def stored(self, joined: Joined) -> list[StoredResult]:
-        """The models of all candidates, after `reconstruct`."""
-        found = []
+    def stored(self, joined: Joined) -> Iterator[tuple[Tile, list[StoredResult]]]:
+        """The models of all candidates, after `reconstruct`, one owner tile at a time."""
+        numbers: dict[Tile, list[int]] = {}
         for number, sites in self._numbered(joined):
-            for tile in sorted({site.owner for site in sites}):
-                found.extend(stored_results(self.scratch, tile, number))
-        return found
+            for tile in {site.owner for site in sites}:
+                numbers.setdefault(tile, []).append(number)
+        for tile in sorted(numbers):
+            yield tile, [entry for number in numbers[tile] for entry in stored_results(self.scratch, tile, number)]
 
     @property
     def gps_kind(self) -> GpsTimeKind:

@@ -1,8 +1,7 @@
-"""Units: a candidate in which several buildings touch becomes one candidate a unit, between join and reconstruct.
+"""Units: a candidate in which several buildings touch becomes one candidate a unit, as the end of the join.
 
 A task sees all points of its candidates, whichever tiles they lie in, so the outcome does not depend on the tiles. The
 points of a divided candidate are stored again, sorted by unit, tile by tile: a range still lies in the tile it names.
-The outline is drawn here too, around all units at once: they share their walls.
 """
 
 from __future__ import annotations
@@ -12,20 +11,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from shapely import MultiPolygon
-from shapely.affinity import translate
 
-from pipeline.io.gps_time import GpsTimeKind
-from pipeline.model import LabelArray
-from pipeline.roof.settings import RoofSettings
-from pipeline.roof.unit_outlines import unit_outlines
-from pipeline.runtime.gather import canonical_order, gather
 from pipeline.runtime.join import CandidateSite, PointRange, object_id
 from pipeline.runtime.scratch import POINT, Scratch
-from pipeline.terrain.units import UnitSettings, units_of
+from pipeline.terrain.units import UnitSettings, smallest_points, units_of
 from pipeline.tiling import Tile, TileGrid
 
-_POINTS_PER_TASK = 200_000
+_POINTS_PER_TASK = 50_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -36,8 +28,6 @@ class UnitTask:
     """The candidates."""
     settings: UnitSettings
     """What separates units."""
-    roof: RoofSettings
-    """How outlines are drawn."""
     grid: TileGrid
     """The lattice, for the owners."""
     scratch: Scratch
@@ -47,12 +37,7 @@ class UnitTask:
 
 
 def unit_tasks(
-    sites: Sequence[CandidateSite],
-    settings: UnitSettings,
-    roof: RoofSettings,
-    grid: TileGrid,
-    scratch: Scratch,
-    crs_name: str,
+    sites: Sequence[CandidateSite], settings: UnitSettings, grid: TileGrid, scratch: Scratch, crs_name: str
 ) -> list[UnitTask]:
     """Group candidates to tasks of some tenths of a second each."""
     groups: list[list[CandidateSite]] = []
@@ -64,7 +49,7 @@ def unit_tasks(
         groups[-1].append(site)
         points += site.points
     return [
-        UnitTask(sites=tuple(group), settings=settings, roof=roof, grid=grid, scratch=scratch, crs_name=crs_name)
+        UnitTask(sites=tuple(group), settings=settings, grid=grid, scratch=scratch, crs_name=crs_name)
         for group in groups
     ]
 
@@ -99,9 +84,7 @@ def _units_of_site(site: CandidateSite, task: UnitTask) -> list[CandidateSite]:
     count = int(unit.max(initial=0)) + 1
     if count == 1:
         return [site]
-    outlines = _outlines(site, unit[canonical_order(points)], task)
-    order = np.lexsort((z, y, x, unit))
-    firsts = order[np.searchsorted(unit[order], np.arange(count))]
+    firsts = smallest_points(x, y, z, unit)
     ranges: list[list[PointRange]] = [[] for _ in range(count)]
     folder = f"units/{site.building_id}"
     start = 0
@@ -120,14 +103,7 @@ def _units_of_site(site: CandidateSite, task: UnitTask) -> list[CandidateSite]:
             owner=task.grid.tile_of(int(x[first]), int(y[first])),
             ranges=tuple(ranges[k]),
             points=sum(part.stop - part.start for part in ranges[k]),
-            outline=outlines[k],
+            block=site.building_id,
         )
         for k, first in enumerate(firsts.tolist())
     ]
-
-
-def _outlines(site: CandidateSite, units: LabelArray, task: UnitTask) -> list[MultiPolygon | None]:
-    """The outlines of a candidate's units in metres of the CRS; `units` in the canonical order of its points."""
-    candidate, _ = gather(task.scratch, task.grid, site, GpsTimeKind.NONE)
-    drawn = unit_outlines(candidate, units, task.roof)
-    return [None if one is None else translate(one, candidate.origin[0], candidate.origin[1]) for one in drawn]

@@ -17,6 +17,7 @@ from pipeline.runtime.executors import Measured, SerialExecutor, measure
 from pipeline.runtime.ingest import ingest
 from pipeline.runtime.manifest import RunStatus, read_manifest
 from pipeline.runtime.modelling import model_batch
+from pipeline.runtime.outlines import draw_outlines
 from pipeline.runtime.publish import publish
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.runtime.scratch import Scratch
@@ -190,7 +191,14 @@ def late(start: Callable[..., RunSummary]) -> dict[str, list[Any]]:
 
 def test_no_late_task_changes_a_run_that_is_over(late: dict[str, list[Any]], tmp_path: Path) -> None:
     before = files_below(tmp_path / "run")
-    functions = {"ingest": ingest, "split": split, "join": divide, "reconstruct": model_batch, "publish": publish}
+    functions = {
+        "ingest": ingest,
+        "split": split,
+        "join": divide,
+        "outline": draw_outlines,
+        "reconstruct": model_batch,
+        "publish": publish,
+    }
     for stage, tasks in late.items():
         for task in tasks:
             with pytest.raises((RunCancelledError, FileNotFoundError)):

@@ -62,7 +62,7 @@ def test_the_presets_differ(compared: tuple[CompareSummary, list[Event]]) -> Non
 def test_candidates_are_found_once_and_modelled_once_a_variant(compared: tuple[CompareSummary, list[Event]]) -> None:
     summary, events = compared
     stages = [event.stage for event in events if event.kind == "stage"]
-    assert stages == ["ingest", "split", "join", "reconstruct", "reconstruct", "publish", "publish"]
+    assert stages == ["ingest", "split", "join", "outline", "reconstruct", "reconstruct", "publish", "publish"]
     candidates = summary.runs["fuzzy-sart"].counts["candidates"]
     counted = [
         (event.done, event.total) for event in events if (event.kind, event.stage) == ("progress", "reconstruct")

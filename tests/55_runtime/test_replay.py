@@ -50,8 +50,11 @@ def bundle() -> Bundle:
         ground=np.column_stack((east, north, np.full(len(east), -0.1))),
         ground_z_m=-0.1,
         split_returns=np.array([[0.25, 0.25, 6.15], [9.75, 0.25, 6.15]]),
+        beside=np.array([[5.0, -0.1, 3.0], [6.0, -1.0, 0.0]]),
+        beside_later=np.array([[7.0, 0.1, 2.0]]),
         footprint=shapely.box(0.0, 0.0, 10.0, 10.0),
         source_id="house 7",
+        outline=shapely.MultiPolygon([shapely.box(0.0, 0.0, 10.0, 9.9)]),
         touches_data_edge=True,
     )
     return Bundle(
@@ -98,7 +101,7 @@ def invoke(*words: str) -> tuple[int, str, str]:
 
 def test_a_bundle_comes_back_as_it_was(bundle: Bundle, path: Path) -> None:
     found = read_bundle(str(path))
-    bare = {name: np.empty((0, 3)) for name in ("points", "ground", "split_returns")}
+    bare = {name: np.empty((0, 3)) for name in ("points", "ground", "split_returns", "beside", "beside_later")}
     for name in bare:
         assert np.array_equal(getattr(found.candidate, name), getattr(bundle.candidate, name))
     for given, back in ((bundle, found),):

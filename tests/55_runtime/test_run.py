@@ -121,7 +121,7 @@ def test_progress_is_told_by_stage_and_never_runs_backwards(suburb: Path, tmp_pa
     settings = RunSettings.from_mapping({"tile_size_m": 40.0})
     run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "run"), settings=settings, workers=0), events.append)
     stages = [event.stage for event in events if event.kind == "stage"]
-    assert stages == ["ingest", "split", "join", "reconstruct", "publish"]
+    assert stages == ["ingest", "split", "join", "outline", "reconstruct", "publish"]
     for stage in ("ingest", "split", "reconstruct", "publish"):
         steps = [event for event in events if event.kind == "progress" and event.stage == stage]
         assert [s.done for s in steps] == sorted(s.done for s in steps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from pathlib import Path
@@ -9,13 +10,20 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+import shapely
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from shapely import MultiPolygon
 
-from pipeline.runtime.gather import points_of
+from pipeline.io.gps_time import GpsTimeKind
+from pipeline.reconstruct import ReconstructSettings, reconstruct_building
+from pipeline.roof.settings import RoofSettings
+from pipeline.runtime.gather import gather, points_of
 from pipeline.runtime.join import CandidateSite, PointRange, object_id
+from pipeline.runtime.outlines import draw_outlines, outline_tasks
 from pipeline.runtime.scratch import POINT, Scratch
 from pipeline.runtime.units import divide, unit_tasks
+from pipeline.terrain.lattice import CELL_MM
 from pipeline.terrain.units import UnitSettings
 from pipeline.tiling import TileGrid
 
@@ -45,10 +53,15 @@ def stored(points: npt.NDArray[np.void], grid: TileGrid, root: Path, fragments: 
     scratch.create()
     column, line = grid.columns_rows(points["x"], points["y"])
     tiles = sorted({grid.tile_of(x, y) for x, y in zip(points["x"].tolist(), points["y"].tolist(), strict=True)})
+    cells = np.column_stack((points["x"], points["y"])) // CELL_MM
+    corner = cells.min(axis=0) - 20
+    occupied = np.zeros((cells.max(axis=0) + 20 - corner)[::-1], np.bool_)
+    occupied[cells[:, 1] - corner[1], cells[:, 0] - corner[0]] = True
+    level = {"corner": corner, "occupied": occupied, "terrain": np.zeros(occupied.shape, np.int32)}
     ranges = []
     for tile in tiles:
         own = points[(column == tile.column) & (line == tile.row)]
-        scratch.put_arrays(f"tiles/{tile.key}", {"points": own.view(np.uint8)})
+        scratch.put_arrays(f"tiles/{tile.key}", {"points": own.view(np.uint8), **level})
         cuts = np.linspace(0, len(own), fragments + 1).astype(int).tolist()
         ranges += [PointRange(tile=tile, start=a, stop=b) for a, b in itertools.pairwise(cuts)]
     lowest = min(zip(points["x"].tolist(), points["y"].tolist(), points["z"].tolist(), strict=True))
@@ -62,7 +75,11 @@ def stored(points: npt.NDArray[np.void], grid: TileGrid, root: Path, fragments: 
 
 
 def divided(site: CandidateSite, grid: TileGrid, scratch: Scratch, own: UnitSettings) -> list[CandidateSite]:
-    return [unit for task in unit_tasks([site], own, grid, scratch, CRS) for unit in divide(task)]
+    units = [unit for task in unit_tasks([site], own, grid, scratch, CRS) for unit in divide(task)]
+    outlines: dict[str, MultiPolygon] = {}
+    for task in outline_tasks(units, RoofSettings(), grid, scratch):
+        outlines |= draw_outlines(task)
+    return [dataclasses.replace(unit, outline=outlines.get(unit.building_id)) for unit in units]
 
 
 ONE_TILE = TileGrid(size_mm=1_000_000, halo_mm=0)
@@ -86,15 +103,42 @@ def test_units_do_not_depend_on_tiles_fragments_and_order(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     whole, scratch = stored(row, ONE_TILE, tmp_path_factory.mktemp("whole"), 1)
-    expected = {u.building_id: points_of(scratch, u) for u in divided(whole, ONE_TILE, scratch, UnitSettings())}
+    expected = {u.building_id: u for u in divided(whole, ONE_TILE, scratch, UnitSettings())}
     assert len(expected) == len(EAVES_M)
+    points = {name: points_of(scratch, unit) for name, unit in expected.items()}
     grid = TileGrid(size_mm=size_mm, halo_mm=0, origin_x_mm=shift_x_mm, origin_y_mm=shift_y_mm)
     mixed = row[np.random.default_rng(seed).permutation(len(row))]
     site, scratch = stored(mixed, grid, tmp_path_factory.mktemp("cut"), fragments)
     units = divided(site, grid, scratch, UnitSettings())
     assert {u.building_id for u in units} == set(expected)
     for unit in units:
-        assert np.array_equal(points_of(scratch, unit), expected[unit.building_id])
+        assert np.array_equal(points_of(scratch, unit), points[unit.building_id])
+        assert unit.outline is not None
+        assert unit.outline.equals_exact(expected[unit.building_id].outline, 0.0)
+
+
+def test_touching_units_share_their_walls(row: npt.NDArray[np.void], tmp_path: Path) -> None:
+    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
+    units = divided(site, ONE_TILE, scratch, UnitSettings())
+    outlines = [unit.outline for unit in units]
+    whole = shapely.union_all(outlines)
+    assert whole.geom_type == "Polygon"
+    assert not whole.interiors
+    assert abs(whole.area - sum(outline.area for outline in outlines)) < 0.05
+    assert abs(whole.area / (8 * len(EAVES_M) * 10) - 1) < 0.04
+    for unit in units:
+        candidate, _ = gather(scratch, ONE_TILE, unit, GpsTimeKind.NONE)
+        model = reconstruct_building(candidate, "fuzzy-sart", ReconstructSettings())
+        drawn = shapely.transform(model.footprint, lambda xy, origin=candidate.origin: xy + origin[:2])
+        assert shapely.symmetric_difference(drawn, unit.outline).area < 0.1
+
+
+def test_the_outline_is_part_of_what_a_model_is_made_of(row: npt.NDArray[np.void], tmp_path: Path) -> None:
+    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
+    unit = divided(site, ONE_TILE, scratch, UnitSettings())[0]
+    _, facts = gather(scratch, ONE_TILE, unit, GpsTimeKind.NONE)
+    _, alone = gather(scratch, ONE_TILE, dataclasses.replace(unit, outline=None), GpsTimeKind.NONE)
+    assert facts.input_hash != alone.input_hash
 
 
 def test_units_keep_every_point_once_in_the_tile_that_holds_it(row: npt.NDArray[np.void], tmp_path: Path) -> None:
@@ -125,7 +169,7 @@ def test_large_candidates_get_tasks_of_their_own() -> None:
     def site(points: int) -> CandidateSite:
         return CandidateSite(building_id=str(points), owner=ONE_TILE.tile_of(0, 0), ranges=(), points=points)
 
-    sites = [site(n) for n in (900_000, 150_000, 40_000, 20_000, 5)]
+    sites = [site(n) for n in (900_000, 40_000, 9_000, 5_000, 5)]
     tasks = unit_tasks(sites, UnitSettings(), ONE_TILE, Scratch("nowhere"), CRS)
-    assert [[s.points for s in task.sites] for task in tasks] == [[900_000], [150_000, 40_000], [20_000, 5]]
+    assert [[s.points for s in task.sites] for task in tasks] == [[900_000], [40_000, 9_000], [5_000, 5]]
     assert unit_tasks([], UnitSettings(), ONE_TILE, Scratch("nowhere"), CRS) == []

@@ -56,7 +56,7 @@ def test_the_run_directory_is_laid_out_as_documented(run: tuple[Path, Any, Any])
 
 def test_the_stages_are_told_in_order(run: tuple[Path, Any, list[dict[str, Any]]]) -> None:
     stages = [event["stage"] for event in run[2] if event["kind"] == "stage"]
-    assert stages == ["ingest", "split", "join", "reconstruct", "publish"]
+    assert stages == ["ingest", "split", "join", "outline", "reconstruct", "publish"]
 
 
 def test_a_building_is_overridden_and_the_run_brought_in_line(

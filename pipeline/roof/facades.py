@@ -1,0 +1,291 @@
+"""Outlines at the facades: the eaves drawn back to where points beneath them put the walls.
+
+A scanner that looks aslant meets walls beneath the eaves. Such facade points lie in one upright sheet along a line of
+the outline, from the ground up to the eave. Where a sheet stands out, the line is moved there. Walls that look away
+from the scanner have none: a line with open ground before it is then drawn back by the mean overhang of those lines of
+the same outline whose walls are known, by a told usual overhang where none is. A line without open ground before it, as
+along a neighbour, stays.
+
+A pulse that was split at the eave met the wall with that part of its beam that passed the edge, but its last return is
+told on the axis of the beam: too far inside, by about the reach of the mixed pulses. So last of several returns are
+moved outwards by that reach before a sheet is looked for.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+from shapely.geometry.polygon import orient
+
+from pipeline.model import BoolArray, FloatArray, IntArray
+from pipeline.roof.footprint import polygons_of
+from pipeline.roof.lines import Run, corners
+
+_LEAST_LENGTH_M = 2.0
+"""A shorter line takes the mean overhang."""
+_STRIP_M = 1.0
+"""Length of the strips along a line in which the eave's height is taken."""
+_EAVE_DEPTH_M = 1.2
+"""The lowest roof point within this of the line is the eave."""
+_END_M = 0.3
+"""Left out at either end of a line: there the next wall begins."""
+_WIDEST_M = 1.0
+"""The widest overhang."""
+_OUTSIDE_M = 0.5
+"""Points as far outside the eave are looked at too: where most are there, they are plants and no wall."""
+_SHEET_M = 0.3
+"""Thickness of a facade with its reliefs, as several strips of a survey show it."""
+_UNDER_EAVE_M = 0.5
+"""Gutters and soffits hang no lower."""
+_ABOVE_GROUND_M = 1.0
+"""What lies lower are steps, fences and bonnets."""
+_SPREAD_M = 1.5
+"""Least height of a sheet."""
+_FEWEST = 8
+"""Least number of points of a sheet."""
+_SHARE = 0.5
+"""Least share of the points beneath and before the eave in the sheet."""
+_OCCUPIED = 0.25
+"""Least share of the strips with points of the sheet."""
+_SLACK_M = 0.1
+"""A sheet as far outside the eave still is the wall beneath it: outlines err by as much."""
+_BEFORE_M = (0.2, 1.5)
+"""Where open ground before a line is looked for."""
+_OPEN_HEIGHT_M = 1.5
+"""Points as low above the terrain are of open ground."""
+_OPEN_SHARE = 0.5
+"""Least share of the strips with such points."""
+_CORNER_REACH_M = 2.0
+"""Lines that meet farther than this from their corner at the eaves are joined by a step there."""
+_MOST_MOVED = 1.5
+"""Most area between eaves and walls: so many times what the lines sweep."""
+_ROUNDING_MM2 = 1e4
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FacadePoints:
+    """What tells of the walls beneath a roof."""
+
+    xyz: FloatArray
+    """(n, 3) float64, points around and beneath the roof, none of its own, local metres."""
+    height_m: FloatArray
+    """(n,) float64, theirs above the terrain."""
+    later: BoolArray
+    """(n,) bool, True for the last of several returns of a pulse."""
+    roof: FloatArray
+    """(m, 3) float64, the roof points, local metres."""
+    tree: shapely.STRtree
+    """Of `xyz` in plan."""
+    roof_tree: shapely.STRtree
+    """Of `roof` in plan."""
+
+    @classmethod
+    def of(
+        cls, single: FloatArray, later: FloatArray, roof: FloatArray, ground: FloatArray, ground_z_m: float
+    ) -> FacadePoints:
+        """Take heights above the terrain and make the points ready to be found.
+
+        Parameters
+        ----------
+        single, later : (n, 3) and (k, 3) float64
+            Points around and beneath the roof, of pulses with one return and the last of several, local metres; in
+            any order.
+        roof : (m, 3) float64
+            The roof points, local metres.
+        ground : (j, 3) float64
+            The terrain at the middles of cells of 1 m, local metres.
+        ground_z_m : float
+            The terrain where no cell tells.
+        """
+        xyz = np.concatenate((single, later))
+        cells, wanted = _cells(ground), _cells(xyz)
+        order = np.argsort(cells, kind="stable")
+        floor = np.full(len(xyz), ground_z_m)
+        if len(cells):
+            place = order[np.minimum(np.searchsorted(cells, wanted, sorter=order), len(cells) - 1)]
+            known = cells[place] == wanted
+            floor[known] = ground[place[known], 2]
+        return cls(
+            xyz=xyz,
+            height_m=xyz[:, 2] - floor,
+            later=np.arange(len(xyz)) >= len(single),
+            roof=roof,
+            tree=shapely.STRtree(shapely.points(xyz[:, :2])),
+            roof_tree=shapely.STRtree(shapely.points(roof[:, :2])),
+        )
+
+
+def _cells(xyz: FloatArray) -> IntArray:
+    """A number for the cell of 1 m of every point, (n,)."""
+    cells = np.floor(xyz[:, :2]).astype(np.int64)
+    numbers: IntArray = (cells[:, 0] << 32) + cells[:, 1]
+    return numbers
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Eave:
+    """One line of an outline and the wall beneath it."""
+
+    length_m: float
+    """From corner to corner."""
+    is_open: bool
+    """Whether open ground lies before it; taken for granted of a short line."""
+    overhang_m: float | None
+    """How far inside the line its wall stands; None where no sheet of points tells."""
+
+
+def eave_of(start: FloatArray, end: FloatArray, points: FacadePoints, reach_m: float) -> Eave:
+    """What the points tell of the wall beneath one line of an outline.
+
+    Parameters
+    ----------
+    start, end : (2,) float64
+        Ends of the line, local metres, the roof on its left.
+    points : FacadePoints
+        Of the building.
+    reach_m : float
+        Reach of the mixed pulses, see `mixed_pulse_reach_mm`.
+
+    Returns
+    -------
+    Eave
+        Its overhang is slightly negative where the outline was drawn a little inside the wall.
+    """
+    length = math.dist(start, end)
+    if length < _LEAST_LENGTH_M:
+        return Eave(length_m=length, is_open=True, overhang_m=None)
+    (x0, y0), (ux, uy) = start.tolist(), ((end - start) / length).tolist()
+    out = np.array([uy, -ux])
+    strips = max(1, math.floor(length / _STRIP_M))
+
+    def near(
+        tree: shapely.STRtree, xyz: FloatArray, inside: float, outside: float
+    ) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
+        """Indices of points by the line, their ways along it and to its right, and their strips."""
+        box = Polygon([start - inside * out, start + outside * out, end + outside * out, end - inside * out])
+        index = np.sort(tree.query(box, predicate="intersects"))
+        x, y = xyz[index, 0] - x0, xyz[index, 1] - y0
+        way = x * ux + y * uy
+        return index, way, x * uy - y * ux, np.clip((way / length * strips).astype(np.int64), 0, strips - 1)
+
+    index, _, _, strip = near(points.roof_tree, points.roof, _EAVE_DEPTH_M, _SHEET_M)
+    if len(index) == 0:
+        return Eave(length_m=length, is_open=False, overhang_m=None)
+    eave_z = np.full(strips, np.inf)
+    np.minimum.at(eave_z, strip, points.roof[index, 2])
+    eave_z[np.isinf(eave_z)] = eave_z.min()
+    index, way, off, strip = near(points.tree, points.xyz, _WIDEST_M + _SHEET_M, _BEFORE_M[1])
+    z, height = points.xyz[index, 2], points.height_m[index]
+    off = off + reach_m * points.later[index]
+    open_strips = np.unique(strip[(off > _BEFORE_M[0]) & (height < _OPEN_HEIGHT_M)])
+    if len(open_strips) < _OPEN_SHARE * strips:
+        return Eave(length_m=length, is_open=False, overhang_m=None)
+    beneath = (off < _OUTSIDE_M) & (z < eave_z[strip] - _UNDER_EAVE_M) & (height > _ABOVE_GROUND_M)
+    beneath &= (way > _END_M) & (way < length - _END_M)
+    overhang_m = _overhang_of_sheet(off[beneath], strip[beneath], z[beneath], strips)
+    return Eave(length_m=length, is_open=True, overhang_m=overhang_m)
+
+
+def _overhang_of_sheet(off: FloatArray, strip: IntArray, z: FloatArray, strips: int) -> float | None:
+    """How far inside a line the sheet stands that holds most of the points; None where it is none.
+
+    `off` is the points' distance to the right of the line, `strip` where along it they are.
+    """
+    if len(off) < _FEWEST:
+        return None
+    order = np.lexsort((z, strip, off))
+    off, strip, z = off[order], strip[order], z[order]
+    counts = np.searchsorted(off, off + _SHEET_M, side="right") - np.arange(len(off))
+    first = int(np.argmax(counts))
+    sheet = slice(first, first + int(counts[first]))
+    if counts[first] < max(_FEWEST, _SHARE * len(off)) or float(np.ptp(z[sheet])) < _SPREAD_M:
+        return None
+    if len(np.unique(strip[sheet])) < _OCCUPIED * strips:
+        return None
+    overhang = -float(np.median(off[sheet]))
+    return min(overhang, _WIDEST_M) if overhang >= -_SLACK_M else None
+
+
+def mean_overhang_m(eaves: Sequence[Eave], usual_m: float) -> float:
+    """The mean overhang of the lines whose wall is known, by their lengths, never negative; else the usual one."""
+    known = [(eave.length_m, eave.overhang_m) for eave in eaves if eave.overhang_m is not None]
+    if not known:
+        return usual_m
+    return max(0.0, math.fsum(length * over for length, over in known) / math.fsum(length for length, _ in known))
+
+
+def at_walls(outline_mm: MultiPolygon, points: FacadePoints, reach_m: float, usual_m: float) -> MultiPolygon:
+    """Draw an outline at the facades.
+
+    Parameters
+    ----------
+    outline_mm : MultiPolygon
+        At the eaves, with straight lines, integer millimetres.
+    points : FacadePoints
+        What tells of the walls.
+    reach_m : float
+        Reach of the mixed pulses, see `mixed_pulse_reach_mm`.
+    usual_m : float
+        Overhang where no wall of the whole outline is known.
+
+    Returns
+    -------
+    MultiPolygon
+        Integer millimetres, valid. A ring that would break stays at the eaves.
+    """
+    polygons = [orient(polygon) for polygon in outline_mm.geoms]
+    rings = [
+        (k, shapely.get_coordinates(ring)[:-1])
+        for k, polygon in enumerate(polygons)
+        for ring in (polygon.exterior, *polygon.interiors)
+    ]
+    eaves_of = [_eaves(ring, points, reach_m) for _, ring in rings]
+    mean_m = mean_overhang_m([eave for eaves in eaves_of for eave in eaves], usual_m)
+    moved: list[list[FloatArray]] = [[] for _ in polygons]
+    for (k, ring), eaves in zip(rings, eaves_of, strict=True):
+        ways_m = [e.overhang_m if e.overhang_m is not None else mean_m if e.is_open else 0.0 for e in eaves]
+        moved[k].append(_moved(ring, ways_m))
+    drawn = MultiPolygon([Polygon(outer, holes) for outer, *holes in moved])
+    return drawn if drawn.is_valid else outline_mm
+
+
+def _eaves(ring: FloatArray, points: FacadePoints, reach_m: float) -> list[Eave]:
+    """The lines of a ring, (n, 2) in millimetres, from each vertex to the next."""
+    starts = ring * 1e-3
+    ends = np.roll(starts, -1, axis=0)
+    return [eave_of(start, end, points, reach_m) for start, end in zip(starts, ends, strict=True)]
+
+
+def _moved(ring: FloatArray, ways_m: Sequence[float]) -> FloatArray:
+    """A ring, (n, 2) in millimetres, with every line moved to its left; as it was where it would break."""
+    runs = []
+    for k, ((x0, y0), (x1, y1), way_m) in enumerate(zip(ring, np.roll(ring, -1, axis=0), ways_m, strict=True)):
+        direction = math.atan2(y1 - y0, x1 - x0)
+        runs.append(
+            Run(
+                first=k,
+                last=k + 1,
+                x=0.5 * (x0 + x1) - 1e3 * way_m * math.sin(direction),
+                y=0.5 * (y0 + y1) + 1e3 * way_m * math.cos(direction),
+                direction=direction,
+                length=math.hypot(x1 - x0, y1 - y0),
+            )
+        )
+    places = Polygon(corners(ring, runs, 1e3 * _CORNER_REACH_M, closed=True))
+    if places.exterior.is_ccw != Polygon(ring).exterior.is_ccw:
+        return ring  # turned inside out: narrower than its overhangs
+    sound = shapely.make_valid(places, method="structure", keep_collapsed=False)
+    parts = [part for piece in polygons_of(sound) for part in polygons_of(shapely.set_precision(piece, 1.0))]
+    if not parts:
+        return ring
+    largest = Polygon(max(parts, key=lambda part: part.area).exterior)
+    swept = math.fsum(run.length * 1e3 * abs(way_m) for run, way_m in zip(runs, ways_m, strict=True))
+    if shapely.symmetric_difference(largest, Polygon(ring)).area > _MOST_MOVED * swept + _ROUNDING_MM2:
+        return ring
+    drawn: FloatArray = shapely.get_coordinates(largest.exterior)[:-1]
+    return drawn

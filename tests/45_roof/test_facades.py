@@ -1,0 +1,223 @@
+"""Outlines at the facades: where the walls stand, told by points beneath the eaves."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import shapely
+
+from pipeline.model import Candidate, FloatArray
+from pipeline.roof.block import block_plane
+from pipeline.roof.facades import Eave, FacadePoints, at_walls, eave_of, mean_overhang_m
+from pipeline.roof.plan import partition_roof, roof_points
+from pipeline.roof.settings import RoofSettings
+from pipeline.synthetic.als import scan_all
+from pipeline.synthetic.seeds import seed_of
+from pipeline.synthetic.sweep import SCANNER, sweep
+
+EAVE_Z = 6.0
+NONE: FloatArray = np.zeros((0, 3))
+EAVES = shapely.box(0.0, 0.0, 12.0, 8.0)
+FACADE = ((0.0, 0.0), (12.0, 0.0)), ((12.0, 0.0), (12.0, 8.0)), ((12.0, 8.0), (0.0, 8.0)), ((0.0, 8.0), (0.0, 0.0))
+"""The lines of the eaves, south, east, north, west."""
+
+
+def wall(side: int, overhang: float, number: int = 40, seed: int = 0) -> FloatArray:
+    """Points of the wall beneath one of the eaves, with 3 cm of noise, up to half a metre below the eave."""
+    random = np.random.default_rng(seed + side)
+    (x0, y0), (x1, y1) = FACADE[side]
+    length = math.dist((x0, y0), (x1, y1))
+    ux, uy = (x1 - x0) / length, (y1 - y0) / length
+    way, off = random.uniform(0.5, length - 0.5, number), overhang + random.normal(0.0, 0.03, number)
+    return np.column_stack(
+        (x0 + way * ux - off * uy, y0 + way * uy + off * ux, random.uniform(0.0, EAVE_Z - 0.5, number))
+    )
+
+
+def street(seed: int = 9) -> FloatArray:
+    """Ground all around the eaves."""
+    random = np.random.default_rng(seed)
+    xy = random.uniform((-2.0, -2.0), (14.0, 10.0), (1500, 2))
+    xy = xy[~shapely.contains_xy(EAVES, xy[:, 0], xy[:, 1])]
+    return np.column_stack((xy, np.zeros(len(xy))))
+
+
+def facades(*beside: FloatArray) -> FacadePoints:
+    """A flat roof over the eaves with points beside it."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0.2, 12.0, 0.4), np.arange(0.2, 8.0, 0.4)))
+    roof = np.column_stack((x, y, np.full(len(x), EAVE_Z)))
+    return FacadePoints.of(np.concatenate(beside), NONE, roof, NONE, 0.0)
+
+
+def south(points: FacadePoints, reach_m: float = 0.0) -> Eave:
+    """The southern line."""
+    start, end = np.array(FACADE[0])
+    return eave_of(start, end, points, reach_m)
+
+
+def drawn(points: FacadePoints, usual_m: float = 0.0) -> shapely.MultiPolygon:
+    """The outline at the walls, in metres."""
+    outline_mm = at_walls(shapely.MultiPolygon([shapely.transform(EAVES, lambda xy: xy * 1e3)]), points, 0.0, usual_m)
+    assert outline_mm.is_valid
+    return shapely.transform(outline_mm, lambda xy: xy / 1e3)
+
+
+def test_every_line_stands_where_its_own_wall_was_hit() -> None:
+    points = facades(street(), wall(0, 0.2), wall(1, 0.5), wall(2, 0.35), wall(3, 0.0))
+    assert np.allclose(drawn(points).bounds, (0.0, 0.2, 11.5, 7.65), atol=0.03)
+
+
+def test_walls_that_were_not_hit_take_the_mean_overhang_by_length() -> None:
+    bounds = drawn(facades(street(), wall(0, 0.2), wall(1, 0.5))).bounds
+    mean = (12.0 * 0.2 + 8.0 * 0.5) / 20.0
+    assert np.allclose(bounds, (mean, 0.2, 11.5, 8.0 - mean), atol=0.03)
+
+
+def test_without_any_facade_points_the_outline_stays_at_the_eaves() -> None:
+    assert drawn(facades(street())).equals(shapely.MultiPolygon([EAVES]))
+    assert drawn(facades(NONE)).equals(shapely.MultiPolygon([EAVES]))
+
+
+def test_a_line_along_a_neighbour_stays() -> None:
+    ground = street()
+    beside = np.column_stack((ground[:, :2], np.where(ground[:, 0] < 0.0, 5.0, 0.0)))
+    bounds = drawn(facades(beside, wall(0, 0.4))).bounds
+    assert bounds[0] == 0.0
+    assert np.allclose(bounds[1:], (0.4, 11.6, 7.6), atol=0.03)
+
+
+def test_plants_before_a_wall_are_no_wall() -> None:
+    random = np.random.default_rng(4)
+    bush = np.column_stack(
+        (random.uniform(0.5, 11.5, 200), random.uniform(-1.5, 0.5, 200), random.uniform(0, 5.0, 200))
+    )
+    points = facades(street(), bush)
+    assert south(points) == Eave(length_m=12.0, is_open=True, overhang_m=None)
+
+
+def test_a_parked_row_of_cars_or_a_fence_is_no_wall() -> None:
+    low = wall(0, 0.3, 80)
+    low[:, 2] *= 0.9 / 5.5
+    assert south(facades(street(), low)).overhang_m is None
+
+
+def test_points_of_one_corner_alone_are_no_wall() -> None:
+    corner = wall(0, 0.3, 200)
+    corner = corner[corner[:, 0] < 2.0]
+    assert len(corner) > 10
+    assert south(facades(street(), corner)).overhang_m is None
+
+
+def test_a_courtyard_grows_to_its_walls() -> None:
+    hole = shapely.box(4.0, 2.0, 8.0, 6.0)
+    random = np.random.default_rng(1)
+    x = random.uniform(4.5, 7.5, 40)
+    south = np.column_stack((x, np.full(40, 1.6), random.uniform(0.0, 5.5, 40)))
+    ground = np.column_stack((random.uniform(4.0, 8.0, 300), random.uniform(2.0, 6.0, 300), np.zeros(300)))
+    base = facades(street(), south, ground)
+    outside = ~shapely.contains_xy(hole, base.roof[:, 0], base.roof[:, 1])
+    points = FacadePoints.of(base.xyz, NONE, base.roof[outside], NONE, 0.0)
+    outline = shapely.MultiPolygon([shapely.transform(EAVES.difference(hole), lambda xy: xy * 1e3)])
+    result = shapely.transform(at_walls(outline, points, 0.0, 0.0), lambda xy: xy / 1e3)
+    (yard,) = result.geoms[0].interiors
+    assert np.allclose(yard.bounds, (3.6, 1.6, 8.4, 6.4), atol=0.03)
+    assert np.allclose(result.bounds, (0.4, 0.4, 11.6, 7.6), atol=0.03)
+
+
+def test_heights_are_above_the_terrain_of_the_place() -> None:
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-4.5, 16.5), np.arange(-4.5, 12.5)))
+    terrain = np.column_stack((x, y, 0.5 * x))
+    points = FacadePoints.of(
+        np.array([[10.2, -1.0, 6.0]]), np.array([[99.0, 0.0, 6.0]]), np.array([[0.0, 0.0, 9.0]]), terrain, -2.0
+    )
+    assert np.allclose(points.height_m, (6.0 - 0.5 * 10.5, 8.0))
+
+
+def test_the_order_of_the_points_does_not_matter() -> None:
+    beside = np.concatenate((street(), wall(0, 0.2), wall(1, 0.5)))
+    mixed = beside[np.random.default_rng(2).permutation(len(beside))]
+    assert drawn(facades(beside)).wkb == drawn(facades(mixed)).wkb
+
+
+def test_a_turned_and_moved_building_gives_the_turned_outline() -> None:
+    points = facades(street(), wall(0, 0.2), wall(1, 0.5))
+
+    def moved(xyz: FloatArray) -> FloatArray:
+        turned = shapely.get_coordinates(shapely.affinity.rotate(shapely.multipoints(xyz[:, :2]), 27.0, origin=(0, 0)))
+        return np.column_stack((turned + np.array([31.0, -12.0]), xyz[:, 2]))
+
+    there = FacadePoints.of(moved(points.xyz), NONE, moved(points.roof), NONE, 0.0)
+    eaves = shapely.affinity.translate(shapely.affinity.rotate(EAVES, 27.0, origin=(0, 0)), 31.0, -12.0)
+    result = at_walls(shapely.MultiPolygon([shapely.transform(eaves, lambda xy: np.rint(xy * 1e3))]), there, 0.0, 0.0)
+    here = shapely.affinity.translate(shapely.affinity.rotate(drawn(points), 27.0, origin=(0, 0)), 31.0, -12.0)
+    assert shapely.hausdorff_distance(shapely.transform(result, lambda xy: xy / 1e3), here) < 0.02
+
+
+def test_a_ring_narrower_than_its_overhangs_stays_at_the_eaves() -> None:
+    random = np.random.default_rng(6)
+    behind = np.column_stack((random.uniform(-2.0, 14.0, 300), random.uniform(1.3, 2.6, 300), np.zeros(300)))
+    for width_m, stays in ((1.2, True), (2.0, False)):
+        narrow = shapely.MultiPolygon([shapely.box(0.0, 0.0, 12e3, width_m * 1e3)])
+        above = behind + np.array([0.0, width_m - 1.2, 0.0])
+        result = at_walls(narrow, facades(street(), above, wall(0, 0.7)), 0.0, 0.0)
+        assert result.is_valid
+        assert result.equals(narrow) == stays
+
+
+def test_the_mean_overhang_is_never_negative() -> None:
+    assert mean_overhang_m([Eave(length_m=3.0, is_open=True, overhang_m=-0.05)], 0.3) == 0.0
+
+
+def test_a_usual_overhang_is_for_buildings_none_of_whose_walls_is_seen() -> None:
+    assert np.allclose(drawn(facades(street()), usual_m=0.3).bounds, (0.3, 0.3, 11.7, 7.7))
+    seen = facades(street(), wall(0, 0.2))
+    assert drawn(seen, usual_m=0.3).equals(drawn(seen))
+
+
+def test_last_of_several_returns_are_told_too_far_inside_by_the_reach() -> None:
+    hit = wall(0, 0.4)
+    later = FacadePoints.of(street(), hit, facades(NONE).roof, NONE, 0.0)
+    deep, right = south(later).overhang_m, south(later, reach_m=0.12).overhang_m
+    assert deep is not None
+    assert right is not None
+    assert abs(deep - right - 0.12) < 1e-9
+    assert south(facades(street(), hit), reach_m=0.12).overhang_m == deep
+
+
+def test_scanned_buildings_without_overhangs_keep_their_true_area() -> None:
+    scene = sweep(seed_of("dev", 1))
+    block = scan_all(scene, dataclasses.replace(SCANNER, pulse_density_per_m2=8.0), 3)
+    settings, walls, areas = RoofSettings(outline="walls"), 0, []
+    for number, building in enumerate(scene.buildings):
+        if "row" in building.building_id:
+            continue
+        x0, y0, x1, y1 = np.array(building.footprint.bounds) + np.tile(scene.origin[:2], 2)
+        x, y, _ = block.points.xyz.T
+        index = np.flatnonzero((x > x0 - 2.0) & (x < x1 + 2.0) & (y > y0 - 2.0) & (y < y1 + 2.0))
+        xyz = np.rint((block.points.xyz[index] - np.floor([x0, y0, 0.0])) * 1e3) / 1e3
+        own = (block.building[index] == number) & (block.face[index] >= 0)
+        of, order = block.points.return_count[index], block.points.return_number[index]
+        floor = float(np.median(xyz[block.building[index] < 0, 2]))
+        candidate = Candidate(
+            building_id="b",
+            origin=(0.0, 0.0, 0.0),
+            points=xyz[own],
+            ground=NONE,
+            ground_z_m=floor,
+            split_returns=xyz[own & (order == 1) & (of > 1)],
+            beside=xyz[~own & (of == 1)],
+            beside_later=xyz[~own & (of > 1) & (order == of)],
+        )
+        bare = roof_points(candidate, settings)
+        labelled = dataclasses.replace(bare, labels=np.zeros(len(bare.points), np.int32))
+        planes = [block_plane(bare.points, floor, 70.0)]
+        at_eaves = partition_roof(dataclasses.replace(labelled, facades=None), planes, settings).outline_mm
+        outline = partition_roof(labelled, planes, settings).outline_mm
+        walls += not outline.equals(at_eaves)
+        areas.append((outline.area * 1e-6, building.footprint.area))
+    drawn_m2, true_m2 = np.array(areas).T
+    assert walls > 0.3 * len(areas)
+    assert abs(np.median(drawn_m2 / true_m2) - 1.0) < 0.01
+    assert abs(drawn_m2.sum() / true_m2.sum() - 1.0) < 0.01

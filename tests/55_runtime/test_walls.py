@@ -1,0 +1,71 @@
+"""Runs with outlines at the walls: which points a candidate sees beside itself, whatever the tiles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+from pipeline.methods import ReconstructSettings
+from pipeline.model import BuildingResult, Candidate
+from pipeline.reconstruct import reconstruct_building
+from pipeline.runtime import modelling
+from pipeline.runtime.run import RunSummary
+
+WALLS = {"outline": "walls"}
+
+
+@pytest.fixture
+def candidates(monkeypatch: pytest.MonkeyPatch) -> list[Candidate]:
+    """Gets the candidates of the runs of a test."""
+    seen: list[Candidate] = []
+
+    def watched(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
+        seen.append(candidate)
+        return reconstruct_building(candidate, method, settings)
+
+    monkeypatch.setattr(modelling, "reconstruct_building", watched)
+    return seen
+
+
+def absolute_mm(candidate: Candidate, xyz: np.ndarray) -> set[tuple[int, ...]]:
+    return {tuple(row) for row in np.rint((xyz + np.array(candidate.origin)) * 1e3).astype(np.int64).tolist()}
+
+
+def test_points_beside_are_those_of_the_file_that_are_near_and_no_points_of_the_candidate(
+    suburb: Path, reconstruct: Callable[..., RunSummary], candidates: list[Candidate]
+) -> None:
+    reconstruct(suburb, settings={"roof": WALLS})
+    las = laspy.read(suburb)
+    mm = np.rint(np.column_stack((las.x, las.y, las.z)) * 1e3).astype(np.int64)
+    of, order = np.array(las.number_of_returns), np.array(las.return_number)
+    assert candidates
+    for candidate in candidates:
+        own = absolute_mm(candidate, candidate.points)
+        cells = {(x // 1000 + i, y // 1000 + j) for x, y, _ in own for i in range(-2, 3) for j in range(-2, 3)}
+        for beside, wanted in ((candidate.beside, of == 1), (candidate.beside_later, (of > 1) & (order == of))):
+            near = {tuple(row) for row in mm[wanted].tolist() if (row[0] // 1000, row[1] // 1000) in cells}
+            assert absolute_mm(candidate, beside) == near - own
+    assert sum(len(candidate.beside) for candidate in candidates) > 100
+
+
+def test_outlines_at_the_eaves_need_no_points_beside(
+    suburb: Path, reconstruct: Callable[..., RunSummary], candidates: list[Candidate]
+) -> None:
+    reconstruct(suburb)
+    reconstruct(suburb, settings={"roof": {**WALLS, "straight_eaves": False}})
+    assert candidates
+    assert not any(len(candidate.beside) or len(candidate.beside_later) for candidate in candidates)
+
+
+def test_outlines_at_the_walls_do_not_depend_on_tiles_and_files(
+    suburb: Path, halves: tuple[Path, Path], reconstruct: Callable[..., RunSummary]
+) -> None:
+    whole = reconstruct(suburb, settings={"roof": WALLS})
+    tiled = reconstruct(suburb, settings={"roof": WALLS, "tile_size_m": 23.7, "lattice_x_m": 7.3, "lattice_y_m": -11.9})
+    assert tiled.digest == whole.digest
+    assert reconstruct(*halves, settings={"roof": WALLS}).digest == whole.digest
+    assert reconstruct(suburb).digest != whole.digest
