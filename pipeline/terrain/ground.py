@@ -73,11 +73,13 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
                 "use fewer passes or smaller cells",
             )
         else:
-            counts = [self.max_window_m, self.trend_m, self.widest_m, self.regrowth_passes, self.regrowth_m]
+            counts = [self.max_window_m, self.trend_m, self.widest_m, self.regrowth_m]
+            counts += [self.regrowth_passes, self.terrace_passes]
             told = (
                 (
                     f"max_window_m {self.max_window_m}, trend_m {self.trend_m}, widest_m {self.widest_m}, regrowth_m"
-                    f" {self.regrowth_m} in {self.regrowth_passes} passes, bridge_m {self.bridge_m}"
+                    f" {self.regrowth_m} in {self.regrowth_passes} and {self.terrace_passes} passes,"
+                    f" bridge_m {self.bridge_m}"
                 ),
                 "use smaller ones",
             )
@@ -91,7 +93,7 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
         """Farthest that the terrain is drawn under objects: at least to the middle of the widest that are cut off."""
         if self.filter == "hierarchical":
             return max(self.bridge_m, 2 * self.seed_cell_m // 3)
-        return max(self.bridge_m, self.max_window_m + 1, self.widest_m // 2 + 2 if self.looks_for_wide else 0)
+        return max(self.bridge_m, self.max_window_m + 1, self.widest_m // 2 + 1 if self.looks_for_wide else 0)
 
     @property
     def support_m(self) -> float:

@@ -3,8 +3,9 @@
 An object is what one step of a growing opening cuts off (Zhang et al. 2003; the rule that the step may take more the
 wider the opening, and the surface with its gaps closed, are those of SMRF: Pingel, Clarke and McBride 2013). On a slope
 an opening cannot see an object lower than the slope rises between two points. So the openings run twice: the first
-gives a provisional ground, and the second works on heights above its trend, where slopes are gone. What brows, crests
-and terraces lose to both comes back from the ground beside it on the same level.
+gives a provisional ground, and the second works on heights above its trend, where slopes are gone. Wide objects and
+decks between two walls are told apart beside that. What brows, crests and terraces lose comes back from the ground
+beside it on the same level.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from numba import njit
 
 from pipeline.model import BoolArray
 from pipeline.parameters import Parameters, parameter
+from pipeline.terrain.between_walls import between_walls, between_walls_support_m
 from pipeline.terrain.lattice import NO_DATA, PIT_CELLS, Elevations
 from pipeline.terrain.openings import cut_off
 from pipeline.terrain.planar_fitting import leaning_planes
-from pipeline.terrain.wide_objects import wide_objects, wide_support_m
+from pipeline.terrain.wide_objects import wide_objects, wide_support_m, with_corners
 
 _GAP_CELLS = 4
 """Gaps between points are closed from their rims so far, and as many rounds of relaxation smooth the fill."""
@@ -67,14 +69,14 @@ class MorphologicalFilterSettings(Parameters):
         0.15, "What a step of the second openings may always take.", unit="m", minimum=0.0, maximum=3.0
     )
     residual_steepness_m: float = parameter(
-        0.4,
+        0.3,
         "What it may take more where the trend rises by 45 degrees, in proportion elsewhere: steep ground is rough.",
         unit="m",
         minimum=0.0,
         maximum=3.0,
     )
     trend_m: int = parameter(
-        12,
+        10,
         "Half side of the squares of the trend's planes; twice as much where they hold little ground.",
         unit="m",
         minimum=4,
@@ -88,7 +90,7 @@ class MorphologicalFilterSettings(Parameters):
         maximum=50.0,
     )
     widest_m: int = parameter(
-        104,
+        102,
         "Objects up to this width are cut off on a coarse lattice, where they are high enough for wide_slope.",
         unit="m",
         minimum=0,
@@ -100,6 +102,14 @@ class MorphologicalFilterSettings(Parameters):
         minimum=0.01,
         maximum=2.0,
     )
+    wall_drop_m: float = parameter(
+        1.0,
+        "Decks and roofs between two parallel drops are no ground where both are deeper than this, and than wide_slope "
+        "times half the width between them; up to widest_m wide.",
+        unit="m",
+        minimum=0.2,
+        maximum=20.0,
+    )
     regrowth_passes: int = parameter(
         3, "How often what lies level with the ground beside it joins the ground.", minimum=0, maximum=10
     )
@@ -110,19 +120,31 @@ class MorphologicalFilterSettings(Parameters):
     regrowth_share: float = parameter(
         0.3, "Least share of the ground beside it above which it lies no higher.", minimum=0.0, maximum=1.0
     )
+    terrace_passes: int = parameter(
+        2, "How often wide objects join the ground after that, which are terraces then.", minimum=0, maximum=10
+    )
+    terrace_share: float = parameter(
+        0.7, "The share of the ground beside it that this asks for.", minimum=0.0, maximum=1.0
+    )
 
     @property
     def morphological_support_m(self) -> float:
         """How far the filter looks: the sum of its chain, or the wide objects beside it."""
         chain = 4 * _GAP_CELLS + 4 * self.max_window_m + 2 * self.trend_m + _CLUMP_CELLS
-        chain += self.regrowth_passes * self.regrowth_m
         wide = wide_support_m(self.widest_m // 2) if self.looks_for_wide else 0.0
-        return PIT_CELLS + max(float(chain), wide + self.regrowth_passes * self.regrowth_m)
+        walls = between_walls_support_m(self.deck_m)
+        grown = (self.regrowth_passes + self.terrace_passes) * self.regrowth_m
+        return PIT_CELLS + max(float(chain), wide, walls) + grown
 
     @property
     def looks_for_wide(self) -> bool:
         """Whether there are objects to cut off that max_window_m leaves."""
         return self.widest_m > 2 * self.max_window_m
+
+    @property
+    def deck_m(self) -> int:
+        """Widest that a deck between two walls may be."""
+        return max(self.widest_m, 2 * self.max_window_m)
 
 
 @njit(cache=True, nogil=True)
@@ -275,13 +297,18 @@ def morphological_ground(
     level, slope_mm = leaning_planes(lowest, is_first, settings.trend_m, 2 * settings.trend_m)
     if settings.looks_for_wide:
         wide = wide_objects(lowest, corner, radius, settings.widest_m // 2, settings.wide_slope * 1000.0)
+        wide = with_corners(lowest, wide, first)
     else:
         wide = np.zeros(lowest.shape, np.bool_)
+    decks = between_walls(lowest, settings.deck_m, settings.wall_drop_m * 1000.0, settings.wide_slope * 1000.0)
     lowest = without_clumps(lowest, level, slope_mm, round(settings.clump_depth_m * 1000))
     limits = (round(settings.residual_step_m * 1000), settings.residual_steepness_m * 1000.0)
     height, base = _heights(lowest, level, slope_mm, limits)
     second = cut_off(closed_gaps(height, _GAP_CELLS), base, settings.residual_slope * 1000.0, radius)
-    ground = (lowest != NO_DATA) & (second == 0) & ~wide
-    beside = (settings.regrowth_m, round(settings.regrowth_step_m * 1000), settings.regrowth_share)
-    found: BoolArray = regrown(lowest, ground, wide, settings.regrowth_passes, beside)
+    ground = (lowest != NO_DATA) & (second == 0) & ~wide & ~decks
+    step_mm = round(settings.regrowth_step_m * 1000)
+    beside = (settings.regrowth_m, step_mm, settings.regrowth_share)
+    ground = regrown(lowest, ground, wide | decks, settings.regrowth_passes, beside)
+    beside = (settings.regrowth_m, step_mm, settings.terrace_share)
+    found: BoolArray = regrown(lowest, ground, decks, settings.terrace_passes, beside)
     return found

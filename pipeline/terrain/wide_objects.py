@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from pipeline.model import BoolArray
+from pipeline.model import BoolArray, ByteArray
 from pipeline.terrain.lattice import NO_DATA, Elevations
 from pipeline.terrain.openings import dilate_back, erode_once, framed
 
@@ -21,6 +21,15 @@ _FILL = 2
 
 _NARROW = 2
 """Half the width, in coarse cells, of the courtyards, trenches and clumps of low outliers that are filled first."""
+
+_RIM_CELLS = 3
+"""So near to a wide object lie the corners that belong to it, in cells of the terrain lattice."""
+
+_RIM_STEP_MM = 200
+"""A corner lies no deeper than this below the wide cells beside it."""
+
+_RIM_SHARE = 0.9
+"""But for a tenth of them."""
 
 
 @njit(cache=True, nogil=True)
@@ -127,6 +136,39 @@ def wide_objects(lowest: Elevations, corner: tuple[int, int], narrower: int, rad
     return _on_fine(lowest, floors, *corner, round(rise_mm * narrower / 2))
 
 
+@njit(cache=True, nogil=True)
+def with_corners(lowest: Elevations, wide: BoolArray, first: ByteArray) -> BoolArray:
+    """Wide objects with the corners into which no octagon fits.
+
+    A narrower opening took the corner of a hall, by steps that are not those of wide objects. It is level with the
+    hall, and the first openings cut it off.
+
+    Parameters
+    ----------
+    lowest : (rows, columns) int32
+        Elevations in mm.
+    wide : (rows, columns) bool
+        Cells of wide objects.
+    first : (rows, columns) uint8
+        Radius at which the first openings cut a cell off; 0 where they did not.
+    """
+    rows, columns = lowest.shape
+    out = wide.copy()
+    for r in range(rows):
+        for c in range(columns):
+            if wide[r, c] or first[r, c] == 0 or lowest[r, c] == NO_DATA:
+                continue
+            beside, level = 0, 0
+            for a in range(max(r - _RIM_CELLS, 0), min(r + _RIM_CELLS + 1, rows)):
+                for b in range(max(c - _RIM_CELLS, 0), min(c + _RIM_CELLS + 1, columns)):
+                    if wide[a, b]:
+                        beside += 1
+                        if lowest[a, b] - lowest[r, c] <= _RIM_STEP_MM:
+                            level += 1
+            out[r, c] = level >= 2 and level >= _RIM_SHARE * beside
+    return out
+
+
 def wide_support_m(radius: int) -> float:
-    """How far it looks: alignment of the coarse cells, gaps, closing, erosion and dilation, the neighbours."""
-    return float(COARSE * (_FILL + 2 * _NARROW + 2 * -(-radius // COARSE) + 1) + COARSE)
+    """How far it looks: alignment of the coarse cells, gaps, closing, erosion and dilation, the neighbours, corners."""
+    return float(COARSE * (_FILL + 2 * _NARROW + 2 * -(-radius // COARSE) + 1) + COARSE - 1 + _RIM_CELLS)

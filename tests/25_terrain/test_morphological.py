@@ -17,7 +17,7 @@ from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.morphological import closed_gaps, morphological_ground, regrown, without_clumps
 from pipeline.terrain.openings import cut_off, dilate_back, erode_once, framed
 from pipeline.terrain.planar_fitting import leaning_planes
-from pipeline.terrain.wide_objects import wide_objects
+from pipeline.terrain.wide_objects import wide_objects, with_corners
 
 Grid = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
@@ -215,6 +215,30 @@ def test_a_trench_beside_a_narrow_strip_of_data_makes_no_object_of_it() -> None:
     assert not wide_objects(lowest, (0, 0), 20, 52, 120.0).any()
 
 
+def test_the_corner_of_a_hall_is_a_wide_object_where_the_first_openings_cut_it_off() -> None:
+    lowest = np.zeros((40, 40), np.int32)
+    lowest[10:30, 10:30] = 4000
+    lowest[12, 28] = 3000
+    wide = np.zeros(lowest.shape, np.bool_)
+    wide[10:30, 10:26] = True
+    first = np.zeros(lowest.shape, np.uint8)
+    first[10:20, 26:32] = 9
+    found = with_corners(lowest, wide, first)
+    expected = wide.copy()
+    expected[10:20, 26:29] = True
+    expected[12, 28] = False
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_a_hall_that_the_corner_of_the_data_cuts_is_no_ground_to_its_own_corner() -> None:
+    c, r = coordinates(150, 150)
+    u, v = (c + r) / math.sqrt(2.0), (c - r) / math.sqrt(2.0)
+    hall = (u < 25) & (v < 12)
+    found = ground_cells(millimetres(np.where(hall, 3.4, 0.01 * r), 20.0))
+    assert found[hall].mean() < 0.02
+    assert found[~hall].mean() > 0.99
+
+
 # -- the whole filter --------------------------------------------------------------------------------------------------
 
 
@@ -272,6 +296,14 @@ def test_terraces_stay_ground_to_their_rims() -> None:
     c, _ = coordinates(130, 130)
     found = ground_cells(millimetres(2.0 * np.floor(c / 12.0) + 0.05 * c, 30.0))
     assert found.mean() > 0.97
+
+
+def test_a_spur_of_a_plateau_that_narrows_grows_back_from_the_plateau() -> None:
+    c, r = coordinates(220, 260)
+    spur = (c > 80) & (np.abs(r - 110) < 10 + 0.6 * (c - 80))
+    lowest = millimetres(np.where(spur, 7.0, 0.0), 20.0)
+    kept = [ground_cells(lowest, GroundSettings(terrace_passes=passes))[spur].mean() for passes in (0, 2, 6)]
+    assert kept[0] < kept[1] < kept[2]
 
 
 def test_low_outliers_and_clumps_of_them_change_nothing_but_their_own_cells() -> None:

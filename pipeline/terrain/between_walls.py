@@ -1,0 +1,152 @@
+"""Decks and roofs between two walls: what has a drop on opposite sides, along edges that run beside one another.
+
+A bridge that meets the road on its level, and a house on a slope whose roof meets the ground uphill, pass for ground in
+openings: on one side there is no step. But across the deck, and across the roof along the contour, the surface ends at
+a drop to the left and to the right, and the two edges are parallel, which a spur of ground between two brows or the
+corner of a terrace seldom has.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.model import BoolArray
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
+
+_DIRECTIONS = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)])
+"""Rows and columns of a stride: every 18 to 27 degrees, so that one of them is nearly square to any edge."""
+
+_STEEPEST = 1.0
+"""Rise over run that is no drop: by as much more must a drop fall as the points on its two sides lie apart."""
+
+_ALONG_CELLS = 6
+"""The edges are compared with those of the cells so far along them, to one side or the other."""
+
+_SAME_EDGE_M = 2.0
+"""An edge is the same where it lies no farther off than that, and _TURN more for each metre along it."""
+
+_TURN = 0.2
+"""Tangent of half the angle between two directions, about."""
+
+_SHARE = 0.5
+"""Of the cells along the edges so many must lie between the same two."""
+
+_FEWEST = 2
+"""And at least so many."""
+
+_OVER_MM = 1000.0
+"""Cells along the edges that stand higher than this above the deck are no part of it: trees."""
+
+_OVER_RISE_MM = 300.0
+"""And than so much more for each metre along them."""
+
+Distances = npt.NDArray[np.float32]
+
+
+@njit(cache=True, nogil=True)
+def _drop(
+    lowest: Elevations, r: int, c: int, stride: tuple[int, int, float], within: float, drop_mm: float
+) -> tuple[float, float]:
+    """How far it is along a direction to the first drop, in cells, and how deep that is in mm; -1 where there is none.
+
+    The walk goes past what stands up steeper than 45 degrees from the surface walked on: parapets, cars, trees, houses.
+    """
+    rows, columns = lowest.shape
+    down, across, length = stride
+    here, at, last = lowest[r, c], 0.0, 0.0
+    number = 1
+    while number * length <= within:
+        a, b = r + number * down, c + number * across
+        if a < 0 or a >= rows or b < 0 or b >= columns:
+            break
+        away = number * length
+        z = lowest[a, b]
+        if z != NO_DATA:
+            if z - here <= _STEEPEST * CELL_MM * (away - last):
+                fall = float(here - z)
+                if fall > drop_mm + _STEEPEST * CELL_MM * (away - at):
+                    return away, fall
+                here, at = z, away
+            last = away
+        number += 1
+    return -1.0, 0.0
+
+
+@njit(cache=True, nogil=True)
+def _widths(
+    lowest: Elevations, stride: tuple[int, int, float], widest: float, drop_mm: float, rise_mm: float
+) -> tuple[Distances, Distances]:
+    """Cells to the drops on both sides along a direction; -1 where they are not there, or too low for their width."""
+    rows, columns = lowest.shape
+    ahead = np.full((rows, columns), -1.0, np.float32)
+    behind = np.full((rows, columns), -1.0, np.float32)
+    back = (-stride[0], -stride[1], stride[2])
+    for r in range(rows):
+        for c in range(columns):
+            if lowest[r, c] == NO_DATA:
+                continue
+            far, fall = _drop(lowest, r, c, stride, widest, drop_mm)
+            if far < 0:
+                continue
+            other_far, other_fall = _drop(lowest, r, c, back, widest - far, drop_mm)
+            if other_far >= 0 and min(fall, other_fall) > rise_mm * (far + other_far) / 2:
+                ahead[r, c], behind[r, c] = far, other_far
+    return ahead, behind
+
+
+@njit(cache=True, nogil=True)
+def _mark(out: BoolArray, lowest: Elevations, ahead: Distances, behind: Distances, along: tuple[float, float]) -> None:
+    """Mark the cells whose two edges go on beside one another, to one side along them."""
+    rows, columns = out.shape
+    for r in range(rows):
+        for c in range(columns):
+            if ahead[r, c] < 0 or out[r, c]:
+                continue
+            for side in (-1, 1):
+                seen, same = 0, 0
+                for t in range(1, _ALONG_CELLS + 1):
+                    a, b = r + round(side * t * along[0]), c + round(side * t * along[1])
+                    if a < 0 or a >= rows or b < 0 or b >= columns or lowest[a, b] == NO_DATA:
+                        continue
+                    if lowest[a, b] - lowest[r, c] > _OVER_MM + _OVER_RISE_MM * t:
+                        continue
+                    seen += 1
+                    off = max(abs(ahead[a, b] - ahead[r, c]), abs(behind[a, b] - behind[r, c]))
+                    if ahead[a, b] >= 0 and off <= _SAME_EDGE_M + _TURN * t:
+                        same += 1
+                if same >= _FEWEST and same >= _SHARE * seen:
+                    out[r, c] = True
+
+
+def between_walls(lowest: Elevations, widest: int, drop_mm: float, rise_mm: float) -> BoolArray:
+    """Mask of the cells of decks and roofs between two drops.
+
+    Parameters
+    ----------
+    lowest : (rows, columns) int32
+        Elevation in mm of the lowest point of each cell; NO_DATA where there is none.
+    widest : int
+        Farthest that the two drops may lie apart, in cells.
+    drop_mm, rise_mm : float
+        Least drop, and what it must be at least for each cell of half the width: wider decks must be higher.
+
+    Returns
+    -------
+    (rows, columns) bool
+        Decks and roofs; none where there is no data.
+    """
+    out = np.zeros(lowest.shape, np.bool_)
+    for down, across in _DIRECTIONS.tolist():
+        length = math.hypot(down, across)
+        ahead, behind = _widths(lowest, (down, across, length), float(widest), drop_mm, rise_mm)
+        _mark(out, lowest, ahead, behind, (-across / length, down / length))
+    return out
+
+
+def between_walls_support_m(widest: int) -> float:
+    """How far it looks: the edges of the cells along the edges."""
+    return float(widest + _ALONG_CELLS)
