@@ -40,8 +40,10 @@ def held_folder(parent: Path) -> Iterator[Path]:
     finally:
         # by another name first, so that no late task finds it and fills it again
         doomed = folder.with_name(f".{folder.name}")
-        with contextlib.suppress(OSError):
+        try:
             folder.rename(doomed)
+        except OSError:
+            doomed = folder
         shutil.rmtree(doomed, ignore_errors=True)
         os.close(handle)
         with contextlib.suppress(OSError):

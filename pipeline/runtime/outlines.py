@@ -13,6 +13,7 @@ import numpy as np
 from shapely import MultiPolygon
 from shapely.affinity import translate
 
+from pipeline.errors import GableworkError
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.unit_outlines import unit_outlines
@@ -41,7 +42,12 @@ class OutlineTask:
 def outline_tasks(
     sites: Sequence[CandidateSite], settings: RoofSettings, grid: TileGrid, scratch: Scratch
 ) -> list[OutlineTask]:
-    """Group the blocks of several units to tasks of some tenths of a second each, the largest blocks first."""
+    """Group the blocks of several units to tasks of some tenths of a second each, the largest blocks first.
+
+    Raw outlines are drawn one by one: then there is no task.
+    """
+    if not settings.straight_eaves:
+        return []
     blocks: dict[str, list[CandidateSite]] = {}
     for site in sites:
         if site.block is not None:
@@ -58,29 +64,59 @@ def outline_tasks(
     return [OutlineTask(blocks=tuple(group), settings=settings, grid=grid, scratch=scratch) for group in groups]
 
 
-def draw_outlines(task: OutlineTask) -> dict[str, MultiPolygon]:
-    """The outlines of units by their building_id, in metres of the CRS; without those that could not be drawn.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DrawnOutlines:
+    """What a task drew."""
+
+    outlines: dict[str, MultiPolygon]
+    """By the units' building_id, in metres of the CRS; without those that could not be drawn."""
+    warnings: tuple[str, ...]
+    """One of each block at which drawing stumbled over a fault of its own."""
+
+
+def draw_outlines(task: OutlineTask) -> DrawnOutlines:
+    """Draw the outlines of the units of some blocks.
+
+    A block that cannot be drawn costs its units the common walls, not the run: they are drawn one by one.
 
     Raises
     ------
     RunCancelledError
         The run was called off.
+    MemoryError, OSError
+        Scratch cannot be read, or not held.
     """
     drawn: dict[str, MultiPolygon] = {}
+    warnings = []
     for units in task.blocks:
         task.scratch.check_cancelled()
-        pieces = [stored_points(task.scratch, site) for site in units]
-        points = np.concatenate(pieces)
-        unit = np.repeat(np.arange(len(units), dtype=np.int32), [len(piece) for piece in pieces])
-        whole = CandidateSite(
-            building_id=units[0].block or "",
-            owner=units[0].owner,
-            ranges=tuple(part for site in units for part in site.ranges),
-            points=len(points),
-        )
-        candidate, _ = gather(task.scratch, task.grid, whole, GpsTimeKind.NONE, beside=task.settings.at_walls)
-        outlines = unit_outlines(candidate, unit[canonical_order(points)], task.settings)
-        for site, outline in zip(units, outlines, strict=True):
-            if outline is not None:
-                drawn[site.building_id] = translate(outline, candidate.origin[0], candidate.origin[1])
-    return drawn
+        try:
+            drawn |= _drawn(task, units)
+        except (MemoryError, OSError, GableworkError):
+            raise
+        except Exception as error:  # noqa: BLE001 - told in the run's warnings
+            names = ", ".join(sorted(site.building_id for site in units))
+            warnings.append(
+                f"the outlines of {names}, which touch, are drawn one by one: {type(error).__name__}: {error}"
+            )
+    return DrawnOutlines(outlines=drawn, warnings=tuple(warnings))
+
+
+def _drawn(task: OutlineTask, units: Sequence[CandidateSite]) -> dict[str, MultiPolygon]:
+    """The outlines of the units of one block by their building_id."""
+    pieces = [stored_points(task.scratch, site) for site in units]
+    points = np.concatenate(pieces)
+    unit = np.repeat(np.arange(len(units), dtype=np.int32), [len(piece) for piece in pieces])
+    whole = CandidateSite(
+        building_id=units[0].block or "",
+        owner=units[0].owner,
+        ranges=tuple(part for site in units for part in site.ranges),
+        points=len(points),
+    )
+    candidate, _ = gather(task.scratch, task.grid, whole, GpsTimeKind.NONE, beside=task.settings.at_walls)
+    outlines = unit_outlines(candidate, unit[canonical_order(points)], task.settings)
+    return {
+        site.building_id: translate(outline, candidate.origin[0], candidate.origin[1])
+        for site, outline in zip(units, outlines, strict=True)
+        if outline is not None
+    }

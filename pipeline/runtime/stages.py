@@ -383,8 +383,12 @@ class Stages:
         """The candidates with the outlines of touching units, drawn together."""
         tasks = outline_tasks(joined.candidates, self.settings.building.roof, self.plan.grid, self.scratch)
         outlines: dict[str, MultiPolygon] = {}
+        warnings: list[str] = []
         for drawn in self.progress.stage(self.executor, "outline", draw_outlines, tasks):
-            outlines |= drawn
+            outlines |= drawn.outlines
+            warnings.extend(drawn.warnings)
+        for warning in sorted(warnings):
+            self.progress.warn("outline", warning)
         sites = (
             dataclasses.replace(site, outline=outlines.get(site.building_id)) if site.block is not None else site
             for site in joined.candidates

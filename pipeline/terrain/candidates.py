@@ -48,7 +48,13 @@ class CandidateSettings(Parameters):
     doubtful_area_m2: float = parameter(
         20.0, "Least plan area of a building's surface that is not.", unit="m2", minimum=1.0, maximum=1000.0
     )
-    min_height_m: float = parameter(2.0, "Least mean height above the terrain.", unit="m", minimum=0.5, maximum=20.0)
+    min_height_m: float = parameter(
+        2.0,
+        "Least height above the terrain: of a flat roof, or of the ridge of a pitched one, as the heights' spread tells.",
+        unit="m",
+        minimum=0.5,
+        maximum=20.0,
+    )
     min_width_m: float = parameter(
         2.0,
         "Least mean width, twice the area over the outline; half of it for what is surely a roof.",
@@ -115,9 +121,14 @@ def _figures(sums: IntArray) -> dict[str, float]:
     area_mm2 = facets_mm2 + half_mm * outline_mm + math.pi * half_mm * half_mm
     grown_outline_mm = outline_mm + 2.0 * math.pi * half_mm
     judged = max(1, int(sums[Sum.PLANAR] + sums[Sum.ROUGH]))
+    vertices = max(1, int(sums[Sum.VERTICES]))
+    mean_mm = float(sums[Sum.HEIGHT]) / vertices
+    # heights over a slope are uniform between eave and ridge: the ridge lies sqrt(3) standard deviations above the mean
+    spread_mm = math.sqrt(max(0.0, 3.0 * (float(sums[Sum.HEIGHT2]) / vertices - mean_mm * mean_mm)))
     return {
         "area_m2": area_mm2 / 1e6,
-        "height_m": float(sums[Sum.HEIGHT]) / max(1, int(sums[Sum.VERTICES])) / 1000.0,
+        "height_m": mean_mm / 1000.0,
+        "top_m": (mean_mm + spread_mm) / 1000.0,
         "width_m": 2.0 * area_mm2 / grown_outline_mm / 1000.0,
         "planar_share": float(sums[Sum.PLANAR]) / judged,
         "judged": float(sums[Sum.PLANAR] + sums[Sum.ROUGH]),
@@ -152,9 +163,9 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
         return Verdict(reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {least_m2:g}")
     if kind == FacetKind.BUILDING:
         return None
-    if f["height_m"] < settings.min_height_m:
+    if f["top_m"] < settings.min_height_m:
         return Verdict(
-            reason=Reason.TOO_LOW, detail=f"mean height {f['height_m']:.2f} m, at least {settings.min_height_m:g}"
+            reason=Reason.TOO_LOW, detail=f"top {f['top_m']:.2f} m above the terrain, at least {settings.min_height_m:g}"
         )
     if kind == FacetKind.CROWN:
         return Verdict(
@@ -201,7 +212,7 @@ def _joins(kind: int, sums: IntArray, verdict: Verdict | None, settings: Candida
     f = _figures(sums)
     small_roof = verdict is None or (
         verdict.reason in {Reason.TOO_SMALL, Reason.TOO_NARROW, Reason.BELOW_Z_AVG}
-        and f["height_m"] >= settings.min_height_m
+        and f["top_m"] >= settings.min_height_m
         and f["planar_share"] >= settings.min_planar_share
         and f["canopy_share"] <= settings.max_canopy_share
     )

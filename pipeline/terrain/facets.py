@@ -63,17 +63,16 @@ def classify_facets(
     """Kind of every facet, int8 (m,), from vertices in mm; steep_slope is rise over run."""
     m = facets.shape[0]
     out = np.empty(m, np.int8)
-    squares = np.empty(3)
     for f in range(m):
         a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
         ux, uy, vx, vy = x[b] - x[a], y[b] - y[a], x[c] - x[a], y[c] - y[a]
         area2 = ux * vy - uy * vx
         wx, wy = x[c] - x[b], y[c] - y[b]
-        squares[0] = ux * ux + uy * uy
-        squares[1] = vx * vx + vy * vy
-        squares[2] = wx * wx + wy * wy
-        squares.sort()  # one order of multiplication, whichever vertex comes first
-        if squares[0] * squares[1] * squares[2] > 4.0 * (float(area2) * area2) * max_radius_mm * max_radius_mm:
+        u2, v2, w2 = float(ux * ux + uy * uy), float(vx * vx + vy * vy), float(wx * wx + wy * wy)
+        # one order of multiplication, whichever vertex comes first
+        least, most = min(u2, v2, w2), max(u2, v2, w2)
+        middle = max(min(u2, v2), min(max(u2, v2), w2))
+        if least * middle * most > 4.0 * (float(area2) * area2) * max_radius_mm * max_radius_mm:
             out[f] = FacetKind.VOID
             continue
         z_difference = max(z[a], z[b], z[c]) - min(z[a], z[b], z[c])

@@ -95,14 +95,17 @@ def assign_points(
     m = facets.shape[0]
     if m == 0 or n == 0:
         return out
-    # a start near each point: one facet a cell of 4 m
-    cell = 4000
+    # a start near each point: one facet a cell of 1 m, where there is none that of the cell before
+    cell = 1000
     column0, row0 = x.min() // cell, y.min() // cell
     columns, rows = x.max() // cell - column0 + 1, y.max() // cell - row0 + 1
     hint = np.full(columns * rows, -1, np.int32)
     for f in range(m):
         v = facets[f, 0]
         hint[(y[v] // cell - row0) * columns + x[v] // cell - column0] = f
+    for k in range(1, hint.size):
+        if hint[k] < 0:
+            hint[k] = hint[k - 1]
     previous = 0
     for i in range(n):
         if allowed[i] == 0 or above_ground[i] < ground_mm:

@@ -58,6 +58,8 @@ class Sum(IntEnum):
     POINTS = 13
     CANOPY = 14
     """Earlier returns well above the fragment."""
+    HEIGHT2 = 15
+    """Squared heights of the vertices above the terrain, mm2."""
 
 
 N_SUMS = len(Sum)
@@ -181,6 +183,7 @@ def sum_fragments(
         if fragment >= 0 and x0 <= x[v] < x1 and y0 <= y[v] < y1:
             sums[fragment, 2] += 1
             sums[fragment, 3] += height[v]
+            sums[fragment, 15] += np.int64(height[v]) * height[v]
             if planar[v] == 1:
                 sums[fragment, 4] += 1
             elif planar[v] == 0:

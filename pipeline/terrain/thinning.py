@@ -103,6 +103,9 @@ def highest_per_cell(
     """
     tie = preferred if among_equals is None else among_equals
     chosen = _highest_per_cell(x_mm, y_mm, z_mm, preferred, used, round(cell_m * 1000), tie)
-    order = np.lexsort((y_mm[chosen], x_mm[chosen]))
-    result: IntArray = chosen[order]
+    if len(chosen) == 0:
+        return np.empty(0, np.int64)
+    x, y = x_mm[chosen], y_mm[chosen]
+    # one sort of one whole number in place of two; all are different
+    result: IntArray = chosen[np.argsort(((x - x.min()) << _BITS) | (y - y.min()))]
     return result

@@ -302,6 +302,17 @@ def _unit_of_points(
     return out
 
 
+@njit(cache=True, nogil=True)
+def smallest_points(x: IntArray, y: IntArray, z: IntArray, label: LabelArray) -> IntArray:
+    """Index of the lexicographically smallest point of every label from 0 on, int64; -1 for a label without points."""
+    found = np.full(label.max() + 1, -1, np.int64)
+    for i in range(x.size):
+        j = found[label[i]]
+        if j < 0 or x[i] < x[j] or (x[i] == x[j] and (y[i] < y[j] or (y[i] == y[j] and z[i] < z[j]))):
+            found[label[i]] = i
+    return found
+
+
 def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSettings) -> LabelArray:
     """Tell apart the units of one candidate.
 
@@ -352,9 +363,10 @@ def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSetti
     label = _unit_of_points(
         x, y, z, vx, vy, vz, cell_mm, unit_of_patch[patches.of_vertex], patches.of_vertex, planes, start, others
     )
-    order = np.lexsort((z, y, x))
-    _, first, number = np.unique(label[order], return_index=True, return_inverse=True)
+    first = smallest_points(x, y, z, label)
+    present = np.flatnonzero(first >= 0)
+    smallest = first[present]
     rank = np.empty(len(first), np.int32)
-    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
-    one[order] = rank[number.ravel()]
-    return one
+    rank[present[np.lexsort((z[smallest], y[smallest], x[smallest]))]] = np.arange(len(present), dtype=np.int32)
+    numbered: LabelArray = rank[label]
+    return numbered

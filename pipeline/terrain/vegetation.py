@@ -12,11 +12,13 @@ import math
 import numpy as np
 from numba import njit
 
-from pipeline.model import BoolArray, IntArray, KindArray
+from pipeline.model import BoolArray, FloatArray, IntArray, KindArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.binning import points_by_cell
 
 _SCALES = 3
+_COUNT = 2**20 - 1
+"""Three counts of up to a million share one whole number."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -88,22 +90,76 @@ def smallest_eigenvalue(xx: float, xy: float, xz: float, yy: float, yz: float, z
 
 
 @njit(cache=True, nogil=True)
-def _add_moments(s: IntArray, dx: int, dy: int, dz: int) -> None:
-    """Count one neighbour: its number and its moments of first and second order."""
-    s[0] += 1
-    s[1] += dx
-    s[2] += dy
-    s[3] += dz
-    s[4] += dx * dx
-    s[5] += dx * dy
-    s[6] += dx * dz
-    s[7] += dy * dy
-    s[8] += dy * dz
-    s[9] += dz * dz
+def _block_around(
+    points: FloatArray, start: IntArray, cell: tuple[int, int], shape: tuple[int, int], reach: int, block: FloatArray
+) -> tuple[FloatArray, int]:
+    """The points (3, n) of the cells around one, in `block` or a larger array; and how many they are."""
+    (r, c), (rows, columns) = cell, shape
+    west, east = max(c - reach, 0), min(c + reach, columns - 1)
+    count = 0
+    for rr in range(max(r - reach, 0), min(r + reach + 1, rows)):
+        low, high = start[rr * columns + west], start[rr * columns + east + 1]
+        if count + high - low > block.shape[1]:
+            larger = np.empty((3, 2 * (count + high - low)))
+            larger[:, :count] = block[:, :count]
+            block = larger
+        for k in range(3):
+            for m in range(high - low):
+                block[k, count + m] = points[k, low + m]
+        count += high - low
+    return block, count
 
 
 @njit(cache=True, nogil=True)
-def _spread_mm2(s: IntArray) -> float:
+def _nearest(
+    block: FloatArray, count: int, at: tuple[float, float, float], limit: float, level: float, out: FloatArray
+) -> int:
+    """Write the points of a block in a circle, and near in elevation, to `out`, about a place; how many they are."""
+    found = 0
+    for k in range(count):
+        dx, dy, dz = block[0, k] - at[0], block[1, k] - at[1], block[2, k] - at[2]
+        # the next one takes the place of one that is too far: no branch to predict
+        out[0, found], out[1, found], out[2, found] = dx, dy, dz
+        found += 1 if dx * dx + dy * dy <= limit and abs(dz) <= level else 0
+    return found
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc"})
+def _moments(
+    block: FloatArray,
+    count: int,
+    at: tuple[float, float, float],
+    shift: tuple[float, float],
+    limit: float,
+    level: float,
+) -> tuple[float, float, float, float, float, float, float, float, float, float]:
+    """Number, and moments of first and second order about a place, of the points of a block in a circle beside it.
+
+    All are whole numbers far below 2^53: no order of summing changes them, so it is left to the compiler.
+    """
+    px, py, pz = block[0], block[1], block[2]
+    n, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
+    xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(count):
+        dx, dy, dz = px[k] - at[0], py[k] - at[1], pz[k] - at[2]
+        ex, ey = dx - shift[0], dy - shift[1]
+        inside = 1.0 if (ex * ex + ey * ey <= limit) & (abs(dz) <= level) else 0.0
+        x, y, z = inside * dx, inside * dy, inside * dz
+        n += inside
+        sx += x
+        sy += y
+        sz += z
+        xx += x * dx
+        xy += x * dy
+        xz += x * dz
+        yy += y * dy
+        yz += y * dz
+        zz += z * dz
+    return n, sx, sy, sz, xx, xy, xz, yy, yz, zz
+
+
+@njit(cache=True, nogil=True)
+def _spread_mm2(s: tuple[float, float, float, float, float, float, float, float, float, float]) -> float:
     """Variance of the counted neighbours across the plane that fits them best."""
     count = s[0]
     mx, my, mz = s[1] / count, s[2] / count, s[3] / count
@@ -133,50 +189,45 @@ def _planar(
     n = x_mm.size
     if n == 0:
         return
-    shift = 4 * radius_mm // 5
-    diagonal = 566 * radius_mm // 1000
-    shift_x = np.array([0, shift, diagonal, 0, -diagonal, -shift, -diagonal, 0, diagonal])
-    shift_y = np.array([0, 0, diagonal, shift, diagonal, 0, -diagonal, -shift, -diagonal])
-    limit = radius_mm * radius_mm
-    cell = 2 * radius_mm
-    start, members, column0, row0, columns, rows = points_by_cell(x_mm, y_mm, np.ones(n, np.bool_), cell)
-    # copies in the order of the cells: three neighbouring cells of a row are one run of memory
-    px, py, pz = x_mm[members], y_mm[members], z_mm[members]
-    sums = np.empty((9, 10), np.int64)
+    shift = 4.0 * radius_mm // 5.0
+    diagonal = 566.0 * radius_mm // 1000.0
+    shift_x = np.array([shift, diagonal, 0.0, -diagonal, -shift, -diagonal, 0.0, diagonal])
+    shift_y = np.array([0.0, diagonal, shift, diagonal, 0.0, -diagonal, -shift, -diagonal])
+    limit = float(radius_mm * radius_mm)
+    # cells as wide as the radius: the window in the middle reaches one of them far, the shifted ones two
+    start, members, _, _, columns, rows = points_by_cell(x_mm, y_mm, np.ones(n, np.bool_), radius_mm)
+    # copies in the order of the cells: neighbouring cells of a row are one run of memory
+    points = np.empty((3, n))
+    points[0], points[1], points[2] = (x_mm - x_mm.min())[members], (y_mm - y_mm.min())[members], z_mm[members]
+    block, wide, near = np.empty((3, 256)), np.empty((3, 256)), np.empty((3, 256))
     planar_mm2 = roughness_mm * roughness_mm
-    for i in range(n):
-        if out[i] >= 0 or not wanted[i]:
-            continue
-        c, r = x_mm[i] // cell - column0, y_mm[i] // cell - row0
-        west, east = max(c - 1, 0), min(c + 1, columns - 1)
-        # the window in the middle alone first: where it is planar the eight others cannot change the verdict
-        s = sums[0]
-        s[:] = 0
-        for rr in range(max(r - 1, 0), min(r + 2, rows)):
-            for m in range(start[rr * columns + west], start[rr * columns + east + 1]):
-                dx, dy, dz = px[m] - x_mm[i], py[m] - y_mm[i], pz[m] - z_mm[i]
-                if dx * dx + dy * dy <= limit and abs(dz) <= level_mm:
-                    _add_moments(s, dx, dy, dz)
-        if s[0] < min_points:
-            continue
-        if _spread_mm2(s) <= planar_mm2:
-            out[i] = 1
-            continue
-        sums[1:] = 0
-        for rr in range(max(r - 1, 0), min(r + 2, rows)):
-            for m in range(start[rr * columns + west], start[rr * columns + east + 1]):
-                dx, dy, dz = px[m] - x_mm[i], py[m] - y_mm[i], pz[m] - z_mm[i]
-                if dx * dx + dy * dy > 4 * limit or abs(dz) > level_mm:  # beyond all windows
-                    continue
-                for w in range(1, 9):
-                    ex, ey = dx - shift_x[w], dy - shift_y[w]
-                    if ex * ex + ey * ey <= limit:
-                        _add_moments(sums[w], dx, dy, dz)
-        out[i] = 0
-        for w in range(1, 9):
-            if sums[w, 0] >= min_points and _spread_mm2(sums[w]) <= planar_mm2:
-                out[i] = 1
-                break
+    for cell in range(rows * columns):
+        place = (cell // columns, cell % columns)
+        count, around = -1, -1
+        for m in range(start[cell], start[cell + 1]):
+            i = members[m]
+            if out[i] >= 0 or not wanted[i]:
+                continue
+            if count < 0:
+                block, count = _block_around(points, start, place, (rows, columns), 1, block)
+            at = (points[0, m], points[1, m], points[2, m])
+            # the window in the middle first: where it is planar the eight others cannot change the verdict
+            s = _moments(block, count, at, (0.0, 0.0), limit, level_mm)
+            if s[0] < min_points:
+                continue
+            out[i] = _spread_mm2(s) <= planar_mm2
+            if out[i] == 1:
+                continue
+            if around < 0:
+                wide, around = _block_around(points, start, place, (rows, columns), 2, wide)
+                if around > near.shape[1]:
+                    near = np.empty((3, 2 * around))
+            found = _nearest(wide, around, at, 4.0 * limit, level_mm, near)
+            for w in range(8):
+                s = _moments(near, found, (0.0, 0.0, 0.0), (shift_x[w], shift_y[w]), limit, level_mm)
+                if s[0] >= min_points and _spread_mm2(s) <= planar_mm2:
+                    out[i] = 1
+                    break
 
 
 def planarity(
@@ -232,27 +283,26 @@ def _crowns(
     """Kernel of `crowns`."""
     n = x_mm.size
     out = np.zeros(n, np.bool_)
-    limit = radius_mm * radius_mm
     if n == 0:
         return out
-    start, members, column0, row0, columns, rows = points_by_cell(x_mm, y_mm, np.ones(n, np.bool_), radius_mm)
-    for i in range(n):
-        if planar[i] < 0:
-            continue
-        c, r = x_mm[i] // radius_mm - column0, y_mm[i] // radius_mm - row0
-        west, east = max(c - 1, 0), min(c + 1, columns - 1)
-        judged, rough, pierced = 0, 0, 0
-        for rr in range(max(r - 1, 0), min(r + 2, rows)):
-            for m in range(start[rr * columns + west], start[rr * columns + east + 1]):
-                j = members[m]
-                if planar[j] < 0:
-                    continue
-                dx, dy, dz = x_mm[j] - x_mm[i], y_mm[j] - y_mm[i], z_mm[j] - z_mm[i]
-                if dx * dx + dy * dy + dz * dz <= limit:
-                    judged += 1
-                    rough += planar[j] == 0
-                    pierced += several[j]
-        out[i] = rough > crown_share * judged and pierced > pierced_share * judged
+    limit = float(radius_mm * radius_mm)
+    start, members, _, _, columns, rows = points_by_cell(x_mm, y_mm, planar >= 0, -(-radius_mm // 2))
+    points = np.empty((3, members.size))
+    points[0], points[1], points[2] = (x_mm - x_mm.min())[members], (y_mm - y_mm.min())[members], z_mm[members]
+    # one number for all three counts: of the judged, of the rough among them, and of the pierced
+    marks = 1 + ((planar[members] == 0).astype(np.int64) << 20) + (several[members].astype(np.int64) << 40)
+    for cell in range(rows * columns):
+        r, c = cell // columns, cell % columns
+        west, east = max(c - 2, 0), min(c + 2, columns - 1)
+        for m in range(start[cell], start[cell + 1]):
+            x, y, z = points[0, m], points[1, m], points[2, m]
+            counts = 0
+            for rr in range(max(r - 2, 0), min(r + 3, rows)):
+                for k in range(start[rr * columns + west], start[rr * columns + east + 1]):
+                    dx, dy, dz = points[0, k] - x, points[1, k] - y, points[2, k] - z
+                    counts += marks[k] if dx * dx + dy * dy + dz * dz <= limit else 0
+            judged, rough, pierced = counts & _COUNT, (counts >> 20) & _COUNT, counts >> 40
+            out[members[m]] = rough > crown_share * judged and pierced > pierced_share * judged
     return out
 
 

@@ -78,7 +78,7 @@ def test_a_roof_with_walls_around_it_is_a_candidate() -> None:
             Reason.TOO_SMALL,
             "area 17.7 m2, at least 20",
         ),
-        ({Sum.HEIGHT: 400 * 1500}, Reason.TOO_LOW, "mean height 1.50 m, at least 2"),
+        ({Sum.HEIGHT: 400 * 1500}, Reason.TOO_LOW, "top 1.50 m above the terrain, at least 2"),
         ({Sum.PLANAR: 40, Sum.ROUGH: 60}, Reason.VEGETATION, "planar share 0.40, at least 0.5"),
         ({Sum.CANOPY: 1600}, Reason.VEGETATION, "canopy share 0.50, at most 0.35"),
         (
@@ -108,6 +108,11 @@ def test_each_reason_names_its_figure_and_threshold(changes: dict[Sum, int], rea
         # a sure roof may lie at the foot of its walls, as annexes do
         ({Sum.PLANAR: 300, Sum.ROUGH: 100, Sum.WALL_TOP: 0}, {Sum.PLANAR: 299, Sum.ROUGH: 101, Sum.WALL_TOP: 0}),
         ({Sum.HEIGHT: 400 * 2000}, {Sum.HEIGHT: 400 * 2000 - 1}),
+        # of a pitched roof the ridge counts: heights from 1.6 to 2.0 m in the first, to 1.96 m in the second
+        (
+            {Sum.HEIGHT: 400 * 1800, Sum.HEIGHT2: 400 * (1800**2 + 13_400)},
+            {Sum.HEIGHT: 400 * 1780, Sum.HEIGHT2: 400 * (1780**2 + 10_800)},
+        ),
         ({Sum.PLANAR: 50, Sum.ROUGH: 50}, {Sum.PLANAR: 49, Sum.ROUGH: 51}),
         ({Sum.POINTS: 65, Sum.CANOPY: 35}, {Sum.POINTS: 64, Sum.CANOPY: 36}),
         ({Sum.WALL: 6000, Sum.WALL_TOP: 6000}, {Sum.WALL: 5999, Sum.WALL_TOP: 5999}),

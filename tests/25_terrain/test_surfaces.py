@@ -256,6 +256,7 @@ def test_a_box_on_flat_ground_is_one_object_with_walls_around_it() -> None:
     assert sums[Sum.STEP] == 0
     assert sums[Sum.WALLS_Z_MX] == sums[Sum.WALLS_OWN_Z] == 6000 * sums[Sum.WALLS]
     assert sums[Sum.HEIGHT] == 6000 * sums[Sum.VERTICES]
+    assert sums[Sum.HEIGHT2] == 6000**2 * sums[Sum.VERTICES]
     assert sums[Sum.PLANAR] == sums[Sum.VERTICES]
     assert (fragments.boxes_mm[roof] // 500 == [24, 28, 55, 51]).all()
     (ground,) = of_kind(fragments, FacetKind.GROUND)

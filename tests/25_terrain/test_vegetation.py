@@ -88,7 +88,7 @@ def test_the_smallest_eigenvalue_of_a_diagonal_is_its_smallest_entry(diagonal: t
     assert smallest_eigenvalue(a, 0.0, 0.0, b, 0.0, c) == pytest.approx(min(diagonal), abs=1e-7)
 
 
-@pytest.mark.parametrize("per_m2", [0.3, 1.0, 4.0])
+@pytest.mark.parametrize("per_m2", [0.3, 1.0, 4.0, 40.0])
 def test_the_verdict_is_that_of_a_slow_twin(per_m2: float) -> None:
     random = np.random.default_rng(round(10 * per_m2))
     xy = scattered(random, 16.0, per_m2)

@@ -15,9 +15,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from shapely import MultiPolygon
 
+from pipeline.errors import RunCancelledError
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.reconstruct import ReconstructSettings, reconstruct_building
 from pipeline.roof.settings import RoofSettings
+from pipeline.runtime import outlines
 from pipeline.runtime.gather import gather, points_of
 from pipeline.runtime.join import CandidateSite, PointRange, object_id
 from pipeline.runtime.outlines import draw_outlines, outline_tasks
@@ -76,10 +78,10 @@ def stored(points: npt.NDArray[np.void], grid: TileGrid, root: Path, fragments: 
 
 def divided(site: CandidateSite, grid: TileGrid, scratch: Scratch, own: UnitSettings) -> list[CandidateSite]:
     units = [unit for task in unit_tasks([site], own, grid, scratch, CRS) for unit in divide(task)]
-    outlines: dict[str, MultiPolygon] = {}
+    drawn: dict[str, MultiPolygon] = {}
     for task in outline_tasks(units, RoofSettings(), grid, scratch):
-        outlines |= draw_outlines(task)
-    return [dataclasses.replace(unit, outline=outlines.get(unit.building_id)) for unit in units]
+        drawn |= draw_outlines(task).outlines
+    return [dataclasses.replace(unit, outline=drawn.get(unit.building_id)) for unit in units]
 
 
 ONE_TILE = TileGrid(size_mm=1_000_000, halo_mm=0)
@@ -120,11 +122,11 @@ def test_units_do_not_depend_on_tiles_fragments_and_order(
 def test_touching_units_share_their_walls(row: npt.NDArray[np.void], tmp_path: Path) -> None:
     site, scratch = stored(row, ONE_TILE, tmp_path, 1)
     units = divided(site, ONE_TILE, scratch, UnitSettings())
-    outlines = [unit.outline for unit in units]
-    whole = shapely.union_all(outlines)
+    parts = [unit.outline for unit in units]
+    whole = shapely.union_all(parts)
     assert whole.geom_type == "Polygon"
     assert not whole.interiors
-    assert abs(whole.area - sum(outline.area for outline in outlines)) < 0.05
+    assert abs(whole.area - sum(outline.area for outline in parts)) < 0.05
     assert abs(whole.area / (8 * len(EAVES_M) * 10) - 1) < 0.04
     for unit in units:
         candidate, _ = gather(scratch, ONE_TILE, unit, GpsTimeKind.NONE)
@@ -139,6 +141,33 @@ def test_the_outline_is_part_of_what_a_model_is_made_of(row: npt.NDArray[np.void
     _, facts = gather(scratch, ONE_TILE, unit, GpsTimeKind.NONE)
     _, alone = gather(scratch, ONE_TILE, dataclasses.replace(unit, outline=None), GpsTimeKind.NONE)
     assert facts.input_hash != alone.input_hash
+
+
+def test_a_block_that_cannot_be_drawn_costs_its_outlines_and_is_told(
+    row: npt.NDArray[np.void], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
+    units = divided(site, ONE_TILE, scratch, UnitSettings())
+    (task,) = outline_tasks(units, RoofSettings(), ONE_TILE, scratch)
+
+    def broken(*_: object) -> None:
+        raise ValueError("a ring of two corners")
+
+    monkeypatch.setattr(outlines, "unit_outlines", broken)
+    drawn = draw_outlines(task)
+    assert drawn.outlines == {}
+    (warning,) = drawn.warnings
+    assert warning.endswith("are drawn one by one: ValueError: a ring of two corners")
+    assert all(unit.building_id in warning for unit in units)
+    scratch.cancel()
+    with pytest.raises(RunCancelledError):
+        draw_outlines(task)
+
+
+def test_raw_outlines_are_not_drawn_together(row: npt.NDArray[np.void], tmp_path: Path) -> None:
+    site, scratch = stored(row, ONE_TILE, tmp_path, 1)
+    units = divided(site, ONE_TILE, scratch, UnitSettings())
+    assert outline_tasks(units, RoofSettings(straight_eaves=False), ONE_TILE, scratch) == []
 
 
 def test_units_keep_every_point_once_in_the_tile_that_holds_it(row: npt.NDArray[np.void], tmp_path: Path) -> None:
