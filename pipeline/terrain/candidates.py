@@ -50,7 +50,7 @@ class CandidateSettings(Parameters):
     )
     min_height_m: float = parameter(
         2.0,
-        "Least height above the terrain: of a flat roof, or of the ridge of a pitched one, as the heights' spread tells.",
+        "Least height above the terrain, of a pitched roof that of its ridge, as the spread of its heights tells.",
         unit="m",
         minimum=0.5,
         maximum=20.0,
@@ -165,7 +165,8 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
         return None
     if f["top_m"] < settings.min_height_m:
         return Verdict(
-            reason=Reason.TOO_LOW, detail=f"top {f['top_m']:.2f} m above the terrain, at least {settings.min_height_m:g}"
+            reason=Reason.TOO_LOW,
+            detail=f"top {f['top_m']:.2f} m above the terrain, at least {settings.min_height_m:g}",
         )
     if kind == FacetKind.CROWN:
         return Verdict(
