@@ -336,8 +336,11 @@ def _same(stages: Stages, record: Record, site: CandidateSite | RejectedSite) ->
     """Whether a site, without overrides, is that of a record."""
     if record.points != site.points:
         return False
-    if isinstance(site, RejectedSite) or record.input_hash is None:
+    if isinstance(site, RejectedSite):
         return True
+    if record.input_hash is None:
+        # the outline of a unit hangs on all units of its block, which may reach beyond the split tiles
+        return site.block is None
     at_walls = stages.settings.building.roof.at_walls
     _, facts = gather(stages.scratch, stages.plan.grid, site, stages.gps_kind, beside=at_walls)
     return facts.input_hash == record.input_hash

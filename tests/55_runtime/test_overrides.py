@@ -21,10 +21,13 @@ import pipeline.runtime.rerun
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.io import SpatialReference
 from pipeline.io.storage import sha256_of
+from pipeline.runtime.earlier import Record
+from pipeline.runtime.join import CandidateSite
 from pipeline.runtime.overrides import overrides_of, own_modelling, read_overrides
 from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.settings import RunSettings
 from pipeline.synthetic.dataset import simulate
+from pipeline.tiling import Tile
 
 TILES = {"tile_size_m": 40.0, "candidates": {"min_area_m2": 88.0}}
 """Small tiles, so that houses cross their borders; and small houses are rejected, so that there is what to accept."""
@@ -448,6 +451,16 @@ def test_a_named_building_is_modelled_again_and_comes_out_the_same(plain: Any, c
     assert done.buildings == {name: rows(first.run_dir, "buildings")[name]["status"]}
     assert done.digest == first.digest == plain.digest
     assert files(first.run_dir) == before
+
+
+def test_a_unit_without_a_digest_of_its_inputs_is_sought_in_all_tiles() -> None:
+    record = Record(points=5, box=None, source_id=None, status="failed", input_hash=None)
+    alone = CandidateSite(building_id="a", owner=Tile(0, 0), ranges=(), points=5)
+    stages: Any = None
+    assert pipeline.runtime.rerun._same(stages, record, alone)
+    assert not pipeline.runtime.rerun._same(stages, record, dataclasses.replace(alone, points=6))
+    # its outline hangs on units that the split tiles may cut off
+    assert not pipeline.runtime.rerun._same(stages, record, dataclasses.replace(alone, block="b"))
 
 
 def test_a_rerun_holds_the_new_files_of_one_tile_at_a_time_and_touches_the_run_when_all_are_written(
