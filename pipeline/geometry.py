@@ -441,6 +441,11 @@ def _checked_search(points: FloatArray, k: int, cell_size_m: float | None) -> tu
     return np.ascontiguousarray(points, dtype=np.float64), k, cell_size_m
 
 
+_SPACING_NEIGHBOURS = 8
+_UNEVEN = 1.3
+"""Spacings over the area and over the points that differ by more come of several densities."""
+
+
 def point_spacing_m(points: FloatArray) -> float:
     """Typical spacing of points in plan: 1 / sqrt(density) where most of them lie.
 
@@ -458,12 +463,51 @@ def point_spacing_m(points: FloatArray) -> float:
     float
         Metres; nan for fewer than two points.
     """
-    k = min(8, len(points) - 1)
+    k = min(_SPACING_NEIGHBOURS, len(points) - 1)
+    return math.nan if k < 1 else _spacing_of_points(_squared_reach(points, k), k)
+
+
+def spacing_over_area_m(points: FloatArray) -> float:
+    """Spacing of points in plan that holds over most of their area.
+
+    Where two strips overlap on a part of a roof, most points lie there, but not most of the roof. Every point stands
+    for an area that grows with the squared distance to its eighth neighbour; the median over the area is taken where it
+    is more than 1.3 times that over the points. Else this is `point_spacing_m`: of one density they differ by less than
+    a quarter, borders included (measured on simulated and real roofs of 1 to 30 points a m2).
+
+    Parameters
+    ----------
+    points : (n, 2) or (n, 3) float64
+        Points in metres; only x and y count.
+
+    Returns
+    -------
+    float
+        Metres; nan for fewer than two points.
+    """
+    k = min(_SPACING_NEIGHBOURS, len(points) - 1)
     if k < 1:
         return math.nan
-    _, squares = _nearest_neighbours(*_checked_search(points[:, :2], k, None))
+    squares = _squared_reach(points, k)
+    usual = _spacing_of_points(squares, k)
+    squares = np.sort(squares)
+    covered = np.cumsum(squares)
+    middle = float(squares[min(int(np.searchsorted(covered, 0.5 * covered[-1])), len(squares) - 1)])
+    # weighted with itself a Gamma(k) variate is Gamma(k + 1) distributed
+    over_area = math.sqrt(middle * math.pi / (k + 2.0 / 3.0))
+    return over_area if over_area > _UNEVEN * usual else usual
+
+
+def _squared_reach(points: FloatArray, k: int) -> FloatArray:
+    """Squared distance in plan of every point to its k-th neighbour, (n,) m2."""
+    squares: FloatArray = _nearest_neighbours(*_checked_search(points[:, :2], k, None))[1][:, k - 1]
+    return squares
+
+
+def _spacing_of_points(squares: FloatArray, k: int) -> float:
+    """1 / sqrt(density) from the squared distances to the k-th neighbour, over the points."""
     # pi density r_k^2 is Gamma(k) distributed; its median is k - 1/3 within 2 % for k >= 1
-    return math.sqrt(float(np.median(squares[:, k - 1])) * math.pi / (k - 1.0 / 3.0))
+    return math.sqrt(float(np.median(squares)) * math.pi / (k - 1.0 / 3.0))
 
 
 @njit(cache=True, nogil=True)

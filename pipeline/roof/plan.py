@@ -12,7 +12,7 @@ import shapely
 from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
-from pipeline.geometry import point_spacing_m, top_visible
+from pipeline.geometry import spacing_over_area_m, top_visible
 from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
@@ -109,7 +109,7 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
         index=index,
         labels=np.full(len(index), -1, np.int32),
         split=_are_among(grid[kept, :2], np.rint(candidate.split_returns[:, :2] * 1e3).astype(np.int64)),
-        spacing_m=min(max(point_spacing_m(points[index]), 0.1), 3.0),
+        spacing_m=min(max(spacing_over_area_m(points[index]), 0.1), 3.0),
         footprint_mm=footprint,
         outline_mm=None if candidate.outline is None else footprint_in_mm(candidate.outline),
         facades=FacadePoints.of(

@@ -280,3 +280,22 @@ def test_order_and_place_do_not_change_what_is_visible() -> None:
     order = np.random.default_rng(3).permutation(len(points))
     np.testing.assert_array_equal(geometry.top_visible(points[order]), visible[order])
     np.testing.assert_array_equal(geometry.top_visible(points + np.array([1_000.0, -2_000.0, 30.0])), visible)
+
+
+def test_the_spacing_over_the_area_is_that_of_the_points_where_they_lie_evenly() -> None:
+    random = np.random.default_rng(5)
+    for count, size in ((60, (6.0, 9.0)), (2000, (20.0, 30.0)), (4000, (200.0, 3.0))):
+        points = random.uniform((0, 0), size, (count, 2))
+        assert geometry.spacing_over_area_m(points) == geometry.point_spacing_m(points)
+    assert math.isnan(geometry.spacing_over_area_m(np.zeros((1, 3))))
+
+
+def test_the_spacing_over_the_area_is_that_of_most_of_the_area() -> None:
+    random = np.random.default_rng(6)
+    sparse, dense = random.uniform((0, 0), (30, 20), (600, 2)), random.uniform((0, 8), (30, 13), (2400, 2))
+    both = np.concatenate((sparse, dense))
+    assert geometry.point_spacing_m(both) == pytest.approx(1 / math.sqrt(17), rel=0.1)
+    assert geometry.spacing_over_area_m(both) == pytest.approx(1.0, rel=0.1)
+    assert geometry.spacing_over_area_m(both[np.random.default_rng(7).permutation(len(both))]) == (
+        geometry.spacing_over_area_m(both)
+    )

@@ -54,3 +54,15 @@ def test_swapped_numbers_swap_the_outlines(halves: tuple[Candidate, LabelArray])
 def test_without_a_plan_no_unit_has_an_outline() -> None:
     three = candidate_of(np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0], [0.0, 1.0, 5.0]]))
     assert unit_outlines(three, np.array([0, 0, 1], np.int32), RoofSettings()) == [None, None]
+
+
+def test_an_overlap_of_strips_does_not_comb_the_outline() -> None:
+    random = np.random.default_rng(9)
+    lines = np.column_stack((np.repeat(np.arange(0.5, 30.0, 1.8), 20), np.tile(np.arange(0.5, 20.0, 1.0), 17)))
+    overlap = random.uniform((0, 7), (30, 12), (2000, 2))
+    xy = np.concatenate((lines + random.uniform(-0.1, 0.1, lines.shape), overlap)).round(3)
+    candidate = candidate_of(np.column_stack((xy, np.full(len(xy), 6.0))))
+    (outline,) = unit_outlines(candidate, np.zeros(len(xy), np.int32), RoofSettings())
+    assert outline is not None
+    assert outline.area == pytest.approx(600.0, rel=0.08)
+    assert outline.length == pytest.approx(100.0, rel=0.1)
