@@ -59,7 +59,7 @@ def percent(stage: str, done: int, total: int) -> int:
     Examples
     --------
     >>> percent("inputs", 0, 1), percent("reconstruct", 0, 80), percent("reconstruct", 40, 80), percent("outputs", 3, 3)
-    (0, 45, 66, 99)
+    (0, 49, 68, 99)
     """
     if stage not in WEIGHTS:
         return 0
