@@ -18,6 +18,7 @@ from pipeline.io.gps_time import GpsTimeKind
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.unit_outlines import unit_outlines
 from pipeline.runtime.gather import canonical_order, gather, stored_points
+from pipeline.runtime.grouping import in_groups
 from pipeline.runtime.join import CandidateSite
 from pipeline.runtime.scratch import Scratch
 from pipeline.tiling import TileGrid
@@ -53,14 +54,8 @@ def outline_tasks(
         if site.block is not None:
             blocks.setdefault(site.block, []).append(site)
     sized = [(sum(site.points for site in units), name) for name, units in blocks.items()]
-    groups: list[list[tuple[CandidateSite, ...]]] = []
-    points = 0
-    for size, name in sorted(sized, key=lambda entry: (-entry[0], entry[1])):
-        if not groups or points + size > _POINTS_PER_TASK:
-            groups.append([])
-            points = 0
-        groups[-1].append(tuple(blocks[name]))
-        points += size
+    largest_first = sorted(sized, key=lambda entry: (-entry[0], entry[1]))
+    groups = in_groups(((tuple(blocks[name]), size) for size, name in largest_first), _POINTS_PER_TASK)
     return [OutlineTask(blocks=tuple(group), settings=settings, grid=grid, scratch=scratch) for group in groups]
 
 

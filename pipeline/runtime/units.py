@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.runtime.grouping import in_groups
 from pipeline.runtime.join import CandidateSite, PointRange, object_id
 from pipeline.runtime.scratch import POINT, Scratch
 from pipeline.terrain.units import UnitSettings, smallest_points, units_of
@@ -40,14 +41,7 @@ def unit_tasks(
     sites: Sequence[CandidateSite], settings: UnitSettings, grid: TileGrid, scratch: Scratch, crs_name: str
 ) -> list[UnitTask]:
     """Group candidates to tasks of some tenths of a second each."""
-    groups: list[list[CandidateSite]] = []
-    points = 0
-    for site in sites:
-        if not groups or points + site.points > _POINTS_PER_TASK:
-            groups.append([])
-            points = 0
-        groups[-1].append(site)
-        points += site.points
+    groups = in_groups(((site, site.points) for site in sites), _POINTS_PER_TASK)
     return [
         UnitTask(sites=tuple(group), settings=settings, grid=grid, scratch=scratch, crs_name=crs_name)
         for group in groups

@@ -11,6 +11,10 @@ import laspy
 import numpy as np
 import pytest
 
+from pipeline.methods import ReconstructSettings
+from pipeline.model import BuildingResult, Candidate
+from pipeline.reconstruct import reconstruct_building
+from pipeline.runtime import modelling
 from pipeline.runtime.executors import Measured, SerialExecutor, measure
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.settings import RunSettings
@@ -88,3 +92,16 @@ def reconstruct(tmp_path: Path) -> Reconstruct:
         return run(request, executor=executor)
 
     return go
+
+
+@pytest.fixture
+def candidates(monkeypatch: pytest.MonkeyPatch) -> list[Candidate]:
+    """Gets the candidates of the runs of a test."""
+    seen: list[Candidate] = []
+
+    def watched(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
+        seen.append(candidate)
+        return reconstruct_building(candidate, method, settings)
+
+    monkeypatch.setattr(modelling, "reconstruct_building", watched)
+    return seen

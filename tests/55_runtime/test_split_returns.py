@@ -7,26 +7,9 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-import pytest
 
-from pipeline.methods import ReconstructSettings
-from pipeline.model import BuildingResult, Candidate
-from pipeline.reconstruct import reconstruct_building
-from pipeline.runtime import modelling
+from pipeline.model import Candidate
 from pipeline.runtime.run import RunSummary
-
-
-@pytest.fixture
-def candidates(monkeypatch: pytest.MonkeyPatch) -> list[Candidate]:
-    """Gets the candidates of the runs of a test."""
-    seen: list[Candidate] = []
-
-    def watched(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
-        seen.append(candidate)
-        return reconstruct_building(candidate, method, settings)
-
-    monkeypatch.setattr(modelling, "reconstruct_building", watched)
-    return seen
 
 
 def test_split_returns_are_the_points_that_were_first_of_several(

@@ -7,28 +7,11 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-import pytest
 
-from pipeline.methods import ReconstructSettings
-from pipeline.model import BuildingResult, Candidate
-from pipeline.reconstruct import reconstruct_building
-from pipeline.runtime import modelling
+from pipeline.model import Candidate
 from pipeline.runtime.run import RunSummary
 
 WALLS = {"outline": "walls"}
-
-
-@pytest.fixture
-def candidates(monkeypatch: pytest.MonkeyPatch) -> list[Candidate]:
-    """Gets the candidates of the runs of a test."""
-    seen: list[Candidate] = []
-
-    def watched(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
-        seen.append(candidate)
-        return reconstruct_building(candidate, method, settings)
-
-    monkeypatch.setattr(modelling, "reconstruct_building", watched)
-    return seen
 
 
 def absolute_mm(candidate: Candidate, xyz: np.ndarray) -> set[tuple[int, ...]]:
