@@ -1,0 +1,448 @@
+"""Roof planes whose thresholds follow the noise and the density of the points.
+
+A dense cloud is first averaged to nodes, so that the noise is small beside their distance. Of all regions that grow
+from flat seeds those are taken that explain the most (`trial_regions`). Planes that touch are one where an F-test finds
+no difference between them, and every point takes the plane near it that has the company of its neighbours. What is
+left is searched once more: dormers and other superstructures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.geometry import nearest_neighbours
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
+from pipeline.parameters import Parameters, parameter
+from pipeline.segmentation.plane_merge import touching_pairs
+from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
+from pipeline.segmentation.point_assignment import distance_to_plane, vote_among_neighbours
+from pipeline.segmentation.redundant_planes import dissolve_redundant
+from pipeline.segmentation.trial_regions import FITTED_NEIGHBOURS, local_planes, noise_of_local_planes, take_regions
+
+_DENSE_SPACING_M = 0.3
+"""Closer points are averaged to nodes: the noise between such neighbours hides the slope, and nodes are fewer."""
+_NODE_CELL_M = 0.5
+"""Cell of the nodes: a whole number of them fills a metre, so that they do not move with an origin in whole metres."""
+_NEIGHBOURS = 8
+"""Nearest points over which regions grow and votes are taken."""
+_GROWING_SHARE = 0.5
+"""Regions grow within this share of the largest distance: the whole of it bridges gentle ridges."""
+_NORMALS_SPACING_M = 0.7
+"""Spacing up to which (about 2 points/m2) a point's own plane says anything about the plane that it lies on."""
+_SLOPE_ERROR = 0.12
+"""Standard deviation of a point's own slope up to which it says so."""
+_F_LIMIT = 3.78
+"""F(3, infinity) at 99 %."""
+_MERGE_TOLERANCE_M = 0.05
+"""Planes whose union moves the smaller by less, root mean square, are one whatever the F-test says."""
+_VOTE_WEIGHT = 0.03
+"""Share of the largest squared distance that a neighbour's vote outweighs."""
+_VOTING_PASSES = 3
+_PLANE_COST = 5.0
+"""Points that would be unexplained without a plane for it to stay."""
+_ROUNDS = 2
+"""Rounds of regression, merging and assignment: labels hardly change later."""
+_LEFTOVER_ROUNDS = 2
+_MAD_TO_SIGMA = 1.4826
+_LEAST_POINTS = 5
+"""Fewest points of any plane: with three free parameters, four fit by chance too often."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AdaptivePlaneSettings(Parameters):
+    """Settings of the detection."""
+
+    noises: float = parameter(
+        3.0,
+        "Distance up to which a point belongs to a plane, in standard deviations of the noise.",
+        minimum=0.5,
+        maximum=20.0,
+    )
+    distance_min_m: float = parameter(0.08, "Least such distance.", unit="m", minimum=0.001, maximum=10.0)
+    distance_max_m: float = parameter(0.35, "Largest such distance.", unit="m", minimum=0.001, maximum=10.0)
+    least_area_m2: float = parameter(
+        2.0, "Least area of a plane in plan where points are dense.", unit="m2", minimum=0.0, maximum=1e4
+    )
+    least_area_sparse_m2: float = parameter(
+        10.0, "Least area that is asked for however sparse the points.", unit="m2", minimum=0.0, maximum=1e4
+    )
+    least_points: int = parameter(
+        6, "Fewest points of a plane where the larger area holds as many.", unit="points", minimum=5, maximum=10_000
+    )
+    max_slope_deg: float = parameter(
+        75.0, "Planes steeper than this are no roof.", unit="deg", minimum=1.0, maximum=89.0
+    )
+    normal_angle_deg: float = parameter(
+        30.0,
+        "Largest angle between a plane and the plane of a point's neighbours, where points are dense and clean enough.",
+        unit="deg",
+        minimum=1.0,
+        maximum=89.0,
+    )
+
+    def cross_faults(self) -> list[str]:
+        """Bounds must be ranges."""
+        faults = super().cross_faults()
+        for low, high in (("distance_min_m", "distance_max_m"), ("least_area_m2", "least_area_sparse_m2")):
+            if getattr(self, low) > getattr(self, high):
+                faults.append(f"{low} is {getattr(self, low):g}: use at most {high}, {getattr(self, high):g}")
+        return faults
+
+    def fewest_points(self, spacing_m: float) -> int:
+        """Fewest points of a plane for a spacing.
+
+        Examples
+        --------
+        >>> [AdaptivePlaneSettings().fewest_points(spacing_m) for spacing_m in (0.25, 0.7, 1.0, 1.6)]
+        [32, 6, 6, 5]
+        """
+        cell_m2 = spacing_m * spacing_m
+        asked = max(self.least_area_m2 / cell_m2, min(self.least_points, self.least_area_sparse_m2 / cell_m2))
+        return max(_LEAST_POINTS, math.ceil(asked))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DetectedPlanes:
+    """Planes, and the plane of every point."""
+
+    coefficients: FloatArray
+    """(k, 3) float64, (a, b, c) of z = a x + b y + c, in the order of their first points; each has points."""
+    labels: LabelArray
+    """(n,) int32, index of the plane of every point; -1 for none."""
+    sigma_m: float
+    """Robust standard deviation of the points across their planes, metres; nan without planes."""
+
+
+def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneSettings) -> DetectedPlanes:
+    """Find the roof planes of one building.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Points that see the sky, metres about an origin in whole metres near them, in canonical order.
+    spacing_m : float
+        Typical spacing in plan, as `geometry.point_spacing_m` tells it.
+    settings : AdaptivePlaneSettings
+        Thresholds.
+
+    Returns
+    -------
+    DetectedPlanes
+        Without planes where points are too few, or flat nowhere; a spacing of nan or 0 counts as too few.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    if len(points) < _LEAST_POINTS or not spacing_m > 0.0:
+        return DetectedPlanes(
+            coefficients=np.zeros((0, 3)), labels=np.full(len(points), -1, np.int32), sigma_m=math.nan
+        )
+    if spacing_m < _DENSE_SPACING_M:
+        nodes, node_of = mean_nodes(points, _NODE_CELL_M, settings.distance_max_m)
+        spacing_m = _NODE_CELL_M
+    else:
+        nodes, node_of = points, np.arange(len(points), dtype=np.int32)
+    coefficients, labels, sigma_m = _detect(
+        points,
+        nodes,
+        node_of,
+        nearest_neighbours(nodes, _NEIGHBOURS),
+        spacing_m,
+        settings.noises,
+        settings.distance_min_m,
+        settings.distance_max_m,
+        settings.fewest_points(spacing_m),
+        math.cos(math.radians(settings.max_slope_deg)),
+        math.cos(math.radians(settings.normal_angle_deg)),
+    )
+    return DetectedPlanes(coefficients=coefficients, labels=labels, sigma_m=sigma_m)
+
+
+@njit(cache=True, nogil=True)
+def mean_nodes(points: FloatArray, cell_m: float, gap_m: float) -> tuple[FloatArray, LabelArray]:
+    """Means of the points of every lattice cell, one for each stack of points that a vertical gap parts from others.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Metres.
+    cell_m : float
+        Size of the cells.
+    gap_m : float
+        Height from which on a gap parts a cell's points.
+
+    Returns
+    -------
+    nodes : (m, 3) float64
+        By cell in x and y, in a cell the lowest first.
+    node_of : (n,) int32
+        Node of every point.
+    """
+    n = len(points)
+    row = np.floor(points[:, 1] / cell_m).astype(np.int64)
+    row -= row.min()
+    order = np.argsort(np.floor(points[:, 0] / cell_m).astype(np.int64) * (row.max() + 1) + row, kind="mergesort")
+    nodes = np.zeros((n, 3))
+    node_of = np.empty(n, np.int32)
+    count = 0
+    begin = 0
+    while begin < n:
+        column = math.floor(points[order[begin], 0] / cell_m)
+        end = begin + 1
+        while end < n and row[order[end]] == row[order[begin]] and math.floor(points[order[end], 0] / cell_m) == column:
+            i = order[end]
+            q = end
+            while q > begin and points[order[q - 1], 2] > points[i, 2]:
+                order[q] = order[q - 1]
+                q -= 1
+            order[q] = i
+            end += 1
+        held = 0
+        for q in range(begin, end):
+            i = order[q]
+            if held > 0 and points[i, 2] - points[order[q - 1], 2] > gap_m:
+                nodes[count] /= held
+                count += 1
+                held = 0
+            node_of[i] = count
+            nodes[count] += points[i]
+            held += 1
+        nodes[count] /= held
+        count += 1
+        begin = end
+    return nodes[:count].copy(), node_of
+
+
+@njit(cache=True, nogil=True)
+def _f_ratio(sums: FloatArray, i: int, j: int, sigma_m: float) -> float:
+    """F of two planes against one for all their points; -1 where they differ too little to matter.
+
+    F = ((SSE_one - SSE_two) / 3) / (SSE_two / (n - 6)); the variance in the denominator is at least that of the noise.
+    """
+    both = sums[i] + sums[j]
+    a, b, c, fitted = best_fit_plane(both)
+    if not fitted:
+        return np.inf
+    square_cosine = cosine_of_slope(a, b) ** 2
+    apart = 0.0
+    for k in (i, j):
+        own_a, own_b, own_c, _ = best_fit_plane(sums[k])
+        apart += mean_square_residual(sums[k], own_a, own_b, own_c) * sums[k, 0] * square_cosine
+    added = mean_square_residual(both, a, b, c) * both[0] * square_cosine - apart
+    if added <= _MERGE_TOLERANCE_M**2 * min(sums[i, 0], sums[j, 0]):
+        return -1.0
+    variance = max(sigma_m * sigma_m, apart / max(both[0] - 6.0, 1.0))
+    return added / (3.0 * variance) if variance > 0.0 else np.inf
+
+
+@njit(cache=True, nogil=True)
+def merge_by_f_test(sums: FloatArray, pairs: IntArray, sigma_m: float) -> LabelArray:
+    """Merge planes that an F-test cannot tell apart, the least different first.
+
+    Parameters
+    ----------
+    sums : (m, 10) float64
+        From `plane_regression.cluster_sums`; changed.
+    pairs : (p,) int64
+        Codes low * m + high of planes that touch, ascending.
+    sigma_m : float
+        Standard deviation of the noise.
+
+    Returns
+    -------
+    (m,) int32
+        The plane that every plane became part of.
+    """
+    n = len(sums)
+    root = np.arange(n).astype(np.int32)
+    first = pairs // max(n, 1)
+    second = pairs % max(n, 1)
+    ratios = np.empty(pairs.size)
+    for p in range(pairs.size):
+        ratios[p] = _f_ratio(sums, first[p], second[p], sigma_m)
+    while pairs.size > 0:
+        best = np.argmin(ratios)
+        if ratios[best] >= _F_LIMIT:
+            break
+        kept = min(first[best], second[best])
+        gone = max(first[best], second[best])
+        sums[kept] += sums[gone]
+        for k in range(n):
+            if root[k] == gone:
+                root[k] = kept
+        for p in range(pairs.size):
+            if first[p] == gone:
+                first[p] = kept
+            if second[p] == gone:
+                second[p] = kept
+            if first[p] == second[p]:
+                ratios[p] = np.inf
+            elif first[p] == kept or second[p] == kept:
+                ratios[p] = _f_ratio(sums, first[p], second[p], sigma_m)
+    return root
+
+
+@njit(cache=True, nogil=True)
+def _fitted(
+    points: FloatArray, labels: LabelArray, count: int, fewest_points: int, min_cosine: float
+) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Planes of the labels, which of them a roof can have, and their sums."""
+    sums = cluster_sums(points, labels, count)
+    planes = np.zeros((count, 3))
+    usable = np.zeros(count, np.bool_)
+    for k in range(count):
+        a, b, c, fitted = best_fit_plane(sums[k])
+        planes[k, 0], planes[k, 1], planes[k, 2] = a, b, c
+        usable[k] = fitted and sums[k, 0] >= fewest_points and cosine_of_slope(a, b) >= min_cosine
+    return planes, usable, sums
+
+
+@njit(cache=True, nogil=True)
+def _settled(
+    points: FloatArray,
+    neighbours: LabelArray,
+    labels: LabelArray,
+    count: int,
+    rounds: int,
+    distance_m: float,
+    sigma_m: float,
+    fewest_points: int,
+    min_cosine: float,
+) -> LabelArray:
+    """Labels after rounds of regression, merging and assignment."""
+    for _ in range(rounds):
+        _, usable, sums = _fitted(points, labels, count, fewest_points, min_cosine)
+        root = merge_by_f_test(sums, touching_pairs(neighbours, labels, usable), sigma_m)
+        for i in range(labels.size):
+            if labels[i] >= 0:
+                labels[i] = root[labels[i]] if usable[labels[i]] else -1
+        planes, usable, _ = _fitted(points, labels, count, fewest_points, min_cosine)
+        dissolve_redundant(points, neighbours, labels, planes, usable, distance_m, _PLANE_COST)
+        labels = vote_among_neighbours(
+            points, neighbours, labels, planes, usable, distance_m, _VOTE_WEIGHT, _VOTING_PASSES
+        )
+    return labels
+
+
+@njit(cache=True, nogil=True)
+def _labels_of_points(
+    points: FloatArray,
+    node_of: LabelArray,
+    neighbours: LabelArray,
+    labels: LabelArray,
+    planes: FloatArray,
+    distance_m: float,
+) -> LabelArray:
+    """Every point chooses among the planes of its node and of the nodes around by distance and votes, as nodes do."""
+    width = neighbours.shape[1]
+    chosen = np.full(len(points), -1, np.int32)
+    kind = np.empty(width + 1, np.int32)
+    votes = np.empty(width + 1, np.int32)
+    for i in range(len(points)):
+        kinds = 0
+        for q in range(-1, width):
+            j = node_of[i] if q < 0 else neighbours[node_of[i], q]
+            if j < 0 or labels[j] < 0:
+                continue
+            at = 0
+            while at < kinds and kind[at] != labels[j]:
+                at += 1
+            if at == kinds:
+                kind[at] = labels[j]
+                votes[at] = 0
+                kinds += 1
+            votes[at] += 1
+        least = 1.0
+        for s in range(kinds):
+            ratio = distance_to_plane(points, i, planes, kind[s]) / distance_m
+            cost = ratio * ratio - _VOTE_WEIGHT * votes[s]
+            if ratio <= 1.0 and (cost < least or (cost == least and kind[s] < chosen[i])):
+                least = cost
+                chosen[i] = kind[s]
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def _noise_about(points: FloatArray, labels: LabelArray, planes: FloatArray) -> float:
+    """1.4826 times the median absolute distance of the points to their planes; nan where no point has one."""
+    distances = np.empty(len(points))
+    known = 0
+    for i in range(len(points)):
+        if labels[i] >= 0:
+            distances[known] = distance_to_plane(points, i, planes, labels[i])
+            known += 1
+    return _MAD_TO_SIGMA * float(np.median(distances[:known])) if known > 0 else np.nan
+
+
+@njit(cache=True, nogil=True)
+def _numbered(points: FloatArray, labels: LabelArray, planes: FloatArray, min_cosine: float) -> FloatArray:
+    """Number the planes by their first point, in place, and fit those that have points to them."""
+    number = np.full(len(planes), -1, np.int32)
+    old = np.empty(len(planes), np.int32)
+    count = 0
+    for i in range(labels.size):
+        k = labels[i]
+        if k >= 0:
+            if number[k] < 0:
+                number[k] = count
+                old[count] = k
+                count += 1
+            labels[i] = number[k]
+    sums = cluster_sums(points, labels, count)
+    final = np.empty((count, 3))
+    for k in range(count):
+        a, b, c, fitted = best_fit_plane(sums[k])
+        if fitted and cosine_of_slope(a, b) >= min_cosine:
+            final[k, 0], final[k, 1], final[k, 2] = a, b, c
+        else:
+            final[k] = planes[old[k]]
+    return final
+
+
+@njit(cache=True, nogil=True)
+def _detect(
+    points: FloatArray,
+    nodes: FloatArray,
+    node_of: LabelArray,
+    neighbours: LabelArray,
+    spacing_m: float,
+    noises: float,
+    distance_min_m: float,
+    distance_max_m: float,
+    fewest_points: int,
+    min_cosine: float,
+    normal_cosine: float,
+) -> tuple[FloatArray, LabelArray, float]:
+    """Kernel of `detect_planes`: planes, labels of the points, noise."""
+    local, variances = local_planes(nodes, neighbours)
+    sigma_m = noise_of_local_planes(variances)
+    distance_m = min(max(noises * sigma_m, distance_min_m), distance_max_m)
+    # of a plane through m points spread evenly over a disc the slope has the error 2 sigma sqrt(pi) / (spacing m)
+    slope_error = 2.0 * math.sqrt(math.pi) * sigma_m / (spacing_m * (FITTED_NEIGHBOURS + 1.0))
+    tells = slope_error < _SLOPE_ERROR and spacing_m < _NORMALS_SPACING_M
+
+    labels = np.full(len(nodes), -1, np.int32)
+    near_m = _GROWING_SHARE * distance_m
+    min_normal_cosine = normal_cosine if tells else 0.0
+    count = take_regions(
+        nodes, neighbours, local, variances, labels, 0, near_m, min_normal_cosine, fewest_points, min_cosine
+    )
+    labels = _settled(nodes, neighbours, labels, count, _ROUNDS, distance_m, sigma_m, fewest_points, min_cosine)
+    first = count
+    count = take_regions(nodes, neighbours, local, variances, labels, first, distance_m, 0.0, fewest_points, min_cosine)
+    if count > first:
+        labels = _settled(
+            nodes, neighbours, labels, count, _LEFTOVER_ROUNDS, distance_m, sigma_m, fewest_points, min_cosine
+        )
+    planes, usable, _ = _fitted(nodes, labels, count, fewest_points, min_cosine)
+    for i in range(labels.size):
+        if labels[i] >= 0 and not usable[labels[i]]:
+            labels[i] = -1
+    if len(nodes) < len(points):
+        sigma_m = _noise_about(points, labels[node_of], planes)
+        distance_m = min(max(noises * sigma_m, distance_min_m), distance_max_m)
+        labels = _labels_of_points(points, node_of, neighbours, labels, planes, distance_m)
+    planes = _numbered(points, labels, planes, min_cosine)
+    return planes, labels, _noise_about(points, labels, planes)
