@@ -1,0 +1,235 @@
+"""Which plane each cell of the subdivision belongs to: the points in it against borders and faces.
+
+The cost of a cell's label is the sum of its points' capped residuals, in unexplained points; a border costs by its
+length, a face as such: a short description of the roof (minimum description length) with the points as its data.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import FloatArray, IntArray, LabelArray
+from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
+from pipeline.roof.arrangement.subdivision import FACE, ORIGIN, between_vertices
+
+_ROW_MM = 500.0
+
+
+@njit(cache=True, nogil=True)
+def cells_of_points(xy: IntArray, graph: LabelArray, n_edges: int, points: FloatArray) -> LabelArray:
+    """The cell in which each point lies, (n,) int32; -1 outside.
+
+    Points on a border belong to the cell east of it; `points` are in metres.
+    """
+    low, high = math.inf, -math.inf
+    for h in range(n_edges):
+        low = min(low, float(xy[graph[h, ORIGIN], 1]))
+        high = max(high, float(xy[graph[h, ORIGIN], 1]))
+    rows = int((high - low) / _ROW_MM) + 1
+    starts = np.zeros(rows + 1, np.int32)
+    for h in range(n_edges):
+        top, bottom = xy[graph[h, ORIGIN], 1], xy[graph[h ^ 1, ORIGIN], 1]
+        if top > bottom:
+            for r in range(int((bottom - low) / _ROW_MM), int((top - low) / _ROW_MM) + 1):
+                starts[r + 1] += 1
+    for r in range(rows):
+        starts[r + 1] += starts[r]
+    filled = starts[:-1].copy()
+    in_row = np.empty(starts[rows], np.int32)
+    for h in range(n_edges):
+        top, bottom = xy[graph[h, ORIGIN], 1], xy[graph[h ^ 1, ORIGIN], 1]
+        if top > bottom:
+            for r in range(int((bottom - low) / _ROW_MM), int((top - low) / _ROW_MM) + 1):
+                in_row[filled[r]] = h
+                filled[r] += 1
+    cells = np.full(len(points), -1, np.int32)
+    for i in range(len(points)):
+        x, y = points[i, 0] * 1e3, between_vertices(points[i, 1] * 1e3)
+        if y < low or y >= high:
+            continue
+        r = int((y - low) / _ROW_MM)
+        nearest = -math.inf
+        for s in range(starts[r], starts[r + 1]):
+            h = in_row[s]
+            p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
+            if xy[p, 1] > y >= xy[q, 1]:
+                at = xy[p, 0] + (y - xy[p, 1]) * (xy[q, 0] - xy[p, 0]) / (xy[q, 1] - xy[p, 1])
+                if nearest < at <= x:
+                    nearest = at
+                    cells[i] = graph[h, FACE]
+    return cells
+
+
+@njit(cache=True, nogil=True)
+def cell_areas_m2(xy: IntArray, graph: LabelArray, n_edges: int, n_cells: int) -> FloatArray:
+    """Area of every cell, (c,) float64."""
+    twice = np.zeros(n_cells, np.int64)
+    for h in range(n_edges):
+        if graph[h, FACE] >= 0:
+            p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
+            twice[graph[h, FACE]] += xy[p, 0] * xy[q, 1] - xy[p, 1] * xy[q, 0]
+    return twice.astype(np.float64) * 0.5e-6
+
+
+@njit(cache=True, nogil=True)
+def cell_costs(
+    xy: IntArray,
+    graph: LabelArray,
+    n_edges: int,
+    n_cells: int,
+    points: FloatArray,
+    labels: LabelArray,
+    planes: FloatArray,
+    cells: LabelArray,
+    cap_m: float,
+    points_per_m2: float,
+    overshoot_m: float,
+) -> IntArray:
+    """Cost of every plane in every cell.
+
+    A plane that leaves the heights of its own points at corners of a cell costs as if that share of the cell were not
+    explained: planes are not continued far above or below their data where no points speak.
+
+    Returns
+    -------
+    (c, k) int64
+        In thousandths of an unexplained point.
+    """
+    k = len(planes)
+    costs = np.zeros((n_cells, k), np.int64)
+    lowest, highest = np.full(k, math.inf), np.full(k, -math.inf)
+    for i in range(len(points)):
+        if labels[i] >= 0:
+            lowest[labels[i]] = min(lowest[labels[i]], points[i, 2])
+            highest[labels[i]] = max(highest[labels[i]], points[i, 2])
+        cell = cells[i]
+        if cell < 0:
+            continue
+        for label in range(k):
+            off = vertical_distance_m(points[i], planes[label])
+            costs[cell, label] += int(COST_SCALE * min(off / cap_m, 1.0))
+    areas = cell_areas_m2(xy, graph, n_edges, n_cells)
+    beyond = np.zeros((n_cells, k), np.int64)
+    corners = np.zeros(n_cells, np.int64)
+    for h in range(n_edges):
+        cell = graph[h, FACE]
+        if cell < 0:
+            continue
+        corners[cell] += 1
+        x, y = xy[graph[h, ORIGIN], 0] * 1e-3, xy[graph[h, ORIGIN], 1] * 1e-3
+        for label in range(k):
+            z = planes[label, 0] * x + planes[label, 1] * y + planes[label, 2]
+            if lowest[label] <= highest[label] and (
+                z < lowest[label] - overshoot_m or z > highest[label] + overshoot_m
+            ):
+                beyond[cell, label] += 1
+    for cell in range(n_cells):
+        for label in range(k):
+            if beyond[cell, label] != 0:
+                share = beyond[cell, label] / corners[cell]
+                costs[cell, label] += int(COST_SCALE * share * areas[cell] * points_per_m2)
+    return costs
+
+
+@njit(cache=True, nogil=True)
+def cell_borders(xy: IntArray, graph: LabelArray, n_edges: int, cost_per_m: float) -> tuple[LabelArray, IntArray]:
+    """Pairs of cells that share an edge, and what a border of faces there costs."""
+    pairs = np.empty((n_edges // 2, 2), np.int32)
+    weights = np.empty(n_edges // 2, np.int64)
+    m = 0
+    for h in range(0, n_edges, 2):
+        f, g = graph[h, FACE], graph[h ^ 1, FACE]
+        if f < 0 or g < 0 or f == g:
+            continue
+        p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
+        length = math.hypot(float(xy[q, 0] - xy[p, 0]), float(xy[q, 1] - xy[p, 1])) * 1e-3
+        pairs[m, 0], pairs[m, 1] = f, g
+        weights[m] = int(COST_SCALE * cost_per_m * length)
+        m += 1
+    return pairs[:m], weights[:m]
+
+
+@njit(cache=True, nogil=True)
+def connected_faces(labels: LabelArray, pairs: LabelArray) -> tuple[LabelArray, int]:
+    """The face of every cell: cells of one label that hang together by edges, numbered by their lowest cell."""
+    parent = np.arange(len(labels)).astype(np.int32)
+    for e in range(len(pairs)):
+        a, b = pairs[e, 0], pairs[e, 1]
+        if labels[a] != labels[b]:
+            continue
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        while parent[b] != b:
+            parent[b] = parent[parent[b]]
+            b = parent[b]
+        parent[max(a, b)] = min(a, b)
+    faces = np.empty(len(labels), np.int32)
+    count = 0
+    for i in range(len(labels)):
+        if parent[i] == i:
+            faces[i] = count
+            count += 1
+        else:
+            root = i
+            while parent[root] != root:
+                root = parent[root]
+            faces[i] = faces[root]
+    return faces, count
+
+
+@njit(cache=True, nogil=True)
+def unite_faces(costs: IntArray, pairs: LabelArray, weights: IntArray, labels: LabelArray, face_cost: int) -> None:
+    """Give whole faces the label of a neighbour while that saves more than it costs, the best first.
+
+    It saves their common border, and a face for every neighbour with that label.
+    """
+    k = costs.shape[1]
+    while True:
+        faces, count = connected_faces(labels, pairs)
+        if count < 2:
+            return
+        data = np.zeros((count, k), np.int64)
+        label_of = np.empty(count, np.int32)
+        for i in range(len(labels)):
+            label_of[faces[i]] = labels[i]
+            data[faces[i]] += costs[i]
+        keys = np.empty(2 * len(pairs), np.int64)
+        between = np.empty(2 * len(pairs), np.int64)
+        m = 0
+        for e in range(len(pairs)):
+            f, g = faces[pairs[e, 0]], faces[pairs[e, 1]]
+            if f != g:
+                keys[m], keys[m + 1] = np.int64(f) * count + g, np.int64(g) * count + f
+                between[m] = between[m + 1] = weights[e]
+                m += 2
+        order = np.argsort(keys[:m], kind="mergesort")
+        best = np.int64(0)
+        best_face, best_label = -1, -1
+        saved = np.zeros(k, np.int64)
+        s = 0
+        while s < m:
+            f = keys[order[s]] // count
+            first = s
+            while s < m and keys[order[s]] // count == f:
+                label = label_of[keys[order[s]] % count]
+                saved[label] += between[order[s]]
+                if s == first or keys[order[s]] != keys[order[s - 1]]:
+                    saved[label] += face_cost
+                s += 1
+            for q in range(first, s):
+                label = label_of[keys[order[q]] % count]
+                change = data[f, label] - data[f, label_of[f]] - saved[label]
+                if change < best:
+                    best = change
+                    best_face, best_label = f, label
+            for q in range(first, s):
+                saved[label_of[keys[order[q]] % count]] = 0
+        if best_face < 0:
+            return
+        for i in range(len(labels)):
+            if faces[i] == best_face:
+                labels[i] = best_label

@@ -1,0 +1,293 @@
+"""Roof faces from labelled cells: borders that cross are parted, cells united, rings traced.
+
+Where two borders cross, walls of four faces can meet in one vertical edge, or one face can touch itself: no solid has
+such an edge (val3dity's 303). There a small corner of one face goes to its neighbour, which parts the borders.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
+from pipeline.roof.arrangement.cells import cell_borders, connected_faces
+from pipeline.roof.arrangement.subdivision import (
+    FACE,
+    LINE,
+    NEXT,
+    ORIGIN,
+    PREVIOUS,
+    insert_chord,
+    insert_vertex,
+)
+
+_CORNER_MM = 120.0
+"""Size of the corner that goes to a neighbour."""
+_LEAST_CORNER_MM = 40.0
+_STRAIGHT_MM = 2.0
+"""A vertex that was put on a line and bends it by less goes again."""
+_MOST_BORDERS = 32
+_LARGE_COST = 100.0
+"""Metres: more than heights differ by."""
+
+
+@njit(cache=True, nogil=True)
+def _face_left(graph: LabelArray, h: int, faces: LabelArray) -> int:
+    cell = graph[h, FACE]
+    return int(faces[cell]) if cell >= 0 else -1
+
+
+@njit(cache=True, nogil=True)
+def _borders_at(graph: LabelArray, h: int, faces: LabelArray, borders: LabelArray) -> int:
+    """The borders between faces that leave the origin of h, turning left; their number."""
+    m = 0
+    g = h
+    while True:
+        if m < len(borders) and _face_left(graph, g, faces) != _face_left(graph, g ^ 1, faces):
+            borders[m] = g
+            m += 1
+        # what comes in before g leaves to the left of it
+        g = graph[g, PREVIOUS] ^ 1
+        if g == h:
+            return m
+
+
+@njit(cache=True, nogil=True)
+def _crosses(around: LabelArray, heights: FloatArray, m: int) -> bool:
+    """Whether a face meets itself at a vertex, or walls of four faces meet above it."""
+    for i in range(m):
+        for j in range(i):
+            if around[i] == around[j]:
+                return True
+    for k in range(m):
+        changes = 0
+        for i in range(m):
+            changes += (heights[i] > heights[k]) != (heights[(i + 1) % m] > heights[k])
+        if changes > 2:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _give_corner(
+    xy: IntArray, graph: LabelArray, counts: LabelArray, labels: LabelArray, first: int, last: int, label: int
+) -> bool:
+    """Give the corner from half-edge `first` to the left up to `last` another label; whether all of it was given."""
+    g = first
+    while True:
+        v, w = graph[g, ORIGIN], graph[g ^ 1, ORIGIN]
+        dx, dy = float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1])
+        length = math.hypot(dx, dy)
+        size = min(_CORNER_MM, 0.4 * length)
+        if size < _LEAST_CORNER_MM or counts[0] >= len(xy) or counts[1] + 4 > len(graph):
+            return False
+        x, y = int(np.rint(xy[v, 0] + size / length * dx)), int(np.rint(xy[v, 1] + size / length * dy))
+        if not insert_vertex(xy, counts[0], graph, counts[1], g, x, y):
+            return False
+        counts[0] += 1
+        counts[1] += 2
+        if g == last:
+            break
+        g = graph[g, PREVIOUS] ^ 1
+    g = first
+    while g != last:
+        left = graph[g, PREVIOUS] ^ 1
+        u, v = graph[g ^ 1, ORIGIN], graph[left ^ 1, ORIGIN]
+        made = insert_chord(xy, graph, counts[1], counts[2], u, v, graph[g, FACE], -1)
+        if made >= 0:
+            counts[1] += 2
+        if made != 1:
+            return False
+        # the triangle lies left of the chord, and so is the new cell
+        labels[counts[2]] = label
+        counts[2] += 1
+        g = left
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _height_m(plane: FloatArray, x_mm: float, y_mm: float) -> float:
+    height: float = plane[0] * x_mm * 1e-3 + plane[1] * y_mm * 1e-3 + plane[2]
+    return height
+
+
+@njit(cache=True, nogil=True)
+def _corner_cost(
+    xy: IntArray, graph: LabelArray, planes: FloatArray, own: int, giver: int, beyond: int, edge: int
+) -> float:
+    """How much heights change where a corner takes its neighbour's plane, metres; much where planes would then cross.
+
+    Along `edge` the neighbour's plane meets that beyond the corner: where they cross close to the vertex, the solid
+    would get vertices too close to one another.
+    """
+    v, w = graph[edge, ORIGIN], graph[edge ^ 1, ORIGIN]
+    fraction = min(_CORNER_MM / math.hypot(float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1])), 0.4)
+    x, y = xy[v, 0] + fraction * (xy[w, 0] - xy[v, 0]), xy[v, 1] + fraction * (xy[w, 1] - xy[v, 1])
+    cost = abs(_height_m(planes[giver], x, y) - _height_m(planes[own], x, y))
+    if beyond >= 0 and beyond != giver:
+        at_vertex = _height_m(planes[giver], xy[v, 0], xy[v, 1]) - _height_m(planes[beyond], xy[v, 0], xy[v, 1])
+        at_end = _height_m(planes[giver], x, y) - _height_m(planes[beyond], x, y)
+        if at_vertex * at_end < 0.0:
+            cost += 0.1 * _LARGE_COST
+    return cost
+
+
+@njit(cache=True, nogil=True)
+def part_crossings(
+    xy: IntArray, graph: LabelArray, counts: LabelArray, labels: LabelArray, planes: FloatArray
+) -> tuple[LabelArray, int]:
+    """Part borders that cross such that no solid could stand on them.
+
+    Parameters
+    ----------
+    xy, graph, counts : arrays
+        The subdivision; changed in place.
+    labels : (c + room,) int32
+        Plane of every cell, with room for the new ones; changed in place.
+    planes : (k, 3) float64
+        Coefficients a, b, c.
+
+    Returns
+    -------
+    faces : (c,) int32
+        Face of every cell.
+    n_faces : int
+        Their number.
+    """
+    borders = np.empty(_MOST_BORDERS, np.int32)
+    around = np.empty(_MOST_BORDERS, np.int32)
+    plane_of = np.empty(_MOST_BORDERS, np.int32)
+    heights = np.empty(_MOST_BORDERS)
+    pairs, _ = cell_borders(xy, graph, counts[1], 0.0)
+    faces, n_faces = connected_faces(labels[: counts[2]], pairs)
+    leaving = np.full(len(xy), -1, np.int32)
+    for h in range(counts[1]):
+        leaving[graph[h, ORIGIN]] = h
+    for v in range(counts[0]):
+        # every corner that goes takes a border away from the vertex
+        while leaving[v] >= 0:
+            m = _borders_at(graph, leaving[v], faces, borders)
+            if m < 4:
+                break
+            for i in range(m):
+                around[i] = _face_left(graph, borders[i], faces)
+                heights[i] = -math.inf
+                plane_of[i] = -1
+                if around[i] >= 0:
+                    plane_of[i] = labels[graph[borders[i], FACE]]
+                    heights[i] = _height_m(planes[plane_of[i]], xy[v, 0], xy[v, 1])
+            if not _crosses(around, heights, m):
+                break
+            least = math.inf
+            corner, giver = -1, -1
+            for i in range(m):
+                for side in range(2):
+                    j, beyond = ((i + 1) % m, (i - 1) % m) if side == 0 else ((i - 1) % m, (i + 1) % m)
+                    if around[i] < 0 or around[j] < 0:
+                        continue
+                    edge = borders[i] if side == 0 else borders[(i + 1) % m]
+                    cost = _corner_cost(xy, graph, planes, plane_of[i], plane_of[j], plane_of[beyond], edge)
+                    if around[j] == around[beyond]:
+                        cost -= _LARGE_COST
+                    if cost < least:
+                        least = cost
+                        corner, giver = i, j
+            if corner < 0:
+                break
+            label = labels[graph[borders[giver], FACE]]
+            given = _give_corner(xy, graph, counts, labels, borders[corner], borders[(corner + 1) % m], label)
+            pairs, _ = cell_borders(xy, graph, counts[1], 0.0)
+            faces, n_faces = connected_faces(labels[: counts[2]], pairs)
+            if not given:
+                break
+    return faces, n_faces
+
+
+@njit(cache=True, nogil=True)
+def corners_of_borders(
+    xy: IntArray, graph: LabelArray, n_vertices: int, n_edges: int, n_outline: int, faces: LabelArray
+) -> BoolArray:
+    """Which vertices the faces need, (v,) bool.
+
+    The outline's own are needed; one that was put on a line is not where two faces only meet along that line.
+    """
+    degree = np.zeros(n_vertices, np.int32)
+    ends = np.full((n_vertices, 2), -1, np.int32)
+    for h in range(n_edges):
+        if _face_left(graph, h, faces) != _face_left(graph, h ^ 1, faces):
+            v = graph[h, ORIGIN]
+            if degree[v] < 2:
+                ends[v, degree[v]] = h
+            degree[v] += 1
+    needed = degree > 0
+    for v in range(n_outline, n_vertices):
+        if degree[v] != 2 or graph[ends[v, 0], LINE] != graph[ends[v, 1], LINE]:
+            continue
+        a, b = graph[ends[v, 0] ^ 1, ORIGIN], graph[ends[v, 1] ^ 1, ORIGIN]
+        dx, dy = float(xy[b, 0] - xy[a, 0]), float(xy[b, 1] - xy[a, 1])
+        cross = (xy[v, 0] - xy[a, 0]) * dy - (xy[v, 1] - xy[a, 1]) * dx
+        if abs(cross) <= _STRAIGHT_MM * math.hypot(dx, dy):
+            needed[v] = False
+    return needed
+
+
+@njit(cache=True, nogil=True)
+def trace_faces(
+    xy: IntArray, graph: LabelArray, n_edges: int, faces: LabelArray, needed: BoolArray
+) -> tuple[LabelArray, LabelArray, LabelArray]:
+    """The rings around all faces, outer rings to the left, holes to the right; rings that touch themselves are parted.
+
+    Returns
+    -------
+    vertices : (n,) int32
+        Vertices of the rings, one ring after the other, not closed.
+    starts : (r + 1,) int32
+        First vertex of every ring.
+    owner : (r,) int32
+        Face of every ring.
+    """
+    vertices = np.empty(n_edges, np.int32)
+    starts = np.zeros(n_edges + 1, np.int32)
+    owner = np.empty(n_edges, np.int32)
+    done = np.zeros(n_edges, np.bool_)
+    place = np.full(len(xy), -1, np.int32)
+    stack = np.empty(n_edges, np.int32)
+    n = 0
+    rings = 0
+    for start in range(n_edges):
+        face = _face_left(graph, start, faces)
+        if done[start] or face < 0 or face == _face_left(graph, start ^ 1, faces):
+            continue
+        depth = 0
+        h = start
+        while not done[h]:
+            done[h] = True
+            v = graph[h, ORIGIN]
+            if needed[v]:
+                if place[v] >= 0:
+                    # back at a vertex of this ring: what lies between is a ring of its own
+                    for s in range(place[v], depth):
+                        vertices[n] = stack[s]
+                        n += 1
+                        if s > place[v]:
+                            place[stack[s]] = -1
+                    depth = place[v]
+                    owner[rings] = face
+                    rings += 1
+                    starts[rings] = n
+                place[v] = depth
+                stack[depth] = v
+                depth += 1
+            h = graph[h, NEXT]
+            while _face_left(graph, h ^ 1, faces) == face:
+                h = graph[h ^ 1, NEXT]
+        for s in range(depth):
+            vertices[n] = stack[s]
+            n += 1
+            place[stack[s]] = -1
+        owner[rings] = face
+        rings += 1
+        starts[rings] = n
+    return vertices[:n].copy(), starts[: rings + 1].copy(), owner[:rings].copy()

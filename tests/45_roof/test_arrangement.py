@@ -1,0 +1,290 @@
+"""The arrangement: labelled points and planes to roof faces that fill an outline."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely import MultiPolygon, Polygon
+
+from pipeline.errors import BuildingError
+from pipeline.geometry import point_spacing_m
+from pipeline.model import FloatArray, Plane, Reason, Solid
+from pipeline.quality.validity import check_solid
+from pipeline.roof.arrangement import ArrangementSettings, arrange
+from pipeline.roof.footprint import footprint_in_mm
+from pipeline.roof.partition import RoofPartition
+from pipeline.roof.solid import solid_parts
+
+ExactRoofs = Callable[..., Any]
+Volume = Callable[[Solid], float]
+
+FACES = {"flat": 1, "pent": 1, "gable": 2, "hip": 4, "stepped": 2, "courtyard": 1, "dormer": 3, "tower": 2}
+SETTINGS = ArrangementSettings()
+
+
+def arranged(roof: Any, *, outline: shapely.Geometry | None = None) -> RoofPartition:
+    points = roof.candidate.points
+    planes = np.array([plane.coefficients for plane in roof.planes])
+    outline_mm = footprint_in_mm(roof.footprint if outline is None else outline)
+    return arrange(points, roof.labels, planes, outline_mm, point_spacing_m(points), SETTINGS)
+
+
+def strewn(outline: shapely.Geometry, density: float, seed: int = 0) -> FloatArray:
+    """Positions over an outline, in canonical order, with z = 0."""
+    x0, y0, x1, y1 = outline.bounds
+    rng = np.random.default_rng(seed)
+    n = round(density * (x1 - x0) * (y1 - y0))
+    xy = np.rint(np.column_stack((rng.uniform(x0, x1, n), rng.uniform(y0, y1, n))) * 1e3) / 1e3
+    xy = xy[shapely.intersects_xy(outline, xy[:, 0], xy[:, 1])]
+    return np.column_stack((xy[np.lexsort((xy[:, 1], xy[:, 0]))], np.zeros(len(xy))))
+
+
+def fills(partition: RoofPartition, outline: shapely.Geometry) -> bool:
+    """Whether the faces are a valid coverage with the outline's area and border."""
+    polygons = list(partition.polygons)
+    outline_mm = footprint_in_mm(outline)
+    return bool(
+        shapely.is_valid(polygons).all()
+        and shapely.coverage_is_valid(polygons)
+        and all(isinstance(polygon, Polygon) and polygon.area > 0.0 for polygon in polygons)
+        and abs(sum(polygon.area for polygon in polygons) / outline_mm.area - 1.0) < 1e-3
+        and shapely.hausdorff_distance(shapely.union_all(polygons).boundary, outline_mm.boundary) < 2.0
+    )
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 31.0])
+@pytest.mark.parametrize("kind", FACES)
+def test_a_dense_roof_gets_its_true_faces_and_one_valid_solid_of_the_true_volume(
+    exact_roof: ExactRoofs, volume: Volume, kind: str, turn_deg: float
+) -> None:
+    roof = exact_roof(kind, turn_deg=turn_deg, density=10.0, noise_m=0.03)
+    partition = arranged(roof)
+    assert fills(partition, roof.footprint)
+    assert sorted(set(partition.labels.tolist())) == list(range(len(roof.planes)))
+    assert len(partition.polygons) == FACES[kind]
+    (part,) = solid_parts(partition, roof.planes, 0.0)
+    assert check_solid(part.solid) == ()
+    assert volume(part.solid) == pytest.approx(roof.volume_m3, rel=0.01)
+
+
+def test_an_l_shaped_roof_gets_its_valley_and_its_ridges(exact_roof: ExactRoofs, volume: Volume) -> None:
+    roof = exact_roof("l", density=10.0, noise_m=0.02)
+    partition = arranged(roof)
+    assert fills(partition, roof.footprint)
+    (part,) = solid_parts(partition, roof.planes, 0.0)
+    assert check_solid(part.solid) == ()
+    assert volume(part.solid) == pytest.approx(roof.volume_m3, rel=0.005)
+    valley = shapely.LineString([(3.0, 5.0), (6.0, 8.0)])
+    borders = shapely.union_all([polygon.boundary for polygon in partition.polygons])
+    for fraction in (0.1, 0.5, 0.9):
+        place = valley.interpolate(fraction, normalized=True)
+        assert borders.distance(shapely.Point(place.x * 1e3, place.y * 1e3)) < 30.0
+
+
+@pytest.mark.parametrize("kind", ["gable", "hip", "stepped", "tower"])
+def test_one_point_a_square_metre_still_gives_the_true_faces(exact_roof: ExactRoofs, volume: Volume, kind: str) -> None:
+    roof = exact_roof(kind, density=1.0, noise_m=0.03)
+    partition = arranged(roof)
+    assert fills(partition, roof.footprint)
+    assert len(partition.polygons) == FACES[kind]
+    (part,) = solid_parts(partition, roof.planes, 0.0)
+    assert check_solid(part.solid) == ()
+    assert volume(part.solid) == pytest.approx(roof.volume_m3, rel=0.05)
+
+
+def test_the_ridge_lies_where_the_planes_cross_to_a_millimetre(exact_roof: ExactRoofs) -> None:
+    partition = arranged(exact_roof("gable", noise_m=0.05))
+    ridge = shapely.intersection(partition.polygons[0], partition.polygons[1])
+    assert shapely.get_coordinates(ridge)[:, 1].tolist() == pytest.approx([4000.0, 4000.0], abs=1.0)
+
+
+def test_the_partition_does_not_depend_on_the_order_of_the_points(exact_roof: ExactRoofs) -> None:
+    roof = exact_roof("dormer", noise_m=0.03)
+    first = arranged(roof)
+    order = np.random.default_rng(3).permutation(len(roof.labels))
+    planes = np.array([plane.coefficients for plane in roof.planes])
+    points = np.ascontiguousarray(roof.candidate.points[order])
+    second = arrange(
+        points, roof.labels[order], planes, footprint_in_mm(roof.footprint), point_spacing_m(points), SETTINGS
+    )
+    assert [polygon.wkb for polygon in first.polygons] == [polygon.wkb for polygon in second.polygons]
+    assert np.array_equal(first.labels, second.labels)
+
+
+def test_a_building_far_from_the_origin_gets_the_same_faces_there(exact_roof: ExactRoofs) -> None:
+    roof = exact_roof("hip", noise_m=0.03)
+    here = arranged(roof)
+    away = np.array([4000.0, -1500.0])
+    planes = np.array([plane.coefficients for plane in roof.planes])
+    moved = planes.copy()
+    moved[:, 2] -= planes[:, :2] @ away
+    points = np.rint((roof.candidate.points + np.array([*away, 0.0])) * 1e3) / 1e3
+    outline = footprint_in_mm(shapely.affinity.translate(roof.footprint, *away))
+    there = arrange(points, roof.labels, moved, outline, point_spacing_m(roof.candidate.points), SETTINGS)
+    assert np.array_equal(here.labels, there.labels)
+    for one, other in zip(here.polygons, there.polygons, strict=True):
+        back = shapely.transform(other, lambda xy: xy - away * 1e3)
+        assert shapely.hausdorff_distance(one, back) < 3.0
+
+
+def test_two_outlines_are_filled_each_for_itself(exact_roof: ExactRoofs) -> None:
+    roof = exact_roof("gable", noise_m=0.03)
+    halves = MultiPolygon([shapely.box(0, 0, 5, 8), shapely.box(7, 0, 12, 8)])
+    partition = arranged(roof, outline=halves)
+    assert fills(partition, halves)
+    assert sorted(partition.labels.tolist()) == [0, 0, 1, 1]
+    assert len(solid_parts(partition, roof.planes, 0.0)) == 2
+
+
+def test_a_ridge_is_cut_at_a_courtyard(volume: Volume) -> None:
+    outline = shapely.box(0, 0, 20, 12).difference(shapely.box(8, 4, 12, 8))
+    points = strewn(outline, 8.0)
+    planes = np.array([(0.0, 0.5, 3.0), (0.0, -0.5, 9.0)])
+    heights = points[:, :2] @ planes[:, :2].T + planes[:, 2]
+    points[:, 2] = heights.min(axis=1)
+    labels = heights.argmin(axis=1).astype(np.int32)
+    partition = arrange(points, labels, planes, footprint_in_mm(outline), 0.35, SETTINGS)
+    assert fills(partition, outline)
+    assert sorted(partition.labels.tolist()) == [0, 1]
+    (part,) = solid_parts(partition, [Plane(a=a, b=b, c=c, n_points=1, rmse_m=0.0) for a, b, c in planes], 0.0)
+    assert check_solid(part.solid) == ()
+    assert len(part.footprint.interiors) == 1
+    assert volume(part.solid) == pytest.approx(20 * 12 * 4.5 - 16 * 5.5, rel=1e-3)
+
+
+def test_a_step_around_a_courtyard_makes_a_face_with_a_hole() -> None:
+    outline = shapely.box(0, 0, 20, 20).difference(shapely.box(9, 9, 11, 11))
+    points = strewn(outline, 8.0)
+    inner = (np.abs(points[:, :2] - 10.0) < 5.0).all(axis=1)
+    points[:, 2] = np.where(inner, 9.0, 4.0)
+    partition = arrange(
+        points, inner.astype(np.int32), np.array([(0.0, 0.0, 4.0), (0.0, 0.0, 9.0)]), footprint_in_mm(outline), 0.35,
+        SETTINGS,
+    )  # fmt: skip
+    assert fills(partition, outline)
+    assert len(partition.polygons) == 2
+    assert [len(polygon.interiors) for polygon in partition.polygons] == [1, 1]
+
+
+def test_a_place_without_points_belongs_to_a_neighbour(exact_roof: ExactRoofs) -> None:
+    roof = exact_roof("gable", noise_m=0.02)
+    kept = roof.candidate.points[:, 0] < 9.0
+    planes = np.array([plane.coefficients for plane in roof.planes])
+    partition = arrange(
+        roof.candidate.points[kept], roof.labels[kept], planes, footprint_in_mm(roof.footprint), 0.35, SETTINGS
+    )
+    assert fills(partition, roof.footprint)
+    assert sorted(partition.labels.tolist()) == [0, 1]
+
+
+def test_a_steep_plane_is_not_continued_far_beyond_its_points() -> None:
+    outline = shapely.box(0, 0, 20, 6)
+    points = strewn(outline, 8.0)
+    # between 3 and 11 m there is nothing: half of it were nearer to the steep plane
+    points = points[(points[:, 0] < 3.0) | (points[:, 0] > 11.0)]
+    planes = np.array([(-1.5, 0.0, 12.0), (0.0, 0.0, 5.0)])
+    labels = (points[:, 0] > 10.0).astype(np.int32)
+    points[:, 2] = np.where(labels == 0, 12.0 - 1.5 * points[:, 0], 5.0)
+    partition = arrange(points, labels, planes, footprint_in_mm(outline), 0.35, SETTINGS)
+    assert fills(partition, outline)
+    steep = shapely.union_all([p for p, k in zip(partition.polygons, partition.labels, strict=True) if k == 0])
+    assert steep.area > 17e6
+    assert steep.bounds[2] < 7000.0
+
+
+def test_walls_of_four_faces_never_meet_in_one_edge() -> None:
+    outline = shapely.box(0, 0, 12, 12)
+    points = strewn(outline, 10.0)
+    east, north = points[:, 0] > 6.0, points[:, 1] > 6.0
+    labels = (2 * north + east).astype(np.int32)
+    planes = np.array([(0.0, 0.0, z) for z in (9.0, 4.0, 5.0, 8.0)])
+    points[:, 2] = planes[labels, 2]
+    partition = arrange(points, labels, planes, footprint_in_mm(outline), 0.3, SETTINGS)
+    assert fills(partition, outline)
+    assert sorted(set(partition.labels.tolist())) == [0, 1, 2, 3]
+    (part,) = solid_parts(partition, [Plane(a=a, b=b, c=c, n_points=1, rmse_m=0.0) for a, b, c in planes], 0.0)
+    assert check_solid(part.solid) == ()
+
+
+def test_faces_of_one_plane_do_not_touch_in_a_single_point() -> None:
+    outline = shapely.box(0, 0, 12, 12)
+    points = strewn(outline, 10.0)
+    labels = ((points[:, 0] > 6.0) != (points[:, 1] > 6.0)).astype(np.int32)
+    planes = np.array([(0.0, 0.0, 4.0), (0.0, 0.0, 8.0)])
+    points[:, 2] = planes[labels, 2]
+    partition = arrange(points, labels, planes, footprint_in_mm(outline), 0.3, SETTINGS)
+    assert fills(partition, outline)
+    (part,) = solid_parts(partition, [Plane(a=a, b=b, c=c, n_points=1, rmse_m=0.0) for a, b, c in planes], 0.0)
+    assert check_solid(part.solid) == ()
+
+
+def test_a_few_stray_points_make_no_face(exact_roof: ExactRoofs) -> None:
+    roof = exact_roof("flat", noise_m=0.02)
+    points = roof.candidate.points.copy()
+    points[::50, 2] += 2.0
+    partition = arrange(
+        points,
+        roof.labels,
+        np.array([(0.0, 0.0, 5.0), (0.0, 0.0, 7.0)]),
+        footprint_in_mm(roof.footprint),
+        0.35,
+        SETTINGS,
+    )
+    assert partition.labels.tolist() == [0]
+
+
+def test_a_tiny_outline_of_one_point_is_one_face() -> None:
+    partition = arrange(
+        np.array([(0.5, 0.5, 3.0)]), np.zeros(1, np.int32), np.array([(0.0, 0.0, 3.0), (0.0, 0.0, 5.0)]),
+        footprint_in_mm(shapely.box(0, 0, 0.9, 0.9)), 1.0, SETTINGS,
+    )  # fmt: skip
+    assert partition.labels.tolist() == [0]
+    assert partition.polygons[0].area == 810_000.0
+
+
+def test_without_planes_there_is_nothing_to_arrange() -> None:
+    with pytest.raises(BuildingError) as error:
+        arrange(
+            np.zeros((1, 3)), np.full(1, -1, np.int32), np.zeros((0, 3)), footprint_in_mm(shapely.box(0, 0, 4, 4)), 1.0,
+            SETTINGS,
+        )  # fmt: skip
+    assert error.value.reason is Reason.NO_PLANE
+
+
+def test_an_empty_outline_is_refused() -> None:
+    with pytest.raises(BuildingError) as error:
+        arrange(np.zeros((1, 3)), np.zeros(1, np.int32), np.zeros((1, 3)), MultiPolygon(), 1.0, SETTINGS)
+    assert error.value.reason is Reason.NO_PARTITION
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_any_outline_with_any_planes_is_filled_exactly_and_makes_valid_solids(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    corners = 5 + seed % 9
+    angles = np.sort(rng.uniform(0.0, 2 * math.pi, corners))
+    star = Polygon(np.column_stack((np.cos(angles), np.sin(angles))) * rng.uniform(5.0, 14.0, (corners, 1)))
+    outline = shapely.make_valid(star)
+    if seed % 3 == 0:
+        outline = outline.difference(shapely.Point(*rng.uniform(-2.0, 2.0, 2)).buffer(1.5, quad_segs=2))
+    outline_mm = footprint_in_mm(outline)
+    outline = shapely.transform(outline_mm, lambda xy: xy * 1e-3)
+    points = strewn(outline, 4.0, seed)
+    k = 2 + seed % 5
+    planes = np.column_stack((rng.uniform(-0.8, 0.8, (k, 2)), rng.uniform(20.0, 26.0, k)))
+    centres = points[rng.integers(0, len(points), k), :2]
+    labels = ((points[:, None, :2] - centres) ** 2).sum(axis=2).argmin(axis=1).astype(np.int32)
+    points[:, 2] = (
+        (points[:, :2] * planes[labels, :2]).sum(axis=1) + planes[labels, 2] + rng.normal(0.0, 0.04, len(points))
+    )
+    partition = arrange(points, labels, planes, outline_mm, 0.5, SETTINGS)
+    assert fills(partition, outline)
+    solids = solid_parts(partition, [Plane(a=a, b=b, c=c, n_points=1, rmse_m=0.0) for a, b, c in planes.tolist()], 0.0)
+    assert [check_solid(part.solid) for part in solids] == [()] * len(outline_mm.geoms)

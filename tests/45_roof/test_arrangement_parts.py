@@ -1,0 +1,189 @@
+"""The steps of the arrangement: minimum cuts, and the subdivision of an outline by chords."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import shapely
+
+from pipeline.model import IntArray, LabelArray
+from pipeline.roof.arrangement.cells import cell_areas_m2, cells_of_points, connected_faces, unite_faces
+from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
+from pipeline.roof.arrangement.subdivision import (
+    FACE,
+    NEXT,
+    ORIGIN,
+    PREVIOUS,
+    cell_at,
+    insert_chord,
+    insert_vertex,
+    outline_graph,
+    subdivide,
+)
+
+
+def random_graph(seed: int, n: int, k: int) -> tuple[IntArray, LabelArray, IntArray]:
+    rng = np.random.default_rng(seed)
+    pairs = np.array([pair for pair in itertools.combinations(range(n), 2) if rng.random() < 0.45], np.int32)
+    pairs = pairs.reshape(-1, 2)
+    return rng.integers(0, 60, (n, k)), pairs, rng.integers(1, 40, len(pairs))
+
+
+def cost(costs: IntArray, pairs: LabelArray, weights: IntArray, labels: LabelArray) -> int:
+    apart = labels[pairs[:, 0]] != labels[pairs[:, 1]]
+    return int(costs[np.arange(len(labels)), labels].sum() + weights[apart].sum())
+
+
+def expanded(costs: IntArray, pairs: LabelArray, weights: IntArray, labels: LabelArray) -> LabelArray:
+    labels = labels.copy()
+    expand_labels(costs, *every_label(*costs.shape), *neighbour_lists(len(costs), pairs, weights), labels, 20)
+    return labels
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_with_two_labels_the_cost_is_the_least_of_all(seed: int) -> None:
+    graph = random_graph(seed, 9, 2)
+    labels = expanded(*graph, np.zeros(9, np.int32))
+    every = (np.array(one, np.int32) for one in itertools.product(range(2), repeat=9))
+    assert cost(*graph, labels) == min(cost(*graph, one) for one in every)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_with_more_labels_no_expansion_is_left_that_costs_less(seed: int) -> None:
+    graph = random_graph(seed, 8, 4)
+    labels = expanded(*graph, graph[0].argmin(axis=1).astype(np.int32))
+    least = cost(*graph, labels)
+    for alpha, taken in itertools.product(range(4), itertools.product((False, True), repeat=8)):
+        assert cost(*graph, np.where(taken, alpha, labels).astype(np.int32)) >= least
+
+
+def test_a_label_that_costs_the_same_is_not_taken() -> None:
+    costs = np.array([[5, 5], [5, 5]])
+    labels = expanded(costs, np.array([[0, 1]], np.int32), np.array([3]), np.array([1, 1], np.int32))
+    assert labels.tolist() == [1, 1]
+
+
+def test_only_allowed_nodes_take_a_label() -> None:
+    costs = np.array([[9, 0], [9, 0]])
+    labels = np.zeros(2, np.int32)
+    lists = neighbour_lists(2, np.zeros((0, 2), np.int32), np.zeros(0, np.int64))
+    expand_labels(costs, np.array([0, 1, 1], np.int32), np.array([0, 2, 3], np.int32), *lists, labels, 5)
+    assert labels.tolist() == [0, 1]
+
+
+def test_a_face_that_explains_too_little_joins_its_neighbour_and_another_stays() -> None:
+    costs = np.array([[0, 900], [900, 600], [90_000, 0]])
+    pairs, weights = np.array([[0, 1], [1, 2]], np.int32), np.array([100, 100])
+    labels = np.array([0, 1, 1], np.int32)
+    unite_faces(costs, pairs, weights, labels, 500)
+    assert connected_faces(labels, pairs)[1] == 2
+    strict = labels.copy()
+    unite_faces(costs, pairs, weights, strict, 1_000_000)
+    assert connected_faces(strict, pairs)[1] == 1
+
+
+def square(holes: int = 0) -> tuple[IntArray, LabelArray, LabelArray]:
+    """A square of 10 m with small square holes along its diagonal, as a graph with its counts."""
+    rings = [np.array([(0, 0), (10_000, 0), (10_000, 10_000), (0, 10_000)])]
+    for hole in range(holes):
+        x = 2000 + 3000 * hole
+        rings.append(np.array([(x, x), (x, x + 1000), (x + 1000, x + 1000), (x + 1000, x)]))
+    starts = np.arange(0, 4 * len(rings) + 1, 4).astype(np.int32)
+    xy, graph = outline_graph(np.concatenate(rings), starts, np.zeros(len(rings), np.int32), 400)
+    return xy, graph, np.array([starts[-1], 2 * starts[-1], 1], np.int32)
+
+
+def loops(graph: LabelArray, n_edges: int) -> list[list[int]]:
+    """All loops of half-edges; every half-edge must lie in exactly one."""
+    left = set(range(n_edges))
+    found = []
+    while left:
+        start = min(left)
+        loop = [start]
+        left.discard(start)
+        h = int(graph[start, NEXT])
+        while h != start:
+            assert graph[h, FACE] == graph[start, FACE]
+            assert graph[graph[h, NEXT], PREVIOUS] == h
+            assert graph[h ^ 1, ORIGIN] == graph[graph[h, NEXT], ORIGIN]
+            left.remove(h)
+            loop.append(h)
+            h = int(graph[h, NEXT])
+        found.append(loop)
+    return found
+
+
+def test_a_chord_between_corners_makes_two_cells() -> None:
+    xy, graph, _ = square()
+    assert insert_chord(xy, graph, 8, 1, 0, 2, 0, 7) == 1
+    assert cell_areas_m2(xy, graph, 10, 2).tolist() == [50.0, 50.0]
+    assert len(loops(graph, 10)) == 3
+    assert {cell_at(xy, graph, 10, 9000.0, 1000.0), cell_at(xy, graph, 10, 1000.0, 9000.0)} == {0, 1}
+    assert cell_at(xy, graph, 10, -5.0, 5000.0) == -1
+
+
+def test_a_chord_to_a_hole_makes_one_loop_of_two_and_the_next_parts_the_cell() -> None:
+    xy, graph, _ = square(holes=1)
+    assert insert_chord(xy, graph, 16, 1, 0, 4, 0, 0) == 0
+    assert insert_chord(xy, graph, 18, 1, 6, 2, 0, 0) == 1
+    assert sorted(cell_areas_m2(xy, graph, 20, 2).tolist()) == [49.5, 49.5]
+    loops(graph, 20)
+
+
+def test_a_hole_stays_in_the_cell_that_it_lies_in() -> None:
+    xy, graph, _ = square(holes=1)
+    assert insert_vertex(xy, 8, graph, 16, 0, 6000, 0)
+    assert insert_vertex(xy, 9, graph, 18, 4, 6000, 10_000)
+    assert insert_chord(xy, graph, 20, 1, 8, 9, 0, 0) == 1
+    assert sorted(cell_areas_m2(xy, graph, 22, 2).tolist()) == [40.0, 59.0]
+    loops(graph, 22)
+
+
+def test_a_chord_through_a_hole_is_not_drawn() -> None:
+    xy, graph, _ = square(holes=2)
+    assert insert_chord(xy, graph, 24, 1, 0, 2, 0, 0) == -1
+
+
+def test_a_vertex_close_to_another_edge_is_not_inserted() -> None:
+    xy, graph, _ = square()
+    assert not insert_vertex(xy, 4, graph, 8, 0, 4, 0)
+    assert insert_vertex(xy, 4, graph, 8, 0, 40, 0)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_any_lines_leave_a_planar_graph_that_fills_the_outline(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    xy, graph, counts = square(holes=seed % 3)
+    area = cell_areas_m2(xy, graph, int(counts[1]), 1)[0]
+    n = 12
+    angles = np.round(rng.uniform(0.0, np.pi, n) * (4 if seed % 2 else 1000)) / (4 if seed % 2 else 1000)
+    through = rng.uniform(1.0, 9.0, (n, 2))
+    lines = np.column_stack((-np.sin(angles), np.cos(angles), np.zeros(n)))
+    lines[:, 2] = -(lines[:, :2] * through).sum(axis=1)
+    scores, numbers = rng.uniform(0.0, 1.0, n), np.arange(n).astype(np.int32)
+    subdivide(xy, graph, counts, lines, scores, np.zeros(n, np.int32), numbers, through, 1.0)
+    n_vertices, n_edges, n_cells = counts.tolist()
+    assert n_cells > 4
+    rings = loops(graph, n_edges)
+    component = list(range(n_vertices))
+    for h in range(0, n_edges, 2):
+        a, b = component[graph[h, ORIGIN]], component[graph[h ^ 1, ORIGIN]]
+        component = [a if one == b else one for one in component]
+    # Euler, with a loop for every border of a cell: vertices - edges + loops = 2 components
+    assert n_vertices - n_edges // 2 + len(rings) == 2 * len(set(component))
+    areas = cell_areas_m2(xy, graph, n_edges, n_cells)
+    assert (areas > 0.0).all()
+    assert areas.sum() == pytest.approx(area, abs=0.02)
+    edges = shapely.linestrings([(xy[graph[h, ORIGIN]], xy[graph[h ^ 1, ORIGIN]]) for h in range(0, n_edges, 2)])
+    tree = shapely.STRtree(edges)
+    for a, b in tree.query(edges, predicate="intersects").T.tolist():
+        if a < b:
+            common = set(graph[[2 * a, 2 * a + 1], ORIGIN].tolist()) & set(graph[[2 * b, 2 * b + 1], ORIGIN].tolist())
+            meeting = shapely.intersection(edges[a], edges[b])
+            assert len(common) == 1
+            assert shapely.get_coordinates(meeting).tolist() == [xy[common.pop()].tolist()]
+    places = np.column_stack((rng.uniform(0.2, 9.8, (200, 2)), np.zeros(200)))
+    cells = cells_of_points(xy, graph, n_edges, places)
+    assert cells.tolist() == [cell_at(xy, graph, n_edges, x * 1e3, y * 1e3) for x, y, _ in places.tolist()]
