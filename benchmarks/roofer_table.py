@@ -1,0 +1,425 @@
+"""The methods beside roofer 1.1.0-beta.1 on real points: `python benchmarks/roofer_table.py --out DIR`.
+
+    [--data ../shared/data] [--survey delft] [--methods METHOD[:PRESET] ...] [--skip PART ...] [--cold] [--repeat 3]
+
+roofer's figures were measured once on `delft_west` and `delft_east` with the given footprints and the file's classes;
+the methods are run here. A survey without given footprints is held against the outlines of its own class 6, and has
+no figures of roofer.
+
+- Processor seconds are those of a whole run of the command line, serial, in a process of its own, with all that it
+  starts: the least of `--repeat` runs after one that compiled what was missing. `--cold` measures one run with empty
+  caches of kernels and bytecode as well.
+- Milliseconds a building are processor time of `reconstruct_building` in this process, for the candidates as the
+  stages of a run find them; of `--repeat` times over the shortest of each building counts.
+- Delivered is what is ok and LoD2.2; valid are those whose solids keep all rules, by this program's own checker, and
+  by val3dity where GABLEWORK_VAL3DITY names that program.
+- Scores are over all points of class 6 inside the outlines, against the highest roof there; a point without a roof is
+  a miss. Top-visible points have no other one of the same building more than 1.1 m higher within 0.5 m in plan.
+- Buildings that differ are those of a serial run and one of two workers, by all columns that `gablework digest` counts.
+- Thinned surveys keep the points whose hash of their place is small, of all classes alike (`thinned_surveys.py`), so
+  that class 6 inside the outlines has the density told; the score is over the points of the whole survey.
+- Told less: class 6 made class 1, or no footprints given, or both. A building's loss is the share of its points within
+  0.2 m that it has less than with all told.
+
+Writes DIR/roofer_table_<survey>.md and the same figures, with those of each building, as .json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import os
+import platform
+import sys
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+
+from benchmarks.entries import Entry, Workplace, markdown_table, run_settings
+from benchmarks.method_times import Times, clock
+from benchmarks.run_scores import RunScore, ScoreLoss, differing_buildings, score_loss, score_run
+from benchmarks.survey_runs import Seconds, candidates_of, cold_run, run_survey
+from benchmarks.thinned_surveys import Change, roof_density, thinned, without_buildings, write_changed
+from pipeline.evaluation.reference import Reference
+from pipeline.evaluation.reference_points import read_points_reference
+from pipeline.io import ReadOptions
+from pipeline.runtime.compare import Variant
+
+PARTS = ("times", "seconds", "differences", "thinned", "told-less")
+"""What can be left out."""
+NO_CLASS_6, NO_FOOTPRINTS, NEITHER = "no-class-6", "no-footprints", "neither"
+
+
+def surveys(data: Path) -> dict[str, Entry]:
+    """The real surveys with building classes, by name."""
+    delft = tuple(data / "ahn3" / f"{name}.laz" for name in ("delft_west", "delft_east"))
+    entries = (
+        Entry(name="delft", tiles=delft, crs="EPSG:7415", footprints=data / "ahn3" / "footprints.gpkg"),
+        Entry(name="hdf_870000", tiles=(data / "ign" / "hdf_870000_6617100.laz",)),
+        Entry(name="hd_770500", tiles=(data / "ign" / "hd_770500_6277500.laz",)),
+    )
+    return {entry.name: entry for entry in entries}
+
+
+# --------------------------------------------------------------------------------------------------------- measuring
+
+
+def building_times(entry: Entry, variants: Sequence[Variant], repeat: int) -> dict[str, Times]:
+    """What each method takes for the candidates of a survey, in this process, by label."""
+    found = candidates_of(entry, run_settings(entry))
+    measured = [candidate for candidate in found if len(candidate.points)]
+    return clock(measured, variants, entry, repeat)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Figures:
+    """All that is measured of one method on one survey. What was left out is None or empty."""
+
+    whole: RunScore
+    """The survey as it is."""
+    warm: Seconds | None = None
+    """The cheapest of several runs that found all caches filled."""
+    cold: Seconds | None = None
+    """A run without caches."""
+    mean_ms: float = math.nan
+    """Processor time of a building."""
+    median_ms: float = math.nan
+    """Its median."""
+    differing: tuple[str, ...] | None = None
+    """Buildings that two runs made differently."""
+    thinned: Mapping[str, RunScore] = dataclasses.field(default_factory=dict)
+    """By the density."""
+    told_less: Mapping[str, RunScore] = dataclasses.field(default_factory=dict)
+    """By what was not told."""
+    losses: Mapping[str, ScoreLoss] = dataclasses.field(default_factory=dict)
+    """The same, building by building against `whole`."""
+
+
+def poorer_surveys(entry: Entry, reference: Reference, place: Workplace, skip: Collection[str]) -> dict[str, Entry]:
+    """The thinned surveys, by their density, and those that tell less, by what they do not tell. Writes their files."""
+    changes: dict[str, Change] = {}
+    if "thinned" not in skip:
+        found = roof_density(reference).per_m2
+        changes |= {f"{wanted:g}": thinned(wanted / found) for wanted in THINNED if wanted < found}
+    if "told-less" not in skip:
+        changes[NO_CLASS_6] = without_buildings
+    poorer = {}
+    for name, change in changes.items():
+        tiles = write_changed(entry.tiles, place.root / "surveys" / entry.name / name, change)
+        poorer[name] = dataclasses.replace(entry, name=f"{entry.name}-{name}", tiles=tiles)
+    if "told-less" not in skip and entry.footprints is not None:
+        poorer[NO_FOOTPRINTS] = dataclasses.replace(entry, name=f"{entry.name}-{NO_FOOTPRINTS}", footprints=None)
+        poorer[NEITHER] = dataclasses.replace(poorer[NO_CLASS_6], name=f"{entry.name}-{NEITHER}", footprints=None)
+    return poorer
+
+
+def measure(
+    entry: Entry,
+    poorer: Mapping[str, Entry],
+    variant: Variant,
+    reference: Reference,
+    place: Workplace,
+    arguments: argparse.Namespace,
+) -> Figures:
+    """Run one method on a survey and all that is made of it; the milliseconds are measured elsewhere."""
+    val3dity = os.environ.get("GABLEWORK_VAL3DITY")
+    out, skip = place.run(variant, entry), arguments.skip
+    first = run_survey(entry, variant, out)
+    told(variant, entry, first)
+    warm = cold = differing = None
+    if "seconds" not in skip:
+        runs = [run_survey(entry, variant, out) for _ in range(arguments.repeat)]
+        warm = min(runs, key=lambda run: run.processor)
+        told(variant, entry, warm)
+    if "differences" not in skip:
+        other = out.with_name("two_workers")
+        told(variant, entry, run_survey(entry, variant, other, workers=2))
+        differing = tuple(sorted(differing_buildings(out, other)))
+    if arguments.cold:
+        cold = cold_run(entry, variant, out.with_name("cold"))
+    whole = score_run(out, reference, val3dity)
+    scores = {}
+    for name, survey in poorer.items():
+        told(variant, survey, run_survey(survey, variant, place.run(variant, survey)))
+        scores[name] = score_run(place.run(variant, survey), reference, val3dity)
+    less = {name: score for name, score in scores.items() if name in TOLD_LESS}
+    return Figures(
+        whole=whole,
+        warm=warm,
+        cold=cold,
+        differing=differing,
+        thinned={name: score for name, score in scores.items() if name not in less},
+        told_less=less,
+        losses={name: score_loss(whole, score) for name, score in less.items()},
+    )
+
+
+def told(variant: Variant, entry: Entry, seconds: Seconds) -> None:
+    """Say on the terminal that a run is done."""
+    print(f"{variant.label} on {entry.name}: {seconds.processor:.1f} CPU s, {seconds.clock:.1f} s", flush=True)
+
+
+# ------------------------------------------------------------------------------------------------------------- table
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Row:
+    """A line of the table."""
+
+    label: str
+    """What is measured."""
+    roofer: str = ""
+    """roofer's figure on `delft`."""
+    required: str = ""
+    """What the default method has to reach there."""
+    stretch: str = ""
+    """What it should reach."""
+    cell: Callable[[Figures], str]
+    """A method's figure; empty where it was left out."""
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A figure; empty for nan."""
+    return "" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _seconds(one: Seconds | None) -> str:
+    return "" if one is None else f"{one.processor:.1f}"
+
+
+def _milliseconds(found: Figures) -> str:
+    return "" if math.isnan(found.mean_ms) else f"{number(found.mean_ms, 1)} / {number(found.median_ms, 1)}"
+
+
+def _lod2(score: RunScore) -> str:
+    return f"{score.lod2} of {score.candidates}"
+
+
+def _reasons(score: RunScore) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in score.reasons.items()) or "none"
+
+
+def _within(score: RunScore) -> str:
+    return number(score.within)
+
+
+def _both_within(score: RunScore) -> str:
+    return f"{number(score.within)} / {number(score.within_top)}"
+
+
+def _judged(own: int, other: int | None, whole: int) -> str:
+    """How many are valid by the own checker and by val3dity."""
+    return f"{own} / {'not run' if other is None else other} of {whole}"
+
+
+def _valid_elsewhere(found: Figures) -> str:
+    """Models of the poorer surveys that are valid."""
+    scores = [*found.thinned.values(), *found.told_less.values()]
+    if not scores:
+        return ""
+    others = [score.models_val3dity for score in scores if score.models_val3dity is not None]
+    own, whole = sum(score.models_valid for score in scores), sum(score.models for score in scores)
+    return _judged(own, sum(others) if len(others) == len(scores) else None, whole)
+
+
+def _poorer(name: str, cell: Callable[[RunScore], str], found: Figures) -> str:
+    """A figure of a poorer survey; empty where there is none."""
+    scores = {**found.thinned, **found.told_less}
+    return cell(scores[name]) if name in scores else ""
+
+
+def _loss(name: str, cell: Callable[[ScoreLoss], str], found: Figures) -> str:
+    """A figure of what a poorer survey loses; empty where there is none."""
+    return cell(found.losses[name]) if name in found.losses else ""
+
+
+def _buildings_that_lose_little(loss: ScoreLoss) -> str:
+    return f"{loss.within_5_points} / {loss.within_2_points} of {loss.buildings}"
+
+
+def _points_lost(loss: ScoreLoss) -> str:
+    return f"{number(100.0 * loss.mean, 1)} / {number(100.0 * loss.median, 1)}"
+
+
+THINNED: Mapping[float, tuple[tuple[str, str, str], tuple[str, str, str]]] = {
+    4.0: (("157", "157", "160"), (".75", ".78", ".81")),
+    2.0: (("136", "150", "160"), (".53", ".70", ".75")),
+    1.0: (("63", "130", "155"), (".34", ".55", ".62")),
+    0.5: (("0", "80", "140"), ("", ".40", ".50")),
+}
+"""By class-6 points a square metre: roofer, required and stretch of what is delivered, and of points within 0.2 m."""
+TOLD_LESS: Mapping[str, str] = {NO_CLASS_6: "no class 6", NO_FOOTPRINTS: "no footprints", NEITHER: "neither"}
+"""What is not told, and what the table calls it."""
+
+
+def _row(label: str, printed: tuple[str, str, str], cell: Callable[[Figures], str]) -> Row:
+    """A row with roofer's figure, what is required and the stretch."""
+    return Row(label=label, roofer=printed[0], required=printed[1], stretch=printed[2], cell=cell)
+
+
+def _thinned_rows() -> Iterator[Row]:
+    for density, (delivered, _) in THINNED.items():
+        yield _row(f"{density:g} class-6 points a m2: LoD2.2", delivered, partial(_poorer, f"{density:g}", _lod2))
+        yield Row(
+            label=f"{density:g} class-6 points a m2: what kept the others",
+            cell=partial(_poorer, f"{density:g}", _reasons),
+        )
+    for density, (_, within) in THINNED.items():
+        label = f"{density:g} class-6 points a m2: within 0.2 m of the full cloud"
+        yield _row(label, within, partial(_poorer, f"{density:g}", _within))
+
+
+def _told_less_rows() -> Iterator[Row]:
+    for name, label in TOLD_LESS.items():
+        yield Row(label=f"{label}: LoD2.2", roofer="0", cell=partial(_poorer, name, _lod2))
+        yield Row(label=f"{label}: within 0.2 m, all / top-visible", cell=partial(_poorer, name, _both_within))
+        yield Row(
+            label=f"{label}: buildings that lose at most 5 / 2 points",
+            cell=partial(_loss, name, _buildings_that_lose_little),
+        )
+        yield Row(
+            label=f"{label}: points that a building loses, mean / median",
+            required="5",
+            stretch="2",
+            cell=partial(_loss, name, _points_lost),
+        )
+
+
+ROWS: tuple[Row, ...] = (
+    Row(
+        label="CPU seconds in all, warm",
+        roofer="3.0",
+        required="3.0",
+        stretch="2.0",
+        cell=lambda found: _seconds(found.warm),
+    ),
+    Row(label="the same, cold", cell=lambda found: _seconds(found.cold)),
+    Row(
+        label="reconstruction of a building, ms, mean / median",
+        roofer="14 / 11",
+        required="10 / 5",
+        stretch="3 / 1.5",
+        cell=_milliseconds,
+    ),
+    Row(label="LoD2.2", roofer="160 of 160", required="158", stretch="160", cell=lambda found: _lod2(found.whole)),
+    Row(
+        label="valid of these, own checker / val3dity",
+        roofer="160 of 160",
+        required="158",
+        stretch="160",
+        cell=lambda found: _judged(found.whole.valid, found.whole.val3dity, found.whole.lod2),
+    ),
+    Row(
+        label="within 0.2 m of all class-6 points",
+        roofer=".814",
+        required=".83",
+        stretch=".85; .86",
+        cell=lambda found: number(found.whole.within),
+    ),
+    Row(
+        label="at this many roof faces",
+        roofer="588",
+        required="620",
+        stretch="675; 735",
+        cell=lambda found: str(found.whole.roof_faces),
+    ),
+    Row(label="points with a roof", cell=lambda found: number(found.whole.coverage)),
+    Row(
+        label="top-visible points within 0.2 m",
+        roofer=".894",
+        required=".91",
+        stretch=".93",
+        cell=lambda found: number(found.whole.within_top),
+    ),
+    Row(
+        label="top-visible points, median RMSE of a building, m",
+        roofer=".367",
+        required=".33",
+        stretch=".30",
+        cell=lambda found: number(found.whole.rmse_top_median_m),
+    ),
+    Row(
+        label="all points, median RMSE of a building, m",
+        roofer=".754",
+        cell=lambda found: number(found.whole.rmse_median_m),
+    ),
+    Row(
+        label="buildings that differ between runs",
+        roofer="2 to 5",
+        required="0",
+        stretch="0",
+        cell=lambda found: "" if found.differing is None else str(len(found.differing)),
+    ),
+    *_thinned_rows(),
+    *_told_less_rows(),
+    Row(label="models of these poorer surveys that are valid, own checker / val3dity", cell=_valid_elsewhere),
+)
+"""The table, line by line."""
+
+
+def roofer_table(found: Mapping[str, Figures], *, with_roofer: bool) -> str:
+    """The figures of all methods as Markdown.
+
+    Parameters
+    ----------
+    found : mapping
+        By the label of the method.
+    with_roofer : bool
+        Whether the survey is the one that roofer's figures, and the demands beside them, are of.
+    """
+    lines = []
+    for row in ROWS:
+        cells = [row.cell(figures) for figures in found.values()]
+        if any(cells):
+            lines.append([row.label, *([row.roofer, row.required, row.stretch] if with_roofer else []), *cells])
+    heads = ["", *(["roofer 1.1.0-beta.1", "required", "stretch"] if with_roofer else []), *found]
+    return markdown_table(heads, lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--survey", choices=tuple(surveys(Path())), default="delft")
+    parser.add_argument("--methods", nargs="+", metavar="METHOD[:PRESET]", default=["fuzzy-sart"])
+    parser.add_argument("--skip", nargs="+", choices=PARTS, default=[], help="parts that are left out")
+    parser.add_argument("--cold", action="store_true", help="one run without caches too")
+    parser.add_argument("--repeat", type=int, default=3, help="times over; the shortest time counts")
+    arguments = parser.parse_args(argv)
+    entry, place = surveys(arguments.data)[arguments.survey], Workplace(root=arguments.out)
+    variants = [Variant.parse(text) for text in arguments.methods]
+    reference = read_points_reference(entry.tiles, footprints=entry.footprints, read_options=ReadOptions(crs=entry.crs))
+    density = roof_density(reference)
+    head = (
+        f"{entry.name}: {len(reference.buildings)} outlines ({reference.outlines}), {density.points} points of "
+        f"class 6 in {density.area_m2:.0f} m2 of them, {density.per_m2:.2f} a m2; {os.cpu_count()} cores, "
+        f"{platform.machine()}, load {os.getloadavg()[0]:.1f} before.\n"
+    )
+    print(head, flush=True)
+    poorer = poorer_surveys(entry, reference, place, arguments.skip)
+    found = {variant.label: measure(entry, poorer, variant, reference, place, arguments) for variant in variants}
+    if "times" not in arguments.skip:
+        for label, times in building_times(entry, variants, arguments.repeat).items():
+            together = 1e3 * (times.segmentation_s + times.solids_s)
+            found[label] = dataclasses.replace(
+                found[label], mean_ms=float(together.mean()), median_ms=float(np.median(together))
+            )
+    text = f"{head}\n{roofer_table(found, with_roofer=entry.name == 'delft')}"
+    print(text)
+    place.root.mkdir(parents=True, exist_ok=True)
+    target = place.root / f"roofer_table_{entry.name}"
+    target.with_suffix(".md").write_text(text, encoding="utf-8")
+    figures = {label: dataclasses.asdict(one) for label, one in found.items()}
+    target.with_suffix(".json").write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

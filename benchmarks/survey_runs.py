@@ -1,0 +1,113 @@
+"""Whole runs of the command line with their processor seconds, and the candidates that such a run models."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from benchmarks.entries import Entry
+from pipeline.io import ReadOptions
+from pipeline.io.gps_time import GpsTimeKind
+from pipeline.model import Candidate
+from pipeline.runtime.compare import Variant
+from pipeline.runtime.events import ignore
+from pipeline.runtime.gather import gather
+from pipeline.runtime.plan import make_plan
+from pipeline.runtime.scratch import Scratch
+from pipeline.runtime.serial import SerialExecutor
+from pipeline.runtime.stages import Progress, Stages, given_footprints
+from pipeline.settings import RunSettings
+
+_ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Seconds:
+    """What a whole run cost."""
+
+    processor: float
+    """User and system time of the run's process and all that it waited for."""
+    clock: float
+    """Wall-clock time."""
+
+
+def run_survey(
+    entry: Entry, variant: Variant, out: Path, *, workers: int = 0, environment: Mapping[str, str] | None = None
+) -> Seconds:
+    """Run the command line on a survey, in a process of its own; nothing else may be started meanwhile.
+
+    Parameters
+    ----------
+    entry : Entry
+        Tiles, CRS, footprints, classes.
+    variant : Variant
+        Method and preset.
+    out : Path
+        The run directory; overwritten.
+    workers : int
+        Of the run.
+    environment : mapping, optional
+        Variables beside those of this process.
+
+    Raises
+    ------
+    RuntimeError
+        The run ended with a fault.
+    """
+    command = [sys.executable, "-m", "service.cli", "reconstruct", *map(str, entry.tiles), "--out", str(out)]
+    command += ["--method", variant.method, "--preset", variant.preset, "--classes", entry.classes]
+    command += ["--workers", str(workers), "--meshes", "none", "--overwrite", "--quiet"]
+    command += [] if entry.crs is None else ["--crs", entry.crs]
+    command += [] if entry.footprints is None else ["--footprints", str(entry.footprints)]
+    paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]  # the code that this file belongs to
+    variables = {**os.environ, **(environment or {}), "PYTHONPATH": os.pathsep.join(paths)}
+    before, began = _processor_s(), time.perf_counter()
+    told = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
+    seconds = Seconds(processor=_processor_s() - before, clock=time.perf_counter() - began)
+    if told.returncode:
+        raise RuntimeError(f"{variant.label} on {entry.name} ended with {told.returncode}: {told.stderr[-600:]}")
+    return seconds
+
+
+def _processor_s() -> float:
+    """Processor seconds of all child processes that ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def cold_run(entry: Entry, variant: Variant, out: Path) -> Seconds:
+    """A run that finds neither compiled kernels nor bytecode."""
+    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
+        empty = {"NUMBA_CACHE_DIR": f"{folder}/kernels", "PYTHONPYCACHEPREFIX": f"{folder}/bytecode"}
+        return run_survey(entry, variant, out, environment=empty)
+
+
+def candidates_of(entry: Entry, settings: RunSettings) -> list[Candidate]:
+    """The candidates of a survey as a run finds them, with the given footprints where there are any."""
+    tiles = [str(tile) for tile in entry.tiles]
+    plan = make_plan(tiles, ReadOptions(crs=entry.crs), settings)
+    given = None if entry.footprints is None else given_footprints(str(entry.footprints), plan)
+    kinds = {info.gps_time_kind for info in plan.sources}
+    kind = kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
+    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
+        scratch = Scratch(str(Path(folder, "scratch")))
+        scratch.create()
+        stages = Stages(
+            settings=settings,
+            meshes="none",
+            plan=plan,
+            progress=Progress(ignore),
+            executor=SerialExecutor(),
+            scratch=scratch,
+        )
+        splits = stages.split(stages.ingest(tiles), given)
+        joined = stages.outline(stages.join(splits, given, plan.sources[0].reference))
+        beside = settings.building.roof.at_walls
+        return [gather(scratch, plan.grid, site, kind, beside=beside)[0] for site in joined.candidates]

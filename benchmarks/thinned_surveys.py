@@ -1,0 +1,145 @@
+"""Point files as a poorer survey would give them: fewer points, or no buildings among the classes.
+
+A point stays where the hash of its place in whole millimetres lies below the wanted share: which points stay depends
+on no order, no file and no random generator, and what a sparse survey keeps every denser one keeps too. All classes
+are thinned alike, for a sparser survey has less ground too. The points left are as irregular as drawn ones: a flight
+that is planned for that density is more even.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import laspy
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from pipeline.evaluation.reference import Reference
+from pipeline.model import BoolArray, IntArray
+from pipeline.scene import BUILDING_CLASS
+
+UNCLASSIFIED = 1
+"""What a building point becomes where the buildings are not told."""
+
+_ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+_MIXERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
+_SHIFTS = (30, 27, 31)
+
+Change = Callable[[laspy.LasData], laspy.LasData]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RoofDensity:
+    """How densely the roofs of a reference were measured."""
+
+    points: int
+    """Points of class 6 inside the outlines of the buildings."""
+    area_m2: float
+    """Area of the outlines, overlaps once."""
+
+    @property
+    def per_m2(self) -> float:
+        """Points a square metre."""
+        return self.points / self.area_m2
+
+
+def roof_density(reference: Reference) -> RoofDensity:
+    """The density of class 6 inside the outlines of the reference buildings. Reads all points once."""
+    return RoofDensity(
+        points=sum(int(points.is_roof.sum()) for points in reference.points()),
+        area_m2=float(shapely.union_all([building.footprint for building in reference.buildings]).area),
+    )
+
+
+def place_hash(xyz_mm: IntArray) -> npt.NDArray[np.uint64]:
+    """A number between 0 and 2^64 for each place, evenly spread and unrelated between neighbours.
+
+    The coordinates are weighted by odd numbers and mixed by the finaliser of SplitMix64 (Steele, Lea and Flood 2014,
+    Fast splittable pseudorandom number generators), axis after axis.
+
+    Parameters
+    ----------
+    xyz_mm : (n, 3) int64
+        Places, whole millimetres.
+
+    Returns
+    -------
+    (n,) uint64
+        The same for the same place, whatever stands beside it.
+    """
+    mixed = np.zeros(len(xyz_mm), np.uint64)
+    for axis, weight in enumerate(_ODD):
+        mixed += (xyz_mm[:, axis].astype(np.uint64) + np.uint64(1)) * weight
+        for shift, mixer in zip(_SHIFTS, _MIXERS, strict=False):
+            mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(mixer)
+        mixed ^= mixed >> np.uint64(_SHIFTS[-1])
+    return mixed
+
+
+def kept(xyz_mm: IntArray, share: float) -> BoolArray:
+    """Which points of a survey stay.
+
+    Parameters
+    ----------
+    xyz_mm : (n, 3) int64
+        Places, whole millimetres.
+    share : float
+        About this share of them stays; all from 1 on.
+
+    Returns
+    -------
+    (n,) bool
+        True where a point stays.
+    """
+    if share >= 1.0:
+        return np.ones(len(xyz_mm), np.bool_)
+    below: BoolArray = place_hash(xyz_mm) < np.uint64(int(share * 2.0**64))
+    return below
+
+
+def thinned(share: float) -> Change:
+    """The change that leaves about a share of the points."""
+
+    def change(las: laspy.LasData) -> laspy.LasData:
+        places = np.rint(np.column_stack((las.x, las.y, las.z)) * 1e3).astype(np.int64)
+        las.points = las.points[kept(places, share)]
+        return las
+
+    return change
+
+
+def without_buildings(las: laspy.LasData) -> laspy.LasData:
+    """The change that tells no buildings: class 6 becomes 1, all else stays."""
+    classes = np.array(las.classification)
+    classes[classes == BUILDING_CLASS] = UNCLASSIFIED
+    las.classification = classes
+    return las
+
+
+def write_changed(tiles: Sequence[Path], folder: Path, change: Change) -> tuple[Path, ...]:
+    """Write point files that were changed, under their own names.
+
+    Parameters
+    ----------
+    tiles : sequence of Path
+        LAS or LAZ files, each read as a whole.
+    folder : Path
+        Where the changed ones go; made where it is not there.
+    change : callable
+        From the points of a file to those that are written.
+
+    Returns
+    -------
+    tuple of Path
+        The new files, in the order of the tiles.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for tile in tiles:
+        target = folder / tile.name
+        change(laspy.read(tile)).write(target)
+        written.append(target)
+    return tuple(written)
