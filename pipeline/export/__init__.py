@@ -1,1 +1,1 @@
-"""Results as GeoParquet, OBJ and CityJSON."""
+"""Results as GeoParquet, CityJSON, OBJ and GLB."""

@@ -12,13 +12,13 @@ import numpy as np
 
 from pipeline.export.coordinates import SpatialReference, crs_coordinates, decimals, epsg_code
 from pipeline.export.obj import part_id
+from pipeline.export.solid_geometry import SOLID_COLUMNS, SURFACES
 from pipeline.model import BuildingResult, FaceKind, Plane, Solid
 
 VERSION = "2.0"
 """Version of CityJSON."""
 
-_SURFACE = {FaceKind.ROOF: "RoofSurface", FaceKind.WALL: "WallSurface", FaceKind.GROUND: "GroundSurface"}
-_NOT_ATTRIBUTES = ("building_id", "geometry")
+_NOT_ATTRIBUTES = ("building_id", "geometry", *SOLID_COLUMNS)
 
 
 def cityjson_lines(
@@ -145,7 +145,7 @@ def _solid(solid: Solid, planes: Sequence[Plane], lod: str, first: int) -> dict[
 
 def _surface(kind: FaceKind, plane_id: int, planes: Sequence[Plane]) -> dict[str, Any]:
     """A semantic surface; those of roof planes tell slope and aspect as the `planes` table does."""
-    surface: dict[str, Any] = {"type": _SURFACE[kind]}
+    surface: dict[str, Any] = {"type": SURFACES[kind]}
     if plane_id >= 0:
         plane = planes[plane_id]
         surface["plane_id"] = plane_id

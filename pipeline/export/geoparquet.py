@@ -2,7 +2,7 @@
 
 Geometries are ISO WKB with planar edges and counter-clockwise exterior rings; an unknown coordinate reference system is
 told as `crs: null`, since a missing key would mean WGS 84. A `bbox` column covers the geometries, so that a reader can
-skip row groups.
+skip row groups. In `buildings` the footprint is the primary geometry, and `solid` is a second one.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ VERSION = "1.1.0"
 """Version of GeoParquet."""
 ROWS_A_GROUP = 20_000
 """Rows in one row group."""
+SOLID = "solid"
+"""The second column of geometry in `buildings`: the faces of the solids as a MultiPolygon Z."""
 
 _BBOX = pa.struct([pa.field(name, pa.float64(), nullable=False) for name in ("xmin", "ymin", "xmax", "ymax")])
 _DIMENSION_SUFFIX = {2: "", 3: " Z"}
@@ -35,7 +37,7 @@ def stored_schema(table_name: str) -> pa.Schema:
     return SCHEMAS[table_name].append(pa.field("bbox", _BBOX))
 
 
-def geo_metadata(geometries: Any, projjson: Mapping[str, Any] | None) -> dict[str, Any]:
+def geo_metadata(geometries: Any, projjson: Mapping[str, Any] | None, solids: Any | None = None) -> dict[str, Any]:
     """The `geo` entry of the file metadata.
 
     Parameters
@@ -44,7 +46,21 @@ def geo_metadata(geometries: Any, projjson: Mapping[str, Any] | None) -> dict[st
         Null ones are left out of types and bounds.
     projjson : mapping or None
         The coordinate reference system; None where it is unknown.
+    solids : array of shapely geometries, optional
+        Those of the column `solid` in tables that have it. Their rings run outward round the solid, not
+        counter-clockwise in plan, and nothing is told of their orientation. The footprint is the outline of the
+        solids, so that one `bbox` column covers both.
     """
+    column = _column_metadata(geometries, projjson)
+    column["orientation"] = "counterclockwise"
+    columns = {"geometry": column}
+    if solids is not None:
+        columns[SOLID] = _column_metadata(solids, projjson)
+    return {"version": VERSION, "primary_column": "geometry", "columns": columns}
+
+
+def _column_metadata(geometries: Any, projjson: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What every column of geometry tells: encoding, types, CRS, bounds."""
     present = geometries[~shapely.is_missing(geometries)]
     has_z = shapely.has_z(present)
     names = {
@@ -57,7 +73,6 @@ def geo_metadata(geometries: Any, projjson: Mapping[str, Any] | None) -> dict[st
         "geometry_types": sorted(names),
         "crs": None if projjson is None else dict(projjson),
         "edges": "planar",
-        "orientation": "counterclockwise",
         "covering": {"bbox": {name: ["bbox", name] for name in ("xmin", "ymin", "xmax", "ymax")}},
     }
     if len(present):
@@ -66,7 +81,7 @@ def geo_metadata(geometries: Any, projjson: Mapping[str, Any] | None) -> dict[st
             z = shapely.get_coordinates(present, include_z=True)[:, 2]
             bounds = [*bounds[:2], float(z.min()), *bounds[2:], float(z.max())]
         column["bbox"] = bounds
-    return {"version": VERSION, "primary_column": "geometry", "columns": {"geometry": column}}
+    return column
 
 
 def geo_table(table_name: str, rows: Sequence[Mapping[str, Any]], projjson: Mapping[str, Any] | None) -> pa.Table:
@@ -84,7 +99,7 @@ def geo_table(table_name: str, rows: Sequence[Mapping[str, Any]], projjson: Mapp
     schema, key = SCHEMAS[table_name], KEYS[table_name]
     ordered = sorted(rows, key=lambda row: tuple(row[column] for column in key))
     table = pa.Table.from_pylist([dict(row) for row in ordered], schema=schema)
-    geometries = shapely.from_wkb(np.array([row["geometry"] for row in ordered], dtype=object))
+    geometries = _from_wkb(ordered, "geometry")
     missing = shapely.is_missing(geometries)
     bounds = shapely.bounds(geometries).reshape(-1, 4)
     bbox = pa.StructArray.from_arrays(
@@ -93,8 +108,14 @@ def geo_table(table_name: str, rows: Sequence[Mapping[str, Any]], projjson: Mapp
         mask=pa.array(missing, pa.bool_()),
     )
     table = table.append_column(pa.field("bbox", _BBOX), bbox)
-    geo = json.dumps(geo_metadata(geometries, projjson), sort_keys=True, separators=(",", ":"))
+    solids = _from_wkb(ordered, SOLID) if SOLID in schema.names else None
+    geo = json.dumps(geo_metadata(geometries, projjson, solids), sort_keys=True, separators=(",", ":"))
     return table.replace_schema_metadata({"geo": geo})
+
+
+def _from_wkb(rows: Sequence[Mapping[str, Any]], column: str) -> Any:
+    """The geometries of a column, None where there is none."""
+    return shapely.from_wkb(np.array([row[column] for row in rows], dtype=object))
 
 
 def parquet_bytes(table: pa.Table) -> bytes:

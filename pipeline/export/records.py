@@ -15,6 +15,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.export.coordinates import SpatialReference, crs_coordinates, crs_elevation, crs_geometry, decimals
 from pipeline.export.dimensions import Dimensions, dimensions
+from pipeline.export.solid_geometry import solid_columns
 from pipeline.model import BuildingResult, Plane, Reason
 
 _TIME = pa.timestamp("us", tz="UTC")
@@ -32,6 +33,10 @@ BUILDINGS = pa.schema(
         pa.field("roof_type", pa.string(), nullable=False),
         pa.field("geometry", pa.binary()),
         pa.field("lod", pa.string()),
+        pa.field("solid", pa.binary()),
+        pa.field("solid_parts", pa.list_(pa.int32())),
+        pa.field("solid_surfaces", pa.list_(pa.string())),
+        pa.field("solid_planes", pa.list_(pa.int32())),
         pa.field("ground_z", pa.float64()),
         pa.field("eave_z", pa.float64()),
         pa.field("ridge_z", pa.float64()),
@@ -207,6 +212,7 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         "roof_type": result.roof_type.value,
         "geometry": _geometry(shapely.force_2d(footprint), result.origin, context.reference),
         "lod": result.lod or None,
+        **solid_columns(result, context.reference),
         **_elevations(result, measured, context.reference),
         "height_m": _or_none(measured.ridge_z_m - result.ground_z_m),
         "footprint_area_m2": None if footprint is None else _or_none(footprint.area),

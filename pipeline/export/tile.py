@@ -12,12 +12,13 @@ from pathlib import Path
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.geoparquet import geo_table, parquet_bytes
+from pipeline.export.glb import glb_bytes
 from pipeline.export.obj import obj_text
 from pipeline.export.records import RecordContext, RejectedObject, building_row, plane_rows, rejected_row
 from pipeline.model import BuildingResult
 
-MESHES = ("building", "tile", "none")
-"""What OBJ files a run writes: one a building, one a tile, none."""
+MESHES = ("building", "tile", "glb", "none")
+"""What meshes a run writes: one OBJ a building, one OBJ a tile, one GLB a tile, none."""
 
 Put = Callable[[str, bytes], None]
 """Stores bytes under a path relative to the run directory, atomically: readers see the old file or the new one."""
@@ -56,10 +57,12 @@ def put_local(run_dir: str | Path) -> Put:
 
 
 def mesh_path(tile_key: str, building_id: str, meshes: str) -> str | None:
-    """Where a building's OBJ lies in the run directory; None where none is written."""
+    """Where a building's mesh lies in the run directory; None where none is written."""
     if meshes == "none":
         return None
-    return f"meshes/{tile_key}/{building_id if meshes == 'building' else tile_key}.obj"
+    if meshes == "building":
+        return f"meshes/{tile_key}/{building_id}.obj"
+    return f"meshes/{tile_key}/{tile_key}.{'glb' if meshes == 'glb' else 'obj'}"
 
 
 def write_tile(
@@ -146,7 +149,12 @@ def _tile_files(
         )
         for result in results
     ]
-    lines = cityjson_lines(list(zip(results, rows, strict=True)), reference, f"buildings of tile {tile_key}")
+    lines = list(cityjson_lines(list(zip(results, rows, strict=True)), reference, f"buildings of tile {tile_key}"))
+    if meshes == "glb" and modelled:
+        yield (
+            f"meshes/{tile_key}/{tile_key}.glb",
+            glb_bytes(lines, reference.horizontal_unit_m, reference.vertical_unit_m),
+        )
     yield f"cityjson/tile={tile_key}/part-0.city.jsonl", "".join(f"{line}\n" for line in lines).encode()
     tables = {
         "planes": [row for result in results for row in plane_rows(result, context)],

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.geoparquet import geo_table, parquet_bytes
+from pipeline.export.glb import glb_bytes
 from pipeline.export.obj import obj_text
 from pipeline.export.records import (
     KEYS,
@@ -72,7 +73,7 @@ def updated_tile(
     context : RecordContext
         Facts of the run, and those of `results`.
     meshes : str
-        As the run was written: building, tile or none.
+        As the run was written: one of `pipeline.export.tile.MESHES`.
 
     Raises
     ------
@@ -105,7 +106,15 @@ def updated_tile(
     ]
     path = f"cityjson/tile={tile_key}/part-0.city.jsonl"
     fresh = cityjson_lines(list(zip(results, rows, strict=True)), context.reference, "")
-    files[path] = _merged_cityjson(_text(root / path), names, fresh).encode()
+    text = _merged_cityjson(_text(root / path), names, fresh)
+    files[path] = text.encode()
+    if meshes == "glb":
+        path = f"meshes/{tile_key}/{tile_key}.glb"
+        units_m = context.reference.horizontal_unit_m, context.reference.vertical_unit_m
+        if data := glb_bytes(text.splitlines(), *units_m):
+            files[path] = data
+        elif (root / path).is_file():
+            gone.append(path)
     added = {
         "planes": [row for result in results for row in plane_rows(result, context)],
         "rejected": [rejected_row(entry, context) for entry in rejected],

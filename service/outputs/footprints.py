@@ -13,12 +13,13 @@ import numpy.typing as npt
 import pyproj
 import shapely
 
+from pipeline.export.solid_geometry import SOLID_COLUMNS
 from service.outputs.catalogue import ResultsCrs
 
 DECIMALS = 9
 """Of degrees: a tenth of a millimetre."""
 
-_NOT_PROPERTIES = ("geometry", "bbox")
+_NOT_PROPERTIES = frozenset({"geometry", "bbox", *SOLID_COLUMNS})
 _UNKNOWN = (
     "The coordinate reference system of the tiles is unknown: these coordinates are theirs, not WGS 84. "
     "Give `crs` with the job to get degrees."
@@ -84,7 +85,7 @@ class FeatureText:
 
     building_id: str
     record: Mapping[str, Any]
-    """The row without geometry and bbox."""
+    """The row without geometries and bbox."""
     text: bytes
     """The GeoJSON feature."""
     geometry_start: int
@@ -117,15 +118,14 @@ def feature_texts(rows: Sequence[Mapping[str, Any]], way: Way) -> list[FeatureTe
     for row, mine, turned, bounds, bounds_deg in zip(
         rows, own, degrees, shapely.bounds(own), shapely.bounds(degrees), strict=True
     ):
-        record = {name: _plain(value) for name, value in row.items() if name not in ("geometry", "bbox")}
-        properties = {name: value for name, value in record.items() if name not in _NOT_PROPERTIES}
+        record = {name: _plain(value) for name, value in row.items() if name not in _NOT_PROPERTIES}
         geometry = _geojson(turned)
         head = b'{"type":"Feature","id":' + _json(row["building_id"]) + b',"geometry":'
         texts.append(
             FeatureText(
                 building_id=row["building_id"],
                 record=record,
-                text=head + geometry + b',"properties":' + _json(properties) + b"}",
+                text=head + geometry + b',"properties":' + _json(record) + b"}",
                 geometry_start=len(head),
                 geometry_size=len(geometry),
                 native=_geojson(mine),

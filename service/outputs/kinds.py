@@ -18,6 +18,8 @@ GEOJSON = "application/geo+json"
 """Media type of RFC 7946."""
 OBJ = "model/obj"
 """Media type of Wavefront OBJ."""
+GLB = "model/gltf-binary"
+"""Media type of glTF 2.0 in one binary file."""
 HTML = "text/html"
 """Media type of a page."""
 ZIP = "application/zip"
@@ -50,8 +52,8 @@ _OF_A_RUN = (
     OutputKind(
         output_id="buildings",
         title="Buildings as GeoParquet",
-        description="One row a candidate, modelled or not: status and reason, roof type, footprint, heights, volume, "
-        "quality and validity. GeoParquet 1.1 in the CRS of the tiles, all tiles in one file.",
+        description="One row a candidate, modelled or not: status and reason, roof type, footprint, solids, heights, "
+        "volume, quality and validity. GeoParquet 1.1 in the CRS of the tiles, all tiles in one file.",
         media_type=GEOPARQUET,
         filename="buildings.parquet",
         schema=_binary(GEOPARQUET),
@@ -74,9 +76,9 @@ _OF_A_RUN = (
     ),
     OutputKind(
         output_id="meshes",
-        title="Meshes as OBJ in a zip file",
-        description="The solids as Wavefront OBJ in full coordinates, one file a building (or a tile, if asked for). "
-        "The names in the zip file are those of the column mesh_path.",
+        title="Meshes as OBJ or GLB in a zip file",
+        description="The solids as Wavefront OBJ in full coordinates, one file a building (or a tile, if asked for); "
+        "or, if asked for, as GLB, one file a tile. The names in the zip file are those of the column mesh_path.",
         media_type=ZIP,
         filename="meshes.zip",
         schema=_binary(ZIP),

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.errors import RunError
-from pipeline.export.geoparquet import geo_metadata, stored_schema
+from pipeline.export.geoparquet import SOLID, geo_metadata, stored_schema
 
 ROWS_A_GROUP = 5_000
 """Rows in one row group: a reader with a window skips the groups whose `bbox` is elsewhere."""
@@ -37,7 +37,9 @@ class MergedTable:
     def __init__(
         self, path: Path, table_name: str, sources: Sequence[Path], projjson: Mapping[str, Any] | None
     ) -> None:
-        nothing = geo_metadata(np.empty(0, dtype=object), projjson)
+        no_geometry = np.empty(0, dtype=object)
+        solids = no_geometry if SOLID in stored_schema(table_name).names else None
+        nothing = geo_metadata(no_geometry, projjson, solids)
         geo = united_metadata(_metadata(source) for source in sources) if sources else nothing
         plain = stored_schema(table_name).append(pa.field("tile", pa.string(), nullable=False))
         self._schema = plain.with_metadata({"geo": json.dumps(geo, sort_keys=True, separators=(",", ":"))})
@@ -113,23 +115,24 @@ def united_metadata(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
     RunError
         There is none, or the files are of several CRS.
     """
-    united: dict[str, Any] | None = None
-    types: set[str] = set()
-    bounds: list[list[float]] = []
-    for part in parts:
-        column = part["columns"]["geometry"]
-        if united is not None and column["crs"] != united["columns"]["geometry"]["crs"]:
-            raise RunError("the tiles have more than one CRS: files of two runs lie in one directory")
-        united = united or part
-        types.update(column["geometry_types"])
-        bounds.extend([column["bbox"]] if "bbox" in column else [])
-    if united is None:
+    found = list(parts)
+    if not found:
         raise RunError("a merged table needs at least one tile")
-    column = {**united["columns"]["geometry"], "geometry_types": sorted(types)}
+    if any(part["columns"]["geometry"]["crs"] != found[0]["columns"]["geometry"]["crs"] for part in found):
+        raise RunError("the tiles have more than one CRS: files of two runs lie in one directory")
+    names = found[0]["columns"]
+    return {**found[0], "columns": {name: _united_column([part["columns"][name] for part in found]) for name in names}}
+
+
+def _united_column(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The metadata of one column of geometry in several files."""
+    types = {kind for part in parts for kind in part["geometry_types"]}
+    bounds = [part["bbox"] for part in parts if "bbox" in part]
+    column = {**parts[0], "geometry_types": sorted(types)}
     column.pop("bbox", None)
     if bounds:
         column["bbox"] = _united_bounds(bounds)
-    return {**united, "columns": {"geometry": column}}
+    return column
 
 
 def _united_bounds(bounds: Sequence[Sequence[float]]) -> list[float]:

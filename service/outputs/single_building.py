@@ -14,6 +14,7 @@ from service.errors import NoSuchBuildingError, NoSuchOutputError
 from service.outputs.building_index import FEATURES_NAME
 from service.outputs.building_pages import GONE, opened_index
 from service.outputs.meshes import building_lines
+from service.outputs.single_glb import cut_glb
 
 ID_PATTERN = "^[a-z2-7]{24}$"
 """What a building_id looks like."""
@@ -28,7 +29,7 @@ class StoredBuilding:
     tile: str
     """Its owner tile."""
     mesh_path: str | None
-    """Its OBJ file, relative to the run directory; None without one."""
+    """Its OBJ or GLB file, relative to the run directory; None without one."""
     feature: dict[str, Any]
     """Its GeoJSON feature."""
     planes: list[dict[str, Any]]
@@ -94,7 +95,33 @@ def building_obj(run_dir: Path, building: StoredBuilding) -> Iterator[str]:
     Raises
     ------
     NoSuchBuildingError
-        It has no model, the job was asked for no meshes, or its file is gone.
+        It has no model, the job was asked for no OBJ files, or its file is gone.
+    """
+    return building_lines(_mesh_file(run_dir, building, "obj"), building.building_id)
+
+
+def building_glb(run_dir: Path, building: StoredBuilding) -> bytes:
+    """A building's GLB, cut out of the file of its tile.
+
+    Raises
+    ------
+    NoSuchBuildingError
+        It has no model, the job was asked for no GLB files, or its file is gone.
+    """
+    path = _mesh_file(run_dir, building, "glb")
+    content = cut_glb(path, building.building_id)
+    if content is None:
+        raise NoSuchBuildingError(f"{path.name} holds no building {building.building_id}: submit the job again")
+    return content
+
+
+def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str) -> Path:
+    """The file of a building's mesh, of one kind.
+
+    Raises
+    ------
+    NoSuchBuildingError
+        There is none of this kind.
     """
     name = building.building_id
     if building.mesh_path is None:
@@ -102,10 +129,14 @@ def building_obj(run_dir: Path, building: StoredBuilding) -> Iterator[str]:
             why = building.feature["properties"]["reason"]
             raise NoSuchBuildingError(f"building {name} has no model ({why}), so it has no mesh")
         raise NoSuchBuildingError(f"this job was asked for no meshes: take building {name} as CityJSON")
+    kind = building.mesh_path.rpartition(".")[2]
+    if kind != wanted:
+        told = f"this job was asked for meshes as {kind.upper()}, not as {wanted.upper()}"
+        raise NoSuchBuildingError(f"{told}: take building {name} with f={kind}")
     path = run_dir / building.mesh_path
     if not path.is_file():
         raise NoSuchBuildingError(f"the mesh of building {name} is no longer in the state folder: submit the job again")
-    return building_lines(path, name)
+    return path
 
 
 def building_cityjson(run_dir: Path, building: StoredBuilding) -> dict[str, Any]:

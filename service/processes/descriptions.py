@@ -11,8 +11,8 @@ from service.drafts import ENDINGS, LONGEST_CRS, LONGEST_TEXT
 from service.outputs import OutputKind
 from service.settings import ServiceSettings
 
-MESHES = ("building", "tile", "none")
-"""How OBJ files are cut."""
+MESHES = ("building", "tile", "glb", "none")
+"""What meshes a job writes."""
 
 PRIORITY = 10
 """Largest priority; its negative is the least."""
@@ -143,7 +143,7 @@ def _inputs(
         ),
         "meshes": _input(
             "Meshes",
-            "One OBJ file a building, one a tile, or none.",
+            "One OBJ file a building (building) or a tile (tile), one GLB file a tile (glb), or none.",
             {"type": "string", "enum": list(MESHES), "default": MESHES[0]},
         ),
         "licence": _input("Licence", "Licence of the source data; goes into the results.", text),

@@ -22,11 +22,12 @@ from service.outputs.building_pages import (
     parsed_bbox,
 )
 from service.outputs.catalogue import ResultsCrs
-from service.outputs.kinds import CITYJSON, GEOJSON, OBJ
+from service.outputs.kinds import CITYJSON, GEOJSON, GLB, OBJ
 from service.outputs.single_building import (
     ID_PATTERN,
     StoredBuilding,
     building_cityjson,
+    building_glb,
     building_obj,
     stored_building,
 )
@@ -39,7 +40,7 @@ from service.routes.status import link
 
 router = APIRouter(tags=["results"])
 
-_FORMATS: Mapping[str, str] = {"json": GEOJSON, "obj": OBJ, "cityjson": CITYJSON}
+_FORMATS: Mapping[str, str] = {"json": GEOJSON, "obj": OBJ, "glb": GLB, "cityjson": CITYJSON}
 _CRS84 = CoordinateChoice.CRS84_URI.value
 
 _FEATURE_EXAMPLE: dict[str, Any] = {
@@ -233,6 +234,7 @@ def buildings(
             "content": {
                 GEOJSON: {"schema": _FEATURE, "example": _FEATURE_EXAMPLE},
                 OBJ: {"schema": {"type": "string"}},
+                GLB: {"schema": {"type": "string", "format": "binary"}},
                 CITYJSON: {"schema": _CITYJSON},
             },
             "headers": _CRS_HEADER,
@@ -248,11 +250,12 @@ def building(
         str, Path(alias="buildingID", description="As the lists tell it.", examples=["3givd2mvtyerfjxv2yytjbmi"])
     ],
     wanted: Annotated[
-        Literal["json", "obj", "cityjson"] | None, Query(alias="f", description="Stands above the header Accept.")
+        Literal["json", "obj", "glb", "cityjson"] | None,
+        Query(alias="f", description="Stands above the header Accept."),
     ] = None,
     crs: _Coordinates = None,
 ) -> Response:
-    """Tell one building: all columns and its roof planes, or its model as OBJ or CityJSON in the CRS of the tiles."""
+    """Tell one building: all columns and its roof planes, or its model as OBJ, GLB or CityJSON."""
     media_type = (
         preferred(request.headers.get("accept"), list(_FORMATS.values())) if wanted is None else _FORMATS[wanted]
     )
@@ -264,6 +267,10 @@ def building(
         lines = building_obj(finished.run_dir, found)
         content = "".join(f"{line}\n" for line in lines).encode()
         headers["Content-Disposition"] = f'inline; filename="{found.building_id}.obj"'
+    elif media_type == GLB:
+        content = building_glb(finished.run_dir, found)
+        headers.pop("Content-Crs", None)  # metres from an origin: the file tells it
+        headers["Content-Disposition"] = f'inline; filename="{found.building_id}.glb"'
     elif media_type == CITYJSON:
         content = _json(building_cityjson(finished.run_dir, found))
         headers["Content-Disposition"] = f'inline; filename="{found.building_id}.city.json"'
@@ -282,7 +289,8 @@ def _feature(found: StoredBuilding, finished: FinishedJob, base: str, *, native:
         link(finished.address(place, f="cityjson"), "alternate", "As CityJSON", CITYJSON),
     ]
     if found.mesh_path is not None:
-        links.append(link(finished.address(place, f="obj"), "alternate", "As OBJ", OBJ))
+        kind = found.mesh_path.rpartition(".")[2]
+        links.append(link(finished.address(place, f=kind), "alternate", f"As {kind.upper()}", _FORMATS[kind]))
     return {
         **found.feature,
         "properties": {**found.feature["properties"], "planes": found.planes},

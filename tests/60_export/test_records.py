@@ -25,9 +25,9 @@ from pipeline.export.records import (
 from pipeline.model import Plane
 
 DESIGNED = """building_id, source_id, source_attributes, status, reason, reason_detail, overridden, method, roof_type,
-geometry, lod, ground_z, eave_z, ridge_z, h_min, h_50p, h_70p, h_max, height_m, footprint_area_m2,
-roof_area_m2, volume_m3, n_points, density_per_m2, n_planes, rmse_m, p95_m, coverage, valid,
-validity_codes, touches_data_edge, acquired_from, acquired_to, mesh_path, input_hash, settings_hash,
+geometry, lod, solid, solid_parts, solid_surfaces, solid_planes, ground_z, eave_z, ridge_z, h_min, h_50p, h_70p, h_max,
+height_m, footprint_area_m2, roof_area_m2, volume_m3, n_points, density_per_m2, n_planes, rmse_m, p95_m, coverage,
+valid, validity_codes, touches_data_edge, acquired_from, acquired_to, mesh_path, input_hash, settings_hash,
 engine_version"""
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
 
@@ -79,6 +79,7 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
         *("source_id", "geometry", "lod", "eave_z", "ridge_z", "h_min", "h_50p", "h_70p", "h_max", "height_m"),
         *("footprint_area_m2", "roof_area_m2", "volume_m3", "density_per_m2", "rmse_m", "p95_m"),
         *("source_attributes", "overridden", "mesh_path", "input_hash"),
+        *("solid", "solid_parts", "solid_surfaces", "solid_planes"),
     }
     assert (row["valid"], row["n_planes"], row["coverage"], row["ground_z"]) == (False, 0, 0.0, 2.0)
 

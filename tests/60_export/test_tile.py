@@ -5,14 +5,17 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import small_buildings as small
 from small_buildings import Contexts, RejectedObjects
 
+from pipeline.cli.options import Meshes
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
-from pipeline.export.tile import put_local, write_tile
+from pipeline.export.tile import MESHES, put_local, write_tile
+from service.processes.descriptions import MESHES as OFFERED_BY_THE_SERVICE
 
 BUILT = (small.gable, small.two_parts, small.failed)
 
@@ -118,5 +121,10 @@ def test_one_building_twice_is_refused(tmp_path: Path, contexts: Contexts) -> No
 
 
 def test_an_unknown_kind_of_meshes_lists_the_known_ones(tmp_path: Path, contexts: Contexts) -> None:
-    with pytest.raises(RunError, match="'all': use one of building, tile, none"):
+    with pytest.raises(RunError, match="'all': use one of building, tile, glb, none"):
         write_tile(tmp_path, "t1", [], [], contexts["compound"], "all")
+
+
+def test_the_command_line_and_the_service_offer_the_meshes_that_are_written() -> None:
+    choices, _ = get_args(Meshes)
+    assert get_args(choices) == MESHES == OFFERED_BY_THE_SERVICE

@@ -35,7 +35,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("case", list(CASES))
-@pytest.mark.parametrize("meshes", ["building", "tile", "none"])
+@pytest.mark.parametrize("meshes", ["building", "tile", "glb", "none"])
 @pytest.mark.parametrize("crs", ["compound", "feet and metres", "US feet", "unknown"])
 def test_an_updated_tile_is_the_tile_written_whole(
     tmp_path: Path, contexts: Contexts, rejected_objects: RejectedObjects, crs: str, meshes: str, case: str

@@ -1,4 +1,4 @@
-"""Buildings by REST: pages by window and words against a slow twin, single buildings in three forms."""
+"""Buildings by REST: pages by window and words against a slow twin, single buildings in four forms."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "60_export"))
 
 import cityjson_rules
 import finished_runs as runs
+import glb_rules
 import small_buildings as small
 
 from pipeline.export.geoparquet import read_table
@@ -355,7 +356,7 @@ def test_the_form_is_chosen_by_f_or_by_the_header(client: TestClient, job_id: st
     assert client.get(path, headers=asked).headers["content-type"] == "application/city+json"
     assert client.get(path, params={"f": "obj"}, headers=asked).headers["content-type"] == "model/obj"
     assert client.get(path, headers={"Accept": "image/png"}).status_code == 406
-    assert client.get(path, params={"f": "glb"}).status_code == 400
+    assert client.get(path, params={"f": "png"}).status_code == 400
 
 
 def test_the_mesh_is_the_file_of_the_run(client: TestClient, service: runs.Service, job_id: str) -> None:
@@ -371,6 +372,62 @@ def test_the_mesh_out_of_a_tiles_file_is_the_same(client: TestClient, service: r
         )
         assert own.status_code == cut.status_code == 200
         assert own.content == cut.content
+
+
+@pytest.fixture(scope="module")
+def glb_job(service: runs.Service) -> str:
+    """A job that was asked for GLB files."""
+    return service.finished(lambda run_dir: runs.write_run(run_dir, meshes="glb"), meshes="glb")
+
+
+@pytest.mark.parametrize("name", ["gable", "courtyard", "two_parts", "pent", "far"])
+def test_the_glb_of_a_building_is_its_node_of_the_tiles_file(
+    client: TestClient, service: runs.Service, glb_job: str, name: str
+) -> None:
+    path = f"/jobs/{glb_job}/buildings/{runs.ident(name)}"
+    sent = client.get(path, params={"f": "glb"})
+    assert (sent.status_code, sent.headers["content-type"]) == (200, "model/gltf-binary")
+    assert sent.content == client.get(path, headers={"Accept": "model/gltf-binary"}).content
+    assert "content-crs" not in sent.headers
+    alone = glb_rules.read_glb(sent.content)
+    assert list(alone.nodes) == [runs.ident(name)]
+    mesh_path = alone.nodes[runs.ident(name)].extras["mesh_path"]
+    tile = glb_rules.read_glb((service.folder.run(glb_job, 1) / mesh_path).read_bytes())
+    mine, theirs = alone.nodes[runs.ident(name)], tile.nodes[runs.ident(name)]
+    assert alone.place == tile.place
+    assert mine.extras == theirs.extras
+    assert mine.translation.tolist() == theirs.translation.tolist()
+    assert len(mine.primitives) == len(theirs.primitives)
+    for own, other in zip(mine.primitives, theirs.primitives, strict=True):
+        assert (own.material, own.extras) == (other.material, other.extras)
+        assert (own.triangles == other.triangles).all()
+        assert (own.normals[own.indices] == other.normals[other.indices]).all()
+        assert (own.planes[own.indices] == other.planes[other.indices]).all()
+    links = {link["href"] for link in client.get(path).json()["links"] if link["type"] == "model/gltf-binary"}
+    assert [client.get(href).content for href in links] == [sent.content]
+
+
+def test_a_job_has_meshes_of_one_kind_and_names_it(client: TestClient, job_id: str, glb_job: str) -> None:
+    for job, asked, there in ((job_id, "glb", "obj"), (glb_job, "obj", "glb")):
+        answer = client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": asked})
+        assert answer.status_code == 404
+        assert answer.json()["detail"].endswith(f"take building {GABLE} with f={there}")
+        assert client.get(f"/jobs/{job}/buildings/{GABLE}", params={"f": there}).status_code == 200
+    failed = client.get(f"/jobs/{glb_job}/buildings/{FAILED}", params={"f": "glb"})
+    assert failed.status_code == 404
+    assert "has no model (too_few_points)" in failed.json()["detail"]
+
+
+def test_a_glb_that_is_gone_or_another_is_told(client: TestClient, service: runs.Service) -> None:
+    job = service.finished(lambda run_dir: runs.write_run(run_dir, meshes="glb"), meshes="glb")
+    (path,) = service.folder.run(job, 1).glob("meshes/x851_y4470/*.glb")
+    (other,) = service.folder.run(job, 1).glob("meshes/x850_y4470/*.glb")
+    path.write_bytes(other.read_bytes())
+    answer = client.get(f"/jobs/{job}/buildings/{TWO_PARTS}", params={"f": "glb"})
+    assert (answer.status_code, "holds no building" in answer.json()["detail"]) == (404, True)
+    path.unlink()
+    answer = client.get(f"/jobs/{job}/buildings/{TWO_PARTS}", params={"f": "glb"})
+    assert (answer.status_code, "no longer in the state folder" in answer.json()["detail"]) == (404, True)
 
 
 def test_a_building_without_model_has_no_mesh_and_says_why(client: TestClient, job_id: str) -> None:
@@ -429,7 +486,7 @@ def test_the_city_object_is_a_document_of_its_own(client: TestClient, job_id: st
     [runs.ident("nobody"), "x", "A" * 24, "a" * 25, "..", "%2e%2e%2frun.json", "..%2f..%2frun.json", "%00", "' OR 1"],
 )
 def test_any_other_id_is_no_building(client: TestClient, job_id: str, name: str) -> None:
-    for form in ("json", "obj", "cityjson"):
+    for form in ("json", "obj", "glb", "cityjson"):
         answer = client.get(f"/jobs/{job_id}/buildings/{name}", params={"f": form})
         # a path that leads elsewhere is never a building
         assert answer.status_code == 404 or "jobID" in answer.json()
@@ -494,7 +551,12 @@ def test_the_openapi_document_describes_pages_and_buildings(client: TestClient) 
     told = {word.strip(" `") for row in rows for word in row.split(",")}
     assert {entry["name"] for entry in listed["parameters"]} - {"jobID"} <= told
     one = described["/jobs/{jobID}/buildings/{buildingID}"]["get"]["responses"]
-    assert set(one["200"]["content"]) == {"application/geo+json", "model/obj", "application/city+json"}
+    assert set(one["200"]["content"]) == {
+        "application/geo+json",
+        "model/obj",
+        "model/gltf-binary",
+        "application/city+json",
+    }
     for answers in (listed["responses"], one):
         assert {"200", "400", "401", "403", "404", "406", "422", "429", "500", "503"} <= set(answers)
     assert listed["responses"]["200"]["content"]["application/geo+json"]["example"]["features"]

@@ -30,6 +30,7 @@ import small_buildings as small
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
+from pipeline.export.solid_geometry import SOLID_COLUMNS
 from pipeline.runtime.manifest import RunStatus
 from service.errors import NoSuchOutputError
 from service.outputs import OUTPUTS, merged_table, output_file, read_catalogue, write_outputs
@@ -201,6 +202,8 @@ def test_geopandas_and_duckdb_read_the_buildings_with_crs_and_window(out_dir: Pa
     assert frame.crs.to_epsg() == 7415
     assert len(frame) == 6
     assert frame.geometry.isna().sum() == 1
+    assert frame.set_geometry("solid").crs.to_epsg() == 7415
+    assert frame["solid"].isna().tolist() == frame["lod"].isna().tolist()
     window = geopandas.read_parquet(path, bbox=(84_990.0, 446_990.0, 85_011.0, 447_011.0))
     assert list(window.building_id) == [runs.ident("gable")]
     with duckdb.connect() as database:
@@ -294,7 +297,7 @@ def test_the_footprints_are_rfc_7946_with_all_columns_and_nobody_missing(out_dir
     assert found["type"] == "FeatureCollection"
     assert "coordRefSys" not in found
     assert sorted(feature["id"] for feature in found["features"]) == sorted(table["building_id"].to_pylist())
-    columns = set(table.schema.names) - {"geometry", "bbox"}
+    columns = set(table.schema.names) - {"geometry", "bbox", *SOLID_COLUMNS}
     for feature in found["features"]:
         assert set(feature["properties"]) == columns
         if feature["geometry"] is None:

@@ -7,8 +7,8 @@ import { bytes } from "./numbers";
 /** Outputs of the process, in the order in which people want them: label, what it is, name of the file. */
 const OUTPUTS: Record<string, [string, string, string]> = {
   cityjson: ["CityJSON", "All models with semantics, CityJSONSeq 2.0", "buildings.city.jsonl"],
-  meshes: ["OBJ", "One file a building, zipped", "meshes.zip"],
-  buildings: ["GeoParquet", "Every building's record with its footprint", "buildings.parquet"],
+  meshes: ["Meshes", "OBJ or GLB as the job was asked for, zipped", "meshes.zip"],
+  buildings: ["GeoParquet", "Every building's record with its footprint and solids", "buildings.parquet"],
   planes: ["GeoParquet, planes", "Every roof plane: slope, aspect, area, fit", "planes.parquet"],
   rejected: ["GeoParquet, rejected", "What was judged to be no building, and why", "rejected.parquet"],
   geojson: ["GeoJSON", "Footprints with the record, for any GIS", "buildings.geojson"],

@@ -147,7 +147,7 @@ function record(
     ...(codes.length > 0 ? [el("p", { class: "hint" }, `Codes of the method's own solid: ${codes.join(", ")}`)] : []),
     ...tables,
     ...planes(properties["planes"]),
-    ...(modelled ? [takeAway(path, method, buildingId)] : []),
+    ...(modelled ? [takeAway(properties["mesh_path"], path, method, buildingId)] : []),
   ];
 }
 
@@ -175,11 +175,13 @@ function planes(value: unknown): HTMLElement[] {
   ];
 }
 
-function takeAway(path: string, method: string | null, buildingId: string): HTMLElement {
+/** Downloads of one building; a job has meshes of one kind, or none. */
+function takeAway(meshPath: unknown, path: string, method: string | null, buildingId: string): HTMLElement {
+  const kind = typeof meshPath === "string" ? meshPath.slice(meshPath.lastIndexOf(".") + 1) : null;
   return el(
     "div",
     { class: "record-links" },
-    downloadLink("OBJ", ofRun(`${path}?f=obj`, method), `${buildingId}.obj`),
+    kind === null ? null : downloadLink(kind.toUpperCase(), ofRun(`${path}?f=${kind}`, method), `${buildingId}.${kind}`),
     downloadLink("CityJSON", ofRun(`${path}?f=cityjson`, method), `${buildingId}.city.json`),
   );
 }

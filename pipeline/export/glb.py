@@ -1,0 +1,328 @@
+"""glTF 2.0 in one binary file (GLB): a node a building with its record, a material a semantic surface.
+
+glTF knows metres, 32-bit floats and a y axis that points up. So every building has a node of its own, whose
+translation is whole metres from the file's origin, and vertices in metres from there: x is easting, y elevation, z
+minus northing. Millimetres survive that way, and `asset.extras` tells the origin and the units, which lead back to the
+CRS. The models are taken from CityJSONSeq, so both files always tell the same.
+
+The rules are those of the Khronos Group's glTF 2.0 specification (ISO/IEC 12113:2022).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.model import FloatArray, IntArray
+from pipeline.triangulation.faces import DONE, triangulate_rings
+from pipeline.triangulation.projection import area_vector
+
+VERSION = "2.0"
+"""Version of glTF."""
+MATERIALS: Mapping[str, tuple[float, float, float]] = {
+    "RoofSurface": (0.50, 0.09, 0.06),
+    "WallSurface": (0.71, 0.66, 0.58),
+    "GroundSurface": (0.25, 0.25, 0.25),
+}
+"""A material a semantic surface of CityJSON, by its name, with its colour in linear RGB."""
+PLANE_ID = "_PLANE_ID"
+"""Vertex attribute: `plane_id` of the roof plane, -1 on walls and ground."""
+
+Float32Array = npt.NDArray[np.float32]
+
+_MM = 1000
+_MAGIC, _CONTAINER_VERSION = 0x46546C67, 2
+_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+_FLOAT, _UNSIGNED_INT = 5126, 5125
+_VERTICES, _INDICES = 34962, 34963
+_AXES = (
+    "metres from origin_m: x easting, y elevation, z minus northing; "
+    "easting = (origin_m[0] + x) / horizontal_unit_m, northing = (origin_m[1] - z) / horizontal_unit_m, "
+    "elevation = (origin_m[2] + y) / vertical_unit_m"
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Mesh:
+    """The solids of one building as triangles."""
+
+    low_mm: IntArray
+    """(3,) easting, northing, elevation below all corners: whole metres, in mm."""
+    positions: Float32Array
+    """(v, 3) metres from there, in glTF's axes; every face has corners of its own."""
+    normals: Float32Array
+    """(v, 3) unit normals of the faces, outward."""
+    planes: Float32Array
+    """(v,) number of the roof plane, -1 elsewhere."""
+    triangles: tuple[tuple[str, str, IntArray], ...]
+    """Name of the part, semantic surface, and its triangles (t, 3), counter-clockwise seen from outside."""
+
+
+def glb_bytes(lines: Iterable[str], horizontal_unit_m: float = 1.0, vertical_unit_m: float = 1.0) -> bytes:
+    """The buildings of a CityJSONSeq text as a GLB file; the same text gives the same bytes.
+
+    Parameters
+    ----------
+    lines : iterable of str
+        As `pipeline.export.cityjson.cityjson_lines` makes them. Buildings without a solid are left out.
+    horizontal_unit_m, vertical_unit_m : float
+        Metres in one unit of easting and northing, and of elevation.
+
+    Returns
+    -------
+    bytes
+        The file; empty where no building has a solid, since glTF has no empty scene of meshes.
+
+    Raises
+    ------
+    ValueError
+        A face cannot be cut into triangles: it crosses or touches itself.
+    """
+    heading, *features = (json.loads(line) for line in lines)
+    frame = _Frame.of(heading["transform"], (horizontal_unit_m, horizontal_unit_m, vertical_unit_m))
+    modelled = [(feature, mesh) for feature in features if (mesh := _mesh(feature, frame)) is not None]
+    if not modelled:
+        return b""
+    origin_mm = np.min([mesh.low_mm for _, mesh in modelled], axis=0)
+    scene = _Scene()
+    for feature, mesh in modelled:
+        name = str(feature["id"])
+        attributes = feature["CityObjects"][name]["attributes"]
+        scene.add(name, {"building_id": name, **attributes}, mesh, origin_mm)
+    metadata = heading["metadata"]
+    place = {
+        "origin_m": [int(v) // _MM for v in origin_mm],
+        "horizontal_unit_m": horizontal_unit_m,
+        "vertical_unit_m": vertical_unit_m,
+        "crs": metadata.get("referenceSystem"),
+        "axes": _AXES,
+    }
+    return scene.file(str(metadata["title"]), place)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Frame:
+    """The transform of a CityJSONSeq text."""
+
+    shift: IntArray
+    """(3,) what the translation adds to a vertex, in steps of its scale."""
+    steps: IntArray
+    """(3,) steps in one unit of the CRS: powers of ten."""
+    units_m: FloatArray
+    """(3,) metres in one unit."""
+
+    @classmethod
+    def of(cls, transform: Mapping[str, Sequence[float]], units_m: Sequence[float]) -> _Frame:
+        steps = np.array([10 ** round(-math.log10(scale)) for scale in transform["scale"]], dtype=np.int64)
+        shift = np.rint(transform["translate"]).astype(np.int64) * steps
+        return cls(shift=shift, steps=steps, units_m=np.array(units_m))
+
+    def millimetres(self, vertices: Sequence[Sequence[int]]) -> IntArray:
+        """Absolute coordinates in mm, shape (v, 3): the exporters keep 1 mm in any unit."""
+        steps = np.array(vertices, dtype=np.int64).reshape(-1, 3) + self.shift
+        return np.rint(steps / self.steps * self.units_m * _MM).astype(np.int64)
+
+
+def _mesh(feature: Mapping[str, Any], frame: _Frame) -> _Mesh | None:
+    """The triangles of a feature's solids; None where it has none."""
+    corners, ring_starts, face_starts = [], [0], [0]
+    told: list[tuple[str, str]] = []
+    planes: list[int] = []
+    for part, entry in feature["CityObjects"].items():
+        for geometry in entry.get("geometry", ()):
+            semantics = geometry["semantics"]
+            for face, value in zip(geometry["boundaries"][0], semantics["values"][0], strict=True):
+                for ring in face:
+                    corners.extend(ring)
+                    ring_starts.append(len(corners))
+                face_starts.append(len(ring_starts) - 1)
+                surface = semantics["surfaces"][value]
+                told.append((part, surface["type"]))
+                planes.extend([surface.get("plane_id", -1)] * (len(corners) - len(planes)))
+    if not corners:
+        return None
+    xyz_mm = frame.millimetres(feature["vertices"])[np.array(corners, dtype=np.int64)]
+    low_mm = xyz_mm.min(axis=0) // _MM * _MM
+    local_mm = xyz_mm - low_mm
+    triangles, counts, normals = _triangulated(local_mm, np.array(ring_starts), np.array(face_starts))
+    if len(counts) < len(told):
+        part, surface_type = told[len(counts)]
+        raise ValueError(f"face {len(counts)} of {part}, a {surface_type}, cannot be cut into triangles")
+    of_face = np.repeat(np.arange(len(told)), counts)
+    groups: dict[tuple[str, str], list[int]] = {}
+    for index, key in enumerate(told):
+        groups.setdefault(key, []).append(index)
+    parts = list(dict.fromkeys(part for part, _ in told))
+    wanted = [(part, name) for part in parts for name in MATERIALS if (part, name) in groups]
+    return _Mesh(
+        low_mm=low_mm,
+        positions=_gltf_axes(local_mm / _MM),
+        normals=_gltf_axes(normals),
+        planes=np.array(planes, dtype="<f4"),
+        triangles=tuple((*key, triangles[np.isin(of_face, groups[key])]) for key in wanted),
+    )
+
+
+def _gltf_axes(xyz: FloatArray) -> Float32Array:
+    """Easting, northing, elevation to x, y up, z minus northing: a turn, so that outward stays outward."""
+    return np.column_stack((xyz[:, 0], xyz[:, 2], 0.0 - xyz[:, 1])).astype("<f4")
+
+
+@njit(cache=True, nogil=True)
+def _triangulated(
+    corners: IntArray, ring_starts: IntArray, face_starts: IntArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Triangles of many faces, each of corners of its own.
+
+    Parameters
+    ----------
+    corners : (n, 3) int64
+        Corners of all rings of all faces in mm, each face's outer ring first.
+    ring_starts : (r + 1,) int64
+        Where each ring starts in corners, and n.
+    face_starts : (f + 1,) int64
+        Where each face starts in ring_starts, and r.
+
+    Returns
+    -------
+    (t, 3) int64, (f,) int64 and (n, 3) float64
+        Triangles as indices into corners, how many each face has, and the unit normal of the face of each corner; where
+        a face cannot be cut, the counts end before it.
+    """
+    n_faces = len(face_starts) - 1
+    triangles = np.empty((len(corners) + 2 * len(ring_starts), 3), np.int64)
+    counts = np.empty(n_faces, np.int64)
+    normals = np.empty((len(corners), 3))
+    written = 0
+    for face in range(n_faces):
+        rings = ring_starts[face_starts[face] : face_starts[face + 1] + 1]
+        start, stop = rings[0], rings[-1]
+        cut, status = triangulate_rings(corners[start:stop], rings - start)
+        if status != DONE:
+            return triangles[:written], counts[:face], normals
+        for t in range(len(cut)):
+            for k in range(3):
+                triangles[written, k] = start + cut[t, k]
+            written += 1
+        counts[face] = len(cut)
+        x, y, z = area_vector(corners, start, rings[1])
+        length = math.sqrt(float(x) * x + float(y) * y + float(z) * z)
+        for corner in range(start, stop):
+            normals[corner, 0], normals[corner, 1], normals[corner, 2] = x / length, y / length, z / length
+    return triangles[:written], counts, normals
+
+
+class _Scene:
+    """The nodes, meshes and buffers of a file, filled building by building."""
+
+    def __init__(self) -> None:
+        self._nodes: list[dict[str, Any]] = []
+        self._meshes: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+        self._views = [_View(stride=12), _View(stride=12), _View(stride=4), _View(stride=None)]
+
+    def add(self, name: str, extras: Mapping[str, Any], mesh: _Mesh, origin_mm: IntArray) -> None:
+        """Append a building."""
+        positions, normals, planes, indices = self._views
+        bounds = {f: [float(v) for v in getattr(mesh.positions, f)(axis=0)] for f in ("min", "max")}
+        attributes = {
+            "POSITION": self._accessor(positions, mesh.positions, "VEC3", _FLOAT, **bounds),
+            "NORMAL": self._accessor(normals, mesh.normals, "VEC3", _FLOAT),
+            PLANE_ID: self._accessor(planes, mesh.planes, "SCALAR", _FLOAT),
+        }
+        primitives = [
+            {
+                "attributes": attributes,
+                "indices": self._accessor(indices, triangles.astype("<u4").reshape(-1), "SCALAR", _UNSIGNED_INT),
+                "material": list(MATERIALS).index(surface),
+                "extras": {"part": part},
+            }
+            for part, surface, triangles in mesh.triangles
+        ]
+        east, north, up = ((mesh.low_mm - origin_mm) // _MM).tolist()
+        node = {"name": name, "mesh": len(self._meshes), "translation": [east, up, -north], "extras": dict(extras)}
+        self._meshes.append({"name": name, "primitives": primitives})
+        self._nodes.append(node)
+
+    def _accessor(self, view: _View, values: Any, kind: str, component: int, **more: Any) -> int:
+        """Append values to a view; the number of their accessor."""
+        self._accessors.append(
+            {
+                "bufferView": self._views.index(view),
+                "byteOffset": view.size,
+                "componentType": component,
+                "count": len(values),
+                "type": kind,
+                **more,
+            }
+        )
+        view.append(values.tobytes())
+        return len(self._accessors) - 1
+
+    def file(self, title: str, place: Mapping[str, Any]) -> bytes:
+        """The whole file."""
+        views, start = [], 0
+        for view in self._views:
+            told = {"buffer": 0, "byteOffset": start, "byteLength": view.size}
+            layout = {"target": _INDICES} if view.stride is None else {"byteStride": view.stride, "target": _VERTICES}
+            views.append({**told, **layout})
+            start += view.size
+        root = {"name": title, "children": list(range(1, len(self._nodes) + 1)), "extras": dict(place)}
+        document = {
+            "asset": {"version": VERSION, "generator": "gablework", "extras": {"title": title, **place}},
+            "scene": 0,
+            "scenes": [{"name": title, "nodes": [0]}],
+            "nodes": [root, *self._nodes],
+            "meshes": self._meshes,
+            "materials": [_material(name, colour) for name, colour in MATERIALS.items()],
+            "accessors": self._accessors,
+            "bufferViews": views,
+            "buffers": [{"byteLength": start}],
+        }
+        return _container(document, b"".join(piece for view in self._views for piece in view.pieces))
+
+
+class _View:
+    """The bytes of one bufferView: all components have four bytes, so all is aligned."""
+
+    def __init__(self, stride: int | None) -> None:
+        self.stride = stride
+        self.size = 0
+        self.pieces: list[bytes] = []
+
+    def append(self, data: bytes) -> None:
+        self.pieces.append(data)
+        self.size += len(data)
+
+
+def _material(name: str, colour: Sequence[float]) -> dict[str, Any]:
+    """A dull material of one colour."""
+    return {
+        "name": name,
+        "pbrMetallicRoughness": {"baseColorFactor": [*colour, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
+    }
+
+
+def _container(document: Mapping[str, Any], binary: bytes) -> bytes:
+    """The GLB container: a header of twelve bytes, a chunk of JSON and one of binary data, each padded to four."""
+    text = json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    size = 12 + 8 + len(text) + 8 + len(binary)
+    return b"".join(
+        (
+            struct.pack("<III", _MAGIC, _CONTAINER_VERSION, size),
+            struct.pack("<II", len(text), _JSON_CHUNK),
+            text,
+            struct.pack("<II", len(binary), _BINARY_CHUNK),
+            binary,
+        )
+    )
