@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import PurePath
 
@@ -22,7 +22,15 @@ from pipeline.roof.block import block_parts, block_plane
 from pipeline.roof.flush_walls import unite_flush_walls
 from pipeline.roof.footprint import hull_of_points, outline
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.plan import RoofPlan, RoofPoints, level_unsupported_faces, partition_roof, plan_forms, roof_points
+from pipeline.roof.plan import (
+    RoofPlan,
+    RoofPoints,
+    arranged_faces,
+    level_unsupported_faces,
+    partition_roof,
+    plan_forms,
+    roof_points,
+)
 from pipeline.roof.primitives import primitive_partition
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.settings import RoofSettings
@@ -95,9 +103,11 @@ def _reconstruct(
         forms: Iterable[Callable[[], RoofPartition]]
         if segmentation.faces is not None:
             forms = (partial(primitive_partition, segmentation.faces),)
-        else:
+        elif not _is_arranged(method, settings.roof):
             plan = partition_roof(roof, segmentation.planes, settings.roof)
             forms = plan_forms(plan, roof, settings.roof)
+        else:
+            forms = _arranged_forms(roof, segmentation.planes, settings)
         parts, planes, codes = _own_solids(
             candidate, roof, forms, segmentation.planes, settings.roof, is_primitive=segmentation.faces is not None
         )
@@ -113,6 +123,19 @@ def _reconstruct(
         candidate, method, settings, parts, planes, status=Status.FALLBACK, lod="1.2", reason=reason, detail=detail,
         codes=codes,
     )  # fmt: skip
+
+
+def _is_arranged(method: str, settings: RoofSettings) -> bool:
+    """Whether the roof faces are cells of an arrangement."""
+    return method_named(method).arranged if settings.faces == "method" else settings.faces == "arranged"
+
+
+def _arranged_forms(
+    roof: RoofPoints, planes: Sequence[Plane], settings: ReconstructSettings
+) -> Iterator[Callable[[], RoofPartition]]:
+    """The arrangement; behind it the traced faces, which are traced only where no solid of it is sound."""
+    yield partial(arranged_faces, roof, planes, settings.roof, settings.plan)
+    yield from plan_forms(partition_roof(roof, planes, settings.roof), roof, settings.roof)
 
 
 def _require_planes(segmentation: Segmentation, roof: RoofPoints) -> None:

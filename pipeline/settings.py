@@ -13,6 +13,7 @@ from typing import Any
 from pipeline.errors import SettingsError
 from pipeline.methods import METHODS, PRESETS, ReconstructSettings, method_named
 from pipeline.parameters import Parameters, build, parameter
+from pipeline.roof.arrangement import ArrangementSettings
 from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings
 from pipeline.scene import SceneSettings
@@ -72,6 +73,7 @@ SECTIONS: Mapping[str, type[Parameters]] = {
     "candidates": CandidateSettings,
     "units": UnitSettings,
     "roof": RoofSettings,
+    "plan": ArrangementSettings,
     "roof-type": RoofTypeSettings,
 }
 """Tables of the settings file that every method shares; each method adds one of its own name."""
@@ -120,6 +122,7 @@ class RunSettings:
             "candidates": self.scene.candidates,
             "units": self.scene.units,
             "roof": self.building.roof,
+            "plan": self.building.plan,
             "roof-type": self.building.roof_type,
             self.general.method: method,
         }
@@ -178,6 +181,7 @@ class RunSettings:
         building = ReconstructSettings(
             method=built.get(method_name),
             roof=built.get("roof", RoofSettings()),
+            plan=built.get("plan", ArrangementSettings()),
             roof_type=built.get("roof-type", RoofTypeSettings()),
         )
         return cls(

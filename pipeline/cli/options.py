@@ -43,7 +43,10 @@ SettingsFile = Annotated[str | None, typer.Option(metavar="FILE", help="Settings
 Scheduler = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
 ]
-Meshes = Annotated[Literal["building", "tile", "none"], typer.Option(help="One OBJ a building, one a tile, or none.")]
+Meshes = Annotated[
+    Literal["building", "tile", "glb", "none"],
+    typer.Option(help="One OBJ a building, one OBJ a tile, one GLB a tile, or none."),
+]
 Licence = Annotated[
     str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
 ]

@@ -122,7 +122,7 @@ def warm_up(as_json: AsJson = False, quiet: Quiet = False) -> None:
         with TemporaryDirectory(prefix="gablework-") as folder:
             started = time.perf_counter()
             scene = simulate_scene("gable", f"{folder}/scene")
-            request = RunRequest(inputs=(str(scene.laz),), out=f"{folder}/run", workers=0)
+            request = RunRequest(inputs=(str(scene.laz),), out=f"{folder}/run", meshes="glb", workers=0)
             summary = run(request, console.on_event)
             load()  # the other methods, too
             classified = ClassifyRequest(inputs=(str(scene.laz),), out=f"{folder}/classified", rasters=True, workers=0)

@@ -8,11 +8,13 @@ from types import MappingProxyType
 from typing import Any
 
 from pipeline.errors import SettingsError
-from pipeline.methods import fuzzy_sart, kmeans, parameter_space
+from pipeline.methods import arrangement, fuzzy_sart, kmeans, parameter_space
 from pipeline.model import Candidate, Segmentation
 from pipeline.parameters import Parameters
+from pipeline.roof.arrangement import ArrangementSettings
 from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings
+from pipeline.segmentation.adaptive_planes import AdaptivePlaneSettings
 
 PRESETS = ("robust", "faithful")
 """Named settings that every method has: those that measured better, the default, and those that keep to the paper."""
@@ -30,6 +32,8 @@ class Method:
     """From a candidate and an instance of `settings_type` to planes and labels."""
     faithful: Parameters
     """The settings that keep to the paper's words; the defaults of `settings_type` are those that measured better."""
+    arranged: bool = False
+    """Whether its roof faces are cells of an arrangement of lines; else they are traced from the labels."""
 
     def preset(self, name: str) -> Parameters:
         """The settings of a named preset.
@@ -53,6 +57,13 @@ METHODS: Mapping[str, Method] = MappingProxyType(
     {
         method.name: method
         for method in (
+            Method(
+                name="arrangement",
+                settings_type=AdaptivePlaneSettings,
+                segment=arrangement.segment,
+                faithful=AdaptivePlaneSettings(),
+                arranged=True,
+            ),
             Method(
                 name="fuzzy-sart",
                 settings_type=fuzzy_sart.FuzzySartSettings,
@@ -119,6 +130,8 @@ class ReconstructSettings:
     """An instance of the method's settings class; None for its defaults."""
     roof: RoofSettings = dataclasses.field(default_factory=RoofSettings)
     """From planes to solids."""
+    plan: ArrangementSettings = dataclasses.field(default_factory=ArrangementSettings)
+    """Costs of roof faces, where they are arranged."""
     roof_type: RoofTypeSettings = dataclasses.field(default_factory=RoofTypeSettings)
     """Thresholds of the roof types."""
 

@@ -14,6 +14,7 @@ from shapely import MultiPolygon
 from pipeline.errors import BuildingError
 from pipeline.geometry import spacing_over_area_m, top_visible
 from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
+from pipeline.roof.arrangement import ArrangementSettings, arrange
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
@@ -221,6 +222,39 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
             reach_m = 1e-3 * mixed_pulse_reach_mm(around, edge_points)
             drawn = at_walls(drawn, roof.facades, reach_m, settings.usual_overhang_m)
     return RoofPlan(planes=tuple(planes), faces=continued_faces, outline_mm=drawn, raw=partition)
+
+
+def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
+    """The outline of a building, integer millimetres: given, drawn with touching units, or drawn around its points.
+
+    Raises
+    ------
+    BuildingError
+        `no_partition` or `too_complex`, as `partition_roof`.
+    """
+    if roof.footprint_mm is not None:
+        return roof.footprint_mm
+    if roof.outline_mm is not None and settings.straight_eaves:
+        return roof.outline_mm
+    z = np.sort(roof.points[:, 2])
+    level = Plane(a=0.0, b=0.0, c=float(z[len(z) // 2]), n_points=len(z), rmse_m=0.0)
+    unlabelled = dataclasses.replace(roof, labels=np.zeros(len(roof.points), np.int32))
+    return partition_roof(unlabelled, [level], settings).outline_mm
+
+
+def arranged_faces(
+    roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettings, costs: ArrangementSettings
+) -> RoofPartition:
+    """The plan as an arrangement of the lines in which planes meet.
+
+    Raises
+    ------
+    BuildingError
+        `no_partition` where the outline cannot be drawn or filled.
+    """
+    coefficients = np.array([plane.coefficients for plane in planes], np.float64).reshape(len(planes), 3)
+    outline_mm = drawn_outline(roof, settings)
+    return arrange(roof.points, roof.labels, coefficients, outline_mm, roof.spacing_m, costs)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -48,6 +48,12 @@ class RoofSettings(Parameters):
         minimum=0.0,
         maximum=1.0,
     )
+    faces: str = parameter(
+        "method",
+        "How the plan is cut into roof faces: as the method does it, traced from the points' labels, or arranged along "
+        "the lines in which planes meet.",
+        choices=("method", "traced", "arranged"),
+    )
     straight_eaves: bool = parameter(
         True, "Whether the outline is drawn with straight lines where no footprint is given."
     )

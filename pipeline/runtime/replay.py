@@ -13,13 +13,14 @@ from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.obj import obj_text
 from pipeline.export.records import RecordContext, building_row
+from pipeline.export.solid_geometry import SOLID_COLUMNS
 from pipeline.model import BuildingResult, Reason
 from pipeline.reconstruct import failed_building
 from pipeline.runtime.bundle import Bundle
 from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
 from pipeline.runtime.modelling import model_bundle
 
-_OF_THE_RUN = ("geometry", "acquired_from", "acquired_to", "mesh_path", "input_hash", "settings_hash")
+_OF_THE_RUN = ("geometry", "acquired_from", "acquired_to", "mesh_path", "input_hash", "settings_hash", *SOLID_COLUMNS)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -395,7 +395,7 @@ def again(run_dir: str, **fields: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    "meshes", ["building", pytest.param("tile", marks=pytest.mark.slow), pytest.param("none", marks=pytest.mark.slow)]
+    "meshes", ["building", *(pytest.param(meshes, marks=pytest.mark.slow) for meshes in ("tile", "glb", "none"))]
 )
 def test_a_rerun_leaves_what_a_whole_run_with_these_overrides_writes(
     everything: str, overridden: Any, copied: Any, tmp_path: Path, meshes: str
