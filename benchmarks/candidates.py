@@ -16,7 +16,7 @@ from pipeline.runtime.join import RejectedSite
 from pipeline.runtime.plan import make_plan
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.serial import SerialExecutor
-from pipeline.runtime.stages import Progress, Stages
+from pipeline.runtime.stages import Progress, Stages, given_footprints
 from pipeline.settings import RunSettings
 
 
@@ -36,9 +36,12 @@ class FoundScene:
     """Wall-clock time by stage: ingest, split, join, outline."""
 
 
-def found_scene(tiles: Sequence[str], crs: str | None, settings: RunSettings) -> FoundScene:
-    """Ingest, split and join point files, serially and in this process."""
+def found_scene(
+    tiles: Sequence[str], crs: str | None, settings: RunSettings, footprints: str | None = None
+) -> FoundScene:
+    """Ingest, split and join point files, serially and in this process, with given footprints where there are any."""
     plan = make_plan(tiles, ReadOptions(crs=crs), settings)
+    given = None if footprints is None else given_footprints(footprints, plan)
     kinds = {info.gps_time_kind for info in plan.sources}
     kind = kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
     progress = Progress(ignore)
@@ -53,8 +56,8 @@ def found_scene(tiles: Sequence[str], crs: str | None, settings: RunSettings) ->
             executor=SerialExecutor(),
             scratch=scratch,
         )
-        splits = stages.split(stages.ingest(tiles), None)
-        joined = stages.outline(stages.join(splits, None, plan.sources[0].reference))
+        splits = stages.split(stages.ingest(tiles), given)
+        joined = stages.outline(stages.join(splits, given, plan.sources[0].reference))
         return FoundScene(
             candidates=tuple(
                 gather(scratch, plan.grid, site, kind, beside=settings.building.roof.at_walls)[0]

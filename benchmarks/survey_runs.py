@@ -12,17 +12,10 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from benchmarks.candidates import found_scene
 from benchmarks.entries import Entry
-from pipeline.io import ReadOptions
-from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import Candidate
 from pipeline.runtime.compare import Variant
-from pipeline.runtime.events import ignore
-from pipeline.runtime.gather import gather
-from pipeline.runtime.plan import make_plan
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.serial import SerialExecutor
-from pipeline.runtime.stages import Progress, Stages, given_footprints
 from pipeline.settings import RunSettings
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -91,23 +84,5 @@ def cold_run(entry: Entry, variant: Variant, out: Path) -> Seconds:
 
 def candidates_of(entry: Entry, settings: RunSettings) -> list[Candidate]:
     """The candidates of a survey as a run finds them, with the given footprints where there are any."""
-    tiles = [str(tile) for tile in entry.tiles]
-    plan = make_plan(tiles, ReadOptions(crs=entry.crs), settings)
-    given = None if entry.footprints is None else given_footprints(str(entry.footprints), plan)
-    kinds = {info.gps_time_kind for info in plan.sources}
-    kind = kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
-    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
-        scratch = Scratch(str(Path(folder, "scratch")))
-        scratch.create()
-        stages = Stages(
-            settings=settings,
-            meshes="none",
-            plan=plan,
-            progress=Progress(ignore),
-            executor=SerialExecutor(),
-            scratch=scratch,
-        )
-        splits = stages.split(stages.ingest(tiles), given)
-        joined = stages.outline(stages.join(splits, given, plan.sources[0].reference))
-        beside = settings.building.roof.at_walls
-        return [gather(scratch, plan.grid, site, kind, beside=beside)[0] for site in joined.candidates]
+    footprints = None if entry.footprints is None else str(entry.footprints)
+    return list(found_scene([str(tile) for tile in entry.tiles], entry.crs, settings, footprints).candidates)

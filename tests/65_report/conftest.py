@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import datetime as dt
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,28 +10,11 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "60_export"))
 
-import small_buildings as small
+from small_runs import street, write_run
 
-from pipeline.export.records import RecordContext, RejectedObject
-from pipeline.export.tile import write_tile
-from pipeline.model import BuildingResult, Reason, Status
-from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
+from pipeline.model import BuildingResult
 
 MakeRun = Callable[..., Path]
-
-
-def moved(result: BuildingResult, east: float, north: float) -> BuildingResult:
-    """A building elsewhere, by whole metres."""
-    x, y, z = result.origin
-    return dataclasses.replace(result, origin=(x + east, y + north, z))
-
-
-def street() -> list[BuildingResult]:
-    """A fallback, two models, and a failed candidate that has an outline."""
-    failed = dataclasses.replace(
-        small.failed(), footprint=small.Polygon([(0, 0), (8, 0), (8, 8), (0, 8)]), status=Status.FAILED
-    )
-    return [moved(small.gable(), 0, 40), small.courtyard(), moved(small.two_parts(), 60, 0), moved(failed, 60, 40)]
 
 
 @pytest.fixture
@@ -41,32 +22,7 @@ def make_run(tmp_path: Path) -> MakeRun:
     """Write a run of the given buildings, in metres or in feet."""
 
     def make(results: list[BuildingResult], name: str = "run", unit_m: float = 1.0) -> Path:
-        folder = tmp_path / name
-        reference = small.Reference(horizontal_unit_m=unit_m, vertical_unit_m=unit_m)
-        context = RecordContext(reference=reference, settings_hash="ab", engine_version="0")
-        tree = RejectedObject(
-            object_id="tree",
-            origin=small.ORIGIN,
-            reason=Reason.VEGETATION,
-            reason_detail="planarity 0.1, at least 0.6",
-            outline=small.Polygon([(44, 30), (50, 30), (47, 36)]),
-            area_m2=18.0,
-            height_m=6.0,
-            n_points=50,
-        )
-        write_tile(folder, "t1", results[:2], [tree] if results else [], context)
-        write_tile(folder, "t2", results[2:], [], context)
-        manifest = RunManifest(
-            status=RunStatus.FINISHED,
-            engine_version="0",
-            method="fuzzy-sart",
-            settings={},
-            settings_hash="ab",
-            started_at=dt.datetime(2026, 1, 1, tzinfo=dt.UTC),
-            crs={"horizontal_unit_m": unit_m, "vertical_unit_m": unit_m},
-        )
-        write_manifest(folder, manifest)
-        return folder
+        return write_run(tmp_path / name, results, unit_m)
 
     return make
 
