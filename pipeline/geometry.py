@@ -433,7 +433,7 @@ def _checked_search(points: FloatArray, k: int, cell_size_m: float | None) -> tu
     if k < 0:
         raise ValueError(f"k is {k}: use 0 or more")
     if cell_size_m is None:
-        width, depth = (points[:, :2].max(axis=0) - points[:, :2].min(axis=0)).tolist() if len(points) else (0.0, 0.0)
+        width, depth = (float(np.ptp(points[:, axis])) if len(points) else 0.0 for axis in range(2))
         longest = max(width, depth)
         cell_size_m = max(math.sqrt(2.0 * width * depth / max(len(points), 1)), longest / max(len(points), 1), 1e-3)
     if not cell_size_m > 0.0:
@@ -464,7 +464,7 @@ def point_spacing_m(points: FloatArray) -> float:
         Metres; nan for fewer than two points.
     """
     k = min(_SPACING_NEIGHBOURS, len(points) - 1)
-    return math.nan if k < 1 else _spacing_of_points(_squared_reach(points, k), k)
+    return math.nan if k < 1 else _spacing_of_points(np.sort(_squared_reach(points, k)), k)
 
 
 def spacing_over_area_m(points: FloatArray) -> float:
@@ -488,9 +488,8 @@ def spacing_over_area_m(points: FloatArray) -> float:
     k = min(_SPACING_NEIGHBOURS, len(points) - 1)
     if k < 1:
         return math.nan
-    squares = _squared_reach(points, k)
+    squares = np.sort(_squared_reach(points, k))
     usual = _spacing_of_points(squares, k)
-    squares = np.sort(squares)
     covered = np.cumsum(squares)
     middle = float(squares[min(int(np.searchsorted(covered, 0.5 * covered[-1])), len(squares) - 1)])
     # weighted with itself a Gamma(k) variate is Gamma(k + 1) distributed
@@ -505,9 +504,11 @@ def _squared_reach(points: FloatArray, k: int) -> FloatArray:
 
 
 def _spacing_of_points(squares: FloatArray, k: int) -> float:
-    """1 / sqrt(density) from the squared distances to the k-th neighbour, over the points."""
+    """1 / sqrt(density) from the sorted squared distances to the k-th neighbour, over the points."""
+    n = len(squares)
+    median = 0.5 * (float(squares[(n - 1) // 2]) + float(squares[n // 2]))
     # pi density r_k^2 is Gamma(k) distributed; its median is k - 1/3 within 2 % for k >= 1
-    return math.sqrt(float(np.median(squares)) * math.pi / (k - 1.0 / 3.0))
+    return math.sqrt(median * math.pi / (k - 1.0 / 3.0))
 
 
 @njit(cache=True, nogil=True)

@@ -253,6 +253,40 @@ class RoofFace:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelQuality:
+    """How well the points support a delivered model; nan is what they cannot tell, or a model that does not exist."""
+
+    point_spacing_m: float = math.nan
+    """Typical distance of neighbouring roof points in plan, metres."""
+    noise_m: float = math.nan
+    """Robust standard deviation of the points about the roof, vertical; nan for a block."""
+    share_within: float = math.nan
+    """Share of all points that have a roof within 0.2 m above or below them."""
+    unexplained_m2: float = math.nan
+    """Plan area of roof without a point within 0.2 m of it nearby, square metres."""
+    largest_hole_m: float = math.nan
+    """Diameter of the largest circle on the roof that holds no point, in plan, metres."""
+    ridge_z_sigma_m: float = math.nan
+    """Standard deviation of the highest roof point, metres, without what a whole strip is off by; nan for a block."""
+    bic_margin: float = math.nan
+    """By how much the information criterion of the chosen form is below the next one's; nan where none competed."""
+    is_curved: bool = False
+    """True where most of the roof is one surface that bends steadily: a dome, a barrel."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LodModel:
+    """A building's model at a coarser level of detail than that of its record."""
+
+    lod: str
+    """1.2 or 1.3."""
+    planes: tuple[Plane, ...]
+    """The horizontal planes that the roofs of the solids number."""
+    solids: tuple[Solid, ...]
+    """Closed solids, one for each solid of the record's model, in the same order."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class BuildingResult:
     """What became of a candidate. Every candidate gives one, also one that failed."""
 
@@ -273,7 +307,7 @@ class BuildingResult:
     roof_type: RoofType
     """From the delivered planes; none where there is no model."""
     lod: str
-    """2.2, 1.2 for a block, empty where there is no model."""
+    """Of the model: the finest that was asked for, 1.2 for a fallback block, empty where there is no model."""
     footprint: Polygon | MultiPolygon | None
     """2D outline of the delivered solids in local metres (failed: of the points where that is possible)."""
     planes: tuple[Plane, ...]
@@ -296,5 +330,9 @@ class BuildingResult:
     """95th percentile of the absolute vertical distances; nan without a model."""
     coverage: float
     """Share of points that have a roof above or below them; 0 without a model."""
+    quality: ModelQuality = ModelQuality()
+    """How well the points support the model."""
     touches_data_edge: bool
     """As the candidate's."""
+    coarser: tuple[LodModel, ...] = ()
+    """Models at the coarser levels of detail that were asked for, the finest first; none beside a fallback block."""

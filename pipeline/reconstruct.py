@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import traceback
@@ -15,17 +16,31 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import BuildingError
 from pipeline.methods import ReconstructSettings, method_named
-from pipeline.model import BuildingResult, Candidate, Plane, Reason, RoofFace, RoofType, Segmentation, Solid, Status
-from pipeline.quality.residuals import summarise, vertical_residuals
+from pipeline.model import (
+    BuildingResult,
+    Candidate,
+    LodModel,
+    Plane,
+    Reason,
+    RoofFace,
+    RoofType,
+    Segmentation,
+    Solid,
+    Status,
+)
+from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, TOLERANCE_M, model_quality
+from pipeline.quality.residuals import summarise, surface_of
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_parts, block_plane
 from pipeline.roof.flush_walls import unite_flush_walls
 from pipeline.roof.footprint import hull_of_points, outline
+from pipeline.roof.lower_lods import LodParts, lower_lods
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import (
     RoofPlan,
     RoofPoints,
     arranged_faces,
+    drawn_outline,
     level_unsupported_faces,
     partition_roof,
     plan_forms,
@@ -35,6 +50,8 @@ from pipeline.roof.primitives import primitive_partition
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.solid import SolidPart, solid_parts
+from pipeline.roof.templates import MOST_POINTS, RankedFaces, Templates, fit_templates, margin_of_templates
+from pipeline.roof.voids import without_voids
 
 __all__ = ["ReconstructSettings", "failed_building", "reconstruct_building"]
 
@@ -97,31 +114,52 @@ def _reconstruct(
     plan: RoofPlan | None = None
     codes: tuple[int, ...] = ()
     try:
-        segmentation = segment(candidate)
+        segmentation, lack = _segmented(candidate, segment, bare)
         roof = dataclasses.replace(bare, labels=segmentation.labels[bare.index])
-        _require_planes(segmentation, roof)
-        forms: Iterable[Callable[[], RoofPartition]]
-        if segmentation.faces is not None:
+        forms: Iterable[_Form]
+        if lack is not None:
+            if not _is_arranged(method, settings.roof) or len(roof.points) > MOST_POINTS:
+                raise lack
+            forms = _template_forms(roof, lack, settings.roof)
+        elif segmentation.faces is not None:
             forms = (partial(primitive_partition, segmentation.faces),)
         elif not _is_arranged(method, settings.roof):
             plan = partition_roof(roof, segmentation.planes, settings.roof)
             forms = plan_forms(plan, roof, settings.roof)
         else:
             forms = _arranged_forms(roof, segmentation.planes, settings)
-        parts, planes, codes = _own_solids(
+        parts, planes, codes, margin = _own_solids(
             candidate, roof, forms, segmentation.planes, settings.roof, is_primitive=segmentation.faces is not None
         )
         if parts:
+            deliver = partial(
+                _result, candidate, method, settings, spacing_m=roof.spacing_m, status=Status.OK, bic_margin=margin
+            )
             own_type = segmentation.roof_type
-            return _result(candidate, method, settings, parts, planes, own_type, status=Status.OK, lod="2.2")
+            if settings.lods == ("2.2",):
+                return deliver(parts, planes, own_type, lod="2.2")
+            detailed = LodParts(lod="2.2", parts=parts, planes=planes)
+            models = lower_lods(
+                detailed, roof.points, candidate.ground_z_m, settings.roof, settings.lods, lambda s: not check_solid(s)
+            )
+            if models and models[0].lod == settings.lods[-1]:
+                if models[0] is not detailed:  # level parts tell nothing of the roof's type
+                    own_type = deliver(parts, planes, own_type, lod="2.2").roof_type
+                finest, *coarser = models
+                record = deliver(finest.parts, finest.planes, own_type, lod=finest.lod)
+                return dataclasses.replace(record, coarser=tuple(_lod_model(model) for model in coarser))
         reason = Reason.INVALID_SOLID
         detail = f"validity codes {', '.join(map(str, codes)) or 'none'}: no form of the solid passes"
     except BuildingError as error:
         reason, detail = error.reason, error.detail
     parts, planes = _block(candidate, bare, plan, settings.roof)
+    if settings.lods == ("1.2",):  # a block is what was asked for
+        return _result(
+            candidate, method, settings, parts, planes, spacing_m=bare.spacing_m, status=Status.OK, lod="1.2"
+        )
     return _result(
-        candidate, method, settings, parts, planes, status=Status.FALLBACK, lod="1.2", reason=reason, detail=detail,
-        codes=codes,
+        candidate, method, settings, parts, planes, spacing_m=bare.spacing_m, status=Status.FALLBACK, lod="1.2",
+        reason=reason, detail=detail, codes=codes,
     )  # fmt: skip
 
 
@@ -130,38 +168,101 @@ def _is_arranged(method: str, settings: RoofSettings) -> bool:
     return method_named(method).arranged if settings.faces == "method" else settings.faces == "arranged"
 
 
-def _arranged_forms(
-    roof: RoofPoints, planes: Sequence[Plane], settings: ReconstructSettings
-) -> Iterator[Callable[[], RoofPartition]]:
-    """The arrangement; behind it the traced faces, which are traced only where no solid of it is sound."""
-    yield partial(arranged_faces, roof, planes, settings.roof, settings.plan)
+_WIDER_CLEARANCES = (2.5, 4.0)
+"""Times the usual distances between an arrangement's vertices, where these made no sound solid."""
+
+_Form = Callable[[], RoofPartition | RankedFaces]
+"""Draws roof faces: over the planes of the segmentation, or over planes of their own."""
+
+
+def _arranged_forms(roof: RoofPoints, planes: Sequence[Plane], settings: ReconstructSettings) -> Iterator[_Form]:
+    """The arrangement; behind it coarser ones and the traced faces, drawn only where no solid of it is sound.
+
+    Where points are few, templates compete with the arrangement: the better go first, worse ones last of all.
+    """
+    outline_mm = drawn_outline(roof, settings.roof)
+    if roof.footprint_mm is not None:
+        outline_mm = without_voids(outline_mm, roof.points, roof.spacing_m, settings.roof)
+    arranged = partial(arranged_faces, roof, planes, outline_mm, settings.plan)
+    first: tuple[_Form, ...] = (arranged,)
+    last: tuple[_Form, ...] = ()
+    if roof.spacing_m >= settings.roof.templates_spacing_m and len(roof.points) <= MOST_POINTS:
+        first, last = _ranked_forms(roof, planes, outline_mm, arranged)
+    yield from first
+    # many planes that meet nearly in one point: with more room between its vertices the solid is sound
+    for clearance in _WIDER_CLEARANCES:
+        yield partial(arranged, clearance=clearance)
     yield from plan_forms(partition_roof(roof, planes, settings.roof), roof, settings.roof)
+    yield from last
 
 
-def _require_planes(segmentation: Segmentation, roof: RoofPoints) -> None:
-    """Raise where no roof point lies on a plane."""
-    if len(segmentation.planes) == 0 or not (roof.labels >= 0).any():
-        raise BuildingError(
-            Reason.NO_PLANE, f"{len(segmentation.planes)} planes; none explains any of {len(roof.points)} roof points"
-        )
+def _ranked_forms(
+    roof: RoofPoints, planes: Sequence[Plane], outline_mm: MultiPolygon, arranged: Callable[[], RoofPartition]
+) -> tuple[tuple[_Form, ...], tuple[_Form, ...]]:
+    """The arrangement and the templates, those of them that can be had: what goes first, what last."""
+    templates: Templates | None = None
+    with contextlib.suppress(BuildingError):
+        templates = fit_templates(roof.points, outline_mm)
+    if templates is None:
+        return (arranged,), ()
+    try:
+        drawn = arranged()
+    except (BuildingError, shapely.errors.GEOSException):
+        return (templates.faces,), ()
+    drawn_planes = drawn.planes or tuple(planes)
+    margin = margin_of_templates(roof.points, templates, drawn, drawn_planes)
+    own = RankedFaces(partition=drawn, planes=drawn_planes, labels=roof.labels, bic_margin=-margin)
+    form = partial(templates.faces, margin)
+    return ((form, lambda: own), ()) if margin > 0.0 else ((lambda: own,), (form,))
+
+
+def _template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings) -> Iterator[_Form]:
+    """The templates alone, where no planes were found; raises that lack where they explain too little."""
+    try:
+        templates = fit_templates(roof.points, drawn_outline(roof, settings))
+    except (BuildingError, shapely.errors.GEOSException):
+        raise lack from None
+    yield templates.faces
+
+
+def _segmented(
+    candidate: Candidate, segment: Callable[[Candidate], Segmentation], roof: RoofPoints
+) -> tuple[Segmentation, BuildingError | None]:
+    """The segmentation, and what it lacks where no roof point lies on a plane."""
+    try:
+        segmentation = segment(candidate)
+    except BuildingError as error:
+        return Segmentation(planes=(), labels=np.full(len(candidate.points), -1, np.int32)), error
+    if len(segmentation.planes) == 0 or not (segmentation.labels[roof.index] >= 0).any():
+        found = f"{len(segmentation.planes)} planes; none explains any of {len(roof.points)} roof points"
+        return segmentation, BuildingError(Reason.NO_PLANE, found)
+    return segmentation, None
 
 
 def _own_solids(
     candidate: Candidate,
     roof: RoofPoints,
-    forms: Iterable[Callable[[], RoofPartition]],
+    forms: Iterable[_Form],
     planes: Sequence[Plane],
     settings: RoofSettings,
     *,
     is_primitive: bool,
-) -> tuple[list[SolidPart], list[Plane], tuple[int, ...]]:
-    """The first form of the method's solids that is valid throughout; no parts and all codes met where none is."""
+) -> tuple[list[SolidPart], list[Plane], tuple[int, ...], float]:
+    """The first form of the method's solids that is valid throughout; no parts and all codes met where none is.
+
+    The last is by how much its faces were better than those that they competed with, nan where they did not.
+    """
     codes: set[int] = set()
     for form in forms:
         try:
-            drawn, own_planes = form(), list(planes)
+            drawn, own_planes, labelled, margin = form(), list(planes), roof, math.nan
+            if isinstance(drawn, RankedFaces):
+                own_planes, margin = list(drawn.planes), drawn.bic_margin
+                drawn, labelled = drawn.partition, dataclasses.replace(roof, labels=drawn.labels)
+            elif drawn.planes is not None:
+                own_planes = list(drawn.planes)
             if not is_primitive:  # a primitive is one form: with a side made level it would be another
-                drawn, own_planes = level_unsupported_faces(drawn, roof, planes, candidate.ground_z_m, settings)
+                drawn, own_planes = level_unsupported_faces(drawn, labelled, own_planes, candidate.ground_z_m, settings)
             parts = large_parts(solid_parts(drawn, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
             if is_primitive:
                 parts = [unite_flush_walls(part) for part in parts]
@@ -169,9 +270,9 @@ def _own_solids(
             continue
         faults = {code for part in parts for code in check_solid(part.solid)}
         if parts and not faults:
-            return parts, own_planes, ()
+            return parts, own_planes, (), margin
         codes |= faults
-    return [], [], tuple(sorted(codes))
+    return [], [], tuple(sorted(codes)), math.nan
 
 
 def large_parts(parts: list[SolidPart], minimum_area_m2: float) -> list[SolidPart]:
@@ -216,11 +317,13 @@ def _result(
     planes: Sequence[Plane],
     own_type: RoofType | None = None,
     *,
+    spacing_m: float,
     status: Status,
     lod: str,
     reason: Reason | None = None,
     detail: str = "",
     codes: tuple[int, ...] = (),
+    bic_margin: float = math.nan,
 ) -> BuildingResult:
     """The record of a building with a model; planes that no face uses are left out."""
     used = sorted({face.plane for part in parts for face in part.faces})
@@ -229,7 +332,10 @@ def _result(
     faces = tuple(RoofFace(plane=number[face.plane], polygon=face.polygon) for part in parts for face in part.faces)
     solids = tuple(_renumbered(part.solid, number) for part in parts)
     footprint = _united([part.footprint for part in parts])
-    summary = summarise(vertical_residuals(candidate.points, faces, delivered))
+    surface = surface_of(faces, delivered)
+    top, face_of_point = surface.at(candidate.points[:, 0], candidate.points[:, 1])
+    residuals = candidate.points[:, 2] - top
+    summary = summarise(residuals, TOLERANCE_M)
     return BuildingResult(
         building_id=candidate.building_id,
         origin=candidate.origin,
@@ -251,8 +357,27 @@ def _result(
         rmse_m=summary.rmse_m,
         p95_m=summary.p95_m,
         coverage=summary.coverage,
+        quality=model_quality(
+            candidate.points,
+            surface,
+            residuals,
+            face_of_point,
+            summary,
+            faces,
+            delivered,
+            solids,
+            spacing_m=spacing_m,
+            outline_sigma_m=0.0 if candidate.footprint is not None else spacing_m * DRAWN_OUTLINE_SPACINGS,
+            is_planar=lod == "2.2",
+            bic_margin=bic_margin,
+        ),
         touches_data_edge=candidate.touches_data_edge,
     )
+
+
+def _lod_model(model: LodParts) -> LodModel:
+    """A coarser model as it is delivered."""
+    return LodModel(lod=model.lod, planes=tuple(model.planes), solids=tuple(part.solid for part in model.parts))
 
 
 def _renumbered(solid: Solid, number: dict[int, int]) -> Solid:

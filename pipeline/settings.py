@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import tomllib
 from collections.abc import Mapping
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import SettingsError
-from pipeline.methods import METHODS, PRESETS, ReconstructSettings, method_named
+from pipeline.methods import LODS, METHODS, PRESETS, ReconstructSettings, method_named
 from pipeline.parameters import Parameters, build, parameter
 from pipeline.roof.arrangement import ArrangementSettings
 from pipeline.roof.roof_type import RoofTypeSettings
@@ -30,12 +31,17 @@ from pipeline.terrain.vegetation import VegetationSettings
 class GeneralSettings(Parameters):
     """Settings of the run as a whole."""
 
-    method: str = parameter("fuzzy-sart", "The method that models the buildings.", choices=tuple(METHODS))
+    method: str = parameter("arrangement", "The method that models the buildings.", choices=tuple(METHODS))
     preset: str = parameter(
         "robust",
         "Where the method's settings start: those that measured better, or those that keep to its paper.",
         choices=PRESETS,
         changes_geometry=False,
+    )
+    lods: str = parameter(
+        LODS[-1],
+        "Levels of detail of the models; the finest is that of the records.",
+        choices=tuple(",".join(chosen) for n in range(1, len(LODS) + 1) for chosen in itertools.combinations(LODS, n)),
     )
     classes: str = parameter(
         "trust",
@@ -93,11 +99,15 @@ class RunSettings:
     """From a candidate to its model; `building.method` is never None here."""
 
     def __post_init__(self) -> None:
-        """Fill in the method's defaults and refuse a halo that is too narrow."""
+        """Fill in the method's defaults and the levels of detail; refuse a halo that is too narrow."""
         entry = method_named(self.general.method)
+        start = entry.preset(self.general.preset)
         if self.building.method is None:
-            building = dataclasses.replace(self.building, method=entry.preset(self.general.preset))
+            building = dataclasses.replace(self.building, method=start)
             object.__setattr__(self, "building", building)
+        lods = tuple(self.general.lods.split(","))
+        if self.building.lods != lods:
+            object.__setattr__(self, "building", dataclasses.replace(self.building, lods=lods))
         support = self.scene.support_m
         if 0.0 < self.general.halo_m < support:
             raise SettingsError([f"halo_m is {self.general.halo_m:g}: use at least {support:g} m, or 0 for just that"])
@@ -164,16 +174,15 @@ class RunSettings:
         general_values = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
         general = build(GeneralSettings, "", general_values, faults)
         method_name = general_values.get("method", GeneralSettings().method)
-        known = {**SECTIONS, **{name: entry.settings_type for name, entry in METHODS.items()}}
         built: dict[str, Any] = {}
         for name, values in table.items():
             if not isinstance(values, Mapping):
                 continue
-            if name not in known:
-                faults.append(f"[{name}] is no table of settings: use one of {', '.join(known)}")
+            if name not in SECTIONS and name not in METHODS:
+                faults.append(f"[{name}] is no table of settings: use one of {', '.join((*SECTIONS, *METHODS))}")
             else:
-                base = METHODS[name].preset(general.preset) if general is not None and name in METHODS else None
-                built[name] = build(known[name], name, values, faults, base)
+                kind = SECTIONS[name] if name in SECTIONS else METHODS[name].settings_type
+                built[name] = build(kind, name, values, faults, _base(name, general))
         if faults:
             raise SettingsError(faults)
         scene_names = {field.name for field in dataclasses.fields(SceneSettings)}
@@ -210,6 +219,13 @@ class RunSettings:
         table = read_table(path)
         table.update(overrides)
         return cls.from_mapping(table)
+
+
+def _base(name: str, general: GeneralSettings | None) -> Parameters | None:
+    """Where the settings of a method start, None for other tables; `RunSettings` refuses a preset it does not have."""
+    if general is None or name not in METHODS or general.preset not in METHODS[name].presets:
+        return None
+    return METHODS[name].preset(general.preset)
 
 
 def read_table(path: str | None) -> dict[str, Any]:

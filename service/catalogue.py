@@ -36,6 +36,8 @@ class Catalogue:
     """What stands at the top of a settings file; `method` among it."""
     tables: Mapping[str, type[Parameters]]
     """The tables that every method shares, then one a method."""
+    presets_of: Mapping[str, tuple[str, ...]]
+    """The presets of every method; the default first."""
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -44,13 +46,18 @@ class Catalogue:
 
     @property
     def presets(self) -> tuple[str, ...]:
-        """Names of the presets that every method has; the default first."""
+        """Names of all presets; the default first."""
         return self._choices("preset")
 
     @property
     def classes(self) -> tuple[str, ...]:
         """What the file's own classes may be worth."""
         return self._choices("classes")
+
+    @property
+    def lods(self) -> tuple[str, ...]:
+        """The sets of levels of detail that can be modelled, each with commas between them."""
+        return self._choices("lods")
 
     def default(self, name: str) -> Any:
         """Default of a general setting."""
@@ -62,6 +69,14 @@ class Catalogue:
     def _choices(self, name: str) -> tuple[str, ...]:
         choices: tuple[str, ...] = self._fields()[name].metadata["choices"]
         return choices
+
+    def variants(self) -> tuple[str, ...]:
+        """What a comparison can run: every method by itself, and with each of its presets."""
+        return tuple(
+            word
+            for method, presets in self.presets_of.items()
+            for word in (method, *(f"{method}:{p}" for p in presets))
+        )
 
     def faults(self, settings: Mapping[str, Any]) -> list[str]:
         """What is wrong with settings, a sentence a fault, the tables' names before them."""
@@ -76,6 +91,15 @@ class Catalogue:
                 build(self.tables[name], name, _sane(value, f"[{name}] ", faults), faults)
         build(self.general, "", _sane(general, "", faults), faults)
         return faults
+
+    def preset_faults(self, settings: Mapping[str, Any]) -> list[str]:
+        """What is wrong with the preset beside the method, each known by itself."""
+        method = settings.get("method", self.default("method"))
+        preset = settings.get("preset", self.default("preset"))
+        own = self.presets_of.get(method)
+        if own is None or preset not in self.presets or preset in own:
+            return []
+        return [f"preset is {preset}, which {method} does not have: use {' or '.join(own)}, or name another method"]
 
     def schema(self) -> dict[str, Any]:
         """JSON schema of the settings."""
@@ -136,6 +160,7 @@ def render() -> str:
     written = {
         "general": _fields_of(GeneralSettings),
         "tables": {name: _fields_of(kind) for name, kind in kinds.items()},
+        "presets": {name: list(entry.presets) for name, entry in METHODS.items()},
     }
     return json.dumps(written, indent=1, ensure_ascii=False) + "\n"
 
@@ -151,6 +176,7 @@ def load() -> Catalogue:
     return Catalogue(
         general=_kind("general", written["general"]),
         tables={name: WHOLE.get(name) or _kind(name, fields) for name, fields in written["tables"].items()},
+        presets_of={name: tuple(presets) for name, presets in written["presets"].items()},
     )
 
 

@@ -11,6 +11,7 @@ import typer
 from pipeline.cli import AsJson, app
 from pipeline.console import Console
 from pipeline.errors import RunError, SettingsError
+from pipeline.runtime.start_up import start_own_process
 
 if TYPE_CHECKING:
     from service.settings import ServiceSettings
@@ -248,6 +249,7 @@ def revoke_key(
 
 def main() -> None:
     """Run the command line; ends the process with an exit code of `pipeline.console.ExitCode`."""
+    start_own_process()
     app(prog_name="gablework")
 
 

@@ -21,6 +21,7 @@ from pipeline.cli.options import (
     Footprints,
     Isolate,
     Licence,
+    Lods,
     Meshes,
     Method,
     Overwrite,
@@ -49,6 +50,7 @@ def reconstruct(
         Literal["robust", "faithful"] | None,
         typer.Option(help="Settings of the method that measured better, or that keep to its paper."),
     ] = None,
+    lods: Lods = None,
     footprints: Footprints = None,
     overrides: Annotated[
         str | None,
@@ -78,7 +80,7 @@ def reconstruct(
         request = RunRequest(
             inputs=tuple(tiles),
             out=out,
-            settings=_run_settings(settings, method=method, preset=preset, classes=classes),
+            settings=_run_settings(settings, method=method, preset=preset, classes=classes, lods=_in_order(lods)),
             footprints=footprints,
             overrides=overrides,
             crs=crs,
@@ -281,6 +283,11 @@ def replay(
         console.document({"incident": incident, "record": dict(row), "stderr": stderr, "written": written})
         if row["status"] == "failed":
             raise typer.Exit(ExitCode.TILES_FAILED)
+
+
+def _in_order(words: str | None) -> str | None:
+    """Levels of detail as the settings write them: each once, the coarsest first."""
+    return None if words is None else ",".join(sorted({word.strip() for word in words.split(",")}))
 
 
 def _run_settings(path: str | None, **overrides: str | None) -> RunSettings:

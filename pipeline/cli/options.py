@@ -24,6 +24,12 @@ Method = Annotated[
         help="fuzzy-sart, parameter-space-2d, parameter-space-3d or kmeans; default as the settings say.",
     ),
 ]
+Lods = Annotated[
+    str | None,
+    typer.Option(
+        metavar="L1,L2,…", help="Levels of detail to write: 1.2, 1.3, 2.2, or several; default as the settings say."
+    ),
+]
 Footprints = Annotated[
     str | None,
     typer.Option(metavar="FILE", help="Building outlines (GeoPackage, GeoJSON, Shapefile, GeoParquet) to model."),

@@ -1,4 +1,7 @@
-"""CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature a building, a BuildingPart with semantics a solid."""
+"""CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature a building, a BuildingPart with semantics a solid.
+
+Coarser levels of detail are further geometries of the same parts, each with its `lod`.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,7 @@ def cityjson_lines(
         decimals(reference.vertical_unit_m),
     )
     placed = [
-        [crs_coordinates(solid.vertices, result.origin, reference) for solid in result.solids] for result, _ in rows
+        [crs_coordinates(solid.vertices, result.origin, reference) for solid in _solids(result)] for result, _ in rows
     ]
     corners = [xyz for solids in placed for xyz in solids]
     low = np.min([xyz.min(axis=0) for xyz in corners], axis=0) if corners else np.zeros(3)
@@ -83,10 +86,15 @@ def _json(value: Mapping[str, Any]) -> str:
     return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
+def _solids(result: BuildingResult) -> list[Solid]:
+    """The solids of all levels of detail, the finest level first."""
+    return [*result.solids, *(solid for model in result.coarser for solid in model.solids)]
+
+
 def _feature(
     result: BuildingResult, row: Mapping[str, Any], vertices: Sequence[np.ndarray[Any, np.dtype[np.int64]]]
 ) -> dict[str, Any]:
-    """The CityJSONFeature of one building; each solid has its own vertices."""
+    """The CityJSONFeature of one building; each solid has its own vertices, each part a solid a level of detail."""
     parts = [part_id(result, part) for part in range(len(result.solids))]
     building: dict[str, Any] = {"type": "Building", "attributes": _attributes(row)}
     if parts:
@@ -100,6 +108,10 @@ def _feature(
             "geometry": [_solid(solid, result.planes, result.lod, first)],
         }
         first += len(solid.vertices)
+    for model in result.coarser:
+        for name, solid in zip(parts, model.solids, strict=True):
+            objects[name]["geometry"].append(_solid(solid, (), model.lod, first))
+            first += len(solid.vertices)
     return {
         "type": "CityJSONFeature",
         "id": result.building_id,
@@ -125,7 +137,10 @@ def _attributes(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _solid(solid: Solid, planes: Sequence[Plane], lod: str, first: int) -> dict[str, Any]:
-    """The geometry of one part: one semantic surface a roof plane, one for the walls, one for the ground."""
+    """The geometry of one part: one semantic surface a roof plane, one for the walls, one for the ground.
+
+    Without planes, those of level parts are told as level surfaces that are none of the table `planes`.
+    """
     surfaces: list[dict[str, Any]] = []
     index: dict[tuple[FaceKind, int], int] = {}
     values = []
@@ -146,7 +161,9 @@ def _solid(solid: Solid, planes: Sequence[Plane], lod: str, first: int) -> dict[
 def _surface(kind: FaceKind, plane_id: int, planes: Sequence[Plane]) -> dict[str, Any]:
     """A semantic surface; those of roof planes tell slope and aspect as the `planes` table does."""
     surface: dict[str, Any] = {"type": SURFACES[kind]}
-    if plane_id >= 0:
+    if plane_id >= 0 and not planes:
+        surface["slope_deg"] = surface["aspect_deg"] = 0.0
+    elif plane_id >= 0:
         plane = planes[plane_id]
         surface["plane_id"] = plane_id
         surface["slope_deg"] = round(plane.slope_deg, 4)

@@ -15,6 +15,8 @@ FLAT_BELOW_DEG = 7.0
 """Roof planes below this slope count as flat (Hofmann, Maas and Streilein 2003): all their outer edges are eaves."""
 EAVE_WITHIN_DEG = 45.0
 """An outer edge is an eave where it faces the plane's aspect within this angle; else it is a rake or a high edge."""
+_MOST_AT_ONCE = 2_000
+"""Levels times triangles up to which the areas below all levels at once take less time than a bisection."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,24 +37,36 @@ class Dimensions:
 
 def area_vector(vertices: FloatArray, rings: Sequence[Sequence[int]]) -> FloatArray:
     """Area vector of a planar face: along its normal, as long as its area (Newell), shape (3,), square metres."""
-    total = np.zeros(3)
-    anchor = vertices[rings[0][0]]
+    return np.array(_area_vector(vertices.tolist(), rings))
+
+
+def _area_vector(corners: Sequence[Sequence[float]], rings: Sequence[Sequence[int]]) -> tuple[float, float, float]:
+    """The same of numbers: a face has few corners, and numpy takes longer to begin than they take."""
+    anchor_x, anchor_y, anchor_z = corners[rings[0][0]]
+    total_x = total_y = total_z = 0.0
     for ring in rings:
-        corner = vertices[list(ring)] - anchor
-        following = np.concatenate((corner[1:], corner[:1]))
-        total[0] += np.sum(corner[:, 1] * following[:, 2] - corner[:, 2] * following[:, 1])
-        total[1] += np.sum(corner[:, 2] * following[:, 0] - corner[:, 0] * following[:, 2])
-        total[2] += np.sum(corner[:, 0] * following[:, 1] - corner[:, 1] * following[:, 0])
-    return 0.5 * total
+        ring_x = ring_y = ring_z = 0.0
+        x, y, z = corners[ring[0]]
+        x, y, z = x - anchor_x, y - anchor_y, z - anchor_z
+        for index in (*ring[1:], ring[0]):
+            next_x, next_y, next_z = corners[index]
+            next_x, next_y, next_z = next_x - anchor_x, next_y - anchor_y, next_z - anchor_z
+            ring_x += y * next_z - z * next_y
+            ring_y += z * next_x - x * next_z
+            ring_z += x * next_y - y * next_x
+            x, y, z = next_x, next_y, next_z
+        total_x, total_y, total_z = total_x + ring_x, total_y + ring_y, total_z + ring_z
+    return 0.5 * total_x, 0.5 * total_y, 0.5 * total_z
 
 
 def volume(solid: Solid) -> float:
     """Volume of a closed, outward oriented solid, cubic metres (divergence theorem)."""
+    corners = solid.vertices.tolist()
     total = 0.0
     for face in solid.faces:
-        normal = area_vector(solid.vertices, face.rings)
-        foot = solid.vertices[face.rings[0][0]]
-        total += float(foot[0] * normal[0] + foot[1] * normal[1] + foot[2] * normal[2])
+        normal_x, normal_y, normal_z = _area_vector(corners, face.rings)
+        x, y, z = corners[face.rings[0][0]]
+        total += x * normal_x + y * normal_y + z * normal_z
     return total / 3.0
 
 
@@ -92,19 +106,17 @@ def _outer_edges(solid: Solid) -> set[tuple[int, int]]:
 
 def _edges(ring: Sequence[int]) -> list[tuple[int, int]]:
     """The directed edges of a ring."""
-    return [(ring[i], ring[(i + 1) % len(ring)]) for i in range(len(ring))]
+    return list(zip(ring, (*ring[1:], ring[0]), strict=True))
 
 
-def _is_eave(step: FloatArray, normal: FloatArray) -> bool:
-    """Whether a roof face's outer edge is its low side; `step` runs counter-clockwise seen from above."""
+def _is_eave(step_x: float, step_y: float, normal: tuple[float, float, float]) -> bool:
+    """Whether a roof face's outer edge is its low side; the step runs counter-clockwise seen from above."""
     flat = math.tan(math.radians(FLAT_BELOW_DEG))
     tilt = math.hypot(normal[0], normal[1])
     if tilt <= flat * abs(normal[2]):
         return True
-    outward = (step[1], -step[0])
-    length = math.hypot(outward[0], outward[1])
-    along = outward[0] * normal[0] + outward[1] * normal[1]
-    return bool(along >= math.cos(math.radians(EAVE_WITHIN_DEG)) * length * tilt)
+    along = step_y * normal[0] - step_x * normal[1]
+    return along >= math.cos(math.radians(EAVE_WITHIN_DEG)) * math.hypot(step_x, step_y) * tilt
 
 
 def eave_elevation(solids: Sequence[Solid]) -> float:
@@ -115,21 +127,20 @@ def eave_elevation(solids: Sequence[Solid]) -> float:
     values: list[float] = []
     weights: list[float] = []
     for solid in solids:
-        outer = _outer_edges(solid)
+        outer, corners = _outer_edges(solid), solid.vertices.tolist()
         for face in solid.faces:
             if face.kind is not FaceKind.ROOF:
                 continue
-            normal = area_vector(solid.vertices, face.rings)
+            normal = _area_vector(corners, face.rings)
             middles, lengths = [], []
-            for ring in face.rings:
-                for a, b in _edges(ring):
-                    step = solid.vertices[b] - solid.vertices[a]
-                    if (b, a) in outer and _is_eave(step, normal):
-                        middles.append(0.5 * float(solid.vertices[a, 2] + solid.vertices[b, 2]))
-                        lengths.append(math.hypot(step[0], step[1]))
+            for a, b in (edge for ring in face.rings for edge in _edges(ring) if edge[::-1] in outer):
+                (from_x, from_y, from_z), (to_x, to_y, to_z) = corners[a], corners[b]
+                if _is_eave(to_x - from_x, to_y - from_y, normal):
+                    middles.append(0.5 * (from_z + to_z))
+                    lengths.append(math.hypot(to_x - from_x, to_y - from_y))
             total = sum(lengths)
             values.extend(middles)
-            weights.extend(abs(float(normal[2])) * length / total for length in lengths)
+            weights.extend(abs(normal[2]) * length / total for length in lengths)
     return weighted_median(values, weights)
 
 
@@ -173,15 +184,17 @@ def roof_percentiles(solids: Sequence[Solid], shares: Sequence[float]) -> tuple[
     if len(area) == 0:
         return tuple(math.nan for _ in shares)
     levels = np.unique(corner_z)
-
-    def below(index: int) -> float:
-        return float(_area_below(levels[index : index + 1], corner_z, area)[0])
+    if len(levels) * len(area) <= _MOST_AT_ONCE:
+        below = _area_below(levels, corner_z, area).tolist().__getitem__
+    else:
+        # a block has thousands of levels and of triangles, and their product is not needed
+        def below(index: int) -> float:
+            return float(_area_below(levels[index : index + 1], corner_z, area)[0])
 
     total = below(len(levels) - 1)
     found = []
     for share in shares:
         target = share * total
-        # bisection: a block has thousands of levels and of triangles, and their product is not needed
         upper = bisect.bisect_left(range(len(levels)), target - 1e-9 * total, key=below)
         if upper == 0 or total <= 0.0:
             found.append(float(levels[min(upper, len(levels) - 1)]))
@@ -216,23 +229,18 @@ def dimensions(solids: Sequence[Solid]) -> Dimensions:
 
     Where no outer edge is an eave (a roof that only leans on others), the lowest roof point stands for the eave.
     """
-    roof_z = [
-        float(solid.vertices[index, 2])
-        for solid in solids
-        for face in solid.faces
-        if face.kind is FaceKind.ROOF
-        for ring in face.rings
-        for index in ring
-    ]
+    roof_z: list[float] = []
+    roof_area = 0.0
+    for solid in solids:
+        corners = solid.vertices.tolist()
+        for face in solid.faces:
+            if face.kind is FaceKind.ROOF:
+                roof_z.extend(corners[index][2] for ring in face.rings for index in ring)
+                x, y, z = _area_vector(corners, face.rings)
+                roof_area += math.sqrt(x**2 + y**2 + z**2)
     lowest, highest = (min(roof_z), max(roof_z)) if roof_z else (math.nan, math.nan)
     eave = eave_elevation(solids)
     median, seventieth = roof_percentiles(solids, (0.5, 0.7))
-    roof_area = 0.0
-    for solid in solids:
-        for face in solid.faces:
-            if face.kind is FaceKind.ROOF:
-                normal = area_vector(solid.vertices, face.rings)
-                roof_area += math.sqrt(float(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2))
     return Dimensions(
         eave_z_m=lowest if math.isnan(eave) else eave,
         ridge_z_m=highest,

@@ -2,7 +2,7 @@
 
 Geometries are ISO WKB with planar edges and counter-clockwise exterior rings; an unknown coordinate reference system is
 told as `crs: null`, since a missing key would mean WGS 84. A `bbox` column covers the geometries, so that a reader can
-skip row groups. In `buildings` the footprint is the primary geometry, and `solid` is a second one.
+skip row groups. In `buildings` the footprint is the primary geometry; the solids are further ones.
 """
 
 from __future__ import annotations
@@ -20,13 +20,12 @@ import shapely
 
 from pipeline.errors import RunError
 from pipeline.export.records import KEYS, SCHEMAS
+from pipeline.export.solid_geometry import SOLIDS
 
 VERSION = "1.1.0"
 """Version of GeoParquet."""
 ROWS_A_GROUP = 20_000
 """Rows in one row group."""
-SOLID = "solid"
-"""The second column of geometry in `buildings`: the faces of the solids as a MultiPolygon Z."""
 
 _BBOX = pa.struct([pa.field(name, pa.float64(), nullable=False) for name in ("xmin", "ymin", "xmax", "ymax")])
 _DIMENSION_SUFFIX = {2: "", 3: " Z"}
@@ -37,7 +36,14 @@ def stored_schema(table_name: str) -> pa.Schema:
     return SCHEMAS[table_name].append(pa.field("bbox", _BBOX))
 
 
-def geo_metadata(geometries: Any, projjson: Mapping[str, Any] | None, solids: Any | None = None) -> dict[str, Any]:
+def solid_names(table_name: str) -> tuple[str, ...]:
+    """The columns of geometry of a table beside the primary one: faces of solids, a MultiPolygon Z each."""
+    return tuple(name for name in SOLIDS if name in SCHEMAS[table_name].names)
+
+
+def geo_metadata(
+    geometries: Any, projjson: Mapping[str, Any] | None, solids: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """The `geo` entry of the file metadata.
 
     Parameters
@@ -46,16 +52,21 @@ def geo_metadata(geometries: Any, projjson: Mapping[str, Any] | None, solids: An
         Null ones are left out of types and bounds.
     projjson : mapping or None
         The coordinate reference system; None where it is unknown.
-    solids : array of shapely geometries, optional
-        Those of the column `solid` in tables that have it. Their rings run outward round the solid, not
-        counter-clockwise in plan, and nothing is told of their orientation. The footprint is the outline of the
-        solids, so that one `bbox` column covers both.
+    solids : mapping of arrays of shapely geometries, optional
+        Those of the columns of solids by their names. Their rings run outward round the solid, not counter-clockwise
+        in plan, and nothing is told of their orientation. The footprint is the outline of the solids, so that the
+        `bbox` column covers both. Coarser solids are told of where there are any; rows may lack them, so `bbox` is not
+        told to cover them.
     """
     column = _column_metadata(geometries, projjson)
     column["orientation"] = "counterclockwise"
     columns = {"geometry": column}
-    if solids is not None:
-        columns[SOLID] = _column_metadata(solids, projjson)
+    for name, faces in (solids or {}).items():
+        told = _column_metadata(faces, projjson)
+        if name == SOLIDS[0]:
+            columns[name] = told
+        elif not shapely.is_missing(faces).all():
+            columns[name] = {key: value for key, value in told.items() if key != "covering"}
     return {"version": VERSION, "primary_column": "geometry", "columns": columns}
 
 
@@ -108,7 +119,7 @@ def geo_table(table_name: str, rows: Sequence[Mapping[str, Any]], projjson: Mapp
         mask=pa.array(missing, pa.bool_()),
     )
     table = table.append_column(pa.field("bbox", _BBOX), bbox)
-    solids = _from_wkb(ordered, SOLID) if SOLID in schema.names else None
+    solids = {name: _from_wkb(ordered, name) for name in solid_names(table_name)}
     geo = json.dumps(geo_metadata(geometries, projjson, solids), sort_keys=True, separators=(",", ":"))
     return table.replace_schema_metadata({"geo": geo})
 

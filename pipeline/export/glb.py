@@ -54,6 +54,8 @@ _AXES = (
 class _Mesh:
     """The solids of one building as triangles."""
 
+    lod: str
+    """Their level of detail."""
     low_mm: IntArray
     """(3,) easting, northing, elevation below all corners: whole metres, in mm."""
     positions: Float32Array
@@ -66,7 +68,9 @@ class _Mesh:
     """Name of the part, semantic surface, and its triangles (t, 3), counter-clockwise seen from outside."""
 
 
-def glb_bytes(lines: Iterable[str], horizontal_unit_m: float = 1.0, vertical_unit_m: float = 1.0) -> bytes:
+def glb_bytes(
+    lines: Iterable[str], horizontal_unit_m: float = 1.0, vertical_unit_m: float = 1.0, lod: str | None = None
+) -> bytes:
     """The buildings of a CityJSONSeq text as a GLB file; the same text gives the same bytes.
 
     Parameters
@@ -75,6 +79,8 @@ def glb_bytes(lines: Iterable[str], horizontal_unit_m: float = 1.0, vertical_uni
         As `pipeline.export.cityjson.cityjson_lines` makes them. Buildings without a solid are left out.
     horizontal_unit_m, vertical_unit_m : float
         Metres in one unit of easting and northing, and of elevation.
+    lod : str, optional
+        The finest level of detail that is taken; None for the finest of each building.
 
     Returns
     -------
@@ -88,7 +94,7 @@ def glb_bytes(lines: Iterable[str], horizontal_unit_m: float = 1.0, vertical_uni
     """
     heading, *features = (json.loads(line) for line in lines)
     frame = _Frame.of(heading["transform"], (horizontal_unit_m, horizontal_unit_m, vertical_unit_m))
-    modelled = [(feature, mesh) for feature in features if (mesh := _mesh(feature, frame)) is not None]
+    modelled = [(feature, mesh) for feature in features if (mesh := _mesh(feature, frame, lod)) is not None]
     if not modelled:
         return b""
     origin_mm = np.min([mesh.low_mm for _, mesh in modelled], axis=0)
@@ -96,7 +102,7 @@ def glb_bytes(lines: Iterable[str], horizontal_unit_m: float = 1.0, vertical_uni
     for feature, mesh in modelled:
         name = str(feature["id"])
         attributes = feature["CityObjects"][name]["attributes"]
-        scene.add(name, {"building_id": name, **attributes}, mesh, origin_mm)
+        scene.add(name, {"building_id": name, **attributes, "lod": mesh.lod}, mesh, origin_mm)
     metadata = heading["metadata"]
     place = {
         "origin_m": [int(v) // _MM for v in origin_mm],
@@ -131,13 +137,17 @@ class _Frame:
         return np.rint(steps / self.steps * self.units_m * _MM).astype(np.int64)
 
 
-def _mesh(feature: Mapping[str, Any], frame: _Frame) -> _Mesh | None:
-    """The triangles of a feature's solids; None where it has none."""
+def _mesh(feature: Mapping[str, Any], frame: _Frame, lod: str | None) -> _Mesh | None:
+    """The triangles of a feature's solids at the finest level up to `lod`; None where it has none."""
     corners, ring_starts, face_starts = [], [0], [0]
     told: list[tuple[str, str]] = []
     planes: list[int] = []
+    levels = {g["lod"] for entry in feature["CityObjects"].values() for g in entry.get("geometry", ())}
+    level = max((name for name in levels if lod is None or name <= lod), default="")
     for part, entry in feature["CityObjects"].items():
         for geometry in entry.get("geometry", ()):
+            if geometry["lod"] != level:
+                continue
             semantics = geometry["semantics"]
             for face, value in zip(geometry["boundaries"][0], semantics["values"][0], strict=True):
                 for ring in face:
@@ -163,6 +173,7 @@ def _mesh(feature: Mapping[str, Any], frame: _Frame) -> _Mesh | None:
     parts = list(dict.fromkeys(part for part, _ in told))
     wanted = [(part, name) for part in parts for name in MATERIALS if (part, name) in groups]
     return _Mesh(
+        lod=level,
         low_mm=low_mm,
         positions=_gltf_axes(local_mm / _MM),
         normals=_gltf_axes(normals),

@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from pipeline.export.coordinates import SpatialReference, crs_coordinates, decimals
+from pipeline.export.solid_geometry import model_at
 from pipeline.model import BuildingResult, FaceKind, FloatArray, Solid, SolidFace
 from pipeline.triangulation import triangulate_face
 
 _KINDS = (FaceKind.ROOF, FaceKind.WALL, FaceKind.GROUND)
 
 
-def obj_text(results: Iterable[BuildingResult], reference: SpatialReference) -> str:
+def obj_text(results: Iterable[BuildingResult], reference: SpatialReference, lod: str | None = None) -> str:
     """The solids of one or more buildings as one OBJ file.
 
     Every solid has its own vertices, so that it is closed by itself. Faces without holes stay polygons, those with
@@ -27,12 +28,15 @@ def obj_text(results: Iterable[BuildingResult], reference: SpatialReference) -> 
         Those without a solid are left out.
     reference : SpatialReference
         Gives the units of the coordinates.
+    lod : str, optional
+        A coarser level of detail in the place of the records' own (`model_at`).
     """
     unit = f"{reference.horizontal_unit_m:.12g} m horizontally, {reference.vertical_unit_m:.12g} m vertically"
     lines = [f"# coordinates are easting, northing, elevation; one unit is {unit}"]
     written = 0
     for result in results:
-        for part, solid in enumerate(result.solids):
+        model = model_at(result, lod)
+        for part, solid in enumerate(model.solids if model is not None else ()):
             lines.append(f"o {part_id(result, part)}")
             lines.extend(_vertex_lines(crs_coordinates(solid.vertices, result.origin, reference), reference))
             lines.extend(_face_lines(solid, written + 1))

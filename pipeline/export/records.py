@@ -16,7 +16,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.export.coordinates import SpatialReference, crs_coordinates, crs_elevation, crs_geometry, decimals
 from pipeline.export.dimensions import Dimensions, dimensions
 from pipeline.export.solid_geometry import solid_columns
-from pipeline.model import BuildingResult, Plane, Reason
+from pipeline.model import BuildingResult, ModelQuality, Plane, Reason
 
 _TIME = pa.timestamp("us", tz="UTC")
 
@@ -37,6 +37,12 @@ BUILDINGS = pa.schema(
         pa.field("solid_parts", pa.list_(pa.int32())),
         pa.field("solid_surfaces", pa.list_(pa.string())),
         pa.field("solid_planes", pa.list_(pa.int32())),
+        pa.field("solid_lod12", pa.binary()),
+        pa.field("solid_lod12_parts", pa.list_(pa.int32())),
+        pa.field("solid_lod12_surfaces", pa.list_(pa.string())),
+        pa.field("solid_lod13", pa.binary()),
+        pa.field("solid_lod13_parts", pa.list_(pa.int32())),
+        pa.field("solid_lod13_surfaces", pa.list_(pa.string())),
         pa.field("ground_z", pa.float64()),
         pa.field("eave_z", pa.float64()),
         pa.field("ridge_z", pa.float64()),
@@ -54,6 +60,14 @@ BUILDINGS = pa.schema(
         pa.field("rmse_m", pa.float64()),
         pa.field("p95_m", pa.float64()),
         pa.field("coverage", pa.float64()),
+        pa.field("point_spacing_m", pa.float64()),
+        pa.field("noise_m", pa.float64()),
+        pa.field("share_within_0_2m", pa.float64()),
+        pa.field("unexplained_m2", pa.float64()),
+        pa.field("largest_hole_m", pa.float64()),
+        pa.field("ridge_z_sigma_m", pa.float64()),
+        pa.field("bic_margin", pa.float64()),
+        pa.field("is_curved", pa.bool_(), nullable=False),
         pa.field("valid", pa.bool_(), nullable=False),
         pa.field("validity_codes", pa.list_(pa.int32()), nullable=False),
         pa.field("touches_data_edge", pa.bool_(), nullable=False),
@@ -150,6 +164,8 @@ class RecordContext:
     """Latest acquisition of the whole run's input."""
     facts: Mapping[str, CandidateFacts] = dataclasses.field(default_factory=dict)
     """Facts by building_id."""
+    coarser_lods: tuple[str, ...] = ()
+    """Levels of detail that were asked for beside the finest one: each has mesh files of its own."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -224,6 +240,7 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         "rmse_m": _or_none(result.rmse_m),
         "p95_m": _or_none(result.p95_m),
         "coverage": _or_none(result.coverage, 4),
+        **_quality(result.quality),
         "valid": modelled,
         "validity_codes": list(result.validity_codes),
         "touches_data_edge": result.touches_data_edge,
@@ -233,6 +250,20 @@ def building_row(result: BuildingResult, context: RecordContext, *, mesh_path: s
         "input_hash": facts.input_hash,
         "settings_hash": facts.settings_hash or context.settings_hash,
         "engine_version": context.engine_version,
+    }
+
+
+def _quality(quality: ModelQuality) -> dict[str, float | bool | None]:
+    """How well the points support the model; None of what they cannot tell."""
+    return {
+        "point_spacing_m": _or_none(quality.point_spacing_m),
+        "noise_m": _or_none(quality.noise_m),
+        "share_within_0_2m": _or_none(quality.share_within, 4),
+        "unexplained_m2": _or_none(quality.unexplained_m2),
+        "largest_hole_m": _or_none(quality.largest_hole_m),
+        "ridge_z_sigma_m": _or_none(quality.ridge_z_sigma_m),
+        "bic_margin": _or_none(quality.bic_margin),
+        "is_curved": quality.is_curved,
     }
 
 

@@ -8,12 +8,40 @@ the solid's faces, outward, and so bound the same solid again; in plan it is no 
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 from pipeline.export.coordinates import SpatialReference, crs_coordinates
-from pipeline.model import BuildingResult, FaceKind
+from pipeline.model import BuildingResult, FaceKind, LodModel, Solid
 
-SOLID_COLUMNS = ("solid", "solid_parts", "solid_surfaces", "solid_planes")
+COARSER_LODS = ("1.2", "1.3")
+"""Levels of detail that have columns and files of their own where a finer one is modelled too."""
+
+
+def lod_suffix(lod: str) -> str:
+    """What ends the names of columns and files of a coarser level of detail.
+
+    Examples
+    --------
+    >>> lod_suffix("1.3")
+    'lod13'
+    """
+    return f"lod{lod.replace('.', '')}"
+
+
+_COARSER_COLUMNS = {
+    lod: tuple(f"solid_{lod_suffix(lod)}{end}" for end in ("", "_parts", "_surfaces")) for lod in COARSER_LODS
+}
+
+SOLIDS = ("solid", *(names[0] for names in _COARSER_COLUMNS.values()))
+"""The columns of geometry among `SOLID_COLUMNS`."""
+SOLID_COLUMNS = (
+    "solid",
+    "solid_parts",
+    "solid_surfaces",
+    "solid_planes",
+    *(name for names in _COARSER_COLUMNS.values() for name in names),
+)
 """The columns that tell a building's solids."""
 SURFACES = {FaceKind.ROOF: "RoofSurface", FaceKind.WALL: "WallSurface", FaceKind.GROUND: "GroundSurface"}
 """CityGML's names of the kinds of faces."""
@@ -25,19 +53,41 @@ _CORNER_BYTES = 24
 
 
 def solid_columns(result: BuildingResult, reference: SpatialReference) -> dict[str, Any]:
-    """The solids of a building as `SOLID_COLUMNS`; None in each where it has no model.
+    """The solids of a building as `SOLID_COLUMNS`; None in each where it has no such model.
 
     `solid` is ISO WKB in CRS units: the faces of all parts, part by part. The other three are lists with one value a
     polygon: the number of the part, the semantic surface, and the `plane_id` of a roof plane (-1 on walls and ground).
+    `solid_lod12` and `solid_lod13` tell coarser models beside the record's own in the same way, but for the planes:
+    level parts are none of the table `planes`.
     """
-    if not result.solids:
-        return dict.fromkeys(SOLID_COLUMNS)
+    columns: dict[str, Any] = dict.fromkeys(SOLID_COLUMNS)
+    if result.solids:
+        columns.update(zip(SOLID_COLUMNS, _told(result.solids, result.origin, reference), strict=False))
+    for model in result.coarser:
+        columns.update(zip(_COARSER_COLUMNS[model.lod], _told(model.solids, result.origin, reference), strict=False))
+    return columns
+
+
+def model_at(result: BuildingResult, lod: str | None) -> LodModel | None:
+    """The finest model of a building that is no finer than `lod`; its own for None, None where there is none.
+
+    A building that fell back to a block has that at every level.
+    """
+    own = (LodModel(lod=result.lod, planes=result.planes, solids=result.solids),) if result.solids else ()
+    known = [model for model in (*own, *result.coarser) if lod is None or model.lod <= lod]
+    return max(known, key=lambda model: model.lod, default=None)
+
+
+def _told(
+    solids: Sequence[Solid], origin: tuple[float, float, float], reference: SpatialReference
+) -> tuple[bytes, list[int], list[str], list[int]]:
+    """Solids as the values of the columns."""
     parts: list[int] = []
     surfaces: list[str] = []
     planes: list[int] = []
     wkb: list[bytes] = []
-    for part, solid in enumerate(result.solids):
-        xyz = crs_coordinates(solid.vertices, result.origin, reference).astype("<f8").tobytes()
+    for part, solid in enumerate(solids):
+        xyz = crs_coordinates(solid.vertices, origin, reference).astype("<f8").tobytes()
         corners = [xyz[start : start + _CORNER_BYTES] for start in range(0, len(xyz), _CORNER_BYTES)]
         for face in solid.faces:
             parts.append(part)
@@ -49,4 +99,4 @@ def solid_columns(result: BuildingResult, reference: SpatialReference) -> dict[s
                 wkb.extend(corners[i] for i in ring)
                 wkb.append(corners[ring[0]])
     head = _HEAD.pack(_LITTLE_ENDIAN, _MULTIPOLYGON_Z, len(parts))
-    return dict(zip(SOLID_COLUMNS, (head + b"".join(wkb), parts, surfaces, planes), strict=True))
+    return head + b"".join(wkb), parts, surfaces, planes

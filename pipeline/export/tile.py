@@ -15,6 +15,7 @@ from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.glb import glb_bytes
 from pipeline.export.obj import obj_text
 from pipeline.export.records import RecordContext, RejectedObject, building_row, plane_rows, rejected_row
+from pipeline.export.solid_geometry import lod_suffix, model_at
 from pipeline.model import BuildingResult
 
 MESHES = ("building", "tile", "glb", "none")
@@ -56,13 +57,52 @@ def put_local(run_dir: str | Path) -> Put:
     return put
 
 
-def mesh_path(tile_key: str, building_id: str, meshes: str) -> str | None:
-    """Where a building's mesh lies in the run directory; None where none is written."""
+def mesh_path(tile_key: str, building_id: str, meshes: str, lod: str | None = None) -> str | None:
+    """Where a building's mesh lies in the run directory; None where none is written.
+
+    Examples
+    --------
+    >>> mesh_path("x85_y447", "abc", "building"), mesh_path("x85_y447", "abc", "glb", "1.2")
+    ('meshes/x85_y447/abc.obj', 'meshes/x85_y447/x85_y447-lod12.glb')
+    """
     if meshes == "none":
         return None
-    if meshes == "building":
-        return f"meshes/{tile_key}/{building_id}.obj"
-    return f"meshes/{tile_key}/{tile_key}.{'glb' if meshes == 'glb' else 'obj'}"
+    stem = building_id if meshes == "building" else tile_key
+    ending = "" if lod is None else f"-{lod_suffix(lod)}"
+    return f"meshes/{tile_key}/{stem}{ending}.{'glb' if meshes == 'glb' else 'obj'}"
+
+
+def mesh_files(
+    tile_key: str, results: Sequence[BuildingResult], lines: Sequence[str], context: RecordContext, meshes: str
+) -> Iterator[tuple[str, bytes]]:
+    """The mesh files of a tile as path and content: one set with the records' models, one a coarser level of detail.
+
+    Parameters
+    ----------
+    tile_key : str
+        The tile.
+    results : sequence of BuildingResult
+        What the OBJ files hold.
+    lines : sequence of str
+        The tile's CityJSONSeq, which the GLB files are made of.
+    context : RecordContext
+        Units, and the coarser levels of detail.
+    meshes : str
+        One of `MESHES`.
+    """
+    units_m = context.reference.horizontal_unit_m, context.reference.vertical_unit_m
+    for lod in (None, *context.coarser_lods):
+        modelled = [result for result in results if model_at(result, lod) is not None]
+        groups = [[result] for result in modelled] if meshes == "building" else [modelled] if modelled else []
+        if meshes == "glb":
+            path = mesh_path(tile_key, "", meshes, lod)
+            if path is not None and (data := glb_bytes(lines, *units_m, lod)):
+                yield path, data
+            continue
+        for group in groups:
+            path = mesh_path(tile_key, group[0].building_id, meshes, lod)
+            if path is not None:
+                yield path, obj_text(group, context.reference, lod).encode()
 
 
 def write_tile(
@@ -136,13 +176,7 @@ def _tile_files(
     meshes: str,
 ) -> Iterator[tuple[str, bytes]]:
     """The tile's files as path and content: meshes first, so that no row names a mesh that is not there yet."""
-    modelled = [result for result in results if result.solids]
     reference = context.reference
-    if meshes == "tile" and modelled:
-        yield f"meshes/{tile_key}/{tile_key}.obj", obj_text(modelled, reference).encode()
-    if meshes == "building":
-        for result in modelled:
-            yield f"meshes/{tile_key}/{result.building_id}.obj", obj_text([result], reference).encode()
     rows = [
         building_row(
             result, context, mesh_path=mesh_path(tile_key, result.building_id, meshes) if result.solids else None
@@ -150,11 +184,7 @@ def _tile_files(
         for result in results
     ]
     lines = list(cityjson_lines(list(zip(results, rows, strict=True)), reference, f"buildings of tile {tile_key}"))
-    if meshes == "glb" and modelled:
-        yield (
-            f"meshes/{tile_key}/{tile_key}.glb",
-            glb_bytes(lines, reference.horizontal_unit_m, reference.vertical_unit_m),
-        )
+    yield from mesh_files(tile_key, results, lines, context, meshes)
     yield f"cityjson/tile={tile_key}/part-0.city.jsonl", "".join(f"{line}\n" for line in lines).encode()
     tables = {
         "planes": [row for result in results for row in plane_rows(result, context)],

@@ -19,7 +19,6 @@ import pyarrow.parquet as pq
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.geoparquet import geo_table, parquet_bytes
-from pipeline.export.glb import glb_bytes
 from pipeline.export.obj import obj_text
 from pipeline.export.records import (
     KEYS,
@@ -30,7 +29,7 @@ from pipeline.export.records import (
     plane_rows,
     rejected_row,
 )
-from pipeline.export.tile import mesh_path
+from pipeline.export.tile import mesh_files, mesh_path
 from pipeline.model import BuildingResult
 
 
@@ -82,22 +81,6 @@ def updated_tile(
     """
     root, names = Path(run_dir), frozenset(replaced)
     results = sorted(results, key=lambda result: result.building_id)
-    modelled = [result for result in results if result.solids]
-    files: dict[str, bytes] = {}
-    gone: list[str] = []
-    if meshes == "building":
-        for result in modelled:
-            files[f"meshes/{tile_key}/{result.building_id}.obj"] = obj_text([result], context.reference).encode()
-        there = (f"meshes/{tile_key}/{name}.obj" for name in sorted(names))
-        gone.extend(path for path in there if path not in files and (root / path).is_file())
-    elif meshes == "tile":
-        path = f"meshes/{tile_key}/{tile_key}.obj"
-        old = (root / path).read_text(encoding="utf-8") if (root / path).is_file() else ""
-        text = _merged_obj(old, names, obj_text(modelled, context.reference))
-        if text:
-            files[path] = text.encode()
-        elif old:
-            gone.append(path)
     rows = [
         building_row(
             result, context, mesh_path=mesh_path(tile_key, result.building_id, meshes) if result.solids else None
@@ -107,14 +90,18 @@ def updated_tile(
     path = f"cityjson/tile={tile_key}/part-0.city.jsonl"
     fresh = cityjson_lines(list(zip(results, rows, strict=True)), context.reference, "")
     text = _merged_cityjson(_text(root / path), names, fresh)
-    files[path] = text.encode()
-    if meshes == "glb":
-        path = f"meshes/{tile_key}/{tile_key}.glb"
-        units_m = context.reference.horizontal_unit_m, context.reference.vertical_unit_m
-        if data := glb_bytes(text.splitlines(), *units_m):
-            files[path] = data
-        elif (root / path).is_file():
-            gone.append(path)
+    files = {path: text.encode(), **dict(mesh_files(tile_key, results, text.splitlines(), context, meshes))}
+    gone: list[str] = []
+    for lod in (None, *context.coarser_lods):
+        there = {name: mesh_path(tile_key, name, meshes, lod) for name in sorted(names)}
+        whole = mesh_path(tile_key, "", meshes, lod)
+        if meshes == "tile" and whole is not None:
+            old = (root / whole).read_text(encoding="utf-8") if (root / whole).is_file() else ""
+            if merged := _merged_obj(old, names, obj_text(results, context.reference, lod)):
+                files[whole] = merged.encode()
+        gone.extend(
+            path for path in dict.fromkeys(there.values()) if path and path not in files and (root / path).is_file()
+        )
     added = {
         "planes": [row for result in results for row in plane_rows(result, context)],
         "rejected": [rejected_row(entry, context) for entry in rejected],

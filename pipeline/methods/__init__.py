@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
+import functools
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from pipeline.errors import SettingsError
-from pipeline.methods import arrangement, fuzzy_sart, kmeans, parameter_space
 from pipeline.model import Candidate, Segmentation
 from pipeline.parameters import Parameters
 from pipeline.roof.arrangement import ArrangementSettings
 from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings
-from pipeline.segmentation.adaptive_planes import AdaptivePlaneSettings
 
+LODS = ("1.2", "1.3", "2.2")
+"""Levels of detail (Biljecki, Ledoux and Stoter 2016): one block, level parts, the roof faces themselves."""
 PRESETS = ("robust", "faithful")
-"""Named settings that every method has: those that measured better, the default, and those that keep to the paper."""
+"""Named settings: those that measured better, the default, which every method has, and those that keep to its paper."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,10 +30,16 @@ class Method:
     """Its settings class."""
     segment: Callable[[Candidate, Any], Segmentation]
     """From a candidate and an instance of `settings_type` to planes and labels."""
-    faithful: Parameters
-    """The settings that keep to the paper's words; the defaults of `settings_type` are those that measured better."""
+    faithful: Parameters | None = None
+    """The settings that keep to the paper's words, None for a method of our own; the defaults of `settings_type` are
+    those that measured better."""
     arranged: bool = False
     """Whether its roof faces are cells of an arrangement of lines; else they are traced from the labels."""
+
+    @property
+    def presets(self) -> tuple[str, ...]:
+        """Names of the presets that it has."""
+        return PRESETS[: 1 if self.faithful is None else 2]
 
     def preset(self, name: str) -> Parameters:
         """The settings of a named preset.
@@ -46,49 +52,99 @@ class Method:
         Raises
         ------
         SettingsError
-            For another name.
+            For another name, or where the method follows no paper.
         """
         if name not in PRESETS:
             raise SettingsError([f"preset is {name!r}: use one of {', '.join(PRESETS)}"])
-        return self.faithful if name == "faithful" else self.settings_type()
+        if name == "robust":
+            return self.settings_type()
+        if self.faithful is None:
+            raise SettingsError([f"preset is {name!r}, and {self.name} follows no paper: use {self.presets[0]}"])
+        return self.faithful
 
 
-METHODS: Mapping[str, Method] = MappingProxyType(
+def _arrangement() -> Method:
+    from pipeline.methods import arrangement
+    from pipeline.segmentation.adaptive_planes import AdaptivePlaneSettings
+
+    return Method(
+        name="arrangement",
+        settings_type=AdaptivePlaneSettings,
+        segment=arrangement.segment,
+        arranged=True,
+    )
+
+
+def _fuzzy_sart() -> Method:
+    from pipeline.methods import fuzzy_sart
+
+    return Method(
+        name="fuzzy-sart",
+        settings_type=fuzzy_sart.FuzzySartSettings,
+        segment=fuzzy_sart.segment,
+        faithful=fuzzy_sart.FuzzySartSettings.faithful(),
+    )
+
+
+def _parameter_space_2d() -> Method:
+    from pipeline.methods import parameter_space
+
+    return Method(
+        name="parameter-space-2d",
+        settings_type=parameter_space.ParameterSpace2dSettings,
+        segment=parameter_space.segment_2d,
+        faithful=parameter_space.ParameterSpace2dSettings.faithful(),
+    )
+
+
+def _parameter_space_3d() -> Method:
+    from pipeline.methods import parameter_space
+
+    return Method(
+        name="parameter-space-3d",
+        settings_type=parameter_space.ParameterSpace3dSettings,
+        segment=parameter_space.segment_3d,
+        faithful=parameter_space.ParameterSpace3dSettings.faithful(),
+    )
+
+
+def _kmeans() -> Method:
+    from pipeline.methods import kmeans
+
+    return Method(
+        name="kmeans",
+        settings_type=kmeans.KMeansSettings,
+        segment=kmeans.segment,
+        faithful=kmeans.KMeansSettings.faithful(),
+    )
+
+
+class _Table(Mapping[str, Method]):
+    """Methods by name, each imported when it is first asked for: a run needs one, and start-up counts."""
+
+    def __init__(self, entries: Mapping[str, Callable[[], Method]]) -> None:
+        self._entries = {name: functools.cache(entry) for name, entry in entries.items()}
+
+    def __getitem__(self, name: str) -> Method:
+        return self._entries[name]()
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._entries
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+
+METHODS: Mapping[str, Method] = _Table(
     {
-        method.name: method
-        for method in (
-            Method(
-                name="arrangement",
-                settings_type=AdaptivePlaneSettings,
-                segment=arrangement.segment,
-                faithful=AdaptivePlaneSettings(),
-                arranged=True,
-            ),
-            Method(
-                name="fuzzy-sart",
-                settings_type=fuzzy_sart.FuzzySartSettings,
-                segment=fuzzy_sart.segment,
-                faithful=fuzzy_sart.FuzzySartSettings.faithful(),
-            ),
-            Method(
-                name="parameter-space-2d",
-                settings_type=parameter_space.ParameterSpace2dSettings,
-                segment=parameter_space.segment_2d,
-                faithful=parameter_space.ParameterSpace2dSettings.faithful(),
-            ),
-            Method(
-                name="parameter-space-3d",
-                settings_type=parameter_space.ParameterSpace3dSettings,
-                segment=parameter_space.segment_3d,
-                faithful=parameter_space.ParameterSpace3dSettings.faithful(),
-            ),
-            Method(
-                name="kmeans",
-                settings_type=kmeans.KMeansSettings,
-                segment=kmeans.segment,
-                faithful=kmeans.KMeansSettings.faithful(),
-            ),
-        )
+        "arrangement": _arrangement,
+        "fuzzy-sart": _fuzzy_sart,
+        "parameter-space-2d": _parameter_space_2d,
+        "parameter-space-3d": _parameter_space_3d,
+        "kmeans": _kmeans,
     }
 )
 """All methods by name."""
@@ -134,6 +190,8 @@ class ReconstructSettings:
     """Costs of roof faces, where they are arranged."""
     roof_type: RoofTypeSettings = dataclasses.field(default_factory=RoofTypeSettings)
     """Thresholds of the roof types."""
+    lods: tuple[str, ...] = LODS[-1:]
+    """Levels of detail to be modelled, of `LODS` and in their order."""
 
     def segmentation(self, method: Method) -> Callable[[Candidate], Segmentation]:
         """The method with its settings bound.

@@ -225,6 +225,15 @@ class TopSurface:
         self._cell_starts, cell_faces = _faces_of_cells(boxes[filled], *self._low, cell, *self._shape)
         self._cell_faces = np.flatnonzero(filled)[cell_faces]
 
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Smallest x, smallest y, largest x, largest y of all faces, metres; nan without any."""
+        if self._empty:
+            return math.nan, math.nan, math.nan, math.nan
+        east, north = self._corner
+        low, high = self._boxes[:, :2].min(axis=0).tolist(), self._boxes[:, 2:].max(axis=0).tolist()
+        return low[0] + east, low[1] + north, high[0] + east, high[1] + north
+
     def at(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, LabelArray]:
         """Elevation of the highest face at places, and its number.
 
@@ -293,9 +302,13 @@ def top_surface(points: FloatArray, faces: Sequence[RoofFace], planes: Sequence[
     (n,) float64
         Metres; nan where no face covers the point.
     """
+    return surface_of(faces, planes).elevation(points[:, 0], points[:, 1])
+
+
+def surface_of(faces: Sequence[RoofFace], planes: Sequence[Plane]) -> TopSurface:
+    """The top surface of a model's roof faces, about its local origin; numbers are those of the faces."""
     coefficients = np.array([planes[face.plane].coefficients for face in faces]).reshape(-1, 3)
-    surface = TopSurface([face.polygon for face in faces], coefficients, corner=(0.0, 0.0))
-    return surface.elevation(points[:, 0], points[:, 1])
+    return TopSurface([face.polygon for face in faces], coefficients, corner=(0.0, 0.0))
 
 
 def vertical_residuals(points: FloatArray, faces: Sequence[RoofFace], planes: Sequence[Plane]) -> FloatArray:
@@ -317,6 +330,14 @@ def vertical_residuals(points: FloatArray, faces: Sequence[RoofFace], planes: Se
     """
     residuals: FloatArray = points[:, 2] - top_surface(points, faces, planes)
     return residuals
+
+
+def _quantile(ascending: FloatArray, share: float) -> float:
+    """Quantile of sorted values, linear between two of them; numpy's costs more than all else of a summary."""
+    place = share * (len(ascending) - 1)
+    low = math.floor(place)
+    high = min(low + 1, len(ascending) - 1)
+    return float(ascending[low]) + (place - low) * float(ascending[high] - ascending[low])
 
 
 def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummary:
@@ -350,8 +371,8 @@ def summarise(residuals: FloatArray, tolerance_m: float = 0.2) -> ResidualSummar
         )
     return ResidualSummary(
         rmse_m=math.sqrt(math.fsum((distances * distances).tolist()) / covered),
-        median_m=float(np.median(distances)),
-        p95_m=float(np.percentile(distances, 95.0)),
+        median_m=_quantile(distances, 0.5),
+        p95_m=_quantile(distances, 0.95),
         share_within=float(np.searchsorted(distances, tolerance_m, side="right")) / n,
         coverage=covered / n,
         n_points=n,

@@ -252,10 +252,10 @@ def _solids(
 
 
 def _viewed_faces(feature: dict[str, Any], xyz: Any, roof_colour: str) -> list[ViewedFace]:
-    """Roofs and walls of a CityJSONFeature."""
+    """Roofs and walls of a CityJSONFeature, of each part at its finest level of detail."""
     faces = []
     for entry in feature["CityObjects"].values():
-        for solid in entry.get("geometry", ()):
+        for solid in sorted(entry.get("geometry", ()), key=lambda geometry: str(geometry["lod"]))[-1:]:
             surfaces = [surface["type"] for surface in solid["semantics"]["surfaces"]]
             for shell, values in zip(solid["boundaries"], solid["semantics"]["values"], strict=True):
                 for rings, value in zip(shell, values, strict=True):

@@ -33,25 +33,26 @@ def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
     BuildingError
         `no_footprint` where nothing with an area is left.
     """
-    scaled = shapely.transform(shapely.force_2d(footprint), lambda xy: xy * 1e3)
+    scaled = shapely.force_2d(footprint)
+    scaled = shapely.set_coordinates(scaled, shapely.get_coordinates(scaled) * 1e3)
     if not scaled.is_valid:
         scaled = shapely.make_valid(scaled, method="structure", keep_collapsed=False)
     snapped = shapely.set_precision(scaled, 1.0)
     straight = shapely.simplify(snapped, _STRAIGHT_MM, preserve_topology=True)
     cleaned = [thinned for polygon in polygons_of(straight) for thinned in without_repeated(polygon, _REPEATED_MM)]
     thinned_all = MultiPolygon(cleaned)
-    cleaned = cleaned if thinned_all.is_valid else polygons_of(snapped)
-    if not cleaned:
+    if not thinned_all.is_valid:
+        thinned_all = MultiPolygon(polygons_of(snapped))
+    if thinned_all.is_empty:
         raise BuildingError(Reason.NO_FOOTPRINT, f"the given footprint has an area of {footprint.area:g} m2")
-    return MultiPolygon(cleaned)
+    return thinned_all
 
 
 def without_repeated(polygon: Polygon, distance_mm: float) -> list[Polygon]:
     """The polygon without vertices that repeat the one before; holes that vanish go, and so does the whole."""
-    rings = []
-    for line in (polygon.exterior, *polygon.interiors):
-        path = shapely.remove_repeated_points(shapely.linestrings(shapely.get_coordinates(line)), distance_mm)
-        rings.append(shapely.get_coordinates(path))
+    paths, number = shapely.get_coordinates(shapely.get_rings(polygon), return_index=True)
+    thinned = shapely.remove_repeated_points(shapely.linestrings(paths, indices=number), distance_mm)
+    rings = [shapely.get_coordinates(line) for line in thinned]
     if len(rings[0]) < 4:
         return []
     return [Polygon(rings[0], [ring for ring in rings[1:] if len(ring) >= 4])]

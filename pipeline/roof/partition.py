@@ -17,7 +17,7 @@ import shapely
 from numba import njit
 
 from pipeline.errors import BuildingError
-from pipeline.model import FloatArray, IntArray, LabelArray, Reason, Tin
+from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason, Tin
 
 OUTSIDE = -1
 """The label of what is no roof."""
@@ -36,6 +36,8 @@ class RoofPartition:
     """In integer millimetres of the candidate's local frame."""
     labels: LabelArray
     """(p,) int32, the plane of each polygon."""
+    planes: tuple[Plane, ...] | None = None
+    """What the labels number; None for the planes of the segmentation."""
 
 
 @njit(cache=True, nogil=True)

@@ -71,7 +71,7 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
     candidate : Candidate
         Its points.
     settings : RoofSettings
-        `minimum_roof_height_m`, `minimum_points`.
+        `minimum_roof_height_m`, `minimum_points`, `minimum_points_in_footprint`.
 
     Returns
     -------
@@ -99,10 +99,11 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
     grid = np.rint(points[index] * 1e3).astype(np.int64)
     kept, _ = unique_xy(grid[:, :2], grid[:, 2])
     index = index[kept]
-    if len(index) < settings.minimum_points:
-        raise BuildingError(
-            Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than minimum_points = {settings.minimum_points}"
-        )
+    name, fewest = "minimum_points", settings.minimum_points
+    if candidate.footprint is not None and settings.minimum_points_in_footprint < fewest:
+        name, fewest = "minimum_points_in_footprint", settings.minimum_points_in_footprint
+    if len(index) < fewest:
+        raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than {name} = {fewest}")
     footprint = None if candidate.footprint is None else footprint_in_mm(candidate.footprint)
     return RoofPoints(
         points=points[index],
@@ -123,8 +124,11 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
 
 def _are_among(xy_mm: IntArray, others_mm: IntArray) -> BoolArray:
     """Which of the positions, (n, 2), are rows of others."""
-    keys = [(xy[:, 0] << 32) + xy[:, 1] for xy in (xy_mm, others_mm)]
-    among: BoolArray = np.isin(keys[0], keys[1])
+    if len(others_mm) == 0:
+        return np.zeros(len(xy_mm), np.bool_)
+    keys, others = ((xy[:, 0] << 32) + xy[:, 1] for xy in (xy_mm, others_mm))
+    others.sort()
+    among: BoolArray = others[np.minimum(np.searchsorted(others, keys), len(others) - 1)] == keys
     return among
 
 
@@ -243,18 +247,21 @@ def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
 
 
 def arranged_faces(
-    roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettings, costs: ArrangementSettings
+    roof: RoofPoints,
+    planes: Sequence[Plane],
+    outline_mm: MultiPolygon,
+    costs: ArrangementSettings,
+    clearance: float = 1.0,
 ) -> RoofPartition:
     """The plan as an arrangement of the lines in which planes meet.
 
     Raises
     ------
     BuildingError
-        `no_partition` where the outline cannot be drawn or filled.
+        `no_partition` where the outline cannot be filled.
     """
     coefficients = np.array([plane.coefficients for plane in planes], np.float64).reshape(len(planes), 3)
-    outline_mm = drawn_outline(roof, settings)
-    return arrange(roof.points, roof.labels, coefficients, outline_mm, roof.spacing_m, costs)
+    return arrange(roof.points, roof.labels, coefficients, outline_mm, roof.spacing_m, costs, clearance)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -397,6 +404,9 @@ def level_unsupported_faces(
     lowest, highest = np.full(len(planes), np.inf), np.full(len(planes), -np.inf)
     np.minimum.at(lowest, roof.labels[known], roof.points[known, 2])
     np.maximum.at(highest, roof.labels[known], roof.points[known, 2])
+    # a side of a template can be without points: it is as high as the others
+    bare = np.isinf(lowest)
+    lowest[bare], highest[bare] = roof.points[:, 2].min(), roof.points[:, 2].max()
     for k, polygon in enumerate(partition.polygons):
         label = int(labels[k])
         plane = planes[label]

@@ -61,7 +61,7 @@ class _Side:
     planes: set[int]
 
 
-_Folds = dict[tuple[int, int], float]
+Folds = dict[tuple[int, int], float]
 """Length in plan over which two planes meet, by their numbers in both orders; each edge counts from both sides."""
 
 
@@ -98,7 +98,7 @@ def roof_type(
     if total <= 0.0:
         return RoofType.NONE
     flat_area = math.fsum(area for p, area in areas.items() if planes[p].slope_deg < settings.flat_below_deg)
-    ridges, bends = _folds(planes, solids, settings.sliver_height_m)
+    ridges, bends = folds(planes, solids, settings.sliver_height_m)
     sides = _sides(planes, areas, bends, settings)
     major = [side for side in sides if side.area >= settings.minor_share * total]
     is_flat = flat_area >= settings.minor_share * total
@@ -118,7 +118,7 @@ def roof_type(
     return RoofType.COMBINATION
 
 
-def _sides(planes: Sequence[Plane], areas: dict[int, float], bends: _Folds, settings: RoofTypeSettings) -> list[_Side]:
+def _sides(planes: Sequence[Plane], areas: dict[int, float], bends: Folds, settings: RoofTypeSettings) -> list[_Side]:
     """Sloping planes gathered by direction, largest first."""
     sides: list[_Side] = []
     for p in sorted(areas, key=lambda p: (-areas[p], p)):
@@ -138,13 +138,13 @@ def _sides(planes: Sequence[Plane], areas: dict[int, float], bends: _Folds, sett
     return sides
 
 
-def _folds(planes: Sequence[Plane], solids: Sequence[Solid], sliver_height_m: float) -> tuple[_Folds, _Folds]:
+def folds(planes: Sequence[Plane], solids: Sequence[Solid], sliver_height_m: float) -> tuple[Folds, Folds]:
     """Where planes meet and fall away from there on both sides (ridges, hips), and where they do not (bends, valleys).
 
     They meet in a common edge, or across a wall that is nowhere higher than a sliver.
     """
-    ridges: _Folds = {}
-    bends: _Folds = {}
+    ridges: Folds = {}
+    bends: Folds = {}
     for solid in solids:
         owner = {edge: face.plane for face in solid.faces if face.kind is FaceKind.ROOF for edge in _edges(face)}
         met = [(edge, owner[edge[::-1]]) for edge in owner if edge[::-1] in owner]
@@ -160,9 +160,9 @@ def _folds(planes: Sequence[Plane], solids: Sequence[Solid], sliver_height_m: fl
             (xa, ya), (xb, yb) = solid.vertices[a, :2].tolist(), solid.vertices[b, :2].tolist()
             p, q = planes[left], planes[right]
             falls = (p.a - q.a) * (ya - yb) + (p.b - q.b) * (xb - xa) < 0.0
-            folds = ridges if falls else bends
+            turned = ridges if falls else bends
             for pair in ((left, right), (right, left)):
-                folds[pair] = folds.get(pair, 0.0) + math.hypot(xb - xa, yb - ya)
+                turned[pair] = turned.get(pair, 0.0) + math.hypot(xb - xa, yb - ya)
     return ridges, bends
 
 
@@ -184,12 +184,12 @@ def _opposite(a: _Side, b: _Side, settings: RoofTypeSettings) -> bool:
     return 180.0 - _turn(a.aspect_deg, b.aspect_deg) <= settings.aspect_tolerance_deg
 
 
-def _length(a: _Side, b: _Side, folds: _Folds) -> float:
+def _length(a: _Side, b: _Side, met: Folds) -> float:
     """Over which the faces of two sides meet."""
-    return math.fsum(folds.get((p, q), 0.0) for p in sorted(a.planes) for q in sorted(b.planes))
+    return math.fsum(met.get((p, q), 0.0) for p in sorted(a.planes) for q in sorted(b.planes))
 
 
-def _is_hip(sides: list[_Side], ridges: _Folds, bends: _Folds, settings: RoofTypeSettings) -> bool:
+def _is_hip(sides: list[_Side], ridges: Folds, bends: Folds, settings: RoofTypeSettings) -> bool:
     """Two opposite pairs, square to one another, with a hip at each corner; slopes may differ.
 
     Valleys as long as the hips are those of a courtyard; short ones are those of dormers.

@@ -12,6 +12,9 @@ class RoofSettings(Parameters):
     """How roof planes become roof faces and closed solids."""
 
     minimum_points: int = parameter(10, "A candidate with fewer roof points is not modelled.", minimum=3, maximum=1000)
+    minimum_points_in_footprint: int = parameter(
+        4, "The same where the footprint is given: few points then tell a simple roof.", minimum=3, maximum=1000
+    )
     maximum_points: int = parameter(4_000_000, "A candidate with more points is refused as too complex.", minimum=1000)
     minimum_roof_height_m: float = parameter(
         1.5, "Points lower than this above the floor are no roof points.", unit="m", minimum=0.2, maximum=10.0
@@ -53,6 +56,13 @@ class RoofSettings(Parameters):
         "How the plan is cut into roof faces: as the method does it, traced from the points' labels, or arranged along "
         "the lines in which planes meet.",
         choices=("method", "traced", "arranged"),
+    )
+    templates_spacing_m: float = parameter(
+        0.6,
+        "Arranged faces compete with simple roof shapes where points lie at least this far apart.",
+        unit="m",
+        minimum=0.0,
+        maximum=100.0,
     )
     straight_eaves: bool = parameter(
         True, "Whether the outline is drawn with straight lines where no footprint is given."
@@ -124,7 +134,18 @@ class RoofSettings(Parameters):
         maximum=100.0,
     )
     block_height_percentile: float = parameter(
-        70.0, "Height of a fallback block: this percentile of the roof points.", unit="%", minimum=1.0, maximum=100.0
+        70.0,
+        "Height of a block and of each level part: this percentile of its roof points.",
+        unit="%",
+        minimum=1.0,
+        maximum=100.0,
+    )
+    level_step_m: float = parameter(
+        2.0,
+        "LoD1.3: roof faces with a lower step between them are one level part.",
+        unit="m",
+        minimum=0.1,
+        maximum=50.0,
     )
 
     @property

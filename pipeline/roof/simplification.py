@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -11,6 +13,11 @@ from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, Reason
 from pipeline.roof.footprint import without_repeated
 from pipeline.roof.partition import RoofPartition
+
+_STRAIGHT_MM = 2.0
+"""A vertex that bends no border by more is idle: what rounding to 1 mm does to a point on a line."""
+
+XY = tuple[int, int]
 
 
 def simplify_partition(partition: RoofPartition, tolerance_m: float, *, outline_too: bool = True) -> RoofPartition:
@@ -95,3 +102,63 @@ def unite_close_vertices(partition: RoofPartition, distance_mm: float) -> RoofPa
     if not drawn or not shapely.is_valid(drawn).all():
         raise BuildingError(Reason.NO_PARTITION, f"a roof face breaks when vertices within {distance_mm:g} mm are one")
     return RoofPartition(polygons=tuple(drawn), labels=partition.labels[kept])
+
+
+def without_idle_vertices(polygons: Sequence[shapely.Polygon]) -> list[shapely.Polygon]:
+    """Polygons that share borders, without vertices that lie on a straight border between two others.
+
+    Where roof faces are united, the ends of the borders between them are left over. A vertex goes where it joins two
+    edges only and all that went between its neighbours is within 2 mm of the line between them.
+
+    Parameters
+    ----------
+    polygons : sequence of Polygon
+        A coverage in integer millimetres.
+
+    Returns
+    -------
+    list of Polygon
+        The same in the same order.
+
+    Examples
+    --------
+    >>> square = shapely.Polygon([(0, 0), (500, 1), (1000, 0), (1000, 1000), (0, 1000)])
+    >>> without_idle_vertices([square])[0].wkt
+    'POLYGON ((0 0, 1000 0, 1000 1000, 0 1000, 0 0))'
+    """
+    beside: dict[XY, set[XY]] = {}
+    for polygon in polygons:
+        for line in (polygon.exterior, *polygon.interiors):
+            ring = [(round(x), round(y)) for x, y in line.coords]
+            for a, b in itertools.pairwise(ring):
+                beside.setdefault(a, set()).add(b)
+                beside.setdefault(b, set()).add(a)
+    gone: dict[frozenset[XY], list[XY]] = {}
+    dropped: set[XY] = set()
+    for v in sorted(beside):
+        if len(beside[v]) != 2:
+            continue
+        a, b = sorted(beside[v])
+        between = [v, *gone.get(frozenset((a, v)), ()), *gone.get(frozenset((v, b)), ())]
+        if b in beside[a] or any(_off_mm(a, b, u) > _STRAIGHT_MM for u in between):
+            continue
+        gone[frozenset((a, b))] = between
+        dropped.add(v)
+        beside[a] = beside[a] - {v} | {b}
+        beside[b] = beside[b] - {v} | {a}
+    if not dropped:
+        return list(polygons)
+
+    def kept(line: shapely.LinearRing) -> list[XY]:
+        return [xy for x, y in line.coords[:-1] if (xy := (round(x), round(y))) not in dropped]
+
+    return [shapely.Polygon(kept(p.exterior), [kept(line) for line in p.interiors]) for p in polygons]
+
+
+def _off_mm(a: XY, b: XY, v: XY) -> float:
+    """Distance of a vertex from the line a b; infinite where it is not between the two."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    along, squared = dx * (v[0] - a[0]) + dy * (v[1] - a[1]), dx * dx + dy * dy
+    if not 0 < along < squared:
+        return math.inf
+    return abs(dx * (v[1] - a[1]) - dy * (v[0] - a[0])) / math.sqrt(squared)

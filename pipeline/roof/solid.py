@@ -11,12 +11,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 import shapely
 
 from pipeline.errors import BuildingError
-from pipeline.model import FaceKind, Plane, Reason, RoofFace, Solid, SolidFace
+from pipeline.model import FaceKind, FloatArray, Plane, Reason, RoofFace, Solid, SolidFace
 from pipeline.roof.partition import RoofPartition
 
 SAME_HEIGHT_MM = 2
@@ -72,8 +73,11 @@ def solid_parts(partition: RoofPartition, planes: Sequence[Plane], ground_z_m: f
         `no_partition` where borders overlap, pinch, or a plane dips under the floor.
     """
     mesh = _mesh(partition)
-    _insert_crossings(mesh, planes)
-    return [_extrude(mesh, members, planes, ground_z_m) for members in _connected(mesh)]
+    edges = _insert_crossings(mesh, planes)
+    parts = _connected(mesh, edges)
+    if len(parts) == 1:
+        return [_extrude(mesh, parts[0], edges, planes, ground_z_m)]
+    return [_extrude(mesh, members, _edges(mesh, members), planes, ground_z_m) for members in parts]
 
 
 def _fault(detail: str) -> BuildingError:
@@ -84,20 +88,19 @@ def _mesh(partition: RoofPartition) -> _Mesh:
     """Number the distinct plan vertices."""
     xy: list[tuple[int, int]] = []
     number: dict[tuple[int, int], int] = {}
-    faces: list[list[Ring]] = []
-    for polygon in partition.polygons:
-        oriented = shapely.orient_polygons(polygon)
-        rings: list[Ring] = []
-        for line in (oriented.exterior, *oriented.interiors):
-            ring: Ring = []
-            for x, y in np.rint(shapely.get_coordinates(line)[:-1]).astype(np.int64).tolist():
-                vertex = number.setdefault((x, y), len(xy))
-                if vertex == len(xy):
-                    xy.append((x, y))
-                if not ring or ring[-1] != vertex:
-                    ring.append(vertex)
-            rings.append(ring)
-        faces.append(rings)
+    lines, owner = shapely.get_rings(shapely.orient_polygons(np.array(partition.polygons, object)), return_index=True)
+    coordinates = np.rint(shapely.get_coordinates(lines)).astype(np.int64).tolist()
+    stops = np.cumsum(shapely.get_num_coordinates(lines)).tolist()
+    faces: list[list[Ring]] = [[] for _ in partition.polygons]
+    for face, start, stop in zip(owner.tolist(), [0, *stops[:-1]], stops, strict=True):
+        ring: Ring = []
+        for x, y in coordinates[start : stop - 1]:
+            vertex = number.setdefault((x, y), len(xy))
+            if vertex == len(xy):
+                xy.append((x, y))
+            if not ring or ring[-1] != vertex:
+                ring.append(vertex)
+        faces[face].append(ring)
     return _Mesh(xy=xy, faces=faces, planes=[int(label) for label in partition.labels])
 
 
@@ -117,8 +120,8 @@ def _height_mm(plane: Plane, xy: tuple[int, int]) -> float:
     return (plane.a * (xy[0] * 1e-3) + plane.b * (xy[1] * 1e-3) + plane.c) * 1e3
 
 
-def _insert_crossings(mesh: _Mesh, planes: Sequence[Plane]) -> None:
-    """Give every shared edge on which the two planes cross a vertex there."""
+def _insert_crossings(mesh: _Mesh, planes: Sequence[Plane]) -> dict[tuple[int, int], int]:
+    """Give every shared edge on which the two planes cross a vertex there; the edges afterwards."""
     edges = _edges(mesh, range(len(mesh.faces)))
     inserted: dict[tuple[int, int], int] = {}
     for (a, b), left in edges.items():
@@ -137,7 +140,7 @@ def _insert_crossings(mesh: _Mesh, planes: Sequence[Plane]) -> None:
         inserted[a, b] = inserted[b, a] = len(mesh.xy)
         mesh.xy.append((round(xa + fraction * (xb - xa)), round(ya + fraction * (yb - ya))))
     if not inserted:
-        return
+        return edges
     for rings in mesh.faces:
         for k, ring in enumerate(rings):
             longer: Ring = []
@@ -146,11 +149,11 @@ def _insert_crossings(mesh: _Mesh, planes: Sequence[Plane]) -> None:
                 if (a, b) in inserted:
                     longer.append(inserted[a, b])
             rings[k] = longer
+    return _edges(mesh, range(len(mesh.faces)))
 
 
-def _connected(mesh: _Mesh) -> list[list[int]]:
+def _connected(mesh: _Mesh, edges: dict[tuple[int, int], int]) -> list[list[int]]:
     """Faces of every part that hangs together by edges."""
-    edges = _edges(mesh, range(len(mesh.faces)))
     root = list(range(len(mesh.faces)))
 
     def find(face: int) -> int:
@@ -274,9 +277,14 @@ def _trace(following: dict[int, int], xy: Sequence[tuple[int, int]]) -> list[Rin
     return rings
 
 
-def _extrude(mesh: _Mesh, members: Sequence[int], planes: Sequence[Plane], ground_z_m: float) -> SolidPart:
+def _extrude(
+    mesh: _Mesh,
+    members: Sequence[int],
+    edges: dict[tuple[int, int], int],
+    planes: Sequence[Plane],
+    ground_z_m: float,
+) -> SolidPart:
     """Roof, walls and floor of one part."""
-    edges = _edges(mesh, members)
     levels = _Levels(mesh, edges, planes, round(ground_z_m * 1e3))
     faces: list[SolidFace] = []
     for face in members:
@@ -299,12 +307,19 @@ def _extrude(mesh: _Mesh, members: Sequence[int], planes: Sequence[Plane], groun
     faces.append(SolidFace(rings=tuple(tuple(levels.at(v, -1) for v in ring) for ring in floor), kind=FaceKind.GROUND))
     vertices = np.array(levels.points, np.float64) / 1e3
     plan = np.array(mesh.xy, np.float64) / 1e3
+    polygons = _polygons(vertices, [face.rings for face in faces[:n_roof]])
     roof_faces = tuple(
-        RoofFace(
-            plane=face.plane,
-            polygon=shapely.Polygon(vertices[list(face.rings[0])], [vertices[list(ring)] for ring in face.rings[1:]]),
-        )
-        for face in faces[:n_roof]
+        RoofFace(plane=face.plane, polygon=polygon) for face, polygon in zip(faces[:n_roof], polygons, strict=True)
     )
-    footprint = shapely.Polygon(plan[floor[0][::-1]], [plan[ring[::-1]] for ring in floor[1:]])
+    (footprint,) = _polygons(plan, [[ring[::-1] for ring in floor]])
     return SolidPart(solid=Solid(vertices=vertices, faces=tuple(faces)), faces=roof_faces, footprint=footprint)
+
+
+def _polygons(vertices: FloatArray, faces: Sequence[Sequence[Sequence[int]]]) -> list[shapely.Polygon]:
+    """A polygon of every face's rings, the outer one first, all made at once."""
+    rings = [ring for face in faces for ring in face]
+    numbers = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    lines = shapely.linearrings(vertices[list(chain.from_iterable(rings))], indices=numbers)
+    owner = np.repeat(np.arange(len(faces)), [len(face) for face in faces])
+    polygons: list[shapely.Polygon] = shapely.polygons(lines, indices=owner).tolist()
+    return polygons

@@ -97,8 +97,10 @@ def write_bundle(folder: str, bundle: Bundle) -> Path:
         "touches_data_edge": candidate.touches_data_edge,
         "method": bundle.method,
         "settings": {
+            "lods": ",".join(bundle.settings.lods),
             bundle.method: dataclasses.asdict(own),
             "roof": dataclasses.asdict(bundle.settings.roof),
+            "plan": dataclasses.asdict(bundle.settings.plan),
             "roof-type": dataclasses.asdict(bundle.settings.roof_type),
         },
         "incident": incident,

@@ -23,6 +23,7 @@ from typing import Any
 
 from pipeline.errors import RunError
 from pipeline.runtime.messages import Batch, Begun, Finished, Frames, OutOfMemory, Raised, Ready, frame
+from pipeline.runtime.start_up import start_own_process
 
 _PIECE = 2**20
 _PR_SET_PDEATHSIG = 1
@@ -35,8 +36,10 @@ def main(arguments: Sequence[str]) -> None:
     Parameters
     ----------
     arguments : sequence of str
-        The parent's process id, then functions to be called once, as `module:function`.
+        The parent's process id, then functions to be called once, as `module:function`, or `module:function:argument`
+        where it takes a text.
     """
+    start_own_process()
     incoming, outgoing = _private_pipes()
     _end_with_parent(int(arguments[0]))
     _be_the_first_victim()
@@ -45,8 +48,8 @@ def main(arguments: Sequence[str]) -> None:
     batches: queue.SimpleQueue[Batch] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(incoming, batches), daemon=True).start()
     for name in arguments[1:]:
-        module, _, function = name.partition(":")
-        getattr(importlib.import_module(module), function)()
+        module, function, *argument = name.split(":", 2)
+        getattr(importlib.import_module(module), function)(*argument)
     _send(outgoing, Ready())
     while True:
         _work(batches.get(), outgoing)

@@ -6,7 +6,7 @@ import atexit
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from pipeline.errors import RunError
 from pipeline.runtime.supervised import SupervisedChild
@@ -35,7 +35,9 @@ class _Children:
         self._closed = False
 
     @contextlib.contextmanager
-    def lent(self, cancelled: Callable[[], bool], *, fresh: bool) -> Iterator[SupervisedChild]:
+    def lent(
+        self, cancelled: Callable[[], bool], *, fresh: bool, loads: Sequence[str] | None
+    ) -> Iterator[SupervisedChild]:
         """A ready child, `fresh` where it must not have done anything yet; ended where its work broke off.
 
         Raises
@@ -45,7 +47,7 @@ class _Children:
         RunError
             No child can be started.
         """
-        child = self._ready_child(cancelled, fresh=fresh)
+        child = self._ready_child(cancelled, fresh=fresh, loads=_LOADS if loads is None else loads)
         try:
             yield child
         except BaseException:
@@ -73,11 +75,11 @@ class _Children:
             for child in lent:
                 child.kill()
 
-    def _ready_child(self, cancelled: Callable[[], bool], *, fresh: bool) -> SupervisedChild:
+    def _ready_child(self, cancelled: Callable[[], bool], *, fresh: bool, loads: Sequence[str]) -> SupervisedChild:
         """An idle child or a new one."""
         fault = ""
         for _ in range(FRUITLESS_STARTS):
-            child = self._idle_or_new(fresh=fresh)
+            child = self._idle_or_new(fresh=fresh, loads=loads)
             try:
                 problem = child.wait_until_ready(_START_TIMEOUT_S, cancelled)
             except BaseException:
@@ -89,7 +91,7 @@ class _Children:
             self._end(child)
         raise RunError(fault)
 
-    def _idle_or_new(self, *, fresh: bool) -> SupervisedChild:
+    def _idle_or_new(self, *, fresh: bool, loads: Sequence[str]) -> SupervisedChild:
         with self._lock:
             if self._closed:
                 raise RunError("this process is about to end: it models no buildings any more")
@@ -101,11 +103,8 @@ class _Children:
                 elif not (fresh and child.begun):
                     self._idle.remove(child)
                     return child
-            return self._started()
-
-    def _started(self) -> SupervisedChild:
-        child = SupervisedChild(_LOADS)
-        self._all.add(child)
+            child = SupervisedChild(loads)
+            self._all.add(child)
         return child
 
     def _end(self, child: SupervisedChild) -> None:
@@ -117,7 +116,9 @@ class _Children:
 _children = _Children()
 
 
-def lent_child(cancelled: Callable[[], bool], *, fresh: bool) -> contextlib.AbstractContextManager[SupervisedChild]:
+def lent_child(
+    cancelled: Callable[[], bool], *, fresh: bool, loads: Sequence[str] | None = None
+) -> contextlib.AbstractContextManager[SupervisedChild]:
     """A ready child of this process, for the time of a `with` block.
 
     Parameters
@@ -126,6 +127,9 @@ def lent_child(cancelled: Callable[[], bool], *, fresh: bool) -> contextlib.Abst
         Asked while the child gets ready.
     fresh : bool
         Whether it must not have done anything yet.
+    loads : sequence of str, optional
+        What a new child calls before it is ready, as `pipeline.runtime.child` takes it; all methods by default. A
+        child that is there already loads what else it needs when it needs it.
 
     Raises
     ------
@@ -134,7 +138,7 @@ def lent_child(cancelled: Callable[[], bool], *, fresh: bool) -> contextlib.Abst
     RunError
         No child can be started.
     """
-    return _children.lent(cancelled, fresh=fresh)
+    return _children.lent(cancelled, fresh=fresh, loads=loads)
 
 
 def kill_children() -> None:

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon, Polygon
-from shapely.affinity import translate
 
 from pipeline.export.records import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
@@ -74,10 +73,11 @@ def surroundings_of(scratch: Scratch, grid: TileGrid, view: Window) -> Surroundi
 def _grown(mask: BoolArray, cells: int) -> BoolArray:
     """Dilation by a square of 2 cells + 1: where the box around a cell holds any True (integral image)."""
     rows, columns = mask.shape
-    sums = np.zeros((rows + 2 * cells + 1, columns + 2 * cells + 1), np.int32)
-    padded = np.pad(mask, cells)
-    sums[1:, 1:] = padded.cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
     side = 2 * cells + 1
+    sums = np.zeros((rows + side, columns + side), np.int32)
+    sums[cells + 1 : cells + 1 + rows, cells + 1 : cells + 1 + columns] = mask
+    np.cumsum(sums, axis=0, out=sums)
+    np.cumsum(sums, axis=1, out=sums)
     inside = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
     grown: BoolArray = inside > 0
     return grown
@@ -100,16 +100,24 @@ def stored_points(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]
     """A candidate's points, range after range."""
     pieces = []
     for part in site.ranges:
-        stored = scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
-        pieces.append(np.array(stored[part.start : part.stop]))
+        first, last = part.start * POINT.itemsize, part.stop * POINT.itemsize
+        pieces.append(scratch.rows(f"{part.folder}/{part.tile.key}", "points", first, last).view(POINT))
     return np.concatenate(pieces) if pieces else np.empty(0, POINT)
 
 
 def canonical_order(points: npt.NDArray[np.void]) -> IntArray:
     """The order of points that does not depend on files and tiles: X, Y, Z, return, GPS time, source; (n,) int64."""
-    return np.lexsort(
-        (points["source"], points["gps_time"], points["return_number"], points["z"], points["y"], points["x"])
-    )
+    x, y = (np.ascontiguousarray(points[name]) for name in "xy")
+    order = np.lexsort((y, x))
+    tied = np.flatnonzero((np.diff(x[order]) == 0) & (np.diff(y[order]) == 0))
+    if len(tied):
+        rows = np.unique(np.concatenate((tied, tied + 1)))
+        among = np.sort(order[rows])
+        few = points[among]
+        order[rows] = among[
+            np.lexsort((few["source"], few["gps_time"], few["return_number"], few["z"], few["y"], few["x"]))
+        ]
+    return order
 
 
 def gather(
@@ -235,7 +243,11 @@ def _others(pieces: Sequence[IntArray], own: int) -> IntArray:
 
 def _moved(area: Area, origin_mm: IntArray) -> Area:
     """An area in metres, from the CRS into a local frame."""
-    moved: Area = translate(area, -float(origin_mm[0] // MM), -float(origin_mm[1] // MM))
+    if area.is_empty:
+        return area
+    xyz = shapely.get_coordinates(area, include_z=bool(area.has_z))
+    xyz[:, :2] -= origin_mm[:2] // MM
+    moved: Area = shapely.transform(area, lambda _: xyz, include_z=bool(area.has_z))
     return moved
 
 

@@ -21,7 +21,8 @@ from pipeline.model import IntArray, PointCloud
 from pipeline.runtime.scratch import POINT, Scratch
 from pipeline.tiling import MM, Tile, TileGrid
 
-_CHUNK_POINTS = 1_000_000
+_CHUNK_POINTS = 250_000
+"""Points that are read at once: few enough that their arrays stay in memory that is used again and again."""
 _MAX_MM = 2**31 - 2
 _TWO_BYTES = 2**16
 

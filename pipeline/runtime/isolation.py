@@ -83,6 +83,7 @@ def supervise(
     cancelled: Callable[[], bool] = never,
     *,
     second_chance: bool = True,
+    loads: Sequence[str] | None = None,
 ) -> Iterator[tuple[int, Result | Loss]]:
     """Call a function on items in a child process, and outlive whatever they do to it.
 
@@ -98,6 +99,8 @@ def supervise(
         Asked four times a second; once it is true the child is killed.
     second_chance : bool
         Whether an item that cost its process is tried once more, alone in a fresh one, before it is given up.
+    loads : sequence of str, optional
+        What new children call before they begin, as `pipeline.runtime.child` takes it.
 
     Yields
     ------
@@ -118,7 +121,7 @@ def supervise(
     while lots:
         lot, alone = lots.popleft()
         end: End | None = None
-        with lent_child(cancelled, fresh=alone) as child:
+        with lent_child(cancelled, fresh=alone, loads=loads) as child:
             for said in child.work(
                 function, lot, timeout_s=limits.timeout_s, memory_bytes=limits.memory_bytes, cancelled=cancelled
             ):

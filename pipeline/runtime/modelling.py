@@ -192,11 +192,18 @@ def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, P
     """Models made in a supervised child process: each building can cost only itself."""
     common = dataclasses.replace(task, sites=())
     cancelled = functools.partial(_cancelled, task)
-    for index, model in supervise(functools.partial(model_site, common), task.sites, limits, cancelled):
+    work = functools.partial(model_site, common)
+    for index, model in supervise(work, task.sites, limits, cancelled, loads=_loads(task)):
         if isinstance(model, Loss):
             yield index, _lost(common, task.sites[index], model, limits, cancelled)
         else:
             yield index, model
+
+
+def _loads(task: BatchTask) -> tuple[str, ...]:
+    """What a child calls that is to work on the task: of its methods only, since each costs a tenth of a second."""
+    methods = dict.fromkeys((task.method, *(own.method for own in task.own.values())))
+    return tuple(f"{__name__}:{load.__name__}:{method}" for method in methods)
 
 
 def _cancelled(task: BatchTask) -> bool:
@@ -237,7 +244,7 @@ def _lost(
     """The record and the bundle of a building that cost its process; made in a child, too."""
     patient = dataclasses.replace(limits, timeout_s=max(limits.timeout_s, _BUNDLE_TIMEOUT_S))
     describe = functools.partial(lost_site, task, loss)
-    ((_, described),) = supervise(describe, [site], patient, cancelled, second_chance=False)
+    ((_, described),) = supervise(describe, [site], patient, cancelled, second_chance=False, loads=_loads(task))
     if not isinstance(described, Loss):
         return described
     detail = f"{loss.detail}; {_NO_BUNDLE}: {described.detail}"
@@ -325,8 +332,14 @@ def model_bundle(bundle: Bundle) -> BuildingResult:
     return reconstruct_building(bundle.candidate, bundle.method, bundle.settings)
 
 
-def load() -> None:
-    """Load all that modelling needs, by modelling a gable and a flat roof: libraries, and the compiled kernels."""
+def load(*methods: str) -> None:
+    """Load all that modelling needs, by modelling a gable and a flat roof: libraries, and the compiled kernels.
+
+    Parameters
+    ----------
+    *methods : str
+        Their names; without any, all methods.
+    """
     spacing = np.arange(0.25, 10.0, 0.5)
     x, y = (axis.ravel() for axis in np.meshgrid(spacing, spacing, indexing="ij"))
     lattice = np.arange(-4.5, 15.0)
@@ -339,5 +352,5 @@ def load() -> None:
             ground=np.column_stack((east, north, np.zeros(len(east)))),
             ground_z_m=0.0,
         )
-        for method in METHODS:
+        for method in methods or METHODS:
             reconstruct_building(candidate, method, ReconstructSettings())

@@ -33,7 +33,7 @@ TABLE = "building"
 _PLACES = ("building_id", "source_id", "point")
 _EFFECTS = ("action", "footprint", "method", "preset", "settings")
 _KEYS = (*_PLACES, *_EFFECTS, "note")
-_SHARED_TABLES = ("roof", "roof-type")
+_SHARED_TABLES = ("roof", "plan", "roof-type")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class Override:
     preset: str | None = None
     """Where the method's settings start; None leaves them as they are."""
     settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    """Tables of settings: `roof`, `roof-type` and the method's own."""
+    """Tables of settings: `roof`, `plan`, `roof-type` and the method's own."""
     note: str = ""
     """The user's reason."""
 

@@ -299,7 +299,8 @@ def run_variants(
                     for k, (v, own) in enumerate(zip(variants, progresses, strict=True))
                 ]
                 if len(variants) > 1 and request.isolation is None:
-                    load()  # or the first building of the first variant would be charged for what all need
+                    # or the first building of the first variant would be charged for what all need
+                    load(*dict.fromkeys(v.settings.general.method for v in variants))
                 modelled = [own.reconstruct(joined) for own in each]
                 published = [
                     own.publish(splits, joined, models, reference, str(run_dir))

@@ -282,11 +282,16 @@ def _inside_footprints(
         above = points.classification[index] == BUILDING_CLASS
     elif task.classes.ground:
         above &= points.classification[index] != GROUND_CLASS
+    from_west = np.flatnonzero(above)
+    from_west = from_west[np.argsort(x[from_west])]
+    x, y = x[from_west], y[from_west]
     # the smaller number wins where footprints overlap, whatever the tile
     for number, polygon in sorted(task.footprints or (), key=lambda item: item[0], reverse=True):
         x0, y0, x1, y1 = (round(v * MM) for v in polygon.bounds)
-        near = np.flatnonzero(above & (x >= x0 - 1) & (x <= x1 + 1) & (y >= y0 - 1) & (y <= y1 + 1))
+        first, last = np.searchsorted(x, x0 - 1, side="left"), np.searchsorted(x, x1 + 1, side="right")
+        near = first + np.flatnonzero((y[first:last] >= y0 - 1) & (y[first:last] <= y1 + 1))
         if len(near):
             shapely.prepare(polygon)
-            owner[near[shapely.contains_xy(polygon, x[near] / MM, y[near] / MM)]] = number
+            inside = shapely.contains_xy(polygon, x[near] / MM, y[near] / MM)
+            owner[from_west[near[inside]]] = number
     return index, owner

@@ -437,6 +437,7 @@ class Stages:
             engine_version=__version__,
             acquired_from=min((a for a, _ in known), default=None),
             acquired_to=max((b for _, b in known), default=None),
+            coarser_lods=self.settings.building.lods[:-1],
         )
 
     def stored(self, joined: Joined) -> Iterator[tuple[Tile, list[StoredResult]]]:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import importlib
 import signal
 
+from pipeline.runtime.start_up import start_own_process
+
 STAGES = tuple(f"pipeline.runtime.{name}" for name in ("ingest", "split", "modelling", "publish"))
 """The modules of all tasks."""
 
@@ -19,6 +21,7 @@ def dask_setup(worker: object) -> None:
     its nanny, or the process that embeds it, ends it once its tasks are settled.
     """
     del worker
+    start_own_process()
     for number in (signal.SIGTERM, signal.SIGINT):
         # a function, not SIG_IGN, which programs that a task starts would inherit
         signal.signal(number, _left_to_the_nanny)

@@ -46,7 +46,6 @@ _PLANE_COST = 5.0
 """Points that would be unexplained without a plane for it to stay."""
 _ROUNDS = 2
 """Rounds of regression, merging and assignment: labels hardly change later."""
-_LEFTOVER_ROUNDS = 2
 _MAD_TO_SIGMA = 1.4826
 _LEAST_POINTS = 5
 """Fewest points of any plane: with three free parameters, four fit by chance too often."""
@@ -62,10 +61,16 @@ class AdaptivePlaneSettings(Parameters):
         minimum=0.5,
         maximum=20.0,
     )
-    distance_min_m: float = parameter(0.08, "Least such distance.", unit="m", minimum=0.001, maximum=10.0)
+    distance_min_m: float = parameter(
+        0.15,
+        "Least such distance: tiles, gutters and sag keep a roof from being plane to less.",
+        unit="m",
+        minimum=0.001,
+        maximum=10.0,
+    )
     distance_max_m: float = parameter(0.35, "Largest such distance.", unit="m", minimum=0.001, maximum=10.0)
     least_area_m2: float = parameter(
-        2.0, "Least area of a plane in plan where points are dense.", unit="m2", minimum=0.0, maximum=1e4
+        1.3, "Least area of a plane in plan where points are dense.", unit="m2", minimum=0.0, maximum=1e4
     )
     least_area_sparse_m2: float = parameter(
         10.0, "Least area that is asked for however sparse the points.", unit="m2", minimum=0.0, maximum=1e4
@@ -98,7 +103,7 @@ class AdaptivePlaneSettings(Parameters):
         Examples
         --------
         >>> [AdaptivePlaneSettings().fewest_points(spacing_m) for spacing_m in (0.25, 0.7, 1.0, 1.6)]
-        [32, 6, 6, 5]
+        [21, 6, 6, 5]
         """
         cell_m2 = spacing_m * spacing_m
         asked = max(self.least_area_m2 / cell_m2, min(self.least_points, self.least_area_sparse_m2 / cell_m2))
@@ -181,17 +186,21 @@ def mean_nodes(points: FloatArray, cell_m: float, gap_m: float) -> tuple[FloatAr
         Node of every point.
     """
     n = len(points)
-    row = np.floor(points[:, 1] / cell_m).astype(np.int64)
-    row -= row.min()
-    order = np.argsort(np.floor(points[:, 0] / cell_m).astype(np.int64) * (row.max() + 1) + row, kind="mergesort")
+    column = np.empty(n, np.int64)
+    row = np.empty(n, np.int64)
+    for i in range(n):
+        column[i] = math.floor(points[i, 0] / cell_m)
+        row[i] = math.floor(points[i, 1] / cell_m)
+    first_row = row.min()
+    rows = row.max() + 1 - first_row
+    order = np.argsort(column * rows + (row - first_row), kind="mergesort")
     nodes = np.zeros((n, 3))
     node_of = np.empty(n, np.int32)
     count = 0
     begin = 0
     while begin < n:
-        column = math.floor(points[order[begin], 0] / cell_m)
         end = begin + 1
-        while end < n and row[order[end]] == row[order[begin]] and math.floor(points[order[end], 0] / cell_m) == column:
+        while end < n and row[order[end]] == row[order[begin]] and column[order[end]] == column[order[begin]]:
             i = order[end]
             q = end
             while q > begin and points[order[q - 1], 2] > points[i, 2]:
@@ -203,13 +212,16 @@ def mean_nodes(points: FloatArray, cell_m: float, gap_m: float) -> tuple[FloatAr
         for q in range(begin, end):
             i = order[q]
             if held > 0 and points[i, 2] - points[order[q - 1], 2] > gap_m:
-                nodes[count] /= held
+                for axis in range(3):
+                    nodes[count, axis] /= held
                 count += 1
                 held = 0
             node_of[i] = count
-            nodes[count] += points[i]
+            for axis in range(3):
+                nodes[count, axis] += points[i, axis]
             held += 1
-        nodes[count] /= held
+        for axis in range(3):
+            nodes[count, axis] /= held
         count += 1
         begin = end
     return nodes[:count].copy(), node_of
@@ -305,14 +317,13 @@ def _settled(
     neighbours: LabelArray,
     labels: LabelArray,
     count: int,
-    rounds: int,
     distance_m: float,
     sigma_m: float,
     fewest_points: int,
     min_cosine: float,
 ) -> LabelArray:
     """Labels after rounds of regression, merging and assignment."""
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         _, usable, sums = _fitted(points, labels, count, fewest_points, min_cosine)
         root = merge_by_f_test(sums, touching_pairs(neighbours, labels, usable), sigma_m)
         for i in range(labels.size):
@@ -373,7 +384,10 @@ def _noise_about(points: FloatArray, labels: LabelArray, planes: FloatArray) -> 
         if labels[i] >= 0:
             distances[known] = distance_to_plane(points, i, planes, labels[i])
             known += 1
-    return _MAD_TO_SIGMA * float(np.median(distances[:known])) if known > 0 else np.nan
+    if known == 0:
+        return np.nan
+    order = np.argsort(distances[:known], kind="mergesort")
+    return float(_MAD_TO_SIGMA * 0.5 * (distances[order[(known - 1) // 2]] + distances[order[known // 2]]))
 
 
 @njit(cache=True, nogil=True)
@@ -397,7 +411,7 @@ def _numbered(points: FloatArray, labels: LabelArray, planes: FloatArray, min_co
         if fitted and cosine_of_slope(a, b) >= min_cosine:
             final[k, 0], final[k, 1], final[k, 2] = a, b, c
         else:
-            final[k] = planes[old[k]]
+            final[k, 0], final[k, 1], final[k, 2] = planes[old[k], 0], planes[old[k], 1], planes[old[k], 2]
     return final
 
 
@@ -424,18 +438,16 @@ def _detect(
     tells = slope_error < _SLOPE_ERROR and spacing_m < _NORMALS_SPACING_M
 
     labels = np.full(len(nodes), -1, np.int32)
-    near_m = _GROWING_SHARE * distance_m
-    min_normal_cosine = normal_cosine if tells else 0.0
-    count = take_regions(
-        nodes, neighbours, local, variances, labels, 0, near_m, min_normal_cosine, fewest_points, min_cosine
-    )
-    labels = _settled(nodes, neighbours, labels, count, _ROUNDS, distance_m, sigma_m, fewest_points, min_cosine)
-    first = count
-    count = take_regions(nodes, neighbours, local, variances, labels, first, distance_m, 0.0, fewest_points, min_cosine)
-    if count > first:
-        labels = _settled(
-            nodes, neighbours, labels, count, _LEFTOVER_ROUNDS, distance_m, sigma_m, fewest_points, min_cosine
+    count = 0
+    for pass_ in range(2):  # the roof; then what is left over
+        reach_m = distance_m if pass_ > 0 else _GROWING_SHARE * distance_m
+        min_normal_cosine = normal_cosine if tells and pass_ == 0 else 0.0
+        before = count
+        count = take_regions(
+            nodes, neighbours, local, variances, labels, before, reach_m, min_normal_cosine, fewest_points, min_cosine
         )
+        if count > before:
+            labels = _settled(nodes, neighbours, labels, count, distance_m, sigma_m, fewest_points, min_cosine)
     planes, usable, _ = _fitted(nodes, labels, count, fewest_points, min_cosine)
     for i in range(labels.size):
         if labels[i] >= 0 and not usable[labels[i]]:

@@ -85,10 +85,13 @@ def noise_of_local_planes(variances: FloatArray) -> float:
 
     From the lower quartile: neighbourhoods across edges and in trees are the upper part of the distribution.
     """
-    finite = variances[np.isfinite(variances)]
-    if finite.size == 0:
+    order = np.argsort(variances, kind="mergesort")
+    known = 0
+    for variance in variances:
+        known += math.isfinite(variance)
+    if known == 0:
         return 0.0
-    return math.sqrt(float(np.percentile(finite, 25.0)) * _FREEDOM / _LOWER_QUARTILE_CHI2)
+    return math.sqrt(variances[order[(known - 1) // 4]] * _FREEDOM / _LOWER_QUARTILE_CHI2)
 
 
 @njit(cache=True, nogil=True)
@@ -102,19 +105,22 @@ def _joins(
     points: FloatArray,
     neighbours: LabelArray,
     local: FloatArray,
+    cosines: FloatArray,
     j: int,
     a: float,
     b: float,
     c: float,
     reach: float,
-    min_normal_cosine: float,
+    least: float,
 ) -> bool:
-    """Whether a point is near a plane and of its direction or, where that says nothing, in company there."""
+    """Whether a point is near a plane and of its direction or, where that says nothing, in company there.
+
+    `least` is the least cosine between the two directions over the cosine of the plane's slope; 0 asks for company.
+    """
     if abs(_height(points, j, a, b, c)) > reach:
         return False
-    if min_normal_cosine > 0.0:
-        between = a * local[j, 0] + b * local[j, 1] + 1.0
-        return bool(between * cosine_of_slope(a, b) * cosine_of_slope(local[j, 0], local[j, 1]) >= min_normal_cosine)
+    if least > 0.0:
+        return bool((a * local[j, 0] + b * local[j, 1] + 1.0) * cosines[j] >= least)
     known = 0
     near = 0
     for other in neighbours[j]:
@@ -129,6 +135,7 @@ def _grow(
     points: FloatArray,
     neighbours: LabelArray,
     local: FloatArray,
+    cosines: FloatArray,
     labels: LabelArray,
     reached: LabelArray,
     seed: int,
@@ -151,6 +158,7 @@ def _grow(
     repeated = 0
     refit = _FIRST_REFIT
     reach = distance_m / cosine_of_slope(a, b)
+    least = min_normal_cosine / cosine_of_slope(a, b)
     while at < held:
         i = queue[at]
         at += 1
@@ -163,11 +171,12 @@ def _grow(
             if fitted:
                 a, b, c = own_a, own_b, own_c
                 reach = distance_m / cosine_of_slope(a, b)
+                least = min_normal_cosine / cosine_of_slope(a, b)
             refit = math.floor(_REFIT_GROWTH * sums[0]) + 1.0
         for j in neighbours[i]:
             if j < 0 or labels[j] >= 0 or asked[j] == mark:
                 continue
-            if _joins(points, neighbours, local, j, a, b, c, reach, min_normal_cosine):
+            if _joins(points, neighbours, local, cosines, j, a, b, c, reach, least):
                 asked[j] = mark
                 queue[held] = j
                 held += 1
@@ -232,6 +241,9 @@ def take_regions(
         One more than the last label.
     """
     n = len(points)
+    cosines = np.empty(n)
+    for i in range(n):
+        cosines[i] = cosine_of_slope(local[i, 0], local[i, 1])
     asked = np.full(n, -1, np.int32)
     queue = np.empty(n, np.int32)
     reached = np.zeros(n, np.int32)
@@ -244,7 +256,7 @@ def take_regions(
         if labels[seed] >= 0 or reached[seed] >= _TRIALS:
             continue
         held, a, b, c, gain = _grow(
-            points, neighbours, local, labels, reached, seed, distance_m, min_normal_cosine, asked, mark, queue
+            points, neighbours, local, cosines, labels, reached, seed, distance_m, min_normal_cosine, asked, mark, queue
         )
         reached[seed] += 1
         if held >= fewest_points:
@@ -265,7 +277,7 @@ def take_regions(
         if labels[seed] >= 0:
             continue
         held, a, b, _, gain = _grow(
-            points, neighbours, local, labels, anew, seed, distance_m, min_normal_cosine, asked, mark, queue
+            points, neighbours, local, cosines, labels, anew, seed, distance_m, min_normal_cosine, asked, mark, queue
         )
         mark += 1
         if held < fewest_points or cosine_of_slope(a, b) < min_cosine:

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.errors import RunError
-from pipeline.export.geoparquet import SOLID, geo_metadata, stored_schema
+from pipeline.export.geoparquet import geo_metadata, solid_names, stored_schema
 
 ROWS_A_GROUP = 5_000
 """Rows in one row group: a reader with a window skips the groups whose `bbox` is elsewhere."""
@@ -38,8 +38,7 @@ class MergedTable:
         self, path: Path, table_name: str, sources: Sequence[Path], projjson: Mapping[str, Any] | None
     ) -> None:
         no_geometry = np.empty(0, dtype=object)
-        solids = no_geometry if SOLID in stored_schema(table_name).names else None
-        nothing = geo_metadata(no_geometry, projjson, solids)
+        nothing = geo_metadata(no_geometry, projjson, dict.fromkeys(solid_names(table_name), no_geometry))
         geo = united_metadata(_metadata(source) for source in sources) if sources else nothing
         plain = stored_schema(table_name).append(pa.field("tile", pa.string(), nullable=False))
         self._schema = plain.with_metadata({"geo": json.dumps(geo, sort_keys=True, separators=(",", ":"))})
@@ -120,8 +119,9 @@ def united_metadata(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:
         raise RunError("a merged table needs at least one tile")
     if any(part["columns"]["geometry"]["crs"] != found[0]["columns"]["geometry"]["crs"] for part in found):
         raise RunError("the tiles have more than one CRS: files of two runs lie in one directory")
-    names = found[0]["columns"]
-    return {**found[0], "columns": {name: _united_column([part["columns"][name] for part in found]) for name in names}}
+    names = dict.fromkeys(name for part in found for name in part["columns"])
+    told = {name: [part["columns"][name] for part in found if name in part["columns"]] for name in names}
+    return {**found[0], "columns": {name: _united_column(columns) for name, columns in told.items()}}
 
 
 def _united_column(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -89,43 +89,43 @@ def stored_building(out_dir: Path, building_id: str, *, native: bool = False) ->
     )
 
 
-def building_obj(run_dir: Path, building: StoredBuilding) -> Iterator[str]:
-    """The lines of a building's OBJ, also where one file holds a whole tile.
+def building_obj(run_dir: Path, building: StoredBuilding, lod: str | None = None) -> Iterator[str]:
+    """The lines of a building's OBJ, also where one file holds a whole tile; in the record's level of detail or `lod`.
 
     Raises
     ------
     NoSuchBuildingError
-        It has no model, the job was asked for no OBJ files, or its file is gone.
+        It has no model, the job was asked for no OBJ files or another level of detail, or its file is gone.
     """
-    return building_lines(_mesh_file(run_dir, building, "obj"), building.building_id)
+    return building_lines(_mesh_file(run_dir, building, "obj", lod), building.building_id)
 
 
-def building_glb(run_dir: Path, building: StoredBuilding) -> bytes:
-    """A building's GLB, cut out of the file of its tile.
+def building_glb(run_dir: Path, building: StoredBuilding, lod: str | None = None) -> bytes:
+    """A building's GLB, cut out of the file of its tile; in the record's level of detail or `lod`.
 
     Raises
     ------
     NoSuchBuildingError
-        It has no model, the job was asked for no GLB files, or its file is gone.
+        It has no model, the job was asked for no GLB files or another level of detail, or its file is gone.
     """
-    path = _mesh_file(run_dir, building, "glb")
+    path = _mesh_file(run_dir, building, "glb", lod)
     content = cut_glb(path, building.building_id)
     if content is None:
         raise NoSuchBuildingError(f"{path.name} holds no building {building.building_id}: submit the job again")
     return content
 
 
-def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str) -> Path:
-    """The file of a building's mesh, of one kind.
+def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str, lod: str | None) -> Path:
+    """The file of a building's mesh, of one kind and level of detail; that of the record for None.
 
     Raises
     ------
     NoSuchBuildingError
-        There is none of this kind.
+        There is none of this kind or level.
     """
-    name = building.building_id
+    name, own_lod = building.building_id, building.feature["properties"]["lod"]
     if building.mesh_path is None:
-        if building.feature["properties"]["lod"] is None:
+        if own_lod is None:
             why = building.feature["properties"]["reason"]
             raise NoSuchBuildingError(f"building {name} has no model ({why}), so it has no mesh")
         raise NoSuchBuildingError(f"this job was asked for no meshes: take building {name} as CityJSON")
@@ -134,6 +134,12 @@ def _mesh_file(run_dir: Path, building: StoredBuilding, wanted: str) -> Path:
         told = f"this job was asked for meshes as {kind.upper()}, not as {wanted.upper()}"
         raise NoSuchBuildingError(f"{told}: take building {name} with f={kind}")
     path = run_dir / building.mesh_path
+    if lod not in {None, own_lod}:
+        # named by pipeline.export.tile.mesh_path
+        coarser = path.with_stem(f"{path.stem}-lod{str(lod).replace('.', '')}")
+        if not coarser.is_file() or str(lod) > own_lod:
+            raise NoSuchBuildingError(f"building {name} has no mesh in LoD{lod}; its own is in LoD{own_lod}")
+        return coarser
     if not path.is_file():
         raise NoSuchBuildingError(f"the mesh of building {name} is no longer in the state folder: submit the job again")
     return path

@@ -48,13 +48,6 @@ def _file(media_types: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def variants(known: catalogue.Catalogue) -> tuple[str, ...]:
-    """What a comparison can run: every method by itself, and with each preset."""
-    return tuple(
-        word for method in known.methods for word in (method, *(f"{method}:{preset}" for preset in known.presets))
-    )
-
-
 def reconstruct_inputs(settings: ServiceSettings) -> dict[str, dict[str, Any]]:
     """The inputs of `reconstruct`."""
     known = catalogue.load()
@@ -70,16 +63,21 @@ def reconstruct_inputs(settings: ServiceSettings) -> dict[str, dict[str, Any]]:
             "(faithful).",
             {"type": "string", "enum": list(known.presets), "default": known.default("preset")},
         ),
+        "lods": _input(
+            "Levels of detail",
+            "LoD1.2 (blocks), LoD1.3 (level parts), LoD2.2 (roof faces), or several; records tell the finest.",
+            {"type": "string", "enum": list(known.lods), "default": known.default("lods")},
+        ),
     }
     return _inputs(settings, known, chosen)
 
 
 def compare_inputs(settings: ServiceSettings) -> dict[str, dict[str, Any]]:
-    """The inputs of `compare`: those of `reconstruct` with `methods` in the place of `method` and `preset`."""
+    """The inputs of `compare`: those of `reconstruct` with `methods` in the place of `method`, `preset` and `lods`."""
     known = catalogue.load()
     several = {
         "type": "array",
-        "items": {"type": "string", "enum": list(variants(known))},
+        "items": {"type": "string", "enum": list(known.variants())},
         "minItems": 2,
         "maxItems": MOST_METHODS,
         "uniqueItems": True,

@@ -16,7 +16,6 @@ from service.processes.descriptions import (
     PRIORITY,
     compare_inputs,
     reconstruct_inputs,
-    variants,
 )
 from service.settings import ServiceSettings
 
@@ -33,8 +32,9 @@ def draft_reconstruct(given: Mapping[str, Any], outputs: Sequence[str] | None, s
     inputs = Inputs(given)
     inputs.unknown(tuple(reconstruct_inputs(settings)))
     chosen = inputs.settings("settings")
-    words = {"method": known.methods, "preset": known.presets, "classes": known.classes}
+    words = {"method": known.methods, "preset": known.presets, "classes": known.classes, "lods": known.lods}
     _choose(inputs, chosen, words)
+    inputs.faults.extend(known.preset_faults(chosen))
     return _draft(inputs, outputs, settings, OUTPUTS, {"settings": chosen})
 
 
@@ -80,12 +80,12 @@ def _methods(inputs: Inputs, known: catalogue.Catalogue) -> tuple[str, ...]:
     if isinstance(value, Mapping) and "value" in value:
         value = value["value"]
     if value in (None, []):
-        inputs.faults.append(f"methods is missing: give 2 to {MOST_METHODS} of {', '.join(variants(known))}")
+        inputs.faults.append(f"methods is missing: give 2 to {MOST_METHODS} of {', '.join(known.variants())}")
         return ()
     words: list[Any] = value if isinstance(value, list) else [value]
-    unknown = [word for word in words if word not in variants(known)]
+    unknown = [word for word in words if word not in known.variants()]
     if unknown:
-        told = f"use METHOD or METHOD:PRESET of {', '.join(variants(known))}"
+        told = f"use METHOD or METHOD:PRESET of {', '.join(known.variants())}"
         inputs.faults.append(f"methods holds {', '.join(map(shortened, unknown))}: {told}")
         return ()
     found = tuple(word.removesuffix(f":{known.default('preset')}") for word in words)

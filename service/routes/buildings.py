@@ -253,6 +253,10 @@ def building(
         Literal["json", "obj", "glb", "cityjson"] | None,
         Query(alias="f", description="Stands above the header Accept."),
     ] = None,
+    lod: Annotated[
+        Literal["1.2", "1.3", "2.2"] | None,
+        Query(description="Of an OBJ or GLB: one of the levels of detail that the job made; default the finest."),
+    ] = None,
     crs: _Coordinates = None,
 ) -> Response:
     """Tell one building: all columns and its roof planes, or its model as OBJ, GLB or CityJSON."""
@@ -264,11 +268,11 @@ def building(
     found = stored_building(finished.out_dir, building_id, native=native)
     headers = _headers(known, native=native or media_type != GEOJSON)
     if media_type == OBJ:
-        lines = building_obj(finished.run_dir, found)
+        lines = building_obj(finished.run_dir, found, lod)
         content = "".join(f"{line}\n" for line in lines).encode()
         headers["Content-Disposition"] = f'inline; filename="{found.building_id}.obj"'
     elif media_type == GLB:
-        content = building_glb(finished.run_dir, found)
+        content = building_glb(finished.run_dir, found, lod)
         headers.pop("Content-Crs", None)  # metres from an origin: the file tells it
         headers["Content-Disposition"] = f'inline; filename="{found.building_id}.glb"'
     elif media_type == CITYJSON:

@@ -172,6 +172,7 @@ SCHEMAS: Mapping[str, dict[str, Any]] = {
         bbox={**_TEXT, "description": "x_min,y_min,x_max,y_max in the tiles' CRS."},
         method=_TEXT,
         preset={**_TEXT, "description": "Where the method's settings start."},
+        lods={**_TEXT, "description": "Levels of detail with commas between them: 1.2, 1.3, 2.2."},
         methods={
             "type": "array",
             "items": _TEXT,

@@ -132,6 +132,36 @@ def test_what_is_smaller_than_the_least_area_is_no_plane() -> None:
     assert (found.labels[inside] == -1).mean() > 0.9
 
 
+def test_a_porch_of_two_square_metres_beside_the_roof_is_a_plane() -> None:
+    points = gable(8.0, 0.02, seed=6)
+    porch = np.random.default_rng(7).uniform([LENGTH_M, 2.0, 0.0], [LENGTH_M + 1.4, 3.5, 0.0], (17, 3))
+    porch[:, 2] = 5.0 + np.random.default_rng(8).normal(0, 0.03, 17)
+    found = detected(canonical(np.vstack([points, porch])))
+    heights = sorted(LENGTH_M * a + 0.7 * a + 2.75 * b + c for a, b, c in found.coefficients.tolist())
+    assert len(heights) == 3
+    assert heights[0] == pytest.approx(5.0, abs=0.03)
+
+
+def test_a_flat_roof_with_gravel_and_puddles_is_one_plane() -> None:
+    points = strewn(9.0, 11)
+    points[:, 2] = 7 + 0.05 * np.sin(points[:, 0]) * np.cos(0.8 * points[:, 1])
+    points[:, 2] += np.random.default_rng(12).normal(0, 0.02, len(points))
+    found = detected(canonical(points))
+    assert len(found.coefficients) == 1
+    assert (found.labels == 0).mean() > 0.98
+
+
+@pytest.mark.parametrize("density_per_m2", [2.0, 8.0, 30.0])
+def test_a_dome_is_several_planes_and_no_swarm(density_per_m2: float) -> None:
+    points = strewn(density_per_m2, 13)
+    radius = np.hypot(points[:, 0] - 6, points[:, 1] - 6)
+    points, radius = points[radius < 5.5], radius[radius < 5.5]
+    points[:, 2] = 8 + np.sqrt(6.5**2 - radius**2) + np.random.default_rng(14).normal(0, 0.02, len(points))
+    found = detected(canonical(points))
+    assert 5 <= len(found.coefficients) <= 40
+    assert (found.labels >= 0).mean() > 0.8
+
+
 @pytest.mark.parametrize(("step_m", "planes"), [(0.0, 1), (0.4, 2)])
 @pytest.mark.parametrize("density_per_m2", [6.0, 24.0])
 def test_a_step_parts_two_level_roofs_and_without_it_they_are_one(

@@ -99,10 +99,26 @@ def test_one_point_a_square_metre_still_gives_the_true_faces(exact_roof: ExactRo
     assert volume(part.solid) == pytest.approx(roof.volume_m3, rel=0.05)
 
 
-def test_the_ridge_lies_where_the_planes_cross_to_a_millimetre(exact_roof: ExactRoofs) -> None:
+def test_the_ridge_lies_where_the_fitted_planes_cross_to_a_millimetre(exact_roof: ExactRoofs) -> None:
     partition = arranged(exact_roof("gable", noise_m=0.05))
-    ridge = shapely.intersection(partition.polygons[0], partition.polygons[1])
-    assert shapely.get_coordinates(ridge)[:, 1].tolist() == pytest.approx([4000.0, 4000.0], abs=1.0)
+    assert partition.planes is not None
+    ridge = shapely.get_coordinates(shapely.intersection(*partition.polygons)) * 1e-3
+    south, north = np.array([plane.coefficients for plane in partition.planes])
+    across = (south - north)[:2] @ ridge.T + (south - north)[2]
+    assert (np.abs(across) / np.hypot(*(south - north)[:2]) < 0.001).all()
+
+
+def test_planes_are_fitted_anew_to_the_points_of_their_places(exact_roof: ExactRoofs) -> None:
+    roof = exact_roof("gable", noise_m=0.02)
+    tilted = np.array([plane.coefficients for plane in roof.planes])
+    tilted[:, 2] += 0.08
+    points = roof.candidate.points
+    partition = arrange(points, roof.labels, tilted, footprint_in_mm(roof.footprint), point_spacing_m(points), SETTINGS)
+    assert partition.planes is not None
+    assert sum(plane.n_points for plane in partition.planes) == len(points)
+    for fitted, true in zip(partition.planes, roof.planes, strict=True):
+        assert fitted.coefficients == pytest.approx(true.coefficients, abs=0.01)
+        assert fitted.rmse_m == pytest.approx(0.02, rel=0.2)
 
 
 def test_the_partition_does_not_depend_on_the_order_of_the_points(exact_roof: ExactRoofs) -> None:
@@ -240,6 +256,31 @@ def test_a_few_stray_points_make_no_face(exact_roof: ExactRoofs) -> None:
     assert partition.labels.tolist() == [0]
 
 
+def test_a_face_that_repeats_the_plane_next_door_within_the_tolerance_is_none() -> None:
+    outline = shapely.box(0, 0, 12, 8)
+    points = strewn(outline, 8.0)
+    labels = (points[:, 0] > 6.0).astype(np.int32)
+    for step_m, faces in ((0.1, 1), (0.4, 2)):
+        planes = np.array([(0.0, 0.0, 5.0), (0.0, 0.0, 5.0 + step_m)])
+        points[:, 2] = planes[labels, 2]
+        partition = arrange(points, labels, planes, footprint_in_mm(outline), 0.35, SETTINGS)
+        assert len(partition.polygons) == faces
+
+
+@pytest.mark.parametrize("density", [4.0, 40.0])
+def test_the_area_that_a_face_must_earn_does_not_depend_on_the_density(density: float) -> None:
+    outline = shapely.box(0, 0, 12, 8)
+    points = strewn(outline, density)
+    planes = np.array([(0.0, 0.0, 5.0), (0.0, 0.0, 6.0)])
+    for half_m, faces in ((0.4, 1), (1.5, 2)):
+        raised = (np.abs(points[:, :2] - 4.0) < half_m).all(axis=1)
+        points[:, 2] = np.where(raised, 6.0, 5.0)
+        partition = arrange(
+            points, raised.astype(np.int32), planes, footprint_in_mm(outline), 1.0 / math.sqrt(density), SETTINGS
+        )
+        assert len(partition.polygons) == faces
+
+
 def test_a_tiny_outline_of_one_point_is_one_face() -> None:
     partition = arrange(
         np.array([(0.5, 0.5, 3.0)]), np.zeros(1, np.int32), np.array([(0.0, 0.0, 3.0), (0.0, 0.0, 5.0)]),
@@ -288,3 +329,30 @@ def test_any_outline_with_any_planes_is_filled_exactly_and_makes_valid_solids(se
     assert fills(partition, outline)
     solids = solid_parts(partition, [Plane(a=a, b=b, c=c, n_points=1, rmse_m=0.0) for a, b, c in planes.tolist()], 0.0)
     assert [check_solid(part.solid) for part in solids] == [()] * len(outline_mm.geoms)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_crossing_gables_a_few_centimetres_off_make_a_sound_solid_with_the_usual_or_more_room(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cross = shapely.union(shapely.box(-10, -4, 10, 4), shapely.box(-4, -10, 4, 10))
+    outline = shapely.transform(shapely.affinity.rotate(cross, 25.0 + seed, origin=(0, 0)), lambda xy: xy + 12.0)
+    points = strewn(outline, 8.0, seed)
+    turn = np.radians(25.0 + seed)
+    axes = np.array([(np.cos(turn), np.sin(turn)), (-np.sin(turn), np.cos(turn))])
+    along, across = ((points[:, :2] - 12.0) @ axes.T).T
+    # two gable roofs that cross, and their planes a few centimetres off where they should lie
+    first = np.abs(across) < np.abs(along)
+    labels = np.where(first, 0 + (across > 0.0), 2 + (along > 0.0)).astype(np.int32)
+    slopes = np.array([0.5 * axes[1], -0.5 * axes[1], 0.5 * axes[0], -0.5 * axes[0]])
+    planes = np.column_stack((slopes, 8.0 - slopes.sum(axis=1) * 12.0))
+    points[:, 2] = (points[:, :2] * slopes[labels]).sum(axis=1) + planes[labels, 2] + rng.normal(0, 0.05, len(points))
+    points[:, 2] += rng.normal(0.0, 0.02, 4)[labels]
+    outline_mm = footprint_in_mm(outline)
+    codes = []
+    for clearance in (1.0, 2.5, 4.0):
+        partition = arrange(points, labels, planes, outline_mm, 0.35, SETTINGS, clearance)
+        assert fills(partition, outline)
+        assert partition.planes is not None
+        (part,) = solid_parts(partition, partition.planes, 0.0)
+        codes.append(check_solid(part.solid))
+    assert () in codes

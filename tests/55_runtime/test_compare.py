@@ -190,7 +190,8 @@ def test_a_methods_own_table_counts_for_all_its_variants() -> None:
     own = RunSettings.from_mapping(table)
     for variant in BOTH:
         chosen = settings_of(own, variant, own_tables(table))
-        assert chosen.settings_hash == RunSettings.from_mapping({"preset": variant.preset, **table}).settings_hash
+        named = {"method": variant.method, "preset": variant.preset, **table}
+        assert chosen.settings_hash == RunSettings.from_mapping(named).settings_hash
     with pytest.raises(SettingsError, match=r"\[fuzzy-sart\] vigilance is 9"):
         settings_of(own, BOTH[0], {"fuzzy-sart": {"vigilance": 9.0}})
 

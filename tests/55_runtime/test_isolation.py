@@ -238,6 +238,11 @@ def test_threads_have_children_of_their_own(orders: Callable[[str], str], tmp_pa
     assert len(child_processes()) == 2
 
 
+def test_a_new_child_calls_what_it_is_told_to_load_with_its_argument(tmp_path: Path) -> None:
+    (outcome,) = supervise(os.path.abspath, ["."], LIMITS, loads=(f"os:chdir:{tmp_path}",))
+    assert outcome == (0, str(tmp_path.resolve()))
+
+
 def test_children_that_cannot_start_are_an_error_that_tells_what_they_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(children, "_LOADS", ("no_such_module:load",))
     with pytest.raises(RunError, match=r"(?s)3 times in a row.*No module named 'no_such_module'"):

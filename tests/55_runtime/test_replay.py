@@ -28,6 +28,7 @@ from pipeline.methods import ReconstructSettings
 from pipeline.methods.fuzzy_sart import FuzzySartSettings
 from pipeline.model import Candidate, Status
 from pipeline.reconstruct import reconstruct_building
+from pipeline.roof.arrangement import ArrangementSettings
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime import children
 from pipeline.runtime.bundle import Bundle, Incident, read_bundle, write_bundle
@@ -61,7 +62,10 @@ def bundle() -> Bundle:
         candidate=candidate,
         method="fuzzy-sart",
         settings=ReconstructSettings(
-            method=FuzzySartSettings(vigilance=0.9), roof=RoofSettings(minimum_roof_height_m=1.0)
+            method=FuzzySartSettings(vigilance=0.9),
+            roof=RoofSettings(minimum_roof_height_m=1.0),
+            plan=ArrangementSettings(line_reach_m=0.7),
+            lods=("1.2", "2.2"),
         ),
         incident=Incident(reason="crashed", detail="by signal 11", seconds=1.5, memory_bytes=7, stderr="Fatal: ä\n"),
         reference=FEET,

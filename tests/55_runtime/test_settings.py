@@ -25,7 +25,7 @@ def test_all_faults_are_told_at_once() -> None:
         )
     text = str(caught.value)
     for part in (
-        "method is 'magic': use one of fuzzy-sart",
+        "method is 'magic': use one of arrangement",
         "tile_size_m is -5",
         "[ground] max_slope is 9",
         "[ground] windows is no setting",
@@ -41,7 +41,17 @@ def test_the_hash_ignores_what_cannot_change_results() -> None:
     assert RunSettings.from_mapping({"classes": "ignore"}).settings_hash != plain.settings_hash
 
 
-@pytest.mark.parametrize("name", list(METHODS))
+OF_PAPERS = [name for name, entry in METHODS.items() if entry.faithful is not None]
+
+
+def test_a_method_of_our_own_has_no_preset_that_keeps_to_a_paper() -> None:
+    told = "preset is 'faithful', and arrangement follows no paper: use robust"
+    for table in ({}, {"arrangement": {"least_points": 9}}):
+        with pytest.raises(SettingsError, match=told):
+            RunSettings.from_mapping({"method": "arrangement", "preset": "faithful", **table})
+
+
+@pytest.mark.parametrize("name", OF_PAPERS)
 def test_a_preset_is_where_the_settings_of_a_method_start(name: str) -> None:
     faithful = RunSettings.from_mapping({"method": name, "preset": "faithful"})
     assert faithful.building.method == METHODS[name].faithful
@@ -56,7 +66,7 @@ def test_an_unknown_preset_is_told_with_the_known_ones() -> None:
         RunSettings.from_mapping({"preset": "bold", "fuzzy-sart": {"vigilance": 0.8}})
 
 
-@pytest.mark.parametrize("name", list(METHODS))
+@pytest.mark.parametrize("name", OF_PAPERS)
 def test_the_hash_is_of_the_values_and_not_of_the_preset_that_gave_them(name: str) -> None:
     values = {
         field.name: getattr(METHODS[name].faithful, field.name) for field in dataclasses.fields(METHODS[name].faithful)

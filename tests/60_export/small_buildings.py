@@ -13,6 +13,8 @@ from pipeline.export.records import RecordContext, RejectedObject
 from pipeline.model import (
     BuildingResult,
     FaceKind,
+    LodModel,
+    ModelQuality,
     Plane,
     Reason,
     RoofFace,
@@ -71,6 +73,18 @@ def roofed_solid(
     return Solid(vertices=vertices, faces=(*faces, SolidFace(rings=floor, kind=FaceKind.GROUND)))
 
 
+QUALITY = ModelQuality(
+    point_spacing_m=0.48,
+    noise_m=0.029,
+    share_within=0.981,
+    unexplained_m2=1.25,
+    largest_hole_m=1.4,
+    ridge_z_sigma_m=0.017,
+    bic_margin=12.5,
+    is_curved=False,
+)
+
+
 def plane_of(solid: Solid, face: SolidFace) -> Plane:
     """The plane through a roof face."""
     xyz = solid.vertices[list(face.rings[0])]
@@ -117,6 +131,7 @@ def building(
         "rmse_m": 0.0312,
         "p95_m": 0.0641,
         "coverage": 0.995,
+        "quality": QUALITY,
         "touches_data_edge": False,
     }
     return BuildingResult(**{**fields, **changes})
@@ -162,6 +177,29 @@ def two_parts(building_id: str = "two_parts") -> BuildingResult:
     return building(building_id, gable_solid(), gable_solid(10.0, 2))
 
 
+def levelled(building_id: str = "levelled") -> BuildingResult:
+    """A gable and, 10 m east of it, a flat annexe of 4 m by 8 m: all levels of detail, all figures of quality."""
+    corners = [(20.0, 0.0, 3.0), (24.0, 0.0, 3.0), (24.0, 8.0, 3.0), (20.0, 8.0, 3.0)]
+    detailed = gable_solid(), roofed_solid(corners, [[[0, 1, 2, 3]]], 0.0, 2)
+    quality = ModelQuality(
+        point_spacing_m=0.5, noise_m=0.03, share_within=0.98, unexplained_m2=1.5, largest_hole_m=1.2,
+        ridge_z_sigma_m=0.02, bic_margin=14.0,
+    )  # fmt: skip
+    coarser = levels("1.3", 4.75, 3.0), levels("1.2", 4.5, 4.5)
+    return building(building_id, *detailed, coarser=coarser, quality=quality)
+
+
+def levels(lod: str, *heights: float) -> LodModel:
+    """Blocks under `levelled`: over the gable, and over the annexe."""
+    plans = [(0.0, 10.0), (20.0, 24.0)]
+    solids = []
+    for number, ((west, east), z) in enumerate(zip(plans, heights, strict=True)):
+        corners = [(west, 0.0, z), (east, 0.0, z), (east, 8.0, z), (west, 8.0, z)]
+        solids.append(roofed_solid(corners, [[[0, 1, 2, 3]]], 0.0, number))
+    planes = tuple(Plane(a=0.0, b=0.0, c=z, n_points=100, rmse_m=0.5) for z in heights)
+    return LodModel(lod=lod, planes=planes, solids=tuple(solids))
+
+
 def failed(building_id: str = "failed") -> BuildingResult:
     """A candidate without model and without outline."""
     return building(
@@ -175,5 +213,6 @@ def failed(building_id: str = "failed") -> BuildingResult:
         rmse_m=float("nan"),
         p95_m=float("nan"),
         coverage=0.0,
+        quality=ModelQuality(),
         n_points=2,
     )

@@ -24,7 +24,7 @@ from pipeline.export.records import RecordContext, building_row
 from pipeline.export.solid_geometry import SOLID_COLUMNS
 
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
-BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent)
+BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent, small.levelled)
 SCHEMAS = "GABLEWORK_CITYJSON_SCHEMAS"
 """Names a folder with the schema files of CityJSON 2.0 as its maintainers publish them."""
 
@@ -95,7 +95,8 @@ def test_integer_vertices_give_back_the_coordinates(contexts: Contexts, crs: str
     units = np.array([reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m])
     built = {build().building_id: build() for build in BUILT}
     for feature in features:
-        solids = built[feature["id"]].solids
+        result = built[feature["id"]]
+        solids = [*result.solids, *(solid for model in result.coarser for solid in model.solids)]
         xyz = (
             np.array(feature["vertices"]).reshape(-1, 3) * first["transform"]["scale"] + first["transform"]["translate"]
         )
@@ -110,13 +111,29 @@ def test_the_scale_is_a_millimetre_in_metres(contexts: Contexts) -> None:
 def test_solids_are_closed_and_one_part_each(contexts: Contexts) -> None:
     for feature in sequence(contexts["compound"])[1:]:
         parts = [entry for entry in feature["CityObjects"].values() if entry["type"] == "BuildingPart"]
-        assert len(parts) == {"two_parts": 2, "failed": 0}.get(feature["id"], 1)
+        assert len(parts) == {"two_parts": 2, "levelled": 2, "failed": 0}.get(feature["id"], 1)
         for part in parts:
-            (shell,) = part["geometry"][0]["boundaries"]
-            rings = [ring for surface in shell for ring in surface]
-            edges = Counter((ring[i - 1], ring[i]) for ring in rings for i in range(len(ring)))
-            assert set(edges.values()) == {1}
-            assert all((b, a) in edges for a, b in edges)
+            for geometry in part["geometry"]:
+                (shell,) = geometry["boundaries"]
+                rings = [ring for surface in shell for ring in surface]
+                edges = Counter((ring[i - 1], ring[i]) for ring in rings for i in range(len(ring)))
+                assert set(edges.values()) == {1}
+                assert all((b, a) in edges for a, b in edges)
+
+
+def test_levels_of_detail_are_geometries_of_the_same_parts(contexts: Contexts) -> None:
+    feature = sequence(contexts["compound"], [small.levelled])[1]
+    objects = feature["CityObjects"]
+    assert objects["levelled"]["children"] == ["levelled-0", "levelled-1"]
+    for part, heights in (("levelled-0", [6.0, 4.75, 4.5]), ("levelled-1", [3.0, 3.0, 4.5])):
+        geometries = objects[part]["geometry"]
+        assert [geometry["lod"] for geometry in geometries] == ["2.2", "1.3", "1.2"]
+        for geometry, height in zip(geometries, heights, strict=True):
+            used = {i for surface in geometry["boundaries"][0] for ring in surface for i in ring}
+            assert max(feature["vertices"][i][2] for i in used) == round(1e3 * height)
+        for geometry in geometries[1:]:
+            roofs = [surface for surface in geometry["semantics"]["surfaces"] if surface["type"] == "RoofSurface"]
+            assert roofs == [{"type": "RoofSurface", "slope_deg": 0.0, "aspect_deg": 0.0}]
 
 
 def test_semantic_surfaces_tell_slope_and_aspect_of_each_roof_plane(contexts: Contexts) -> None:
@@ -155,7 +172,7 @@ def test_cjio_reads_the_sequence_as_one_model(contexts: Contexts, crs: str, tmp_
     cjio("stdin", "save", str(tmp_path / "one.city.json"), lines=sequence(contexts[crs]))
     model = json.loads((tmp_path / "one.city.json").read_text())
     names = {build().building_id for build in BUILT}
-    parts = {"gable-0", "courtyard-0", "two_parts-0", "two_parts-1", "pent-0"}
+    parts = {"gable-0", "courtyard-0", "two_parts-0", "two_parts-1", "pent-0", "levelled-0", "levelled-1"}
     assert set(model["CityObjects"]) == names | parts
     first = sequence(contexts[crs])[0]
     assert model["metadata"].get("referenceSystem") == first["metadata"].get("referenceSystem")

@@ -26,7 +26,7 @@ from pipeline.export.tile import write_tile
 from pipeline.runtime import digest
 from pipeline.runtime.digest import NOT_CONTENT, canonical_rows, run_digest
 
-BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent)
+BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent, small.levelled)
 
 
 @pytest.fixture(scope="module")

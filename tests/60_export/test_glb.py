@@ -223,3 +223,16 @@ def test_a_tile_is_published_with_one_file_that_its_rows_name(tmp_path: Path, co
     assert again == told
     nothing = write_tile(tmp_path, "t2", [small.failed()], [], contexts["compound"], "glb")
     assert not any(path.startswith("meshes/") for path in nothing.digests)
+
+
+def test_a_file_holds_one_level_of_detail_and_tells_it(contexts: Contexts) -> None:
+    lines = lines_of([small.levelled(), small.courtyard(), small.gable()], contexts["compound"])
+    volumes = {}
+    for lod in (None, "1.3", "1.2"):
+        nodes = read_glb(glb_bytes(lines, 1.0, 1.0, lod)).nodes
+        volumes[lod] = {n.name: (n.extras["lod"], round(signed_volume(triangles_of(n)), 3)) for n in nodes.values()}
+    court = ("1.2", 2700.0)
+    assert volumes[None] == {"levelled": ("2.2", 456.0), "courtyard": court, "gable": ("2.2", 360.0)}
+    assert volumes["1.3"] == {"levelled": ("1.3", 476.0), "courtyard": court}
+    assert volumes["1.2"] == {"levelled": ("1.2", 504.0), "courtyard": court}
+    assert glb_bytes(lines_of([small.gable()], contexts["compound"]), lod="1.3") == b""

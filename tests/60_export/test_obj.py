@@ -106,3 +106,18 @@ def test_faces_with_holes_become_triangles_that_keep_volume_and_orientation(cont
 def test_buildings_without_a_solid_leave_no_object(contexts: Contexts) -> None:
     vertices, objects = read_obj(obj_text([small.failed()], contexts["compound"].reference))
     assert (len(vertices), objects) == (0, [])
+
+
+def test_a_coarser_level_takes_the_place_of_the_records_own_and_a_fallback_block_stays(contexts: Contexts) -> None:
+    results = [small.levelled(), small.courtyard(), small.gable()]
+    tops = {}
+    for lod in (None, "1.3", "1.2"):
+        vertices, objects = read_obj(obj_text(results, contexts["compound"].reference, lod))
+        tops[lod] = {
+            o.name: float(max(vertices[i, 2] for _, _, ring in o.faces for i in ring)) - small.ORIGIN[2]
+            for o in objects
+        }
+    # the gable has no coarser model: it is in the file of its own level only
+    assert tops[None] == {"levelled-0": 6.0, "levelled-1": 3.0, "courtyard-0": 9.0, "gable-0": 6.0}
+    assert tops["1.3"] == {"levelled-0": 4.75, "levelled-1": 3.0, "courtyard-0": 9.0}
+    assert tops["1.2"] == {"levelled-0": 4.5, "levelled-1": 4.5, "courtyard-0": 9.0}

@@ -25,8 +25,10 @@ from pipeline.export.records import (
 from pipeline.model import Plane
 
 DESIGNED = """building_id, source_id, source_attributes, status, reason, reason_detail, overridden, method, roof_type,
-geometry, lod, solid, solid_parts, solid_surfaces, solid_planes, ground_z, eave_z, ridge_z, h_min, h_50p, h_70p, h_max,
+geometry, lod, solid, solid_parts, solid_surfaces, solid_planes, solid_lod12, solid_lod12_parts, solid_lod12_surfaces,
+solid_lod13, solid_lod13_parts, solid_lod13_surfaces, ground_z, eave_z, ridge_z, h_min, h_50p, h_70p, h_max,
 height_m, footprint_area_m2, roof_area_m2, volume_m3, n_points, density_per_m2, n_planes, rmse_m, p95_m, coverage,
+point_spacing_m, noise_m, share_within_0_2m, unexplained_m2, largest_hole_m, ridge_z_sigma_m, bic_margin, is_curved,
 valid, validity_codes, touches_data_edge, acquired_from, acquired_to, mesh_path, input_hash, settings_hash,
 engine_version"""
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
@@ -55,6 +57,16 @@ def test_a_gable_in_metres_reads_as_built(contexts: Contexts) -> None:
     assert shapely.from_wkb(row["geometry"]).equals(shapely.box(85_000, 447_000, 85_010, 447_008))
 
 
+def test_the_quality_of_a_model_is_told_as_it_was_measured(contexts: Contexts) -> None:
+    row = building_row(small.gable(), contexts["US feet"])
+    supported = [row[name] for name in ("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2")]
+    assert supported == [0.48, 0.029, 0.981, 1.25]
+    known = [row[name] for name in ("largest_hole_m", "ridge_z_sigma_m", "bic_margin", "is_curved")]
+    assert known == [1.4, 0.017, 12.5, False]
+    curved = dataclasses.replace(small.gable(), quality=dataclasses.replace(small.QUALITY, is_curved=True))
+    assert building_row(curved, contexts["US feet"])["is_curved"] is True
+
+
 def test_columns_in_metres_stay_in_metres_where_the_crs_is_in_feet(contexts: Contexts) -> None:
     metres = building_row(small.gable(), contexts["unknown"])
     feet = building_row(small.gable(), contexts["US feet"])
@@ -78,8 +90,11 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
     assert empty == {
         *("source_id", "geometry", "lod", "eave_z", "ridge_z", "h_min", "h_50p", "h_70p", "h_max", "height_m"),
         *("footprint_area_m2", "roof_area_m2", "volume_m3", "density_per_m2", "rmse_m", "p95_m"),
-        *("source_attributes", "overridden", "mesh_path", "input_hash"),
+        *("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2", "largest_hole_m", "ridge_z_sigma_m"),
+        *("bic_margin", "source_attributes", "overridden", "mesh_path", "input_hash"),
         *("solid", "solid_parts", "solid_surfaces", "solid_planes"),
+        *("solid_lod12", "solid_lod12_parts", "solid_lod12_surfaces"),
+        *("solid_lod13", "solid_lod13_parts", "solid_lod13_surfaces"),
     }
     assert (row["valid"], row["n_planes"], row["coverage"], row["ground_z"]) == (False, 0, 0.0, 2.0)
 

@@ -20,7 +20,7 @@ from small_buildings import Builder, Contexts
 from pipeline.export.dimensions import volume
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.records import RecordContext, building_row
-from pipeline.export.solid_geometry import SOLID_COLUMNS, solid_columns
+from pipeline.export.solid_geometry import SOLID_COLUMNS, model_at, solid_columns
 from pipeline.model import FaceKind, Solid, SolidFace
 from pipeline.quality.validity import check_solid
 
@@ -134,3 +134,41 @@ def test_duckdb_reads_the_solids_and_their_semantics(tmp_path: Path, contexts: C
         wanted = next((b() for b in BUILT if b.__name__ == name), small.failed())
         found = solid_columns(wanted, contexts["compound"].reference)["solid"]
         assert (None if wkb is None else bytes(wkb)) == found
+
+
+def test_coarser_solids_have_columns_of_their_own(contexts: Contexts) -> None:
+    result, reference = small.levelled(), contexts["compound"].reference
+    columns = solid_columns(result, reference)
+    assert tuple(columns) == SOLID_COLUMNS
+    for model in result.coarser:
+        name = f"solid_lod{model.lod.replace('.', '')}"
+        told = {end: columns[f"{name}_{end}"] for end in ("parts", "surfaces")}
+        planes = [face.plane for solid in model.solids for face in solid.faces]
+        again = solids_again(
+            {"solid": columns[name], "solid_planes": planes, **{f"solid_{end}": v for end, v in told.items()}},
+            (1.0, 1.0),
+        )
+        assert [volume(solid) for solid in again] == pytest.approx([volume(solid) for solid in model.solids])
+        assert [check_solid(solid) for solid in again] == [(), ()]
+    assert solid_columns(small.gable(), reference)["solid_lod13"] is None
+
+
+def test_geopandas_reads_coarser_solids_where_there_are_any(tmp_path: Path, contexts: Contexts) -> None:
+    path = tmp_path / "buildings.parquet"
+    path.write_bytes(table_of(contexts["compound"], *BUILT, small.levelled))
+    geo = json.loads(pq.read_schema(path).metadata[b"geo"])
+    assert list(geo["columns"]) == ["geometry", "solid", "solid_lod12", "solid_lod13"]
+    assert "covering" not in geo["columns"]["solid_lod12"]
+    frame = geopandas.read_parquet(path).set_index("building_id")
+    levels = frame.set_geometry("solid_lod13").geometry
+    assert levels.isna().sum() == len(BUILT)
+    assert levels["levelled"].bounds == frame.geometry["levelled"].bounds
+    assert len(levels["levelled"].geoms) == len(frame["solid_lod13_surfaces"]["levelled"])
+
+
+def test_the_finest_model_up_to_a_level_is_found() -> None:
+    levelled, block = small.levelled(), small.courtyard()
+    assert [model_at(levelled, lod).lod for lod in (None, "2.2", "1.3", "1.2")] == ["2.2", "2.2", "1.3", "1.2"]
+    assert [model_at(block, lod).lod for lod in (None, "1.3", "1.2")] == ["1.2", "1.2", "1.2"]
+    assert model_at(small.gable(), "1.3") is None
+    assert model_at(small.failed(), None) is None

@@ -128,3 +128,24 @@ def test_an_unknown_kind_of_meshes_lists_the_known_ones(tmp_path: Path, contexts
 def test_the_command_line_and_the_service_offer_the_meshes_that_are_written() -> None:
     choices, _ = get_args(Meshes)
     assert get_args(choices) == MESHES == OFFERED_BY_THE_SERVICE
+
+
+@pytest.mark.parametrize(
+    ("meshes", "stems", "ending"),
+    [
+        ("building", ("levelled", "courtyard"), "obj"),
+        ("tile", ("t1",), "obj"),
+        ("glb", ("t1",), "glb"),
+        ("none", (), ""),
+    ],
+)
+def test_every_level_of_detail_has_mesh_files_of_its_own(
+    tmp_path: Path, contexts: Contexts, meshes: str, stems: tuple[str, ...], ending: str
+) -> None:
+    context = dataclasses.replace(contexts["compound"], coarser_lods=("1.2", "1.3"))
+    told = write_tile(tmp_path, "t1", [small.levelled(), small.courtyard(), small.failed()], [], context, meshes)
+    wanted = {f"meshes/t1/{stem}{suffix}.{ending}" for stem in stems for suffix in ("", "-lod12", "-lod13")}
+    assert {path for path in told.digests if path.startswith("meshes/")} == wanted
+    assert told.digests == files_of(tmp_path)
+    paths = {path for path in read_table(str(tmp_path), "buildings")["mesh_path"].to_pylist() if path}
+    assert paths == {path for path in wanted if "-lod" not in path}

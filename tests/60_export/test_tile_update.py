@@ -26,6 +26,8 @@ CASES: dict[str, tuple[list[BuildingResult], list[BuildingResult], set[str]]] = 
     "one that has a model now": ([small.gable(), small.failed("two_parts")], [small.two_parts()], {"two_parts"}),
     "the last with a model": ([small.gable(), small.failed()], [small.failed("gable")], {"gable"}),
     "the first with a model": ([small.failed("gable")], [small.gable()], {"gable"}),
+    "one with levels of detail": ([small.gable(), small.levelled()], [small.gable("levelled", 40.0)], {"levelled"}),
+    "one that has levels now": ([small.courtyard(), small.failed("levelled")], [small.levelled()], {"levelled"}),
     "all of them": ([small.gable(), small.two_parts()], [small.courtyard(), FAR], {"gable", "two_parts"}),
 }
 
@@ -43,7 +45,7 @@ def test_an_updated_tile_is_the_tile_written_whole(
     before, fresh, replaced = CASES[case]
     if case == "one that moves the origin":
         before = [*[b for b in before if b.building_id != "gable"], MOVED]
-    context = contexts[crs]
+    context = dataclasses.replace(contexts[crs], coarser_lods=("1.3",))
     write_tile(tmp_path / "old", KEY, before, rejected_objects[:1], context, meshes)
     after = [*[b for b in before if b.building_id not in replaced], *fresh]
     gone = dataclasses.replace(rejected_objects[1], object_id="gable" if "gable" in replaced else "pole")

@@ -19,6 +19,7 @@ from model_files import small
 
 from pipeline.errors import InputError, RunError
 from pipeline.evaluation.reading import READERS, read_models
+from pipeline.export.obj import obj_text
 from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
 
 FOOT_M = 0.3048
@@ -54,6 +55,26 @@ def test_a_run_that_broke_off_or_lacks_solids_says_so(tmp_path: Path) -> None:
     assert all(model.solids == () for model in models.models)
     told = [note.split(":")[0] for note in models.notes]
     assert told[1:] == ["the run is incomplete", "no folder cityjson in the run"]
+
+
+def test_of_several_levels_of_detail_the_finest_is_measured(tmp_path: Path) -> None:
+    (model,) = read_models(files.write_run(tmp_path / "run", [small.levelled()])).models
+    assert (model.lod, len(model.solids), len(model.surfaces)) == ("2.2", 2, 3)
+    (same,) = read_models(next((tmp_path / "run").glob("cityjson/*/*.city.jsonl"))).models
+    assert (same.lod, len(same.solids), len(same.surfaces)) == ("2.2", 2, 3)
+
+
+def test_obj_files_of_coarser_levels_of_detail_are_passed_over(tmp_path: Path) -> None:
+    reference = small.Reference()
+    for suffix, lod in (("", None), ("-lod12", "1.2"), ("-lod13", "1.3")):
+        (tmp_path / f"levelled{suffix}.obj").write_text(obj_text([small.levelled()], reference, lod))
+    read = read_models(tmp_path)
+    assert [(len(model.solids), len(model.surfaces)) for model in read.models] == [(2, 3)]
+    assert "2 files of coarser levels of detail are passed over" in read.notes
+    (tmp_path / "levelled.obj").unlink()
+    (tmp_path / "levelled-lod13.obj").unlink()
+    (block,) = read_models(tmp_path).models
+    assert len(block.surfaces) == 2
 
 
 def test_given_footprints_are_known_by_their_ids(tmp_path: Path) -> None:

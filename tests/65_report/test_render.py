@@ -80,6 +80,14 @@ def test_a_run_in_feet_looks_as_one_in_metres(make_run: Callable[..., Path], tmp
     assert np.mean(np.abs(pictures[0] - pictures[1]) > 0.02) < 0.002
 
 
+def test_coarser_levels_of_detail_are_not_drawn_over_the_finest(make_run: Callable[..., Path], tmp_path: Path) -> None:
+    pictures = []
+    for name, result in (("all", small.levelled()), ("finest", dataclasses.replace(small.levelled(), coarser=()))):
+        render_run(make_run([result], name), tmp_path / f"{name}.png", dpi=DPI)
+        pictures.append(pixels_of(tmp_path / f"{name}.png"))
+    assert np.array_equal(*pictures)
+
+
 def test_a_run_without_models_still_gives_a_picture(make_run: Callable[..., Path], tmp_path: Path) -> None:
     render_run(make_run([]), tmp_path / "empty.png", dpi=DPI)
     render_run(make_run([small.failed()], "failed"), tmp_path / "failed.png", dpi=DPI)

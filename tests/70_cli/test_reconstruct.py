@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
+from pipeline.console import ExitCode
 
 
 def invoke(*words: str) -> tuple[int, str, str]:
@@ -52,6 +53,23 @@ def test_the_run_directory_is_laid_out_as_documented(run: tuple[Path, Any, Any])
     documented = {line.split("/")[0].split(" ")[0] for line in page.read_text().split("```")[1].splitlines() if line}
     assert {entry.name for entry in folder.iterdir()} == documented
     assert len(list(folder.glob("meshes/*/*.obj"))) == 1
+
+
+def test_levels_of_detail_are_written_side_by_side(
+    scene: Path, run: tuple[Path, dict[str, Any], Any], tmp_path: Path
+) -> None:
+    words = ("reconstruct", str(scene / "gable.laz"), "--out", str(tmp_path / "run"), "--workers", "0", "--json")
+    code, said, _ = invoke(*words, "--lods", "2.2, 1.2,1.3")
+    assert code == 0
+    assert json.loads(said)["statuses"] == {"ok": 1}
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["settings"]["general"]["lods"] == "1.2,1.3,2.2"
+    (own,) = run[0].glob("meshes/*/*.obj")
+    meshes = {path.name: path for path in tmp_path.glob("run/meshes/*/*.obj")}
+    assert set(meshes) == {own.name, f"{own.stem}-lod12.obj", f"{own.stem}-lod13.obj"}
+    assert meshes[own.name].read_bytes() == own.read_bytes()
+    code, said, _ = invoke(*words, "--lods", "2.1")
+    assert code == ExitCode.USAGE
+    assert "lods is '2.1': use one of 1.2, 1.3, 2.2" in said
 
 
 def test_the_stages_are_told_in_order(run: tuple[Path, Any, list[dict[str, Any]]]) -> None:

@@ -101,6 +101,7 @@ def write_run(
     meshes: str = "building",
     failed_tile: str | None = None,
     status: RunStatus = RunStatus.FINISHED,
+    coarser_lods: tuple[str, ...] = (),
 ) -> Path:
     """A run directory with these buildings a tile, and a rejected object in every tile."""
     tiles = four_tiles() if tiles is None else tiles
@@ -110,6 +111,7 @@ def write_run(
         engine_version="0.1.0",
         acquired_from=dt.datetime(2014, 3, 1, 10, tzinfo=dt.UTC),
         acquired_to=dt.datetime(2014, 3, 1, 11, tzinfo=dt.UTC),
+        coarser_lods=coarser_lods,
     )
     (run_dir / "state").mkdir(parents=True)
     for key, buildings in tiles.items():

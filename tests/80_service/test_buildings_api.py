@@ -418,6 +418,37 @@ def test_a_job_has_meshes_of_one_kind_and_names_it(client: TestClient, job_id: s
     assert "has no model (too_few_points)" in failed.json()["detail"]
 
 
+@pytest.mark.parametrize("meshes", ["building", "tile", "glb"])
+def test_a_building_is_had_in_each_level_of_detail_that_was_made(
+    client: TestClient, service: runs.Service, meshes: str
+) -> None:
+    levelled, block = runs.placed(small.levelled(), "levelled", 0.0, 0.0), runs.placed(small.courtyard(), "c", 0, 50.0)
+    tiles = {"x850_y4470": [levelled, block]}
+    job = service.finished(
+        lambda run_dir: runs.write_run(run_dir, tiles, meshes=meshes, coarser_lods=("1.2", "1.3")), meshes=meshes
+    )
+    form = "glb" if meshes == "glb" else "obj"
+
+    def sent(building: str, lod: str | None) -> bytes | int:
+        asked = {"f": form} if lod is None else {"f": form, "lod": lod}
+        answer = client.get(f"/jobs/{job}/buildings/{building}", params=asked)
+        return answer.content if answer.status_code == 200 else answer.status_code
+
+    contents = [sent(levelled.building_id, lod) for lod in ("2.2", "1.3", "1.2")]
+    assert len({content for content in contents if isinstance(content, bytes)}) == 3
+    assert sent(levelled.building_id, None) == contents[0]
+    assert [sent(block.building_id, lod) for lod in ("1.2", "1.3", "2.2")] == [sent(block.building_id, None), 404, 404]
+    for lod, height in (("1.3", b"6.75"), ("1.2", b"6.5")):
+        found = sent(levelled.building_id, lod)
+        if form == "obj":
+            assert height in found
+        else:
+            assert glb_rules.read_glb(found).nodes[levelled.building_id].extras["lod"] == lod
+    city = client.get(f"/jobs/{job}/buildings/{levelled.building_id}", params={"f": "cityjson"}).json()
+    part = city["CityObjects"][f"{levelled.building_id}-0"]
+    assert [geometry["lod"] for geometry in part["geometry"]] == ["2.2", "1.3", "1.2"]
+
+
 def test_a_glb_that_is_gone_or_another_is_told(client: TestClient, service: runs.Service) -> None:
     job = service.finished(lambda run_dir: runs.write_run(run_dir, meshes="glb"), meshes="glb")
     (path,) = service.folder.run(job, 1).glob("meshes/x851_y4470/*.glb")

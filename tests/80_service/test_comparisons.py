@@ -102,10 +102,10 @@ def test_jobs_are_listed_by_their_process(local_service) -> None:
 @pytest.mark.parametrize(
     ("inputs", "words"),
     [
-        ({}, "methods is missing: give 2 to 8 of fuzzy-sart"),
+        ({}, "methods is missing: give 2 to 8 of arrangement"),
         ({"methods": TWO[:1]}, "methods holds 1: give 2 to 8"),
         ({"methods": "fuzzy-sart"}, "methods holds 1: give 2 to 8"),
-        ({"methods": ["fuzzy-sart", "guess"]}, 'methods holds "guess": use METHOD or METHOD:PRESET of fuzzy-sart'),
+        ({"methods": ["fuzzy-sart", "guess"]}, 'methods holds "guess": use METHOD or METHOD:PRESET of arrangement'),
         ({"methods": ["fuzzy-sart", "fuzzy-sart:loose"]}, "fuzzy-sart:loose"),
         ({"methods": ["fuzzy-sart", "fuzzy-sart:robust"]}, "methods holds fuzzy-sart twice: give each once"),
         ({"methods": {"a": 1}}, "methods holds"),
@@ -143,11 +143,11 @@ def test_one_call_with_several_methods_compares_them(local_service, methods: lis
 @pytest.mark.parametrize("left_empty", ["", " , "])
 def test_one_call_takes_a_preset_and_no_methods_for_none(local_service, left_empty: str) -> None:
     files = {"tile": ("a.xyz", b"".join(b"%d.0 %d.0 3.5\n" % (x, y) for x in range(9) for y in range(9)))}
-    form = {"crs": "EPSG:28992", "preset": "faithful", "methods": left_empty}
+    form = {"crs": "EPSG:28992", "method": "kmeans", "preset": "faithful", "methods": left_empty}
     answer = local_service.client.post("/jobs", files=files, data=form)
     assert answer.status_code == 201, answer.text
     asked = local_service.store.get(answer.json()["jobID"]).request
-    assert (asked.process_id, asked.settings) == ("reconstruct", {"preset": "faithful"})
+    assert (asked.process_id, asked.settings) == ("reconstruct", {"method": "kmeans", "preset": "faithful"})
 
 
 def test_jobs_from_before_there_were_comparisons_are_read() -> None:

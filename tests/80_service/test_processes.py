@@ -246,6 +246,16 @@ def test_a_body_that_is_no_json_is_refused_with_the_reason(local_service) -> Non
         assert answer.headers["content-type"] == "application/problem+json"
 
 
+def test_levels_of_detail_are_an_input_of_their_own(local_service) -> None:
+    tile = {"href": f"/uploads/{local_service.upload()}"}
+    answer = execute(local_service, {"tiles": tile, "crs": "EPSG:28992", "lods": "1.2,2.2"})
+    assert answer.status_code == 201, answer.text
+    stored = local_service.store.get(answer.json()["jobID"]).request.settings
+    assert stored == {"lods": "1.2,2.2"}
+    assert RunSettings.from_mapping(stored).building.lods == ("1.2", "2.2")
+    assert "lods is" in faults_of(execute(local_service, {"tiles": tile, "lods": "2.1"}))
+
+
 def test_a_preset_stands_beside_the_method(local_service) -> None:
     tile = {"href": f"/uploads/{local_service.upload()}"}
     inputs = {"tiles": tile, "crs": "EPSG:28992", "method": "fuzzy-sart", "preset": "faithful"}
@@ -255,6 +265,8 @@ def test_a_preset_stands_beside_the_method(local_service) -> None:
     assert stored == {"method": "fuzzy-sart", "preset": "faithful"}
     assert RunSettings.from_mapping(stored).building.method == METHODS["fuzzy-sart"].preset("faithful")
     assert "preset is" in faults_of(execute(local_service, {**inputs, "preset": "loose"}))
+    without_paper = faults_of(execute(local_service, {**inputs, "method": "arrangement"}))
+    assert "preset is faithful, which arrangement does not have: use robust" in without_paper
     contradicted = {**inputs, "settings": {"preset": "robust"}}
     assert "settings.preset" in faults_of(execute(local_service, contradicted))
 

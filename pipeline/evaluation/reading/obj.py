@@ -23,6 +23,8 @@ _OWN_HEADER = re.compile(
 )
 """First line of the files that this program writes: it tells the units, and that objects are parts of buildings."""
 _OWN_MATERIAL = re.compile(r"^roof_(\d+)$")
+_COARSER_STEM = re.compile(r"^(.+)-lod\d+$")
+"""Name of a file of this program that holds a coarser level of detail than the file of the name before it."""
 _LEAST_SOLID_FACES = 4
 
 
@@ -56,7 +58,7 @@ def read_obj_files(paths: Sequence[Path], into: Collected) -> None:
 
     One building an `o`; in files of this program its parts are objects of their own. Without `o`, one a group that
     tells no kind and has faces enough for a solid. Without either a file is a building, or, where it is the only one,
-    one building for all that touches in plan.
+    one building for all that touches in plan. Coarser levels of detail are passed over where the finest is there too.
 
     Raises
     ------
@@ -64,7 +66,12 @@ def read_obj_files(paths: Sequence[Path], into: Collected) -> None:
         If a file is broken; the message names file and line.
     """
     pieces: dict[str, list[RawPart]] = {}
+    known = set(paths)
+    coarser = {path for path in paths if (m := _COARSER_STEM.match(path.stem)) and path.with_stem(m[1]) in known}
     for path in paths:
+        if path in coarser:
+            into.count("{n} files of coarser levels of detail are passed over")
+            continue
         mesh = _read(path)
         if not mesh.is_own:
             into.note("an OBJ tells no units and no reference system: coordinates are taken as metres")

@@ -17,7 +17,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.errors import RunError, UnreadableInputError
 from pipeline.evaluation.models import ModelSet, RoofModel, RoofSurface
 from pipeline.evaluation.reading.cityjson import features
-from pipeline.evaluation.reading.cityjson_geometry import parts_of
+from pipeline.evaluation.reading.cityjson_geometry import chosen, parts_of
 from pipeline.evaluation.reading.collected import Collected
 from pipeline.evaluation.reading.raw import MILLIMETRES_PER_METRE, RawPart
 from pipeline.evaluation.reading.surfaces import GRID_M
@@ -174,14 +174,10 @@ def _solids(path: Path, units_m: tuple[float, float], into: Collected) -> Solids
     for file in sorted(folder.glob("*/*.city.jsonl")):
         for feature, places, where in features(file, told, units_m):
             try:
-                parts = [
-                    part
-                    for entry in feature["CityObjects"].values()
-                    for geometry in entry.get("geometry", ())
-                    for part in parts_of(geometry, places)
-                    if part.is_solid
-                ]
                 name = feature["id"]
+                objects = feature["CityObjects"].values()
+                geometries, _ = chosen((), [entry.get("geometry") or () for entry in objects], places)
+                parts = [part for geometry in geometries for part in parts_of(geometry, places) if part.is_solid]
             except (KeyError, TypeError, ValueError, IndexError, AttributeError) as fault:
                 raise UnreadableInputError(
                     str(file), f"{where}{fault!r}", "The run directory is damaged: run it again"

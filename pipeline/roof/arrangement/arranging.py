@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import shapely
 from numba import njit
-from shapely import MultiPolygon
+from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import BuildingError
-from pipeline.model import FloatArray, IntArray, LabelArray, Reason
+from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.arrangement.candidate_lines import border_places, candidate_lines
 from pipeline.roof.arrangement.cells import cell_borders, cell_costs, cells_of_points, unite_faces
 from pipeline.roof.arrangement.faces import corners_of_borders, part_crossings, trace_faces
 from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
+from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, raster_labels
 from pipeline.roof.arrangement.settings import ArrangementSettings
 from pipeline.roof.arrangement.subdivision import outline_graph, subdivide
@@ -39,8 +42,9 @@ def _arranged(
     line_length_m: float,
     line_reach_m: float,
     overshoot_m: float,
-) -> tuple[IntArray, LabelArray, LabelArray, LabelArray, LabelArray, LabelArray, LabelArray]:
-    """Vertices; rings, their starts and faces without and with all vertices on lines; planes of the faces."""
+    clearance: float,
+) -> tuple[IntArray, LabelArray, LabelArray, LabelArray, LabelArray, LabelArray, LabelArray, FloatArray, FloatArray]:
+    """Vertices; rings, their starts and faces; the faces' planes; graph, cells' faces; planes and their support."""
     n_outline = len(ring_xy)
     edges = np.empty((n_outline, 4))
     for r in range(len(ring_starts) - 1):
@@ -54,9 +58,14 @@ def _arranged(
     lines, scores = np.empty((0, 3)), np.empty(0)
     crossing, line_of = np.empty(0, np.int32), np.empty(0, np.int32)
     places = np.empty((0, 2))
-    if k > 1:
+    label_of_point = np.zeros(len(points), np.int32)
+    if k == 1:
+        planes = refitted_planes(points, label_of_point, planes, cap_m)
+    else:
         raster, place, low_x, low_y, columns = raster_labels(points, planes, edges, cell_m, cap_m, cost_per_m)
         half = 0.5 * cell_m
+        label_of_point = labels_of_points(points, raster, place, low_x, low_y, half, columns)
+        planes = refitted_planes(points, label_of_point, planes, cap_m)
         places, pairs = border_places(raster, place, low_x, low_y, half, columns, k)
         lines, scores, crossing, line_of = candidate_lines(
             places, pairs, points, planes, edges, half, cap_m, line_length_m
@@ -64,13 +73,13 @@ def _arranged(
 
     xy, graph = outline_graph(ring_xy, ring_starts, polygon_of_ring, _SPARE_EDGES + _EDGES_PER_LINE * len(lines))
     counts = np.array([n_outline, 2 * n_outline, polygon_of_ring.max() + 1], np.int32)
-    subdivide(xy, graph, counts, lines, scores, crossing, line_of, places, line_reach_m)
+    subdivide(xy, graph, counts, lines, scores, crossing, line_of, places, line_reach_m, clearance)
 
     n_cells = counts[2]
     cell_labels = np.zeros(n_cells + len(xy), np.int32)
     if k > 1:
         cells = cells_of_points(xy, graph, counts[1], points)
-        costs = cell_costs(
+        costs, misfits = cell_costs(
             xy, graph, counts[1], n_cells, points, labels, planes, cells, cap_m, points_per_m2, overshoot_m
         )
         borders, weights = cell_borders(xy, graph, counts[1], cost_per_m)
@@ -80,15 +89,19 @@ def _arranged(
         starts, others, border_costs = neighbour_lists(n_cells, borders, weights)
         allowed, allowed_starts = every_label(n_cells, k)
         expand_labels(costs, allowed, allowed_starts, starts, others, border_costs, chosen, _ROUNDS)
-        unite_faces(costs, borders, weights, chosen, face_cost)
+        unite_faces(misfits, borders, weights, chosen, face_cost)
+        for i in range(len(points)):
+            label_of_point[i] = chosen[cells[i]] if cells[i] >= 0 else -1
+    support = support_of_planes(points, label_of_point, planes, cap_m)
 
-    faces, n_faces = part_crossings(xy, graph, counts, cell_labels, planes)
+    faces, n_faces = part_crossings(xy, graph, counts, cell_labels, planes, clearance)
     plane_of_face = np.empty(n_faces, np.int32)
     for i in range(counts[2]):
         plane_of_face[faces[i]] = cell_labels[i]
     needed = corners_of_borders(xy, graph, counts[0], counts[1], n_outline, faces)
     vertices, starts, owner = trace_faces(xy, graph, counts[1], faces, needed)
-    return xy[: counts[0]].copy(), vertices, starts, owner, plane_of_face, graph[: counts[1]].copy(), faces
+    used = graph[: counts[1]].copy()
+    return xy[: counts[0]].copy(), vertices, starts, owner, plane_of_face, used, faces, planes, support
 
 
 def _rings_of(outline_mm: MultiPolygon) -> tuple[IntArray, LabelArray, LabelArray]:
@@ -104,9 +117,9 @@ def _rings_of(outline_mm: MultiPolygon) -> tuple[IntArray, LabelArray, LabelArra
 
 
 def _polygons(
-    xy: IntArray, vertices: LabelArray, starts: LabelArray, owner: LabelArray, plane_of_face: LabelArray
-) -> RoofPartition | None:
-    """The faces as polygons; None where they are no coverage."""
+    xy: IntArray, vertices: LabelArray, starts: LabelArray, owner: LabelArray, n_faces: int
+) -> tuple[Polygon, ...] | None:
+    """The faces; None where they are no coverage."""
     nodes = xy[vertices].astype(np.float64)
     following = np.arange(1, len(vertices) + 1)
     following[starts[1:] - 1] = starts[:-1]
@@ -122,11 +135,11 @@ def _polygons(
     )
     firsts = np.flatnonzero(np.diff(owner[order], prepend=-1))
     polygons = shapely.polygons(rings, indices=owner[order])
-    if (twice_area[order[firsts]] <= 0.0).any() or (twice_area > 0.0).sum() != len(plane_of_face):
+    if (twice_area[order[firsts]] <= 0.0).any() or (twice_area > 0.0).sum() != n_faces:
         return None
     if not shapely.is_valid(polygons).all() or not shapely.coverage_is_valid(polygons):
         return None
-    return RoofPartition(polygons=tuple(polygons.tolist()), labels=plane_of_face)
+    return tuple(polygons.tolist())
 
 
 def arrange(
@@ -136,11 +149,13 @@ def arrange(
     outline_mm: MultiPolygon,
     spacing_m: float,
     settings: ArrangementSettings,
+    clearance: float = 1.0,
 ) -> RoofPartition:
     """Fill an outline with the roof faces that explain the points best for their number and their borders' length.
 
     Coarse labels of a raster give candidate lines along their borders; the lines cut the outline into cells where
-    they have support; the cells get the labels of least cost; cells of one label are a face.
+    they have support; the cells get the labels of least cost; cells of one label are a face. Before the lines are
+    drawn every plane is fitted anew to the points of its places.
 
     Parameters
     ----------
@@ -156,12 +171,15 @@ def arrange(
         Typical distance of neighbouring points in plan.
     settings : ArrangementSettings
         Costs and lengths.
+    clearance : float
+        Times the usual distances that vertices keep from each other: more where planes meet nearly in one point and no
+        solid is sound.
 
     Returns
     -------
     RoofPartition
         A valid coverage of the whole outline: polygons in integer millimetres that share their borders exactly. A
-        place without points belongs to a neighbour's plane.
+        place without points belongs to a neighbour's plane. With its planes, in the order of the given ones.
 
     Raises
     ------
@@ -179,7 +197,7 @@ def arrange(
     moved = np.ascontiguousarray(planes, dtype=np.float64).copy()
     moved[:, 2] += moved[:, 0] * shift[0] + moved[:, 1] * shift[1]
     points_per_m2 = 1.0 / spacing_m**2
-    xy, vertices, starts, owner, plane_of_face, graph, faces = _arranged(
+    xy, vertices, starts, owner, plane_of_face, graph, faces, fitted, support = _arranged(
         points - shift,
         labels,
         moved,
@@ -190,16 +208,22 @@ def arrange(
         points_per_m2,
         settings.residual_cap_m,
         settings.border_cost / spacing_m,
-        round(settings.face_cost * COST_SCALE),
+        round(max(settings.face_cost, settings.face_area_m2 * points_per_m2) * COST_SCALE),
         settings.line_length_m,
         max(settings.line_reach_m, spacing_m),
         settings.overshoot_m,
+        clearance,
     )
-    partition = _polygons(xy + low, vertices, starts, owner, plane_of_face)
-    if partition is None:
+    polygons = _polygons(xy + low, vertices, starts, owner, len(plane_of_face))
+    if polygons is None:
         # with every vertex that was put on a line the faces are as exact as the subdivision itself
         vertices, starts, owner = trace_faces(xy, graph, len(graph), faces, np.ones(len(xy), np.bool_))
-        partition = _polygons(xy + low, vertices, starts, owner, plane_of_face)
-    if partition is None:
+        polygons = _polygons(xy + low, vertices, starts, owner, len(plane_of_face))
+    if polygons is None:
         raise BuildingError(Reason.NO_PARTITION, "the cells of the outline make no coverage")
-    return partition
+    fitted[:, 2] -= fitted[:, 0] * shift[0] + fitted[:, 1] * shift[1]
+    described = tuple(
+        Plane(a=a, b=b, c=c, n_points=int(n), rmse_m=math.sqrt(squares / n) if n else 0.0)
+        for (a, b, c), (n, squares) in zip(fitted.tolist(), support.tolist(), strict=True)
+    )
+    return RoofPartition(polygons=polygons, labels=plane_of_face, planes=described)

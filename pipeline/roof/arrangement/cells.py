@@ -2,6 +2,8 @@
 
 The cost of a cell's label is the sum of its points' capped residuals, in unexplained points; a border costs by its
 length, a face as such: a short description of the roof (minimum description length) with the points as its data.
+Whether a face earns its cost is another question than where it ends: there only the points count that misfit the plane
+next door.
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distanc
 from pipeline.roof.arrangement.subdivision import FACE, ORIGIN, between_vertices
 
 _ROW_MM = 500.0
+_TOLERANCE = 0.5
+"""Of the cap: points nearer than this to a plane fit it; from there to the cap they misfit more and more."""
 
 
 @njit(cache=True, nogil=True)
@@ -87,19 +91,24 @@ def cell_costs(
     cap_m: float,
     points_per_m2: float,
     overshoot_m: float,
-) -> IntArray:
+) -> tuple[IntArray, IntArray]:
     """Cost of every plane in every cell.
 
     A plane that leaves the heights of its own points at corners of a cell costs as if that share of the cell were not
-    explained: planes are not continued far above or below their data where no points speak.
+    explained: planes are not continued far above or below their data where no points speak. That share of the points
+    that the cell lacks for its area misfits.
 
     Returns
     -------
-    (c, k) int64
-        In thousandths of an unexplained point.
+    costs : (c, k) int64
+        By the capped residuals, in thousandths of an unexplained point.
+    misfits : (c, k) int64
+        The same without what lies within half the cap.
     """
     k = len(planes)
-    costs = np.zeros((n_cells, k), np.int64)
+    costs, misfits = np.zeros((n_cells, k), np.int64), np.zeros((n_cells, k), np.int64)
+    expected = cell_areas_m2(xy, graph, n_edges, n_cells) * points_per_m2
+    lacking = expected.copy()
     lowest, highest = np.full(k, math.inf), np.full(k, -math.inf)
     for i in range(len(points)):
         if labels[i] >= 0:
@@ -108,10 +117,12 @@ def cell_costs(
         cell = cells[i]
         if cell < 0:
             continue
+        lacking[cell] -= 1.0
         for label in range(k):
-            off = vertical_distance_m(points[i], planes[label])
-            costs[cell, label] += int(COST_SCALE * min(off / cap_m, 1.0))
-    areas = cell_areas_m2(xy, graph, n_edges, n_cells)
+            share = min(vertical_distance_m(points[i], planes[label]) / cap_m, 1.0)
+            costs[cell, label] += int(COST_SCALE * share)
+            if share > _TOLERANCE:
+                misfits[cell, label] += int(COST_SCALE * (share - _TOLERANCE) / (1.0 - _TOLERANCE))
     beyond = np.zeros((n_cells, k), np.int64)
     corners = np.zeros(n_cells, np.int64)
     for h in range(n_edges):
@@ -130,8 +141,9 @@ def cell_costs(
         for label in range(k):
             if beyond[cell, label] != 0:
                 share = beyond[cell, label] / corners[cell]
-                costs[cell, label] += int(COST_SCALE * share * areas[cell] * points_per_m2)
-    return costs
+                costs[cell, label] += int(COST_SCALE * share * expected[cell])
+                misfits[cell, label] += int(COST_SCALE * share * max(lacking[cell], 0.0))
+    return costs, misfits
 
 
 @njit(cache=True, nogil=True)
@@ -182,12 +194,23 @@ def connected_faces(labels: LabelArray, pairs: LabelArray) -> tuple[LabelArray, 
 
 
 @njit(cache=True, nogil=True)
-def unite_faces(costs: IntArray, pairs: LabelArray, weights: IntArray, labels: LabelArray, face_cost: int) -> None:
+def unite_faces(misfits: IntArray, pairs: LabelArray, weights: IntArray, labels: LabelArray, face_cost: int) -> None:
     """Give whole faces the label of a neighbour while that saves more than it costs, the best first.
 
-    It saves their common border, and a face for every neighbour with that label.
+    It saves their common border, and a face for every neighbour with that label; it costs the points that misfit then.
+
+    Parameters
+    ----------
+    misfits : (c, k) int64
+        From `cell_costs`.
+    pairs, weights : arrays
+        From `cell_borders`.
+    labels : (c,) int32
+        Plane of every cell; changed in place.
+    face_cost : int
+        Cost of a face.
     """
-    k = costs.shape[1]
+    k = misfits.shape[1]
     while True:
         faces, count = connected_faces(labels, pairs)
         if count < 2:
@@ -196,7 +219,7 @@ def unite_faces(costs: IntArray, pairs: LabelArray, weights: IntArray, labels: L
         label_of = np.empty(count, np.int32)
         for i in range(len(labels)):
             label_of[faces[i]] = labels[i]
-            data[faces[i]] += costs[i]
+            data[faces[i]] += misfits[i]
         keys = np.empty(2 * len(pairs), np.int64)
         between = np.empty(2 * len(pairs), np.int64)
         m = 0

@@ -25,7 +25,7 @@ from pipeline.roof.arrangement.subdivision import (
 
 _CORNER_MM = 120.0
 """Size of the corner that goes to a neighbour."""
-_LEAST_CORNER_MM = 40.0
+_LEAST_CORNER_MM = 20.0
 _STRAIGHT_MM = 2.0
 """A vertex that was put on a line and bends it by less goes again."""
 _MOST_BORDERS = 32
@@ -72,15 +72,22 @@ def _crosses(around: LabelArray, heights: FloatArray, m: int) -> bool:
 
 @njit(cache=True, nogil=True)
 def _give_corner(
-    xy: IntArray, graph: LabelArray, counts: LabelArray, labels: LabelArray, first: int, last: int, label: int
+    xy: IntArray,
+    graph: LabelArray,
+    counts: LabelArray,
+    labels: LabelArray,
+    first: int,
+    last: int,
+    label: int,
+    corner_mm: float,
 ) -> bool:
-    """Give the corner from half-edge `first` to the left up to `last` another label; whether all of it was given."""
+    """Give the corner from half-edge `first` to the left up to `last` another label; whether there was room for it."""
     g = first
     while True:
         v, w = graph[g, ORIGIN], graph[g ^ 1, ORIGIN]
         dx, dy = float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1])
         length = math.hypot(dx, dy)
-        size = min(_CORNER_MM, 0.4 * length)
+        size = min(corner_mm, 0.4 * length)
         if size < _LEAST_CORNER_MM or counts[0] >= len(xy) or counts[1] + 4 > len(graph):
             return False
         x, y = int(np.rint(xy[v, 0] + size / length * dx)), int(np.rint(xy[v, 1] + size / length * dy))
@@ -91,14 +98,17 @@ def _give_corner(
         if g == last:
             break
         g = graph[g, PREVIOUS] ^ 1
+    given_from = counts[2]
     g = first
     while g != last:
         left = graph[g, PREVIOUS] ^ 1
         u, v = graph[g ^ 1, ORIGIN], graph[left ^ 1, ORIGIN]
-        made = insert_chord(xy, graph, counts[1], counts[2], u, v, graph[g, FACE], -1)
+        cell = graph[g, FACE]
+        made = insert_chord(xy, graph, counts[1], counts[2], u, v, cell, -1)
         if made >= 0:
             counts[1] += 2
         if made != 1:
+            labels[given_from : counts[2]] = labels[cell]
             return False
         # the triangle lies left of the chord, and so is the new cell
         labels[counts[2]] = label
@@ -115,7 +125,7 @@ def _height_m(plane: FloatArray, x_mm: float, y_mm: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _corner_cost(
-    xy: IntArray, graph: LabelArray, planes: FloatArray, own: int, giver: int, beyond: int, edge: int
+    xy: IntArray, graph: LabelArray, planes: FloatArray, own: int, giver: int, beyond: int, edge: int, corner_mm: float
 ) -> float:
     """How much heights change where a corner takes its neighbour's plane, metres; much where planes would then cross.
 
@@ -123,7 +133,7 @@ def _corner_cost(
     would get vertices too close to one another.
     """
     v, w = graph[edge, ORIGIN], graph[edge ^ 1, ORIGIN]
-    fraction = min(_CORNER_MM / math.hypot(float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1])), 0.4)
+    fraction = min(corner_mm / math.hypot(float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1])), 0.4)
     x, y = xy[v, 0] + fraction * (xy[w, 0] - xy[v, 0]), xy[v, 1] + fraction * (xy[w, 1] - xy[v, 1])
     cost = abs(_height_m(planes[giver], x, y) - _height_m(planes[own], x, y))
     if beyond >= 0 and beyond != giver:
@@ -136,7 +146,12 @@ def _corner_cost(
 
 @njit(cache=True, nogil=True)
 def part_crossings(
-    xy: IntArray, graph: LabelArray, counts: LabelArray, labels: LabelArray, planes: FloatArray
+    xy: IntArray,
+    graph: LabelArray,
+    counts: LabelArray,
+    labels: LabelArray,
+    planes: FloatArray,
+    clearance: float = 1.0,
 ) -> tuple[LabelArray, int]:
     """Part borders that cross such that no solid could stand on them.
 
@@ -148,6 +163,8 @@ def part_crossings(
         Plane of every cell, with room for the new ones; changed in place.
     planes : (k, 3) float64
         Coefficients a, b, c.
+    clearance : float
+        Times the usual size of a corner.
 
     Returns
     -------
@@ -156,9 +173,11 @@ def part_crossings(
     n_faces : int
         Their number.
     """
+    corner_mm = clearance * _CORNER_MM
     borders = np.empty(_MOST_BORDERS, np.int32)
     around = np.empty(_MOST_BORDERS, np.int32)
     plane_of = np.empty(_MOST_BORDERS, np.int32)
+    refused = np.empty(2 * _MOST_BORDERS, np.bool_)
     heights = np.empty(_MOST_BORDERS)
     pairs, _ = cell_borders(xy, graph, counts[1], 0.0)
     faces, n_faces = connected_faces(labels[: counts[2]], pairs)
@@ -180,24 +199,34 @@ def part_crossings(
                     heights[i] = _height_m(planes[plane_of[i]], xy[v, 0], xy[v, 1])
             if not _crosses(around, heights, m):
                 break
-            least = math.inf
-            corner, giver = -1, -1
-            for i in range(m):
-                for side in range(2):
-                    j, beyond = ((i + 1) % m, (i - 1) % m) if side == 0 else ((i - 1) % m, (i + 1) % m)
-                    if around[i] < 0 or around[j] < 0:
-                        continue
-                    edge = borders[i] if side == 0 else borders[(i + 1) % m]
-                    cost = _corner_cost(xy, graph, planes, plane_of[i], plane_of[j], plane_of[beyond], edge)
-                    if around[j] == around[beyond]:
-                        cost -= _LARGE_COST
-                    if cost < least:
-                        least = cost
-                        corner, giver = i, j
-            if corner < 0:
-                break
-            label = labels[graph[borders[giver], FACE]]
-            given = _give_corner(xy, graph, counts, labels, borders[corner], borders[(corner + 1) % m], label)
+            refused[:] = False
+            given = False
+            while not given:
+                least = math.inf
+                corner, giver, choice = -1, -1, -1
+                for i in range(m):
+                    for side in range(2):
+                        j, beyond = ((i + 1) % m, (i - 1) % m) if side == 0 else ((i - 1) % m, (i + 1) % m)
+                        if around[i] < 0 or around[j] < 0 or refused[2 * i + side]:
+                            continue
+                        edge = borders[i] if side == 0 else borders[(i + 1) % m]
+                        cost = _corner_cost(
+                            xy, graph, planes, plane_of[i], plane_of[j], plane_of[beyond], edge, corner_mm
+                        )
+                        if around[j] == around[beyond]:
+                            cost -= _LARGE_COST
+                        elif plane_of[j] == plane_of[beyond]:
+                            # a neck would make two faces one
+                            cost += _LARGE_COST
+                        if cost < least:
+                            least = cost
+                            corner, giver, choice = i, j, 2 * i + side
+                if corner < 0:
+                    break
+                label = labels[graph[borders[giver], FACE]]
+                first, last = borders[corner], borders[(corner + 1) % m]
+                given = _give_corner(xy, graph, counts, labels, first, last, label, corner_mm)
+                refused[choice] = not given
             pairs, _ = cell_borders(xy, graph, counts[1], 0.0)
             faces, n_faces = connected_faces(labels[: counts[2]], pairs)
             if not given:

@@ -26,13 +26,20 @@ class ArrangementSettings(Parameters):
         maximum=100.0,
     )
     face_cost: float = parameter(
-        3.0, "Unexplained points that a roof face must save.", unit="points", minimum=0.0, maximum=1000.0
+        3.0, "Misfitting points that a roof face must save.", unit="points", minimum=0.0, maximum=1000.0
+    )
+    face_area_m2: float = parameter(
+        1.75,
+        "A roof face must save at least the points that fall on this area.",
+        unit="m2",
+        minimum=0.0,
+        maximum=100.0,
     )
     raster_cell_m: float = parameter(
-        0.5, "Cell of the coarse labels; at least one point spacing.", unit="m", minimum=0.1, maximum=5.0
+        0.35, "Cell of the coarse labels; at least one point spacing.", unit="m", minimum=0.1, maximum=5.0
     )
     line_length_m: float = parameter(
-        1.0, "Shorter borders of the coarse labels give no line.", unit="m", minimum=0.1, maximum=20.0
+        0.7, "Shorter borders of the coarse labels give no line.", unit="m", minimum=0.1, maximum=20.0
     )
     line_reach_m: float = parameter(0.6, "How far beyond its border a line cuts.", unit="m", minimum=0.0, maximum=20.0)
     overshoot_m: float = parameter(

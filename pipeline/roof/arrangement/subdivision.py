@@ -452,6 +452,7 @@ def subdivide(
     line_of: LabelArray,
     places: FloatArray,
     reach_m: float,
+    clearance: float = 1.0,
 ) -> None:
     """Cut an outline by candidate lines, those with the highest scores first.
 
@@ -465,6 +466,8 @@ def subdivide(
         From `candidate_lines` and `border_places`, metres.
     reach_m : float
         How far beyond its supporting places a line cuts.
+    clearance : float
+        Times the usual distance within which a line passes through a vertex.
     """
     in_mm = np.empty(3)
     for number in np.argsort(-scores, kind="mergesort"):
@@ -472,4 +475,4 @@ def subdivide(
         in_mm[:] = lines[number]
         in_mm[2] *= 1e3
         snap_mm = _SNAP_CROSSING_MM if crossing[number] != 0 else _SNAP_MM
-        _cut_by_line(xy, graph, counts, in_mm, number, snap_mm, spans)
+        _cut_by_line(xy, graph, counts, in_mm, number, clearance * snap_mm, spans)

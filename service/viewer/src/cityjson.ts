@@ -58,6 +58,7 @@ export class SequenceReader {
 
 interface RawGeometry {
   type: string;
+  lod?: string;
   boundaries: unknown;
   semantics?: { surfaces: { type: string }[]; values: unknown };
 }
@@ -89,9 +90,15 @@ function featureOf(line: RawLine, { scale, translate }: Transform): Building {
   });
   const faces: Face[] = [];
   for (const object of Object.values(line.CityObjects ?? {})) {
-    for (const geometry of object.geometry ?? []) faces.push(...facesOf(geometry));
+    for (const geometry of finest(object.geometry ?? [])) faces.push(...facesOf(geometry));
   }
   return { id, attributes: line.CityObjects?.[id]?.attributes ?? {}, vertices, faces };
+}
+
+/** The geometries of the finest level of detail: coarser ones stand at the same place. */
+function finest(geometries: RawGeometry[]): RawGeometry[] {
+  const levels = geometries.map(({ lod }) => Number(lod ?? 0));
+  return geometries.filter((_, i) => levels[i] === Math.max(...levels));
 }
 
 type Rings = number[][];

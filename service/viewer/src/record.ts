@@ -15,6 +15,7 @@ interface Row {
 }
 
 const metres = (digits: number) => (value: unknown) => measure(value, digits, "m");
+const percent = (value: unknown): string => (typeof value === "number" ? measure(100 * value, 1, "%") : "–");
 const whole = (value: unknown): string => (typeof value === "number" ? count(value) : "–");
 
 /** The columns of the record that people look at; the file has all of them. */
@@ -45,7 +46,12 @@ function groups(verticalUnit: string): [string, Row[]][] {
       [
         { label: "RMSE", column: "rmse_m", show: metres(3) },
         { label: "95th percentile", column: "p95_m", show: metres(3) },
-        { label: "Points covered", column: "coverage", show: (v) => (typeof v === "number" ? measure(100 * v, 1, "%") : "–") },
+        { label: "Points covered", column: "coverage", show: percent },
+        { label: "Within 0.2 m of the roof", column: "share_within_0_2m", show: percent },
+        { label: "Noise of the points", column: "noise_m", show: metres(3) },
+        { label: "Ridge known to (one sigma)", column: "ridge_z_sigma_m", show: metres(3) },
+        { label: "Roof unexplained by points", column: "unexplained_m2", show: (v) => measure(v, 1, "m²") },
+        { label: "Largest hole in the points", column: "largest_hole_m", show: metres(1) },
         { label: "Points", column: "n_points", show: whole },
         { label: "Density", column: "density_per_m2", show: (v) => measure(v, 1, "per m²") },
       ],
@@ -121,6 +127,7 @@ function record(
     { class: "marks" },
     typeof lod === "string" ? el("li", { class: "mark-plain" }, `LoD${lod}`) : null,
     modelled ? el("li", { class: valid === true ? "mark-good" : "mark-bad" }, valid === true ? "valid solid" : "not valid") : null,
+    properties["is_curved"] === true ? el("li", { class: "mark-plain" }, "curved roof") : null,
     properties["touches_data_edge"] === true ? el("li", { class: "mark-warn" }, "at the edge of the data") : null,
   );
   const why =

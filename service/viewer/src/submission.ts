@@ -18,7 +18,7 @@ interface Sent {
 }
 
 interface InputDescription {
-  schema: { enum?: string[]; default?: string };
+  schema: { enum?: string[]; default?: string; items?: { enum?: string[] } };
 }
 
 /** The form: tiles are sent as soon as they are dropped, the job starts on the button. */
@@ -109,15 +109,16 @@ export class Submission {
         );
       }
       this.usualPreset = this.preset.value;
-      this.offerOthers(process.inputs["method"]?.schema.enum ?? [], process.inputs["preset"]?.schema.enum ?? [""]);
+      const comparison = await getJson<{ inputs: Record<string, InputDescription> }>("processes/compare");
+      this.offerOthers(comparison.inputs["methods"]?.schema.items?.enum ?? []);
     } catch (error) {
       this.tell(asProblem(error));
     }
   }
 
-  /** A box for every method with every preset: any that is set makes the job a comparison. */
-  private offerOthers(methods: string[], presets: string[]): void {
-    const words = methods.flatMap((method) => presets.map((preset) => variantOf(method, preset, this.usualPreset)));
+  /** A box for every method with each of its presets: any that is set makes the job a comparison. */
+  private offerOthers(variants: string[]): void {
+    const words = variants.filter((variant) => !variant.endsWith(`:${this.usualPreset}`));
     this.others.replaceChildren(
       ...words.map((value) => el("label", {}, el("input", { type: "checkbox", value }), ` ${value.replace(":", ", ")}`)),
     );

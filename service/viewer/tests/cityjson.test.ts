@@ -23,6 +23,13 @@ test("a feature gives its vertices in the CRS, its faces by kind and its record"
   expect(building?.attributes["roof_type"]).toBe("gable");
 });
 
+test("of several levels of detail the finest is drawn", () => {
+  const part = GABLE.CityObjects["house-0"];
+  const block = { ...part.geometry[0], lod: "1.2", boundaries: [[[[0, 1, 2, 3]]]] };
+  const levels = { ...GABLE, CityObjects: { ...GABLE.CityObjects, "house-0": { ...part, geometry: [block, ...part.geometry] } } };
+  expect(read(METADATA, levels).buildings[1]?.faces).toEqual(read(METADATA, GABLE).buildings[1]?.faces);
+});
+
 test("a later line of metadata stands for what follows it", () => {
   const moved = { ...METADATA, transform: { scale: [0.01, 0.01, 0.01], translate: [0, 0, 0] } };
   const building = read(METADATA, moved, GABLE).buildings[2];

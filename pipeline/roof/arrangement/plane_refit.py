@@ -1,0 +1,122 @@
+"""Planes fitted anew to the points of the places that they were given."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from pipeline.model import FloatArray, LabelArray
+from pipeline.roof.arrangement.raster_labels import vertical_distance_m
+
+_ROUNDS = 3
+_FEWEST_POINTS = 6
+"""Planes with fewer points keep their coefficients."""
+_LEAST_WIDTH_M = 0.2
+"""Standard deviation across the longest direction of the points, below which they tell no slope across it."""
+
+
+@njit(cache=True, nogil=True)
+def labels_of_points(
+    points: FloatArray, labels: LabelArray, place: LabelArray, low_x: float, low_y: float, cell_m: float, columns: int
+) -> LabelArray:
+    """The label of the raster cell in which each point lies, (n,) int32; -1 outside."""
+    cells = np.full(place.max() + 1 if len(place) > 0 else 1, -1, np.int32)
+    for i in range(len(place)):
+        cells[place[i]] = labels[i]
+    found = np.full(len(points), -1, np.int32)
+    for i in range(len(points)):
+        c, r = math.floor((points[i, 0] - low_x) / cell_m), math.floor((points[i, 1] - low_y) / cell_m)
+        if 0 <= c < columns and r >= 0 and r * columns + c < len(cells):
+            found[i] = cells[r * columns + c]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _fit(points: FloatArray, chosen: LabelArray, plane: FloatArray, cap_m: float, fitted: FloatArray) -> bool:
+    """Least squares over the chosen points nearer than the cap to a plane; whether they tell one."""
+    n = 0
+    mean = np.zeros(3)
+    for i in chosen:
+        if vertical_distance_m(points[i], plane) < cap_m:
+            n += 1
+            for axis in range(3):
+                mean[axis] += points[i, axis]
+    if n < _FEWEST_POINTS:
+        return False
+    mean /= n
+    xx, xy, yy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in chosen:
+        if vertical_distance_m(points[i], plane) < cap_m:
+            x, y, z = points[i, 0] - mean[0], points[i, 1] - mean[1], points[i, 2] - mean[2]
+            xx += x * x
+            xy += x * y
+            yy += y * y
+            xz += x * z
+            yz += y * z
+    determinant = xx * yy - xy * xy
+    # the smaller eigenvalue of the scatter is at least determinant / trace
+    if determinant < n * _LEAST_WIDTH_M**2 * (xx + yy):
+        return False
+    fitted[0] = (xz * yy - yz * xy) / determinant
+    fitted[1] = (yz * xx - xz * xy) / determinant
+    fitted[2] = mean[2] - fitted[0] * mean[0] - fitted[1] * mean[1]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def refitted_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, cap_m: float) -> FloatArray:
+    """Every plane by least squares over the points of its places that it explains, while that lowers their cost.
+
+    The cost is the sum of capped residuals.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        Local metres, in a canonical order.
+    labels : (n,) int32
+        Plane of the place of each point; -1 for none.
+    planes : (k, 3) float64
+        Coefficients a, b, c.
+    cap_m : float
+        Residual from which a point is unexplained.
+
+    Returns
+    -------
+    (k, 3) float64
+        Coefficients.
+    """
+    better = planes.copy()
+    fitted = np.empty(3)
+    chosen = np.empty(len(points), np.int32)
+    for label in range(len(planes)):
+        n = 0
+        for i in range(len(points)):
+            if labels[i] == label:
+                chosen[n] = i
+                n += 1
+        for _ in range(_ROUNDS):
+            if not _fit(points, chosen[:n], better[label], cap_m, fitted):
+                break
+            change = 0.0
+            for i in chosen[:n]:
+                change += min(vertical_distance_m(points[i], fitted), cap_m)
+                change -= min(vertical_distance_m(points[i], better[label]), cap_m)
+            if change >= 0.0:
+                break
+            better[label] = fitted
+    return better
+
+
+@njit(cache=True, nogil=True)
+def support_of_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, cap_m: float) -> FloatArray:
+    """Points that each plane explains of those with its label, and their squared vertical residuals, (k, 2) float64."""
+    support = np.zeros((len(planes), 2))
+    for i in range(len(points)):
+        if labels[i] >= 0:
+            off = vertical_distance_m(points[i], planes[labels[i]])
+            if off < cap_m:
+                support[labels[i], 0] += 1.0
+                support[labels[i], 1] += off * off
+    return support

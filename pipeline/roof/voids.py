@@ -1,0 +1,170 @@
+"""Places inside a given outline that no roof point is near to: courtyards that the outline does not tell, lost parts.
+
+A place farther than the void distance from every roof point starts a void; it reaches as far as the points leave off.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import shapely
+from numba import njit
+from shapely import MultiPolygon
+
+from pipeline.model import FloatArray, LabelArray
+from pipeline.roof.arrangement.raster_labels import raster_cells
+from pipeline.roof.footprint import polygons_of
+from pipeline.roof.settings import RoofSettings
+
+_PITCH_M = 0.5
+"""Cells of the raster on which voids are found."""
+_JOG = 1.2
+"""Cells, or point spacings: smaller jogs of a void's border are none."""
+
+
+@njit(cache=True, nogil=True)
+def _empty_cells(
+    points: FloatArray, edges: FloatArray, pitch_m: float, gap_m: float, far_m: float
+) -> tuple[FloatArray, LabelArray]:
+    """Centres of the cells in voids, and the void of each.
+
+    Parameters
+    ----------
+    points : (n, 2) float64
+        Roof points, metres.
+    edges : (e, 4) float64
+        Edges of the outline, metres.
+    pitch_m : float
+        Size of the cells.
+    gap_m, far_m : float
+        A void consists of cells farther than `gap_m` from every point that hang together, at least one of them
+        farther than `far_m`.
+    """
+    low_x, low_y = edges[:, 0].min(), edges[:, 1].min()
+    columns = int((edges[:, 0].max() - low_x) / pitch_m) + 1
+    rows = int((edges[:, 1].max() - low_y) / pitch_m) + 1
+    number, place = raster_cells(edges, low_x, low_y, pitch_m, columns, rows)
+    # points by cells, as linked lists
+    first = np.full(rows * columns, -1, np.int32)
+    following = np.full(len(points), -1, np.int32)
+    for i in range(len(points)):
+        c, r = math.floor((points[i, 0] - low_x) / pitch_m), math.floor((points[i, 1] - low_y) / pitch_m)
+        if 0 <= c < columns and 0 <= r < rows:
+            following[i] = first[r * columns + c]
+            first[r * columns + c] = i
+    n = len(place)
+    nearest = np.full(n, far_m)
+    reach = math.ceil(far_m / pitch_m)
+    for i in range(n):
+        r, c = place[i] // columns, place[i] % columns
+        x, y = low_x + (c + 0.5) * pitch_m, low_y + (r + 0.5) * pitch_m
+        for ring in range(reach + 1):
+            if (ring - 0.5) * pitch_m >= nearest[i] or nearest[i] <= gap_m:
+                break
+            for rr in range(max(r - ring, 0), min(r + ring + 1, rows)):
+                step = 1 if abs(rr - r) == ring else max(2 * ring, 1)
+                for cc in range(c - ring, c + ring + 1, step):
+                    if cc < 0 or cc >= columns:
+                        continue
+                    p = first[rr * columns + cc]
+                    while p >= 0:
+                        nearest[i] = min(nearest[i], math.hypot(points[p, 0] - x, points[p, 1] - y))
+                        p = following[p]
+    void = np.full(n, -1, np.int32)
+    queue = np.empty(n, np.int32)
+    count = 0
+    for seed in range(n):
+        if void[seed] >= 0 or nearest[seed] < far_m:
+            continue
+        void[seed] = count
+        queue[0] = seed
+        head, tail = 0, 1
+        while head < tail:
+            r, c = place[queue[head]] // columns, place[queue[head]] % columns
+            head += 1
+            for step in range(4):
+                rr, cc = r + (step == 0) - (step == 1), c + (step == 2) - (step == 3)
+                if rr < 0 or cc < 0 or rr >= rows or cc >= columns:
+                    continue
+                j = number[rr * columns + cc]
+                if j >= 0 and void[j] < 0 and nearest[j] > gap_m:
+                    void[j] = count
+                    queue[tail] = j
+                    tail += 1
+        count += 1
+    chosen = np.flatnonzero(void >= 0)
+    centres = np.empty((len(chosen), 2))
+    for i in range(len(chosen)):
+        centres[i, 0] = low_x + (place[chosen[i]] % columns + 0.5) * pitch_m
+        centres[i, 1] = low_y + (place[chosen[i]] // columns + 0.5) * pitch_m
+    return centres, void[chosen]
+
+
+def without_voids(
+    outline_mm: MultiPolygon, points: FloatArray, spacing_m: float, settings: RoofSettings
+) -> MultiPolygon:
+    """An outline without the places that are no roof.
+
+    Parameters
+    ----------
+    outline_mm : MultiPolygon
+        Valid, integer millimetres.
+    points : (n, 3) float64
+        Roof points of the same frame, metres.
+    spacing_m : float
+        Typical distance of neighbouring points in plan.
+    settings : RoofSettings
+        `void_distance_m`, `minimum_void_m2`, `gap_spacings`, `minimum_part_area_m2`.
+
+    Returns
+    -------
+    MultiPolygon
+        Valid, integer millimetres; the very outline where there is no void, or where nothing would be left.
+    """
+    far_m = max(settings.void_distance_m, 2.0 * settings.gap_spacings * spacing_m)
+    gap_m = settings.gap_spacings * spacing_m
+    # a building narrower than that has no room for a void
+    corners = shapely.get_coordinates(outline_mm)
+    if min(np.ptp(corners, axis=0)) * 1e-3 < far_m:
+        return outline_mm
+    # along the longest edge: walls around courtyards are parallel to the others
+    edges = np.concatenate(
+        [
+            np.hstack((xy[:-1], xy[1:])) * 1e-3
+            for ring in shapely.get_rings(shapely.get_parts(outline_mm))
+            for xy in (shapely.get_coordinates(ring),)
+        ]
+    )
+    steps = edges[:, 2:] - edges[:, :2]
+    along = steps[np.argmax(np.hypot(steps[:, 0], steps[:, 1]))]
+    turn = np.array([(along[0], -along[1]), (along[1], along[0])]) / math.hypot(along[0], along[1])
+    turned = np.ascontiguousarray(points[:, :2] @ turn)
+    pitch_m = max(_PITCH_M, 0.5 * gap_m)
+    reach_m = max(gap_m, pitch_m)
+    centres, numbers = _empty_cells(turned, (edges.reshape(-1, 2) @ turn).reshape(-1, 4), pitch_m, reach_m, far_m)
+    if len(centres) == 0:
+        return outline_mm
+    half = 0.5 * pitch_m
+    cells = shapely.box(centres[:, 0] - half, centres[:, 1] - half, centres[:, 0] + half, centres[:, 1] + half)
+    voids = []
+    for k in range(int(numbers.max()) + 1):
+        # the cells' centres keep the gap from the points, their union half a cell less; narrow bays are none
+        void = _widened(shapely.union_all(cells[numbers == k]), reach_m - half + pitch_m)
+        void = _widened(_widened(void, -2.0 * pitch_m), pitch_m)
+        voids.append(shapely.simplify(void, _JOG * max(pitch_m, spacing_m)))
+    drawn = [
+        shapely.transform(piece, lambda xy: np.rint(xy @ turn.T * 1e3))
+        for piece in polygons_of(shapely.union_all(voids))
+        if piece.area >= settings.minimum_void_m2
+    ]
+    if not drawn:
+        return outline_mm
+    left = polygons_of(shapely.difference(outline_mm, shapely.union_all(drawn), grid_size=1.0))
+    large = [piece for piece in left if piece.area * 1e-6 >= settings.minimum_part_area_m2]
+    return MultiPolygon(large) if large else outline_mm
+
+
+def _widened(area: shapely.Geometry, distance_m: float) -> shapely.Geometry:
+    """An area with straight corners kept."""
+    return shapely.buffer(area, distance_m, join_style="mitre")

@@ -1,0 +1,110 @@
+"""Levels of detail on request: the finest is the record's, others stand beside it, a block asked for is no fault."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import shapely
+
+from pipeline import reconstruct
+from pipeline.errors import SettingsError
+from pipeline.methods import LODS, Method, ReconstructSettings
+from pipeline.model import BuildingResult, Candidate, Reason, RoofType, Segmentation, Status
+from pipeline.parameters import Parameters
+from pipeline.quality.validity import check_solid
+from pipeline.reconstruct import reconstruct_building
+from pipeline.settings import RunSettings
+
+
+def house(n: int = 2_400, seed: int = 0) -> Candidate:
+    """A gable of 12 m by 8 m with the eaves at 5 m, and a flat annexe of 5 m by 8 m at 2.6 m."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 17, n), rng.uniform(0, 8, n)
+    z = np.where(x < 12.0, 5.0 + 0.7 * np.minimum(y, 8.0 - y), 2.6) + rng.normal(0, 0.02, n)
+    points = np.rint(np.column_stack((x, y, z)) * 1e3) / 1e3
+    return Candidate(
+        building_id="b",
+        origin=(84_000.0, 447_000.0, 0.0),
+        points=points[np.lexsort(points.T[::-1])],
+        ground=np.zeros((0, 3)),
+        ground_z_m=0.0,
+        footprint=shapely.box(0, 0, 17, 8),
+    )
+
+
+@pytest.fixture
+def planeless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes a method of the name `planeless`, which finds no plane."""
+
+    def segment(candidate: Candidate, _: Parameters) -> Segmentation:
+        return Segmentation(planes=(), labels=np.full(len(candidate.points), -1, np.int32))
+
+    method = Method(name="planeless", settings_type=Parameters, segment=segment)
+    monkeypatch.setattr(reconstruct, "method_named", lambda _: method)
+
+
+def modelled(candidate: Candidate, *lods: str, method: str = "arrangement") -> BuildingResult:
+    return reconstruct_building(candidate, method, ReconstructSettings(lods=lods))
+
+
+def vertices(result: BuildingResult) -> dict[str, list[bytes]]:
+    """The solids of every level of detail."""
+    models = {result.lod: result.solids, **{model.lod: model.solids for model in result.coarser}}
+    return {lod: [solid.vertices.tobytes() for solid in solids] for lod, solids in models.items()}
+
+
+@pytest.mark.parametrize("method", ["arrangement", "fuzzy-sart"])
+def test_the_finest_is_the_record_and_the_others_stand_beside_it(method: str) -> None:
+    result = modelled(house(), *LODS, method=method)
+    assert (result.status, result.lod, result.roof_type) == (Status.OK, "2.2", RoofType.COMBINATION)
+    assert [model.lod for model in result.coarser] == ["1.3", "1.2"]
+    levels, block = result.coarser
+    assert sorted(plane.c for plane in levels.planes) == pytest.approx([2.6, 5.0 + 0.7 * 0.7 * 4.0], abs=0.1)
+    assert [len(block.planes), len(block.solids), len(levels.solids)] == [1, 1, 1]
+    assert [check_solid(solid) for model in result.coarser for solid in model.solids] == [(), ()]
+    alone = modelled(house(), "2.2", method=method)
+    assert dataclasses.replace(result, coarser=()).rmse_m == alone.rmse_m
+    assert vertices(result)["2.2"] == vertices(alone)["2.2"]
+
+
+@pytest.mark.parametrize("asked", [("1.2",), ("1.3",), ("1.2", "1.3"), ("1.3", "2.2"), ("1.2", "2.2")])
+def test_a_level_is_the_same_whatever_stands_beside_it(asked: tuple[str, ...]) -> None:
+    everything = vertices(modelled(house(), *LODS))
+    result = modelled(house(), *asked)
+    assert (result.status, result.reason, result.lod) == (Status.OK, None, asked[-1])
+    assert vertices(result) == {lod: everything[lod] for lod in asked}
+    assert result.roof_type is RoofType.COMBINATION
+
+
+def test_figures_are_those_of_the_finest_level() -> None:
+    detailed, levels, block = (modelled(house(), lod) for lod in ("2.2", "1.3", "1.2"))
+    assert detailed.rmse_m < 0.3 < levels.rmse_m < 1.2 < block.rmse_m
+    assert [len(result.planes) for result in (levels, block)] == [2, 1]
+    assert levels.coverage == block.coverage == 1.0
+
+
+@pytest.mark.usefixtures("planeless")
+def test_a_block_that_was_asked_for_is_no_fallback() -> None:
+    result = modelled(house(), "1.2", method="planeless")
+    assert (result.status, result.reason, result.lod) == (Status.OK, None, "1.2")
+    assert check_solid(result.solids[0]) == ()
+
+
+@pytest.mark.usefixtures("planeless")
+@pytest.mark.parametrize("asked", [("2.2",), LODS, ("1.3",), ("1.2", "1.3")])
+def test_a_fallback_is_a_block_and_nothing_stands_beside_it(asked: tuple[str, ...]) -> None:
+    result = modelled(house(), *asked, method="planeless")
+    assert (result.status, result.reason, result.lod) == (Status.FALLBACK, Reason.NO_PLANE, "1.2")
+    assert result.coarser == ()
+    assert vertices(result) == vertices(modelled(house(), "1.2", method="planeless"))
+
+
+def test_settings_name_the_levels_and_change_the_hash() -> None:
+    assert RunSettings.from_mapping({}).building.lods == ("2.2",)
+    some = RunSettings.from_mapping({"lods": "1.2,2.2"})
+    assert some.building.lods == ("1.2", "2.2")
+    assert some.settings_hash != RunSettings.from_mapping({}).settings_hash
+    with pytest.raises(SettingsError, match=r"lods is '2\.2,1\.2': use one of 1\.2, 1\.3, 2\.2, 1\.2,1\.3"):
+        RunSettings.from_mapping({"lods": "2.2,1.2"})
