@@ -8,7 +8,8 @@ no figures of roofer.
 
 - Processor seconds are those of a whole run of the command line, serial, in a process of its own, with all that it
   starts: the least of `--repeat` runs after one that compiled what was missing. `--cold` measures one run with empty
-  caches of kernels and bytecode as well.
+  caches of kernels and bytecode as well. GABLEWORK_PYTHON names the interpreter of another environment, such as one
+  without the tools of the tests, which some libraries load where they find them.
 - Milliseconds a building are processor time of `reconstruct_building` in this process, for the candidates as the
   stages of a run find them; of `--repeat` times over the shortest of each building counts.
 - Delivered is what is ok and LoD2.2; valid are those whose solids keep all rules, by this program's own checker, and

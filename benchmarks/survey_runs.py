@@ -54,13 +54,22 @@ def run_survey(
     RuntimeError
         The run ended with a fault.
     """
-    command = [sys.executable, "-m", "service.cli", "reconstruct", *map(str, entry.tiles), "--out", str(out)]
+    command = [
+        os.environ.get("GABLEWORK_PYTHON", sys.executable),
+        "-m",
+        "service.cli",
+        "reconstruct",
+        *map(str, entry.tiles),
+        "--out",
+        str(out),
+    ]
     command += ["--method", variant.method, "--preset", variant.preset, "--classes", entry.classes]
     command += ["--workers", str(workers), "--meshes", "none", "--overwrite", "--quiet"]
     command += [] if entry.crs is None else ["--crs", entry.crs]
     command += [] if entry.footprints is None else ["--footprints", str(entry.footprints)]
     paths = [str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]  # the code that this file belongs to
     variables = {**os.environ, **(environment or {}), "PYTHONPATH": os.pathsep.join(paths)}
+    variables.pop("PYTHONDONTWRITEBYTECODE", None)  # a second run finds what the first compiled
     before, began = _processor_s(), time.perf_counter()
     told = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
     seconds = Seconds(processor=_processor_s() - before, clock=time.perf_counter() - began)

@@ -192,7 +192,13 @@ def _arranged_forms(roof: RoofPoints, planes: Sequence[Plane], settings: Reconst
     # many planes that meet nearly in one point: with more room between its vertices the solid is sound
     for clearance in _WIDER_CLEARANCES:
         yield partial(arranged, clearance=clearance)
-    yield from plan_forms(partition_roof(roof, planes, settings.roof), roof, settings.roof)
+    try:
+        plan = partition_roof(roof, planes, settings.roof)
+    except BuildingError:
+        if not last:
+            raise
+    else:
+        yield from plan_forms(plan, roof, settings.roof)
     yield from last
 
 
@@ -286,12 +292,15 @@ def _block(
 ) -> tuple[list[SolidPart], list[Plane]]:
     """A valid block on the footprint, else on the partition's outline, else on the points' outline."""
     plane = block_plane(roof.points, candidate.ground_z_m, settings.block_height_percentile)
-    if plan is None:
-        unlabelled = dataclasses.replace(roof, labels=np.zeros(len(roof.points), np.int32))
-        plan = partition_roof(unlabelled, [plane], settings)
-    outlines = [plan.outline_mm]
-    if plan.raw is not None:
-        outlines.append(outline(plan.raw))
+    if plan is None and roof.footprint_mm is not None:
+        outlines = [roof.footprint_mm]
+    else:
+        if plan is None:
+            unlabelled = dataclasses.replace(roof, labels=np.zeros(len(roof.points), np.int32))
+            plan = partition_roof(unlabelled, [plane], settings)
+        outlines = [plan.outline_mm]
+        if plan.raw is not None:
+            outlines.append(outline(plan.raw))
     tolerance = settings.simplification_spacings * roof.spacing_m
     hull = hull_of_points(roof.points)
     if hull is not None:

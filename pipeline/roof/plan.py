@@ -177,9 +177,7 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     if given is not None:
         bounds = np.rint(given.bounds).astype(np.int64)
         low, high = np.minimum(low, bounds[:2] - margin), np.maximum(high, bounds[2:] + margin)
-    extent_m = float((high - low).max()) * 1e-3
-    if extent_m > _MAX_EXTENT_M:
-        raise BuildingError(Reason.TOO_COMPLEX, f"extends over {extent_m:.0f} m, more than {_MAX_EXTENT_M:.0f} m")
+    _require_extent(float((high - low).max()) * 1e-3)
     pitch = max(50, round(_PITCH_SPACINGS * roof.spacing_m * 1e3))
     gap_m = settings.gap_spacings * roof.spacing_m
     samples, nearest, distance_m = empty_samples(roof.xy_mm, low, high, pitch, gap_m)
@@ -237,6 +235,7 @@ def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
         `no_partition` or `too_complex`, as `partition_roof`.
     """
     if roof.footprint_mm is not None:
+        _require_extent(float(np.ptp(shapely.get_coordinates(roof.footprint_mm), axis=0).max()) * 1e-3)
         return roof.footprint_mm
     if roof.outline_mm is not None and settings.straight_eaves:
         return roof.outline_mm
@@ -244,6 +243,12 @@ def drawn_outline(roof: RoofPoints, settings: RoofSettings) -> MultiPolygon:
     level = Plane(a=0.0, b=0.0, c=float(z[len(z) // 2]), n_points=len(z), rmse_m=0.0)
     unlabelled = dataclasses.replace(roof, labels=np.zeros(len(roof.points), np.int32))
     return partition_roof(unlabelled, [level], settings).outline_mm
+
+
+def _require_extent(extent_m: float) -> None:
+    """Raise `too_complex` for a plan that is wider than what can be triangulated, or laid out in rasters."""
+    if extent_m > _MAX_EXTENT_M:
+        raise BuildingError(Reason.TOO_COMPLEX, f"extends over {extent_m:.0f} m, more than {_MAX_EXTENT_M:.0f} m")
 
 
 def arranged_faces(

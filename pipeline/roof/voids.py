@@ -138,11 +138,13 @@ def without_voids(
     )
     steps = edges[:, 2:] - edges[:, :2]
     along = steps[np.argmax(np.hypot(steps[:, 0], steps[:, 1]))]
-    turn = np.array([(along[0], -along[1]), (along[1], along[0])]) / math.hypot(along[0], along[1])
-    turned = np.ascontiguousarray(points[:, :2] @ turn)
+    length = math.hypot(along[0], along[1])
+    cos, sin = float(along[0]) / length, float(along[1]) / length
+    turned = _turned(points[:, :2], cos, -sin)
     pitch_m = max(_PITCH_M, 0.5 * gap_m)
     reach_m = max(gap_m, pitch_m)
-    centres, numbers = _empty_cells(turned, (edges.reshape(-1, 2) @ turn).reshape(-1, 4), pitch_m, reach_m, far_m)
+    framed = _turned(edges.reshape(-1, 2), cos, -sin).reshape(-1, 4)
+    centres, numbers = _empty_cells(turned, framed, pitch_m, reach_m, far_m)
     if len(centres) == 0:
         return outline_mm
     half = 0.5 * pitch_m
@@ -154,7 +156,7 @@ def without_voids(
         void = _widened(_widened(void, -2.0 * pitch_m), pitch_m)
         voids.append(shapely.simplify(void, _JOG * max(pitch_m, spacing_m)))
     drawn = [
-        shapely.transform(piece, lambda xy: np.rint(xy @ turn.T * 1e3))
+        shapely.transform(piece, lambda xy: np.rint(_turned(xy, cos, sin) * 1e3))
         for piece in polygons_of(shapely.union_all(voids))
         if piece.area >= settings.minimum_void_m2
     ]
@@ -163,6 +165,11 @@ def without_voids(
     left = polygons_of(shapely.difference(outline_mm, shapely.union_all(drawn), grid_size=1.0))
     large = [piece for piece in left if piece.area * 1e-6 >= settings.minimum_part_area_m2]
     return MultiPolygon(large) if large else outline_mm
+
+
+def _turned(xy: FloatArray, cos: float, sin: float) -> FloatArray:
+    """Places turned to the left about the origin; written out, since a product of matrices differs between machines."""
+    return np.column_stack((xy[:, 0] * cos - xy[:, 1] * sin, xy[:, 0] * sin + xy[:, 1] * cos))
 
 
 def _widened(area: shapely.Geometry, distance_m: float) -> shapely.Geometry:

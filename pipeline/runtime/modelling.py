@@ -333,22 +333,22 @@ def model_bundle(bundle: Bundle) -> BuildingResult:
 
 
 def load(*methods: str) -> None:
-    """Load all that modelling needs, by modelling a gable and a flat roof: libraries, and the compiled kernels.
+    """Load all that modelling needs, by modelling gables and a flat roof: libraries, and the compiled kernels.
 
     Parameters
     ----------
     *methods : str
         Their names; without any, all methods.
     """
-    spacing = np.arange(0.25, 10.0, 0.5)
-    x, y = (axis.ravel() for axis in np.meshgrid(spacing, spacing, indexing="ij"))
     lattice = np.arange(-4.5, 15.0)
     east, north = (axis.ravel() for axis in np.meshgrid(lattice, lattice, indexing="ij"))
-    for z in (9.0 - 0.6 * np.abs(y - 5.0), np.full(len(y), 6.0)):
+    for spacing_m, slope in ((0.5, 0.6), (0.5, 0.0), (1.0, 0.6)):  # templates are fitted where points are few
+        places = np.arange(0.5 * spacing_m, 10.0, spacing_m)
+        x, y = (axis.ravel() for axis in np.meshgrid(places, places, indexing="ij"))
         candidate = Candidate(
             building_id="",
             origin=(0.0, 0.0, 0.0),
-            points=np.rint(np.column_stack((x, y, z)) * 1e3) / 1e3,
+            points=np.rint(np.column_stack((x, y, 9.0 - slope * np.abs(y - 5.0))) * 1e3) / 1e3,
             ground=np.column_stack((east, north, np.zeros(len(east)))),
             ground_z_m=0.0,
         )

@@ -107,12 +107,18 @@ class Scratch:
         return flat.reshape(shape, order=order)
 
     def rows(self, name: str, key: str, start: int, stop: int) -> npt.NDArray[Any]:
-        """Some rows of a stored array, whose others are not read."""
+        """Some rows of a stored array, whose others are not read.
+
+        Raises
+        ------
+        ValueError
+            The file ends before them.
+        """
         with open(f"{self.root}/{name}/{key}.npy", "rb", buffering=0) as stream:  # noqa: PTH123 - a Path takes longer
             dtype, shape, _, offset = _layout(stream.read(_LONGEST_HEADER_BYTES))
             width = math.prod(shape[1:])
             stream.seek(offset + start * width * dtype.itemsize)
-            return np.fromfile(stream, dtype, (stop - start) * width).reshape(-1, *shape[1:])
+            return np.fromfile(stream, dtype, (stop - start) * width).reshape(stop - start, *shape[1:])
 
     def has(self, name: str) -> bool:
         """Whether anything is stored under a name."""

@@ -85,6 +85,19 @@ def test_a_courtyard_stays_open(exact_roof: ExactRoofs) -> None:
     assert sum(polygon.area for polygon in faces.partition.polygons) == pytest.approx(1e6 * roof.footprint.area, 1e-4)
 
 
+def test_an_outline_of_many_vertices_gets_the_faces_of_one_with_few() -> None:
+    xy = np.random.default_rng(2).uniform((0, 0), (12, 8), (60, 2))
+    points = np.column_stack((xy, 9.0 - 0.6 * np.abs(xy[:, 1] - 4.0)))
+    few = footprint_in_mm(shapely.box(0.0, 0.0, 12.0, 8.0))
+    many = shapely.MultiPolygon([shapely.segmentize(polygon, 50.0) for polygon in few.geoms])
+    assert shapely.get_num_coordinates(many) > 700
+    one, other = (fit_templates(points, outline).faces() for outline in (few, many))
+    assert [polygon.area for polygon in other.partition.polygons] == [pytest.approx(48e6, rel=1e-3)] * 2
+    assert [plane.coefficients for plane in other.planes] == [
+        pytest.approx(plane.coefficients, abs=1e-6) for plane in one.planes
+    ]
+
+
 def test_four_points_tell_a_flat_roof() -> None:
     points = np.array([(1.0, 1.0, 3.0), (5.0, 1.0, 3.02), (1.0, 3.0, 2.97), (4.0, 3.5, 3.01)])
     faces = fit_templates(points, SHED).faces()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -89,3 +90,19 @@ def test_the_order_of_the_points_changes_nothing(density: int) -> None:
     one, other = modelled(candidate(points)), modelled(candidate(points[::-1]))
     assert one.solids[0].faces == other.solids[0].faces
     assert np.array_equal(one.solids[0].vertices, other.solids[0].vertices)
+
+
+def test_points_that_no_face_can_be_made_of_become_a_block_on_the_given_outline() -> None:
+    points = np.array([(1, 1, 4.0), (11, 1, 9.0), (6, 7, 6.0), (2, 6, 13.0)]) + np.array([40.0, 0.0, 0.0])
+    result = modelled(candidate(points))
+    assert (result.status, result.lod, result.reason) == (Status.FALLBACK, "1.2", Reason.TOO_FEW_POINTS)
+    assert result.footprint is not None
+    assert result.footprint.area == pytest.approx(HOUSE.area, rel=1e-3)
+
+
+def test_an_outline_of_kilometres_is_too_complex_and_a_block() -> None:
+    points = hip_points(600)
+    far = shapely.MultiPolygon([HOUSE, shapely.affinity.translate(HOUSE, 20_000.0, 20_000.0)])
+    result = modelled(dataclasses.replace(candidate(points), footprint=far))
+    assert (result.status, result.lod, result.reason) == (Status.FALLBACK, "1.2", Reason.TOO_COMPLEX)
+    assert "more than 1900 m" in result.reason_detail

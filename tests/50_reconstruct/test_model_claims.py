@@ -16,13 +16,12 @@ from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, FaceKind, Status
 from pipeline.quality.validity import check_solid
 from pipeline.reconstruct import reconstruct_building
-from pipeline.roof.settings import RoofSettings
 from pipeline.synthetic.als import ScannerSettings, scan_all
 from pipeline.synthetic.scene import Building, Scene
 
 SURVEY = ScannerSettings(pulse_density_per_m2=5.0, range_noise_m=0.04)
 SCENES = range(4)
-FAR_M = RoofSettings().maximum_overshoot_m
+FAR_M = 1.0
 """No corner of a roof face lies higher above the points around the face, or lower below them."""
 
 

@@ -211,7 +211,7 @@ def arrange(
         round(max(settings.face_cost, settings.face_area_m2 * points_per_m2) * COST_SCALE),
         settings.line_length_m,
         max(settings.line_reach_m, spacing_m),
-        settings.overshoot_m,
+        max(settings.overshoot_m, spacing_m),
         clearance,
     )
     polygons = _polygons(xy + low, vertices, starts, owner, len(plane_of_face))

@@ -17,6 +17,8 @@ from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
 from pipeline.roof.arrangement.subdivision import FACE, ORIGIN, between_vertices
 
+_LEAST_BEYOND = 3.0
+"""Points that a cell counts for at least where a plane leaves the heights of its own: splinters hold none."""
 _ROW_MM = 500.0
 _TOLERANCE = 0.5
 """Of the cap: points nearer than this to a plane fit it; from there to the cap they misfit more and more."""
@@ -94,9 +96,8 @@ def cell_costs(
 ) -> tuple[IntArray, IntArray]:
     """Cost of every plane in every cell.
 
-    A plane that leaves the heights of its own points at corners of a cell costs as if that share of the cell were not
-    explained: planes are not continued far above or below their data where no points speak. That share of the points
-    that the cell lacks for its area misfits.
+    A plane that leaves the heights of its own points at corners of a cell costs as if that share of the cell, or a few
+    points, were not explained: planes are not continued far above or below their data where no points speak.
 
     Returns
     -------
@@ -108,7 +109,6 @@ def cell_costs(
     k = len(planes)
     costs, misfits = np.zeros((n_cells, k), np.int64), np.zeros((n_cells, k), np.int64)
     expected = cell_areas_m2(xy, graph, n_edges, n_cells) * points_per_m2
-    lacking = expected.copy()
     lowest, highest = np.full(k, math.inf), np.full(k, -math.inf)
     for i in range(len(points)):
         if labels[i] >= 0:
@@ -117,7 +117,6 @@ def cell_costs(
         cell = cells[i]
         if cell < 0:
             continue
-        lacking[cell] -= 1.0
         for label in range(k):
             share = min(vertical_distance_m(points[i], planes[label]) / cap_m, 1.0)
             costs[cell, label] += int(COST_SCALE * share)
@@ -141,8 +140,9 @@ def cell_costs(
         for label in range(k):
             if beyond[cell, label] != 0:
                 share = beyond[cell, label] / corners[cell]
-                costs[cell, label] += int(COST_SCALE * share * expected[cell])
-                misfits[cell, label] += int(COST_SCALE * share * max(lacking[cell], 0.0))
+                unexplained = int(COST_SCALE * max(share * expected[cell], _LEAST_BEYOND))
+                costs[cell, label] += unexplained
+                misfits[cell, label] += unexplained
     return costs, misfits
 
 

@@ -29,7 +29,7 @@ class ArrangementSettings(Parameters):
         3.0, "Misfitting points that a roof face must save.", unit="points", minimum=0.0, maximum=1000.0
     )
     face_area_m2: float = parameter(
-        1.75,
+        2.0,
         "A roof face must save at least the points that fall on this area.",
         unit="m2",
         minimum=0.0,
@@ -43,8 +43,9 @@ class ArrangementSettings(Parameters):
     )
     line_reach_m: float = parameter(0.6, "How far beyond its border a line cuts.", unit="m", minimum=0.0, maximum=20.0)
     overshoot_m: float = parameter(
-        1.5,
-        "A plane that goes farther than this beyond the heights of its points is unlikely there.",
+        0.5,
+        "A plane that goes farther than this beyond the heights of its points is unlikely there; at least one point "
+        "spacing.",
         unit="m",
         minimum=0.1,
         maximum=100.0,

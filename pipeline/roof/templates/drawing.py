@@ -19,6 +19,8 @@ from pipeline.roof.templates.shapes import MOST_PLANES, height
 _MARGIN_M = 1.0
 """By how much parts go beyond the outline before it cuts them."""
 _UNITE_MM = 10.0
+_MOST_PAIRED = 500
+"""Vertices; of more not all pairs are looked at, which takes memory."""
 
 
 def lower_piece(region: FloatArray, planes: FloatArray, number: int) -> FloatArray:
@@ -133,12 +135,17 @@ def draw_parts(
     )
     partition = _united(cells, own, least_face_m2)
     vertices = np.unique(shapely.get_coordinates(partition.polygons), axis=0)
-    apart = np.abs(vertices[:, None] - vertices[None]).max(axis=2) + np.diag(np.full(len(vertices), np.inf))
-    if apart.min() <= _UNITE_MM:
+    if len(vertices) > _MOST_PAIRED or _least_distance_mm(vertices) <= _UNITE_MM:
         partition = unite_close_vertices(partition, _UNITE_MM)
     if not shapely.is_valid(partition.polygons).all() or not shapely.coverage_is_valid(partition.polygons):
         raise BuildingError(Reason.NO_PARTITION, "the faces of the templates make no coverage")
     return partition
+
+
+def _least_distance_mm(vertices: FloatArray) -> float:
+    """Between any two of the places, (n, 2), along x or y, whichever is more; infinite for fewer than two."""
+    apart = np.abs(vertices[:, None] - vertices[None]).max(axis=2) + np.diag(np.full(len(vertices), np.inf))
+    return float(apart.min())
 
 
 @njit(cache=True, nogil=True)
