@@ -29,7 +29,7 @@ from pipeline.model import (
     Status,
 )
 from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, TOLERANCE_M, model_quality
-from pipeline.quality.residuals import summarise, surface_of
+from pipeline.quality.residuals import summarise, surface_of, vertical_residuals
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_parts, block_plane
 from pipeline.roof.flush_walls import unite_flush_walls
@@ -132,6 +132,15 @@ def _reconstruct(
             candidate, roof, forms, segmentation.planes, settings.roof, is_primitive=segmentation.faces is not None
         )
         if parts:
+            few = len(roof.points) < settings.roof.minimum_points
+            unlikely = few or (lack is not None and roof.spacing_m < settings.roof.templates_spacing_m)
+            share = _explained_share(roof, parts, planes, settings.plan.residual_cap_m) if unlikely else 1.0
+            if share < _FEW_EXPLAINED:
+                if lack is not None and not few:
+                    raise lack
+                told = f"{share:.0%} of {len(roof.points)} roof points lie on a roof, less than {_FEW_EXPLAINED:.0%}"
+                fewest = f"where there are fewer than minimum_points = {settings.roof.minimum_points}"
+                return failed_building(candidate, method, Reason.TOO_FEW_POINTS, f"{told}, {fewest}")
             deliver = partial(
                 _result, candidate, method, settings, spacing_m=roof.spacing_m, status=Status.OK, bic_margin=margin
             )
@@ -146,12 +155,16 @@ def _reconstruct(
                 if models[0] is not detailed:  # level parts tell nothing of the roof's type
                     own_type = deliver(parts, planes, own_type, lod="2.2").roof_type
                 finest, *coarser = models
+                if finest.lod != detailed.lod:  # what competed is not what is delivered
+                    deliver = partial(deliver, bic_margin=math.nan)
                 record = deliver(finest.parts, finest.planes, own_type, lod=finest.lod)
                 return dataclasses.replace(record, coarser=tuple(_lod_model(model) for model in coarser))
         reason = Reason.INVALID_SOLID
         detail = f"validity codes {', '.join(map(str, codes)) or 'none'}: no form of the solid passes"
     except BuildingError as error:
         reason, detail = error.reason, error.detail
+    except shapely.errors.GEOSException as error:
+        reason, detail = Reason.NO_PARTITION, f"the plan cannot be drawn: {error}"
     parts, planes = _block(candidate, bare, plan, settings.roof)
     if settings.lods == ("1.2",):  # a block is what was asked for
         return _result(
@@ -259,7 +272,16 @@ def _own_solids(
     The last is by how much its faces were better than those that they competed with, nan where they did not.
     """
     codes: set[int] = set()
-    for form in forms:
+    remaining = iter(forms)
+    while True:
+        try:
+            form = next(remaining, None)
+        except BuildingError:
+            if not codes:
+                raise
+            form = None  # what was drawn before tells more
+        if form is None:
+            break
         try:
             drawn, own_planes, labelled, margin = form(), list(planes), roof, math.nan
             if isinstance(drawn, RankedFaces):
@@ -382,6 +404,17 @@ def _result(
         ),
         touches_data_edge=candidate.touches_data_edge,
     )
+
+
+_FEW_EXPLAINED = 0.75
+"""Share of its roof points that a model has to explain where they are fewer than usual, or show no plane though they
+are dense: a tree would make a roof, too."""
+
+
+def _explained_share(roof: RoofPoints, parts: Sequence[SolidPart], planes: Sequence[Plane], within_m: float) -> float:
+    """Share of the roof points that lie near the roof faces, vertically."""
+    faces = [RoofFace(plane=face.plane, polygon=face.polygon) for part in parts for face in part.faces]
+    return float(np.mean(np.abs(vertical_residuals(roof.points, faces, planes)) <= within_m))
 
 
 def _lod_model(model: LodParts) -> LodModel:

@@ -26,6 +26,9 @@ from pipeline.roof.solid import SolidPart, solid_parts
 
 XY = tuple[int, int]
 
+_MOST_FORMS = 8
+"""Of a part's levels; what is not sound then is one level."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LodParts:
@@ -167,11 +170,13 @@ def level_forms(
     regions.unite_without_step(settings.level_step_m)
     while regions.unite_closest(settings.level_step_m, settings.minimum_part_area_m2):
         pass
-    while True:
+    for form in itertools.count(1):
         planes = [block_plane(z, ground_z_m, settings.block_height_percentile) for z in regions.points()]
         yield from _drawn(regions.polygons(), planes, ground_z_m)
         if not regions.unite_closest(math.inf, 0.0):
             return
+        while form >= _MOST_FORMS and regions.unite_closest(math.inf, 0.0):
+            pass
 
 
 def _polygon_mm(face: RoofFace) -> shapely.Polygon:

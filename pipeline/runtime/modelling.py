@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
+import shapely
 
 from pipeline.errors import GableworkError
 from pipeline.export.records import CandidateFacts
@@ -333,7 +334,7 @@ def model_bundle(bundle: Bundle) -> BuildingResult:
 
 
 def load(*methods: str) -> None:
-    """Load all that modelling needs, by modelling gables and a flat roof: libraries, and the compiled kernels.
+    """Load all that modelling needs, by modelling roofs of many and of few points: libraries, and compiled kernels.
 
     Parameters
     ----------
@@ -342,7 +343,8 @@ def load(*methods: str) -> None:
     """
     lattice = np.arange(-4.5, 15.0)
     east, north = (axis.ravel() for axis in np.meshgrid(lattice, lattice, indexing="ij"))
-    for spacing_m, slope in ((0.5, 0.6), (0.5, 0.0), (1.0, 0.6)):  # templates are fitted where points are few
+    outline = shapely.box(0.0, 0.0, 16.0, 10.0)  # partly without points, which is looked at in given outlines
+    for spacing_m, slope, footprint in ((0.5, 0.6, None), (0.5, 0.0, outline), (1.0, 0.6, None)):
         places = np.arange(0.5 * spacing_m, 10.0, spacing_m)
         x, y = (axis.ravel() for axis in np.meshgrid(places, places, indexing="ij"))
         candidate = Candidate(
@@ -351,6 +353,7 @@ def load(*methods: str) -> None:
             points=np.rint(np.column_stack((x, y, 9.0 - slope * np.abs(y - 5.0))) * 1e3) / 1e3,
             ground=np.column_stack((east, north, np.zeros(len(east)))),
             ground_z_m=0.0,
+            footprint=footprint,
         )
         for method in methods or METHODS:
             reconstruct_building(candidate, method, ReconstructSettings())

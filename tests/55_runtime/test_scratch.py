@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +11,7 @@ import pytest
 
 from pipeline.runtime.scratch import POINT, Scratch
 
-ARRAYS = {
+ARRAYS: dict[str, npt.NDArray[Any]] = {
     "bytes": np.arange(POINT.itemsize * 7).astype(np.uint8),
     "lattice": np.arange(-6, 6, dtype=np.int32).reshape(3, 4),
     "by columns": np.asfortranarray(np.arange(12.0).reshape(3, 4)),
