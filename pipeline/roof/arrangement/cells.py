@@ -97,7 +97,8 @@ def cell_costs(
     """Cost of every plane in every cell.
 
     A plane that leaves the heights of its own points at corners of a cell costs as if that share of the cell, or a few
-    points, were not explained: planes are not continued far above or below their data where no points speak.
+    points, were not explained: planes are not continued far above or below their data where no points speak. That share
+    of the points that the cell lacks for its area misfits, or a few.
 
     Returns
     -------
@@ -109,6 +110,7 @@ def cell_costs(
     k = len(planes)
     costs, misfits = np.zeros((n_cells, k), np.int64), np.zeros((n_cells, k), np.int64)
     expected = cell_areas_m2(xy, graph, n_edges, n_cells) * points_per_m2
+    lacking = expected.copy()
     lowest, highest = np.full(k, math.inf), np.full(k, -math.inf)
     for i in range(len(points)):
         if labels[i] >= 0:
@@ -117,6 +119,7 @@ def cell_costs(
         cell = cells[i]
         if cell < 0:
             continue
+        lacking[cell] -= 1.0
         for label in range(k):
             share = min(vertical_distance_m(points[i], planes[label]) / cap_m, 1.0)
             costs[cell, label] += int(COST_SCALE * share)
@@ -140,9 +143,8 @@ def cell_costs(
         for label in range(k):
             if beyond[cell, label] != 0:
                 share = beyond[cell, label] / corners[cell]
-                unexplained = int(COST_SCALE * max(share * expected[cell], _LEAST_BEYOND))
-                costs[cell, label] += unexplained
-                misfits[cell, label] += unexplained
+                costs[cell, label] += int(COST_SCALE * max(share * expected[cell], _LEAST_BEYOND))
+                misfits[cell, label] += int(COST_SCALE * max(share * lacking[cell], _LEAST_BEYOND))
     return costs, misfits
 
 
