@@ -154,7 +154,7 @@ def test_no_method_is_charged_for_loading_what_all_of_them_need(
     suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[str] = []
-    monkeypatch.setattr("pipeline.runtime.run.load", lambda *methods: told.append("loaded"))
+    monkeypatch.setattr("pipeline.runtime.run.load", lambda *_: told.append("loaded"))
     compare(request(suburb, tmp_path / "out"), lambda event: told.append(event.stage))
     assert told.index("loaded") < told.index("reconstruct")
     assert told.count("loaded") == 1
