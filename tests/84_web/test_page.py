@@ -169,6 +169,10 @@ def test_a_comparison_shows_each_method_and_the_page_of_all(
     page.set_input_files("#tiles", house)
     expect(page.locator(".facts")).to_contain_text("points")
     page.locator("summary", has_text="Options").click()
+    expect(page.get_by_label("Method", exact=True)).to_have_value("arrangement")
+    expect(page.get_by_role("checkbox", name="arrangement", exact=True)).to_be_disabled()
+    expect(page.get_by_role("checkbox", name="arrangement, faithful")).to_have_count(0)
+    page.get_by_label("Method", exact=True).select_option("fuzzy-sart")
     expect(page.get_by_label("Preset")).to_have_value("robust")
     # what is chosen above cannot be chosen once more
     expect(page.get_by_role("checkbox", name="fuzzy-sart", exact=True)).to_be_disabled()
