@@ -1,7 +1,7 @@
 """One tile's points to surface fragments, end to end, without I/O.
 
 Ground, heights, a TIN of thinned points, wall facets, fragments: the front half of the science
-(`reconstruct` is the other). Every step declares how far it looks; `SceneSettings.support_m` is
+(`reconstruct` is the other). Every step declares how far it looks; `SceneSettings.support_with` is
 their sum, and a halo at least that wide makes the outcome independent of the tiles.
 """
 
@@ -30,6 +30,20 @@ NEUTRAL_CLASSES = (0, 1, 12, 19)
 """Classes that say nothing about buildings: never classified, unclassified, overlap, overhead structure."""
 
 
+APRON_M = 6
+"""Width of the terrain that a tile stores beyond its core."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ClassesInUse:
+    """Which of the file's classes are believed, decided once for a run."""
+
+    ground: bool = False
+    """Class 2 is the ground; no filter runs."""
+    building: bool = False
+    """Class 6 is building, classes that exclude buildings are believed, the rest is judged by its own evidence."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SceneSettings:
     """The settings of the stages between a tile's points and its candidates."""
@@ -43,23 +57,40 @@ class SceneSettings:
 
     @property
     def support_m(self) -> float:
-        """How far the fragments of a tile look beyond its core."""
-        return (
-            self.outliers.support_m
-            + self.ground.support_m
-            + max(self.surfaces.support_m, self.vegetation.support_m)
-            + self.vegetation.support_m
-        )
+        """How far a tile looks beyond its core at most: to find fragments among points whose classes tell nothing."""
+        return self.support_with(ClassesInUse(), footprints=False)
 
+    def support_with(self, classes: ClassesInUse, *, footprints: bool) -> float:
+        """How far a tile looks beyond its core, by what is known beforehand.
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ClassesInUse:
-    """Which of the file's classes are believed, decided once for a run."""
+        Three lengths add up: how far off the terrain is wanted, how far a terrain elevation looks from there, and how
+        far it takes to tell whether a point that it looks at is an outlier.
 
-    ground: bool = False
-    """Class 2 is the ground; no filter runs."""
-    building: bool = False
-    """Class 6 is building, classes that exclude buildings are believed, the rest is judged by its own evidence."""
+        - Terrain is stored for the core and its apron (`APRON_M`). Fragments want it at all points of the core and of
+          the facets and vertices around it. The points in given footprints are the core's own: no TIN is made for
+          them, no surroundings are judged, and each is asked only whether it lies in a footprint and above the ground.
+        - A terrain elevation looks as far as the filter that finds the ground; where class 2 is the ground none runs,
+          and `GroundSettings.trusted_support_m` is left.
+        - Class 6 narrows nothing: its points are judged one by one.
+
+        Parameters
+        ----------
+        classes : ClassesInUse
+            Which classes of the file are believed.
+        footprints : bool
+            Whether the footprints are given.
+
+        Returns
+        -------
+        float
+            Metres; never more than `support_m`.
+        """
+        wanted_m = float(APRON_M)
+        if not footprints:
+            around_m = max(self.surfaces.support_m, self.vegetation.support_m) + self.vegetation.support_m
+            wanted_m = max(wanted_m, around_m)
+        ground_m = self.ground.trusted_support_m if classes.ground else self.ground.support_m
+        return self.outliers.support_m + ground_m + wanted_m
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -149,7 +180,7 @@ def split_tile(
     Parameters
     ----------
     points : WindowPoints
-        All points of the window: the core and a halo of at least `settings.support_m`.
+        All points of the window: the core and a halo of at least `settings.support_with(classes, footprints=False)`.
     core : Window
         What the tile owns.
     window : Window

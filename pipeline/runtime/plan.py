@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 
 from pipeline.errors import CrsError, InputError
 from pipeline.io import ReadOptions, SourceInfo, open_source
+from pipeline.scene import ClassesInUse
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
@@ -131,7 +132,29 @@ def check_memory(plan: Plan, limit_bytes: int | None) -> None:
     )
 
 
-def check_windows(plan: Plan, points_by_tile: Mapping[Tile, int], limit_bytes: int | None) -> None:
+def split_grid(plan: Plan, settings: RunSettings, classes: ClassesInUse, *, footprints: bool) -> TileGrid:
+    """The plan's lattice with the windows that its tiles are split in: no wider than what is known makes them.
+
+    Classes are known when the points are read, so the plan reckons with the widest. A halo that the user set stays.
+
+    Parameters
+    ----------
+    plan : Plan
+        The plan.
+    settings : RunSettings
+        How far the stages look.
+    classes : ClassesInUse
+        Which classes of the inputs are believed.
+    footprints : bool
+        Whether the footprints are given.
+    """
+    if settings.general.halo_m:
+        return plan.grid
+    support_m = settings.scene.support_with(classes, footprints=footprints)
+    return dataclasses.replace(plan.grid, halo_mm=math.ceil(support_m * MM))
+
+
+def check_windows(plan: Plan, grid: TileGrid, points_by_tile: Mapping[Tile, int], limit_bytes: int | None) -> None:
     """Refuse tiles whose windows hold more points than a worker can, now that the points are counted.
 
     Headers can claim wide bounds and hide dense corners, so the plan's own check is not the last word.
@@ -140,6 +163,8 @@ def check_windows(plan: Plan, points_by_tile: Mapping[Tile, int], limit_bytes: i
     ----------
     plan : Plan
         The plan.
+    grid : TileGrid
+        Its lattice with the windows that the tiles are split in, of `split_grid`.
     points_by_tile : mapping
         Points of each tile.
     limit_bytes : int or None
@@ -152,12 +177,12 @@ def check_windows(plan: Plan, points_by_tile: Mapping[Tile, int], limit_bytes: i
     """
     if limit_bytes is None:
         return
-    area = plan.grid.size_mm**2
+    area = grid.size_mm**2
     for tile in points_by_tile:
-        window = plan.grid.window(tile)
+        window = grid.window(tile)
         seen = 0.0
-        for other in plan.grid.tiles_over(window):
-            core = plan.grid.core(other)
+        for other in grid.tiles_over(window):
+            core = grid.core(other)
             width = min(core.x1_mm, window.x1_mm) - max(core.x0_mm, window.x0_mm)
             depth = min(core.y1_mm, window.y1_mm) - max(core.y0_mm, window.y0_mm)
             seen += points_by_tile.get(other, 0) * (width * depth / area)

@@ -16,6 +16,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 from pipeline.runtime.scratch import POINT, Scratch
 from pipeline.scene import (
+    APRON_M,
     BUILDING_CLASS,
     GROUND_CLASS,
     ClassesInUse,
@@ -32,8 +33,6 @@ from pipeline.tiling import MM, Tile, TileGrid, Window
 
 _PLACE_BITS = 20
 """Bits of a coordinate in a sort key: 1,048 m in millimetres."""
-APRON_MM = 6 * MM
-"""Width of the terrain that a tile stores beyond its core; less than the halo's own margin."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,7 +42,7 @@ class SplitTask:
     tile: Tile
     """The tile."""
     grid: TileGrid
-    """The lattice."""
+    """The lattice, its halo as wide as `settings.support_with` asks for."""
     settings: SceneSettings
     """Ground to candidates."""
     classes: ClassesInUse
@@ -253,7 +252,7 @@ def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core:
     The apron lets a candidate at the data's edge see terrain whose own tile holds no point and so is never made.
     Where aprons overlap they agree.
     """
-    apron = core.grown(APRON_MM)
+    apron = core.grown(APRON_M * MM)
     column0, row0, n_columns, n_rows = lattice_of(apron)
     rows = slice(row0 - terrain.row0, row0 - terrain.row0 + n_rows)
     columns = slice(column0 - terrain.column0, column0 - terrain.column0 + n_columns)

@@ -28,7 +28,7 @@ from pipeline.runtime.modelling import BatchTask, Modelled, StoredResult, batche
 from pipeline.runtime.outlines import draw_outlines, outline_tasks
 from pipeline.runtime.overrides import Override, own_modelling
 from pipeline.runtime.overriding import EntryOutcome, accepts, layers_of, outcomes_of, overridden
-from pipeline.runtime.plan import Plan, check_windows
+from pipeline.runtime.plan import Plan, check_windows, split_grid
 from pipeline.runtime.publish import PublishTask, publish
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.split import Split, SplitTask, split
@@ -268,17 +268,18 @@ class Stages:
     ) -> list[Split]:
         """Fragments of all tiles, or of some only."""
         tiles = points_by_tile(ingested)
-        check_windows(self.plan, tiles, self.executor.memory_limit_bytes)
+        classes, told = classes_in_use(ingested, trust=self.settings.general.classes == "trust")
+        grid = split_grid(self.plan, self.settings, classes, footprints=footprints is not None)
+        check_windows(self.plan, grid, tiles, self.executor.memory_limit_bytes)
         if only is not None:
             tiles = Counter({tile: points for tile, points in tiles.items() if tile in only})
-        classes, told = classes_in_use(ingested, trust=self.settings.general.classes == "trust")
         if told:
             self.progress.warn("split", told)
         numbers_of = {} if footprints is None else self._numbers_of(tiles, footprints.polygons)
         tasks = [
             SplitTask(
                 tile=tile,
-                grid=self.plan.grid,
+                grid=grid,
                 settings=self.settings.scene,
                 classes=classes,
                 scratch=self.scratch,
@@ -329,11 +330,12 @@ class Stages:
             # the user knows better than the classes, which say that there is no building
             classes = dataclasses.replace(classes, building=False)
         polygons = [polygon for _, polygon in named]
+        grid = split_grid(self.plan, self.settings, classes, footprints=True)
         numbers_of = self._numbers_of(points_by_tile(ingested), polygons)
         tasks = [
             SplitTask(
                 tile=tile,
-                grid=self.plan.grid,
+                grid=grid,
                 settings=self.settings.scene,
                 classes=classes,
                 scratch=self.scratch,

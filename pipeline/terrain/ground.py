@@ -102,6 +102,15 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
             return self.hierarchical_support_m + self.reach_m + 4
         return self.morphological_support_m + self.reach_m + 4
 
+    @property
+    def trusted_support_m(self) -> float:
+        """How far a terrain elevation looks where the ground is known by its class: no filter, and no pit test.
+
+        A plane is drawn through the ground cells of a square that never reaches farther than `reach_m`, however wide
+        the gap: where there is no ground in it there is no terrain. The rest is as in `support_m`.
+        """
+        return float(self.reach_m + 4)
+
 
 @njit(cache=True, nogil=True)
 def _terrain(lowest: Elevations, is_ground: BoolArray, bridge: int, max_slope: float) -> Elevations:

@@ -392,7 +392,7 @@ def test_tiles_give_the_surfaces_of_the_whole(
     strays = np.column_stack((random.integers(0, 110_000, (60, 2)), random.integers(-9000, 30_000, 60)))
     points = with_points(taken(p, dry), np.repeat(strays, 3, axis=0) + random.integers(0, 900, (180, 3)))
     points = taken(points, WHOLE.contains(points.x_mm, points.y_mm))
-    support_mm = math.ceil(1000 * NARROW.support_m)
+    support_mm = math.ceil(1000 * NARROW.support_with(classes, footprints=False))
     everything = TileGrid(size_mm=400_000, halo_mm=support_mm, origin_x_mm=-100_000, origin_y_mm=-100_000)
     expected, expected_owner = in_tiles(points, everything, NARROW, classes)
     grid = TileGrid(size_mm=size_mm, halo_mm=support_mm, origin_x_mm=origin_mm[0], origin_y_mm=origin_mm[1])
