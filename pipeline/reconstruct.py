@@ -85,9 +85,10 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
     MemoryError
         As it came.
     """
-    segment = settings.segmentation(method_named(method))
+    entry = method_named(method)
+    segment, is_arranged = settings.segmentation(entry), settings.arranges(entry)
     try:
-        return _reconstruct(candidate, method, segment, settings)
+        return _reconstruct(candidate, method, segment, settings, is_arranged=is_arranged)
     except BuildingError as error:
         return failed_building(candidate, method, error.reason, error.detail)
     except MemoryError:
@@ -108,6 +109,8 @@ def _reconstruct(
     method: str,
     segment: Callable[[Candidate], Segmentation],
     settings: ReconstructSettings,
+    *,
+    is_arranged: bool,
 ) -> BuildingResult:
     """The chain of a method's own solids, then the block."""
     bare = roof_points(candidate, settings.roof)
@@ -118,12 +121,12 @@ def _reconstruct(
         roof = dataclasses.replace(bare, labels=segmentation.labels[bare.index])
         forms: Iterable[_Form]
         if lack is not None:
-            if not _is_arranged(method, settings.roof) or len(roof.points) > MOST_POINTS:
+            if not is_arranged or len(roof.points) > MOST_POINTS:
                 raise lack
             forms = _template_forms(roof, lack, settings.roof)
         elif segmentation.faces is not None:
             forms = (partial(primitive_partition, segmentation.faces),)
-        elif not _is_arranged(method, settings.roof):
+        elif not is_arranged:
             plan = partition_roof(roof, segmentation.planes, settings.roof)
             forms = plan_forms(plan, roof, settings.roof)
         else:
@@ -174,11 +177,6 @@ def _reconstruct(
         candidate, method, settings, parts, planes, spacing_m=bare.spacing_m, status=Status.FALLBACK, lod="1.2",
         reason=reason, detail=detail, codes=codes,
     )  # fmt: skip
-
-
-def _is_arranged(method: str, settings: RoofSettings) -> bool:
-    """Whether the roof faces are cells of an arrangement."""
-    return method_named(method).arranged if settings.faces == "method" else settings.faces == "arranged"
 
 
 _WIDER_CLEARANCES = (2.5, 4.0)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from pipeline.errors import SettingsError
+from pipeline.methods.roof_faces import RoofFaceSettings
 from pipeline.model import Candidate, Segmentation
 from pipeline.parameters import Parameters
 from pipeline.roof.arrangement import ArrangementSettings
@@ -33,8 +34,6 @@ class Method:
     faithful: Parameters | None = None
     """The settings that keep to the paper's words, None for a method of our own; the defaults of `settings_type` are
     those that measured better."""
-    arranged: bool = False
-    """Whether its roof faces are cells of an arrangement of lines; else they are traced from the labels."""
 
     @property
     def presets(self) -> tuple[str, ...]:
@@ -71,7 +70,6 @@ def _arrangement() -> Method:
         name="arrangement",
         settings_type=AdaptivePlaneSettings,
         segment=arrangement.segment,
-        arranged=True,
     )
 
 
@@ -201,8 +199,32 @@ class ReconstructSettings:
         SettingsError
             Where the settings belong to another method.
         """
+        settings = self._of(method)
+        return lambda candidate: method.segment(candidate, settings)
+
+    def arranges(self, method: Method) -> bool:
+        """Whether the plan is cut into roof faces along the lines in which planes meet.
+
+        It is for every method but those that are told to trace them from the labels (`RoofFaceSettings.faces`).
+
+        Raises
+        ------
+        SettingsError
+            Where the settings belong to another method.
+
+        Examples
+        --------
+        >>> kmeans = method_named("kmeans")
+        >>> ReconstructSettings().arranges(kmeans), ReconstructSettings(method=kmeans.faithful).arranges(kmeans)
+        (True, False)
+        """
+        settings = self._of(method)
+        return not isinstance(settings, RoofFaceSettings) or settings.faces == "arranged"
+
+    def _of(self, method: Method) -> Parameters:
+        """The settings of a method, its defaults where there are none."""
         settings = method.settings_type() if self.method is None else self.method
         if not isinstance(settings, method.settings_type):
             wanted, got = method.settings_type.__name__, type(settings).__name__
             raise SettingsError([f"the settings of {method.name} are {got}: use {wanted}"])
-        return lambda candidate: method.segment(candidate, settings)
+        return settings

@@ -24,6 +24,7 @@ from pipeline.geometry import (
 )
 from pipeline.methods.local_frame import check_extent, ground_around, local_metres, plane_over_origin
 from pipeline.methods.refinement import RefinementSettings, planes_of_clusters
+from pipeline.methods.roof_faces import RoofFaceSettings
 from pipeline.model import BoolArray, Candidate, FloatArray, Reason, Segmentation
 from pipeline.parameters import parameter
 from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
@@ -39,8 +40,8 @@ from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, in
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FuzzySartSettings(FuzzySartClusteringSettings, RefinementSettings):
-    """Settings of the recipe; those of the clustering and of the refinement are among them."""
+class FuzzySartSettings(RoofFaceSettings, FuzzySartClusteringSettings, RefinementSettings):
+    """Settings of the recipe; those of the clustering, of the refinement and of the roof faces are among them."""
 
     absorption: str = parameter(
         "bucket",
@@ -91,6 +92,7 @@ class FuzzySartSettings(FuzzySartClusteringSettings, RefinementSettings):
             assignment="all_planes",
             rounds=1,
             leftover_rounds=0,
+            faces="traced",
         )
 
     def cross_faults(self) -> list[str]:

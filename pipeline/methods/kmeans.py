@@ -29,6 +29,7 @@ from pipeline.geometry import (
 )
 from pipeline.methods.local_frame import check_extent, local_metres, plane_over_origin
 from pipeline.methods.refinement import RefinementSettings, planes_of_clusters
+from pipeline.methods.roof_faces import RoofFaceSettings
 from pipeline.model import Candidate, FloatArray, IntArray, LabelArray, Plane, PlanFace, Reason, Segmentation, Tin
 from pipeline.parameters import parameter
 from pipeline.roof.primitives import BuildingPrimitive, fit_box, fit_gable
@@ -50,8 +51,8 @@ _LEAST_FACETS = 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class KMeansSettings(NormalClusteringSettings, RefinementSettings):
-    """Settings of the recipe; those of the clustering and of the refinement are among them."""
+class KMeansSettings(RoofFaceSettings, NormalClusteringSettings, RefinementSettings):
+    """Settings of the recipe; those of the clustering, of the refinement and of the roof faces are among them."""
 
     longest_edge_spacings: float = parameter(
         4.0,
@@ -146,6 +147,7 @@ class KMeansSettings(NormalClusteringSettings, RefinementSettings):
             model="always",
             outline="rectangle",
             margin_spacings=0.0,
+            faces="traced",
         )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.errors import BuildingError
 from pipeline.geometry import facet_areas_m2, nearest_neighbours, noise_sigma_m, point_spacing_m, top_visible
 from pipeline.methods.local_frame import check_extent, ground_around, local_metres, plane_over_origin
+from pipeline.methods.roof_faces import RoofFaceSettings
 from pipeline.model import BoolArray, Candidate, FloatArray, LabelArray, Reason, RoofType, Segmentation, Tin
 from pipeline.parameters import parameter
 from pipeline.segmentation.cluster_membership import ClusterMembershipSettings, may_be_roof, refine_clusters
@@ -36,7 +37,7 @@ _VOTING_PASSES = 4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ParameterSpaceSettings(RegionGrowingSettings, RoofTreeSettings):
+class ParameterSpaceSettings(RoofFaceSettings, RegionGrowingSettings, RoofTreeSettings):
     """What both methods share."""
 
     tin_spacing_m: float = parameter(
@@ -108,6 +109,7 @@ class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
             least_members=11,
             point_groups="membership",
             type_from="tree",
+            faces="traced",
         )
 
 
@@ -125,6 +127,7 @@ class ParameterSpace3dSettings(ParameterSpaceSettings, ParameterBoxSettings, Clu
             least_members=11,
             point_groups="membership",
             type_from="tree",
+            faces="traced",
         )
 
 

@@ -51,12 +51,6 @@ class RoofSettings(Parameters):
         minimum=0.0,
         maximum=1.0,
     )
-    faces: str = parameter(
-        "method",
-        "How the plan is cut into roof faces: as the method does it, traced from the points' labels, or arranged along "
-        "the lines in which planes meet.",
-        choices=("method", "traced", "arranged"),
-    )
     templates_spacing_m: float = parameter(
         0.6,
         "Arranged faces compete with simple roof shapes where points lie at least this far apart.",
