@@ -31,7 +31,7 @@ from pipeline.model import (
 from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, TOLERANCE_M, model_quality
 from pipeline.quality.residuals import summarise, surface_of, vertical_residuals
 from pipeline.quality.validity import check_solid
-from pipeline.roof.block import block_parts, block_plane
+from pipeline.roof.block import block_forms, block_plane
 from pipeline.roof.flush_walls import unite_flush_walls
 from pipeline.roof.footprint import hull_of_points, outline
 from pipeline.roof.lower_lods import LodParts, lower_lods
@@ -326,11 +326,9 @@ def _block(
     if hull is not None:
         outlines.append(MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))]))
     for footprint in outlines:
-        for factor in (0.0, 0.5, 1.0):
+        for form in block_forms(footprint, plane, candidate.ground_z_m, tolerance, settings.minimum_part_area_m2):
             try:
-                parts = block_parts(
-                    footprint, plane, candidate.ground_z_m, factor * tolerance, settings.minimum_part_area_m2
-                )
+                parts = form()
             except (BuildingError, shapely.errors.GEOSException):
                 continue
             if not any(check_solid(part.solid) for part in parts):

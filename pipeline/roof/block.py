@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 import shapely
@@ -17,6 +19,7 @@ from pipeline.roof.solid import SolidPart, solid_parts
 
 _MINIMUM_HEIGHT_M = 0.1
 _DRAWN_BACK_MM = (2.0, 20.0, 100.0)
+_SHARES_OF_TOLERANCE = (0.0, 0.5, 1.0)
 
 
 def block_plane(points: FloatArray, ground_z_m: float, percentile: float) -> Plane:
@@ -43,12 +46,13 @@ def block_plane(points: FloatArray, ground_z_m: float, percentile: float) -> Pla
     return Plane(a=0.0, b=0.0, c=height, n_points=len(z), rmse_m=math.sqrt(squares / len(z)))
 
 
-def block_parts(
+def block_forms(
     footprint_mm: MultiPolygon, plane: Plane, ground_z_m: float, tolerance_m: float, minimum_area_m2: float
-) -> list[SolidPart]:
-    """One block for every part of a footprint.
+) -> Iterator[Callable[[], list[SolidPart]]]:
+    """Ways to draw one block for every part of a footprint, the nearest to it first.
 
-    Parts are opened by a few centimetres where they pinch, and simplified.
+    First on the very footprint; then opened by a few centimetres where it pinches, drawn back so far that parts and
+    holes do not touch, more and more simplified; in the last resort on its convex hull.
 
     Parameters
     ----------
@@ -59,40 +63,44 @@ def block_parts(
     ground_z_m : float
         Elevation of the floor.
     tolerance_m : float
-        Simplification of the outline (0 for none).
+        Largest simplification of the outline (0 for none).
     minimum_area_m2 : float
         Smaller parts are left out unless there is no larger one.
 
-    Returns
-    -------
-    list of SolidPart
-        At least one.
-
-    Raises
+    Yields
     ------
-    BuildingError
-        `no_footprint` where no part has an area.
+    callable
+        Draws the blocks, at least one and not yet judged. Raises `BuildingError` where they cannot be drawn:
+        `no_footprint` where no part has an area, `no_partition` where parts overlap or touch.
     """
+    build = partial(_blocks, plane=plane, ground_z_m=ground_z_m, minimum_area_m2=minimum_area_m2)
+    yield partial(build, footprint_mm)
     opened = shapely.buffer(shapely.buffer(footprint_mm, -25.0, join_style="mitre"), 25.0, join_style="mitre")
-    fault = BuildingError(Reason.NO_FOOTPRINT, f"the outline has an area of {footprint_mm.area * 1e-6:g} m2")
-    # the opening can leave parts or holes that touch: draw them back, in the last resort fill everything
-    for shape in (*(shapely.buffer(opened, -mm, join_style="mitre") for mm in _DRAWN_BACK_MM), opened.convex_hull):
-        large = _clean_parts(shape, tolerance_m, minimum_area_m2)
-        if not large:
-            continue
-        partition = RoofPartition(polygons=tuple(large), labels=np.zeros(len(large), np.int32))
-        try:
-            return solid_parts(partition, [plane], ground_z_m)
-        except BuildingError as error:
-            fault = error
-    raise fault
+    for share in _SHARES_OF_TOLERANCE if tolerance_m > 0.0 else (0.0,):
+        for back_mm in _DRAWN_BACK_MM:
+            drawn_back = shapely.buffer(opened, -back_mm, join_style="mitre")
+            yield partial(build, drawn_back, tolerance_mm=share * tolerance_m * 1e3)
+    yield partial(build, opened.convex_hull)
 
 
-def _clean_parts(shape: BaseGeometry, tolerance_m: float, minimum_area_m2: float) -> list[Polygon]:
+def _blocks(
+    shape: BaseGeometry, *, plane: Plane, ground_z_m: float, minimum_area_m2: float, tolerance_mm: float = 0.0
+) -> list[SolidPart]:
+    """Extrude the large parts of a shape, simplified."""
+    polygons = _clean_parts(shape, tolerance_mm, minimum_area_m2)
+    if not polygons:
+        raise BuildingError(Reason.NO_FOOTPRINT, f"the outline has an area of {shape.area * 1e-6:g} m2")
+    partition = RoofPartition(polygons=tuple(polygons), labels=np.zeros(len(polygons), np.int32))
+    return solid_parts(partition, [plane], ground_z_m)
+
+
+def _clean_parts(shape: BaseGeometry, tolerance_mm: float, minimum_area_m2: float) -> list[Polygon]:
     """Simplified polygons on whole millimetres: those large enough, else the largest; none of an empty shape."""
-    if tolerance_m > 0.0:
-        shape = shapely.simplify(shape, tolerance_m * 1e3, preserve_topology=True)
+    if tolerance_mm > 0.0:
+        shape = shapely.simplify(shape, tolerance_mm, preserve_topology=True)
     snapped = polygons_of(shapely.set_precision(shape, 1.0))
-    polygons = [thinned for polygon in snapped for thinned in without_repeated(polygon, 5.0) if thinned.is_valid]
-    large = [p for p in polygons if p.area >= minimum_area_m2 * 1e6]
-    return large or sorted(polygons, key=lambda p: -p.area)[:1]
+    polygons = [thinned for polygon in snapped for thinned in without_repeated(polygon, 5.0)]
+    large = [p for p in polygons if p.area >= minimum_area_m2 * 1e6] or sorted(polygons, key=lambda p: -p.area)[:1]
+    if not shapely.is_valid(large).all():  # left out it would be missing, and another form may have it
+        raise BuildingError(Reason.NO_PARTITION, "the outline of a block crosses itself")
+    return large

@@ -159,7 +159,7 @@ def test_a_method_that_gives_up_leaves_a_block_with_its_reason(
     assert (result.status, result.reason, result.reason_detail) == (
         Status.FALLBACK, Reason.TOO_COMPLEX, "7 rounds, the limit is 6",
     )  # fmt: skip
-    assert result.footprint.area == pytest.approx(96.0, rel=0.01)
+    assert result.footprint.equals(shapely.box(0, 0, 12, 8))
 
 
 def test_a_solid_that_stays_invalid_becomes_a_block_with_the_codes(monkeypatch: pytest.MonkeyPatch) -> None:
