@@ -219,6 +219,58 @@ def test_a_comparison_shows_each_method_and_the_page_of_all(
     assert (side_by_side.errors, side_by_side.elsewhere) == ([], [])
 
 
+def test_levels_of_detail_are_chosen_for_the_job_and_in_the_view(
+    visit: Open, service: str, house: Path, finished: str, tmp_path: Path
+) -> None:
+    opened = visit(service)
+    page = opened.page
+    page.set_input_files("#tiles", house)
+    expect(page.locator(".facts")).to_contain_text("points")
+    page.locator("summary", has_text="Options").click()
+    boxes = page.get_by_role("group", name="Levels of detail").get_by_role("checkbox")
+    names = ["LoD1.2: one block", "LoD1.3: level parts", "LoD2.2: roof faces"]
+    assert [text.strip() for text in boxes.locator("..").all_inner_texts()] == names
+    assert [box.is_checked() for box in boxes.all()] == [False, False, True]
+    button = page.locator("button[type=submit]")
+    boxes.last.uncheck()
+    expect(button).to_have_text("Choose a level of detail")
+    expect(button).to_have_attribute("aria-disabled", "true")
+    other = page.get_by_role("checkbox", name="kmeans", exact=True)
+    other.check()
+    expect(boxes.first).to_be_disabled()
+    expect(button).to_have_text("Compare 2 methods")
+    other.uncheck()
+    for box in reversed(boxes.all()):
+        box.check()
+    with page.expect_request("**/execution") as sent:
+        button.click()
+    assert json.loads(sent.value.post_data or "")["inputs"]["lods"] == "1.2,1.3,2.2"
+
+    opened.wait_for_models()
+    page.locator(".building").first.click()
+    expect(page.locator(".record dl").first).to_be_visible()
+    choice = page.locator(".tools").get_by_role("group", name="Level of detail").get_by_role("button")
+    assert choice.all_inner_texts() == ["LoD1.2", "LoD1.3", "LoD2.2"]
+    expect(choice.last).to_have_attribute("aria-pressed", "true")
+    page.get_by_role("button", name="Fit").click()
+    page.wait_for_timeout(1000.0)  # the flight there
+    roof = opened.pixels(tmp_path / "lod22.png")
+    choice.first.click()
+    expect(choice.first).to_have_attribute("aria-pressed", "true")
+    expect(choice.last).to_have_attribute("aria-pressed", "false")
+    block = opened.pixels(tmp_path / "lod12.png")
+    assert (block != roof).any(axis=2).mean() > 0.01, "the block looks like the roof"
+    assert page.locator("canvas").get_attribute("data-models") == "1"
+    choice.last.click()
+    expect(choice.last).to_have_attribute("aria-pressed", "true")
+    assert (opened.pixels() != roof).any(axis=2).mean() < 0.001, "the view has moved"
+
+    page.locator(f'a[href="#/jobs/{finished}"]').click()  # of one level
+    opened.wait_for_models()
+    expect(page.get_by_role("button", name="Fit")).to_be_visible()
+    expect(page.get_by_role("button", name="LoD2.2")).to_have_count(0)
+
+
 def test_a_refused_file_is_told_with_what_to_do(visit: Open, service: str, tmp_path: Path) -> None:
     broken = tmp_path / "broken.laz"
     broken.write_bytes(b"LASF" + bytes(500))

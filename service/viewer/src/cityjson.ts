@@ -1,5 +1,7 @@
 /** CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature a building. */
 
+import { inOrder, levelShown } from "./levels_of_detail";
+
 export type Xyz = [number, number, number];
 
 export interface Transform {
@@ -22,8 +24,10 @@ export interface Building {
   attributes: Record<string, unknown>;
   /** Easting, northing, elevation one after another. */
   vertices: Float64Array;
-  /** Empty where no model could be made. */
+  /** Those of one level of detail; empty where no model could be made. */
   faces: Face[];
+  /** All levels of detail that there are of it, coarse to fine. */
+  levels: string[];
 }
 
 export interface Metadata {
@@ -44,6 +48,9 @@ const KINDS: Record<string, SurfaceKind> = { RoofSurface: "roof", GroundSurface:
 export class SequenceReader {
   metadata: Metadata | null = null;
 
+  /** @param lod The level of detail that is read: of each building the finest that is no finer; null for its finest. */
+  constructor(private readonly lod: string | null = null) {}
+
   read(line: string): Building | null {
     const value = JSON.parse(line) as RawLine;
     if (value.type === "CityJSON") {
@@ -52,7 +59,7 @@ export class SequenceReader {
     }
     if (value.type !== "CityJSONFeature") throw new Error(`a line of type ${String(value.type)} in the CityJSONSeq`);
     if (this.metadata === null) throw new Error("the CityJSONSeq does not begin with its metadata");
-    return featureOf(value, this.metadata.transform);
+    return featureOf(value, this.metadata.transform, this.lod);
   }
 }
 
@@ -81,24 +88,23 @@ function metadataOf(line: RawLine): Metadata {
   };
 }
 
-function featureOf(line: RawLine, { scale, translate }: Transform): Building {
+function featureOf(line: RawLine, { scale, translate }: Transform, lod: string | null): Building {
   const id = line.id ?? "";
   const raw = line.vertices ?? [];
   const vertices = new Float64Array(raw.length * 3);
   raw.forEach((xyz, i) => {
     for (let axis = 0; axis < 3; axis++) vertices[3 * i + axis] = xyz[axis] * scale[axis] + translate[axis];
   });
-  const faces: Face[] = [];
-  for (const object of Object.values(line.CityObjects ?? {})) {
-    for (const geometry of finest(object.geometry ?? [])) faces.push(...facesOf(geometry));
-  }
-  return { id, attributes: line.CityObjects?.[id]?.attributes ?? {}, vertices, faces };
+  // one level of the whole building: the others stand at the same place
+  const geometries = Object.values(line.CityObjects ?? {}).flatMap(({ geometry }) => geometry ?? []);
+  const levels = inOrder(geometries.map(levelOf));
+  const shown = levelShown(levels, lod);
+  const faces = geometries.filter((geometry) => levelOf(geometry) === shown).flatMap(facesOf);
+  return { id, attributes: line.CityObjects?.[id]?.attributes ?? {}, vertices, faces, levels };
 }
 
-/** The geometries of the finest level of detail: coarser ones stand at the same place. */
-function finest(geometries: RawGeometry[]): RawGeometry[] {
-  const levels = geometries.map(({ lod }) => Number(lod ?? 0));
-  return geometries.filter((_, i) => levels[i] === Math.max(...levels));
+function levelOf({ lod }: RawGeometry): string {
+  return lod ?? "0";
 }
 
 type Rings = number[][];

@@ -30,7 +30,7 @@ export function failedFootprints(
     }));
     level(vertices);
     for (const { rings } of faces) if (seenFromBelow(vertices, rings[0] ?? [])) rings.forEach((ring) => ring.reverse());
-    batcher.add({ id: name, attributes: { status: "failed" }, vertices: Float64Array.from(vertices), faces });
+    batcher.add({ id: name, attributes: { status: "failed" }, vertices: Float64Array.from(vertices), faces, levels: [] });
   }
   return batcher.take();
 }

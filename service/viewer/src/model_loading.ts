@@ -9,13 +9,19 @@ export interface ToLoading {
   /** Metres in a unit of the coordinates. */
   horizontalUnitM: number;
   verticalUnitM: number;
+  /** The level of detail that is shown; null for the finest of each building. */
+  lod: string | null;
 }
+
+/** How the models are read. */
+export type Reading = Omit<ToLoading, "bytes">;
 
 /** What the worker tells. */
 export type FromLoading =
   | { kind: "frame"; origin: [number, number, number] }
   | { kind: "buildings"; listed: Listed[]; batches: Batch[] }
-  | { kind: "finished" }
+  /** The levels of detail that can be chosen from, coarse to fine; none where each building has one. */
+  | { kind: "finished"; levels: string[] }
   | { kind: "failed"; detail: string };
 
 /**
@@ -23,29 +29,30 @@ export type FromLoading =
  *
  * The page fetches, since a worker's own requests are bound by the policy that its script was sent with.
  *
+ * @returns The levels of detail that can be chosen from, coarse to fine; none where each building has one.
  * @throws Problem when they cannot be had, Error when they cannot be read, AbortError when called off.
  */
 export async function loadModels(
   path: string,
-  units: Pick<ToLoading, "horizontalUnitM" | "verticalUnitM">,
+  reading: Reading,
   onMessage: (message: FromLoading) => void,
   signal: AbortSignal,
-): Promise<void> {
+): Promise<string[]> {
   const response = await request(path, { headers: { Accept: "application/city+json-seq" }, signal });
   if (response.body === null) throw new TypeError("the answer has no body");
   const worker = new Worker(new URL("./model_loading.worker.ts", import.meta.url), { type: "module" });
   try {
-    const read = new Promise<void>((resolve, reject) => {
+    const read = new Promise<string[]>((resolve, reject) => {
       worker.onmessage = ({ data }: MessageEvent<FromLoading>) => {
         if (data.kind === "failed") reject(new Error(data.detail));
-        else if (data.kind === "finished") resolve();
+        else if (data.kind === "finished") resolve(data.levels);
         else if (!signal.aborted) onMessage(data);
       };
       worker.onerror = (event) => reject(new Error(event.message || "the reader of the models could not start"));
       signal.addEventListener("abort", () => reject(new DOMException("called off", "AbortError")));
     });
-    const sent = send(response.body, units, worker);
-    await Promise.all([sent, read]);
+    const [levels] = await Promise.all([read, send(response.body, reading, worker)]);
+    return levels;
   } finally {
     worker.terminate();
   }
@@ -53,9 +60,9 @@ export async function loadModels(
 
 async function send(
   body: ReadableStream<Uint8Array>,
-  units: Pick<ToLoading, "horizontalUnitM" | "verticalUnitM">,
+  reading: Reading,
   worker: Worker,
 ): Promise<void> {
-  for await (const bytes of chunks(body)) worker.postMessage({ ...units, bytes } satisfies ToLoading);
-  worker.postMessage({ ...units, bytes: null } satisfies ToLoading);
+  for await (const bytes of chunks(body)) worker.postMessage({ ...reading, bytes } satisfies ToLoading);
+  worker.postMessage({ ...reading, bytes: null } satisfies ToLoading);
 }

@@ -1,6 +1,6 @@
 import { addressOf, ofRun, placeOf, type Place } from "./address";
 import { getJson, request, type Feature, type StatusInfo } from "./api";
-import type { Listed } from "./batching";
+import type { Batch, Listed } from "./batching";
 import { BuildingList } from "./building_list";
 import { downloadMenu, pageLink } from "./downloads";
 import { el } from "./elements";
@@ -8,7 +8,8 @@ import { failedFootprints } from "./failed_footprints";
 import type { Hooks } from "./job_view";
 import { titleOf } from "./job_list";
 import { Legend } from "./legend";
-import { loadModels } from "./model_loading";
+import { LevelChoice } from "./level_choice";
+import { loadModels, type FromLoading } from "./model_loading";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
 import { count, counted, duration } from "./numbers";
 import { showRecord } from "./record";
@@ -49,10 +50,12 @@ class ResultsView {
   private readonly panel = el("aside", { class: "panel", "aria-label": "Buildings" });
   private readonly list: BuildingList;
   private readonly legend: Legend;
+  private readonly levels = new LevelChoice((lod) => void this.showLevel(lod));
   private readonly counts = new Map<Category, number>();
   private readonly listed: Listed[] = [];
   private scene: ModelScene | null = null;
   private stopRecord: () => void = () => undefined;
+  private otherLevel = new AbortController();
   private report: Report = {};
   private selected: string | null = null;
   private origin: readonly [number, number, number] = [0, 0, 0];
@@ -72,9 +75,9 @@ class ResultsView {
       this.scene?.show(category, visible);
       this.list.show(category, visible);
     });
-    const tools = el(
+    const view = el(
       "div",
-      { class: "tools", role: "group", "aria-label": "View" },
+      { class: "tool-group", role: "group", "aria-label": "View" },
       el("button", { type: "button", title: "Show all (f)", onclick: () => this.scene?.fit() }, "Fit"),
       el("button", { type: "button", title: "From above, north up (t)", onclick: () => this.scene?.top() }, "Top"),
     );
@@ -90,7 +93,7 @@ class ResultsView {
           this.downloads,
         ),
         this.legend.element,
-        el("div", { class: "stage3d" }, this.canvas, tools, this.note),
+        el("div", { class: "stage3d" }, this.canvas, el("div", { class: "tools" }, this.levels.element, view), this.note),
         this.panel,
       ),
     );
@@ -111,10 +114,8 @@ class ResultsView {
       );
     }
     this.note.append(el("p", { class: "loading" }, "Loading the models…"));
-    const { crs } = report;
-    await loadModels(
-      ofRun(`${this.jobPath}/results/cityjson`, this.method),
-      { horizontalUnitM: crs?.horizontal_unit_m ?? 1, verticalUnitM: crs?.vertical_unit_m ?? 1 },
+    const levels = await this.load(
+      null,
       (message) => {
         if (message.kind === "frame") this.origin = message.origin;
         if (message.kind !== "buildings") return;
@@ -124,6 +125,7 @@ class ResultsView {
       this.calledOff.signal,
     );
     await this.finished(first);
+    if (this.scene !== null) this.levels.offer(levels);
   }
 
   fail(error: unknown): void {
@@ -135,6 +137,7 @@ class ResultsView {
 
   leave(): void {
     this.calledOff.abort();
+    this.otherLevel.abort();
     this.stopRecord();
     this.scene?.dispose();
   }
@@ -149,6 +152,32 @@ class ResultsView {
       if (asProblem(error).status === 404) return {};
       throw error;
     }
+  }
+
+  /** Read the models at a level of detail, null for the finest of each; those that there are come back. */
+  private load(lod: string | null, onMessage: (message: FromLoading) => void, signal: AbortSignal): Promise<string[]> {
+    const { crs } = this.report;
+    const reading = { horizontalUnitM: crs?.horizontal_unit_m ?? 1, verticalUnitM: crs?.vertical_unit_m ?? 1, lod };
+    return loadModels(ofRun(`${this.jobPath}/results/cityjson`, this.method), reading, onMessage, signal);
+  }
+
+  /** The models at another level of detail, seen from the same place; what is there stays until they are read. */
+  private async showLevel(lod: string): Promise<void> {
+    this.otherLevel.abort();
+    const { signal } = (this.otherLevel = new AbortController());
+    const batches: Batch[] = [];
+    this.note.replaceChildren(el("p", { class: "loading" }, `Loading LoD${lod}…`));
+    try {
+      await this.load(lod, (message) => void (message.kind === "buildings" && batches.push(...message.batches)), signal);
+    } catch (error) {
+      if (!signal.aborted) this.fail(error);
+      return;
+    }
+    this.note.replaceChildren();
+    this.scene?.replace(batches);
+    this.scene?.select(this.selected, false);
+    this.levels.mark(lod);
+    announce(`LoD${lod} is shown.`);
   }
 
   private take(listed: Listed[]): void {

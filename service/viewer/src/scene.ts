@@ -130,6 +130,25 @@ export class ModelScene {
 
   /** Draw more buildings; until somebody moves the view it keeps showing all of them. */
   add(batches: readonly Batch[]): void {
+    this.put(batches);
+    if (batches.length > 0 && !this.touched) this.fit(false);
+    this.settle();
+  }
+
+  /** Draw these models in the place of those that are there, seen from where they were; footprints alone stay. */
+  replace(batches: readonly Batch[]): void {
+    const staying = this.drawn.filter(({ batch }) => batch.category === "failed").map(({ batch }) => batch);
+    for (const { mesh, edges } of this.drawn.splice(0)) {
+      this.remove(mesh);
+      this.remove(edges);
+    }
+    this.places.clear();
+    this.bounds.makeEmpty();
+    this.put([...staying, ...batches]);
+    this.settle();
+  }
+
+  private put(batches: readonly Batch[]): void {
     for (const batch of batches) {
       const geometry = new BufferGeometry();
       geometry.setAttribute("position", new BufferAttribute(batch.positions, 3));
@@ -151,8 +170,6 @@ export class ModelScene {
         this.bounds.union(boxOf(batch, index));
       });
     }
-    if (batches.length > 0 && !this.touched) this.fit(false);
-    this.settle();
   }
 
   /** All that is there was added: draw the ground beneath it. */
@@ -351,7 +368,7 @@ export class ModelScene {
     this.request();
   }
 
-  private remove(object: Mesh | LineSegments2): void {
+  private remove(object: Mesh | LineSegments | LineSegments2): void {
     this.scene.remove(object);
     object.geometry.dispose();
   }

@@ -1,6 +1,7 @@
 import { variantOf } from "./address";
 import { Problem, getJson, request, upload, type UploadInfo } from "./api";
 import { el, svg } from "./elements";
+import { levelWords, levelsOffered, lodsInput } from "./levels_of_detail";
 import { announce, asProblem, problemNotice, warningNotice } from "./notices";
 import { bytes, count, measure } from "./numbers";
 
@@ -35,7 +36,9 @@ export class Submission {
   private readonly method = choice("method", {});
   private readonly preset = choice("preset", {});
   private usualPreset = "";
-  private readonly others = el("div", { class: "others" });
+  private readonly others = el("div", { class: "boxes" });
+  private readonly levels = el("div", { class: "boxes" });
+  private readonly levelsHint = el("p", { class: "hint", id: "lods-hint" });
   private readonly classes = choice("classes", {});
   private readonly title = el("input", { id: "title", type: "text", autocomplete: "off", maxlength: 200 });
   private readonly options = el("details", { class: "options" });
@@ -70,13 +73,20 @@ export class Submission {
       field("Vertical unit", this.verticalUnit),
       field("Method", this.method),
       field("Preset", this.preset, "What measured better, or what keeps to the method's paper."),
+      el(
+        "fieldset",
+        { class: "field", "aria-describedby": this.levelsHint.id },
+        el("legend", {}, "Levels of detail"),
+        this.levels,
+        this.levelsHint,
+      ),
       el("fieldset", { class: "field" }, el("legend", {}, "Compare with"), this.others),
       field("Classes of the file", this.classes, "Trusted, only compared with what is found, or not looked at."),
       field("Footprints", footprintPicker, "GeoPackage, GeoJSON or GeoParquet: one model a polygon."),
       this.footprintRow,
       field("Title", this.title),
     );
-    for (const select of [this.method, this.preset]) select.addEventListener("change", () => this.draw());
+    for (const control of [this.method, this.preset, this.levels]) control.addEventListener("change", () => this.draw());
     const form = el(
       "form",
       { novalidate: true },
@@ -109,6 +119,8 @@ export class Submission {
         );
       }
       this.usualPreset = this.preset.value;
+      const lods = process.inputs["lods"]?.schema;
+      this.offerLevels(levelsOffered(lods?.enum ?? []), levelsOffered([lods?.default ?? ""]));
       const comparison = await getJson<{ inputs: Record<string, InputDescription> }>("processes/compare");
       this.offerOthers(comparison.inputs["methods"]?.schema.items?.enum ?? []);
     } catch (error) {
@@ -124,6 +136,26 @@ export class Submission {
     );
     this.others.addEventListener("change", () => this.draw());
     this.draw();
+  }
+
+  /** A box for every level of detail. */
+  private offerLevels(lods: string[], usual: string[]): void {
+    this.levels.replaceChildren(
+      ...lods.map((value) =>
+        el(
+          "label",
+          {},
+          el("input", { type: "checkbox", name: "lods", value, checked: usual.includes(value) }),
+          ` LoD${value}: ${levelWords(value)}`,
+        ),
+      ),
+    );
+    this.draw();
+  }
+
+  /** What is chosen of the levels of detail, as the process takes it; empty where nothing is. */
+  private lods(): string {
+    return lodsInput([...this.levels.querySelectorAll<HTMLInputElement>("input:checked")].map(({ value }) => value));
   }
 
   /** All that is to be run; more than one is a comparison. */
@@ -242,7 +274,7 @@ export class Submission {
       ];
       const variants = this.variants();
       if (variants.length > 1) inputs["methods"] = variants;
-      else chosen.push(["method", this.method.value], ["preset", this.preset.value]);
+      else chosen.push(["method", this.method.value], ["preset", this.preset.value], ["lods", this.lods()]);
       for (const [name, value] of chosen) if (value !== "") inputs[name] = value;
       if (this.footprints?.uploaded != null) inputs["footprints"] = { href: this.footprints.uploaded.href };
       const response = await request(`processes/${variants.length > 1 ? "compare" : "reconstruct"}/execution`, {
@@ -280,7 +312,12 @@ export class Submission {
     const files = this.footprints === null ? this.tiles : [...this.tiles, this.footprints];
     const refused = files.some(({ problem }) => problem !== null);
     const waiting = files.some(({ uploaded, problem }) => uploaded === null && problem === null);
-    const ready = this.tiles.length > 0 && !refused && !waiting && !this.starting;
+    const comparison = this.variants().length > 1;
+    const levelBoxes = [...this.levels.querySelectorAll("input")];
+    const noLevel = !comparison && levelBoxes.length > 0 && this.lods() === "";
+    const ready = this.tiles.length > 0 && !refused && !waiting && !noLevel && !this.starting;
+    for (const box of levelBoxes) box.disabled = comparison;
+    this.levelsHint.textContent = comparison ? "Comparisons are made at LoD2.2." : "One or several; the records tell the finest.";
     const chosen = this.chosen();
     for (const box of this.others.querySelectorAll("input")) box.disabled = box.value === chosen;
     // not `disabled`: the button keeps its place in the tab order and its name tells why it waits
@@ -291,9 +328,11 @@ export class Submission {
         ? "Uploading…"
         : refused
           ? "Remove what was refused"
-          : this.variants().length > 1
+          : comparison
             ? `Compare ${this.variants().length} methods`
-            : "Reconstruct";
+            : noLevel
+              ? "Choose a level of detail"
+              : "Reconstruct";
   }
 }
 

@@ -2,11 +2,20 @@ import { expect, test } from "vitest";
 import { SequenceReader } from "../src/cityjson";
 import { GABLE, METADATA } from "./gable";
 
-const read = (...lines: unknown[]) => {
-  const reader = new SequenceReader();
+const read = (...lines: unknown[]) => readAt(null, ...lines);
+
+const readAt = (lod: string | null, ...lines: unknown[]) => {
+  const reader = new SequenceReader(lod);
   const buildings = lines.map((line) => reader.read(JSON.stringify(line)));
   return { reader, buildings };
 };
+
+/** The house with a block of one face beside its own model. */
+const TWO_LEVELS = (() => {
+  const part = GABLE.CityObjects["house-0"];
+  const block = { ...part.geometry[0], lod: "1.2", boundaries: [[[[0, 1, 2, 3]]]] };
+  return { ...GABLE, CityObjects: { ...GABLE.CityObjects, "house-0": { ...part, geometry: [block, ...part.geometry] } } };
+})();
 
 test("the metadata gives transform, EPSG code and extent", () => {
   const { reader } = read(METADATA);
@@ -24,10 +33,24 @@ test("a feature gives its vertices in the CRS, its faces by kind and its record"
 });
 
 test("of several levels of detail the finest is drawn", () => {
-  const part = GABLE.CityObjects["house-0"];
-  const block = { ...part.geometry[0], lod: "1.2", boundaries: [[[[0, 1, 2, 3]]]] };
-  const levels = { ...GABLE, CityObjects: { ...GABLE.CityObjects, "house-0": { ...part, geometry: [block, ...part.geometry] } } };
-  expect(read(METADATA, levels).buildings[1]?.faces).toEqual(read(METADATA, GABLE).buildings[1]?.faces);
+  expect(read(METADATA, TWO_LEVELS).buildings[1]?.faces).toEqual(read(METADATA, GABLE).buildings[1]?.faces);
+  expect(read(METADATA, TWO_LEVELS).buildings[1]?.levels).toEqual(["1.2", "2.2"]);
+  expect(read(METADATA, GABLE).buildings[1]?.levels).toEqual(["2.2"]);
+});
+
+test("a level that is asked for is drawn, or the next coarser one that there is, never a finer one", () => {
+  const rings = (lod: string, house: unknown) => readAt(lod, METADATA, house).buildings[1]?.faces.map((face) => face.rings);
+  expect(rings("1.2", TWO_LEVELS)).toEqual([[[0, 1, 2, 3]]]);
+  expect(rings("1.3", TWO_LEVELS)).toEqual([[[0, 1, 2, 3]]]);
+  expect(rings("2.2", TWO_LEVELS)).toHaveLength(7);
+  expect(rings("1.2", GABLE)).toEqual([]);
+});
+
+test("of a building of several parts all are drawn at one level", () => {
+  const part = { ...TWO_LEVELS.CityObjects["house-0"], geometry: TWO_LEVELS.CityObjects["house-0"].geometry.slice(0, 1) };
+  const blockBeside = { ...TWO_LEVELS, CityObjects: { ...TWO_LEVELS.CityObjects, "house-1": part } };
+  expect(read(METADATA, blockBeside).buildings[1]?.faces).toHaveLength(7);
+  expect(readAt("1.2", METADATA, blockBeside).buildings[1]?.faces).toHaveLength(2);
 });
 
 test("a later line of metadata stands for what follows it", () => {
