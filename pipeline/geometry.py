@@ -334,53 +334,50 @@ def _nearest_neighbours(points: FloatArray, k: int, wanted_cell_size_m: float) -
         return neighbours, squares
     x_min, y_min, size, columns, rows = _grid_shape(points, wanted_cell_size_m)
     start, members = _sort_into_grid(points, x_min, y_min, size, columns, rows)
-    sorted_points = points[members]
+    sorted_x, sorted_y, sorted_z = points[members, 0], points[members, 1], np.zeros(n)
+    if dimensions == 3:
+        sorted_z = points[members, 2]
     nearest = np.empty(k, np.int32)
     distance = np.empty(k)
     for s in range(n):
         i = members[s]
-        px = sorted_points[s, 0]
-        py = sorted_points[s, 1]
-        pz = sorted_points[s, 2] if dimensions == 3 else 0.0
+        px, py, pz = sorted_x[s], sorted_y[s], sorted_z[s]
         column = int((px - x_min) / size)
         row = int((py - y_min) / size)
         inset_x = min(px - x_min - column * size, x_min + (column + 1) * size - px)
         inset_y = min(py - y_min - row * size, y_min + (row + 1) * size - py)
         inset = min(inset_x, inset_y)
+        distance[:] = np.inf
         found = 0
-        ring = 0
+        # the cell and those around it at once, then ring by ring: cells side by side hold a run of the sorted points
+        ring = 1
         while True:
             for r in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
-                on_side = r in (row - ring, row + ring)
-                c = column - ring
-                while c <= column + ring:
-                    if 0 <= c < columns:
-                        for q in range(start[r * columns + c], start[r * columns + c + 1]):
-                            if q == s:
-                                continue
-                            dx = sorted_points[q, 0] - px
-                            dy = sorted_points[q, 1] - py
-                            square = dx * dx + dy * dy
-                            if dimensions == 3:
-                                dz = sorted_points[q, 2] - pz
-                                square += dz * dz
-                            if found == k and square > distance[k - 1]:
-                                continue
-                            j = members[q]
-                            if found < k:
-                                found += 1
-                            elif square == distance[k - 1] and j > nearest[k - 1]:
-                                continue
-                            m = found - 1
-                            while m > 0 and (
-                                distance[m - 1] > square or (distance[m - 1] == square and nearest[m - 1] > j)
-                            ):
-                                distance[m] = distance[m - 1]
-                                nearest[m] = nearest[m - 1]
-                                m -= 1
-                            distance[m] = square
-                            nearest[m] = j
-                    c += 1 if on_side or ring == 0 else 2 * ring
+                whole = ring == 1 or r in (row - ring, row + ring)
+                for side in range(1 if whole else 2):
+                    low = max(column - ring, 0) if whole or side == 0 else column + ring
+                    high = min(column + ring, columns - 1) if whole or side == 1 else column - ring
+                    if low > high or low >= columns or high < 0:
+                        continue
+                    for q in range(start[r * columns + low], start[r * columns + high + 1]):
+                        dx, dy, dz = sorted_x[q] - px, sorted_y[q] - py, sorted_z[q] - pz
+                        square = dx * dx + dy * dy + dz * dz
+                        if square > distance[k - 1] or q == s:
+                            continue
+                        j = members[q]
+                        if found < k:
+                            found += 1
+                        elif square == distance[k - 1] and j > nearest[k - 1]:
+                            continue
+                        m = found - 1
+                        while m > 0 and (
+                            distance[m - 1] > square or (distance[m - 1] == square and nearest[m - 1] > j)
+                        ):
+                            distance[m] = distance[m - 1]
+                            nearest[m] = nearest[m - 1]
+                            m -= 1
+                        distance[m] = square
+                        nearest[m] = j
             # whatever is not yet seen lies beyond the rings' outer border; a hair less allows for rounding
             reach = (inset + ring * size) * (1.0 - 1e-9) - 1e-9
             if found == k and reach > 0.0 and distance[k - 1] < reach * reach:

@@ -9,9 +9,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
-from pipeline.model import BoolArray, FloatArray, LabelArray, ModelQuality, Plane, RoofFace, Solid
+from pipeline.model import FloatArray, LabelArray, ModelQuality, Plane, RoofFace, Solid
 from pipeline.quality.curved_roof import is_curved_roof
 from pipeline.quality.residuals import ResidualSummary, TopSurface
 from pipeline.quality.ridge_height import ridge_height_sigma_m
@@ -105,104 +104,7 @@ def _seen(
     low_x, low_y, high_x, high_y = surface.bounds
     cell = max(_LEAST_CELL_M, spacing_m, math.sqrt((high_x - low_x) * (high_y - low_y) / _MOST_CELLS))
     raster = (low_x, low_y, cell, math.floor((high_x - low_x) / cell) + 1, math.floor((high_y - low_y) / cell) + 1)
-    on_roof = surface.face(*_middles(*raster)) >= 0
-    places, unseen, square = _unseen(points, residuals, on_roof, *raster, TOLERANCE_M, GAP_SPACINGS * spacing_m)
+    places, unseen, square = surface.seen(points, residuals, raster, TOLERANCE_M, GAP_SPACINGS * spacing_m)
     if places == 0:
         return math.nan, math.nan
     return unseen / places * math.fsum(face.polygon.area for face in faces), 2.0 * math.sqrt(square)
-
-
-@njit(cache=True, nogil=True)
-def _middles(low_x: float, low_y: float, cell: float, columns: int, rows: int) -> tuple[FloatArray, FloatArray]:
-    """Middles of a raster's cells, line by line, x and y, (rows * columns,) metres."""
-    x = np.empty(rows * columns)
-    y = np.empty(rows * columns)
-    for row in range(rows):
-        for column in range(columns):
-            x[row * columns + column] = low_x + (column + 0.5) * cell
-            y[row * columns + column] = low_y + (row + 0.5) * cell
-    return x, y
-
-
-@njit(cache=True, nogil=True)
-def _unseen(
-    points: FloatArray,
-    residuals: FloatArray,
-    on_roof: BoolArray,
-    low_x: float,
-    low_y: float,
-    cell: float,
-    columns: int,
-    rows: int,
-    tolerance_m: float,
-    gap_m: float,
-) -> tuple[int, int, float]:
-    """Cells on the roof, those of them far from all points on it, and the largest squared distance to any point, m2."""
-    any_point = _nearest_squares(points, residuals, np.inf, low_x, low_y, cell, columns, rows)
-    explained = _nearest_squares(points, residuals, tolerance_m, low_x, low_y, cell, columns, rows)
-    places = 0
-    unseen = 0
-    largest = 0.0
-    for k in range(len(on_roof)):
-        if on_roof[k]:
-            places += 1
-            unseen += explained[k] > gap_m * gap_m
-            largest = max(largest, any_point[k])
-    return places, unseen, largest
-
-
-@njit(cache=True, nogil=True)
-def _nearest_squares(
-    points: FloatArray,
-    residuals: FloatArray,
-    tolerance_m: float,
-    low_x: float,
-    low_y: float,
-    cell: float,
-    columns: int,
-    rows: int,
-) -> FloatArray:
-    """Squared distance in plan from every cell's middle to the nearest point that is so near to a roof above or below.
-
-    Each cell keeps the point nearest to its middle, and cells hand theirs on to their neighbours, in two sweeps of the
-    raster with two of each line (Danielsson 1980): distances are too large by less than a cell, most not at all.
-    (rows * columns,) m2; infinite without points.
-    """
-    squares = np.full(rows * columns, np.inf)
-    nearest_x = np.full(rows * columns, np.inf)
-    nearest_y = np.full(rows * columns, np.inf)
-    for i in range(len(points)):
-        if abs(residuals[i]) <= tolerance_m:
-            x, y = (points[i, 0] - low_x) / cell, (points[i, 1] - low_y) / cell
-            column = min(max(math.floor(x), 0), columns - 1)
-            row = min(max(math.floor(y), 0), rows - 1)
-            _offer(x, y, column, row, row * columns + column, squares, nearest_x, nearest_y)
-    for sweep in range(2):
-        for line in range(rows):
-            row = line if sweep == 0 else rows - 1 - line
-            before = row - 1 if sweep == 0 else row + 1
-            first = row * columns
-            if 0 <= before < rows:
-                for column in range(columns):
-                    j = before * columns + column
-                    _offer(nearest_x[j], nearest_y[j], column, row, first + column, squares, nearest_x, nearest_y)
-            for column in range(1, columns):
-                j = first + column - 1
-                _offer(nearest_x[j], nearest_y[j], column, row, first + column, squares, nearest_x, nearest_y)
-            for column in range(columns - 2, -1, -1):
-                j = first + column + 1
-                _offer(nearest_x[j], nearest_y[j], column, row, first + column, squares, nearest_x, nearest_y)
-    return squares * (cell * cell)
-
-
-@njit(cache=True, nogil=True)
-def _offer(
-    x: float, y: float, column: int, row: int, k: int, squares: FloatArray, nearest_x: FloatArray, nearest_y: FloatArray
-) -> None:
-    """Take a point, in cells, for cell k where it is nearer to its middle than the one that it has."""
-    dx, dy = x - (column + 0.5), y - (row + 0.5)
-    square = dx * dx + dy * dy
-    if square < squares[k]:
-        squares[k] = square
-        nearest_x[k] = x
-        nearest_y[k] = y

@@ -12,6 +12,7 @@ from numba import njit
 from shapely import MultiPolygon, Polygon
 
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, RoofFace
+from pipeline.quality.unseen_roof import middles_of_cells, unseen_cells
 
 _MAX_CELLS = 1_000_000
 
@@ -125,19 +126,63 @@ def _top_surface(
 
 
 @njit(cache=True, nogil=True)
-def _faces_of_cells(
-    boxes: FloatArray, low_x: float, low_y: float, cell: float, columns: int, rows: int
-) -> tuple[IntArray, IntArray]:
-    """Faces whose bounding box touches a cell, cell by cell."""
+def _laid_out(
+    xy: FloatArray, ring_of: IntArray, face_of_ring: IntArray, n: int, tolerance: float
+) -> tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray, float, float, float, int, int]:
+    """Edges of all faces, where each face's start, their boxes; faces by cells, where each cell's start; the cells.
+
+    Parameters
+    ----------
+    xy : (v, 2) float64
+        Vertices of the rings, each closed, ring after ring.
+    ring_of : (v,) int64
+        Ring of each.
+    face_of_ring : (r,) int64
+        Face of each ring, ascending.
+    n : int
+        Faces; those without a ring are in no cell.
+    tolerance : float
+        By how much the boxes are widened.
+    """
+    edges = np.empty((len(xy), 4))
+    edge_starts = np.zeros(n + 1, np.int64)
+    boxes = np.empty((n, 4))
+    boxes[:, :2], boxes[:, 2:] = np.inf, -np.inf
+    m = 0
+    for v in range(len(xy)):
+        face = face_of_ring[ring_of[v]]
+        x, y = xy[v, 0], xy[v, 1]
+        box = boxes[face]
+        box[0], box[1], box[2], box[3] = min(box[0], x), min(box[1], y), max(box[2], x), max(box[3], y)
+        if v > 0 and ring_of[v - 1] == ring_of[v]:
+            edges[m, 0], edges[m, 1], edges[m, 2], edges[m, 3] = xy[v - 1, 0], xy[v - 1, 1], x, y
+            edge_starts[face + 1] += 1
+            m += 1
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for f in range(n):
+        edge_starts[f + 1] += edge_starts[f]
+        if boxes[f, 0] <= boxes[f, 2]:
+            boxes[f, :2] -= tolerance
+            boxes[f, 2:] += tolerance
+            low_x, low_y = min(low_x, boxes[f, 0]), min(low_y, boxes[f, 1])
+            high_x, high_y = max(high_x, boxes[f, 2]), max(high_y, boxes[f, 3])
+    width, depth = high_x - low_x, high_y - low_y
+    cell = max(0.5, math.sqrt(width * depth / (4 * n)))
+    while (width / cell + 1) * (depth / cell + 1) > max(_MAX_CELLS, 8 * n):
+        cell *= 2.0
+    columns, rows = math.floor(width / cell) + 1, math.floor(depth / cell) + 1
     starts = np.zeros(columns * rows + 1, np.int64)
     faces = np.empty(0, np.int64)
+    filled = np.empty(0, np.int64)
     for turn in range(2):
         if turn == 1:
             for k in range(columns * rows):
                 starts[k + 1] += starts[k]
             faces = np.empty(starts[-1], np.int64)
             filled = starts[:-1].copy()
-        for f in range(len(boxes)):
+        for f in range(n):
+            if not boxes[f, 0] <= boxes[f, 2]:
+                continue
             c0 = math.floor((boxes[f, 0] - low_x) / cell)
             r0 = math.floor((boxes[f, 1] - low_y) / cell)
             c1 = min(columns - 1, math.floor((boxes[f, 2] - low_x) / cell))
@@ -149,7 +194,45 @@ def _faces_of_cells(
                     else:
                         faces[filled[r * columns + c]] = f
                         filled[r * columns + c] += 1
-    return starts, faces
+    return edges[:m].copy(), edge_starts, boxes, starts, faces, low_x, low_y, cell, columns, rows
+
+
+@njit(cache=True, nogil=True)
+def _seen(
+    points: FloatArray,
+    residuals: FloatArray,
+    raster_x: float,
+    raster_y: float,
+    raster_cell: float,
+    raster_columns: int,
+    raster_rows: int,
+    tolerance_m: float,
+    gap_m: float,
+    origin_x: float,
+    origin_y: float,
+    edges: FloatArray,
+    edge_starts: IntArray,
+    boxes: FloatArray,
+    coefficients: FloatArray,
+    cell_starts: IntArray,
+    cell_faces: IntArray,
+    low_x: float,
+    low_y: float,
+    cell: float,
+    columns: int,
+    rows: int,
+    tolerance: float,
+) -> tuple[int, int, float]:
+    """The kernel of `TopSurface.seen`."""
+    x, y = middles_of_cells(raster_x, raster_y, raster_cell, raster_columns, raster_rows)
+    _, number = _top_surface(
+        x, y, origin_x, origin_y, edges, edge_starts, boxes, coefficients, cell_starts, cell_faces,
+        low_x, low_y, cell, columns, rows, tolerance,
+    )  # fmt: skip
+    return unseen_cells(
+        points, residuals, number >= 0, raster_x, raster_y, raster_cell, raster_columns, raster_rows,
+        tolerance_m, gap_m,
+    )  # fmt: skip
 
 
 class TopSurface:
@@ -192,18 +275,10 @@ class TopSurface:
         xy, ring = shapely.get_coordinates(rings, return_index=True)
         self._corner = (float(np.floor(xy[:, 0].min())), float(np.floor(xy[:, 1].min()))) if corner is None else corner
         xy = xy - np.array(self._corner)
-        joined = ring[:-1] == ring[1:]
-        self._edges = np.ascontiguousarray(np.hstack((xy[:-1][joined], xy[1:][joined])))
-        face = owner[part[ring[:-1][joined]]]
-        self._edge_starts = np.searchsorted(face, np.arange(n + 1)).astype(np.int64)
-        of_face = owner[part[ring]]
-        starts = np.searchsorted(of_face, np.arange(n))
-        filled = np.append(starts[1:], len(of_face)) > starts
-        boxes = np.tile(np.array([np.inf, np.inf, -np.inf, -np.inf]), (n, 1))
-        boxes[filled, :2] = np.minimum.reduceat(xy, starts[filled])
-        boxes[filled, 2:] = np.maximum.reduceat(xy, starts[filled])
-        boxes += np.array([-tolerance_m, -tolerance_m, tolerance_m, tolerance_m])
-        self._boxes = boxes
+        (
+            self._edges, self._edge_starts, self._boxes, self._cell_starts, self._cell_faces, *grid,
+        ) = _laid_out(xy, ring, owner[part], n, tolerance_m)  # fmt: skip
+        self._grid: tuple[float, float, float, int, int] = tuple(grid)
         planes = np.array(coefficients, dtype=np.float64).reshape(n, 3)
         if origins is not None:
             shift = np.asarray(origins, dtype=np.float64)
@@ -215,15 +290,6 @@ class TopSurface:
         elif self._corner != (0.0, 0.0):
             planes[:, 2] += planes[:, 0] * self._corner[0] + planes[:, 1] * self._corner[1]
         self._planes = planes
-        self._low = float(boxes[filled, 0].min()), float(boxes[filled, 1].min())
-        width, depth = float(boxes[filled, 2].max()) - self._low[0], float(boxes[filled, 3].max()) - self._low[1]
-        cell = max(0.5, math.sqrt(width * depth / (4 * n)))
-        while (width / cell + 1) * (depth / cell + 1) > max(_MAX_CELLS, 8 * n):
-            cell *= 2.0
-        self._cell = cell
-        self._shape = math.floor(width / cell) + 1, math.floor(depth / cell) + 1
-        self._cell_starts, cell_faces = _faces_of_cells(boxes[filled], *self._low, cell, *self._shape)
-        self._cell_faces = np.flatnonzero(filled)[cell_faces]
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -252,8 +318,18 @@ class TopSurface:
         if self._empty or len(x) == 0:
             return np.full(len(x), np.nan), np.full(len(x), -1, np.int32)
         top, number = _top_surface(
-            np.ascontiguousarray(x, dtype=np.float64),
-            np.ascontiguousarray(y, dtype=np.float64),
+            np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64), *self._arguments()
+        )
+        return top, number
+
+    def _arguments(
+        self,
+    ) -> tuple[
+        float, float, FloatArray, IntArray, FloatArray, FloatArray, IntArray, IntArray,
+        float, float, float, int, int, float,
+    ]:  # fmt: skip
+        """What the kernels take."""
+        return (
             *self._corner,
             self._edges,
             self._edge_starts,
@@ -261,12 +337,48 @@ class TopSurface:
             self._planes,
             self._cell_starts,
             self._cell_faces,
-            *self._low,
-            self._cell,
-            *self._shape,
+            *self._grid,
             self._tolerance,
         )
-        return top, number
+
+    def seen(
+        self,
+        points: FloatArray,
+        residuals: FloatArray,
+        raster: tuple[float, float, float, int, int],
+        tolerance_m: float,
+        gap_m: float,
+    ) -> tuple[int, int, float]:
+        """How much of the faces points are near to, by the cells of a raster.
+
+        Parameters
+        ----------
+        points : (n, 3) float64
+            Metres.
+        residuals : (n,) float64
+            Points minus this surface, metres; nan where there is no face.
+        raster : tuple
+            Lower left corner, cell in metres, columns, rows.
+        tolerance_m : float
+            Vertical distance up to which a point is on the surface.
+        gap_m : float
+            Distance in plan from which on a cell is far from points.
+
+        Returns
+        -------
+        cells : int
+            With a face at their middle.
+        far : int
+            Those of them far from all points on the surface.
+        square_m2 : float
+            Largest squared distance in plan of one of them to any point over or under a face; infinite without points.
+        """
+        if self._empty:
+            return 0, 0, 0.0
+        places, far, square = _seen(
+            np.ascontiguousarray(points, dtype=np.float64), residuals, *raster, tolerance_m, gap_m, *self._arguments()
+        )
+        return places, far, square
 
     def elevation(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Elevation of the highest face at places, (n,) float64; nan where there is none."""

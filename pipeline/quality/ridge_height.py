@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from pipeline.model import FaceKind, FloatArray, LabelArray, Plane, Solid
+from pipeline.model import FaceKind, FloatArray, IntArray, LabelArray, Plane, Solid
 
 SAME_TOP_M = 0.05
 """Roof faces that end within this of the highest point meet there."""
@@ -64,11 +64,9 @@ def ridge_height_sigma_m(
     if top is None:
         return math.nan
     x, y, numbers = top
-    sums = _support(points, residuals, plane_of_point, reach_m, len(planes))
-    variances = [
-        float(_variance_at(points, residuals, plane_of_point, reach_m, number, sums[number], x, y))
-        for number in numbers
-    ]
+    variances = _variances_at(
+        points, residuals, plane_of_point, reach_m, len(planes), np.array(numbers, np.int64), x, y
+    ).tolist()
     if any(math.isnan(variance) for variance in variances):
         return math.nan
     weights, gradient = _weights([(planes[number].a, planes[number].b) for number in numbers])
@@ -96,6 +94,26 @@ def _top(solids: Sequence[Solid]) -> tuple[float, float, list[int]] | None:
         if face.kind is FaceKind.ROOF and any(not there.isdisjoint(ring) for ring in face.rings)
     }
     return x, y, sorted(numbers)
+
+
+@njit(cache=True, nogil=True)
+def _variances_at(
+    points: FloatArray,
+    residuals: FloatArray,
+    plane_of_point: LabelArray,
+    reach_m: float,
+    n_planes: int,
+    numbers: IntArray,
+    x: float,
+    y: float,
+) -> FloatArray:
+    """`_variance_at` of several planes, (m,) m2."""
+    sums = _support(points, residuals, plane_of_point, reach_m, n_planes)
+    variances = np.empty(len(numbers))
+    for k in range(len(numbers)):
+        number = numbers[k]
+        variances[k] = _variance_at(points, residuals, plane_of_point, reach_m, number, sums[number], x, y)
+    return variances
 
 
 @njit(cache=True, nogil=True)

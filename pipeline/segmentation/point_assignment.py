@@ -58,12 +58,24 @@ def vote_among_neighbours(
     """
     width = neighbours.shape[1]
     old = labels.copy()
+    new = np.empty_like(old)
+    cosines = np.empty(len(planes))
+    for k in range(len(planes)):
+        cosines[k] = cosine_of_slope(planes[k, 0], planes[k, 1])
+    changed = np.ones(old.size, np.bool_)
+    changes = np.empty(old.size, np.int32)
     kind = np.empty(width + 1, np.int32)
     votes = np.empty(width + 1, np.int32)
     for _ in range(passes):
-        new = np.full(old.size, -1, np.int32)
-        changes = 0
+        n_changes = 0
         for i in range(old.size):
+            # amid labels that stayed as they were a point chooses as before
+            new[i] = old[i]
+            asked = changed[i]
+            for q in range(width):
+                asked = asked or (neighbours[i, q] >= 0 and changed[neighbours[i, q]])
+            if not asked:
+                continue
             kinds = 0
             for q in range(-1, width):
                 j = i if q < 0 else neighbours[i, q]
@@ -82,18 +94,27 @@ def vote_among_neighbours(
                 if q >= 0:
                     votes[at] += 1
             least = 1.0
+            chosen = np.int32(-1)
             for s in range(kinds):
-                ratio = distance_to_plane(points, i, planes, kind[s]) / distance_m
+                k = kind[s]
+                vertical = points[i, 2] - planes[k, 0] * points[i, 0] - planes[k, 1] * points[i, 1] - planes[k, 2]
+                ratio = abs(vertical) * cosines[k] / distance_m
                 if ratio > 1.0:
                     continue
                 cost = ratio * ratio - vote_weight * votes[s]
-                if cost < least or (cost == least and kind[s] < new[i]):
+                if cost < least or (cost == least and k < chosen):
                     least = cost
-                    new[i] = kind[s]
-            changes += new[i] != old[i]
-        old = new
-        if changes == 0:
+                    chosen = k
+            new[i] = chosen
+            if chosen != old[i]:
+                changes[n_changes] = i
+                n_changes += 1
+        old, new = new, old
+        if n_changes == 0:
             break
+        changed[:] = False
+        for q in range(n_changes):
+            changed[changes[q]] = True
     return old
 
 

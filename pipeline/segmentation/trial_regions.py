@@ -143,12 +143,15 @@ def _grow(
     min_normal_cosine: float,
     asked: LabelArray,
     mark: int,
+    refused: LabelArray,
     queue: LabelArray,
 ) -> tuple[int, float, float, float, float]:
     """A region from a seed over unlabelled points: how many, at the head of `queue`; (a, b, c) of it; its gain.
 
-    None at all where it only repeats regions before it.
+    None at all where it only repeats regions before it. A point that one plane refused is not asked again until there
+    is another one: `refused` has the number of that plane, its last entry how many there were.
     """
+    n = len(points)
     a, b, c = local[seed, 0], local[seed, 1], local[seed, 2]
     sums = np.zeros(N_SUMS)
     queue[0] = seed
@@ -159,6 +162,7 @@ def _grow(
     refit = _FIRST_REFIT
     reach = distance_m / cosine_of_slope(a, b)
     least = min_normal_cosine / cosine_of_slope(a, b)
+    refused[n] += 1
     while at < held:
         i = queue[at]
         at += 1
@@ -172,14 +176,17 @@ def _grow(
                 a, b, c = own_a, own_b, own_c
                 reach = distance_m / cosine_of_slope(a, b)
                 least = min_normal_cosine / cosine_of_slope(a, b)
+                refused[n] += 1
             refit = math.floor(_REFIT_GROWTH * sums[0]) + 1.0
         for j in neighbours[i]:
-            if j < 0 or labels[j] >= 0 or asked[j] == mark:
+            if j < 0 or labels[j] >= 0 or asked[j] == mark or refused[j] == refused[n]:
                 continue
             if _joins(points, neighbours, local, cosines, j, a, b, c, reach, least):
                 asked[j] = mark
                 queue[held] = j
                 held += 1
+            else:
+                refused[j] = refused[n]
     a, b, c, fitted = best_fit_plane(sums)
     if not fitted:
         return 0, a, b, c, 0.0
@@ -245,6 +252,7 @@ def take_regions(
     for i in range(n):
         cosines[i] = cosine_of_slope(local[i, 0], local[i, 1])
     asked = np.full(n, -1, np.int32)
+    refused = np.zeros(n + 1, np.int32)
     queue = np.empty(n, np.int32)
     reached = np.zeros(n, np.int32)
     anew = np.zeros(n, np.int32)
@@ -256,8 +264,9 @@ def take_regions(
         if labels[seed] >= 0 or reached[seed] >= _TRIALS:
             continue
         held, a, b, c, gain = _grow(
-            points, neighbours, local, cosines, labels, reached, seed, distance_m, min_normal_cosine, asked, mark, queue
-        )
+            points, neighbours, local, cosines, labels, reached, seed, distance_m, min_normal_cosine, asked, mark,
+            refused, queue,
+        )  # fmt: skip
         reached[seed] += 1
         if held >= fewest_points:
             # points just beyond the limit would only grow the same region once more
@@ -277,8 +286,9 @@ def take_regions(
         if labels[seed] >= 0:
             continue
         held, a, b, _, gain = _grow(
-            points, neighbours, local, cosines, labels, anew, seed, distance_m, min_normal_cosine, asked, mark, queue
-        )
+            points, neighbours, local, cosines, labels, anew, seed, distance_m, min_normal_cosine, asked, mark,
+            refused, queue,
+        )  # fmt: skip
         mark += 1
         if held < fewest_points or cosine_of_slope(a, b) < min_cosine:
             continue

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from pipeline.geometry import fit_plane
 from pipeline.model import FloatArray, ModelQuality, Plane
 from pipeline.quality.curved_roof import is_curved_roof
-from pipeline.quality.model_quality import TOLERANCE_M, _nearest_squares, model_quality
+from pipeline.quality.model_quality import TOLERANCE_M, model_quality
 from pipeline.quality.residuals import summarise, surface_of
 from pipeline.quality.ridge_height import _weights
+from pipeline.quality.unseen_roof import _nearest_squares
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart, solid_parts
 
@@ -133,7 +134,7 @@ def test_the_nearest_point_of_every_cell_is_that_of_a_plain_search_to_a_tenth_of
     points = rng.uniform(0, 1, (int(rng.integers(1, 60)), 3)) * [columns * cell, rows * cell, 9.0]
     residuals = rng.uniform(-0.4, 0.4, len(points))
     residuals[rng.uniform(size=len(points)) < 0.2] = np.nan
-    found = _nearest_squares(points, residuals, 0.2, 0.0, 0.0, cell, columns, rows)
+    found = _nearest_squares(points, residuals, 0.2, 0.0, 0.0, cell, columns, rows)[:, 1]
     x = np.tile((np.arange(columns) + 0.5) * cell, rows)
     y = np.repeat((np.arange(rows) + 0.5) * cell, columns)
     near = points[np.abs(residuals) <= 0.2]

@@ -140,6 +140,66 @@ def _cut(
 
 
 @njit(cache=True, nogil=True)
+def _number_those_that_may_change(
+    costs: IntArray,
+    nodes: LabelArray,
+    starts: LabelArray,
+    others: LabelArray,
+    weights: IntArray,
+    labels: LabelArray,
+    alpha: int,
+    number: LabelArray,
+    least: IntArray,
+    queue: LabelArray,
+) -> None:
+    """Mark in `number`, by 0, the nodes that can take alpha in a minimum cut; all others keep -1.
+
+    A node that alpha does not make cheaper even if all its neighbours that are still open take it keeps its label: of
+    minimum cuts the one is sought in which the fewest nodes change. So do then, perhaps, its neighbours. Nearly every
+    node is settled so, without a flow.
+
+    `least` and `queue` are room for as many numbers as there are nodes.
+    """
+    for p in nodes:
+        if labels[p] != alpha:
+            number[p] = 0
+    tail = 0
+    for p in nodes:
+        if labels[p] == alpha:
+            continue
+        cost = costs[p, alpha] - costs[p, labels[p]]
+        for e in range(starts[p], starts[p + 1]):
+            r = others[e]
+            if number[r] >= 0:
+                cost -= weights[e]
+            elif labels[r] == alpha:
+                cost -= weights[e]  # it differs from the node's own label
+            elif labels[r] == labels[p]:
+                cost += weights[e]
+        least[p] = cost
+        if cost >= 0:
+            queue[tail] = p
+            tail += 1
+    head = 0
+    for head in range(tail):
+        number[queue[head]] = -1
+    head = 0
+    while head < tail:
+        p = queue[head]
+        head += 1
+        for e in range(starts[p], starts[p + 1]):
+            r = others[e]
+            if number[r] < 0:
+                continue
+            # it counted on the neighbour's change: instead of w less, w more, or nothing where the labels differ anyway
+            least[r] += weights[e] if labels[p] != labels[r] else 2 * weights[e]
+            if least[r] >= 0:
+                number[r] = -1
+                queue[tail] = r
+                tail += 1
+
+
+@njit(cache=True, nogil=True)
 def expand_labels(
     costs: IntArray,
     allowed: LabelArray,
@@ -174,15 +234,20 @@ def expand_labels(
     distance = np.empty(n + 2, np.int32)
     number = np.full(n, -1, np.int32)
     unary = np.empty(n, np.int64)
+    queue = np.empty(n, np.int32)
     quiet = 0
     turn = 0
     while quiet < k and turn < rounds * k:
         alpha = turn % k
         turn += 1
         quiet += 1
+        _number_those_that_may_change(
+            costs, allowed[allowed_starts[alpha] : allowed_starts[alpha + 1]], starts, others, weights, labels, alpha,
+            number, unary, queue,
+        )  # fmt: skip
         active = 0
         for s in range(allowed_starts[alpha], allowed_starts[alpha + 1]):
-            if labels[allowed[s]] != alpha:
+            if number[allowed[s]] >= 0:
                 number[allowed[s]] = active
                 active += 1
         if active == 0:
@@ -193,9 +258,9 @@ def expand_labels(
         unary[:active] = 0
         for s in range(allowed_starts[alpha], allowed_starts[alpha + 1]):
             p = allowed[s]
-            if labels[p] == alpha:
-                continue
             i = number[p]
+            if i < 0:
+                continue
             cost = costs[p, alpha] - costs[p, labels[p]]
             for e in range(starts[p], starts[p + 1]):
                 r = others[e]

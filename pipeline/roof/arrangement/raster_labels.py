@@ -202,7 +202,6 @@ def _near_own_points(
 @njit(cache=True, nogil=True)
 def _settle(
     costs: IntArray,
-    number: LabelArray,
     place: LabelArray,
     columns: int,
     rows: int,
@@ -210,45 +209,62 @@ def _settle(
     diagonal: int,
     labels: LabelArray,
 ) -> None:
-    """Give every cell the best label among its own and its neighbours', until none changes."""
-    around = np.empty(8, np.int32)
-    weight = np.empty(8, np.int64)
+    """Give every cell the best label among its own and its neighbours', until none changes.
+
+    A cell that has chosen chooses alike until a neighbour changes, so after the first round only those are looked at
+    again of which one has.
+    """
+    # a frame of cells without a label spares all tests of the raster's border
+    width = columns + 2
+    around = np.array([-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1])
+    weight = np.array([diagonal, side, diagonal, side, side, diagonal, side, diagonal])
+    framed = np.full(width * (rows + 2), -1, np.int32)
+    waits = np.zeros(width * (rows + 2), np.bool_)
+    at = np.empty(len(place), np.int32)
+    for i in range(len(place)):
+        at[i] = (place[i] // columns + 1) * width + place[i] % columns + 1
+        framed[at[i]] = labels[i]
+        waits[at[i]] = True
     for _ in range(_SETTLING_ROUNDS):
         changed = False
         for i in range(len(place)):
-            r, c = place[i] // columns, place[i] % columns
-            m = 0
+            here = at[i]
+            if not waits[here]:
+                continue
+            waits[here] = False
+            own = framed[here]
             mixed = False
-            for step in range(9):
-                rr, cc = r + step // 3 - 1, c + step % 3 - 1
-                if step == 4 or rr < 0 or cc < 0 or rr >= rows or cc >= columns:
-                    continue
-                j = number[rr * columns + cc]
-                if j < 0:
-                    continue
-                around[m] = labels[j]
-                weight[m] = side if step % 2 == 1 else diagonal
-                mixed = mixed or labels[j] != labels[i]
-                m += 1
+            for q in range(8):
+                label = framed[here + around[q]]
+                mixed |= (label != own) & (label >= 0)
             if not mixed:
                 continue
-            best = labels[i]
+            best = own
             least = costs[i, best]
-            for q in range(m):
-                if around[q] != best:
+            for q in range(8):
+                label = framed[here + around[q]]
+                if label >= 0 and label != best:
                     least += weight[q]
-            for s in range(m):
-                label = around[s]
+            tried = own
+            for s in range(8):
+                label = framed[here + around[s]]
+                if label < 0 or label in (own, tried):
+                    continue
+                tried = label
                 cost = costs[i, label]
-                for q in range(m):
-                    if around[q] != label:
+                for q in range(8):
+                    other = framed[here + around[q]]
+                    if other >= 0 and other != label:
                         cost += weight[q]
-                if cost < least or (cost == least and label < best and best != labels[i]):
+                if cost < least or (cost == least and label < best and best != own):
                     best = label
                     least = cost
-            if best != labels[i]:
+            if best != own:
+                framed[here] = best
                 labels[i] = best
                 changed = True
+                for q in range(8):
+                    waits[here + around[q]] = True
         if not changed:
             break
 
@@ -294,7 +310,7 @@ def raster_labels(
     side = int(COST_SCALE * cost_per_m * cell_m * _SIDE)
     diagonal = int(COST_SCALE * cost_per_m * cell_m * _DIAGONAL)
     if len(planes) > 1:
-        _settle(costs, number, place, columns, rows, side, diagonal, coarse)
+        _settle(costs, place, columns, rows, side, diagonal, coarse)
         pairs, weights = _raster_edges(number, place, columns, rows, side, diagonal)
         starts, others, border = neighbour_lists(len(place), pairs, weights)
         allowed, allowed_starts = _near_own_points(near, coarse, number, place, columns, rows)
@@ -316,5 +332,5 @@ def raster_labels(
         costs, _, _ = _cell_costs(
             points, planes, cap_m, fine_number, len(fine_place), low_x, low_y, half, 2 * columns, 2 * rows
         )
-        _settle(costs, fine_number, fine_place, 2 * columns, 2 * rows, side // 2, diagonal // 2, labels)
+        _settle(costs, fine_place, 2 * columns, 2 * rows, side // 2, diagonal // 2, labels)
     return labels, fine_place, low_x, low_y, 2 * columns
