@@ -27,7 +27,7 @@ from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import Joined
 from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, write_manifest
-from pipeline.runtime.modelling import Modelled, load
+from pipeline.runtime.modelling import Modelled
 from pipeline.runtime.overrides import read_overrides
 from pipeline.runtime.plan import Plan, check_memory, make_plan
 from pipeline.runtime.scratch import Scratch
@@ -278,6 +278,7 @@ def run_variants(
                 executor=engine,
                 scratch=scratch,
                 isolation=request.isolation,
+                compared=len(variants) > 1,
             )
             progresses: list[Progress] = []
             try:
@@ -298,9 +299,6 @@ def run_variants(
                     )
                     for k, (v, own) in enumerate(zip(variants, progresses, strict=True))
                 ]
-                if len(variants) > 1 and request.isolation is None:
-                    # or the first building of the first variant would be charged for what all need
-                    load(*dict.fromkeys(v.settings.general.method for v in variants))
                 modelled = [own.reconstruct(joined) for own in each]
                 published = [
                     own.publish(splits, joined, models, reference, str(run_dir))

@@ -232,6 +232,8 @@ class Stages:
     """Folder for the bundles of buildings that cost their process; empty keeps none."""
     variant: int = 0
     """Which of the run's variants this is: keeps their models apart in scratch."""
+    compared: bool = False
+    """Whether there are several variants, whose seconds are told side by side."""
 
     def ingest(self, paths: Sequence[str]) -> list[Ingested]:
         """Bucket all points by tile, and look at what they are."""
@@ -416,6 +418,7 @@ class Stages:
                     for site in sites
                     if site.override is not None and site.override.remodels
                 },
+                compared=self.compared,
             )
             for number, sites in self._numbered(joined)
         ]

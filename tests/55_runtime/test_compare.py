@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from pipeline.errors import InputError, RunCancelledError, RunError, SettingsError
+from pipeline.runtime import modelling
 from pipeline.runtime.compare import (
     BUILDINGS,
     PAGE,
@@ -23,6 +25,7 @@ from pipeline.runtime.compare import (
     settings_of,
 )
 from pipeline.runtime.events import Event
+from pipeline.runtime.modelling import load_once
 from pipeline.runtime.run import RunRequest, RunVariant, run, run_variants
 from pipeline.settings import RunSettings
 
@@ -150,14 +153,28 @@ def test_no_page_of_an_earlier_comparison_stands_beside_runs_that_were_called_of
         compare(request(suburb, out, overwrite=True), listen)
 
 
-def test_no_method_is_charged_for_loading_what_all_of_them_need(
+def test_no_building_is_charged_for_loading_its_method(
     suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[str] = []
-    monkeypatch.setattr("pipeline.runtime.run.load", lambda *_: told.append("loaded"))
-    compare(request(suburb, tmp_path / "out"), lambda event: told.append(event.stage))
-    assert told.index("loaded") < told.index("reconstruct")
-    assert told.count("loaded") == 1
+    loaded: list[str] = []
+    # a clock that stands still but while a method is loaded
+    monkeypatch.setattr(modelling, "time", SimpleNamespace(perf_counter=lambda: 100.0 * len(loaded)))
+    monkeypatch.setattr(modelling, "load", loaded.append)
+    load_once.cache_clear()
+    try:
+        variants = parse_variants(["fuzzy-sart,kmeans,fuzzy-sart:faithful"])
+        summary = compare(dataclasses.replace(request(suburb, tmp_path / "out"), variants=variants))
+    finally:
+        load_once.cache_clear()  # nothing was loaded
+    assert loaded == ["fuzzy-sart", "kmeans"]
+    assert {seconds for each in summary.seconds.values() for seconds in each.values()} == {0.0}
+
+
+def test_a_run_by_one_method_loads_nothing_ahead(suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[str] = []
+    monkeypatch.setattr(modelling, "load_once", loaded.append)
+    run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "out"), workers=0))
+    assert loaded == []
 
 
 def test_variants_that_would_find_other_candidates_are_refused(suburb: Path, tmp_path: Path) -> None:
