@@ -47,6 +47,7 @@ const KINDS: Record<string, SurfaceKind> = { RoofSurface: "roof", GroundSurface:
  */
 export class SequenceReader {
   metadata: Metadata | null = null;
+  private readonly several = new Set<string>();
 
   /** @param lod The level of detail that is read: of each building the finest that is no finer; null for its finest. */
   constructor(private readonly lod: string | null = null) {}
@@ -59,7 +60,17 @@ export class SequenceReader {
     }
     if (value.type !== "CityJSONFeature") throw new Error(`a line of type ${String(value.type)} in the CityJSONSeq`);
     if (this.metadata === null) throw new Error("the CityJSONSeq does not begin with its metadata");
-    return featureOf(value, this.metadata.transform, this.lod);
+    const building = featureOf(value, this.metadata.transform, this.lod);
+    if (building.levels.length > 1) for (const level of building.levels) this.several.add(level);
+    return building;
+  }
+
+  /**
+   * The levels of detail that can be chosen from, coarse to fine: those of buildings that have several. A block in the
+   * place of a model that could not be made is no level that the job was asked for.
+   */
+  get levels(): string[] {
+    return inOrder(this.several);
   }
 }
 

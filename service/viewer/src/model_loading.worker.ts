@@ -3,7 +3,6 @@
 import { Batcher } from "./batching";
 import { SequenceReader, type Building } from "./cityjson";
 import { jsonLines } from "./json_lines";
-import { inOrder } from "./levels_of_detail";
 import type { FromLoading, Reading, ToLoading } from "./model_loading";
 
 const FIRST_BATCH = 200; // buildings; each batch is twice as large: something to see at once, few batches in the end
@@ -34,7 +33,6 @@ async function* arriving(): AsyncGenerator<Uint8Array> {
 
 async function read({ horizontalUnitM, verticalUnitM, lod }: Reading): Promise<void> {
   const reader = new SequenceReader(lod);
-  const levels = new Set<string>();
   const early: Building[] = []; // those without a vertex, before the origin is known
   let batcher: Batcher | null = null;
   let listed: ReturnType<Batcher["add"]>[] = [];
@@ -47,8 +45,6 @@ async function read({ horizontalUnitM, verticalUnitM, lod }: Reading): Promise<v
   for await (const line of jsonLines(arriving())) {
     const building = reader.read(line);
     if (building === null) continue;
-    // a block in the place of a model that could not be made is no level that the job was asked for
-    if (building.levels.length > 1) for (const level of building.levels) levels.add(level);
     if (batcher === null && building.vertices.length === 0) {
       early.push(building);
       continue;
@@ -67,7 +63,7 @@ async function read({ horizontalUnitM, verticalUnitM, lod }: Reading): Promise<v
   batcher ??= new Batcher({ origin: [0, 0, 0], horizontalUnitM, verticalUnitM });
   for (const building of early) listed.push(batcher.add(building));
   give();
-  tell({ kind: "finished", levels: inOrder(levels) });
+  tell({ kind: "finished", levels: reader.levels });
 }
 
 /** Whole units in the middle of all models, or at the first one's corner. */

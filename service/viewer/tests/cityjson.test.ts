@@ -46,6 +46,13 @@ test("a level that is asked for is drawn, or the next coarser one that there is,
   expect(rings("1.2", GABLE)).toEqual([]);
 });
 
+test("levels to choose from are those of buildings that have several, not a block among roofs", () => {
+  expect(read(METADATA, TWO_LEVELS, GABLE).reader.levels).toEqual(["1.2", "2.2"]);
+  const part = GABLE.CityObjects["house-0"];
+  const fallback = { ...GABLE, CityObjects: { ...GABLE.CityObjects, "house-0": { ...part, geometry: [{ ...part.geometry[0], lod: "1.2" }] } } };
+  expect(read(METADATA, fallback, GABLE).reader.levels).toEqual([]);
+});
+
 test("of a building of several parts all are drawn at one level", () => {
   const part = { ...TWO_LEVELS.CityObjects["house-0"], geometry: TWO_LEVELS.CityObjects["house-0"].geometry.slice(0, 1) };
   const blockBeside = { ...TWO_LEVELS, CityObjects: { ...TWO_LEVELS.CityObjects, "house-1": part } };
