@@ -67,6 +67,8 @@ class AsciiFile:
     columns : str, optional
         Names of the columns, parted by spaces, such as `x y z - classification` or `x1 y1 z1 i1 x2 y2 z2 i2`;
         None to find out.
+    facts : FileFacts, optional
+        Those of the same file, opened before: then it is not read through again.
 
     Raises
     ------
@@ -78,7 +80,7 @@ class AsciiFile:
         If the columns do not fit the rows.
     """
 
-    def __init__(self, path: Path, columns: str | None = None) -> None:
+    def __init__(self, path: Path, columns: str | None = None, facts: FileFacts | None = None) -> None:
         self._path = path
         self._width = 0
         self._separator: str | None = None
@@ -86,7 +88,7 @@ class AsciiFile:
         self._header_lines, names, sample = self._look(path)
         self._columns = self._choose(columns, names, sample)
         self._is_pairs = "x2" in self._columns
-        self._facts = self._measure(sample)
+        self._facts = self._measure(sample) if facts is None else facts
 
     @property
     def facts(self) -> FileFacts:

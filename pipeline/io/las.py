@@ -51,6 +51,8 @@ class LasFile:
     ----------
     path : Path
         The file.
+    facts : FileFacts, optional
+        Those of the same file, opened before: then neither the points of its last chunk nor a sample is decoded again.
 
     Raises
     ------
@@ -58,7 +60,7 @@ class LasFile:
         If the header, the table of compressed chunks and the file's size do not fit one another.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, facts: FileFacts | None = None) -> None:
         self._path = path
         self._warnings: list[str] = []
         self._block = read_header_block(path)
@@ -70,11 +72,12 @@ class LasFile:
             if self._block.compressed:
                 self._laszip_record = self._read_laszip_record()
                 self._chunks = read_chunk_table(path, stream, self._block, self._laszip_record)
-                check_chunks(path, stream, self._block, self._laszip_record, self._chunks)
+                if facts is None:
+                    check_chunks(path, stream, self._block, self._laszip_record, self._chunks)
                 self._copc = copc.octree_info(self._header)
             else:
                 self._check_room()
-        self._facts = self._read_facts()
+        self._facts = self._read_facts() if facts is None else facts
 
     @property
     def facts(self) -> FileFacts:

@@ -80,12 +80,14 @@ class Element:
 
 
 class PlyFile:
-    """A PLY file. Opening it reads the vertices through once, for their bounds.
+    """A PLY file. Opening it for the first time reads the vertices through, for their bounds.
 
     Parameters
     ----------
     path : Path
         The file.
+    facts : FileFacts, optional
+        Those of the same file, opened before: then it is not read through again.
 
     Raises
     ------
@@ -93,7 +95,7 @@ class PlyFile:
         If header and data do not fit one another, there are no vertices, or a coordinate is not finite.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, facts: FileFacts | None = None) -> None:
         self._path = path
         with path.open("rb") as stream:
             self._byte_order, self._elements = _read_header(path, stream)
@@ -102,7 +104,7 @@ class PlyFile:
         self._fields = self._find_fields()
         if self._byte_order:
             self._start = self._check_room()
-        self._facts = self._measure()
+        self._facts = self._measure() if facts is None else facts
 
     @property
     def facts(self) -> FileFacts:

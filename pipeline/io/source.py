@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import shapely
@@ -123,27 +123,43 @@ class SourceInfo:
     """What is odd but usable, one sentence each."""
     file_size: int
     """Bytes."""
+    modified_ns: int
+    """When the file was last written, nanoseconds since 1970."""
+    facts: FileFacts
+    """What the file says about itself."""
+
+    def is_of(self, path: Path) -> bool:
+        """Whether a file is still the one that was looked at, by its size and its time."""
+        now = path.stat()
+        return (now.st_size, now.st_mtime_ns) == (self.file_size, self.modified_ns)
 
 
-def _open_las(path: Path, _options: ReadOptions) -> PointFile:
+class Reader(Protocol):
+    """Opens a file of one format; faster with the facts of the same file, opened before."""
+
+    def __call__(self, path: Path, options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
+        """The opened file."""
+
+
+def _open_las(path: Path, _options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
     from pipeline.io.las import LasFile
 
-    return LasFile(path)
+    return LasFile(path, facts)
 
 
-def _open_ply(path: Path, _options: ReadOptions) -> PointFile:
+def _open_ply(path: Path, _options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
     from pipeline.io.ply import PlyFile
 
-    return PlyFile(path)
+    return PlyFile(path, facts)
 
 
-def _open_ascii(path: Path, options: ReadOptions) -> PointFile:
+def _open_ascii(path: Path, options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
     from pipeline.io.ascii import AsciiFile
 
-    return AsciiFile(path, options.ascii_columns)
+    return AsciiFile(path, options.ascii_columns, facts)
 
 
-READERS: dict[str, Callable[[Path, ReadOptions], PointFile]] = {
+READERS: dict[str, Reader] = {
     "las": _open_las,
     "ply": _open_ply,
     "ascii": _open_ascii,
@@ -160,13 +176,17 @@ class Source:
         The file.
     options : ReadOptions
         What the user says and wants.
+    known : SourceInfo, optional
+        Of the same file by the same options, opened before; not believed where the file was changed since.
     """
 
-    def __init__(self, path: Path, options: ReadOptions) -> None:
+    def __init__(self, path: Path, options: ReadOptions, known: SourceInfo | None = None) -> None:
         self._path = path
         self._options = options
-        self._file = READERS[recognise_format(path)](path, options)
-        self._info = _info_of(path, self._file, options)
+        if known is not None and not known.is_of(path):
+            known = None
+        self._file = READERS[recognise_format(path)](path, options, None if known is None else known.facts)
+        self._info = _info_of(path, self._file, options) if known is None else known
         self._dropped = dict.fromkeys(("withheld", "noise_class", "outside"), 0)
         self._warnings: list[str] = []
 
@@ -297,7 +317,7 @@ class Source:
         return 0 if beyond is None else int(beyond.sum())
 
 
-def open_source(path: str | Path, options: ReadOptions | None = None) -> Source:
+def open_source(path: str | Path, options: ReadOptions | None = None, known: SourceInfo | None = None) -> Source:
     """Open a LAS, LAZ, COPC, PLY or ASCII file, and check all that can be checked without reading it through.
 
     Parameters
@@ -306,6 +326,8 @@ def open_source(path: str | Path, options: ReadOptions | None = None) -> Source:
         The file.
     options : ReadOptions, optional
         Overrides and limits.
+    known : SourceInfo, optional
+        What was found when the file was opened before, by the same options: what takes time is not done again.
 
     Raises
     ------
@@ -318,7 +340,7 @@ def open_source(path: str | Path, options: ReadOptions | None = None) -> Source:
     CrsError
         The CRS is geographic or not understood.
     """
-    return Source(Path(path), options or ReadOptions())
+    return Source(Path(path), options or ReadOptions(), known)
 
 
 def _info_of(path: Path, file: PointFile, options: ReadOptions) -> SourceInfo:
@@ -337,7 +359,7 @@ def _info_of(path: Path, file: PointFile, options: ReadOptions) -> SourceInfo:
     x_min, y_min, z_min, x_max, y_max, z_max = facts.bounds
     bounds_m = (x_min * plan, y_min * plan, z_min * up, x_max * plan, y_max * plan, z_max * up)
     area_m2 = (bounds_m[3] - bounds_m[0]) * (bounds_m[4] - bounds_m[1])
-    acquired = None
+    acquired, now = None, path.stat()
     if facts.gps_time_kind is GpsTimeKind.ADJUSTED and facts.gps_time_range is not None:
         acquired = utc_of(facts.gps_time_range[0]), utc_of(facts.gps_time_range[1])
     return SourceInfo(
@@ -355,7 +377,9 @@ def _info_of(path: Path, file: PointFile, options: ReadOptions) -> SourceInfo:
         acquired_to=acquired[1] if acquired else None,
         created=facts.created,
         warnings=facts.warnings + told,
-        file_size=path.stat().st_size,
+        file_size=now.st_size,
+        modified_ns=now.st_mtime_ns,
+        facts=facts,
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import InconsistentInputError
-from pipeline.io import ReadOptions, open_source
+from pipeline.io import ReadOptions, SourceInfo, open_source
 from pipeline.io.storage import sha256_of
 from pipeline.model import IntArray, PointCloud
 from pipeline.runtime.scratch import POINT, Scratch
@@ -41,6 +41,8 @@ class IngestTask:
     """The lattice."""
     scratch: Scratch
     """Where the buckets go."""
+    known: SourceInfo | None = None
+    """What the plan found in the file."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +111,7 @@ def ingest(task: IngestTask) -> Ingested:
         The run was called off.
     """
     task.scratch.check_cancelled()
-    source = open_source(task.path, task.options)
+    source = open_source(task.path, task.options, task.known)
     suffix = f".{uuid4().hex}.part"
     counts: Counter[Tile] = Counter()
     classes: Counter[int] = Counter()

@@ -237,8 +237,16 @@ class Stages:
 
     def ingest(self, paths: Sequence[str]) -> list[Ingested]:
         """Bucket all points by tile, and look at what they are."""
+        known = {info.path: info for info in self.plan.sources}
         tasks = [
-            IngestTask(index=k, path=path, options=self.plan.options, grid=self.plan.grid, scratch=self.scratch)
+            IngestTask(
+                index=k,
+                path=path,
+                options=self.plan.options,
+                grid=self.plan.grid,
+                scratch=self.scratch,
+                known=known.get(path),
+            )
             for k, path in enumerate(paths)
         ]
         ingested = sorted(self.progress.stage(self.executor, "ingest", ingest, tasks), key=lambda found: found.index)

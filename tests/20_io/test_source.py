@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import pickle
+
 import numpy as np
 import pytest
 import shapely
 from shapely import MultiPolygon, Polygon, box
 
-from pipeline.errors import SettingsError
+from pipeline.errors import InputError, SettingsError
 from pipeline.io import ReadOptions, open_source
+from pipeline.io.ascii import AsciiFile
+from pipeline.io.las import LasFile
+from pipeline.io.ply import PlyFile
 
 
 def test_a_bbox_keeps_points_on_its_edge_and_counts_the_others(tmp_path, write_las):
@@ -80,3 +86,58 @@ def test_what_is_dropped_and_kept_adds_up_to_the_file(tmp_path, points, write_la
     kept = sum(map(len, source.chunks(250)))
     assert kept + sum(source.dropped.values()) == source.info.point_count
     assert min(kept, *source.dropped.values()) > 0
+
+
+def text_of(path, xyz):
+    np.savetxt(path, xyz, fmt="%.2f")
+    return path
+
+
+def ply_of(path, xyz):
+    names = "".join(f"property double {axis}\n" for axis in "xyz")
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(xyz)}\n{names}end_header\n"
+    path.write_bytes(header.encode() + xyz.astype("<f8").tobytes())
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.xyz", "a.ply"])
+def test_a_file_opened_before_is_not_looked_through_again(tmp_path, points, write_las, monkeypatch, name):
+    writers = {"laz": write_las, "las": write_las, "xyz": text_of, "ply": ply_of}
+    path = writers[name[2:]](tmp_path / name, points(3_000))
+    options = ReadOptions(crs="EPSG:7415")
+    first = open_source(path, options)
+    # as a task of another process gets it
+    known = pickle.loads(pickle.dumps(first.info))
+    assert known == first.info
+    with monkeypatch.context() as patched:
+        for forbidden in (LasFile, PlyFile, AsciiFile):
+            patched.setattr(forbidden, "_sample" if forbidden is LasFile else "_measure", None)
+        patched.setattr("pipeline.io.las.check_chunks", None)
+        again = open_source(path, options, known)
+    assert again.info == first.info
+    assert again.crs_given == first.crs_given
+    for one, other in zip(first.chunks(700), again.chunks(700), strict=True):
+        np.testing.assert_array_equal(one.xyz, other.xyz)
+        np.testing.assert_array_equal(one.classification, other.classification)
+    assert (again.dropped, again.warnings) == (first.dropped, first.warnings)
+
+
+def test_a_file_that_was_changed_since_is_opened_anew(tmp_path, points, write_las):
+    path = write_las(tmp_path / "a.laz", points(3_000))
+    known = open_source(path).info
+    write_las(path, points(4_000))
+    assert open_source(path, None, known).info.point_count == 4_000
+    cut = path.read_bytes()
+    known = open_source(path).info
+    path.write_bytes(cut[:-1_000])
+    with pytest.raises(InputError):
+        open_source(path, None, known)
+
+
+def test_a_file_of_one_size_that_was_written_again_is_opened_anew(tmp_path, points, write_las):
+    path = write_las(tmp_path / "a.las", points(3_000))
+    known = open_source(path).info
+    write_las(path, points(3_000) + 7.0)
+    os.utime(path, ns=(known.modified_ns + 1, known.modified_ns + 1))
+    assert path.stat().st_size == known.file_size
+    assert open_source(path, None, known).info.bounds_m[0] == pytest.approx(known.bounds_m[0] + 7.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 from pipeline.errors import InconsistentInputError
 from pipeline.io import ReadOptions
+from pipeline.io.las import LasFile
+from pipeline.io.records import PointRecords
 from pipeline.model import PointCloud
 from pipeline.runtime.ingest import IngestTask, ingest, spread_m, to_records
 from pipeline.runtime.scratch import POINT, Scratch
@@ -95,3 +98,16 @@ def test_many_tiles_in_a_chunk_are_sorted_apart_as_few_are(
     assert many == few
     for key, bucket in stored(tmp_path / "few").items():
         assert (stored(tmp_path / "many")[key] == bucket).all()
+
+
+def test_a_run_samples_each_file_once(suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    sampled = []
+    whole = LasFile._sample
+
+    def counted(file: LasFile) -> PointRecords:
+        sampled.append(file)
+        return whole(file)
+
+    monkeypatch.setattr(LasFile, "_sample", counted)
+    reconstruct(suburb)
+    assert len(sampled) == 1

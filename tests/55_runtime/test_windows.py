@@ -16,6 +16,7 @@ from pipeline.errors import InputError
 from pipeline.io import ReadOptions
 from pipeline.runtime import stages
 from pipeline.runtime.plan import Plan, check_windows, make_plan, split_grid
+from pipeline.runtime.split import Split, SplitTask, split
 from pipeline.scene import ClassesInUse, SceneSettings
 from pipeline.settings import RunSettings
 from pipeline.terrain.ground import GroundSettings
@@ -62,11 +63,10 @@ def grids(monkeypatch: pytest.MonkeyPatch) -> list[TileGrid]:
     """Gets the lattices by which the runs of a test split their tiles."""
     seen: list[TileGrid] = []
 
-    def watched(task: Any) -> Any:
+    def watched(task: SplitTask) -> Split:
         seen.append(task.grid)
         return split(task)
 
-    split = stages.split
     monkeypatch.setattr(stages, "split", watched)
     return seen
 
