@@ -42,7 +42,7 @@ def _first_of_each(
     while size < 2 * n:
         size *= 2
     mask = size - 1
-    holder = np.full(size, -1, np.int64)
+    holder = np.full(size, -1, np.int32)
     for i in range(n):
         mixed = (np.uint64(x_mm[i]) * _PRIMES[0]) ^ (np.uint64(y_mm[i]) * _PRIMES[1])
         mixed ^= (np.uint64(z_mm[i]) * _PRIMES[2]) ^ (np.uint64(gps_bits[i]) * _PRIMES[3]) ^ np.uint64(return_number[i])

@@ -275,15 +275,17 @@ def _inside_footprints(
     """
     index = np.flatnonzero(usable)
     owner = np.full(len(index), -1, np.int64)
-    x, y = points.x_mm[index], points.y_mm[index]
-    above = ~ground_points(x, y, points.z_mm[index], terrain, task.settings.ground)
     if task.classes.building:
         above = points.classification[index] == BUILDING_CLASS
-    elif task.classes.ground:
-        above &= points.classification[index] != GROUND_CLASS
+    else:
+        above = ~ground_points(
+            points.x_mm[index], points.y_mm[index], points.z_mm[index], terrain, task.settings.ground
+        )
+        if task.classes.ground:
+            above &= points.classification[index] != GROUND_CLASS
     from_west = np.flatnonzero(above)
-    from_west = from_west[np.argsort(x[from_west])]
-    x, y = x[from_west], y[from_west]
+    from_west = from_west[np.argsort(points.x_mm[index[from_west]])]
+    x, y = points.x_mm[index[from_west]], points.y_mm[index[from_west]]
     # the smaller number wins where footprints overlap, whatever the tile
     for number, polygon in sorted(task.footprints or (), key=lambda item: item[0], reverse=True):
         x0, y0, x1, y1 = (round(v * MM) for v in polygon.bounds)

@@ -11,6 +11,7 @@ from scipy.ndimage import convolve
 
 from pipeline.errors import SettingsError
 from pipeline.model import BoolArray
+from pipeline.terrain import outliers as outliers_module
 from pipeline.terrain.outliers import OutlierSettings, dense_enough
 
 Points = npt.NDArray[np.int64]
@@ -134,3 +135,33 @@ def test_a_single_point_is_an_outlier_unless_no_neighbour_is_asked_for() -> None
 def test_cubes_out_of_range_are_refused() -> None:
     with pytest.raises(SettingsError, match=r"cube_m is 0\.5"):
         OutlierSettings(cube_m=0.5)
+
+
+@pytest.mark.parametrize("cube_m", [1.0, 3.3, 50.0])
+@pytest.mark.parametrize("corner_mm", [(0, 0, 0), (84_000_000, 447_000_000, -3_000), (-7_000_000_001, 13, 1)])
+def test_borders_of_cubes_are_the_same_in_an_array_and_in_a_table(
+    cube_m: float, corner_mm: tuple[int, int, int]
+) -> None:
+    cube_mm = round(cube_m * 1000)
+    random = np.random.default_rng(6)
+    # at the borders, and just beside them
+    cloud = random.integers(0, 9, (3000, 3)) * cube_mm + random.integers(-1, 2, (3000, 3))
+    cloud += np.array(corner_mm) // cube_mm * cube_mm
+    x, y, z = (np.ascontiguousarray(cloud[:, k]) for k in range(3))
+    cubes = cloud // cube_mm
+    low, high = cubes.min(axis=0) - 1, cubes.max(axis=0) + 1
+    shape = tuple((high - low + 1).tolist())
+    for few in (3, 60, 90):
+        array = outliers_module._by_grid(x, y, z, cube_mm, few, tuple(low.tolist()), shape)
+        table = outliers_module._by_table(x, y, z, cube_mm, few, tuple(low.tolist()))
+        np.testing.assert_array_equal(array, table)
+        np.testing.assert_array_equal(dense_enough(x, y, z, OutlierSettings(cube_m=cube_m, min_neighbours=few)), table)
+    assert not table.all()
+    assert table.any()
+
+
+def test_a_stray_far_off_costs_no_memory() -> None:
+    cloud = np.concatenate((town(np.random.default_rng(8)), [[10**9, 10**9, 2 * 10**9]]))
+    kept = kept_of(cloud)
+    assert kept[:-1].all()
+    assert not kept[-1]
