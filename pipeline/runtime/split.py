@@ -103,25 +103,27 @@ Columns: TypeAlias = tuple[
 ]
 """x, y, z in mm, return number, GPS time, source, class, return count: as `first_of_each` takes them."""
 
+_OF_POINTS = (0, 1, 2, 3, 6, 7)
+"""Those that are held of the points of a window; the others only tell duplicates."""
+
 
 @njit(cache=True, nogil=True)
 def _columns_inside(records: npt.NDArray[np.void], x0: int, y0: int, x1: int, y1: int) -> Columns:
     """Kernel: the columns of the records with x0 <= x < x1 and y0 <= y < y1, in their order."""
+    size = records.size
+    # room for all of them, of which only what is written takes memory: records are wide, and looked at once
+    x, y, z = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
+    return_number, return_count = np.empty(size, np.uint8), np.empty(size, np.uint8)
+    classification, source, gps_time = np.empty(size, np.uint8), np.empty(size, np.uint16), np.empty(size, np.float64)
     n = 0
-    for i in range(records.size):
-        n += x0 <= records[i].x < x1 and y0 <= records[i].y < y1
-    x, y, z = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    return_number, return_count = np.empty(n, np.uint8), np.empty(n, np.uint8)
-    classification, source, gps_time = np.empty(n, np.uint8), np.empty(n, np.uint16), np.empty(n, np.float64)
-    k = 0
-    for i in range(records.size):
+    for i in range(size):
         point = records[i]
         if x0 <= point.x < x1 and y0 <= point.y < y1:
-            x[k], y[k], z[k] = point.x, point.y, point.z
-            return_number[k], return_count[k] = point.return_number, point.return_count
-            classification[k], source[k], gps_time[k] = point.classification, point.source, point.gps_time
-            k += 1
-    return x, y, z, return_number, gps_time, source, classification, return_count
+            x[n], y[n], z[n] = point.x, point.y, point.z
+            return_number[n], return_count[n] = point.return_number, point.return_count
+            classification[n], source[n], gps_time[n] = point.classification, point.source, point.gps_time
+            n += 1
+    return x[:n], y[:n], z[:n], return_number[:n], gps_time[:n], source[:n], classification[:n], return_count[:n]
 
 
 def _columns_of(parts: Sequence[npt.NDArray[np.void]], window: Window) -> tuple[Columns, BoolArray]:
@@ -149,8 +151,9 @@ def load_window(scratch: Scratch, grid: TileGrid, tile: Tile) -> LoadedWindow:
     del own, records
     around = [bucket_paths(scratch, other) for other in grid.tiles_over(window) if other != tile]
     halo = [_columns_of([np.fromfile(path, POINT) for path in paths], window)[0] for paths in around if paths]
-    x, y, z, return_number, _, _, classification, return_count = (
-        column[0] if len(column) == 1 else np.concatenate(column) for column in zip(columns, *halo, strict=True)
+    everything = list(zip(columns, *halo, strict=True))
+    x, y, z, return_number, classification, return_count = (
+        everything[k][0] if len(everything[k]) == 1 else np.concatenate(everything[k]) for k in _OF_POINTS
     )
     points = WindowPoints(
         x_mm=x, y_mm=y, z_mm=z, return_number=return_number, return_count=return_count, classification=classification
