@@ -325,68 +325,102 @@ def _sort_into_grid(
 
 
 @njit(cache=True, nogil=True)
-def _nearest_neighbours(points: FloatArray, k: int, wanted_cell_size_m: float) -> tuple[LabelArray, FloatArray]:
-    """The kernel of `nearest_neighbours`; returns the squared distances too, infinite where there is no neighbour."""
+def _cell_for_few(points: FloatArray) -> float:
+    """Size of cells that hold about two points each, metres."""
+    n = max(len(points), 1)
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(len(points)):
+        low_x, low_y = min(low_x, points[i, 0]), min(low_y, points[i, 1])
+        high_x, high_y = max(high_x, points[i, 0]), max(high_y, points[i, 1])
+    width, depth = max(high_x - low_x, 0.0), max(high_y - low_y, 0.0)
+    return max(math.sqrt(2.0 * width * depth / n), max(width, depth) / n, 1e-3)
+
+
+@njit(cache=True, nogil=True)
+def _nearest_neighbours(
+    points: FloatArray, k: int, wanted_cell_size_m: float, named: bool
+) -> tuple[LabelArray, FloatArray]:
+    """The kernel of `nearest_neighbours`; returns the squared distances too, infinite where there is no neighbour.
+
+    A cell size of 0 leaves it the choice; where neighbours need not be named they are all -1.
+    """
     n, dimensions = points.shape
     neighbours = np.full((n, k), -1, np.int32)
     squares = np.full((n, k), np.inf)
     if n == 0 or k == 0:
         return neighbours, squares
-    x_min, y_min, size, columns, rows = _grid_shape(points, wanted_cell_size_m)
+    size = wanted_cell_size_m if wanted_cell_size_m > 0.0 else _cell_for_few(points)
+    x_min, y_min, size, columns, rows = _grid_shape(points, size)
     start, members = _sort_into_grid(points, x_min, y_min, size, columns, rows)
     sorted_x, sorted_y, sorted_z = points[members, 0], points[members, 1], np.zeros(n)
     if dimensions == 3:
         sorted_z = points[members, 2]
-    nearest = np.empty(k, np.int32)
-    distance = np.empty(k)
+    least = np.empty(k)
+    held = np.empty(n)
+    holder = np.empty(n, np.int32)
     for s in range(n):
-        i = members[s]
         px, py, pz = sorted_x[s], sorted_y[s], sorted_z[s]
         column = int((px - x_min) / size)
         row = int((py - y_min) / size)
         inset_x = min(px - x_min - column * size, x_min + (column + 1) * size - px)
         inset_y = min(py - y_min - row * size, y_min + (row + 1) * size - py)
         inset = min(inset_x, inset_y)
-        distance[:] = np.inf
-        found = 0
+        # first the k least squares alone, without branches: where a square ranks cannot be foretold
+        least[:] = np.inf
+        count = 0
         # the cell and those around it at once, then ring by ring: cells side by side hold a run of the sorted points
         ring = 1
         while True:
-            for r in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
-                whole = ring == 1 or r in (row - ring, row + ring)
+            for step in range(2 * ring + 1):
+                r = row + ((step + 1) // 2 if step % 2 == 1 else -(step // 2))
+                if r < 0 or r >= rows:
+                    continue
+                whole = ring == 1 or step >= 2 * ring - 1
                 for side in range(1 if whole else 2):
                     low = max(column - ring, 0) if whole or side == 0 else column + ring
                     high = min(column + ring, columns - 1) if whole or side == 1 else column - ring
-                    if low > high or low >= columns or high < 0:
+                    if low > high:
                         continue
                     for q in range(start[r * columns + low], start[r * columns + high + 1]):
                         dx, dy, dz = sorted_x[q] - px, sorted_y[q] - py, sorted_z[q] - pz
                         square = dx * dx + dy * dy + dz * dz
-                        if square > distance[k - 1] or q == s:
+                        if square > least[k - 1] or q == s:
                             continue
-                        j = members[q]
-                        if found < k:
-                            found += 1
-                        elif square == distance[k - 1] and j > nearest[k - 1]:
-                            continue
-                        m = found - 1
-                        while m > 0 and (
-                            distance[m - 1] > square or (distance[m - 1] == square and nearest[m - 1] > j)
-                        ):
-                            distance[m] = distance[m - 1]
-                            nearest[m] = nearest[m - 1]
-                            m -= 1
-                        distance[m] = square
-                        nearest[m] = j
+                        held[count] = square
+                        holder[count] = members[q]
+                        count += 1
+                        for m in range(k):
+                            other = least[m]
+                            before = square < other
+                            least[m] = square if before else other
+                            square = other if before else square
             # whatever is not yet seen lies beyond the rings' outer border; a hair less allows for rounding
             reach = (inset + ring * size) * (1.0 - 1e-9) - 1e-9
-            if found == k and reach > 0.0 and distance[k - 1] < reach * reach:
+            if reach > 0.0 and least[k - 1] < reach * reach:
                 break
             ring += 1
             if ring > max(columns, rows):
                 break
-        neighbours[i, :found] = nearest[:found]
-        squares[i, :found] = distance[:found]
+        squares[members[s]] = least
+        if not named:
+            continue
+        # then who has them
+        ranked = 0
+        for c in range(count):
+            held[ranked], holder[ranked] = held[c], holder[c]
+            ranked += held[c] <= least[k - 1]
+        nearest = neighbours[members[s]]
+        for c in range(ranked):
+            square, j = held[c], holder[c]
+            m = min(c, k)
+            while m > 0 and (held[m - 1] > square or (held[m - 1] == square and nearest[m - 1] > j)):
+                if m < k:
+                    held[m] = held[m - 1]
+                    nearest[m] = nearest[m - 1]
+                m -= 1
+            if m < k:
+                held[m] = square
+                nearest[m] = j
     return neighbours, squares
 
 
@@ -420,22 +454,21 @@ def nearest_neighbours(points: FloatArray, k: int, cell_size_m: float | None = N
            [0, 2],
            [1, 0]], dtype=int32)
     """
-    return _nearest_neighbours(*_checked_search(points, k, cell_size_m))[0]
+    return _nearest_neighbours(*_checked_search(points, k, cell_size_m), True)[0]
 
 
 def _checked_search(points: FloatArray, k: int, cell_size_m: float | None) -> tuple[FloatArray, int, float]:
-    """The arguments of a neighbour search, validated and completed."""
+    """The arguments of a neighbour search, validated; a cell size of 0 where none is given."""
     if points.ndim != 2 or points.shape[1] not in {2, 3}:
         raise ValueError(f"points has shape {points.shape}, not (n, 2) or (n, 3)")
     if k < 0:
         raise ValueError(f"k is {k}: use 0 or more")
+    points = np.ascontiguousarray(points, dtype=np.float64)
     if cell_size_m is None:
-        width, depth = (float(np.ptp(points[:, axis])) if len(points) else 0.0 for axis in range(2))
-        longest = max(width, depth)
-        cell_size_m = max(math.sqrt(2.0 * width * depth / max(len(points), 1)), longest / max(len(points), 1), 1e-3)
-    if not cell_size_m > 0.0:
+        cell_size_m = 0.0
+    elif not cell_size_m > 0.0:
         raise ValueError(f"cell_size_m is {cell_size_m}: use a positive size")
-    return np.ascontiguousarray(points, dtype=np.float64), k, cell_size_m
+    return points, k, cell_size_m
 
 
 _SPACING_NEIGHBOURS = 8
@@ -460,8 +493,7 @@ def point_spacing_m(points: FloatArray) -> float:
     float
         Metres; nan for fewer than two points.
     """
-    k = min(_SPACING_NEIGHBOURS, len(points) - 1)
-    return math.nan if k < 1 else _spacing_of_points(np.sort(_squared_reach(points, k)), k)
+    return _spacings(_plan(points))[0]
 
 
 def spacing_over_area_m(points: FloatArray) -> float:
@@ -482,30 +514,29 @@ def spacing_over_area_m(points: FloatArray) -> float:
     float
         Metres; nan for fewer than two points.
     """
-    k = min(_SPACING_NEIGHBOURS, len(points) - 1)
-    if k < 1:
-        return math.nan
-    squares = np.sort(_squared_reach(points, k))
-    usual = _spacing_of_points(squares, k)
-    covered = np.cumsum(squares)
-    middle = float(squares[min(int(np.searchsorted(covered, 0.5 * covered[-1])), len(squares) - 1)])
-    # weighted with itself a Gamma(k) variate is Gamma(k + 1) distributed
-    over_area = math.sqrt(middle * math.pi / (k + 2.0 / 3.0))
+    usual, over_area = _spacings(_plan(points))
     return over_area if over_area > _UNEVEN * usual else usual
 
 
-def _squared_reach(points: FloatArray, k: int) -> FloatArray:
-    """Squared distance in plan of every point to its k-th neighbour, (n,) m2."""
-    squares: FloatArray = _nearest_neighbours(*_checked_search(points[:, :2], k, None))[1][:, k - 1]
-    return squares
+def _plan(points: FloatArray) -> FloatArray:
+    """Positions in plan, (n, 2), without gaps in memory."""
+    return np.ascontiguousarray(points[:, :2], dtype=np.float64)
 
 
-def _spacing_of_points(squares: FloatArray, k: int) -> float:
-    """1 / sqrt(density) from the sorted squared distances to the k-th neighbour, over the points."""
-    n = len(squares)
-    median = 0.5 * (float(squares[(n - 1) // 2]) + float(squares[n // 2]))
-    # pi density r_k^2 is Gamma(k) distributed; its median is k - 1/3 within 2 % for k >= 1
-    return math.sqrt(median * math.pi / (k - 1.0 / 3.0))
+@njit(cache=True, nogil=True)
+def _spacings(points: FloatArray) -> tuple[float, float]:
+    """1 / sqrt(density) in plan, by medians over the points and over their area; nan for fewer than two points."""
+    n = len(points)
+    k = min(_SPACING_NEIGHBOURS, n - 1)
+    if k < 1:
+        return np.nan, np.nan
+    squares = np.sort(_nearest_neighbours(points, k, 0.0, False)[1][:, k - 1])
+    median = 0.5 * (squares[(n - 1) // 2] + squares[n // 2])
+    covered = np.cumsum(squares)
+    middle = squares[min(np.searchsorted(covered, 0.5 * covered[-1]), n - 1)]
+    # pi density r_k^2 is Gamma(k) distributed; its median is k - 1/3 within 2 % for k >= 1; weighted with itself a
+    # Gamma(k) variate is Gamma(k + 1) distributed
+    return math.sqrt(median * math.pi / (k - 1.0 / 3.0)), math.sqrt(middle * math.pi / (k + 2.0 / 3.0))
 
 
 @njit(cache=True, nogil=True)
@@ -541,7 +572,7 @@ def noise_sigma_m(points: FloatArray) -> float:
     if freedom < 1:
         return math.nan
     xyz, k, cell_size_m = _checked_search(points, freedom + 2, None)
-    neighbours, _ = _nearest_neighbours(np.ascontiguousarray(xyz[:, :2]), k, cell_size_m)
+    neighbours, _ = _nearest_neighbours(np.ascontiguousarray(xyz[:, :2]), k, cell_size_m, True)
     quartile = float(np.percentile(_local_plane_sse(xyz, neighbours), 25.0))
     return math.sqrt(quartile / _LOWER_QUARTILE_CHI2[freedom])
 

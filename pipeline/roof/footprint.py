@@ -39,13 +39,23 @@ def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
         scaled = shapely.make_valid(scaled, method="structure", keep_collapsed=False)
     snapped = shapely.set_precision(scaled, 1.0)
     straight = shapely.simplify(snapped, _STRAIGHT_MM, preserve_topology=True)
-    cleaned = [thinned for polygon in polygons_of(straight) for thinned in without_repeated(polygon, _REPEATED_MM)]
+    cleaned = polygons_of(straight)
+    if cleaned and _has_repeated(cleaned, _REPEATED_MM):
+        cleaned = [thinned for polygon in cleaned for thinned in without_repeated(polygon, _REPEATED_MM)]
     thinned_all = MultiPolygon(cleaned)
     if not thinned_all.is_valid:
         thinned_all = MultiPolygon(polygons_of(snapped))
     if thinned_all.is_empty:
         raise BuildingError(Reason.NO_FOOTPRINT, f"the given footprint has an area of {footprint.area:g} m2")
     return thinned_all
+
+
+def _has_repeated(polygons: list[Polygon], distance_mm: float) -> bool:
+    """Whether a vertex is as near to the one before it."""
+    xy, ring = shapely.get_coordinates(shapely.get_rings(polygons), return_index=True)
+    steps = xy[1:] - xy[:-1]
+    squares = steps[:, 0] * steps[:, 0] + steps[:, 1] * steps[:, 1]
+    return bool((squares[ring[1:] == ring[:-1]] <= distance_mm * distance_mm).any())
 
 
 def without_repeated(polygon: Polygon, distance_mm: float) -> list[Polygon]:

@@ -412,17 +412,18 @@ def level_unsupported_faces(
     # a side of a template can be without points: it is as high as the others
     bare = np.isinf(lowest)
     lowest[bare], highest[bare] = roof.points[:, 2].min(), roof.points[:, 2].max()
-    for k, polygon in enumerate(partition.polygons):
-        label = int(labels[k])
-        plane = planes[label]
-        xy = shapely.get_coordinates(polygon) * 1e-3
-        z = plane.a * xy[:, 0] + plane.b * xy[:, 1] + plane.c
-        bottom, top = float(z.min()), float(z.max())
-        low, high = float(lowest[label]), float(highest[label])
-        if bottom >= max(floor, low - settings.maximum_overshoot_m) and top <= high + settings.maximum_overshoot_m:
-            continue
+    xy, face = shapely.get_coordinates(np.array(partition.polygons, object), return_index=True)
+    a, b, c = np.array([plane.coefficients for plane in planes]).reshape(len(planes), 3)[labels[face]].T
+    z = a * (xy[:, 0] * 1e-3) + b * (xy[:, 1] * 1e-3) + c
+    starts = np.searchsorted(face, np.arange(len(labels)))
+    bottoms, tops = np.minimum.reduceat(z, starts), np.maximum.reduceat(z, starts)
+    tolerance = settings.maximum_overshoot_m
+    fits = (bottoms >= np.maximum(floor, lowest[labels] - tolerance)) & (tops <= highest[labels] + tolerance)
+    for k in np.flatnonzero(~fits).tolist():
+        polygon, label = partition.polygons[k], int(labels[k])
+        middle = 0.5 * (float(bottoms[k]) + float(tops[k]))
         labels[k] = len(extended)
-        extended.append(_level_plane(polygon, label, roof, max(floor, min(0.5 * (bottom + top), high)), floor))
+        extended.append(_level_plane(polygon, label, roof, max(floor, min(middle, float(highest[label]))), floor))
     return RoofPartition(polygons=partition.polygons, labels=labels), extended
 
 

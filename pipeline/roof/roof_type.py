@@ -146,18 +146,20 @@ def folds(planes: Sequence[Plane], solids: Sequence[Solid], sliver_height_m: flo
     ridges: Folds = {}
     bends: Folds = {}
     for solid in solids:
+        vertices: list[tuple[float, float, float]] = solid.vertices.tolist()
         owner = {edge: face.plane for face in solid.faces if face.kind is FaceKind.ROOF for edge in _edges(face)}
         met = [(edge, owner[edge[::-1]]) for edge in owner if edge[::-1] in owner]
         for face in solid.faces:
-            if face.kind is FaceKind.WALL and _height_m(solid, face) <= sliver_height_m:
+            if face.kind is FaceKind.WALL:
                 roof_edges = [edge[::-1] for edge in _edges(face) if edge[::-1] in owner]
-                met += [(edge, owner[other]) for edge in roof_edges for other in roof_edges]
+                if len(roof_edges) > 1 and _height_m(vertices, face) <= sliver_height_m:
+                    met += [(edge, owner[other]) for edge in roof_edges for other in roof_edges]
         for (a, b), right in met:
             left = owner[a, b]
             if right == left:
                 continue
             # a step of one metre to the left of the edge: the left plane lies below the right one's continuation
-            (xa, ya), (xb, yb) = solid.vertices[a, :2].tolist(), solid.vertices[b, :2].tolist()
+            (xa, ya, _), (xb, yb, _) = vertices[a], vertices[b]
             p, q = planes[left], planes[right]
             falls = (p.a - q.a) * (ya - yb) + (p.b - q.b) * (xb - xa) < 0.0
             turned = ridges if falls else bends
@@ -171,13 +173,14 @@ def _edges(face: SolidFace) -> list[tuple[int, int]]:
     return [edge for ring in face.rings for edge in zip(ring, ring[1:] + ring[:1], strict=True)]
 
 
-def _height_m(solid: Solid, face: SolidFace) -> float:
+def _height_m(vertices: Sequence[tuple[float, float, float]], face: SolidFace) -> float:
     """Greatest height of a wall over one place."""
-    heights: dict[tuple[float, float], list[float]] = {}
+    ends: dict[tuple[float, float], tuple[float, float]] = {}
     for vertex in face.rings[0]:
-        x, y, z = solid.vertices[vertex].tolist()
-        heights.setdefault((x, y), []).append(z)
-    return max(max(z) - min(z) for z in heights.values())
+        x, y, z = vertices[vertex]
+        low, high = ends.get((x, y), (z, z))
+        ends[x, y] = min(low, z), max(high, z)
+    return max(high - low for low, high in ends.values())
 
 
 def _opposite(a: _Side, b: _Side, settings: RoofTypeSettings) -> bool:
