@@ -386,8 +386,8 @@ def _noise_about(points: FloatArray, labels: LabelArray, planes: FloatArray) -> 
             known += 1
     if known == 0:
         return np.nan
-    order = np.argsort(distances[:known], kind="mergesort")
-    return float(_MAD_TO_SIGMA * 0.5 * (distances[order[(known - 1) // 2]] + distances[order[known // 2]]))
+    ordered = np.sort(distances[:known])
+    return float(_MAD_TO_SIGMA * 0.5 * (ordered[(known - 1) // 2] + ordered[known // 2]))
 
 
 @njit(cache=True, nogil=True)
@@ -431,7 +431,8 @@ def _detect(
 ) -> tuple[FloatArray, LabelArray, float]:
     """Kernel of `detect_planes`: planes, labels of the points, noise."""
     local, variances = local_planes(nodes, neighbours)
-    sigma_m = noise_of_local_planes(variances)
+    order = np.argsort(variances, kind="mergesort")
+    sigma_m = noise_of_local_planes(variances, order)
     distance_m = min(max(noises * sigma_m, distance_min_m), distance_max_m)
     # of a plane through m points spread evenly over a disc the slope has the error 2 sigma sqrt(pi) / (spacing m)
     slope_error = 2.0 * math.sqrt(math.pi) * sigma_m / (spacing_m * (FITTED_NEIGHBOURS + 1.0))
@@ -444,8 +445,9 @@ def _detect(
         min_normal_cosine = normal_cosine if tells and pass_ == 0 else 0.0
         before = count
         count = take_regions(
-            nodes, neighbours, local, variances, labels, before, reach_m, min_normal_cosine, fewest_points, min_cosine
-        )
+            nodes, neighbours, local, variances, order, labels, before, reach_m, min_normal_cosine, fewest_points,
+            min_cosine,
+        )  # fmt: skip
         if count > before:
             labels = _settled(nodes, neighbours, labels, count, distance_m, sigma_m, fewest_points, min_cosine)
     planes, usable, _ = _fitted(nodes, labels, count, fewest_points, min_cosine)

@@ -72,9 +72,21 @@ def vote_among_neighbours(
             # amid labels that stayed as they were a point chooses as before
             new[i] = old[i]
             asked = changed[i]
+            alike = width > 0 and old[i] >= 0
             for q in range(width):
-                asked = asked or (neighbours[i, q] >= 0 and changed[neighbours[i, q]])
+                j = neighbours[i, q]
+                asked |= j >= 0 and changed[j]
+                alike &= j >= 0 and j != i and old[j] == old[i]
             if not asked:
+                continue
+            if alike and usable[old[i]]:
+                k = old[i]
+                vertical = points[i, 2] - planes[k, 0] * points[i, 0] - planes[k, 1] * points[i, 1] - planes[k, 2]
+                ratio = abs(vertical) * cosines[k] / distance_m
+                if ratio > 1.0 or not ratio * ratio - vote_weight * width < 1.0:
+                    new[i] = -1
+                    changes[n_changes] = i
+                    n_changes += 1
                 continue
             kinds = 0
             for q in range(-1, width):

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numba import njit
 
-from pipeline.model import FloatArray, LabelArray
+from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import (
     N_SUMS,
     add_point,
@@ -80,12 +80,18 @@ def local_planes(points: FloatArray, neighbours: LabelArray) -> tuple[FloatArray
 
 
 @njit(cache=True, nogil=True)
-def noise_of_local_planes(variances: FloatArray) -> float:
+def noise_of_local_planes(variances: FloatArray, order: IntArray) -> float:
     """Standard deviation of the noise, metres, from what `local_planes` tells; 0 where there is no plane.
 
     From the lower quartile: neighbourhoods across edges and in trees are the upper part of the distribution.
+
+    Parameters
+    ----------
+    variances : (n,) float64
+        From `local_planes`.
+    order : (n,) int64
+        The points by ascending variance.
     """
-    order = np.argsort(variances, kind="mergesort")
     known = 0
     for variance in variances:
         known += math.isfinite(variance)
@@ -209,6 +215,7 @@ def take_regions(
     neighbours: LabelArray,
     local: FloatArray,
     variances: FloatArray,
+    order: IntArray,
     labels: LabelArray,
     first_label: int,
     distance_m: float,
@@ -228,7 +235,9 @@ def take_regions(
     neighbours : (n, k) int32
         Nearest neighbours of every point, -1 where there are fewer.
     local, variances : (n, 3) and (n,) float64
-        From `local_planes`. Points of little variance are the first seeds.
+        From `local_planes`.
+    order : (n,) int64
+        The points by ascending variance: those of little variance are the first seeds.
     labels : (n,) int32
         -1 for none; changed.
     first_label : int
@@ -258,7 +267,7 @@ def take_regions(
     anew = np.zeros(n, np.int32)
     trials = [(0.0, -1)]
     mark = 0
-    for seed in np.argsort(variances, kind="mergesort"):
+    for seed in order:
         if variances[seed] > 4.0 * distance_m * distance_m:
             break
         if labels[seed] >= 0 or reached[seed] >= _TRIALS:

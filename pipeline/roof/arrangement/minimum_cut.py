@@ -151,6 +151,7 @@ def _number_those_that_may_change(
     number: LabelArray,
     least: IntArray,
     queue: LabelArray,
+    bound: IntArray,
 ) -> None:
     """Mark in `number`, by 0, the nodes that can take alpha in a minimum cut; all others keep -1.
 
@@ -158,14 +159,14 @@ def _number_those_that_may_change(
     minimum cuts the one is sought in which the fewest nodes change. So do then, perhaps, its neighbours. Nearly every
     node is settled so, without a flow.
 
-    `least` and `queue` are room for as many numbers as there are nodes.
+    `least` and `queue` are room for as many numbers as there are nodes; `bound` is the sum of the weights at each.
     """
     for p in nodes:
-        if labels[p] != alpha:
+        if labels[p] != alpha and costs[p, alpha] - costs[p, labels[p]] < bound[p]:
             number[p] = 0
     tail = 0
     for p in nodes:
-        if labels[p] == alpha:
+        if number[p] < 0:
             continue
         cost = costs[p, alpha] - costs[p, labels[p]]
         for e in range(starts[p], starts[p + 1]):
@@ -180,7 +181,6 @@ def _number_those_that_may_change(
         if cost >= 0:
             queue[tail] = p
             tail += 1
-    head = 0
     for head in range(tail):
         number[queue[head]] = -1
     head = 0
@@ -235,6 +235,10 @@ def expand_labels(
     number = np.full(n, -1, np.int32)
     unary = np.empty(n, np.int64)
     queue = np.empty(n, np.int32)
+    bound = np.zeros(n, np.int64)
+    for i in range(n):
+        for e in range(starts[i], starts[i + 1]):
+            bound[i] += weights[e]
     quiet = 0
     turn = 0
     while quiet < k and turn < rounds * k:
@@ -243,7 +247,7 @@ def expand_labels(
         quiet += 1
         _number_those_that_may_change(
             costs, allowed[allowed_starts[alpha] : allowed_starts[alpha + 1]], starts, others, weights, labels, alpha,
-            number, unary, queue,
+            number, unary, queue, bound,
         )  # fmt: skip
         active = 0
         for s in range(allowed_starts[alpha], allowed_starts[alpha + 1]):
