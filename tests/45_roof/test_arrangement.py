@@ -59,6 +59,29 @@ def fills(partition: RoofPartition, outline: shapely.Geometry) -> bool:
     )
 
 
+@pytest.mark.parametrize(("density", "faces"), [(5.0, 1), (20.0, 2), (60.0, 2)])
+def test_a_small_superstructure_is_a_face_where_points_are_dense_enough_to_tell(density: float, faces: int) -> None:
+    roof, shaft = shapely.box(0.0, 0.0, 12.0, 10.0), shapely.box(5.0, 4.0, 6.3, 5.2)
+    points = strewn(roof, density)
+    labels = shapely.intersects_xy(shaft, points[:, 0], points[:, 1]).astype(np.int32)
+    points[:, 2] = 6.0 + labels
+    planes = np.array([[0.0, 0.0, 6.0], [0.0, 0.0, 7.0]])
+    partition = arrange(points, labels, planes, footprint_in_mm(roof), point_spacing_m(points), SETTINGS)
+    assert len(partition.polygons) == faces
+
+
+@pytest.mark.parametrize("density", [10.0, 20.0, 60.0])
+def test_a_crown_over_a_roof_gives_no_face(density: float) -> None:
+    roof, crown = shapely.box(0.0, 0.0, 12.0, 10.0), shapely.Point(6.0, 5.0).buffer(0.9)
+    points = strewn(roof, density)
+    under = shapely.intersects_xy(crown, points[:, 0], points[:, 1])
+    points[:, 2] = 6.0 + np.where(under, np.random.default_rng(3).uniform(0.0, 2.0, len(points)), 0.0)
+    labels = (under & (abs(points[:, 2] - 7.0) < 0.3)).astype(np.int32)
+    planes = np.array([[0.0, 0.0, 6.0], [0.0, 0.0, 7.0]])
+    partition = arrange(points, labels, planes, footprint_in_mm(roof), point_spacing_m(points), SETTINGS)
+    assert len(partition.polygons) == 1
+
+
 @pytest.mark.parametrize("turn_deg", [0.0, 31.0])
 @pytest.mark.parametrize("kind", FACES)
 def test_a_dense_roof_gets_its_true_faces_and_one_valid_solid_of_the_true_volume(

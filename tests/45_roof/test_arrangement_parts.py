@@ -9,7 +9,13 @@ import pytest
 import shapely
 
 from pipeline.model import IntArray, LabelArray
-from pipeline.roof.arrangement.cells import cell_areas_m2, cells_of_points, connected_faces, unite_faces
+from pipeline.roof.arrangement.cells import (
+    cell_areas_m2,
+    cells_of_points,
+    connected_faces,
+    points_per_cell,
+    unite_faces,
+)
 from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.subdivision import (
     FACE,
@@ -77,11 +83,26 @@ def test_a_face_that_explains_too_little_joins_its_neighbour_and_another_stays()
     costs = np.array([[0, 900], [900, 600], [90_000, 0]])
     pairs, weights = np.array([[0, 1], [1, 2]], np.int32), np.array([100, 100])
     labels = np.array([0, 1, 1], np.int32)
-    unite_faces(costs, pairs, weights, labels, 500)
+    held = np.array([10, 10, 100], np.int32)
+    unite_faces(costs, held, pairs, weights, labels, 500, 500)
     assert connected_faces(labels, pairs)[1] == 2
     strict = labels.copy()
-    unite_faces(costs, pairs, weights, strict, 1_000_000)
+    unite_faces(costs, held, pairs, weights, strict, 1_000_000, 1_000_000)
     assert connected_faces(strict, pairs)[1] == 1
+
+
+@pytest.mark.parametrize(("own_misfit", "faces"), [(0, 2), (4_000, 2), (20_000, 1)])
+def test_a_face_costs_the_more_the_more_of_its_own_points_misfit_it(own_misfit: int, faces: int) -> None:
+    # beside a large face forty points, that save thirty; half of them or more would make the face cost sixty
+    costs = np.array([[0, 200_000], [30_000 + own_misfit, own_misfit]])
+    pairs, weights = np.array([[0, 1]], np.int32), np.array([100])
+    labels = np.array([0, 1], np.int32)
+    unite_faces(costs, np.array([200, 40], np.int32), pairs, weights, labels, 16_000, 60_000)
+    assert connected_faces(labels, pairs)[1] == faces
+
+
+def test_points_are_counted_by_cell_and_those_outside_not_at_all() -> None:
+    assert points_per_cell(np.array([2, 0, -1, 2], np.int32), 4).tolist() == [1, 0, 2, 0]
 
 
 def square(holes: int = 0) -> tuple[IntArray, LabelArray, LabelArray]:

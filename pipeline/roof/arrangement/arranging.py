@@ -12,7 +12,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.arrangement.candidate_lines import border_places, candidate_lines
-from pipeline.roof.arrangement.cells import cell_borders, cell_costs, cells_of_points, unite_faces
+from pipeline.roof.arrangement.cells import cell_borders, cell_costs, cells_of_points, points_per_cell, unite_faces
 from pipeline.roof.arrangement.faces import corners_of_borders, part_crossings, trace_faces
 from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
@@ -39,6 +39,7 @@ def _arranged(
     cap_m: float,
     cost_per_m: float,
     face_cost: int,
+    doubtful_cost: int,
     line_length_m: float,
     line_reach_m: float,
     overshoot_m: float,
@@ -89,7 +90,8 @@ def _arranged(
         starts, others, border_costs = neighbour_lists(n_cells, borders, weights)
         allowed, allowed_starts = every_label(n_cells, k)
         expand_labels(costs, allowed, allowed_starts, starts, others, border_costs, chosen, _ROUNDS)
-        unite_faces(misfits, borders, weights, chosen, face_cost)
+        held = points_per_cell(cells, n_cells)
+        unite_faces(misfits, held, borders, weights, chosen, face_cost, doubtful_cost)
         for i in range(len(points)):
             label_of_point[i] = chosen[cells[i]] if cells[i] >= 0 else -1
     support = support_of_planes(points, label_of_point, planes, cap_m)
@@ -197,6 +199,7 @@ def arrange(
     moved = np.ascontiguousarray(planes, dtype=np.float64).copy()
     moved[:, 2] += moved[:, 0] * shift[0] + moved[:, 1] * shift[1]
     points_per_m2 = 1.0 / spacing_m**2
+    face_cost, doubtful_cost = settings.costs_of_face(points_per_m2)
     xy, vertices, starts, owner, plane_of_face, graph, faces, fitted, support = _arranged(
         points - shift,
         labels,
@@ -208,7 +211,8 @@ def arrange(
         points_per_m2,
         settings.residual_cap_m,
         settings.border_cost / spacing_m,
-        round(max(settings.face_cost, settings.face_area_m2 * points_per_m2) * COST_SCALE),
+        round(face_cost * COST_SCALE),
+        round(doubtful_cost * COST_SCALE),
         settings.line_length_m,
         max(settings.line_reach_m, spacing_m),
         max(settings.overshoot_m, spacing_m),

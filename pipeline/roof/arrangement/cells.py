@@ -3,7 +3,8 @@
 The cost of a cell's label is the sum of its points' capped residuals, in unexplained points; a border costs by its
 length, a face as such: a short description of the roof (minimum description length) with the points as its data.
 Whether a face earns its cost is another question than where it ends: there only the points count that misfit the plane
-next door.
+next door. A few points are evidence enough where they lie on its plane; where part of them misfit it too, as
+in a crown above the roof, the face has to be larger.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ _LEAST_BEYOND = 3.0
 _ROW_MM = 500.0
 _TOLERANCE = 0.5
 """Of the cap: points nearer than this to a plane fit it; from there to the cap they misfit more and more."""
+_DOUBTFUL_SHARE = 0.5
+"""Share of a face's points that misfit its own plane from which on it costs the most: a plane amid points that fill a
+space, as a crown does, is met by about half of them."""
 
 
 @njit(cache=True, nogil=True)
@@ -196,21 +200,42 @@ def connected_faces(labels: LabelArray, pairs: LabelArray) -> tuple[LabelArray, 
 
 
 @njit(cache=True, nogil=True)
-def unite_faces(misfits: IntArray, pairs: LabelArray, weights: IntArray, labels: LabelArray, face_cost: int) -> None:
+def points_per_cell(cells: LabelArray, n_cells: int) -> LabelArray:
+    """How many points lie in each cell, (c,) int32; `cells` as from `cells_of_points`."""
+    held = np.zeros(n_cells, np.int32)
+    for cell in cells:
+        if cell >= 0:
+            held[cell] += 1
+    return held
+
+
+@njit(cache=True, nogil=True)
+def unite_faces(
+    misfits: IntArray,
+    held: LabelArray,
+    pairs: LabelArray,
+    weights: IntArray,
+    labels: LabelArray,
+    face_cost: int,
+    doubtful_cost: int,
+) -> None:
     """Give whole faces the label of a neighbour while that saves more than it costs, the best first.
 
     It saves their common border, and a face for every neighbour with that label; it costs the points that misfit then.
+    The more of its own points misfit it, the more a face costs.
 
     Parameters
     ----------
     misfits : (c, k) int64
         From `cell_costs`.
+    held : (c,) int32
+        From `points_per_cell`.
     pairs, weights : arrays
         From `cell_borders`.
     labels : (c,) int32
         Plane of every cell; changed in place.
-    face_cost : int
-        Cost of a face.
+    face_cost, doubtful_cost : int
+        Cost of a face that all its points fit, and of one that half of them misfit.
     """
     k = misfits.shape[1]
     while True:
@@ -218,10 +243,12 @@ def unite_faces(misfits: IntArray, pairs: LabelArray, weights: IntArray, labels:
         if count < 2:
             return
         data = np.zeros((count, k), np.int64)
+        inside = np.zeros(count, np.int64)
         label_of = np.empty(count, np.int32)
         for i in range(len(labels)):
             label_of[faces[i]] = labels[i]
             data[faces[i]] += misfits[i]
+            inside[faces[i]] += held[i]
         keys = np.empty(2 * len(pairs), np.int64)
         between = np.empty(2 * len(pairs), np.int64)
         m = 0
@@ -245,9 +272,12 @@ def unite_faces(misfits: IntArray, pairs: LabelArray, weights: IntArray, labels:
                 if s == first or keys[order[s]] != keys[order[s - 1]]:
                     saved[label] += face_cost
                 s += 1
+            own = data[f, label_of[f]]
+            doubt = min(own / (_DOUBTFUL_SHARE * COST_SCALE * inside[f]), 1.0) if inside[f] > 0 else 1.0
+            own += int(doubt * (doubtful_cost - face_cost))
             for q in range(first, s):
                 label = label_of[keys[order[q]] % count]
-                change = data[f, label] - data[f, label_of[f]] - saved[label]
+                change = data[f, label] - own - saved[label]
                 if change < best:
                     best = change
                     best_face, best_label = f, label
