@@ -290,13 +290,15 @@ def test_a_face_that_repeats_the_plane_next_door_within_the_tolerance_is_none() 
         assert len(partition.polygons) == faces
 
 
-@pytest.mark.parametrize("density", [4.0, 40.0])
-def test_the_area_that_a_face_must_earn_does_not_depend_on_the_density(density: float) -> None:
+@pytest.mark.parametrize(("density", "small_m", "large_m"), [(4.0, 0.8, 3.0), (8.0, 0.8, 3.0), (40.0, 0.5, 0.8)])
+def test_a_face_must_earn_an_area_and_where_points_are_dense_a_number_of_them(
+    density: float, small_m: float, large_m: float
+) -> None:
     outline = shapely.box(0, 0, 12, 8)
     points = strewn(outline, density)
     planes = np.array([(0.0, 0.0, 5.0), (0.0, 0.0, 6.0)])
-    for half_m, faces in ((0.4, 1), (1.5, 2)):
-        raised = (np.abs(points[:, :2] - 4.0) < half_m).all(axis=1)
+    for width_m, faces in ((small_m, 1), (large_m, 2)):
+        raised = (np.abs(points[:, :2] - 4.0) < 0.5 * width_m).all(axis=1)
         points[:, 2] = np.where(raised, 6.0, 5.0)
         partition = arrange(
             points, raised.astype(np.int32), planes, footprint_in_mm(outline), 1.0 / math.sqrt(density), SETTINGS

@@ -207,7 +207,7 @@ def arrange(
         ring_xy - low,
         ring_starts,
         polygon_of_ring,
-        max(settings.raster_cell_m, spacing_m),
+        settings.raster_cell_of(spacing_m),
         points_per_m2,
         settings.residual_cap_m,
         settings.border_cost / spacing_m,

@@ -6,6 +6,10 @@ import dataclasses
 
 from pipeline.parameters import Parameters, parameter
 
+_CELL_SPACINGS = 1.2
+_LEAST_CELL_M = 0.25
+"""A superstructure of a metre has four such cells a side."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ArrangementSettings(Parameters):
@@ -19,7 +23,7 @@ class ArrangementSettings(Parameters):
         maximum=5.0,
     )
     border_cost: float = parameter(
-        0.3,
+        0.2,
         "Unexplained points that a border of the length of one point spacing must save.",
         unit="points",
         minimum=0.0,
@@ -43,10 +47,14 @@ class ArrangementSettings(Parameters):
         maximum=10_000.0,
     )
     raster_cell_m: float = parameter(
-        0.35, "Cell of the coarse labels; at least one point spacing.", unit="m", minimum=0.1, maximum=5.0
+        0.35,
+        "Cell of the coarse labels; at least one point spacing. Of dense points 1.2 spacings, at least 0.25 m.",
+        unit="m",
+        minimum=0.1,
+        maximum=5.0,
     )
     line_length_m: float = parameter(
-        0.7, "Shorter borders of the coarse labels give no line.", unit="m", minimum=0.1, maximum=20.0
+        0.5, "Shorter borders of the coarse labels give no line.", unit="m", minimum=0.1, maximum=20.0
     )
     line_reach_m: float = parameter(0.6, "How far beyond its border a line cuts.", unit="m", minimum=0.0, maximum=20.0)
     overshoot_m: float = parameter(
@@ -57,6 +65,16 @@ class ArrangementSettings(Parameters):
         minimum=0.1,
         maximum=100.0,
     )
+
+    def raster_cell_of(self, spacing_m: float) -> float:
+        """Cell of the coarse labels for a spacing, metres.
+
+        Examples
+        --------
+        >>> [ArrangementSettings().raster_cell_of(spacing_m) for spacing_m in (0.1, 0.25, 0.3, 0.5)]
+        [0.25, 0.3, 0.35, 0.5]
+        """
+        return max(min(self.raster_cell_m, max(_CELL_SPACINGS * spacing_m, _LEAST_CELL_M)), spacing_m)
 
     def costs_of_face(self, points_per_m2: float) -> tuple[float, float]:
         """Misfitting points that a face must save that explains all its own points, and one that explains half.
