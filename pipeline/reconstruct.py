@@ -33,7 +33,7 @@ from pipeline.quality.residuals import summarise, surface_of, vertical_residuals
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_forms, block_plane
 from pipeline.roof.flush_walls import unite_flush_walls
-from pipeline.roof.footprint import hull_of_points, outline
+from pipeline.roof.footprint import hull_of_points, outline, simpler_outlines
 from pipeline.roof.lower_lods import LodParts, lower_lods
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import (
@@ -128,7 +128,7 @@ def _reconstruct(
             forms = (partial(primitive_partition, segmentation.faces),)
         elif not is_arranged:
             plan = partition_roof(roof, segmentation.planes, settings.roof)
-            forms = plan_forms(plan, roof, settings.roof)
+            forms = _traced_forms(plan, roof, settings.roof)
         else:
             forms = _arranged_forms(roof, segmentation.planes, settings)
         parts, planes, codes, margin = _own_solids(
@@ -189,28 +189,46 @@ _Form = Callable[[], RoofPartition | RankedFaces]
 def _arranged_forms(roof: RoofPoints, planes: Sequence[Plane], settings: ReconstructSettings) -> Iterator[_Form]:
     """The arrangement; behind it coarser ones and the traced faces, drawn only where no solid of it is sound.
 
-    Where points are few, templates compete with the arrangement: the better go first, worse ones last of all.
+    Where points are few, templates compete with the arrangement: the better go first, worse ones last of all. Given
+    outlines of many short edges are made simpler before faces are traced: those are drawn back to be sound.
     """
     outline_mm = drawn_outline(roof, settings.roof)
     if roof.footprint_mm is not None:
         outline_mm = without_voids(outline_mm, roof.points, roof.spacing_m, settings.roof)
-    arranged = partial(arranged_faces, roof, planes, outline_mm, settings.plan)
-    first: tuple[_Form, ...] = (arranged,)
-    last: tuple[_Form, ...] = ()
-    if roof.spacing_m >= settings.roof.templates_spacing_m and len(roof.points) <= MOST_POINTS:
-        first, last = _ranked_forms(roof, planes, outline_mm, arranged)
+    first, last = _best_forms(roof, planes, outline_mm, settings)
     yield from first
     # many planes that meet nearly in one point: with more room between its vertices the solid is sound
     for clearance in _WIDER_CLEARANCES:
-        yield partial(arranged, clearance=clearance)
+        yield partial(arranged_faces, roof, planes, outline_mm, settings.plan, clearance)
+    if roof.footprint_mm is not None:
+        for simpler in simpler_outlines(outline_mm):
+            yield from _best_forms(roof, planes, simpler, settings)[0]
     try:
         plan = partition_roof(roof, planes, settings.roof)
     except BuildingError:
         if not last:
             raise
     else:
-        yield from plan_forms(plan, roof, settings.roof)
+        yield from _traced_forms(plan, roof, settings.roof)
     yield from last
+
+
+def _traced_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> Iterator[_Form]:
+    """The traced faces; behind them the same within simpler outlines, where the outline is given."""
+    yield from plan_forms(plan, roof, settings)
+    if roof.footprint_mm is not None:
+        for simpler in simpler_outlines(plan.outline_mm):
+            yield from plan_forms(dataclasses.replace(plan, outline_mm=simpler), roof, settings)
+
+
+def _best_forms(
+    roof: RoofPoints, planes: Sequence[Plane], outline_mm: MultiPolygon, settings: ReconstructSettings
+) -> tuple[tuple[_Form, ...], tuple[_Form, ...]]:
+    """The arrangement within an outline, and where points are few the templates: what goes first, what last."""
+    arranged = partial(arranged_faces, roof, planes, outline_mm, settings.plan)
+    if roof.spacing_m < settings.roof.templates_spacing_m or len(roof.points) > MOST_POINTS:
+        return (arranged,), ()
+    return _ranked_forms(roof, planes, outline_mm, arranged)
 
 
 def _ranked_forms(
@@ -236,10 +254,15 @@ def _ranked_forms(
 def _template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings) -> Iterator[_Form]:
     """The templates alone, where no planes were found; raises that lack where they explain too little."""
     try:
-        templates = fit_templates(roof.points, drawn_outline(roof, settings))
+        outline_mm = drawn_outline(roof, settings)
+        templates = fit_templates(roof.points, outline_mm)
     except (BuildingError, shapely.errors.GEOSException):
         raise lack from None
     yield templates.faces
+    if roof.footprint_mm is not None:
+        for simpler in simpler_outlines(outline_mm):
+            with contextlib.suppress(BuildingError):
+                yield fit_templates(roof.points, simpler).faces
 
 
 def _segmented(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
@@ -13,6 +15,8 @@ from pipeline.roof.partition import RoofPartition
 _REPEATED_MM = 10.0
 _STRAIGHT_MM = 1.5
 """Vertices this near to the line through their neighbours are not corners."""
+_ROUND_MM = (5.0, 20.0)
+"""How far the simpler forms of an outline with many short edges go from it."""
 
 
 def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
@@ -66,6 +70,85 @@ def without_repeated(polygon: Polygon, distance_mm: float) -> list[Polygon]:
     if len(rings[0]) < 4:
         return []
     return [Polygon(rings[0], [ring for ring in rings[1:] if len(ring) >= 4])]
+
+
+def simpler_outlines(outline_mm: MultiPolygon) -> Iterator[MultiPolygon]:
+    """Outlines of fewer vertices and the same area, 5 mm and 20 mm from a given one or nearer.
+
+    Over the edge of a round tower, drawn with edges of a decimetre, the corners of a sloping roof rise and fall by less
+    than the millimetre that heights are rounded to: triangles of such corners point anywhere. With fewer corners they
+    do not. Those that are left go outward to where their chords enclose the area of the arc between them.
+
+    Parameters
+    ----------
+    outline_mm : MultiPolygon
+        Valid, integer millimetres.
+
+    Yields
+    ------
+    MultiPolygon
+        Valid, integer millimetres. None where it would have the same vertices, or as many as the one before.
+    """
+    count = shapely.get_num_coordinates(outline_mm)
+    oriented = shapely.orient_polygons(outline_mm)
+    for tolerance_mm in _ROUND_MM:
+        simple = shapely.simplify(oriented, tolerance_mm, preserve_topology=True)
+        fewer = shapely.get_num_coordinates(simple)
+        if fewer == count:
+            continue
+        count = fewer
+        widened = [
+            Polygon(*_rings_of_area(before, after))
+            for before, after in zip(polygons_of(oriented), polygons_of(simple), strict=True)
+        ]
+        for shape in (MultiPolygon(widened), simple):
+            if shape.is_valid:
+                yield shape
+                break
+
+
+def _rings_of_area(before: Polygon, after: Polygon) -> tuple[FloatArray, list[FloatArray]]:
+    """Rings of a simplified polygon that enclose the areas of the ones before."""
+    rings = [
+        _of_same_area(*(shapely.get_coordinates(ring)[:-1] for ring in pair))
+        for pair in zip(shapely.get_rings(before).tolist(), shapely.get_rings(after).tolist(), strict=True)
+    ]
+    return rings[0], rings[1:]
+
+
+def _of_same_area(ring: FloatArray, kept: FloatArray) -> FloatArray:
+    """Some vertices of a ring, moved outward (to its right) or inward by the areas that their edges cut off.
+
+    Vertices between two edges of the ring itself stay where they are, and so do those at its corners of 90 degrees and
+    more; those of one arc move alike.
+    """
+    number = {xy: k for k, xy in enumerate(map(tuple, ring.tolist()))}
+    first = [number[xy] for xy in map(tuple, kept.tolist())]
+    n, m = len(ring), len(kept)
+    cut_off = np.zeros(m)
+    for k in range(m):
+        steps = (first[(k + 1) % m] - first[k]) % n
+        x, y = (ring[[(first[k] + s) % n for s in range(steps + 1)]] - ring[first[k]]).T
+        cut_off[k] = 0.5 * float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) if steps > 1 else 0.0
+    edges = np.roll(kept, -1, axis=0) - kept
+    lengths = np.hypot(edges[:, 0], edges[:, 1])
+    outward = np.column_stack((edges[:, 1], -edges[:, 0])) / lengths[:, None]
+    into = np.roll(outward, 1, axis=0)
+    cosine = (into * outward).sum(axis=1)
+    is_free = (cut_off != 0.0) & (np.roll(cut_off, 1) != 0.0) & (cosine > 0.0)
+    if not is_free.any():
+        return kept
+    moved = kept.copy()
+    # an arc: the edges from one vertex that stays to the next, all of them where none does
+    stays = np.flatnonzero(~is_free).tolist() or [0]
+    for begin, end in zip(stays, [*stays[1:], stays[0] + m], strict=True):
+        arc = np.arange(begin, end) % m
+        free = arc[is_free[arc]]
+        if len(free):
+            reach = 0.5 * (lengths[free] + lengths[free - 1]).sum()
+            by = float(cut_off[arc].sum()) / float(reach)
+            moved[free] += by * ((into + outward) / (1.0 + cosine)[:, None])[free]
+    return np.rint(moved)
 
 
 def polygons_of(geometry: shapely.Geometry) -> list[Polygon]:

@@ -15,7 +15,7 @@ from pipeline.errors import BuildingError
 from pipeline.model import FaceKind, Plane, Reason
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_forms, block_plane
-from pipeline.roof.footprint import clip_partition, footprint_in_mm, hull_of_points, outline
+from pipeline.roof.footprint import clip_partition, footprint_in_mm, hull_of_points, outline, simpler_outlines
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart
 
@@ -140,6 +140,33 @@ def test_a_block_without_an_area_is_told() -> None:
     for form in block_forms(shapely.MultiPolygon(), plane, 0.0, 0.3, 1.0):
         with pytest.raises(BuildingError, match="has an area of 0 m2"):
             form()
+
+
+def rounded_hall() -> shapely.MultiPolygon:
+    """A hall with a half-round end and a round courtyard, both of short edges."""
+    angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 80)
+    apse = [(12.0 + 4.0 * math.cos(a), 4.0 + 4.0 * math.sin(a)) for a in angle.tolist()]
+    hall = shapely.Polygon([(0.0, 0.0), *apse, (0.0, 8.0)])
+    return footprint_in_mm(hall.difference(shapely.Point(5.0, 4.0).buffer(2.0, quad_segs=32)))
+
+
+def test_a_simpler_outline_has_the_same_area_and_lies_near() -> None:
+    before = rounded_hall()
+    simpler = list(simpler_outlines(before))
+    assert len(simpler) == 2
+    counts = [int(shapely.get_num_coordinates(one)) for one in (before, *simpler)]
+    assert counts[0] > 1.5 * counts[1] > 2.25 * counts[2]
+    for one, reach_mm in zip(simpler, (5.0, 20.0), strict=True):
+        assert one.is_valid
+        assert (shapely.get_coordinates(one) % 1.0 == 0.0).all()
+        assert one.area == pytest.approx(before.area, rel=1e-4)
+        assert shapely.hausdorff_distance(one, before, densify=0.05) < 1.5 * reach_mm
+        assert {(0.0, 0.0), (0.0, 8000.0)} <= {tuple(xy) for xy in shapely.get_coordinates(one).tolist()}
+
+
+@pytest.mark.parametrize("shape", [shapely.box(0, 0, 9, 6), shapely.Point(0, 0).buffer(20.0, quad_segs=16)])
+def test_an_outline_of_long_edges_has_no_simpler_one(shape: shapely.Polygon) -> None:
+    assert list(simpler_outlines(footprint_in_mm(shape))) == []
 
 
 def test_a_partition_with_a_border_that_crosses_itself_has_an_outline_all_the_same() -> None:

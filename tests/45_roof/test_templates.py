@@ -172,6 +172,20 @@ def test_the_main_direction_is_that_of_the_longest_walls(degrees: float) -> None
     assert math.degrees(main_direction(edges_of(turned))) == pytest.approx(degrees, abs=1e-6)
 
 
+def test_the_walls_tell_the_main_direction_of_an_outline_with_a_round_end_of_a_thousand_edges() -> None:
+    angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 1001)
+    hall = [(0.0, 0.0), *((12.0 + 4.0 * math.cos(a), 4.0 + 4.0 * math.sin(a)) for a in angle.tolist()), (0.0, 8.0)]
+    turned = shapely.affinity.rotate(Polygon(hall), 20.0, origin=(0, 0))
+    assert math.degrees(main_direction(edges_of(turned))) == pytest.approx(20.0, abs=0.2)
+
+
+def test_only_the_longest_edges_of_an_outline_tell_its_main_direction() -> None:
+    """64 edges of one direction, and of another one many more that are shorter: what they add up to does not count."""
+    long = np.array([[0.0, k, 2.0, k] for k in range(64)])
+    short = np.array([[0.0, k, 0.9, k + 0.9] for k in range(200)])
+    assert main_direction(np.concatenate((short, long)).astype(np.float64)) == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_robust_line_goes_past_a_third_of_outliers() -> None:
     t = np.linspace(0.0, 10.0, 30)
     z = 2.0 + 0.5 * t
