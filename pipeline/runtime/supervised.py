@@ -18,8 +18,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-import psutil  # type: ignore[import-untyped]
-
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.messages import Batch, Begun, Finished, Frames, OutOfMemory, Raised, Ready, frame
 
@@ -78,7 +76,10 @@ class SupervisedChild:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._stdin, self._stdout = self._process.stdin, self._process.stdout
+        import psutil  # type: ignore[import-untyped]  # slow to load, and a serial run has no child
+
         self._watched = psutil.Process(self._process.pid)
+        self._is_gone = psutil.Error
         self._poll = select.poll()
         self._poll.register(self._stdout, select.POLLIN)
         self._frames = Frames()
@@ -97,7 +98,7 @@ class SupervisedChild:
         """Its private memory: resident, without what it shares with files; 0 once it is gone."""
         try:
             info = self._watched.memory_info()
-        except psutil.Error:
+        except self._is_gone:
             return 0
         return int(info.rss) - int(getattr(info, "shared", 0))
 
