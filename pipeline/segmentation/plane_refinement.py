@@ -197,13 +197,24 @@ def describe_planes(points: FloatArray, planes: FloatArray, labels: LabelArray) 
     labels : (n,) int32
         Plane of every point, -1 for none.
     """
+    planes = np.ascontiguousarray(planes, dtype=np.float64).reshape(-1, 3)
+    support = _support(points, planes, labels).tolist()
+    return tuple(
+        Plane(a=a, b=b, c=c, n_points=int(count), rmse_m=rmse_m)
+        for (a, b, c), (count, rmse_m) in zip(planes.tolist(), support, strict=True)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _support(points: FloatArray, planes: FloatArray, labels: LabelArray) -> FloatArray:
+    """Number of each plane's points and root mean square of their vertical residuals, 0 of none, (k, 2)."""
     sums = cluster_sums(points, labels, len(planes))
-    described = []
-    for (a, b, c), plane_sums in zip(planes.tolist(), sums, strict=True):
-        count = int(plane_sums[0])
-        rmse_m = math.sqrt(mean_square_residual(plane_sums, a, b, c)) if count else 0.0
-        described.append(Plane(a=a, b=b, c=c, n_points=count, rmse_m=rmse_m))
-    return tuple(described)
+    support = np.zeros((len(planes), 2))
+    for k in range(len(planes)):
+        if sums[k, 0] > 0.0:
+            support[k, 0] = sums[k, 0]
+            support[k, 1] = math.sqrt(mean_square_residual(sums[k], planes[k, 0], planes[k, 1], planes[k, 2]))
+    return support
 
 
 @njit(cache=True, nogil=True)
