@@ -8,6 +8,7 @@ their sum, and a halo at least that wide makes the outcome independent of the ti
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -85,12 +86,15 @@ class SceneSettings:
         float
             Metres; never more than `support_m`.
         """
-        wanted_m = float(APRON_M)
-        if not footprints:
-            around_m = max(self.surfaces.support_m, self.vegetation.support_m) + self.vegetation.support_m
-            wanted_m = max(wanted_m, around_m)
         ground_m = self.ground.trusted_support_m if classes.ground else self.ground.support_m
-        return self.outliers.support_m + ground_m + wanted_m
+        return self.outliers.support_m + ground_m + self.terrain_m(footprints=footprints)
+
+    def terrain_m(self, *, footprints: bool) -> float:
+        """How far beyond a tile's core terrain is wanted, in metres; for the points in given footprints, or for all."""
+        if footprints:
+            return float(APRON_M)
+        around_m = max(self.surfaces.support_m, self.vegetation.support_m) + self.vegetation.support_m
+        return max(float(APRON_M), around_m)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -124,7 +128,7 @@ class SplitTile:
     point_fragment: LabelArray
     """(n,) int32, their fragments; -1 where none."""
     terrain: Terrain
-    """The ground of the whole window."""
+    """The ground, on the lattice of the window; drawn where the core and its surroundings ask for it."""
     occupied: BoolArray
     """(rows, columns) on the terrain's lattice: some point lies in the cell."""
     outliers: int
@@ -147,7 +151,11 @@ def _occupied(points: WindowPoints, kept: BoolArray, lattice: tuple[int, int, in
 
 
 def terrain_of(
-    points: WindowPoints, window: Window, settings: SceneSettings, classes: ClassesInUse
+    points: WindowPoints,
+    window: Window,
+    settings: SceneSettings,
+    classes: ClassesInUse,
+    wanted: Window | None = None,
 ) -> tuple[Terrain, BoolArray, BoolArray]:
     """Terrain of a window, the mask of points that are no outliers, and the occupied cells.
 
@@ -161,6 +169,8 @@ def terrain_of(
         Outliers and ground.
     classes : ClassesInUse
         Whether class 2 is believed.
+    wanted : Window, optional
+        Where terrain is asked for; in the whole window by default.
     """
     lattice = lattice_of(window)
     kept = dense_enough(points.x_mm, points.y_mm, points.z_mm, settings.outliers)
@@ -168,7 +178,16 @@ def terrain_of(
         usable = kept & (points.classification == GROUND_CLASS)
     else:
         usable = kept & (points.return_number >= points.return_count)
-    terrain = ground_of(points.x_mm, points.y_mm, points.z_mm, usable, lattice, settings.ground, trusted=classes.ground)
+    terrain = ground_of(
+        points.x_mm,
+        points.y_mm,
+        points.z_mm,
+        usable,
+        lattice,
+        settings.ground,
+        trusted=classes.ground,
+        wanted=None if wanted is None else lattice_of(wanted),
+    )
     return terrain, kept, _occupied(points, kept, lattice)
 
 
@@ -195,7 +214,8 @@ def split_tile(
     SplitTile
         Fragments and the assignment of the core's points.
     """
-    terrain, kept, occupied = terrain_of(points, window, settings, classes)
+    wanted = core.grown(math.ceil(1000 * settings.terrain_m(footprints=False)))
+    terrain, kept, occupied = terrain_of(points, window, settings, classes, wanted)
     outliers = int((core.contains(points.x_mm, points.y_mm) & ~kept).sum())
     # from here on only the core and what its fragments can reach; most of the halo served the terrain
     near = core.grown(round(1000 * (settings.surfaces.support_m + settings.vegetation.support_m)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -33,6 +34,10 @@ from pipeline.tiling import MM, Tile, TileGrid, Window
 
 _PLACE_BITS = 20
 """Bits of a coordinate in a sort key: 1,048 m in millimetres."""
+
+
+_STRIPS = 2**16 - 1
+"""Strips of a tile in which the points of footprints are looked for; their numbers fit two bytes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -190,10 +195,11 @@ def split(task: SplitTask) -> Split:
         index, owner = result.core_index, result.point_fragment.astype(np.int64)
         fragments, terrain, occupied, outliers = result.fragments, result.terrain, result.occupied, result.outliers
     else:
-        terrain, kept, occupied = terrain_of(points, window, task.settings, task.classes)
-        in_core = core.contains(points.x_mm, points.y_mm)
-        outliers = int((in_core & ~kept).sum())
-        index, owner = _inside_footprints(points, in_core & kept, terrain, task)
+        wanted = core.grown(math.ceil(task.settings.terrain_m(footprints=True) * MM))
+        terrain, kept, occupied = terrain_of(points, window, task.settings, task.classes, wanted)
+        own = len(loaded.core)
+        outliers = int((~kept[:own]).sum())
+        index, owner = _inside_footprints(points, np.flatnonzero(kept[:own]), terrain, task)
     is_building = points.classification[index] == BUILDING_CLASS
     assigned = owner >= 0
     audit = (
@@ -270,13 +276,12 @@ def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core:
 
 
 def _inside_footprints(
-    points: WindowPoints, usable: BoolArray, terrain: Terrain, task: SplitTask
+    points: WindowPoints, index: npt.NDArray[np.int64], terrain: Terrain, task: SplitTask
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Indices of the core's points and the footprint that holds each, -1 where none.
+    """Indices of the core's points, as they are given, and the footprint that holds each, -1 where none.
 
     Inside a footprint all points above the ground count, or those of class 6 where it is believed.
     """
-    index = np.flatnonzero(usable)
     owner = np.full(len(index), -1, np.int64)
     if task.classes.building:
         above = points.classification[index] == BUILDING_CLASS
@@ -286,13 +291,21 @@ def _inside_footprints(
         )
         if task.classes.ground:
             above &= points.classification[index] != GROUND_CLASS
-    from_west = np.flatnonzero(above)
-    from_west = from_west[np.argsort(points.x_mm[index[from_west]])]
+    inner = np.flatnonzero(above)
+    if len(inner) == 0:
+        return index, owner
+    # by strips of the tile, so many that their numbers have two bytes: a stable sort of these is a radix sort
+    west = int(points.x_mm[index[inner]].min())
+    strip_mm = task.grid.size_mm // _STRIPS + 1
+    strip = (points.x_mm[index[inner]] - west) // strip_mm
+    order = np.argsort(strip.astype(np.uint16), kind="stable")
+    from_west, strip = inner[order], strip[order]
     x, y = points.x_mm[index[from_west]], points.y_mm[index[from_west]]
     # the smaller number wins where footprints overlap, whatever the tile
     for number, polygon in sorted(task.footprints or (), key=lambda item: item[0], reverse=True):
         x0, y0, x1, y1 = (round(v * MM) for v in polygon.bounds)
-        first, last = np.searchsorted(x, x0 - 1, side="left"), np.searchsorted(x, x1 + 1, side="right")
+        first = np.searchsorted(strip, (x0 - 1 - west) // strip_mm, side="left")
+        last = np.searchsorted(strip, (x1 + 1 - west) // strip_mm, side="right")
         near = first + np.flatnonzero((y[first:last] >= y0 - 1) & (y[first:last] <= y1 + 1))
         if len(near):
             shapely.prepare(polygon)

@@ -113,13 +113,18 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
 
 
 @njit(cache=True, nogil=True)
-def _terrain(lowest: Elevations, is_ground: BoolArray, bridge: int, max_slope: float) -> Elevations:
-    """Draw local least-squares planes through the ground cells of the smallest box that holds enough."""
+def _terrain(
+    lowest: Elevations, is_ground: BoolArray, bridge: int, max_slope: float, drawn: tuple[int, int, int, int]
+) -> Elevations:
+    """Draw local least-squares planes through the ground cells of the smallest box that holds enough.
+
+    Only the cells of `drawn`, first and one past the last column and row, get one.
+    """
     rows, columns = lowest.shape
     sums = plane_sums(lowest, is_ground)
     terrain = np.full((rows, columns), NO_DATA, np.int32)
-    for r in range(rows):
-        for c in range(columns):
+    for r in range(max(drawn[1], 0), min(drawn[3], rows)):
+        for c in range(max(drawn[0], 0), min(drawn[2], columns)):
             half = 1
             while True:
                 n, level, _, _, carries = plane_around(sums, r, c, half)
@@ -189,6 +194,7 @@ def ground_of(
     settings: GroundSettings,
     *,
     trusted: bool,
+    wanted: tuple[int, int, int, int] | None = None,
 ) -> Terrain:
     """Terrain under a window of points.
 
@@ -204,6 +210,9 @@ def ground_of(
         Windows, slope and tolerances.
     trusted : bool
         The usable points are ground by the file's classes: no filter, only interpolation.
+    wanted : tuple of int, optional
+        column0, row0, columns, rows of the cells within which heights and slopes are asked for; all by default. The
+        rest of the window only serves them.
 
     Returns
     -------
@@ -227,7 +236,11 @@ def ground_of(
                 is_ground = hierarchical_ground(part, corner, settings, pit_depth_mm)
             else:
                 is_ground = morphological_ground(part, corner, settings)
-        elevation[seen] = _terrain(part, is_ground, settings.reach_m, settings.max_slope)
+        # one cell more for heights between the middles of cells, one for the slope there
+        west, south, width, depth = window if wanted is None else wanted
+        west, south = west - column0 - seen[1].start - 2, south - row0 - seen[0].start - 2
+        drawn = (west, south, west + width + 4, south + depth + 4)
+        elevation[seen] = _terrain(part, is_ground, settings.reach_m, settings.max_slope, drawn)
         slope[seen] = slopes_of(elevation[seen])
         measured[seen] = is_ground
     return Terrain(elevation_mm=elevation, slope_mm=slope, measured=measured, column0=column0, row0=row0)
