@@ -310,6 +310,9 @@ class BuildingResult:
     """Of the model: the finest that was asked for, 1.2 for a fallback block, empty where there is no model."""
     footprint: Polygon | MultiPolygon | None
     """2D outline of the delivered solids in local metres (failed: of the points where that is possible)."""
+    footprint_share: float = math.nan
+    """Area of that outline over the area of the given footprint: below 1 where a part of it, having no points, was left
+    out; nan without a given footprint or without a model."""
     planes: tuple[Plane, ...]
     """The delivered roof planes."""
     faces: tuple[RoofFace, ...]

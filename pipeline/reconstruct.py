@@ -144,9 +144,7 @@ def _reconstruct(
                 told = f"{share:.0%} of {len(roof.points)} roof points lie on a roof, less than {_FEW_EXPLAINED:.0%}"
                 fewest = f"where there are fewer than minimum_points = {settings.roof.minimum_points}"
                 return failed_building(candidate, method, Reason.TOO_FEW_POINTS, f"{told}, {fewest}")
-            deliver = partial(
-                _result, candidate, method, settings, spacing_m=roof.spacing_m, status=Status.OK, bic_margin=margin
-            )
+            deliver = partial(_result, candidate, method, settings, roof=roof, status=Status.OK, bic_margin=margin)
             own_type = segmentation.roof_type
             if settings.lods == ("2.2",):
                 return deliver(parts, planes, own_type, lod="2.2")
@@ -170,11 +168,9 @@ def _reconstruct(
         reason, detail = Reason.NO_PARTITION, f"the plan cannot be drawn: {error}"
     parts, planes = _block(candidate, bare, plan, settings.roof)
     if settings.lods == ("1.2",):  # a block is what was asked for
-        return _result(
-            candidate, method, settings, parts, planes, spacing_m=bare.spacing_m, status=Status.OK, lod="1.2"
-        )
+        return _result(candidate, method, settings, parts, planes, roof=bare, status=Status.OK, lod="1.2")
     return _result(
-        candidate, method, settings, parts, planes, spacing_m=bare.spacing_m, status=Status.FALLBACK, lod="1.2",
+        candidate, method, settings, parts, planes, roof=bare, status=Status.FALLBACK, lod="1.2",
         reason=reason, detail=detail, codes=codes,
     )  # fmt: skip
 
@@ -367,7 +363,7 @@ def _result(
     planes: Sequence[Plane],
     own_type: RoofType | None = None,
     *,
-    spacing_m: float,
+    roof: RoofPoints,
     status: Status,
     lod: str,
     reason: Reason | None = None,
@@ -397,6 +393,7 @@ def _result(
         roof_type=own_type or roof_type(delivered, faces, solids, settings.roof_type),
         lod=lod,
         footprint=footprint,
+        footprint_share=math.nan if roof.footprint_mm is None else footprint.area / (roof.footprint_mm.area * 1e-6),
         planes=delivered,
         faces=faces,
         solids=solids,
@@ -416,8 +413,8 @@ def _result(
             faces,
             delivered,
             solids,
-            spacing_m=spacing_m,
-            outline_sigma_m=0.0 if candidate.footprint is not None else spacing_m * DRAWN_OUTLINE_SPACINGS,
+            spacing_m=roof.spacing_m,
+            outline_sigma_m=0.0 if candidate.footprint is not None else roof.spacing_m * DRAWN_OUTLINE_SPACINGS,
             is_planar=lod == "2.2",
             bic_margin=bic_margin,
         ),

@@ -247,6 +247,33 @@ def test_a_footprint_away_from_the_points_gives_a_record() -> None:
     assert result.coverage == 0.0
 
 
+@pytest.mark.parametrize("method", ["arrangement", "fuzzy-sart", "parameter-space-2d", "parameter-space-3d", "kmeans"])
+def test_a_part_of_a_footprint_without_points_is_left_out_and_its_share_told(method: str) -> None:
+    house, empty = shapely.box(0, 0, 12, 8), shapely.box(30, 0, 36, 8)
+    whole, part = (
+        reconstruct_building(gable(footprint=given), method, DEFAULTS)
+        for given in (house, shapely.MultiPolygon([house, empty]))
+    )
+    assert (whole.status, whole.lod, whole.footprint_share) == (Status.OK, "2.2", pytest.approx(1.0, abs=1e-3))
+    assert (part.status, part.lod) == (Status.OK, "2.2")
+    assert part.footprint.equals(whole.footprint)
+    assert part.footprint_share == pytest.approx(2.0 / 3.0, abs=1e-3)
+
+
+def test_without_a_given_footprint_or_a_model_there_is_no_share_to_tell() -> None:
+    assert math.isnan(reconstruct_building(gable(), "arrangement", DEFAULTS).footprint_share)
+    failed = reconstruct_building(gable(n=2, footprint=shapely.box(0, 0, 12, 8)), "arrangement", DEFAULTS)
+    assert failed.status is Status.FAILED
+    assert math.isnan(failed.footprint_share)
+
+
+def test_a_block_covers_the_parts_without_points_too(stub: Install) -> None:
+    stub(lambda c: Segmentation(planes=(), labels=np.full(len(c.points), -1, np.int32)))
+    parts = shapely.MultiPolygon([shapely.box(0, 0, 12, 8), shapely.box(30, 0, 36, 8)])
+    result = reconstruct_building(gable(footprint=parts), "stub", DEFAULTS)
+    assert (result.lod, result.footprint_share) == ("1.2", 1.0)
+
+
 def test_an_unknown_method_names_the_valid_ones() -> None:
     with pytest.raises(SettingsError, match="fuzzy-sart"):
         reconstruct_building(gable(), "magic", DEFAULTS)

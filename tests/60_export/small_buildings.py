@@ -186,7 +186,7 @@ def levelled(building_id: str = "levelled") -> BuildingResult:
         ridge_z_sigma_m=0.02, bic_margin=14.0,
     )  # fmt: skip
     coarser = levels("1.3", 4.75, 3.0), levels("1.2", 4.5, 4.5)
-    return building(building_id, *detailed, coarser=coarser, quality=quality)
+    return building(building_id, *detailed, coarser=coarser, quality=quality, footprint_share=0.98)
 
 
 def levels(lod: str, *heights: float) -> LodModel:

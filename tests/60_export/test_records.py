@@ -26,10 +26,10 @@ from pipeline.model import Plane
 
 DESIGNED = """building_id, source_id, source_attributes, status, reason, reason_detail, overridden, method, roof_type,
 geometry, lod, solid, solid_parts, solid_surfaces, solid_planes, solid_lod12, solid_lod12_parts, solid_lod12_surfaces,
-solid_lod13, solid_lod13_parts, solid_lod13_surfaces, ground_z, eave_z, ridge_z, h_min, h_50p, h_70p, h_max,
-height_m, footprint_area_m2, roof_area_m2, volume_m3, n_points, density_per_m2, n_planes, rmse_m, p95_m, coverage,
-point_spacing_m, noise_m, share_within_0_2m, unexplained_m2, largest_hole_m, ridge_z_sigma_m, bic_margin, is_curved,
-valid, validity_codes, touches_data_edge, acquired_from, acquired_to, mesh_path, input_hash, settings_hash,
+solid_lod13, solid_lod13_parts, solid_lod13_surfaces, ground_z, eave_z, ridge_z, h_min, h_50p, h_70p, h_max, height_m,
+footprint_area_m2, footprint_share, roof_area_m2, volume_m3, n_points, density_per_m2, n_planes, rmse_m, p95_m,
+coverage, point_spacing_m, noise_m, share_within_0_2m, unexplained_m2, largest_hole_m, ridge_z_sigma_m, bic_margin,
+is_curved, valid, validity_codes, touches_data_edge, acquired_from, acquired_to, mesh_path, input_hash, settings_hash,
 engine_version"""
 CRSES = ["compound", "feet and metres", "US feet", "unknown"]
 
@@ -55,6 +55,11 @@ def test_a_gable_in_metres_reads_as_built(contexts: Contexts) -> None:
     assert (row["height_m"], row["footprint_area_m2"], row["roof_area_m2"], row["volume_m3"]) == (6.0, 80.0, 100.0, 360)
     assert (row["status"], row["reason"], row["valid"], row["n_planes"], row["lod"]) == ("ok", None, True, 2, "2.2")
     assert shapely.from_wkb(row["geometry"]).equals(shapely.box(85_000, 447_000, 85_010, 447_008))
+
+
+def test_the_share_of_a_given_footprint_is_told_and_null_without_one(contexts: Contexts) -> None:
+    assert building_row(small.gable(footprint_share=2.0 / 3.0), contexts["US feet"])["footprint_share"] == 0.6667
+    assert building_row(small.gable(), contexts["US feet"])["footprint_share"] is None
 
 
 def test_the_quality_of_a_model_is_told_as_it_was_measured(contexts: Contexts) -> None:
@@ -89,7 +94,7 @@ def test_what_a_failed_candidate_lacks_is_null_and_not_zero(contexts: Contexts) 
     empty = {name for name, value in row.items() if value is None}
     assert empty == {
         *("source_id", "geometry", "lod", "eave_z", "ridge_z", "h_min", "h_50p", "h_70p", "h_max", "height_m"),
-        *("footprint_area_m2", "roof_area_m2", "volume_m3", "density_per_m2", "rmse_m", "p95_m"),
+        *("footprint_area_m2", "footprint_share", "roof_area_m2", "volume_m3", "density_per_m2", "rmse_m", "p95_m"),
         *("point_spacing_m", "noise_m", "share_within_0_2m", "unexplained_m2", "largest_hole_m", "ridge_z_sigma_m"),
         *("bic_margin", "source_attributes", "overridden", "mesh_path", "input_hash"),
         *("solid", "solid_parts", "solid_surfaces", "solid_planes"),
