@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -61,11 +62,31 @@ def _area_vector(corners: Sequence[Sequence[float]], rings: Sequence[Sequence[in
 
 def volume(solid: Solid) -> float:
     """Volume of a closed, outward oriented solid, cubic metres (divergence theorem)."""
+    return _volume(_measured(solid))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Measured:
+    """A solid with what several figures are made of: numbers in lists, since its faces have few corners."""
+
+    solid: Solid
+    corners: list[list[float]]
+    """Its vertices."""
+    vectors: list[tuple[float, float, float]]
+    """The area vectors of its faces, in their order."""
+
+
+def _measured(solid: Solid) -> _Measured:
+    """A solid, its faces measured once for all figures."""
     corners = solid.vertices.tolist()
+    return _Measured(solid, corners, [_area_vector(corners, face.rings) for face in solid.faces])
+
+
+def _volume(measured: _Measured) -> float:
+    """The volume of a measured solid."""
     total = 0.0
-    for face in solid.faces:
-        normal_x, normal_y, normal_z = _area_vector(corners, face.rings)
-        x, y, z = corners[face.rings[0][0]]
+    for face, (normal_x, normal_y, normal_z) in zip(measured.solid.faces, measured.vectors, strict=True):
+        x, y, z = measured.corners[face.rings[0][0]]
         total += x * normal_x + y * normal_y + z * normal_z
     return total / 3.0
 
@@ -124,14 +145,18 @@ def eave_elevation(solids: Sequence[Solid]) -> float:
 
     An edge counts at its middle; a face's weight is its plan area, shared among its eaves by length.
     """
+    return _eave_elevation([_measured(solid) for solid in solids])
+
+
+def _eave_elevation(measured: Sequence[_Measured]) -> float:
+    """The same of measured solids."""
     values: list[float] = []
     weights: list[float] = []
-    for solid in solids:
-        outer, corners = _outer_edges(solid), solid.vertices.tolist()
-        for face in solid.faces:
+    for each in measured:
+        outer, corners = _outer_edges(each.solid), each.corners
+        for face, normal in zip(each.solid.faces, each.vectors, strict=True):
             if face.kind is not FaceKind.ROOF:
                 continue
-            normal = _area_vector(corners, face.rings)
             middles, lengths = [], []
             for a, b in (edge for ring in face.rings for edge in _edges(ring) if edge[::-1] in outer):
                 (from_x, from_y, from_z), (to_x, to_y, to_z) = corners[a], corners[b]
@@ -146,20 +171,23 @@ def eave_elevation(solids: Sequence[Solid]) -> float:
 
 def _roof_triangles(solids: Sequence[Solid]) -> tuple[FloatArray, FloatArray]:
     """Sorted elevations (t, 3) and signed plan areas (t,) of fans over the roof faces; signs cancel outside a face."""
-    corners, areas = [], []
+    corners: list[list[float]] = []
+    areas: list[float] = []
     for solid in solids:
+        xyz = solid.vertices.tolist()
         for face in solid.faces:
             if face.kind is not FaceKind.ROOF:
                 continue
             for ring in face.rings:
-                ring_xyz = solid.vertices[list(ring)]
-                apex, first, second = ring_xyz[0], ring_xyz[1:-1], ring_xyz[2:]
-                one, two = first[:, :2] - apex[:2], second[:, :2] - apex[:2]
-                areas.append(0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]))
-                corners.append(np.stack([np.full(len(first), apex[2]), first[:, 2], second[:, 2]], axis=1))
+                apex_x, apex_y, apex_z = xyz[ring[0]]
+                for first, second in itertools.pairwise(ring[1:]):
+                    (one_x, one_y, one_z), (two_x, two_y, two_z) = xyz[first], xyz[second]
+                    one_x, one_y, two_x, two_y = one_x - apex_x, one_y - apex_y, two_x - apex_x, two_y - apex_y
+                    areas.append(0.5 * (one_x * two_y - one_y * two_x))
+                    corners.append(sorted((apex_z, one_z, two_z)))
     if not corners:
         return np.empty((0, 3)), np.empty(0)
-    return np.sort(np.concatenate(corners), axis=1), np.concatenate(areas)
+    return np.array(corners), np.array(areas)
 
 
 def _area_below(level: FloatArray, corner_z: FloatArray, area: FloatArray) -> FloatArray:
@@ -231,20 +259,19 @@ def dimensions(solids: Sequence[Solid]) -> Dimensions:
     """
     roof_z: list[float] = []
     roof_area = 0.0
-    for solid in solids:
-        corners = solid.vertices.tolist()
-        for face in solid.faces:
+    measured = [_measured(solid) for solid in solids]
+    for each in measured:
+        for face, (x, y, z) in zip(each.solid.faces, each.vectors, strict=True):
             if face.kind is FaceKind.ROOF:
-                roof_z.extend(corners[index][2] for ring in face.rings for index in ring)
-                x, y, z = _area_vector(corners, face.rings)
+                roof_z.extend(each.corners[index][2] for ring in face.rings for index in ring)
                 roof_area += math.sqrt(x**2 + y**2 + z**2)
     lowest, highest = (min(roof_z), max(roof_z)) if roof_z else (math.nan, math.nan)
-    eave = eave_elevation(solids)
+    eave = _eave_elevation(measured)
     median, seventieth = roof_percentiles(solids, (0.5, 0.7))
     return Dimensions(
         eave_z_m=lowest if math.isnan(eave) else eave,
         ridge_z_m=highest,
         roof_z_m=(lowest, median, seventieth, highest),
         roof_area_m2=roof_area,
-        volume_m3=sum(volume(solid) for solid in solids),
+        volume_m3=sum(_volume(each) for each in measured),
     )

@@ -191,6 +191,7 @@ def _tile_files(
         "rejected": [rejected_row(entry, context) for entry in rejected],
         "buildings": rows,
     }
+    projjson = reference.projjson
     for name, table_rows in tables.items():
-        table = geo_table(name, table_rows, reference.projjson)
+        table = geo_table(name, table_rows, projjson)
         yield f"{name}/tile={tile_key}/part-0.parquet", parquet_bytes(table)
