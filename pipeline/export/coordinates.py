@@ -62,11 +62,14 @@ def crs_coordinates(local: FloatArray, origin: tuple[float, float, float], refer
     array, shape as `local`
         Easting, northing (and elevation) in CRS units.
     """
+    units = (reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m)[: local.shape[1]]
+    absolute = local + np.array(origin[: local.shape[1]])
+    if units.count(1.0) == len(units):  # metres, as nearly always: one step for all axes, and a division by 1 less
+        rounded: FloatArray = np.round(absolute, decimals(1.0)) + 0.0
+        return rounded
     out = np.empty(local.shape)
-    units = (reference.horizontal_unit_m, reference.horizontal_unit_m, reference.vertical_unit_m)
-    for axis in range(local.shape[1]):
-        absolute = (local[:, axis] + origin[axis]) / units[axis]
-        out[:, axis] = np.round(absolute, decimals(units[axis]))
+    for axis, unit_m in enumerate(units):
+        out[:, axis] = np.round(absolute[:, axis] / unit_m, decimals(unit_m))
     return out + 0.0
 
 

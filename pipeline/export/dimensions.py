@@ -16,6 +16,7 @@ FLAT_BELOW_DEG = 7.0
 """Roof planes below this slope count as flat (Hofmann, Maas and Streilein 2003): all their outer edges are eaves."""
 EAVE_WITHIN_DEG = 45.0
 """An outer edge is an eave where it faces the plane's aspect within this angle; else it is a rake or a high edge."""
+_FLAT, _FACING = math.tan(math.radians(FLAT_BELOW_DEG)), math.cos(math.radians(EAVE_WITHIN_DEG))
 _MOST_AT_ONCE = 2_000
 """Levels times triangles up to which the areas below all levels at once take less time than a bisection."""
 
@@ -132,12 +133,11 @@ def _edges(ring: Sequence[int]) -> list[tuple[int, int]]:
 
 def _is_eave(step_x: float, step_y: float, normal: tuple[float, float, float]) -> bool:
     """Whether a roof face's outer edge is its low side; the step runs counter-clockwise seen from above."""
-    flat = math.tan(math.radians(FLAT_BELOW_DEG))
     tilt = math.hypot(normal[0], normal[1])
-    if tilt <= flat * abs(normal[2]):
+    if tilt <= _FLAT * abs(normal[2]):
         return True
     along = step_y * normal[0] - step_x * normal[1]
-    return along >= math.cos(math.radians(EAVE_WITHIN_DEG)) * math.hypot(step_x, step_y) * tilt
+    return along >= _FACING * math.hypot(step_x, step_y) * tilt
 
 
 def eave_elevation(solids: Sequence[Solid]) -> float:
