@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 
 from pipeline.model import FloatArray, LabelArray, ModelQuality, Plane, RoofFace, Solid
 from pipeline.quality.curved_roof import is_curved_roof
@@ -107,4 +108,4 @@ def _seen(
     places, unseen, square = surface.seen(points, residuals, raster, TOLERANCE_M, GAP_SPACINGS * spacing_m)
     if places == 0:
         return math.nan, math.nan
-    return unseen / places * math.fsum(face.polygon.area for face in faces), 2.0 * math.sqrt(square)
+    return unseen / places * math.fsum(shapely.area([face.polygon for face in faces]).tolist()), 2.0 * math.sqrt(square)

@@ -275,10 +275,9 @@ class TopSurface:
         xy, ring = shapely.get_coordinates(rings, return_index=True)
         self._corner = (float(np.floor(xy[:, 0].min())), float(np.floor(xy[:, 1].min()))) if corner is None else corner
         xy = xy - np.array(self._corner)
-        (
-            self._edges, self._edge_starts, self._boxes, self._cell_starts, self._cell_faces, *grid,
-        ) = _laid_out(xy, ring, owner[part], n, tolerance_m)  # fmt: skip
-        self._grid: tuple[float, float, float, int, int] = tuple(grid)
+        laid_out = _laid_out(xy, ring, owner[part], n, tolerance_m)
+        self._edges, self._edge_starts, self._boxes, self._cell_starts, self._cell_faces = laid_out[:5]
+        self._grid = laid_out[5:]
         planes = np.array(coefficients, dtype=np.float64).reshape(n, 3)
         if origins is not None:
             shift = np.asarray(origins, dtype=np.float64)
@@ -375,9 +374,11 @@ class TopSurface:
         """
         if self._empty:
             return 0, 0, 0.0
+        low_x, low_y, cell, columns, rows = raster
         places, far, square = _seen(
-            np.ascontiguousarray(points, dtype=np.float64), residuals, *raster, tolerance_m, gap_m, *self._arguments()
-        )
+            np.ascontiguousarray(points, dtype=np.float64), residuals, low_x, low_y, cell, columns, rows,
+            tolerance_m, gap_m, *self._arguments(),
+        )  # fmt: skip
         return places, far, square
 
     def elevation(self, x: FloatArray, y: FloatArray) -> FloatArray:

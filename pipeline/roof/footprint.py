@@ -153,6 +153,8 @@ def _of_same_area(ring: FloatArray, kept: FloatArray) -> FloatArray:
 
 def polygons_of(geometry: shapely.Geometry) -> list[Polygon]:
     """The polygons with an area in any geometry."""
+    if isinstance(geometry, Polygon):
+        return [geometry] if geometry.area > 0.0 else []
     parts = shapely.get_parts(shapely.get_parts(geometry))
     return [p for p in parts.tolist() if isinstance(p, Polygon) and p.area > 0.0]
 

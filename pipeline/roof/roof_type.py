@@ -12,6 +12,9 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
+import numpy as np
+import shapely
+
 from pipeline.model import FaceKind, Plane, RoofFace, RoofType, Solid, SolidFace
 from pipeline.parameters import Parameters, parameter
 
@@ -92,8 +95,10 @@ def roof_type(
         `none` without faces, `combination` for what has no simpler name.
     """
     areas: dict[int, float] = {}
-    for face in faces:
-        areas[face.plane] = areas.get(face.plane, 0.0) + face.polygon.area
+    for face, area in zip(
+        faces, shapely.area(np.array([face.polygon for face in faces], object)).tolist(), strict=True
+    ):
+        areas[face.plane] = areas.get(face.plane, 0.0) + area
     total = math.fsum(areas.values())
     if total <= 0.0:
         return RoofType.NONE

@@ -187,8 +187,8 @@ class _Levels:
         united: list[tuple[int, int, int]] = []
         for (a, b), face in edges.items():
             plane = planes[mesh.planes[face]]
-            for v in (a, b):
-                touching.setdefault(v, {})[face] = _height_mm(plane, mesh.xy[v])
+            # every vertex of a ring is the start of one of its edges
+            touching.setdefault(a, {})[face] = _height_mm(plane, mesh.xy[a])
             other = edges.get((b, a), -1)
             if other < 0:
                 outline.update((a, b))

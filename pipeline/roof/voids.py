@@ -125,17 +125,11 @@ def without_voids(
     far_m = max(settings.void_distance_m, 2.0 * settings.gap_spacings * spacing_m)
     gap_m = settings.gap_spacings * spacing_m
     # a building narrower than that has no room for a void
-    corners = shapely.get_coordinates(outline_mm)
-    if min(np.ptp(corners, axis=0)) * 1e-3 < far_m:
+    xy, ring = shapely.get_coordinates(shapely.get_rings(shapely.get_parts(outline_mm)), return_index=True)
+    if min(np.ptp(xy, axis=0)) * 1e-3 < far_m:
         return outline_mm
     # along the longest edge: walls around courtyards are parallel to the others
-    edges = np.concatenate(
-        [
-            np.hstack((xy[:-1], xy[1:])) * 1e-3
-            for ring in shapely.get_rings(shapely.get_parts(outline_mm))
-            for xy in (shapely.get_coordinates(ring),)
-        ]
-    )
+    edges = np.hstack((xy[:-1], xy[1:]))[ring[:-1] == ring[1:]] * 1e-3
     steps = edges[:, 2:] - edges[:, :2]
     along = steps[np.argmax(np.hypot(steps[:, 0], steps[:, 1]))]
     length = math.hypot(along[0], along[1])
