@@ -106,10 +106,8 @@ def check_solid(solid: Solid, tolerances: ValidityTolerances = DEFAULT_TOLERANCE
     face_offsets = _offsets([len(face.rings) for face in solid.faces])
     planarity_mm = tolerances.planarity_m * MILLIMETRES_PER_METRE
     least_cosine = math.cos(math.radians(tolerances.normals_deg))
-    joined, apart, differ = _snap(vertices, ring_vertices, tolerances.snap_m * MILLIMETRES_PER_METRE)
-    found = _find_faults(vertices, joined, ring_offsets, face_offsets, planarity_mm, least_cosine)
-    if differ:
-        found |= _find_faults(vertices, apart, ring_offsets, face_offsets, planarity_mm, least_cosine)
+    snap_mm = tolerances.snap_m * MILLIMETRES_PER_METRE
+    found = _faults(vertices, ring_vertices, ring_offsets, face_offsets, snap_mm, planarity_mm, least_cosine)
     return tuple(int(code) for code in np.flatnonzero(found))
 
 
@@ -125,6 +123,26 @@ def _offsets(lengths: list[int]) -> IntArray:
     offsets = np.zeros(len(lengths) + 1, dtype=np.int64)
     np.cumsum(lengths, out=offsets[1:])
     return offsets
+
+
+@njit(cache=True, nogil=True)
+def _faults(
+    vertices: IntArray,
+    ring_vertices: IntArray,
+    ring_offsets: IntArray,
+    face_offsets: IntArray,
+    snap_mm: float,
+    planarity_mm: float,
+    least_cosine: float,
+) -> BoolArray:
+    """(406,) bool, True at the codes of the faults of a solid, by either verdict on pairs at the snapping tolerance."""
+    joined, apart, differ = _snap(vertices, ring_vertices, snap_mm)
+    found = _find_faults(vertices, joined, ring_offsets, face_offsets, planarity_mm, least_cosine)
+    if differ:
+        others = _find_faults(vertices, apart, ring_offsets, face_offsets, planarity_mm, least_cosine)
+        for code in range(len(found)):
+            found[code] |= others[code]
+    return found
 
 
 @njit(cache=True, nogil=True)

@@ -137,10 +137,9 @@ def fit_templates(points: FloatArray, outline_mm: MultiPolygon) -> Templates:
     rings = [ring for polygon in outline_mm.geoms for ring in (polygon.exterior, *polygon.interiors)]
     around = [shapely.get_coordinates(ring) * 1e-3 for ring in rings]
     origin = np.array(outline_mm.bounds[:2]) * 1e-3
-    direction, framed, edges = _in_frame(
-        np.ascontiguousarray(points), np.concatenate([np.hstack((xy[:-1], xy[1:])) for xy in around]), origin
-    )
-    parameters, parts, regions, counts, planes, residuals, plane_of = fit_parts(framed, edges, SIGMA_M, _POINTS_OF_PART)
+    edges = np.concatenate([np.hstack((xy[:-1], xy[1:])) for xy in around])
+    direction, fitted = _fit_in_frame(np.ascontiguousarray(points), edges, origin, SIGMA_M, _POINTS_OF_PART)
+    parameters, parts, regions, counts, planes, residuals, plane_of = fitted
     explained = int((np.abs(residuals) <= _REACH_M).sum())
     if explained < max(_LEAST_EXPLAINED * len(points), parameters + _SPARE_POINTS):
         found = f"{explained} of {len(points)} roof points with {parameters:g} parameters"
@@ -156,6 +155,15 @@ def fit_templates(points: FloatArray, outline_mm: MultiPolygon) -> Templates:
         residuals_m=residuals,
         plane_of_point=plane_of,
     )
+
+
+@njit(cache=True, nogil=True)
+def _fit_in_frame(
+    points: FloatArray, edges: FloatArray, origin: FloatArray, sigma_m: float, fewest: int
+) -> tuple[float, tuple[float, int, FloatArray, LabelArray, FloatArray, FloatArray, LabelArray]]:
+    """The main direction of an outline, and what `fit_parts` finds along it and across."""
+    direction, framed, turned = _in_frame(points, edges, origin)
+    return direction, fit_parts(framed, turned, sigma_m, fewest)
 
 
 @njit(cache=True, nogil=True)
