@@ -25,6 +25,11 @@ def test_the_console_script_imports_nothing_heavy() -> None:
     assert modules_after("import service.cli") & {*HEAVY, "numpy", "numba", "scipy", "shapely"} == set()
 
 
+def test_a_serial_run_imports_no_engine_and_nothing_for_child_processes() -> None:
+    unused = {"dask", "distributed", "matplotlib", "psutil"}
+    assert modules_after("import pipeline.runtime.run") & unused == set()
+
+
 def test_the_check_sees_a_heavy_import() -> None:
     assert "pandas" in modules_after("import pandas")
 
