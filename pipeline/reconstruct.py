@@ -85,10 +85,9 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
     MemoryError
         As it came.
     """
-    entry = method_named(method)
-    segment, is_arranged = settings.segmentation(entry), settings.arranges(entry)
+    segment = settings.segmentation(method_named(method))
     try:
-        return _reconstruct(candidate, method, segment, settings, is_arranged=is_arranged)
+        return _reconstruct(candidate, method, segment, settings)
     except BuildingError as error:
         return failed_building(candidate, method, error.reason, error.detail)
     except MemoryError:
@@ -109,10 +108,9 @@ def _reconstruct(
     method: str,
     segment: Callable[[Candidate], Segmentation],
     settings: ReconstructSettings,
-    *,
-    is_arranged: bool,
 ) -> BuildingResult:
     """The chain of a method's own solids, then the block."""
+    is_arranged = settings.arranges(method_named(method))
     bare = roof_points(candidate, settings.roof)
     plan: RoofPlan | None = None
     codes: tuple[int, ...] = ()
