@@ -13,7 +13,7 @@ from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.arrangement.candidate_lines import border_places, candidate_lines
 from pipeline.roof.arrangement.cells import cell_borders, cell_costs, cells_of_points, points_per_cell, unite_faces
-from pipeline.roof.arrangement.faces import corners_of_borders, part_crossings, trace_faces
+from pipeline.roof.arrangement.faces import corners_of_borders, part_crossings, rings_of_faces, trace_faces
 from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, raster_labels
@@ -44,8 +44,16 @@ def _arranged(
     line_reach_m: float,
     overshoot_m: float,
     clearance: float,
-) -> tuple[IntArray, LabelArray, LabelArray, LabelArray, LabelArray, LabelArray, LabelArray, FloatArray, FloatArray]:
-    """Vertices; rings, their starts and faces; the faces' planes; graph, cells' faces; planes and their support."""
+) -> tuple[
+    IntArray,
+    tuple[FloatArray, IntArray, LabelArray, bool],
+    LabelArray,
+    LabelArray,
+    LabelArray,
+    FloatArray,
+    FloatArray,
+]:
+    """Vertices; rings from `rings_of_faces`; the faces' planes; graph, cells' faces; planes and their support."""
     n_outline = len(ring_xy)
     edges = np.empty((n_outline, 4))
     for r in range(len(ring_starts) - 1):
@@ -103,7 +111,8 @@ def _arranged(
     needed = corners_of_borders(xy, graph, counts[0], counts[1], n_outline, faces)
     vertices, starts, owner = trace_faces(xy, graph, counts[1], faces, needed)
     used = graph[: counts[1]].copy()
-    return xy[: counts[0]].copy(), vertices, starts, owner, plane_of_face, used, faces, planes, support
+    rings = rings_of_faces(xy, vertices, starts, owner, n_faces)
+    return xy[: counts[0]].copy(), rings, plane_of_face, used, faces, planes, support
 
 
 def _rings_of(outline_mm: MultiPolygon) -> tuple[IntArray, LabelArray, LabelArray]:
@@ -118,27 +127,9 @@ def _rings_of(outline_mm: MultiPolygon) -> tuple[IntArray, LabelArray, LabelArra
     return np.concatenate(rings), starts, np.array(polygons, np.int32)
 
 
-def _polygons(
-    xy: IntArray, vertices: LabelArray, starts: LabelArray, owner: LabelArray, n_faces: int
-) -> tuple[Polygon, ...] | None:
-    """The faces; None where they are no coverage."""
-    nodes = xy[vertices].astype(np.float64)
-    following = np.arange(1, len(vertices) + 1)
-    following[starts[1:] - 1] = starts[:-1]
-    cross = nodes[:, 0] * nodes[following, 1] - nodes[following, 0] * nodes[:, 1]
-    sizes = np.diff(starts)
-    if sizes.min() < 3:
-        return None
-    twice_area = np.add.reduceat(cross, starts[:-1])
-    order = np.lexsort((twice_area <= 0.0, owner))
-    rings = shapely.linearrings(
-        nodes[np.concatenate([np.arange(starts[r], starts[r + 1]) for r in order])],
-        indices=np.repeat(np.arange(len(order)), sizes[order]),
-    )
-    firsts = np.flatnonzero(np.diff(owner[order], prepend=-1))
-    polygons = shapely.polygons(rings, indices=owner[order])
-    if (twice_area[order[firsts]] <= 0.0).any() or (twice_area > 0.0).sum() != n_faces:
-        return None
+def _polygons(nodes: FloatArray, ring_of: IntArray, owner: LabelArray) -> tuple[Polygon, ...] | None:
+    """The faces, from `rings_of_faces`; None where they are no coverage."""
+    polygons = shapely.polygons(shapely.linearrings(nodes, indices=ring_of), indices=owner)
     if not shapely.is_valid(polygons).all() or not shapely.coverage_is_valid(polygons):
         return None
     return tuple(polygons.tolist())
@@ -200,7 +191,7 @@ def arrange(
     moved[:, 2] += moved[:, 0] * shift[0] + moved[:, 1] * shift[1]
     points_per_m2 = 1.0 / spacing_m**2
     face_cost, doubtful_cost = settings.costs_of_face(points_per_m2)
-    xy, vertices, starts, owner, plane_of_face, graph, faces, fitted, support = _arranged(
+    xy, rings, plane_of_face, graph, faces, fitted, support = _arranged(
         points - shift,
         labels,
         moved,
@@ -218,11 +209,13 @@ def arrange(
         max(settings.overshoot_m, spacing_m),
         clearance,
     )
-    polygons = _polygons(xy + low, vertices, starts, owner, len(plane_of_face))
+    nodes, ring_of, owner, is_sound = rings
+    polygons = _polygons(nodes + low, ring_of, owner) if is_sound else None
     if polygons is None:
         # with every vertex that was put on a line the faces are as exact as the subdivision itself
         vertices, starts, owner = trace_faces(xy, graph, len(graph), faces, np.ones(len(xy), np.bool_))
-        polygons = _polygons(xy + low, vertices, starts, owner, len(plane_of_face))
+        nodes, ring_of, owner, is_sound = rings_of_faces(xy, vertices, starts, owner, len(plane_of_face))
+        polygons = _polygons(nodes + low, ring_of, owner) if is_sound else None
     if polygons is None:
         raise BuildingError(Reason.NO_PARTITION, "the cells of the outline make no coverage")
     fitted[:, 2] -= fitted[:, 0] * shift[0] + fitted[:, 1] * shift[1]
