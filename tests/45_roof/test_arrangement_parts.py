@@ -16,7 +16,9 @@ from pipeline.roof.arrangement.cells import (
     points_per_cell,
     unite_faces,
 )
+from pipeline.roof.arrangement.faces import rings_of_faces
 from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
+from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, _settle
 from pipeline.roof.arrangement.subdivision import (
     FACE,
     NEXT,
@@ -77,6 +79,62 @@ def test_only_allowed_nodes_take_a_label() -> None:
     lists = neighbour_lists(2, np.zeros((0, 2), np.int32), np.zeros(0, np.int64))
     expand_labels(costs, np.array([0, 1, 1], np.int32), np.array([0, 2, 3], np.int32), *lists, labels, 5)
     assert labels.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_of_expansions_that_cost_the_same_the_one_that_changes_least_is_taken(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    costs, pairs, weights = random_graph(seed, 9, 2)
+    costs, weights = costs // 12, weights // 12 + 1  # many ties
+    before = rng.integers(0, 2, 9).astype(np.int32)
+    allowed, allowed_starts = np.arange(9, dtype=np.int32), np.array([0, 0, 9], np.int32)  # only label 1 expands
+    lists = neighbour_lists(9, pairs, weights)
+    labels = before.copy()
+    expand_labels(costs, allowed, allowed_starts, *lists, labels, 1)
+    moves = [np.where(taken, 1, before).astype(np.int32) for taken in itertools.product((False, True), repeat=9)]
+    least = min(cost(costs, pairs, weights, one) for one in moves)
+    best = [one for one in moves if cost(costs, pairs, weights, one) == least]
+    assert labels.tolist() == min(best, key=lambda one: int((one != before).sum())).tolist()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_cells_settle_as_if_all_were_looked_at_in_every_round(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    columns, rows, k = 9, 7, 3
+    place = np.flatnonzero(rng.random(columns * rows) < 0.8).astype(np.int32)
+    costs = rng.integers(0, 40, (len(place), k))
+    labels = rng.integers(0, k, len(place)).astype(np.int32)
+    expected = {int(cell): int(label) for cell, label in zip(place, labels, strict=True)}
+    for _ in range(_SETTLING_ROUNDS):
+        for i, cell in enumerate(place.tolist()):
+            r, c = divmod(cell, columns)
+            around = [
+                (expected[rr * columns + cc], 7 if (rr == r) != (cc == c) else 5)
+                for rr, cc in itertools.product(range(r - 1, r + 2), range(c - 1, c + 2))
+                if (rr, cc) != (r, c) and 0 <= cc < columns and rr * columns + cc in expected
+            ]
+            total = {
+                label: int(costs[i, label]) + sum(weight for other, weight in around if other != label)
+                for label in {expected[cell], *(other for other, _ in around)}
+            }
+            least, best = min((value, label) for label, value in total.items())
+            if least < total[expected[cell]]:
+                expected[cell] = best
+    _settle(costs, place, columns, rows, 7, 5, labels)
+    assert labels.tolist() == [expected[cell] for cell in place.tolist()]
+
+
+def test_rings_come_by_faces_the_outer_one_first() -> None:
+    xy = np.array([(0, 0), (9, 0), (9, 9), (0, 9), (3, 3), (3, 6), (6, 6), (6, 3)])
+    hole_first = np.array([4, 5, 6, 7, 0, 1, 2, 3, 4, 7, 6, 5], np.int32)
+    starts, owner = np.array([0, 4, 8, 12], np.int32), np.array([1, 1, 0], np.int32)
+    nodes, ring_of, faces, is_sound = rings_of_faces(xy, hole_first, starts, owner, 2)
+    assert is_sound
+    assert faces.tolist() == [0, 1, 1]
+    assert nodes.tolist() == xy[[4, 7, 6, 5, 0, 1, 2, 3, 4, 5, 6, 7]].tolist()
+    assert ring_of.tolist() == [0] * 4 + [1] * 4 + [2] * 4
+    assert not rings_of_faces(xy, hole_first, starts, owner, 3)[3]
+    assert not rings_of_faces(xy, hole_first[:8], starts[:3], np.array([1, 0], np.int32), 2)[3]
 
 
 def test_a_face_that_explains_too_little_joins_its_neighbour_and_another_stays() -> None:
