@@ -47,6 +47,7 @@ function groups(verticalUnit: string): [string, Row[]][] {
         { label: "RMSE", column: "rmse_m", show: metres(3) },
         { label: "95th percentile", column: "p95_m", show: metres(3) },
         { label: "Points covered", column: "coverage", show: percent },
+        { label: "Given footprint filled", column: "footprint_share", show: percent },
         { label: "Within 0.2 m of the roof", column: "share_within_0_2m", show: percent },
         { label: "Noise of the points", column: "noise_m", show: metres(3) },
         { label: "Ridge known to (one sigma)", column: "ridge_z_sigma_m", show: metres(3) },
