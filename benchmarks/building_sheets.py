@@ -1,11 +1,13 @@
 """Contact sheets of models over their points, to be looked at one by one.
 
     python -m benchmarks.building_sheets RUN [RUN ...] --points TILE [TILE ...] --out DIR [--crs CRS] [--most 200]
+        [--outside FOOTPRINTS] [--edges] [--across 4] [--down 3]
 
 Every building is one cell: its points in plan by height, then the model of each run with the points over it, coloured
 by their distance to the roof (`pipeline.report.section`). The share of its points within 0.2 m stands beneath. Of more
-buildings than `--most`, every k-th in the order of their ids is drawn: no choice by result. `sheets.md` in DIR lists
-the cells, for notes.
+buildings than `--most`, every k-th in the order of their ids is drawn: no choice by result. `--outside` leaves out what
+meets a polygon of a vector file in the CRS of the points; `--edges` draws the edges of the first run's faces into the
+plan, where no wall hides them. `sheets.md` in DIR lists the cells, for notes.
 """
 
 from __future__ import annotations
@@ -24,12 +26,13 @@ from PIL import Image, ImageDraw
 from pipeline.evaluation.models import RoofModel
 from pipeline.evaluation.reading import read_models
 from pipeline.io import ReadOptions
+from pipeline.io.vector_layer import read_layer
 from pipeline.model import FloatArray
 from pipeline.report.comparison_pictures import LOW_M, BuildingPictures, draw_building
 from pipeline.report.comparison_points import PointFiles, points_within
 
 COLUMNS, ROWS = 4, 3
-"""Buildings across and down a sheet."""
+"""Buildings across and down a sheet, where nothing else is asked."""
 _TEXT_PX = 26
 _WITHIN_M = 0.2
 _REACH_M = 0.3
@@ -59,9 +62,9 @@ def cell(pictures: BuildingPictures, told: Sequence[str]) -> Image.Image:
     return image
 
 
-def sheet(cells: Sequence[Image.Image]) -> Image.Image:
-    """The cells in rows, each row as high as its highest cell."""
-    rows = [cells[k : k + COLUMNS] for k in range(0, len(cells), COLUMNS)]
+def sheet(cells: Sequence[Image.Image], across: int = COLUMNS) -> Image.Image:
+    """The cells in rows of `across`, each row as high as its highest cell."""
+    rows = [cells[k : k + across] for k in range(0, len(cells), across)]
     width = max(sum(image.width for image in row) for row in rows)
     heights = [max(image.height for image in row) for row in rows]
     whole = Image.new("RGB", (width, sum(heights)), "white")
@@ -80,6 +83,13 @@ def _models(run: str) -> dict[str, RoofModel]:
     return {model.source_id or model.building_id: model for model in found.models}
 
 
+def _outside(names: Sequence[str], models: Sequence[dict[str, RoofModel]], path: Path) -> list[str]:
+    """The buildings that meet no polygon of a vector file in any run."""
+    taken = shapely.union_all(read_layer(path, None).geometries)
+    shapely.prepare(taken)
+    return [name for name in names if not any(taken.intersects(own[name].footprint) for own in models if name in own)]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draw the sheets."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -88,9 +98,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--crs")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--most", type=int, default=200)
+    parser.add_argument("--outside", type=Path, metavar="FOOTPRINTS")
+    parser.add_argument("--edges", action="store_true")
+    parser.add_argument("--across", type=int, default=COLUMNS)
+    parser.add_argument("--down", type=int, default=ROWS)
     asked = parser.parse_args(arguments)
     models = [_models(run) for run in asked.runs]
     names = sorted(set().union(*models))
+    if asked.outside is not None:
+        names = _outside(names, models, asked.outside)
     chosen = names[:: max(1, math.ceil(len(names) / asked.most))]
     footprints = [
         shapely.union_all([own[name].footprint for own in models if name in own]).buffer(_REACH_M, join_style="mitre")
@@ -101,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked.out.mkdir(parents=True, exist_ok=True)
     lines = ["| cell | building | " + " | ".join(Path(run).name for run in asked.runs) + " |"]
     lines.append("| --- | --- |" + " --- |" * len(models))
-    on_sheet = COLUMNS * ROWS
+    on_sheet = asked.across * asked.down
     for first in range(0, len(chosen), on_sheet):
         cells = []
         for number in range(first, min(first + on_sheet, len(chosen))):
@@ -110,9 +126,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             shares = [within_share(model, xyz) for model in own]
             faces = [0 if model is None else len(model.surfaces) for model in own]
             told = [f"{share:.2f}, {count} faces" for share, count in zip(shares, faces, strict=True)]
-            cells.append(cell(draw_building(own, None, xyz), [f"{number + 1}: {name[:20]}", *told]))
+            pictures = draw_building(own, own[0] if asked.edges else None, xyz)
+            cells.append(cell(pictures, [f"{number + 1}: {name[:20]}", *told]))
             lines.append(f"| {number + 1} | {name} | " + " | ".join(told) + " |")
-        sheet(cells).save(asked.out / f"sheet_{first // on_sheet + 1:02d}.png")
+        sheet(cells, asked.across).save(asked.out / f"sheet_{first // on_sheet + 1:02d}.png")
     (asked.out / "sheets.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     print(f"{len(chosen)} of {len(names)} buildings on {math.ceil(len(chosen) / on_sheet)} sheets in {asked.out}")
     return 0

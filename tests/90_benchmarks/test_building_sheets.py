@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "60_export"))
@@ -58,3 +59,19 @@ def test_a_sheet_is_as_large_as_its_rows() -> None:
 
 def _rows(cells: int) -> list[range]:
     return [range(first, min(first + COLUMNS, cells)) for first in range(0, cells, COLUMNS)]
+
+
+def test_what_meets_given_outlines_is_left_out_and_sheets_are_as_asked(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", street())
+    tile = tmp_path / "points.xyz"
+    np.savetxt(tile, roof_points(run, 0.6), fmt="%.3f")
+    models = read_models(str(run)).models
+    given = tmp_path / "given.geojson"
+    given.write_text(shapely.to_geojson(models[0].footprint.representative_point().buffer(0.1)), encoding="utf-8")
+    told = [str(run), "--points", str(tile), "--crs", "EPSG:28992", "--outside", str(given), "--edges"]
+    assert main([*told, "--across", "1", "--down", "1", "--out", str(tmp_path / "sheets")]) == 0
+    lines = (tmp_path / "sheets" / "sheets.md").read_text(encoding="utf-8").splitlines()[2:]
+    assert {line.split("|")[2].strip() for line in lines} == {
+        model.source_id or model.building_id for model in models[1:]
+    }
+    assert len(list((tmp_path / "sheets").glob("*.png"))) == len(lines) > 1
