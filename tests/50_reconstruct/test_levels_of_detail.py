@@ -80,7 +80,7 @@ def test_a_level_is_the_same_whatever_stands_beside_it(asked: tuple[str, ...]) -
 
 def test_figures_are_those_of_the_finest_level() -> None:
     detailed, levels, block = (modelled(house(), lod) for lod in ("2.2", "1.3", "1.2"))
-    assert detailed.rmse_m < 0.3 < levels.rmse_m < 1.2 < block.rmse_m
+    assert 2.0 * detailed.rmse_m < levels.rmse_m < 1.2 < block.rmse_m
     assert [len(result.planes) for result in (levels, block)] == [2, 1]
     assert levels.coverage == block.coverage == 1.0
 
