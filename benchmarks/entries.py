@@ -145,9 +145,12 @@ def sweep_entries(split: str, cells: Sequence[Cell] = CELLS) -> Iterator[Entry]:
 
 
 def all_variants(*, with_faithful: bool) -> list[Variant]:
-    """Every method with its default settings, and on demand each as its paper has it."""
-    presets = ("robust", "faithful") if with_faithful else ("robust",)
-    return [Variant(method=method, preset=preset) for method in METHODS for preset in presets]
+    """Every method with its default settings, and on demand each that has a paper as the paper has it."""
+    return [
+        Variant(method=name, preset=preset)
+        for name, method in METHODS.items()
+        for preset in method.presets[: None if with_faithful else 1]
+    ]
 
 
 def tiles_of(entry: Entry, place: Workplace) -> tuple[str, ...]:
