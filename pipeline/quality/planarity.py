@@ -9,11 +9,16 @@ from pipeline.model import FloatArray, IntArray
 
 _SWEEPS = 12
 """Jacobi sweeps: four reach machine precision for a 3 x 3 matrix, the others cost nothing then."""
+MICROMETRES_PER_MILLIMETRE = 1e3
+_LARGEST = 5e8
 
 
 @njit(cache=True, nogil=True)
-def _smallest_axis(matrix: FloatArray) -> tuple[float, float, float]:
-    """Unit eigenvector of the smallest eigenvalue of a symmetric 3 x 3 matrix, by cyclic Jacobi rotations."""
+def _principal_axes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues (3,) and unit eigenvectors, the columns of (3, 3), of a symmetric matrix: cyclic Jacobi rotations.
+
+    The smallest comes first.
+    """
     axes = np.eye(3)
     for _ in range(_SWEEPS):
         rest = abs(matrix[0, 1]) + abs(matrix[0, 2]) + abs(matrix[1, 2])
@@ -37,19 +42,30 @@ def _smallest_axis(matrix: FloatArray) -> tuple[float, float, float]:
                 for k in range(3):
                     kp, kq = axes[k, p], axes[k, q]
                     axes[k, p], axes[k, q] = cosine * kp - sine * kq, sine * kp + cosine * kq
-    least = 0
-    for k in range(1, 3):
-        if matrix[k, k] < matrix[least, least]:
-            least = k
-    return axes[0, least], axes[1, least], axes[2, least]
+    values = np.array([matrix[0, 0], matrix[1, 1], matrix[2, 2]])
+    order = np.argsort(values)
+    return values[order], axes[:, order].copy()
 
 
 @njit(cache=True, nogil=True)
-def distance_to_plane(corners: IntArray) -> float:
-    """The largest distance in mm of corners (n, 3) to their least-squares plane; 0 for three corners."""
+def fitted_plane(corners: IntArray) -> tuple[float, float, FloatArray]:
+    """The least-squares plane of a face.
+
+    Parameters
+    ----------
+    corners : (n, 3) int64
+        Corners of all its rings in mm.
+
+    Returns
+    -------
+    distance_mm : float
+        The largest of a corner to the plane.
+    slenderness : float
+        How far the corners spread across the face in the plane, over how far they spread along it.
+    axes : (3, 3) float64
+        Columns: unit normal, direction across, direction along.
+    """
     count = len(corners)
-    if count <= 3:
-        return 0.0
     centre = np.zeros(3)
     for i in range(count):
         for k in range(3):
@@ -62,16 +78,54 @@ def distance_to_plane(corners: IntArray) -> float:
             at_k = float(corners[i, k] - corners[0, k]) - centre[k]
             for m in range(3):
                 covariance[k, m] += at_k * (float(corners[i, m] - corners[0, m]) - centre[m])
-    x, y, z = _smallest_axis(covariance)
+    values, axes = _principal_axes(covariance)
     largest = 0.0
     for i in range(count):
-        distance = abs(
-            (float(corners[i, 0] - corners[0, 0]) - centre[0]) * x
-            + (float(corners[i, 1] - corners[0, 1]) - centre[1]) * y
-            + (float(corners[i, 2] - corners[0, 2]) - centre[2]) * z
-        )
-        largest = max(largest, distance)
-    return largest
+        distance = 0.0
+        for k in range(3):
+            distance += (float(corners[i, k] - corners[0, k]) - centre[k]) * axes[k, 0]
+        largest = max(largest, abs(distance))
+    return largest, np.sqrt(max(values[1], 0.0) / values[2]) if values[2] > 0.0 else 0.0, axes
+
+
+@njit(cache=True, nogil=True)
+def bends_where_it_is_straight(
+    corners: IntArray, ring_offsets: IntArray, axes: FloatArray, least_cosine: float
+) -> bool:
+    """Whether three consecutive corners of a ring span a triangle that is tilted against the face.
+
+    Corners that lie nearly on one line do, by the rounding of their coordinates to millimetres.
+    """
+    for r in range(len(ring_offsets) - 1):
+        start, stop = ring_offsets[r], ring_offsets[r + 1]
+        for i in range(start, stop):
+            before = i - 1 if i > start else stop - 1
+            after = i + 1 if i + 1 < stop else start
+            x, y, z = _unit_normal(corners, before, i, after)
+            if abs(x * axes[0, 0] + y * axes[1, 0] + z * axes[2, 0]) < least_cosine:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def in_fitted_plane(corners: IntArray, axes: FloatArray) -> IntArray:
+    """Corners (n, 3) projected onto their least-squares plane: micrometres across and along it, and 0.
+
+    Coarser in faces of more than a kilometre, so that products of two fit into 64 bits.
+    """
+    extent = 1.0
+    for i in range(len(corners)):
+        for k in range(3):
+            extent = max(extent, abs(float(corners[i, k] - corners[0, k])))
+    scale = min(MICROMETRES_PER_MILLIMETRE, _LARGEST / extent)
+    flat = np.zeros((len(corners), 3), np.int64)
+    for i in range(len(corners)):
+        for m in range(2):
+            place = 0.0
+            for k in range(3):
+                place += float(corners[i, k] - corners[0, k]) * axes[k, 1 + m]
+            flat[i, m] = round(place * scale)
+    return flat
 
 
 @njit(cache=True, nogil=True)
@@ -85,7 +139,7 @@ def _unit_normal(corners: IntArray, a: int, b: int, c: int) -> tuple[float, floa
     vz = float(corners[c, 2] - corners[a, 2])
     x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     length = np.sqrt(x * x + y * y + z * z)
-    return x / length, y / length, z / length
+    return (x / length, y / length, z / length) if length > 0.0 else (0.0, 0.0, 0.0)
 
 
 @njit(cache=True, nogil=True)

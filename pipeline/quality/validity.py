@@ -5,11 +5,11 @@ Code   Fault
 =====  ================================================================================================
 101    ring of fewer than three vertices
 102    consecutive vertices of a ring coincide (within the snapping tolerance)
-104    ring crosses or touches itself, or encloses no area
+104    ring crosses or touches itself, encloses no area, or is 10,000 times longer than wide
 201    rings of a face cross, overlap or touch off their vertices
 202    two rings of a face are the same
 203    a vertex is farther from the face's least-squares plane than the tolerance
-204    two triangles of a face have normals that differ by more than the tolerance
+204    two triangles of a face have normals that differ by more than the tolerance, however it is projected
 205    rings that touch cut the interior of a face in two
 206    a hole lies outside the outer ring
 207    a hole lies in a hole
@@ -44,7 +44,12 @@ from numba import njit
 
 from pipeline.model import BoolArray, IntArray, Solid
 from pipeline.parameters import Parameters, parameter
-from pipeline.quality.planarity import distance_to_plane, least_cosine_of_normals
+from pipeline.quality.planarity import (
+    bends_where_it_is_straight,
+    fitted_plane,
+    in_fitted_plane,
+    least_cosine_of_normals,
+)
 from pipeline.quality.rings import RING_SELF_INTERSECTION, has_repeated_neighbours, polygon_code
 from pipeline.quality.self_intersection import shell_intersects_itself
 from pipeline.quality.shell import is_sound_shell, six_volumes
@@ -63,6 +68,9 @@ SHELL_SELF_INTERSECTION = 306
 WRONG_ORIENTATION_SHELL = 405
 
 _CODE_LIMIT = 406
+_LEAST_SLENDERNESS = 1e-4
+"""Narrower faces, such as a wall of 2 mm under a ridge of 40 m, are lines to a validator that fits planes in floating
+point."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -208,10 +216,29 @@ def _face_code(corners: IntArray, ids: IntArray, rings: IntArray, planarity_mm: 
     if len(corners) == 3:
         x, y, z = area_vector(corners, 0, 3)
         return RING_SELF_INTERSECTION if x == 0 and y == 0 and z == 0 else 0
-    if distance_to_plane(corners) > planarity_mm:
+    distance_mm, slenderness, _ = fitted_plane(corners)
+    if distance_mm > planarity_mm:
         return NON_PLANAR_DISTANCE
+    if slenderness < _LEAST_SLENDERNESS:
+        return RING_SELF_INTERSECTION
     flat, has_area = project_along_dominant_axis(corners, rings[1])
     return int(polygon_code(flat, ids, rings)) if has_area else RING_SELF_INTERSECTION
+
+
+@njit(cache=True, nogil=True)
+def _is_folded(corners: IntArray, rings: IntArray, cut: IntArray, least_cosine: float) -> bool:
+    """Whether two triangles of a face have normals too far apart: of its triangulation, or of that in its fitted plane.
+
+    val3dity triangulates in the fitted plane. Where corners lie on one line but for the rounding to millimetres, it
+    depends on the projection which of them bulge outwards, and with it whether a sliver of any normal is cut off there.
+    """
+    if least_cosine_of_normals(corners, cut, least_cosine) < least_cosine:
+        return True
+    _, _, axes = fitted_plane(corners)
+    if not bends_where_it_is_straight(corners, rings, axes, least_cosine):
+        return False
+    in_plane, status = triangulate_rings(in_fitted_plane(corners, axes), rings)
+    return status != DONE or least_cosine_of_normals(corners, in_plane, least_cosine) < least_cosine
 
 
 @njit(cache=True, nogil=True)
@@ -255,7 +282,7 @@ def _find_faults(
             found[NOT_VALID_2_MANIFOLD] = True
             sound = False
             continue
-        if len(cut) > 1 and least_cosine_of_normals(corners[start:stop], cut, least_cosine) < least_cosine:
+        if len(cut) > 1 and _is_folded(corners[start:stop], rings - start, cut, least_cosine):
             found[NON_PLANAR_NORMALS] = True
             sound = False
         for t in range(len(cut)):

@@ -203,6 +203,26 @@ def _roof_hole(*holes: Sequence[tuple[float, float]]) -> Solid:
     return with_rings(solid, 0, [outer, *([(x, y, 6.0) for x, y in hole] for hole in holes)])
 
 
+def _bulging_ridge() -> Solid:
+    """A slope over its walls, with three corners on the ridge that lie on its line but for the rounding.
+
+    Seen from above they do not bulge; in the plane of the slope the middle one does, and the sliver there is tilted.
+    """
+    roof = [
+        (66.194, 21.735, 4.754),
+        (53.817, 29.178, 4.897),
+        (52.023, 26.195, 7.073),
+        (58.845, 21.948, 7.070),
+        (58.866, 21.935, 7.071),
+        (59.009, 21.846, 7.070),
+        (64.286, 18.562, 7.069),
+    ]
+    faces: list[Rings] = [[roof], [[(x, y, 0.0) for x, y, _ in reversed(roof)]]]
+    for (x0, y0, z0), (x1, y1, z1) in zip(roof, [*roof[1:], roof[0]], strict=True):
+        faces.append([[(x0, y0, 0.0), (x1, y1, 0.0), (x1, y1, z1), (x0, y0, z0)]])
+    return solid_of(faces)
+
+
 def _folded_roof() -> Solid:
     """A cube whose flat roof has a fold of 8 mm over 12 mm, too small for the distance to its plane."""
     xs, zs = [0.0, 2.0, 2.012, 4.0], [4.0, 4.0, 4.008, 4.008]
@@ -249,6 +269,10 @@ BROKEN: dict[str, tuple[tuple[int, ...], Callable[[], Solid]]] = {
         (104,),
         lambda: solid_of([*places_of(cube()), [[(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (8.0, 0.0, 0.0)]]]),
     ),
+    "walls of 2 mm along 40 m": (
+        (104,),
+        lambda: extruded([(0.0, 0.0), (40.0, 0.0), (40.0, 10.0), (0.0, 10.0)], [], 0.002),
+    ),
     "a ring that touches itself": (
         (104,),
         lambda: with_rings(ell(), 0, [[*places_of(ell())[0][0][:3], (0.0, 4.0, 5.0), *places_of(ell())[0][0][4:]]]),
@@ -270,6 +294,7 @@ BROKEN: dict[str, tuple[tuple[int, ...], Callable[[], Solid]]] = {
     ),
     "a corner 5 cm off the plane": ((203,), lambda: with_vertex(ell(), (9.0, 4.0, 5.0), (9.0, 4.0, 5.05))),
     "a fold of 8 mm": ((204,), _folded_roof),
+    "a sliver where a ridge bulges by half a millimetre": ((204,), _bulging_ridge),
     "a hole from corner to corner": (
         (205,),
         lambda: _roof_hole([(0.0, 0.0), (4.0, 5.0), (12.0, 10.0), (6.0, 3.0)]),

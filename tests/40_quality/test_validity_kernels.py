@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.model import IntArray, Solid
-from pipeline.quality.planarity import distance_to_plane, least_cosine_of_normals
+from pipeline.quality.planarity import fitted_plane, in_fitted_plane, least_cosine_of_normals
 from pipeline.quality.rings import polygon_code, ring_is_simple
 from pipeline.quality.self_intersection import side_of_plane, triangles_intersect
 from pipeline.quality.shell import is_sound_shell, six_volumes
@@ -170,7 +170,20 @@ def test_the_distance_to_the_plane_is_that_of_numpys_eigenvectors(
     if values[1] - values[0] < 1e-6 * max(values[2], 1.0):
         return
     expected = np.abs(centred @ axes[:, 0]).max()
-    assert distance_to_plane(corners) == pytest.approx(expected, rel=1e-6, abs=1e-5)
+    distance_mm, slenderness, found = fitted_plane(corners)
+    assert distance_mm == pytest.approx(expected, rel=1e-6, abs=1e-5)
+    assert slenderness == pytest.approx(np.sqrt(max(values[1], 0.0) / values[2]), rel=1e-6, abs=1e-6)
+    assert found.T @ found == pytest.approx(np.eye(3), abs=1e-9)
+
+
+def test_in_the_fitted_plane_lengths_stay_and_millimetres_are_thousands() -> None:
+    corners = np.array([[0, 0, 0], [30, 0, 40], [30, 120, 40], [0, 120, 0]], dtype=np.int64)
+    _, slenderness, axes = fitted_plane(corners)
+    flat = in_fitted_plane(corners, axes)
+    assert slenderness == pytest.approx(50 / 120)
+    assert flat[:, 2].tolist() == [0, 0, 0, 0]
+    sides = np.hypot(*np.diff(flat[[0, 1, 2, 3, 0], :2], axis=0).T)
+    assert sides == pytest.approx([50_000, 120_000, 50_000, 120_000], abs=2)
 
 
 def test_normals_of_a_fold_differ_by_its_angle() -> None:
