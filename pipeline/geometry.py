@@ -65,11 +65,6 @@ def aspects_deg(normals: FloatArray) -> FloatArray:
     return np.where(flat | (aspects >= 360.0), 0.0, aspects)
 
 
-def facet_slopes_deg(xyz: FloatArray, facets: LabelArray) -> FloatArray:
-    """Slope of every facet, (m,) float64, 0 horizontal, 90 vertical or without area."""
-    return slopes_deg(facet_normals(xyz, facets))
-
-
 @njit(cache=True, nogil=True)
 def facet_areas_m2(xyz: FloatArray, facets: LabelArray) -> FloatArray:
     """Surface area of every facet, (m,) float64, square metres."""
@@ -80,18 +75,6 @@ def facet_areas_m2(xyz: FloatArray, facets: LabelArray) -> FloatArray:
         vx, vy, vz = xyz[k, 0] - xyz[i, 0], xyz[k, 1] - xyz[i, 1], xyz[k, 2] - xyz[i, 2]
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
         areas[t] = 0.5 * math.sqrt(nx * nx + ny * ny + nz * nz)
-    return areas
-
-
-@njit(cache=True, nogil=True)
-def facet_plan_areas_m2(xyz: FloatArray, facets: LabelArray) -> FloatArray:
-    """Signed area of every facet in plan, (m,) float64; positive where it turns left."""
-    areas = np.empty(len(facets))
-    for t in range(len(facets)):
-        i, j, k = facets[t, 0], facets[t, 1], facets[t, 2]
-        areas[t] = 0.5 * (
-            (xyz[j, 0] - xyz[i, 0]) * (xyz[k, 1] - xyz[i, 1]) - (xyz[j, 1] - xyz[i, 1]) * (xyz[k, 0] - xyz[i, 0])
-        )
     return areas
 
 
@@ -228,12 +211,6 @@ def vertical_residuals_m(points: FloatArray, coefficients: tuple[float, float, f
     return points[:, 2] - (a * points[:, 0] + b * points[:, 1] + c)
 
 
-def perpendicular_residuals_m(points: FloatArray, coefficients: tuple[float, float, float]) -> FloatArray:
-    """Distance of points from the plane (a, b, c), (n,) float64 metres, positive above (Eq. 1 with its sign)."""
-    a, b, _ = coefficients
-    return vertical_residuals_m(points, coefficients) / math.sqrt(1.0 + a * a + b * b)
-
-
 # ----------------------------------------------------------------------------------------------------------- rings
 
 
@@ -251,32 +228,6 @@ def ring_area_m2(ring: FloatArray) -> float:
         area += (ring[k, 0] - ring[0, 0]) * (ring[k + 1, 1] - ring[0, 1])
         area -= (ring[k, 1] - ring[0, 1]) * (ring[k + 1, 0] - ring[0, 0])
     return 0.5 * area
-
-
-def is_counter_clockwise(ring: FloatArray) -> bool:
-    """Whether a ring runs counter-clockwise in plan; False for one without area."""
-    return bool(ring_area_m2(ring) > 0.0)
-
-
-@njit(cache=True, nogil=True)
-def ring_normal_m2(ring: FloatArray) -> tuple[float, float, float]:
-    """Area vector of a ring in space (Newell): its direction is the normal, its length the area in square metres.
-
-    Parameters
-    ----------
-    ring : (n, 3) float64
-        Vertices, counter-clockwise seen from the tip of the normal; the first may be repeated at the end.
-    """
-    nx = 0.0
-    ny = 0.0
-    nz = 0.0
-    for k in range(1, len(ring) - 1):
-        ux, uy, uz = ring[k, 0] - ring[0, 0], ring[k, 1] - ring[0, 1], ring[k, 2] - ring[0, 2]
-        vx, vy, vz = ring[k + 1, 0] - ring[0, 0], ring[k + 1, 1] - ring[0, 1], ring[k + 1, 2] - ring[0, 2]
-        nx += uy * vz - uz * vy
-        ny += uz * vx - ux * vz
-        nz += ux * vy - uy * vx
-    return 0.5 * nx, 0.5 * ny, 0.5 * nz
 
 
 # -------------------------------------------------------------------------------------------------- neighbourhoods

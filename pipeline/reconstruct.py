@@ -130,8 +130,9 @@ def _reconstruct(
         else:
             forms = _arranged_forms(roof, segmentation.planes, settings)
         parts, planes, codes, margin = _own_solids(
-            candidate, roof, forms, segmentation.planes, settings.roof, is_primitive=segmentation.faces is not None
-        )
+            candidate, roof, forms, segmentation.planes, settings.roof, settings.plan.residual_cap_m,
+            is_primitive=segmentation.faces is not None,
+        )  # fmt: skip
         if parts:
             few = len(roof.points) < settings.roof.minimum_points
             unlikely = few or (lack is not None and roof.spacing_m < settings.roof.templates_spacing_m)
@@ -175,6 +176,9 @@ def _reconstruct(
 
 _WIDER_CLEARANCES = (2.5, 4.0)
 """Times the usual distances between an arrangement's vertices, where these made no sound solid."""
+
+_MUCH_LEVELLED = 0.05
+"""Share of the plan: where faces of more than this had to be made level, other forms are drawn and held against it."""
 
 _Form = Callable[[], RoofPartition | RankedFaces]
 """Draws roof faces: over the planes of the segmentation, or over planes of their own."""
@@ -230,7 +234,7 @@ def _ranked_forms(
 ) -> tuple[tuple[_Form, ...], tuple[_Form, ...]]:
     """The arrangement and the templates, those of them that can be had: what goes first, what last."""
     templates: Templates | None = None
-    with contextlib.suppress(BuildingError):
+    with contextlib.suppress(BuildingError, shapely.errors.GEOSException):
         templates = fit_templates(roof.points, outline_mm)
     if templates is None:
         return (arranged,), ()
@@ -255,7 +259,7 @@ def _template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSetting
     yield templates.faces
     if roof.footprint_mm is not None:
         for simpler in simpler_outlines(outline_mm):
-            with contextlib.suppress(BuildingError):
+            with contextlib.suppress(BuildingError, shapely.errors.GEOSException):
                 yield fit_templates(roof.points, simpler).faces
 
 
@@ -279,20 +283,24 @@ def _own_solids(
     forms: Iterable[_Form],
     planes: Sequence[Plane],
     settings: RoofSettings,
+    within_m: float,
     *,
     is_primitive: bool,
 ) -> tuple[list[SolidPart], list[Plane], tuple[int, ...], float]:
     """The first form of the method's solids that is valid throughout; no parts and all codes met where none is.
 
-    The last is by how much its faces were better than those that they competed with, nan where they did not.
+    A form that had to make a large face level waits: it is taken unless a later one explains more roof points. The
+    last is by how much its faces were better than those that they competed with, nan where they did not.
     """
     codes: set[int] = set()
+    waiting: tuple[list[SolidPart], list[Plane], float] | None = None
+    share = 0.0
     remaining = iter(forms)
     while True:
         try:
             form = next(remaining, None)
-        except BuildingError:
-            if not codes:
+        except (BuildingError, shapely.errors.GEOSException):
+            if not codes and waiting is None:
                 raise
             form = None  # what was drawn before tells more
         if form is None:
@@ -304,18 +312,36 @@ def _own_solids(
                 drawn, labelled = drawn.partition, dataclasses.replace(roof, labels=drawn.labels)
             elif drawn.planes is not None:
                 own_planes = list(drawn.planes)
+            is_levelled = False
             if not is_primitive:  # a primitive is one form: with a side made level it would be another
-                drawn, own_planes = level_unsupported_faces(drawn, labelled, own_planes, candidate.ground_z_m, settings)
+                level, own_planes = level_unsupported_faces(drawn, labelled, own_planes, candidate.ground_z_m, settings)
+                is_levelled = _is_much_changed(drawn, level)
+                drawn = level
             parts = large_parts(solid_parts(drawn, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
             if is_primitive:
                 parts = [unite_flush_walls(part) for part in parts]
         except (BuildingError, shapely.errors.GEOSException):
             continue
         faults = {code for part in parts for code in check_solid(part.solid)}
-        if parts and not faults:
-            return parts, own_planes, (), margin
         codes |= faults
-    return [], [], tuple(sorted(codes)), math.nan
+        if not parts or faults:
+            continue
+        if waiting is None and not is_levelled:
+            return parts, own_planes, (), margin
+        explained = _explained_share(roof, parts, own_planes, within_m)
+        if waiting is None or explained > share:
+            waiting, share = (parts, own_planes, margin), explained
+            if not is_levelled:
+                break
+    if waiting is None:
+        return [], [], tuple(sorted(codes)), math.nan
+    return *waiting[:2], (), waiting[2]
+
+
+def _is_much_changed(drawn: RoofPartition, level: RoofPartition) -> bool:
+    """Whether faces of more than a small share of the plan have another plane."""
+    areas = shapely.area(np.array(drawn.polygons, object))
+    return bool(areas[drawn.labels != level.labels].sum() > _MUCH_LEVELLED * areas.sum())
 
 
 def large_parts(parts: list[SolidPart], minimum_area_m2: float) -> list[SolidPart]:

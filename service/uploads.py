@@ -202,11 +202,6 @@ async def _blocks(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
         yield b"".join(held)
 
 
-def path_of(upload: Upload, folder: StateFolder) -> Path:
-    """Where an upload's file lies."""
-    return folder.upload(upload.upload_id) / upload.filename
-
-
 def remove_file(upload_id: str, folder: StateFolder) -> None:
     """Remove an upload's folder; its record is the store's business, and goes first."""
     shutil.rmtree(folder.upload(upload_id), ignore_errors=True)

@@ -130,7 +130,10 @@ class SourceInfo:
 
     def is_of(self, path: Path) -> bool:
         """Whether a file is still the one that was looked at, by its size and its time."""
-        now = path.stat()
+        try:
+            now = path.stat()
+        except OSError:  # whoever opens it tells
+            return False
         return (now.st_size, now.st_mtime_ns) == (self.file_size, self.modified_ns)
 
 

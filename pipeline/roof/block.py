@@ -71,16 +71,26 @@ def block_forms(
     ------
     callable
         Draws the blocks, at least one and not yet judged. Raises `BuildingError` where they cannot be drawn:
-        `no_footprint` where no part has an area, `no_partition` where parts overlap or touch.
+        `no_footprint` where no part has an area, `no_partition` where parts overlap or touch; or what GEOS raises.
     """
     build = partial(_blocks, plane=plane, ground_z_m=ground_z_m, minimum_area_m2=minimum_area_m2)
     yield partial(build, footprint_mm)
-    opened = shapely.buffer(shapely.buffer(footprint_mm, -25.0, join_style="mitre"), 25.0, join_style="mitre")
     for share in _SHARES_OF_TOLERANCE if tolerance_m > 0.0 else (0.0,):
         for back_mm in _DRAWN_BACK_MM:
-            drawn_back = shapely.buffer(opened, -back_mm, join_style="mitre")
-            yield partial(build, drawn_back, tolerance_mm=share * tolerance_m * 1e3)
-    yield partial(build, opened.convex_hull)
+            yield partial(_drawn_back, footprint_mm, back_mm, partial(build, tolerance_mm=share * tolerance_m * 1e3))
+    yield lambda: build(_opened(footprint_mm).convex_hull)
+
+
+def _opened(footprint_mm: MultiPolygon) -> BaseGeometry:
+    """The footprint without what is narrower than 5 cm."""
+    return shapely.buffer(shapely.buffer(footprint_mm, -25.0, join_style="mitre"), 25.0, join_style="mitre")
+
+
+def _drawn_back(
+    footprint_mm: MultiPolygon, back_mm: float, build: Callable[[BaseGeometry], list[SolidPart]]
+) -> list[SolidPart]:
+    """Blocks on the opened footprint, drawn back."""
+    return build(shapely.buffer(_opened(footprint_mm), -back_mm, join_style="mitre"))
 
 
 def _blocks(

@@ -73,11 +73,11 @@ def without_repeated(polygon: Polygon, distance_mm: float) -> list[Polygon]:
 
 
 def simpler_outlines(outline_mm: MultiPolygon) -> Iterator[MultiPolygon]:
-    """Outlines of fewer vertices and the same area, 5 mm and 20 mm from a given one or nearer.
+    """Outlines of fewer vertices: without those within 5 mm of the line between others, then within 20 mm.
 
     Over the edge of a round tower, drawn with edges of a decimetre, the corners of a sloping roof rise and fall by less
     than the millimetre that heights are rounded to: triangles of such corners point anywhere. With fewer corners they
-    do not. Those that are left go outward to where their chords enclose the area of the arc between them.
+    do not. Those that are left between two chords go outward to where these enclose the area of the arc between them.
 
     Parameters
     ----------

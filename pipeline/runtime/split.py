@@ -34,8 +34,6 @@ from pipeline.tiling import MM, Tile, TileGrid, Window
 
 _PLACE_BITS = 20
 """Bits of a coordinate in a sort key: 1,048 m in millimetres."""
-
-
 _STRIPS = 2**16 - 1
 """Strips of a tile in which the points of footprints are looked for; their numbers fit two bytes."""
 

@@ -68,6 +68,8 @@ class SupervisedChild:
     """
 
     def __init__(self, loads: Sequence[str]) -> None:
+        import psutil  # type: ignore[import-untyped]  # slow to load, and a serial run has no child
+
         self._stderr = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - closed in `end`
         # both processes write behind the end, also after it was cut
         fcntl.fcntl(self._stderr, fcntl.F_SETFL, fcntl.fcntl(self._stderr, fcntl.F_GETFL) | os.O_APPEND)
@@ -76,8 +78,6 @@ class SupervisedChild:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._stdin, self._stdout = self._process.stdin, self._process.stdout
-        import psutil  # type: ignore[import-untyped]  # slow to load, and a serial run has no child
-
         self._watched = psutil.Process(self._process.pid)
         self._is_gone = psutil.Error
         self._poll = select.poll()

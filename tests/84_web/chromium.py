@@ -15,6 +15,10 @@ HUES = {"pent": 0.454, "gable": 0.113, "hip": 0.909, "combination": 0.557}
 """Hues of roof types (0 to 1), those of the palette of Okabe and Ito; light does not change them."""
 
 
+FRAMES_AT_REST = 5
+"""Frames alike that show that nothing moves."""
+
+
 class Visit:
     """A page with its complaints.
 
@@ -59,6 +63,13 @@ class Visit:
     def _wait_for_frame(self) -> None:
         """Wait until the browser has drawn what it was asked for."""
         self.page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+    def pixels_at_rest(self) -> NDArray[np.uint8]:
+        """The same once several frames after one another are alike: the camera has arrived."""
+        shots = [self.pixels()]
+        while len(shots) < FRAMES_AT_REST or any((shot != shots[-1]).any() for shot in shots[-FRAMES_AT_REST:]):
+            shots.append(self.pixels())
+        return shots[-1]
 
     def pixels(self, save_as: Path | None = None) -> NDArray[np.uint8]:
         """What the canvas shows, as rows of red, green, blue."""

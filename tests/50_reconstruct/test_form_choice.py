@@ -1,0 +1,81 @@
+"""Which of several sound forms of a roof is delivered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import shapely
+
+from pipeline import reconstruct
+from pipeline.methods import ReconstructSettings
+from pipeline.model import Candidate, Plane, Status
+from pipeline.reconstruct import reconstruct_building
+from pipeline.roof import block
+from pipeline.roof.partition import RoofPartition
+from pipeline.roof.plan import RoofPoints
+from pipeline.roof.settings import RoofSettings
+
+
+def gable(seed: int = 0) -> Candidate:
+    """A gable of 12 m by 8 m with the eaves at 5 m, 10 points a m2."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 12, 960), rng.uniform(0, 8, 960)
+    z = 5.0 + 0.7 * np.minimum(y, 8.0 - y) + rng.normal(0, 0.02, 960)
+    points = np.rint(np.column_stack((x, y, z)) * 1e3) / 1e3
+    return Candidate(
+        building_id="b",
+        origin=(84_000.0, 447_000.0, 0.0),
+        points=points[np.lexsort(points.T[::-1])],
+        ground=np.zeros((0, 3)),
+        ground_z_m=0.0,
+        footprint=shapely.box(0, 0, 12, 8),
+    )
+
+
+def levelled_at_first(monkeypatch: pytest.MonkeyPatch, forms: int) -> list[int]:
+    """Makes all faces of so many first forms level; the list holds an entry for every form that was drawn."""
+    drawn_forms: list[int] = []
+    usual = reconstruct.level_unsupported_faces
+
+    def level(
+        drawn: RoofPartition, roof: RoofPoints, planes: Sequence[Plane], ground_z_m: float, settings: RoofSettings
+    ) -> tuple[RoofPartition, list[Plane]]:
+        drawn_forms.append(len(drawn.polygons))
+        if len(drawn_forms) > forms:
+            return usual(drawn, roof, planes, ground_z_m, settings)
+        flat = Plane(a=0.0, b=0.0, c=6.4, n_points=1, rmse_m=0.0)
+        return RoofPartition(polygons=drawn.polygons, labels=drawn.labels * 0 + len(planes)), [*planes, flat]
+
+    monkeypatch.setattr(reconstruct, "level_unsupported_faces", level)
+    return drawn_forms
+
+
+def test_a_form_that_was_made_level_gives_way_to_one_that_explains_the_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn_forms = levelled_at_first(monkeypatch, 1)
+    result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
+    assert (result.status, result.lod, len(drawn_forms)) == (Status.OK, "2.2", 2)
+    assert result.rmse_m < 0.05
+
+
+def test_a_form_that_was_made_level_is_delivered_where_no_other_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn_forms = levelled_at_first(monkeypatch, 1_000)
+    result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
+    assert (result.status, result.lod) == (Status.OK, "2.2")
+    assert len(drawn_forms) > 2
+    assert [plane.c for plane in result.planes] == [6.4]
+
+
+def test_a_block_that_cannot_be_drawn_gives_way_to_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    def opened(_: shapely.MultiPolygon) -> shapely.Polygon:
+        raise shapely.errors.GEOSException("on purpose")
+
+    monkeypatch.setattr(block, "_opened", opened)
+    monkeypatch.setattr(reconstruct, "_own_solids", lambda *_, **__: ([], [], (306,), float("nan")))
+    judged = iter([(306,)])
+    usual = reconstruct.check_solid
+    monkeypatch.setattr(reconstruct, "check_solid", lambda solid: next(judged, None) or usual(solid))
+    result = reconstruct_building(gable(), "arrangement", ReconstructSettings())
+    assert (result.status, result.lod) == (Status.FALLBACK, "1.2")
+    assert result.reason_detail.startswith("validity codes 306")
