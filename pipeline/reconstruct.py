@@ -180,6 +180,9 @@ _WIDER_CLEARANCES = (2.5, 4.0)
 _MUCH_LEVELLED = 0.05
 """Share of the plan: where faces of more than this had to be made level, other forms are drawn and held against it."""
 
+_AROUND_M, _FAR_M = 1.0, 1.0
+"""Points so near to a face in plan tell how high it may be, give or take this."""
+
 _Form = Callable[[], RoofPartition | RankedFaces]
 """Draws roof faces: over the planes of the segmentation, or over planes of their own."""
 
@@ -289,8 +292,9 @@ def _own_solids(
 ) -> tuple[list[SolidPart], list[Plane], tuple[int, ...], float]:
     """The first form of the method's solids that is valid throughout; no parts and all codes met where none is.
 
-    A form that had to make a large face level waits: it is taken unless a later one explains more roof points. The
-    last is by how much its faces were better than those that they competed with, nan where they did not.
+    A form that had to make a large face level waits: it is taken unless a later one explains more roof points. Of
+    those the first is taken whose faces stay near the points, else the one that explains most. The last is by how much
+    its faces were better than those that they competed with, nan where they did not.
     """
     codes: set[int] = set()
     waiting: tuple[list[SolidPart], list[Plane], float] | None = None
@@ -331,7 +335,7 @@ def _own_solids(
         explained = _explained_share(roof, parts, own_planes, within_m)
         if waiting is None or explained > share:
             waiting, share = (parts, own_planes, margin), explained
-            if not is_levelled:
+            if not is_levelled and _stays_near(parts, roof):
                 break
     if waiting is None:
         return [], [], tuple(sorted(codes)), math.nan
@@ -342,6 +346,18 @@ def _is_much_changed(drawn: RoofPartition, level: RoofPartition) -> bool:
     """Whether faces of more than a small share of the plan have another plane."""
     areas = shapely.area(np.array(drawn.polygons, object))
     return bool(areas[drawn.labels != level.labels].sum() > _MUCH_LEVELLED * areas.sum())
+
+
+def _stays_near(parts: Sequence[SolidPart], roof: RoofPoints) -> bool:
+    """Whether no corner of a roof face lies far above or below all points in the face and around it."""
+    faces = [face.polygon for part in parts for face in part.faces]
+    x, y, z = roof.points.T
+    for face in faces:
+        around = z[shapely.intersects_xy(face.buffer(_AROUND_M), x, y)]
+        corners = shapely.get_coordinates(face, include_z=True)[:, 2]
+        if len(around) and (corners.max() > around.max() + _FAR_M or corners.min() < around.min() - _FAR_M):
+            return False
+    return True
 
 
 def large_parts(parts: list[SolidPart], minimum_area_m2: float) -> list[SolidPart]:
