@@ -14,6 +14,13 @@ from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.arrangement.candidate_lines import border_places, candidate_lines
 from pipeline.roof.arrangement.cells import cell_borders, cell_costs, cells_of_points, points_per_cell, unite_faces
 from pipeline.roof.arrangement.faces import corners_of_borders, part_crossings, rings_of_faces, trace_faces
+from pipeline.roof.arrangement.far_corners import (
+    add_costs_of_far_planes,
+    cut_off_far_corners,
+    heights_around,
+    heights_raster,
+    with_level_planes,
+)
 from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, raster_labels
@@ -24,6 +31,8 @@ from pipeline.roof.partition import RoofPartition
 _EDGES_PER_LINE = 24
 _SPARE_EDGES = 256
 _ROUNDS = 5
+_CUTS = 3
+"""How often cells are cut whose plane leaves the points."""
 
 
 @njit(cache=True, nogil=True)
@@ -84,16 +93,25 @@ def _arranged(
     counts = np.array([n_outline, 2 * n_outline, polygon_of_ring.max() + 1], np.int32)
     subdivide(xy, graph, counts, lines, scores, crossing, line_of, places, line_reach_m, clearance)
 
-    n_cells = counts[2]
-    cell_labels = np.zeros(n_cells + len(xy), np.int32)
-    if k > 1:
+    spacing_m = 1.0 / math.sqrt(points_per_m2)
+    raster_of_heights = heights_raster(points, spacing_m)
+    chosen = np.empty(0, np.int32)
+    for attempt in range(_CUTS + 1):
+        n_cells, before = counts[2], chosen
+        cell_labels = np.zeros(n_cells + len(xy), np.int32)
+        if k == 1:
+            break
+        chosen = cell_labels[:n_cells]
+        chosen[: len(before)] = before
         cells = cells_of_points(xy, graph, counts[1], points)
         costs, misfits = cell_costs(
             xy, graph, counts[1], n_cells, points, labels, planes, cells, cap_m, points_per_m2, overshoot_m
         )
+        around = heights_around(xy, counts[0], raster_of_heights)
+        if attempt > 0:
+            add_costs_of_far_planes(xy, graph, counts[1], planes, around, overshoot_m, costs, misfits)
         borders, weights = cell_borders(xy, graph, counts[1], cost_per_m)
-        chosen = cell_labels[:n_cells]
-        for i in range(n_cells):
+        for i in range(len(before), n_cells):
             chosen[i] = np.argmin(costs[i])
         starts, others, border_costs = neighbour_lists(n_cells, borders, weights)
         allowed, allowed_starts = every_label(n_cells, k)
@@ -102,6 +120,17 @@ def _arranged(
         unite_faces(misfits, held, borders, weights, chosen, face_cost, doubtful_cost)
         for i in range(len(points)):
             label_of_point[i] = chosen[cells[i]] if cells[i] >= 0 else -1
+        if attempt == _CUTS:
+            break
+        planes = with_level_planes(xy, graph, counts[1], planes, chosen, around, overshoot_m)
+        is_more, k = len(planes) > k, len(planes)
+        line = len(lines) + attempt * len(graph)
+        found = cut_off_far_corners(
+            xy, graph, counts, points, cells, planes, chosen, around, raster_of_heights, overshoot_m, cap_m, line,
+            clearance,
+        )  # fmt: skip
+        if found == 0 or (attempt > 0 and counts[2] == n_cells and not is_more):
+            break
     support = support_of_planes(points, label_of_point, planes, cap_m)
 
     faces, n_faces = part_crossings(xy, graph, counts, cell_labels, planes, clearance)
@@ -148,7 +177,8 @@ def arrange(
 
     Coarse labels of a raster give candidate lines along their borders; the lines cut the outline into cells where
     they have support; the cells get the labels of least cost; cells of one label are a face. Before the lines are
-    drawn every plane is fitted anew to the points of its places.
+    drawn every plane is fitted anew to the points of its places. Cells whose plane leaves the points around them are
+    cut once more (`far_corners`).
 
     Parameters
     ----------
@@ -172,7 +202,8 @@ def arrange(
     -------
     RoofPartition
         A valid coverage of the whole outline: polygons in integer millimetres that share their borders exactly. A
-        place without points belongs to a neighbour's plane. With its planes, in the order of the given ones.
+        place without points belongs to a neighbour's plane. With its planes: the given ones in their order, behind
+        them horizontal ones for places where none of them fits.
 
     Raises
     ------

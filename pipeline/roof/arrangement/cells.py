@@ -129,6 +129,9 @@ def cell_costs(
             costs[cell, label] += int(COST_SCALE * share)
             if share > _TOLERANCE:
                 misfits[cell, label] += int(COST_SCALE * (share - _TOLERANCE) / (1.0 - _TOLERANCE))
+    for label in range(k):
+        if lowest[label] > highest[label] and planes[label, 0] == 0.0 == planes[label, 1]:
+            lowest[label] = highest[label] = planes[label, 2]
     beyond = np.zeros((n_cells, k), np.int64)
     corners = np.zeros(n_cells, np.int64)
     for h in range(n_edges):

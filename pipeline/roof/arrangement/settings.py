@@ -33,15 +33,15 @@ class ArrangementSettings(Parameters):
         3.0, "Misfitting points that a roof face must save.", unit="points", minimum=0.0, maximum=1000.0
     )
     face_area_m2: float = parameter(
-        2.0,
+        2.5,
         "A roof face must save at least the points that fall on this area, or those of `face_points`.",
         unit="m2",
         minimum=0.0,
         maximum=100.0,
     )
     face_points: float = parameter(
-        16.0,
-        "So many points are enough where a roof face explains all its own; a place of four by four point spacings.",
+        18.0,
+        "So many points are enough where a roof face explains all its own; a place of about four by four spacings.",
         unit="points",
         minimum=0.0,
         maximum=10_000.0,
@@ -59,8 +59,8 @@ class ArrangementSettings(Parameters):
     line_reach_m: float = parameter(0.6, "How far beyond its border a line cuts.", unit="m", minimum=0.0, maximum=20.0)
     overshoot_m: float = parameter(
         0.5,
-        "A plane that goes farther than this beyond the heights of its points is unlikely there; at least one point "
-        "spacing.",
+        "A plane that goes farther than this beyond the heights of its points, or of all points around a corner of a "
+        "roof face, is unlikely there; at least one point spacing.",
         unit="m",
         minimum=0.1,
         maximum=100.0,
@@ -86,7 +86,7 @@ class ArrangementSettings(Parameters):
         Examples
         --------
         >>> [ArrangementSettings().costs_of_face(density) for density in (1.0, 6.5, 40.0)]
-        [(3.0, 3.0), (13.0, 13.0), (16.0, 80.0)]
+        [(3.0, 3.0), (16.25, 16.25), (18.0, 100.0)]
         """
         by_area = max(self.face_cost, self.face_area_m2 * points_per_m2)
         return max(self.face_cost, min(by_area, self.face_points)), by_area

@@ -340,7 +340,7 @@ def outline_graph(
 
 
 @njit(cache=True, nogil=True)
-def _cut_by_line(
+def cut_by_line(
     xy: IntArray,
     graph: LabelArray,
     counts: LabelArray,
@@ -348,8 +348,9 @@ def _cut_by_line(
     number: int,
     snap_mm: float,
     spans: FloatArray,
+    only: int = -1,
 ) -> None:
-    """Cut the cells in which a line has support.
+    """Cut the cells in which a line has support, or only one of them.
 
     `counts` holds the numbers of vertices, half-edges and cells; `spans` are the stretches of the line with support,
     in mm along it. `line` is in mm.
@@ -395,7 +396,7 @@ def _cut_by_line(
             continue
         middle = 0.5 * (low + high)
         face = cell_at(xy, graph, counts[1], -nx * line[2] - ny * middle, -ny * line[2] + nx * middle)
-        if face < 0:
+        if face < 0 or (only >= 0 and face != only):
             continue
         room = True
         for e in (i, j):
@@ -475,4 +476,4 @@ def subdivide(
         in_mm[:] = lines[number]
         in_mm[2] *= 1e3
         snap_mm = _SNAP_CROSSING_MM if crossing[number] != 0 else _SNAP_MM
-        _cut_by_line(xy, graph, counts, in_mm, number, clearance * snap_mm, spans)
+        cut_by_line(xy, graph, counts, in_mm, number, clearance * snap_mm, spans)
