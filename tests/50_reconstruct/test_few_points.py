@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import candidates_by_hand as by_hand
 import numpy as np
 import pytest
 import shapely
@@ -19,15 +20,7 @@ HOUSE = shapely.box(0.0, 0.0, 12.0, 8.0)
 
 
 def candidate(points: FloatArray, outline: shapely.Polygon | None = HOUSE) -> Candidate:
-    points = np.rint(points * 1e3) / 1e3
-    return Candidate(
-        building_id="house",
-        origin=(0.0, 0.0, 0.0),
-        points=points[np.lexsort((points[:, 2], points[:, 1], points[:, 0]))],
-        ground=np.zeros((0, 3)),
-        ground_z_m=0.0,
-        footprint=outline,
-    )
+    return by_hand.candidate(points, building_id="house", origin=(0.0, 0.0, 0.0), footprint=outline)
 
 
 def hip_points(n: int, seed: int = 0) -> FloatArray:

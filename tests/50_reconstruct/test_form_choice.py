@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import shapely
+from candidates_by_hand import candidate
 
 from pipeline import reconstruct
 from pipeline.methods import ReconstructSettings
@@ -23,15 +24,7 @@ def gable(seed: int = 0) -> Candidate:
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(0, 12, 960), rng.uniform(0, 8, 960)
     z = 5.0 + 0.7 * np.minimum(y, 8.0 - y) + rng.normal(0, 0.02, 960)
-    points = np.rint(np.column_stack((x, y, z)) * 1e3) / 1e3
-    return Candidate(
-        building_id="b",
-        origin=(84_000.0, 447_000.0, 0.0),
-        points=points[np.lexsort(points.T[::-1])],
-        ground=np.zeros((0, 3)),
-        ground_z_m=0.0,
-        footprint=shapely.box(0, 0, 12, 8),
-    )
+    return candidate(np.column_stack((x, y, z)), footprint=shapely.box(0, 0, 12, 8))
 
 
 def levelled_at_first(monkeypatch: pytest.MonkeyPatch, forms: int) -> list[int]:

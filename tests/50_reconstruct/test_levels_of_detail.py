@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import shapely
+from candidates_by_hand import candidate
 
 from pipeline import reconstruct
 from pipeline.errors import SettingsError
@@ -23,15 +24,7 @@ def house(n: int = 2_400, seed: int = 0) -> Candidate:
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(0, 17, n), rng.uniform(0, 8, n)
     z = np.where(x < 12.0, 5.0 + 0.7 * np.minimum(y, 8.0 - y), 2.6) + rng.normal(0, 0.02, n)
-    points = np.rint(np.column_stack((x, y, z)) * 1e3) / 1e3
-    return Candidate(
-        building_id="b",
-        origin=(84_000.0, 447_000.0, 0.0),
-        points=points[np.lexsort(points.T[::-1])],
-        ground=np.zeros((0, 3)),
-        ground_z_m=0.0,
-        footprint=shapely.box(0, 0, 17, 8),
-    )
+    return candidate(np.column_stack((x, y, z)), footprint=shapely.box(0, 0, 17, 8))
 
 
 @pytest.fixture

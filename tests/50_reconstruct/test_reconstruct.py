@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import shapely
+from candidates_by_hand import candidate
 from shapely import Polygon
 
 from pipeline import reconstruct
@@ -25,19 +25,6 @@ from pipeline.roof.settings import RoofSettings
 Install = Callable[[Callable[[Candidate], Segmentation]], None]
 
 DEFAULTS = ReconstructSettings()
-
-
-def candidate(points: npt.ArrayLike, **fields: Any) -> Candidate:
-    points = np.rint(np.asarray(points, np.float64).reshape(-1, 3) * 1e3) / 1e3
-    points = points[np.lexsort((points[:, 2], points[:, 1], points[:, 0]))]
-    values = {
-        "building_id": "b",
-        "origin": (84_000.0, 447_000.0, 0.0),
-        "points": points,
-        "ground": np.zeros((0, 3)),
-        "ground_z_m": 0.0,
-    }
-    return Candidate(**(values | fields))
 
 
 def gable(n: int = 800, noise_m: float = 0.03, seed: int = 0, **fields: Any) -> Candidate:

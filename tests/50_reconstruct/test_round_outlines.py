@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import shapely
+from candidates_by_hand import candidate
 
 from pipeline.model import BuildingResult, Candidate, FloatArray, Status
 from pipeline.quality.validity import check_solid
@@ -39,15 +40,8 @@ def tower(outline: shapely.Polygon, heights: Heights, density_per_m2: float) -> 
     inside = shapely.contains_xy(outline, x, y)
     x, y = x[inside], y[inside]
     u, v = x * math.cos(0.3) + y * math.sin(0.3), y * math.cos(0.3) - x * math.sin(0.3)
-    points = np.rint(np.column_stack((x, y, heights(u, v) + rng.normal(0.0, 0.02, len(x)))) * 1e3) / 1e3
-    return Candidate(
-        building_id="tower",
-        origin=(0.0, 0.0, 0.0),
-        points=points[np.lexsort((points[:, 2], points[:, 1], points[:, 0]))],
-        ground=np.zeros((0, 3)),
-        ground_z_m=0.0,
-        footprint=outline,
-    )
+    points = np.column_stack((x, y, heights(u, v) + rng.normal(0.0, 0.02, len(x))))
+    return candidate(points, origin=(0.0, 0.0, 0.0), footprint=outline)
 
 
 def modelled(one: Candidate, method: str = "arrangement", preset: str = "robust") -> BuildingResult:

@@ -20,7 +20,16 @@ from numba import njit
 
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
-from pipeline.roof.arrangement.subdivision import FACE, NEXT, ORIGIN, PREVIOUS, cut_by_line, insert_chord, insert_vertex
+from pipeline.roof.arrangement.subdivision import (
+    FACE,
+    NEXT,
+    ORIGIN,
+    PREVIOUS,
+    SNAP_CROSSING_MM,
+    cut_by_line,
+    insert_chord,
+    insert_vertex,
+)
 
 HeightsRaster: TypeAlias = tuple[FloatArray, FloatArray, float, float, float]
 """From `heights_raster`."""
@@ -36,8 +45,6 @@ _STEEPEST = 1.0
 _COST_PER_M = 20.0
 _MOST_COST = 40.0
 """Points that a plane costs by the metre, and at most: more than a face, less than what a large cell holds."""
-_SNAP_MM = 35.0
-"""A line passes through vertices nearer to it than this: as all where planes cross."""
 _STEP_MM = 250.0
 """A third of the raster's cells: its heights say no more."""
 _MOST_LEVEL = 8
@@ -411,7 +418,7 @@ def cut_off_far_corners(
         n_before = counts[2]
         other = _plane_beyond(points, cells, planes, cell, labels[cell], fits, math.copysign(1.0, farthest), cap_m)
         if other >= 0:
-            snap_mm = clearance * _SNAP_MM
+            snap_mm = clearance * SNAP_CROSSING_MM
             _cut_where_planes_meet(xy, graph, counts, cell, plane, planes[other], line + found, snap_mm)
         if counts[2] == n_before:
             _cut_by_chord(xy, graph, counts, cell, plane, around, raster, far_m, near_corner, line + found)

@@ -22,7 +22,7 @@ ORIGIN, NEXT, PREVIOUS, FACE, LINE = 0, 1, 2, 3, 4
 """Start vertex; half-edges after and before; cell to the left; the line it lies on (outline edges from -2 down)."""
 _SNAP_MM = 60.0
 """A line passes through vertices nearer to it than this."""
-_SNAP_CROSSING_MM = 35.0
+SNAP_CROSSING_MM = 35.0
 """The same where planes cross: there the line is exact."""
 _CLEARANCE_MM = 25.0
 """Chords keep this far from vertices."""
@@ -475,5 +475,5 @@ def subdivide(
         spans = _supported_spans(lines[number], number, line_of, places, reach_m)
         in_mm[:] = lines[number]
         in_mm[2] *= 1e3
-        snap_mm = _SNAP_CROSSING_MM if crossing[number] != 0 else _SNAP_MM
+        snap_mm = SNAP_CROSSING_MM if crossing[number] != 0 else _SNAP_MM
         cut_by_line(xy, graph, counts, in_mm, number, clearance * snap_mm, spans)
