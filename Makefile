@@ -19,7 +19,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/uv --no-progress
 COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra postgres
+	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra postgres --extra s3
 
 KERNEL_SOURCES := $(shell grep -rl --include='*.py' njit pipeline | LC_ALL=C sort)
 
