@@ -14,9 +14,10 @@ from pipeline.runtime.events import ignore
 from pipeline.runtime.gather import gather
 from pipeline.runtime.join import RejectedSite
 from pipeline.runtime.plan import make_plan
+from pipeline.runtime.progress import Progress
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.serial import SerialExecutor
-from pipeline.runtime.stages import Progress, Stages, given_footprints
+from pipeline.runtime.stages import Stages, given_footprints
 from pipeline.settings import RunSettings
 
 
@@ -65,7 +66,7 @@ def found_scene(
             ),
             rejected=joined.rejected,
             small_fragments=joined.small_fragments,
-            points=sum(split.points for split in splits),
+            points=sum(split.points for split in splits.told),
             seconds=progress.timings,
         )
 

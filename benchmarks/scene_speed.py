@@ -36,9 +36,10 @@ from pipeline.io import ReadOptions
 from pipeline.runtime.events import ignore
 from pipeline.runtime.executors import Executor, executor_for
 from pipeline.runtime.plan import Plan, make_plan
+from pipeline.runtime.progress import Progress
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.serial import SerialExecutor
-from pipeline.runtime.stages import Progress, Stages
+from pipeline.runtime.stages import Stages
 from pipeline.settings import RunSettings
 from pipeline.synthetic.dataset import simulate
 from pipeline.synthetic.seeds import seed_of
@@ -94,7 +95,7 @@ def one_lap(tiles: Sequence[str], plan: Plan, settings: RunSettings, executor: E
     return Lap(
         seconds={stage: progress.timings[stage] for stage in STAGES},
         cpu_s=cpu_s if isinstance(executor, SerialExecutor) else None,
-        points=sum(split.points for split in splits),
+        points=sum(split.points for split in splits.told),
         candidates=len(joined.candidates),
         peaks=dict(progress.peaks),
         scratch_bytes=held,

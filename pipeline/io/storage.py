@@ -92,6 +92,10 @@ class LocalStorage:
         except FileNotFoundError:
             raise RunError(f"{key!r} is not in {self.root}") from None
 
+    def remove(self, key: str) -> None:
+        """Remove what stands under a key; nothing where there is nothing."""
+        self.path(key).unlink(missing_ok=True)
+
     def has(self, key: str) -> bool:
         """Whether something complete stands under the key."""
         return self.path(key).is_file()

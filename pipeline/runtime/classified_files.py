@@ -52,8 +52,8 @@ _SCALE = 0.001
 class ClassifiedTask:
     """One input file."""
 
-    index: int
-    """As ingest numbered it."""
+    part: str
+    """As ingest names it in scratch."""
     path: str
     """The file."""
     used: int
@@ -144,7 +144,7 @@ class _Labels:
 
     def _next(self, tile: Tile, count: int) -> ByteArray:
         """The next classes of a tile."""
-        path = class_path(self._task.scratch, tile, f"{self._task.index}.bin")
+        path = class_path(self._task.scratch, tile, f"{self._task.part}.bin")
         found = np.fromfile(path, np.uint8, count, offset=self._done[tile])
         if len(found) < count:
             raise InconsistentInputError(

@@ -22,10 +22,11 @@ from pipeline.runtime.classified_files import (
 from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.executors import Executor, executor_for, peak_of_process
 from pipeline.runtime.held_folder import held_folder, remove_abandoned
-from pipeline.runtime.ingest import Ingested
+from pipeline.runtime.ingest import Ingested, part_of
 from pipeline.runtime.join import Joined, PointRange
 from pipeline.runtime.labelling import LabelTask, label, neighbourhood
 from pipeline.runtime.plan import check_memory
+from pipeline.runtime.progress import Progress
 from pipeline.runtime.rasters import (
     RASTERS,
     MosaicTask,
@@ -37,7 +38,7 @@ from pipeline.runtime.rasters import (
 )
 from pipeline.runtime.run import RunRequest, calling_off, plan_inputs
 from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.stages import Progress, Stages, classes_in_use, given_footprints
+from pipeline.runtime.stages import Stages, classes_in_use, given_footprints
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile
 
@@ -181,7 +182,7 @@ def classify(
                 ingested = stages.ingest(paths)
                 splits = stages.split(ingested, footprints)
                 joined = stages.join(splits, footprints, reference)
-                tiles = sorted(s.tile for s in splits)
+                tiles = sorted(splits.places)
                 _label_all(stages, tiles, joined, ingested)
                 files = _write_all(stages, paths, ingested, out)
                 rasters = _draw_all(stages, tiles, ingested, cell, reference, out) if request.rasters else []
@@ -240,7 +241,7 @@ def _write_all(stages: Stages, paths: Sequence[str], ingested: Sequence[Ingested
     """All files, in the inputs' order."""
     tasks = [
         ClassifiedTask(
-            index=k,
+            part=part_of(path),
             path=path,
             used=sum(ingested[k].points_by_tile.values()),
             name=output_name(path),

@@ -6,6 +6,7 @@ LAZ has no spatial index: reading windows of it would decode the file again for 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
 from collections import Counter
 from pathlib import Path
@@ -19,6 +20,7 @@ from pipeline.io import ReadOptions, SourceInfo, open_source
 from pipeline.io.storage import sha256_of
 from pipeline.model import IntArray, PointCloud
 from pipeline.runtime.scratch import POINT, Scratch
+from pipeline.runtime.tile_content import ZoneSums, zone_sums
 from pipeline.tiling import MM, Tile, TileGrid
 
 _CHUNK_POINTS = 250_000
@@ -31,8 +33,8 @@ _TWO_BYTES = 2**16
 class IngestTask:
     """One input file."""
 
-    index: int
-    """Position in the sorted list of inputs; names the file's parts in scratch."""
+    part: str
+    """Names the file's parts in scratch; no two inputs share one."""
     path: str
     """The file."""
     options: ReadOptions
@@ -49,10 +51,12 @@ class IngestTask:
 class Ingested:
     """What one input file held."""
 
-    index: int
-    """As the task's."""
+    path: str
+    """The file."""
     points_by_tile: dict[Tile, int]
     """Points in each tile's bucket."""
+    content: dict[Tile, bytes]
+    """What points they are: the bytes of the tile's `ZoneSums`."""
     classes: dict[int, int]
     """Points by ASPRS class, of those kept."""
     dropped: dict[str, int]
@@ -69,6 +73,15 @@ class Ingested:
     """Whether any kept pulse has more than one return."""
     sha256: str
     """Digest of the file."""
+
+
+def part_of(path: str) -> str:
+    """Names the parts of an input file in scratch: whatever other inputs there are.
+
+    >>> part_of("/data/37EN1.LAZ")
+    '406afe307fa1d623'
+    """
+    return hashlib.sha256(path.encode()).hexdigest()[:16]
 
 
 def to_records(cloud: PointCloud, path: str) -> npt.NDArray[np.void]:
@@ -101,7 +114,7 @@ def ingest(task: IngestTask) -> Ingested:
     Returns
     -------
     Ingested
-        Counts and facts; the points are in scratch under `points/<tile>/<index>.bin`.
+        Counts and facts; the points are in scratch under `points/<tile>/<part>.bin`.
 
     Raises
     ------
@@ -114,6 +127,7 @@ def ingest(task: IngestTask) -> Ingested:
     source = open_source(task.path, task.options, task.known)
     suffix = f".{uuid4().hex}.part"
     counts: Counter[Tile] = Counter()
+    content: dict[Tile, ZoneSums] = {}
     classes: Counter[int] = Counter()
     low = np.full(3, 2**62)
     high = np.full(3, -(2**62))
@@ -134,13 +148,15 @@ def ingest(task: IngestTask) -> Ingested:
         histogram = np.bincount(records["classification"])
         classes.update({int(c): int(histogram[c]) for c in np.flatnonzero(histogram)})
         multiple = multiple or bool((records["return_count"] > 1).any())
-        counts.update(_append_by_tile(records, x, y, task, suffix))
+        counts.update(_append_by_tile(records, x, y, task, suffix, content))
     for tile in counts:
-        part = task.scratch.path("points", tile.key, f"{task.index}{suffix}")
-        part.replace(task.scratch.path("points", tile.key, f"{task.index}.bin"))
+        part = task.scratch.path("points", tile.key, f"{task.part}{suffix}")
+        task.scratch.check_cancelled()
+        part.replace(task.scratch.path("points", tile.key, f"{task.part}.bin"))
     return Ingested(
-        index=task.index,
+        path=task.path,
         points_by_tile=dict(counts),
+        content={tile: sums.tobytes() for tile, sums in content.items()},
         classes=dict(classes),
         dropped=source.dropped,
         warnings=source.warnings,
@@ -153,9 +169,14 @@ def ingest(task: IngestTask) -> Ingested:
 
 
 def _append_by_tile(
-    records: npt.NDArray[np.void], x_mm: IntArray, y_mm: IntArray, task: IngestTask, suffix: str
+    records: npt.NDArray[np.void],
+    x_mm: IntArray,
+    y_mm: IntArray,
+    task: IngestTask,
+    suffix: str,
+    content: dict[Tile, ZoneSums],
 ) -> Counter[Tile]:
-    """Append a chunk to the parts of its tiles; points of each tile."""
+    """Append a chunk to the parts of its tiles; points of each tile. Their content is added to that of the file."""
     columns, rows = task.grid.columns_rows(x_mm, y_mm)
     west, south = int(columns.min()), int(rows.min())
     height = int(rows.max()) - south + 1
@@ -169,8 +190,13 @@ def _append_by_tile(
     for start, stop in zip(starts, [*starts[1:], len(ordered)], strict=True):
         column, row = divmod(int(number[start]), height)
         tile = Tile(west + column, south + row)
-        with task.scratch.path("points", tile.key, f"{task.index}{suffix}").open("ab") as part:
+        with task.scratch.path("points", tile.key, f"{task.part}{suffix}").open("ab") as part:
             ordered[start:stop].tofile(part)
+        core = task.grid.core(tile)
+        points = ordered[start:stop]
+        bits = np.ascontiguousarray(points["gps_time"]).view(np.uint64)
+        sums = zone_sums(points, bits, core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm, task.grid.halo_mm)
+        content[tile] = content[tile] + sums if tile in content else sums
         counts[tile] += int(stop - start)
     return counts
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -102,6 +102,8 @@ class Joined:
     """By id."""
     small_fragments: int
     """Surfaces below the size of an object: counted, not listed."""
+    keys: Mapping[Tile, str] = dataclasses.field(default_factory=dict)
+    """Digest of what lies in and around each tile: equal where nothing that comes after sees a difference."""
 
 
 def object_id(crs_name: str, lowest_point_mm: Sequence[int]) -> str:
@@ -317,6 +319,7 @@ def join(splits: Sequence[Split], grid: TileGrid, settings: CandidateSettings, c
 def join_footprints(
     splits: Sequence[Split],
     grid: TileGrid,
+    numbers: Mapping[Tile, Sequence[int]],
     footprints: Sequence[Polygon | MultiPolygon],
     source_ids: Sequence[str],
     crs_name: str,
@@ -330,6 +333,8 @@ def join_footprints(
         All tiles, in any order.
     grid : TileGrid
         The lattice, for the owners.
+    numbers : mapping
+        By tile, the numbers of the footprints that its split knows by their place.
     footprints, source_ids : sequences
         The given outlines in metres, in the order of their numbers, and their own ids.
     crs_name : str
@@ -338,12 +343,13 @@ def join_footprints(
         Their columns, each as the text of a JSON object.
     """
     splits = sorted(splits, key=lambda s: s.tile)
-    numbers = {(t, key): key for t, s in enumerate(splits) for key in s.keys.tolist()}
-    ranges = _ranges_by_key(splits, numbers)
+    number_of = {(t, key): numbers[s.tile][key] for t, s in enumerate(splits) for key in s.keys.tolist()}
+    ranges = _ranges_by_key(splits, number_of)
     lowest: dict[int, tuple[int, ...]] = {}
     for s in splits:
         for key, point in zip(s.keys.tolist(), s.lowest_points_mm.tolist(), strict=True):
-            lowest[key] = min(lowest.get(key, tuple(point)), tuple(point))
+            owner = numbers[s.tile][key]
+            lowest[owner] = min(lowest.get(owner, tuple(point)), tuple(point))
     candidates = []
     for number, (footprint, source_id) in enumerate(zip(footprints, source_ids, strict=True)):
         name, point = crs_name, lowest.get(number)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 import shapely
 
-from pipeline.errors import GableworkError
+from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.export.records import CandidateFacts
 from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
@@ -23,6 +23,7 @@ from pipeline.runtime.bundle import Bundle, Incident, write_bundle
 from pipeline.runtime.gather import gather
 from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
 from pipeline.runtime.join import CandidateSite
+from pipeline.runtime.kept import Place, key_of, result_of
 from pipeline.runtime.overrides import OwnModelling
 from pipeline.runtime.scratch import Scratch
 from pipeline.tiling import Tile, TileGrid
@@ -37,8 +38,6 @@ _NO_BUNDLE = "there is no bundle, since its points cannot be put together"
 class BatchTask:
     """Some candidates for one task."""
 
-    number: int
-    """Names the batch's files in scratch."""
     sites: tuple[CandidateSite, ...]
     """The candidates."""
     method: str
@@ -57,6 +56,8 @@ class BatchTask:
     """Of the run, for its bundles."""
     own: Mapping[str, OwnModelling] = dataclasses.field(default_factory=dict)
     """Method and settings of the buildings that have their own, by building_id."""
+    earlier: tuple[Place, ...] = ()
+    """Outcomes of earlier batches of these candidates' tile: what is modelled there from the same input is taken."""
     compared: bool = False
     """Whether seconds are held against those of other methods: a method is then loaded before the clock starts."""
 
@@ -78,6 +79,8 @@ class Modelled:
     faces: int
     points: int
     seconds: float
+    reused: bool = False
+    """Whether the model is that of an earlier batch, of the same input."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -88,8 +91,24 @@ class StoredResult:
     facts: CandidateFacts
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Batch:
+    """The models of a batch."""
+
+    told: tuple[Modelled, ...]
+    """What the driver learns, in the order of the task's candidates."""
+    stored: Mapping[str, tuple[str, bytes]]
+    """By building_id: the digest of all that the model was made from, empty where that is not to be trusted again; and
+    a pickled `StoredResult`."""
+
+
+def told_of_batch(batch: Batch) -> tuple[Modelled, ...]:
+    """What the driver learns of a batch."""
+    return batch.told
+
+
 def batches(sites: Sequence[CandidateSite]) -> list[tuple[CandidateSite, ...]]:
-    """Group candidates, which come largest first, to tasks of some seconds each.
+    """Group the candidates of a tile, which come largest first, to tasks of some seconds each.
 
     >>> from pipeline.runtime.join import CandidateSite
     >>> site = lambda n: CandidateSite(building_id=str(n), owner=Tile(0, 0), ranges=(), points=n)
@@ -110,8 +129,8 @@ def batches(sites: Sequence[CandidateSite]) -> list[tuple[CandidateSite, ...]]:
     return groups
 
 
-def model_batch(task: BatchTask) -> tuple[Modelled, ...]:
-    """Model a batch; the results are stored under `results/<tile>/<batch>` for their tiles to publish.
+def model_batch(task: BatchTask) -> Batch:
+    """Model a batch.
 
     Raises
     ------
@@ -128,21 +147,17 @@ def model_batch(task: BatchTask) -> tuple[Modelled, ...]:
     except OSError:
         task.scratch.check_cancelled()  # a run that is over has no scratch any more
         raise
-    by_tile: dict[Tile, list[bytes]] = {}
-    for index, site in enumerate(task.sites):
-        by_tile.setdefault(site.owner, []).append(packed[index].stored)
-    for tile, pickles in by_tile.items():
-        task.scratch.put_object(_results_name(tile, task.number), pickles)
-    return tuple(packed[index].told for index in range(len(task.sites)))
+    each = [packed[index] for index in range(len(task.sites))]
+    return Batch(
+        told=tuple(model.told for model in each),
+        stored={model.told.building_id: (model.made_from, model.stored) for model in each},
+    )
 
 
-def stored_results(scratch: Scratch, tile: Tile, number: int) -> list[StoredResult]:
-    """What a batch modelled of a tile. Of this run's own scratch only: pickles run code."""
-    return [pickle.loads(stored) for stored in scratch.get_object(_results_name(tile, number))]  # noqa: S301
-
-
-def _results_name(tile: Tile, number: int) -> str:
-    return f"results/{tile.key}/{number}.pickle"
+def stored_results(scratch: Scratch, place: Place) -> list[StoredResult]:
+    """What a batch modelled. Of this run's own scratch only: pickles run code."""
+    batch: Batch = result_of(scratch, place)
+    return [pickle.loads(stored) for _, stored in batch.stored.values()]  # noqa: S301
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,10 +167,19 @@ class Packed:
     told: Modelled
     stored: bytes
     """A pickled `StoredResult`."""
+    made_from: str = ""
+    """Digest of candidate, method and settings; empty where the model is not to be taken again."""
 
 
 def _packed(
-    task: BatchTask, site: CandidateSite, result: BuildingResult, facts: CandidateFacts, seconds: float
+    task: BatchTask,
+    site: CandidateSite,
+    result: BuildingResult,
+    facts: CandidateFacts,
+    seconds: float,
+    made_from: str = "",
+    *,
+    reused: bool = False,
 ) -> Packed:
     told = Modelled(
         building_id=result.building_id,
@@ -166,6 +190,7 @@ def _packed(
         faces=len(result.faces),
         points=result.n_points,
         seconds=seconds,
+        reused=reused,
     )
     own = task.own.get(site.building_id)
     facts = dataclasses.replace(
@@ -175,7 +200,8 @@ def _packed(
         settings_hash=None if own is None else own.settings_hash,
     )
     stored = StoredResult(result=result, facts=facts)
-    return Packed(told=told, stored=pickle.dumps(stored, protocol=pickle.HIGHEST_PROTOCOL))
+    packed = pickle.dumps(stored, protocol=pickle.HIGHEST_PROTOCOL)
+    return Packed(told=told, stored=packed, made_from=made_from)
 
 
 def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:
@@ -230,9 +256,14 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     started = time.perf_counter()
     candidate: Candidate | None = None
     facts = CandidateFacts()
+    made_from = ""
+    reused = False
     try:
         candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, beside=task.settings.roof.at_walls)
-        result = reconstruct_building(candidate, task.method, task.settings)
+        made_from = key_of(candidate, task.method, task.settings)
+        earlier = _modelled_before(task, site.building_id, made_from)
+        reused = earlier is not None
+        result = earlier or reconstruct_building(candidate, task.method, task.settings)
     except (MemoryError, OSError, GableworkError):
         raise
     except Exception as error:  # noqa: BLE001 - told in the record
@@ -241,7 +272,29 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     if result.reason is Reason.INTERNAL_ERROR:
         incident = Incident(reason=result.reason.value, detail=result.reason_detail, seconds=seconds)
         result = _kept(task, candidate, result, incident)
-    return _packed(task, site, result, facts, seconds)
+        made_from = ""
+    return _packed(task, site, result, facts, seconds, made_from, reused=reused)
+
+
+def _modelled_before(task: BatchTask, building_id: str, made_from: str) -> BuildingResult | None:
+    """The model of the same input by the same settings, where an earlier batch made it."""
+    for place in task.earlier:
+        known, stored = _batch_of(task.scratch, place).get(building_id, ("", b""))
+        if known == made_from:
+            found: StoredResult = pickle.loads(stored)  # noqa: S301 - of our own scratch
+            return found.result
+    return None
+
+
+@functools.lru_cache(maxsize=8)
+def _batch_of(scratch: Scratch, place: Place) -> Mapping[str, tuple[str, bytes]]:
+    """The models of an earlier batch; nothing where it is gone meanwhile."""
+    try:
+        batch: Batch = result_of(scratch, place)
+    except RunCancelledError:
+        scratch.check_cancelled()
+        return {}
+    return batch.stored
 
 
 def _lost(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from pathlib import Path
 
@@ -10,12 +11,18 @@ import shapely
 
 from pipeline.errors import RunCancelledError
 from pipeline.export.records import RecordContext, RejectedObject
-from pipeline.export.tile import Put, TileFiles, write_tile
+from pipeline.export.tile import Put, write_tile
 from pipeline.io import LocalStorage
+from pipeline.model import Status
+from pipeline.runtime.bundle import SUFFIX
 from pipeline.runtime.join import RejectedSite
+from pipeline.runtime.kept import Place
 from pipeline.runtime.modelling import StoredResult, stored_results
 from pipeline.runtime.scratch import Scratch
 from pipeline.tiling import MM, Tile
+
+QUARANTINE = "quarantine"
+"""Folder of a run directory, and of scratch, for the bundles of buildings that cost their process."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,8 +32,8 @@ class PublishTask:
     tile: Tile
     run_dir: str
     scratch: Scratch
-    batches: tuple[int, ...]
-    """Batches that modelled buildings of this tile."""
+    batches: tuple[Place, ...]
+    """Outcomes of the batches that modelled the buildings of this tile."""
     rejected: tuple[RejectedSite, ...]
     """Objects of this tile that are no buildings."""
     context: RecordContext
@@ -37,10 +44,11 @@ class PublishTask:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Published:
-    """One tile's files, or why there are none."""
+    """What became of one tile."""
 
     tile: Tile
-    files: TileFiles | None
+    n_files: int
+    """How many it has; their digests are in its state."""
     error: str = ""
     """Why the tile failed; empty where it did not."""
 
@@ -81,7 +89,7 @@ def publish(task: PublishTask) -> Published:
         storage.put(key, content)
 
     task.scratch.check_cancelled()
-    files: TileFiles | None = None
+    files: dict[str, str] = {}
     error = ""
     try:
         if task.batches or task.rejected or task.empty_tables:
@@ -90,23 +98,46 @@ def publish(task: PublishTask) -> Published:
         raise
     except Exception as fault:  # noqa: BLE001 - told in the tile's state, the manifest and the exit code
         error = f"{type(fault).__name__}: {fault}"
+    before = files_of(storage, task.tile)
     state = {
         "tile": task.tile.key,
         "state": "failed" if error else "done",
         "error": error,
-        "files": {} if files is None else dict(files.digests),
+        "files": files,
     }
     put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
-    return Published(tile=task.tile, files=files, error=error)
+    for name in sorted(before - files.keys()):
+        storage.remove(name)
+    return Published(tile=task.tile, n_files=len(files), error=error)
 
 
-def _write(task: PublishTask, put: Put) -> TileFiles:
-    """Write the files of a tile that owns something."""
+def files_of(storage: LocalStorage, tile: Tile) -> set[str]:
+    """The files that a tile's state names; none where it has no state yet."""
+    key = f"state/{tile.key}.json"
+    return set(json.loads(storage.get(key))["files"]) if storage.has(key) else set()
+
+
+def retire(storage: LocalStorage, tile: Tile) -> None:
+    """Remove what a tile published that owns nothing any more: its files, then its state."""
+    for name in sorted(files_of(storage, tile)):
+        storage.remove(name)
+    storage.remove(f"state/{tile.key}.json")
+
+
+def _write(task: PublishTask, put: Put) -> dict[str, str]:
+    """Write the files of a tile that owns something; the sha256 of each by its path."""
     stored: list[StoredResult] = []
-    for number in task.batches:
-        stored.extend(stored_results(task.scratch, task.tile, number))
+    for place in task.batches:
+        stored.extend(stored_results(task.scratch, place))
+    bundles: dict[str, str] = {}
+    for entry in stored:
+        bundle = Path(task.scratch.root, QUARANTINE, f"{entry.result.building_id}{SUFFIX}")
+        if entry.result.status is Status.FAILED and bundle.is_file():
+            content = bundle.read_bytes()
+            put(f"{QUARANTINE}/{bundle.name}", content)
+            bundles[f"{QUARANTINE}/{bundle.name}"] = hashlib.sha256(content).hexdigest()
     context = dataclasses.replace(task.context, facts={entry.result.building_id: entry.facts for entry in stored})
-    return write_tile(
+    files = write_tile(
         task.run_dir,
         task.tile.key,
         [entry.result for entry in stored],
@@ -115,3 +146,4 @@ def _write(task: PublishTask, put: Put) -> TileFiles:
         meshes=task.meshes,
         put=put,
     )
+    return {**files.digests, **bundles}

@@ -46,10 +46,10 @@ from pipeline.runtime.modelling import Modelled, StoredResult
 from pipeline.runtime.overrides import Override, read_overrides
 from pipeline.runtime.overriding import WARNING, EntryOutcome
 from pipeline.runtime.plan import check_memory
-from pipeline.runtime.publish import rejected_object
+from pipeline.runtime.progress import Progress
+from pipeline.runtime.publish import QUARANTINE, rejected_object
 from pipeline.runtime.run import (
     OVERRIDES,
-    QUARANTINE,
     SCRATCH,
     RunRequest,
     calling_off,
@@ -60,8 +60,7 @@ from pipeline.runtime.run import (
     told_request,
 )
 from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.split import Split
-from pipeline.runtime.stages import GivenFootprints, Progress, Stages, given_footprints, points_by_tile
+from pipeline.runtime.stages import GivenFootprints, Models, Splits, Stages, given_footprints, points_by_tile
 from pipeline.tiling import MM, Tile
 
 AROUND_M = 30.0
@@ -178,7 +177,6 @@ def rerun(
                 executor=engine,
                 scratch=scratch,
                 isolation=request.isolation,
-                quarantine=str(Path(scratch.root, QUARANTINE)),  # put in place with the other files
             )
             try:
                 ingested = stages.ingest(paths)
@@ -187,9 +185,10 @@ def rerun(
                 for outcome in found.outcomes:
                     if outcome.warning:
                         progress.warn("join", outcome.warning)
-                modelled = stages.reconstruct(found.again)
+                models = stages.reconstruct(found.again)
+                modelled = list(models.each())
                 new = LocalStorage(root=Path(scratch.root, _NEW))
-                prepared = _prepared(stages, earlier, found, wanted.meshes, new)
+                prepared = _prepared(stages, earlier, found, models, wanted.meshes, new)
             except BaseException:
                 scratch.cancel()
                 raise
@@ -205,7 +204,7 @@ def rerun(
         digest=digest,
         buildings=dict(sorted(status.items())),
         tiles=tuple(sorted(tile.key for tile in prepared)),
-        tiles_split=len(found.splits),
+        tiles_split=len(found.splits.told),
         warnings=tuple(outcome.warning for outcome in found.outcomes if outcome.warning),
         seconds=seconds,
     )
@@ -221,7 +220,7 @@ def _overrides_file(request: RerunRequest, earlier: Earlier) -> str | None:
 class _Found:
     """What the split of some tiles, or of all, found."""
 
-    splits: list[Split]
+    splits: Splits
     judged: Joined
     """Before the overrides."""
     outcomes: tuple[EntryOutcome, ...]
@@ -356,7 +355,9 @@ class _Prepared:
     """Paths of meshes that no row names any more."""
 
 
-def _prepared(stages: Stages, earlier: Earlier, found: _Found, meshes: str, new: LocalStorage) -> dict[Tile, _Prepared]:
+def _prepared(
+    stages: Stages, earlier: Earlier, found: _Found, models: Models, meshes: str, new: LocalStorage
+) -> dict[Tile, _Prepared]:
     """Write the new files of the tiles that own what was made again, one tile at a time, beside the run's."""
     context = stages.record_context(stages.plan.sources[0].reference)
     rejected: dict[Tile, list[RejectedSite]] = {}
@@ -379,7 +380,7 @@ def _prepared(stages: Stages, earlier: Earlier, found: _Found, meshes: str, new:
             new.put(path, data)
         return _Prepared(digests=update.digests, gone=update.gone)
 
-    prepared = {tile: prepare(tile, stored) for tile, stored in itertools.chain(stages.stored(found.again), without)}
+    prepared = {tile: prepare(tile, stored) for tile, stored in itertools.chain(models.stored(), without)}
     return dict(sorted(prepared.items()))
 
 

@@ -26,13 +26,15 @@ from pipeline.runtime.flight import TICK_S
 from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import Joined
-from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, write_manifest
-from pipeline.runtime.modelling import Modelled
+from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, read_manifest, write_manifest
 from pipeline.runtime.overrides import read_overrides
 from pipeline.runtime.plan import Plan, check_memory, make_plan
+from pipeline.runtime.progress import Progress
+from pipeline.runtime.publish import QUARANTINE
 from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.split import Split
-from pipeline.runtime.stages import Progress, Stages, given_footprints
+from pipeline.runtime.stages import MODELS, Models, Splits, Stages, given_footprints
+from pipeline.runtime.stale import tidy
+from pipeline.runtime.work_folder import held_work
 from pipeline.settings import RunSettings
 
 FOOTPRINTS = "footprints.json"
@@ -40,7 +42,6 @@ FOOTPRINTS = "footprints.json"
 OVERRIDES = "overrides.json"
 """What became of each entry of the overrides; there where overrides were given."""
 SCRATCH = "scratch"
-QUARANTINE = "quarantine"
 
 _RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state", QUARANTINE)
 
@@ -77,6 +78,9 @@ class RunRequest:
     """Licence of the source data, in the user's words."""
     overwrite: bool = False
     """Replace what an earlier run left in `out`."""
+    work: str | None = None
+    """A folder that keeps what the tasks find. A run with the same one goes on where the one before was cut off, and
+    does again only what changed since; None keeps nothing."""
     isolate: bool | None = None
     """Model buildings in supervised child processes; None does so with workers and not serially."""
     building_timeout_s: float = IsolationLimits.timeout_s
@@ -232,10 +236,7 @@ def run_variants(
         shared.warn("plan", warning)
     reference = plan.sources[0].reference
     overrides = () if request.overrides is None else read_overrides(request.overrides, reference, settings)
-    run_dirs = [_checked(variant.out, overwrite=request.overwrite) for variant in variants]
-    scratch_dir = Path(work_dir).resolve() / SCRATCH
-    remove_folder(scratch_dir)
-    scratch = Scratch(str(scratch_dir / uuid4().hex))
+    run_dirs = [_checked(variant.out, overwrite=request.overwrite, work=request.work) for variant in variants]
     manifests = [
         RunManifest(
             status=RunStatus.RUNNING,
@@ -251,11 +252,11 @@ def run_variants(
         for variant in variants
     ]
     shared.timings["plan"] = time.perf_counter() - began
-    engine = executor or executor_for(
-        workers=request.workers, scheduler=request.scheduler, local_directory=str(scratch_dir / "dask")
-    )
-    scratch.create()
-    try:
+    with contextlib.ExitStack() as held:
+        scratch = held.enter_context(_scratch(work_dir) if request.work is None else held_work(request.work))
+        engine = executor or executor_for(
+            workers=request.workers, scheduler=request.scheduler, local_directory=str(Path(scratch.root, "dask"))
+        )
         starting = time.perf_counter()
         with calling_off(scratch, cancelled) as called_off, engine:
             shared.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)
@@ -264,7 +265,8 @@ def run_variants(
             check_memory(plan, engine.memory_limit_bytes)
             # nothing of an earlier run goes before all that can be checked is checked
             for run_dir, manifest in zip(run_dirs, manifests, strict=True):
-                _clear_results(run_dir)
+                if request.work is None or not _is_of_work(run_dir, request.work):
+                    _clear_results(run_dir)
                 write_manifest(run_dir, manifest, LocalStorage(root=run_dir).put)
                 if footprints is not None:
                     put_json(run_dir, FOOTPRINTS, footprints.report)
@@ -294,16 +296,15 @@ def run_variants(
                         put_json(run_dir, OVERRIDES, [outcome.as_dict() for outcome in outcomes_of_entries])
                 progresses.extend(shared.part(k, len(variants), v.label) for k, v in enumerate(variants))
                 each = [
-                    dataclasses.replace(
-                        stages, settings=v.settings, progress=own, variant=k, quarantine=str(run_dirs[k] / QUARANTINE)
-                    )
-                    for k, (v, own) in enumerate(zip(variants, progresses, strict=True))
+                    dataclasses.replace(stages, settings=v.settings, progress=own)
+                    for v, own in zip(variants, progresses, strict=True)
                 ]
                 modelled = [own.reconstruct(joined) for own in each]
                 published = [
                     own.publish(splits, joined, models, reference, str(run_dir))
                     for own, models, run_dir in zip(each, modelled, run_dirs, strict=True)
                 ]
+                found = [_Counted.of(models) for models in modelled]
             except BaseException as error:
                 scratch.cancel()
                 off = isinstance(error, RunCancelledError | KeyboardInterrupt)
@@ -314,8 +315,8 @@ def run_variants(
                     broken = dataclasses.replace(manifest, status=status, warnings=(*warnings, message))
                     write_manifest(run_dir, broken, LocalStorage(root=run_dir).put)
                 raise
-    finally:
-        remove_folder(scratch_dir)
+            if request.work is not None:
+                tidy(scratch, joined, {f"{MODELS}-{v.settings.settings_hash[:16]}" for v in variants}, run_dirs)
     inputs = _inputs_told(request, paths, ingested)
     driver, peak_bytes = peak_of_process()
     outcomes = []
@@ -327,8 +328,9 @@ def run_variants(
         alone = len(variants) == 1
         own.timings["total"] = time.perf_counter() - began if alone else sum(own.timings.values())
         own.peaks[driver] = peak_bytes
-        tiles, failed_tiles = published[k]
-        counts = _counts(plan, ingested, splits, joined, modelled[k])
+        tiles = [outcome.tile.key for outcome in published[k]]
+        failed_tiles = [outcome.tile.key for outcome in published[k] if outcome.error]
+        counts = _counts(plan, ingested, splits, joined, found[k])
         write_manifest(
             run_dir,
             dataclasses.replace(
@@ -349,17 +351,17 @@ def run_variants(
         summary = RunSummary(
             run_dir=str(run_dir),
             digest=digest,
-            statuses=dict(Counter(m.status for m in modelled[k])),
-            reasons=dict(Counter(m.reason for m in modelled[k] if m.reason is not None)),
+            statuses=dict(found[k].statuses),
+            reasons=dict(found[k].reasons),
             rejected=dict(Counter(site.verdict.reason.value for site in joined.rejected)),
-            roof_types=dict(Counter(m.roof_type for m in modelled[k])),
+            roof_types=dict(found[k].roof_types),
             counts=counts,
             timings_s=own.timings,
             peak_memory_bytes=own.peaks,
             warnings=tuple(own.warnings),
             failed_tiles=tuple(failed_tiles),
         )
-        outcomes.append(VariantOutcome(summary=summary, seconds={m.building_id: m.seconds for m in modelled[k]}))
+        outcomes.append(VariantOutcome(summary=summary, seconds=found[k].seconds))
     seconds = time.perf_counter() - began
     shared.tell("finished", "", f"{outcomes[0].summary.counts['candidates']} candidates in {seconds:.1f} s")
     return outcomes
@@ -417,6 +419,7 @@ def told_request(request: RunRequest) -> dict[str, object]:
         "bbox": None if request.bbox is None else list(request.bbox),
         "aoi": whole(request.aoi),
         "meshes": request.meshes,
+        "work": whole(request.work),
     }
 
 
@@ -484,7 +487,29 @@ def plan_inputs(request: RunRequest, settings: RunSettings, progress: Progress) 
     return plan, paths
 
 
-def _checked(out: str, *, overwrite: bool) -> Path:
+@contextlib.contextmanager
+def _scratch(work_dir: str) -> Iterator[Scratch]:
+    """A scratch folder for the duration of a run."""
+    folder = Path(work_dir).resolve() / SCRATCH
+    remove_folder(folder)
+    scratch = Scratch(str(folder / uuid4().hex))
+    scratch.create()
+    try:
+        yield scratch
+    finally:
+        remove_folder(folder)
+
+
+def _is_of_work(run_dir: Path, work: str) -> bool:
+    """Whether a run directory was written from this very work folder, so that what is there is known there."""
+    try:
+        told = read_manifest(run_dir).request.get("work")
+    except RunError:
+        return False
+    return told == str(Path(work).resolve())
+
+
+def _checked(out: str, *, overwrite: bool, work: str | None = None) -> Path:
     """The run directory, which may be written.
 
     Raises
@@ -498,7 +523,7 @@ def _checked(out: str, *, overwrite: bool) -> Path:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         left = sorted(entry.name for entry in run_dir.iterdir())
-        if left and not overwrite:
+        if left and not overwrite and not (work is not None and _is_of_work(run_dir, work)):
             raise RunError(f"{run_dir} is not empty ({left[0]} …): give another --out, or --overwrite")
         if left and NAME not in left:
             raise RunError(f"{run_dir} holds {left[0]} and no run.json, so it is no run: give another --out")
@@ -552,29 +577,59 @@ def _crs_facts(reference: SpatialReference) -> dict[str, object]:
     }
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Counted:
+    """What a run counts of its models."""
+
+    statuses: Counter[str]
+    reasons: Counter[str]
+    roof_types: Counter[str]
+    faces: int
+    reused: int
+    seconds: dict[str, float]
+
+    @classmethod
+    def of(cls, models: Models) -> _Counted:
+        statuses, reasons, roof_types = Counter[str](), Counter[str](), Counter[str]()
+        seconds: dict[str, float] = {}
+        faces = reused = 0
+        for model in models.each():
+            statuses[model.status] += 1
+            if model.reason is not None:
+                reasons[model.reason] += 1
+            roof_types[model.roof_type] += 1
+            faces += model.faces
+            reused += model.reused
+            seconds[model.building_id] = model.seconds
+        return cls(
+            statuses=statuses, reasons=reasons, roof_types=roof_types, faces=faces, reused=reused, seconds=seconds
+        )
+
+
 def _counts(
-    plan: Plan, ingested: Sequence[Ingested], splits: Sequence[Split], joined: Joined, modelled: Sequence[Modelled]
+    plan: Plan, ingested: Sequence[Ingested], splits: Splits, joined: Joined, found: _Counted
 ) -> dict[str, int]:
     """The counts of run.json."""
-    by_status = Counter(m.status for m in modelled)
+    by_status = found.statuses
     dropped: Counter[str] = Counter()
-    for found in ingested:
-        dropped.update(found.dropped)
+    for entry in ingested:
+        dropped.update(entry.dropped)
     return {
         "points_promised": plan.points,
-        "points": sum(s.points for s in splits),
+        "points": sum(s.points for s in splits.told),
         **{f"dropped_{cause}": count for cause, count in sorted(dropped.items())},
-        "duplicates": sum(s.duplicates for s in splits),
-        "outliers": sum(s.outliers for s in splits),
-        "tiles": len(splits),
-        "candidates": len(modelled),
+        "duplicates": sum(s.duplicates for s in splits.told),
+        "outliers": sum(s.outliers for s in splits.told),
+        "tiles": len(splits.told),
+        "candidates": sum(by_status.values()),
         "ok": by_status["ok"],
         "fallback": by_status["fallback"],
         "failed": by_status["failed"],
         "rejected": len(joined.rejected),
+        "reused": found.reused,
         "small_surfaces": joined.small_fragments,
-        "roof_faces": sum(m.faces for m in modelled),
-        "class_6_in_candidates": sum(s.audit[0] for s in splits),
-        "other_classes_in_candidates": sum(s.audit[1] for s in splits),
-        "class_6_elsewhere": sum(s.audit[2] for s in splits),
+        "roof_faces": found.faces,
+        "class_6_in_candidates": sum(s.audit[0] for s in splits.told),
+        "other_classes_in_candidates": sum(s.audit[1] for s in splits.told),
+        "class_6_elsewhere": sum(s.audit[2] for s in splits.told),
     }

@@ -2,6 +2,9 @@
 
 Plain files of fixed records under one folder that all workers see. Every file is written under a
 temporary name and renamed, so a task may run twice or die half way.
+
+The folder may outlive a run. Then each attempt at a run has a mark of its own there, and takes that of the one before
+away: tasks of a driver that died, which may still run somewhere, find theirs gone and write nothing any more.
 """
 
 from __future__ import annotations
@@ -13,7 +16,6 @@ import io
 import math
 import mmap
 import os
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -40,6 +42,7 @@ POINT = np.dtype(
 
 
 _CANCELLED = "cancelled"
+_ATTEMPTS = "attempts"
 _LONGEST_HEADER_BYTES = 256
 """Of the arrays that are stored here: numbers of up to three dimensions."""
 
@@ -63,10 +66,21 @@ class Scratch:
 
     root: str
     """Path of the folder; a string, so that tasks stay small and picklable."""
+    attempt: str = ""
+    """Names the attempt at a run in a folder that outlives it; empty where the folder ends with the run."""
 
     def create(self) -> None:
-        """Make the folder, once, by whoever starts the run; no task ever makes it again."""
+        """Make the folder, once, by whoever starts the run; no task ever makes it again.
+
+        Of a folder that outlives its runs: take it over from the attempts before.
+        """
         Path(self.root).mkdir(parents=True, exist_ok=True)
+        if self.attempt:
+            folder = Path(self.root, _ATTEMPTS)
+            folder.mkdir(exist_ok=True)
+            for earlier in folder.iterdir():
+                earlier.unlink(missing_ok=True)
+            (folder / self.attempt).touch()
 
     def path(self, *parts: str) -> Path:
         """A path inside; its folder exists afterwards.
@@ -89,8 +103,12 @@ class Scratch:
         for key, array in arrays.items():
             target = self.path(name, f"{key}.npy")
             temporary = target.with_name(f".{key}.{uuid4().hex}.npy")
-            np.save(temporary, array, allow_pickle=False)
-            temporary.replace(target)
+            try:
+                np.save(temporary, array, allow_pickle=False)
+                self.check_cancelled()
+                temporary.replace(target)
+            finally:
+                temporary.unlink(missing_ok=True)
 
     def array(self, name: str, key: str, *, mapped: bool = False) -> npt.NDArray[Any]:
         """One stored array, read whole or mapped."""
@@ -124,16 +142,22 @@ class Scratch:
         """Whether anything is stored under a name."""
         return os.path.exists(f"{self.root}/{name}")  # noqa: PTH110 - a Path takes longer
 
-    def put_object(self, name: str, value: object) -> None:
-        """Store one of our own frozen records."""
+    def put_bytes(self, name: str, content: bytes) -> None:
+        """Store bytes under a name, whole or not at all.
+
+        Raises
+        ------
+        RunCancelledError
+            The run was called off, or another took its place.
+        """
         target = self.path(name)
         temporary = target.with_name(f".{target.name}.{uuid4().hex}")
-        temporary.write_bytes(pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL))
-        temporary.replace(target)
-
-    def get_object(self, name: str) -> Any:
-        """A record stored by this run. Never called on files that others wrote."""
-        return pickle.loads(Path(self.root, name).read_bytes())  # noqa: S301
+        try:
+            temporary.write_bytes(content)
+            self.check_cancelled()
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
 
     def cancel(self) -> None:
         """Tell all tasks of the run to end: they look for this mark wherever they can stop.
@@ -141,11 +165,20 @@ class Scratch:
         Where it cannot be set, because the folder is gone or the disk is full, the folder's removal tells them.
         """
         with contextlib.suppress(OSError):
-            Path(self.root, _CANCELLED).touch()
+            if self.attempt:
+                self._mark.unlink(missing_ok=True)
+            else:
+                Path(self.root, _CANCELLED).touch()
+
+    @property
+    def _mark(self) -> Path:
+        return Path(self.root, _ATTEMPTS, self.attempt)
 
     @property
     def cancelled(self) -> bool:
-        """Whether the run was called off, or is over: then there is no folder any more."""
+        """Whether the run was called off, or is over: then there is no folder any more, or another took it over."""
+        if self.attempt:
+            return not self._mark.exists()
         root = Path(self.root)
         return (root / _CANCELLED).exists() or not root.exists()
 

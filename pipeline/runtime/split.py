@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,9 @@ from pipeline.terrain.ground import Terrain, ground_points
 from pipeline.terrain.surfaces import Fragments
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
+if TYPE_CHECKING:
+    from hashlib import _Hash as Hash
+
 _PLACE_BITS = 20
 """Bits of a coordinate in a sort key: 1,048 m in millimetres."""
 _STRIPS = 2**16 - 1
@@ -52,8 +56,9 @@ class SplitTask:
     """Which of the file's classes are believed."""
     scratch: Scratch
     """Points in, fragments out."""
-    footprints: tuple[tuple[int, Polygon | MultiPolygon], ...] | None
-    """Numbers and outlines in metres of the given footprints that meet the tile; None where none were given."""
+    footprints: tuple[Polygon | MultiPolygon, ...] | None
+    """Outlines in metres of the given footprints that meet the tile; None where none were given. The first wins where
+    they overlap."""
     folder: str = "tiles"
     """Folder of the scratch for the outcome."""
 
@@ -69,7 +74,7 @@ class Split:
     starts: npt.NDArray[np.int64]
     """(k + 1,) int64, where each fragment's (or footprint's) points start in the tile's sorted points."""
     keys: npt.NDArray[np.int64]
-    """(k,) int64, the fragment's or footprint's number."""
+    """(k,) int64, the fragment's number, or the footprint's place in the task."""
     lowest_points_mm: npt.NDArray[np.int64]
     """(k, 3) int64, lexicographically smallest point of each."""
     points: int
@@ -80,6 +85,32 @@ class Split:
     """Gross outliers in the core."""
     audit: tuple[int, int, int]
     """Points of the core: assigned and class 6, assigned and not, class 6 and not assigned."""
+    outcome: str
+    """Digest of the points and the terrain that were stored: equal where what comes after sees no difference."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SplitTold:
+    """A split without its descriptors: its figures, as of `Split`."""
+
+    tile: Tile
+    points: int
+    duplicates: int
+    outliers: int
+    audit: tuple[int, int, int]
+    outcome: str
+
+
+def told_of_split(found: Split) -> SplitTold:
+    """What the driver learns of a split."""
+    return SplitTold(
+        tile=found.tile,
+        points=found.points,
+        duplicates=found.duplicates,
+        outliers=found.outliers,
+        audit=found.audit,
+        outcome=found.outcome,
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -205,8 +236,9 @@ def split(task: SplitTask) -> Split:
         int((assigned & ~is_building).sum()),
         int((~assigned & is_building).sum()),
     )
-    keys, starts, lowest = _store(task, loaded.core[index[assigned]], owner[assigned])
-    _store_terrain(task, terrain, occupied, core)
+    outcome = hashlib.sha256()
+    keys, starts, lowest = _store(task, loaded.core[index[assigned]], owner[assigned], outcome)
+    _store_terrain(task, terrain, occupied, core, outcome)
     return Split(
         tile=task.tile,
         fragments=fragments,
@@ -217,16 +249,25 @@ def split(task: SplitTask) -> Split:
         duplicates=loaded.duplicates,
         outliers=outliers,
         audit=audit,
+        outcome=outcome.hexdigest(),
     )
 
 
+def _put(task: SplitTask, arrays: dict[str, npt.NDArray[Any]], outcome: Hash) -> None:
+    """Store arrays of the tile, and add them to the digest of its outcome."""
+    for name, array in sorted(arrays.items()):
+        outcome.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        outcome.update(array.tobytes())
+    task.scratch.put_arrays(f"{task.folder}/{task.tile.key}", arrays)
+
+
 def _store(
-    task: SplitTask, records: npt.NDArray[np.void], owner: npt.NDArray[np.int64]
+    task: SplitTask, records: npt.NDArray[np.void], owner: npt.NDArray[np.int64], outcome: Hash
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Store points sorted by owner; the owners, where each one's points start, and their smallest points."""
     order = _order_by_owner(records, owner)
     records, owner = np.take(records, order), owner[order]
-    task.scratch.put_arrays(f"{task.folder}/{task.tile.key}", {"points": records.view(np.uint8)})
+    _put(task, {"points": records.view(np.uint8)}, outcome)
     keys, starts = np.unique(owner, return_index=True)
     lowest = np.column_stack([records[name][starts] for name in "xyz"]).astype(np.int64)
     return keys, np.append(starts, len(owner)).astype(np.int64), lowest
@@ -253,7 +294,7 @@ def _order_by_owner(records: npt.NDArray[np.void], owner: npt.NDArray[np.int64])
     return order.astype(np.int64)
 
 
-def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core: Window) -> None:
+def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core: Window, outcome: Hash) -> None:
     """Store the terrain of the core and an apron around it.
 
     The apron lets a candidate at the data's edge see terrain whose own tile holds no point and so is never made.
@@ -263,14 +304,12 @@ def _store_terrain(task: SplitTask, terrain: Terrain, occupied: BoolArray, core:
     column0, row0, n_columns, n_rows = lattice_of(apron)
     rows = slice(row0 - terrain.row0, row0 - terrain.row0 + n_rows)
     columns = slice(column0 - terrain.column0, column0 - terrain.column0 + n_columns)
-    task.scratch.put_arrays(
-        f"{task.folder}/{task.tile.key}",
-        {
-            "terrain": np.ascontiguousarray(terrain.elevation_mm[rows, columns]),
-            "occupied": np.ascontiguousarray(occupied[rows, columns]),
-            "corner": np.array([column0, row0], np.int64),
-        },
-    )
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "terrain": np.ascontiguousarray(terrain.elevation_mm[rows, columns]),
+        "occupied": np.ascontiguousarray(occupied[rows, columns]),
+        "corner": np.array([column0, row0], np.int64),
+    }
+    _put(task, arrays, outcome)
 
 
 def _inside_footprints(
@@ -299,8 +338,8 @@ def _inside_footprints(
     order = np.argsort(strip.astype(np.uint16), kind="stable")
     from_west, strip = inner[order], strip[order]
     x, y = points.x_mm[index[from_west]], points.y_mm[index[from_west]]
-    # the smaller number wins where footprints overlap, whatever the tile
-    for number, polygon in sorted(task.footprints or (), key=lambda item: item[0], reverse=True):
+    # the first wins where footprints overlap, whatever the tile
+    for number, polygon in reversed(list(enumerate(task.footprints or ()))):
         x0, y0, x1, y1 = (round(v * MM) for v in polygon.bounds)
         first = np.searchsorted(strip, (x0 - 1 - west) // strip_mm, side="left")
         last = np.searchsorted(strip, (x1 + 1 - west) // strip_mm, side="right")

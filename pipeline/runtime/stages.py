@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import shapely
@@ -16,30 +16,44 @@ from shapely import MultiPolygon, Polygon
 from pipeline import __version__
 from pipeline.errors import EmptyInputError, InconsistentInputError
 from pipeline.export.records import RecordContext
-from pipeline.io import SpatialReference
+from pipeline.io import LocalStorage, SpatialReference
 from pipeline.io.footprints import read_footprints
 from pipeline.io.gps_time import GpsTimeKind
-from pipeline.runtime.events import Event, EventKind, Listener, Watch
 from pipeline.runtime.executors import Executor
-from pipeline.runtime.ingest import Ingested, IngestTask, ingest, spread_m
+from pipeline.runtime.ingest import Ingested, IngestTask, ingest, part_of, spread_m
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import CandidateSite, Joined, PointRange, RejectedSite, join, join_footprints
-from pipeline.runtime.modelling import BatchTask, Modelled, StoredResult, batches, model_batch, stored_results
+from pipeline.runtime.kept import Keeper, Place, key_of, result_of, told_of, whole
+from pipeline.runtime.modelling import (
+    BatchTask,
+    Modelled,
+    StoredResult,
+    batches,
+    model_batch,
+    stored_results,
+    told_of_batch,
+)
 from pipeline.runtime.outlines import draw_outlines, outline_tasks
 from pipeline.runtime.overrides import Override, own_modelling
 from pipeline.runtime.overriding import EntryOutcome, accepts, layers_of, outcomes_of, overridden
 from pipeline.runtime.plan import Plan, check_windows, split_grid
-from pipeline.runtime.publish import PublishTask, publish
+from pipeline.runtime.progress import Progress
+from pipeline.runtime.publish import QUARANTINE, Published, PublishTask, publish, retire
 from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.split import Split, SplitTask, split
+from pipeline.runtime.split import Split, SplitTask, SplitTold, split, told_of_split
+from pipeline.runtime.stale import clear_points, clear_tiles, drop_stale, publishing
+from pipeline.runtime.tile_content import ZoneSums, content_of_window, zone_sums_of
 from pipeline.runtime.units import divide, unit_tasks
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse
 from pipeline.settings import RunSettings
-from pipeline.tiling import MM, Tile
+from pipeline.tiling import MM, Tile, TileGrid, Window
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+Told = TypeVar("Told")
 
+MODELS = "models"
+"""Begins the names of the stages under which models are kept; the settings follow."""
 _LINE_SPREAD_M = 0.05
 _ISSUES_TOLD = 10
 """Unusable or repaired footprints that are warned of one by one; the run directory lists them all."""
@@ -130,7 +144,7 @@ def classes_in_use(ingested: Sequence[Ingested], *, trust: bool) -> tuple[Classe
     if not trust:
         return ClassesInUse(), ""
     bare = [
-        found.index
+        found.path
         for found in ingested
         if found.classes and found.classes.get(GROUND_CLASS, 0) < _CLASSIFIED_SHARE * sum(found.classes.values())
     ]
@@ -144,76 +158,39 @@ def classes_in_use(ingested: Sequence[Ingested], *, trust: bool) -> tuple[Classe
     return ClassesInUse(ground=True, building=buildings), ""
 
 
-class Progress:
-    """What a run learns about itself: timings, peak memory, warnings; all of it told to the listener.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Splits:
+    """All tiles, split."""
 
-    Parameters
-    ----------
-    listener : callable
-        Gets the events.
-    watch : Watch
-        Handed to the executor with every map.
-    """
+    told: tuple[SplitTold, ...]
+    """Their figures."""
+    places: Mapping[Tile, Place]
+    """Where their descriptors are kept."""
+    keys: Mapping[Tile, str]
+    """Digest of what lies in and around each tile: equal where nothing that comes after sees a difference."""
+    numbers: Mapping[Tile, Sequence[int]]
+    """Of each tile the numbers of the given footprints that meet it; empty where none were given."""
 
-    def __init__(self, listener: Listener, watch: Watch | None = None) -> None:
-        self._listener = listener
-        self.watch = watch or Watch(listener=listener)
-        self.timings: dict[str, float] = {}
-        self.peaks: dict[str, int] = {}
-        self.warnings: list[str] = []
-        self._part, self._parts, self._label = 0, 1, ""
 
-    def part(self, number: int, parts: int, label: str) -> Progress:
-        """The progress of one of several equal parts of what follows: a copy that knows what was before.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Models:
+    """All candidates, modelled."""
 
-        Parameters
-        ----------
-        number : int
-            Which part, from 0.
-        parts : int
-            Of how many; done and total of a stage count all of them, one after the other.
-        label : str
-            What messages call it.
-        """
-        own = Progress(self._listener, self.watch)
-        own.timings, own.peaks, own.warnings = dict(self.timings), dict(self.peaks), list(self.warnings)
-        own._part, own._parts, own._label = number, parts, label
-        return own
+    places: Mapping[Tile, Sequence[Place]]
+    """Where the outcomes are kept, by owner tile."""
+    scratch: Scratch
+    """Where that is."""
 
-    def tell(self, kind: EventKind, stage: str, message: str = "", done: int = 0, total: int = 0) -> None:
-        """Send an event."""
-        self._listener(Event(kind=kind, stage=stage, done=done, total=total, message=message))
+    def each(self) -> Iterator[Modelled]:
+        """What is told of each, tile after tile; nothing is held."""
+        for places in self.places.values():
+            for place in places:
+                yield from told_of(self.scratch, place)
 
-    def warn(self, stage: str, message: str) -> None:
-        """Keep and send a warning."""
-        if message not in self.warnings:
-            self.warnings.append(message)
-            self.tell("warning", stage, message)
-
-    def stage(
-        self,
-        executor: Executor,
-        name: str,
-        function: Callable[[Task], Result],
-        tasks: Sequence[Task],
-        weight: Callable[[Result], int] = lambda _: 1,
-        total: int | None = None,
-    ) -> list[Result]:
-        """Run a stage's tasks and report its progress in units of `weight`."""
-        started = time.perf_counter()
-        whole = len(tasks) if total is None else total
-        done, all_parts = self._part * whole, self._parts * whole
-        self.tell("stage", name, self._label, done=done, total=all_parts)
-        results = []
-        # closed at once where the listener raises, so that no task goes on for nobody
-        with contextlib.closing(executor.map(name, function, tasks, self.watch)) as running:
-            for measured in running:
-                results.append(measured.result)
-                self.peaks[measured.process] = max(self.peaks.get(measured.process, 0), measured.peak_bytes)
-                done += weight(measured.result)
-                self.tell("progress", name, done=done, total=all_parts)
-        self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started
-        return results
+    def stored(self) -> Iterator[tuple[Tile, list[StoredResult]]]:
+        """The models themselves, one owner tile at a time."""
+        for tile, places in self.places.items():
+            yield tile, [entry for place in places for entry in stored_results(self.scratch, place)]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -228,31 +205,30 @@ class Stages:
     scratch: Scratch
     isolation: IsolationLimits | None = None
     """Limits of the supervised children that model buildings; None models in the workers themselves."""
-    quarantine: str = ""
-    """Folder for the bundles of buildings that cost their process; empty keeps none."""
-    variant: int = 0
-    """Which of the run's variants this is: keeps their models apart in scratch."""
     compared: bool = False
     """Whether there are several variants, whose seconds are told side by side."""
 
     def ingest(self, paths: Sequence[str]) -> list[Ingested]:
-        """Bucket all points by tile, and look at what they are."""
+        """Bucket all points by tile, and look at what they are; in the order of the paths."""
         known = {info.path: info for info in self.plan.sources}
-        tasks = [
-            IngestTask(
-                index=k,
+        tasks = {}
+        for path in paths:
+            task = IngestTask(
+                part=part_of(path),
                 path=path,
                 options=self.plan.options,
                 grid=self.plan.grid,
                 scratch=self.scratch,
                 known=known.get(path),
             )
-            for k, path in enumerate(paths)
-        ]
-        ingested = sorted(self.progress.stage(self.executor, "ingest", ingest, tasks), key=lambda found: found.index)
+            file = Path(path).stat()
+            key = key_of(path, file.st_size, file.st_mtime_ns, task.options, task.grid)
+            tasks[Place("ingest", task.part, key)] = task
+        clear_points(self.scratch, tasks)
+        ingested = list(self.progress.kept(self.executor, "ingest", ingest, tasks, self.scratch, whole).values())
         for found in ingested:
             for warning in found.warnings:
-                self.progress.warn("ingest", f"{paths[found.index]}: {warning}")
+                self.progress.warn("ingest", f"{found.path}: {warning}")
         kept = sum(sum(found.points_by_tile.values()) for found in ingested)
         if kept == 0:
             causes = Counter[str]()
@@ -275,7 +251,7 @@ class Stages:
 
     def split(
         self, ingested: Sequence[Ingested], footprints: GivenFootprints | None, only: Collection[Tile] | None = None
-    ) -> list[Split]:
+    ) -> Splits:
         """Fragments of all tiles, or of some only."""
         tiles = points_by_tile(ingested)
         classes, told = classes_in_use(ingested, trust=self.settings.general.classes == "trust")
@@ -285,26 +261,59 @@ class Stages:
             tiles = Counter({tile: points for tile, points in tiles.items() if tile in only})
         if told:
             self.progress.warn("split", told)
-        numbers_of = {} if footprints is None else self._numbers_of(tiles, footprints.polygons)
-        tasks = [
-            SplitTask(
-                tile=tile,
-                grid=grid,
-                settings=self.settings.scene,
-                classes=classes,
-                scratch=self.scratch,
-                footprints=None if footprints is None else tuple((k, footprints.polygons[k]) for k in numbers_of[tile]),
-            )
-            # the fullest first, so that no long task is left for the end
-            for tile, _ in sorted(tiles.items(), key=lambda item: (-item[1], item[0]))
-        ]
-        splits = self.progress.stage(self.executor, "split", split, tasks)
-        duplicates, outliers = sum(s.duplicates for s in splits), sum(s.outliers for s in splits)
+        polygons = () if footprints is None else footprints.polygons
+        numbers_of = {} if footprints is None else self._numbers_of(tiles, polygons)
+        # the fullest first, so that no long task is left for the end
+        order = [tile for tile, _ in sorted(tiles.items(), key=lambda item: (-item[1], item[0]))]
+        given = {tile: None if footprints is None else tuple(polygons[k] for k in numbers_of[tile]) for tile in order}
+        splits = self._splits("split", "tiles", given, grid, classes, ingested, numbers_of)
+        duplicates, outliers = sum(s.duplicates for s in splits.told), sum(s.outliers for s in splits.told)
         if duplicates:
             self.progress.warn("split", f"{duplicates} duplicated points were dropped")
         if outliers:
             self.progress.warn("split", f"{outliers} gross outliers were left out")
         return splits
+
+    def _splits(
+        self,
+        stage: str,
+        folder: str,
+        given: Mapping[Tile, tuple[Polygon | MultiPolygon, ...] | None],
+        grid: TileGrid,
+        classes: ClassesInUse,
+        ingested: Sequence[Ingested],
+        numbers_of: Mapping[Tile, Sequence[int]],
+    ) -> Splits:
+        """Split some tiles, each with its footprints."""
+        content = content_by_tile(ingested)
+        held = {tile: content_of_window(content, self.plan.grid, self.plan.grid.window(tile), tile) for tile in given}
+        tasks = {}
+        for tile, outlines in given.items():
+            task = SplitTask(
+                tile=tile,
+                grid=grid,
+                settings=self.settings.scene,
+                classes=classes,
+                scratch=self.scratch,
+                footprints=outlines,
+                folder=folder,
+            )
+            key = key_of(tile, grid, task.settings, classes, outlines, folder, held[tile])
+            tasks[Place(folder, tile.key, key)] = task
+        clear_tiles(self.scratch, folder, tasks)
+        found = self.progress.kept(self.executor, stage, split, tasks, self.scratch, told_of_split)
+        outcomes = {told.tile: told.outcome for told in found.values()}
+        keys = {}
+        for tile in outcomes:
+            core = grid.core(tile)
+            around = [(other.key, outcomes.get(other, "")) for other in grid.tiles_over(core.grown(grid.size_mm))]
+            keys[tile] = key_of(around, held[tile])
+        return Splits(
+            told=tuple(found.values()),
+            places={told.tile: place for place, told in found.items()},
+            keys=keys,
+            numbers=numbers_of,
+        )
 
     def _numbers_of(self, tiles: Collection[Tile], polygons: Sequence[Polygon | MultiPolygon]) -> dict[Tile, list[int]]:
         """The polygons, by number, that meet each tile."""
@@ -341,38 +350,43 @@ class Stages:
             classes = dataclasses.replace(classes, building=False)
         polygons = [polygon for _, polygon in named]
         grid = split_grid(self.plan, self.settings, classes, footprints=True)
-        numbers_of = self._numbers_of(points_by_tile(ingested), polygons)
-        tasks = [
-            SplitTask(
-                tile=tile,
-                grid=grid,
-                settings=self.settings.scene,
-                classes=classes,
-                scratch=self.scratch,
-                footprints=tuple((k, polygons[k]) for k in numbers),
-                folder=folder,
-            )
-            for tile, numbers in sorted(numbers_of.items())
-            if numbers
-        ]
-        splits = self.progress.stage(self.executor, "redraw", split, tasks)
-        sites = join_footprints(splits, self.plan.grid, polygons, [name for name, _ in named], "").candidates
+        numbers_of = {
+            tile: numbers for tile, numbers in self._numbers_of(points_by_tile(ingested), polygons).items() if numbers
+        }
+        given = {tile: tuple(polygons[k] for k in numbers) for tile, numbers in sorted(numbers_of.items())}
+        splits = self._splits("redraw", folder, given, grid, classes, ingested, numbers_of)
+        sites = join_footprints(
+            self._descriptors(splits), self.plan.grid, splits.numbers, polygons, [name for name, _ in named], ""
+        ).candidates
         return {
             str(site.source_id): tuple(dataclasses.replace(part, folder=folder) for part in site.ranges)
             for site in sites
         }
 
-    def join(self, splits: Sequence[Split], footprints: GivenFootprints | None, reference: SpatialReference) -> Joined:
+    def _descriptors(self, splits: Splits) -> list[Split]:
+        """The descriptors of all tiles."""
+        return [result_of(self.scratch, place) for place in splits.places.values()]
+
+    def join(self, splits: Splits, footprints: GivenFootprints | None, reference: SpatialReference) -> Joined:
         """Whole surfaces, judged."""
         started = time.perf_counter()
         self.progress.tell("stage", "join", total=1)
         crs_name = f"EPSG:{reference.epsg}" if reference.epsg is not None else reference.name
+        described = self._descriptors(splits)
         if footprints is None:
-            joined = self._divided(join(splits, self.plan.grid, self.settings.scene.candidates, crs_name), crs_name)
+            joined = join(described, self.plan.grid, self.settings.scene.candidates, crs_name)
+            joined = self._divided(dataclasses.replace(joined, keys=splits.keys), crs_name)
         else:
             joined = join_footprints(
-                splits, self.plan.grid, footprints.polygons, footprints.ids, crs_name, footprints.attributes
+                described,
+                self.plan.grid,
+                splits.numbers,
+                footprints.polygons,
+                footprints.ids,
+                crs_name,
+                footprints.attributes,
             )
+            joined = dataclasses.replace(joined, keys=splits.keys)
         self.progress.timings["join"] = time.perf_counter() - started
         self.progress.tell("progress", "join", done=1, total=1, message=f"{len(joined.candidates)} candidates")
         return joined
@@ -382,63 +396,97 @@ class Stages:
         settings = self.settings.scene.units
         if settings.split == "nothing":
             return joined
-        tasks = unit_tasks(joined.candidates, settings, self.plan.grid, self.scratch, crs_name)
-        sites: list[CandidateSite] = []
-        with contextlib.closing(self.executor.map("join", divide, tasks, self.progress.watch)) as running:
-            for measured in running:
-                sites.extend(measured.result)
-                peaks = self.progress.peaks
-                peaks[measured.process] = max(peaks.get(measured.process, 0), measured.peak_bytes)
+        tasks = {}
+        for tile, candidates in by_owner(joined.candidates).items():
+            for task in unit_tasks(candidates, settings, self.plan.grid, self.scratch, crs_name):
+                key = key_of(settings, crs_name, task.sites, self._around(joined, task.sites))
+                tasks[Place("units", tile.key, key)] = task
+        drop_stale(self.scratch, "units", tasks)
+        divided = self.progress.kept(self.executor, "join", divide, tasks, self.scratch, whole, quiet=True)
+        sites = [site for found in divided.values() for site in found]
         return dataclasses.replace(joined, candidates=tuple(sorted(sites, key=lambda c: (-c.points, c.building_id))))
+
+    def _around(self, joined: Joined, sites: Sequence[CandidateSite]) -> list[str]:
+        """Digests of what lies in and around the tiles of some candidates."""
+        tiles = {part.tile for site in sites for part in site.ranges}
+        for site in sites:
+            for area in (site.footprint, site.outline):
+                if area is not None and not area.is_empty:
+                    x0, y0, x1, y1 = (round(value * MM) for value in area.bounds)
+                    window = Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1)
+                    tiles.update(self.plan.grid.tiles_over(window))
+        return [joined.keys.get(tile, "") for tile in sorted(tiles)]
 
     def outline(self, joined: Joined) -> Joined:
         """The candidates with the outlines of touching units, drawn together."""
-        tasks = outline_tasks(joined.candidates, self.settings.building.roof, self.plan.grid, self.scratch)
+        settings = self.settings.building.roof
+        tasks = {}
+        for tile, units in blocks_by_tile(joined.candidates).items():
+            for task in outline_tasks(units, settings, self.plan.grid, self.scratch):
+                sites = [site for block in task.blocks for site in block]
+                key = key_of(settings, task.blocks, self._around(joined, sites))
+                tasks[Place("outline", tile.key, key)] = task
+        drop_stale(self.scratch, "outline", tasks)
+        drawn = self.progress.kept(self.executor, "outline", draw_outlines, tasks, self.scratch, whole)
         outlines: dict[str, MultiPolygon] = {}
-        warnings: list[str] = []
-        for drawn in self.progress.stage(self.executor, "outline", draw_outlines, tasks):
-            outlines |= drawn.outlines
-            warnings.extend(drawn.warnings)
-        for warning in sorted(warnings):
+        for found in drawn.values():
+            outlines |= found.outlines
+        for warning in sorted(warning for found in drawn.values() for warning in found.warnings):
             self.progress.warn("outline", warning)
-        sites = (
+        outlined = (
             dataclasses.replace(site, outline=outlines.get(site.building_id)) if site.block is not None else site
             for site in joined.candidates
         )
-        return dataclasses.replace(joined, candidates=tuple(sites))
+        return dataclasses.replace(joined, candidates=tuple(outlined))
 
-    def reconstruct(self, joined: Joined) -> list[Modelled]:
-        """All candidates, largest first."""
-        tasks = [
-            BatchTask(
-                number=number,
-                sites=sites,
-                method=self.settings.general.method,
-                settings=self.settings.building,
-                grid=self.plan.grid,
-                scratch=self.scratch,
-                gps_kind=self.gps_kind,
-                isolation=self.isolation,
-                quarantine=self.quarantine,
-                reference=self.plan.sources[0].reference,
-                own={
+    def reconstruct(self, joined: Joined) -> Models:
+        """All candidates, the batches of most points first."""
+        keeper = Keeper(self.scratch)
+        method, settings = self.settings.general.method, self.settings.building
+        stage = f"{MODELS}-{self.settings.settings_hash[:16]}"
+        tasks: dict[Place, BatchTask] = {}
+        places: dict[Tile, list[Place]] = {}
+        for tile, candidates in sorted(by_owner(joined.candidates).items()):
+            earlier = tuple(Place(stage, tile.key, key) for key in sorted(keeper.keys(stage, tile.key)))
+            for sites in batches(candidates):
+                own = {
                     site.building_id: own_modelling(site.override, self.settings)
                     for site in sites
                     if site.override is not None and site.override.remodels
-                },
-                compared=self.compared,
-            )
-            for number, sites in self._numbered(joined)
-        ]
-        parts = self.progress.stage(
-            self.executor, "reconstruct", model_batch, tasks, weight=len, total=len(joined.candidates)
+                }
+                limits = self.isolation
+                around = self._around(joined, sites)
+                key = key_of(sites, around, method, settings, own, self.gps_kind, limits, self.plan.grid)
+                place = Place(stage, tile.key, key)
+                places.setdefault(tile, []).append(place)
+                tasks[place] = BatchTask(
+                    sites=sites,
+                    method=method,
+                    settings=settings,
+                    grid=self.plan.grid,
+                    scratch=self.scratch,
+                    gps_kind=self.gps_kind,
+                    isolation=limits,
+                    quarantine=str(Path(self.scratch.root, QUARANTINE)),
+                    reference=self.plan.sources[0].reference,
+                    own=own,
+                    earlier=earlier,
+                    compared=self.compared,
+                )
+        largest_first = sorted(tasks.items(), key=lambda item: -sum(site.points for site in item[1].sites))
+        self.progress.kept(
+            self.executor,
+            "reconstruct",
+            model_batch,
+            dict(largest_first),
+            self.scratch,
+            told_of_batch,
+            weight=len,
+            total=len(joined.candidates),
         )
-        return [building for part in parts for building in part]
-
-    def _numbered(self, joined: Joined) -> list[tuple[int, tuple[CandidateSite, ...]]]:
-        """The batches of this variant, by numbers that no other variant uses."""
-        groups = batches(joined.candidates)
-        return list(enumerate(groups, start=self.variant * len(groups)))
+        # only now: batches of before are what models are taken from where their input did not change
+        drop_stale(self.scratch, stage, tasks)
+        return Models(places=places, scratch=self.scratch)
 
     def record_context(self, reference: SpatialReference) -> RecordContext:
         """Facts of the run for its records."""
@@ -453,15 +501,6 @@ class Stages:
             coarser_lods=self.settings.building.lods[:-1],
         )
 
-    def stored(self, joined: Joined) -> Iterator[tuple[Tile, list[StoredResult]]]:
-        """The models of all candidates, after `reconstruct`, one owner tile at a time."""
-        numbers: dict[Tile, list[int]] = {}
-        for number, sites in self._numbered(joined):
-            for tile in {site.owner for site in sites}:
-                numbers.setdefault(tile, []).append(number)
-        for tile in sorted(numbers):
-            yield tile, [entry for number in numbers[tile] for entry in stored_results(self.scratch, tile, number)]
-
     @property
     def gps_kind(self) -> GpsTimeKind:
         """Whether the GPS times of all inputs tell dates."""
@@ -469,39 +508,81 @@ class Stages:
         return kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
 
     def publish(
-        self,
-        splits: Sequence[Split],
-        joined: Joined,
-        modelled: Sequence[Modelled],
-        reference: SpatialReference,
-        run_dir: str,
-    ) -> tuple[list[str], list[str]]:
-        """Write every tile; the keys of all, and of those that failed."""
-        batch_of = {site.building_id: number for number, sites in self._numbered(joined) for site in sites}
-        numbers: dict[Tile, set[int]] = {}
-        for building in modelled:
-            numbers.setdefault(building.owner, set()).add(batch_of[building.building_id])
+        self, splits: Splits, joined: Joined, models: Models, reference: SpatialReference, run_dir: str
+    ) -> list[Published]:
+        """Write every tile; what became of each, in their order."""
         rejected: dict[Tile, list[RejectedSite]] = {}
         for site in joined.rejected:
             rejected.setdefault(site.owner, []).append(site)
-        owners = sorted({*numbers, *rejected, *(s.tile for s in splits)})
+        owners = sorted({*models.places, *rejected, *splits.places})
         context = self.record_context(reference)
-        tasks = [
-            PublishTask(
+        stage = publishing(run_dir)
+        tasks = {}
+        for tile in owners:
+            task = PublishTask(
                 tile=tile,
                 run_dir=run_dir,
                 scratch=self.scratch,
-                batches=tuple(sorted(numbers.get(tile, ()))),
+                batches=tuple(models.places.get(tile, ())),
                 rejected=tuple(rejected.get(tile, ())),
                 context=context,
                 meshes=self.meshes,
-                empty_tables=not numbers and not rejected and tile == owners[0],
+                empty_tables=not models.places and not rejected and tile == owners[0],
             )
-            for tile in owners
-        ]
-        published = self.progress.stage(self.executor, "publish", publish, tasks)
-        failed = sorted(p.tile.key for p in published if p.error)
-        for p in published:
-            if p.error:
-                self.progress.warn("publish", f"tile {p.tile.key} failed: {p.error}")
-        return sorted(p.tile.key for p in published), failed
+            key = key_of(run_dir, task.batches, task.rejected, _told_context(context), task.meshes, task.empty_tables)
+            tasks[Place(stage, tile.key, key)] = task
+        # what somebody removed from the run directory is published again
+        storage = LocalStorage(root=Path(run_dir))
+        there = {Path(name).stem for name in storage.keys("state")}
+        drop_stale(self.scratch, stage, [place for place in tasks if place.unit in there])
+        published = self.progress.kept(self.executor, "publish", publish, tasks, self.scratch, whole)
+        for tile_key in sorted(there - {tile.key for tile in owners}):
+            retire(storage, Tile.from_key(tile_key))
+        for place, outcome in published.items():
+            if outcome.error:
+                self.progress.warn("publish", f"tile {outcome.tile.key} failed: {outcome.error}")
+                Path(self.scratch.root, place.name).unlink(missing_ok=True)  # to be tried again by whoever goes on
+        return list(published.values())
+
+
+def _told_context(context: RecordContext) -> tuple[object, ...]:
+    """What of a run goes into its records."""
+    return (
+        context.reference,
+        context.settings_hash,
+        context.engine_version,
+        context.acquired_from,
+        context.acquired_to,
+        context.coarser_lods,
+    )
+
+
+def content_by_tile(ingested: Sequence[Ingested]) -> dict[Tile, ZoneSums]:
+    """What points each tile holds, over all inputs."""
+    content: dict[Tile, ZoneSums] = {}
+    for found in ingested:
+        for tile, stored in found.content.items():
+            sums = zone_sums_of(stored)
+            content[tile] = content[tile] + sums if tile in content else sums
+    return content
+
+
+def by_owner(sites: Sequence[CandidateSite]) -> dict[Tile, list[CandidateSite]]:
+    """Candidates by the tile that publishes them, in their order."""
+    found: dict[Tile, list[CandidateSite]] = {}
+    for site in sites:
+        found.setdefault(site.owner, []).append(site)
+    return found
+
+
+def blocks_by_tile(sites: Sequence[CandidateSite]) -> dict[Tile, list[CandidateSite]]:
+    """Units by the first of the tiles that own some of their block, in their order."""
+    home: dict[str, Tile] = {}
+    for site in sites:
+        if site.block is not None:
+            home[site.block] = min(home.get(site.block, site.owner), site.owner)
+    found: dict[Tile, list[CandidateSite]] = {}
+    for site in sites:
+        if site.block is not None:
+            found.setdefault(home[site.block], []).append(site)
+    return found

@@ -19,11 +19,11 @@ from pipeline.runtime.scratch import POINT, Scratch
 from pipeline.tiling import TileGrid
 
 
-def task(path: Path, folder: Path, index: int = 0) -> IngestTask:
+def task(path: Path, folder: Path, part: str = "a") -> IngestTask:
     grid = TileGrid(size_mm=30_000, halo_mm=10_000)
     scratch = Scratch(str(folder))
     scratch.create()
-    return IngestTask(index=index, path=str(path), options=ReadOptions(), grid=grid, scratch=scratch)
+    return IngestTask(part=part, path=str(path), options=ReadOptions(), grid=grid, scratch=scratch)
 
 
 def stored(folder: Path) -> dict[str, np.ndarray]:

@@ -1,0 +1,122 @@
+"""What points a tile holds, as a few sums: equal sums mean equal points, whatever files they came from, in any order.
+
+A tile's neighbours see only the points near their common border, so the sums are told by zone: a tile is cut at the
+halo's width from each side into three by three zones. What a neighbour's window holds of the tile is then named by the
+zones that face it; a change elsewhere in the tile is none for the neighbour.
+
+The sum of a zone is a multiset hash: every point is mixed to two words of 64 bits, and the words of all points are
+added. Adding is blind to order and lets files be summed apart (Bellare and Micciancio 1997, AdHash). It guards against
+chance (2^-128), not against points that someone chose to collide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from pipeline.tiling import Tile, TileGrid, Window
+
+ZoneSums: TypeAlias = npt.NDArray[np.uint64]
+"""(3, 3, 3) uint64: by column and row of the zone, from the south-west on, points and the two words of their sum."""
+
+# the finalizer of splitmix64 (Steele, Lea, Flood 2014): every bit of the input changes half of those of the output
+_GAMMA = np.uint64(0x9E3779B97F4A7C15)
+_MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX_2 = np.uint64(0x94D049BB133111EB)
+_SECOND = np.uint64(0xD6E8FEB86659FD93)
+_S30, _S27, _S31 = np.uint64(30), np.uint64(27), np.uint64(31)
+_S32, _S40, _S48, _S56 = np.uint64(32), np.uint64(40), np.uint64(48), np.uint64(56)
+
+
+@njit(cache=True, nogil=True)
+def _mixed(state: np.uint64, word: np.uint64) -> np.uint64:
+    z = (state ^ word) + _GAMMA
+    z = (z ^ (z >> _S30)) * _MIX_1
+    z = (z ^ (z >> _S27)) * _MIX_2
+    return z ^ (z >> _S31)
+
+
+@njit(cache=True, nogil=True)
+def zone_sums(
+    records: npt.NDArray[np.void], gps_bits: npt.NDArray[np.uint64], x0: int, y0: int, x1: int, y1: int, halo: int
+) -> ZoneSums:
+    """Sums of the points of one tile, by zone.
+
+    Parameters
+    ----------
+    records : (n,) POINT
+        Points of the tile.
+    gps_bits : (n,) uint64
+        The bits of their GPS times.
+    x0, y0, x1, y1 : int
+        The tile's core in mm, half-open.
+    halo : int
+        Width of the outer zones in mm.
+    """
+    sums = np.zeros((3, 3, 3), np.uint64)
+    for i in range(records.size):
+        point = records[i]
+        column = 0 if point.x < x0 + halo else 2 if point.x >= x1 - halo else 1
+        row = 0 if point.y < y0 + halo else 2 if point.y >= y1 - halo else 1
+        small = (
+            np.uint64(point.source)
+            | (np.uint64(point.return_number) << _S32)
+            | (np.uint64(point.return_count) << _S40)
+            | (np.uint64(point.classification) << _S48)
+        )
+        first = _mixed(np.uint64(0), np.uint64(point.x))
+        first = _mixed(first, np.uint64(point.y))
+        first = _mixed(first, np.uint64(point.z))
+        first = _mixed(first, gps_bits[i])
+        first = _mixed(first, small)
+        sums[column, row, 0] += np.uint64(1)
+        sums[column, row, 1] += first
+        sums[column, row, 2] += _mixed(_SECOND, first)
+    return sums
+
+
+def zone_sums_of(stored: bytes) -> ZoneSums:
+    """Sums from their bytes, as they travel."""
+    return np.frombuffer(stored, np.uint64).reshape(3, 3, 3)
+
+
+def are_apart(grid: TileGrid) -> bool:
+    """Whether the zones of a tile do not overlap; else neighbours hang on the whole of it."""
+    return 2 * grid.halo_mm <= grid.size_mm
+
+
+def content_of_window(sums: Mapping[Tile, ZoneSums], grid: TileGrid, window: Window, tile: Tile) -> list[object]:
+    """What a tile's window holds, for its key: the tile's own sums, and of each neighbour those that face it.
+
+    Parameters
+    ----------
+    sums : mapping
+        Of all tiles with points, over all inputs; made with the halo of `grid`.
+    grid : TileGrid
+        The lattice of the plan.
+    window : Window
+        What the tile sees: its core and a halo that is at most that of the lattice.
+    tile : Tile
+        The tile.
+    """
+    found: list[object] = []
+    apart = are_apart(grid)
+    for other in grid.tiles_over(window):
+        own = sums.get(other)
+        if own is None:
+            continue
+        columns, rows = other.column - tile.column, other.row - tile.row
+        if apart and (columns, rows) != (0, 0):
+            own = own[_facing(columns), _facing(rows)]
+        if own[..., 0].any():
+            found.append((other.key, own))
+    return found
+
+
+def _facing(offset: int) -> slice:
+    """The zones of a neighbour that lie towards the tile, along one axis."""
+    return {-1: slice(2, 3), 0: slice(0, 3), 1: slice(0, 1)}[offset]

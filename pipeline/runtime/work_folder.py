@@ -1,0 +1,119 @@
+"""A folder that keeps what the tasks of a run found: a run that was cut off goes on there, a later one begins there.
+
+One process at a time works in it. It holds the folder by a lock of the system, which ends with the process whatever
+ended it, so nothing needs to be cleared away after a crash.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import fcntl
+import json
+import os
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from uuid import uuid4
+
+from pipeline.errors import RunError
+from pipeline.runtime.scratch import Scratch
+
+_LOCK = "lock"
+_SCRATCH = "scratch"
+_MARK = "work.json"
+_FORMAT = 1
+
+
+@contextlib.contextmanager
+def held_work(folder: str) -> Iterator[Scratch]:
+    """Hold a work folder, made where it is not there, until the block ends.
+
+    Parameters
+    ----------
+    folder : str
+        On a file system that all workers share.
+
+    Yields
+    ------
+    Scratch
+        Where tasks keep what they find, taken over from all earlier attempts.
+
+    Raises
+    ------
+    RunError
+        Another process works there, or the folder is none of ours, or cannot be written.
+    """
+    root = Path(folder).resolve()
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        _check_mark(root)
+        handle = os.open(root / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise RunError(f"{root} cannot be written: {error.strerror or error}. Give another work folder") from error
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            told = os.pread(handle, 4096, 0).decode(errors="replace").strip()
+            raise RunError(
+                f"{root} is at work already ({told or 'by another process'}): wait for it, or end it first"
+            ) from None
+        except OSError as error:
+            raise RunError(
+                f"{root} is on a file system without locks ({error.strerror or error}): "
+                "two runs could meet there unseen. Give a work folder elsewhere"
+            ) from error
+        now = dt.datetime.now(tz=dt.UTC).isoformat(timespec="seconds")
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()} since {now}".encode(), 0)
+        scratch = Scratch(str(root / _SCRATCH), attempt=uuid4().hex)
+        scratch.create()
+        shutil.rmtree(Path(scratch.root, "dask"), ignore_errors=True)  # left by a process that was killed
+        yield scratch
+    finally:
+        os.close(handle)
+
+
+def is_held(folder: str) -> bool:
+    """Whether some process of this machine, or of one that shares the folder's locks, works there just now."""
+    try:
+        handle = os.open(Path(folder, _LOCK), os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(handle)
+    return False
+
+
+def clear_work(scratch: Scratch) -> None:
+    """Forget what was kept: by another name first, so that no late task finds it."""
+    for entry in Path(scratch.root).iterdir():
+        if entry.is_dir() and entry.name != "attempts":
+            doomed = entry.with_name(f".{entry.name}.{uuid4().hex}")
+            entry.rename(doomed)
+            shutil.rmtree(doomed, ignore_errors=True)
+
+
+def _check_mark(root: Path) -> None:
+    """Refuse a folder with other people's files, or of another format; mark it as ours."""
+    mark = root / _MARK
+    if mark.is_file():
+        try:
+            found = json.loads(mark.read_text()).get("format")
+        except (json.JSONDecodeError, AttributeError):
+            found = None
+        if found != _FORMAT:
+            raise RunError(f"{root} was made by another version (format {found!r}): remove it, or give another folder")
+        return
+    left = sorted(entry.name for entry in root.iterdir() if entry.name != _LOCK)
+    if left:
+        raise RunError(f"{root} holds {left[0]} and is no work folder: give a new or empty one")
+    mark.write_text(json.dumps({"format": _FORMAT}) + "\n")

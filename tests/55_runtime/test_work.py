@@ -1,0 +1,260 @@
+"""A work folder: a run that was cut off goes on, a later one does again only what changed, and nobody can tell."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pytest
+
+from pipeline.errors import RunError
+from pipeline.runtime.events import Event
+from pipeline.runtime.executors import Measured, SerialExecutor
+from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.runtime.work_folder import held_work, is_held
+from pipeline.settings import RunSettings
+from pipeline.synthetic.dataset import simulate
+
+STAGES = ("ingest", "split", "reconstruct", "publish")
+TILE_M = 40.0
+
+
+class CountingExecutor(SerialExecutor):
+    """Counts the tasks of each stage."""
+
+    def __init__(self) -> None:
+        self.tasks: Counter[str] = Counter()
+
+    def map(
+        self, stage: str, function: Callable[[Any], Any], tasks: Sequence[Any], watch: Any
+    ) -> Generator[Measured[Any], None, None]:
+        for task in tasks:
+            self.tasks[stage] += 1
+            yield from super().map(stage, function, [task], watch)
+
+
+class Place:
+    """Inputs that can be changed, a work folder, and runs there."""
+
+    def __init__(self, folder: Path, tiles: Path) -> None:
+        self.folder = folder
+        self.inputs = folder / "inputs"
+        shutil.copytree(tiles, self.inputs)
+        self.tasks: Counter[str] = Counter()
+
+    def run(
+        self, out: str = "run", work: str | None = "work", settings: dict[str, Any] | None = None, **options: Any
+    ) -> RunSummary:
+        """Run serially."""
+        executor = CountingExecutor()
+        request = RunRequest(
+            inputs=(str(self.inputs),),
+            out=str(self.folder / out),
+            settings=RunSettings.from_mapping({"tile_size_m": TILE_M, **(settings or {})}),
+            workers=0,
+            work=None if work is None else str(self.folder / work),
+        )
+        try:
+            return run(request, executor=executor, **options)
+        finally:
+            self.tasks = executor.tasks
+
+    def fresh(self, settings: dict[str, Any] | None = None) -> RunSummary:
+        """A run of the same inputs that knows nothing of any other."""
+        shutil.rmtree(self.folder / "fresh", ignore_errors=True)
+        return self.run("fresh", None, settings)
+
+    def change(self, name: str, change: Callable[[laspy.LasData], Any]) -> None:
+        """Change the points of one input."""
+        path = self.inputs / name
+        las = laspy.read(path)
+        change(las)
+        las.write(path)
+
+
+@pytest.fixture(scope="module")
+def quarters(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small town in four files by place."""
+    folder = tmp_path_factory.mktemp("quarters")
+    simulate("town", folder.with_name("whole"), 5, size_m=(110.0, 100.0), density_per_m2=3.0)
+    las = laspy.read(folder.with_name("whole") / "town.laz")
+    east, north = las.x > np.median(las.x), las.y > np.median(las.y)
+    for name, chosen in {
+        "sw": ~east & ~north,
+        "se": east & ~north,
+        "nw": ~east & north,
+        "ne": east & north,
+    }.items():
+        part = laspy.LasData(las.header)
+        part.points = las.points[chosen]
+        part.write(folder / f"{name}.laz")
+    return folder
+
+
+@pytest.fixture
+def place(quarters: Path, tmp_path: Path) -> Place:
+    return Place(tmp_path, quarters)
+
+
+def raised(las: laspy.LasData) -> None:
+    """One corner of a file lies 30 cm higher: about one building."""
+    corner = (las.x > las.x.max() - 25.0) & (las.y > las.y.max() - 25.0)
+    z = np.array(las.z)
+    z[corner] += 0.3
+    las.z = z
+
+
+def files_of(run_dir: Path) -> dict[str, bytes]:
+    """What a run delivered, but for its manifest."""
+    return {
+        str(path.relative_to(run_dir)): path.read_bytes()
+        for path in sorted(run_dir.rglob("*"))
+        if path.is_file() and path.name != "run.json"
+    }
+
+
+def stop_at(stage: str, done: int) -> Callable[[Event], None]:
+    """Interrupts a run when a stage is so far."""
+
+    def on_event(event: Event) -> None:
+        if event.kind == "progress" and event.stage == stage and event.done >= done:
+            raise KeyboardInterrupt
+
+    return on_event
+
+
+def test_a_run_in_a_work_folder_is_any_run(place: Place) -> None:
+    assert place.run().digest == place.fresh().digest
+    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+
+
+def test_a_run_after_a_finished_one_does_nothing_again(place: Place) -> None:
+    first = place.run()
+    assert min(place.tasks[stage] for stage in STAGES) > 0
+    before = files_of(place.folder / "run")
+    again = place.run()
+    assert not place.tasks
+    assert again.digest == first.digest
+    assert {**again.counts, "reused": 0} == first.counts
+    assert files_of(place.folder / "run") == before
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_run_that_was_cut_off_goes_on_where_it_stopped(place: Place, stage: str) -> None:
+    whole = place.fresh()
+    all_tasks = place.tasks
+    with pytest.raises(KeyboardInterrupt):
+        place.run(on_event=stop_at(stage, 2))
+    before = place.tasks
+    assert json.loads((place.folder / "run" / "run.json").read_text())["status"] == "cancelled"
+    assert place.run().digest == whole.digest
+    assert before[stage] > 0
+    assert before + place.tasks == all_tasks
+    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+
+
+def test_what_changed_is_done_again_and_nothing_else(place: Place) -> None:
+    first = place.run()
+    whole = place.tasks
+    place.change("sw.laz", raised)
+    again = place.run()
+    tasks = place.tasks
+    assert again.digest == place.fresh().digest != first.digest
+    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+    assert tasks["ingest"] == 1
+    assert 0 < tasks["split"] <= whole["split"]
+
+
+def test_a_file_that_was_only_touched_costs_its_reading(place: Place) -> None:
+    first = place.run()
+    place.change("ne.laz", len)
+    again = place.run()
+    assert place.tasks == {"ingest": 1}
+    assert again.digest == first.digest
+
+
+def test_models_of_input_that_did_not_change_are_taken_again(place: Place) -> None:
+    place.run()
+    place.change("sw.laz", raised)
+    again = place.run()
+    assert place.tasks["reconstruct"] > 0
+    remade = again.counts["candidates"] - again.counts["reused"]
+    assert 0 < remade < again.counts["candidates"] / 2
+
+
+def test_a_file_that_is_gone_and_one_that_is_new(place: Place) -> None:
+    place.run()
+    (place.inputs / "nw.laz").rename(place.folder / "nw.laz")
+    assert place.run().digest == place.fresh().digest
+    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+    (place.folder / "nw.laz").rename(place.inputs / "nw.laz")
+    assert place.run().digest == place.fresh().digest
+    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"method": "kmeans"}, {"candidates": {"min_area_m2": 30.0}}, {"tile_size_m": 60.0}, {"lods": "1.2,2.2"}],
+)
+def test_other_settings_are_another_result(place: Place, settings: dict[str, Any]) -> None:
+    place.run()
+    assert place.run(settings=settings).digest == place.fresh(settings).digest
+    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+
+
+def test_another_run_directory_is_published_without_modelling_again(place: Place) -> None:
+    first = place.run()
+    second = place.run("second")
+    assert set(place.tasks) == {"publish"}
+    assert second.digest == first.digest
+    assert files_of(place.folder / "second") == files_of(place.folder / "run")
+
+
+def test_what_somebody_removed_from_the_run_directory_is_published_again(place: Place) -> None:
+    first = place.run()
+    before = files_of(place.folder / "run")
+    shutil.rmtree(place.folder / "run" / "state")
+    shutil.rmtree(place.folder / "run" / "buildings")
+    assert place.run().digest == first.digest
+    assert set(place.tasks) == {"publish"}
+    assert files_of(place.folder / "run") == before
+
+
+def test_what_a_task_left_half_done_is_no_result(place: Place) -> None:
+    whole = place.fresh()
+    with pytest.raises(KeyboardInterrupt):
+        place.run(on_event=stop_at("ingest", 2))
+    scratch = place.folder / "work" / "scratch"
+    bucket = next((scratch / "points").glob("*/*.bin"))
+    (bucket.parent / f"{'0' * 16}.bin").write_bytes(bucket.read_bytes())
+    (bucket.parent / f"{'1' * 16}.{'2' * 32}.part").write_bytes(bucket.read_bytes())
+    assert place.run().digest == whole.digest
+
+
+def test_two_runs_do_not_work_in_one_folder(place: Place) -> None:
+    with held_work(str(place.folder / "work")):
+        assert is_held(str(place.folder / "work"))
+        with pytest.raises(RunError, match=r"at work already \(process \d+ on "):
+            place.run()
+    assert not is_held(str(place.folder / "work"))
+    place.run()
+
+
+def test_a_folder_of_other_things_is_no_work_folder(place: Place) -> None:
+    with pytest.raises(RunError, match="is no work folder"):
+        place.run(work="inputs")
+
+
+def test_tasks_of_a_driver_that_died_write_nothing_any_more(tmp_path: Path) -> None:
+    with held_work(str(tmp_path / "work")) as late:
+        pass
+    assert not late.cancelled
+    with held_work(str(tmp_path / "work")) as now:
+        assert late.cancelled
+        assert not now.cancelled
