@@ -59,7 +59,9 @@ EXIT_CODES: Mapping[ExitCode, str] = {
     ),
     ExitCode.USAGE: "The command line or a setting is wrong; nothing was done.",
     ExitCode.INPUT: "An input cannot be used; the message names the file, the value and the fix.",
-    ExitCode.RUN_DIRECTORY: "The run directory cannot be written, read or resumed.",
+    ExitCode.RUN_DIRECTORY: (
+        "A run directory or work folder cannot be written, read or resumed; or what a batch plans cannot work."
+    ),
     ExitCode.INTERNAL: "A fault of gablework itself; the traceback is printed.",
     ExitCode.INTERRUPTED: "Interrupted from the keyboard.",
 }

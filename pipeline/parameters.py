@@ -78,6 +78,8 @@ def _fault(name: str, value: Any, field: dataclasses.Field[Any]) -> str | None:
             low_text = "any" if low is None else f"{low:g}"
             high_text = "any" if high is None else f"{high:g}"
             return f"{name} is {value:g}: use {low_text} to {high_text} {unit}".rstrip()
+    if isinstance(default, str) and not isinstance(value, str):
+        return f"{name} is {value!r}: use a text in quotes"
     return None
 
 

@@ -1,6 +1,7 @@
 """The science commands. Each composes what stands below and imports it only when it runs: start-up counts."""
 
 from pipeline.cli.app import app
+from pipeline.cli.batch import batch
 from pipeline.cli.classifying import classify
 from pipeline.cli.cluster import worker
 from pipeline.cli.measuring import digest, evaluate, inspect
@@ -17,3 +18,4 @@ _COMMANDS = (
 )
 for _command in _COMMANDS:
     app.command()(_command)
+app.add_typer(batch)

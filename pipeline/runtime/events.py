@@ -25,6 +25,10 @@ class Event:
     """Units of this stage; 0 where unknown."""
     message: str = ""
     """One sentence for people; empty for mere progress."""
+    kept: int = 0
+    """Of the units done, those that were kept from an earlier run; told once, as the stage begins."""
+    failed: int = 0
+    """Of the units done since the event before, those that failed."""
 
 
 Listener = Callable[[Event], None]

@@ -227,6 +227,17 @@ class DaskExecutor:
         limits = [worker["memory_limit"] for worker in found["workers"].values()]
         return min((limit for limit in limits if limit), default=None)
 
+    @property
+    def worker_count(self) -> int:
+        """Workers that are there now.
+
+        Raises
+        ------
+        ClusterError
+            The scheduler is lost.
+        """
+        return len(self._ask(self._client.scheduler.identity, n_workers=-1)["workers"])
+
     def prepare(self, stage: str, watch: Watch) -> None:
         """Wait for a worker, tell the waiting, and compare the versions of all processes.
 
@@ -319,6 +330,25 @@ class DaskExecutor:
         faults = [f"{process}: {', '.join(what)}" for process, what in told.items() if what]
         if faults:
             raise VersionMismatchError(mismatch_told(faults))
+
+
+def memory_of_workers(*, workers: int, scheduler: str | None) -> tuple[int, int | None]:
+    """How many workers a run would have now, and the memory limit of the smallest; nothing is started.
+
+    Raises
+    ------
+    ClusterError
+        The scheduler does not answer.
+    """
+    if scheduler is None:
+        if workers == 0:
+            return 1, None
+        from distributed.system import MEMORY_LIMIT
+
+        # as LocalCluster shares it out among workers of one thread
+        return workers, int(MEMORY_LIMIT / workers)
+    with DaskExecutor(Cluster(scheduler=scheduler)) as executor:
+        return executor.worker_count, executor.memory_limit_bytes
 
 
 def _plain(found: Mapping[str, Any]) -> dict[str, str]:

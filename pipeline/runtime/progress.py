@@ -53,9 +53,18 @@ class Progress:
         own._part, own._parts, own._label = number, parts, label
         return own
 
-    def tell(self, kind: EventKind, stage: str, message: str = "", done: int = 0, total: int = 0) -> None:
+    def tell(
+        self,
+        kind: EventKind,
+        stage: str,
+        message: str = "",
+        done: int = 0,
+        total: int = 0,
+        kept: int = 0,
+        failed: int = 0,
+    ) -> None:
         """Send an event."""
-        self._listener(Event(kind=kind, stage=stage, done=done, total=total, message=message))
+        self._listener(Event(kind=kind, stage=stage, done=done, total=total, message=message, kept=kept, failed=failed))
 
     def warn(self, stage: str, message: str) -> None:
         """Keep and send a warning."""
@@ -98,6 +107,7 @@ class Progress:
         told: Callable[[Result], Told],
         weight: Callable[[Told], int] = lambda _: 1,
         total: int | None = None,
+        failed: Callable[[Told], int] = lambda _: 0,
         *,
         quiet: bool = False,
     ) -> dict[Place, Told]:
@@ -117,6 +127,8 @@ class Progress:
             Progress of a task, by what it tells.
         total : int, optional
             Progress of all; the number of tasks by default.
+        failed : callable
+            How much of a task's progress failed, by what it tells.
         quiet : bool
             Part of another stage: no event and no timing of its own.
         """
@@ -131,7 +143,10 @@ class Progress:
                 found[place] = told_of(scratch, place)
                 done += weight(found[place])
         if found and not quiet:
-            self.tell("progress", name, f"{len(found)} of {len(tasks)} kept", done=done, total=all_parts)
+            kept = sum(map(weight, found.values()))
+            lost = sum(map(failed, found.values()))
+            message = f"{len(found)} of {len(tasks)} tasks were done before"
+            self.tell("progress", name, message, done=done, total=all_parts, kept=kept, failed=lost)
         todo = [
             Keeping(function=function, task=task, place=place, scratch=scratch, told=told)
             for place, task in tasks.items()
@@ -140,12 +155,12 @@ class Progress:
         # closed at once where the listener raises, so that no task goes on for nobody
         with contextlib.closing(executor.map(name, keep, todo, self.watch)) as running:
             for measured in running:
-                kept = measured.result
-                found[kept.place] = kept.told
+                landed = measured.result
+                found[landed.place] = landed.told
                 self.peaks[measured.process] = max(self.peaks.get(measured.process, 0), measured.peak_bytes)
-                done += weight(kept.told)
+                done += weight(landed.told)
                 if not quiet:
-                    self.tell("progress", name, done=done, total=all_parts)
+                    self.tell("progress", name, done=done, total=all_parts, failed=failed(landed.told))
         if not quiet:
             self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started
         return {place: found[place] for place in tasks}

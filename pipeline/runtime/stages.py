@@ -19,6 +19,7 @@ from pipeline.export.records import RecordContext
 from pipeline.io import LocalStorage, SpatialReference
 from pipeline.io.footprints import read_footprints
 from pipeline.io.gps_time import GpsTimeKind
+from pipeline.model import Status
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.ingest import Ingested, IngestTask, ingest, part_of, spread_m
 from pipeline.runtime.isolation import IsolationLimits
@@ -483,6 +484,7 @@ class Stages:
             told_of_batch,
             weight=len,
             total=len(joined.candidates),
+            failed=_failed_of,
         )
         # only now: batches of before are what models are taken from where their input did not change
         drop_stale(self.scratch, stage, tasks)
@@ -543,6 +545,11 @@ class Stages:
                 self.progress.warn("publish", f"tile {outcome.tile.key} failed: {outcome.error}")
                 Path(self.scratch.root, place.name).unlink(missing_ok=True)  # to be tried again by whoever goes on
         return list(published.values())
+
+
+def _failed_of(models: Sequence[Modelled]) -> int:
+    """How many buildings of a batch failed."""
+    return sum(model.status == Status.FAILED.value for model in models)
 
 
 def _told_context(context: RecordContext) -> tuple[object, ...]:

@@ -56,10 +56,7 @@ def held_work(folder: str) -> Iterator[Scratch]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            told = os.pread(handle, 4096, 0).decode(errors="replace").strip()
-            raise RunError(
-                f"{root} is at work already ({told or 'by another process'}): wait for it, or end it first"
-            ) from None
+            raise RunError(f"{root} is at work already ({_holder(root)}): wait for it, or end it first") from None
         except OSError as error:
             raise RunError(
                 f"{root} is on a file system without locks ({error.strerror or error}): "
@@ -74,6 +71,26 @@ def held_work(folder: str) -> Iterator[Scratch]:
         yield scratch
     finally:
         os.close(handle)
+
+
+def refuse_held(folder: str) -> None:
+    """Say early that another process works in a folder; `held_work` has the last word.
+
+    Raises
+    ------
+    RunError
+        One does.
+    """
+    if is_held(folder):
+        raise RunError(f"{folder} is at work already ({_holder(Path(folder))}): wait for it, or end it first")
+
+
+def _holder(root: Path) -> str:
+    """Who holds a folder, as the holder says."""
+    try:
+        return (root / _LOCK).read_text(errors="replace").strip() or "by another process"
+    except OSError:
+        return "by another process"
 
 
 def is_held(folder: str) -> bool:
@@ -113,7 +130,7 @@ def _check_mark(root: Path) -> None:
         if found != _FORMAT:
             raise RunError(f"{root} was made by another version (format {found!r}): remove it, or give another folder")
         return
-    left = sorted(entry.name for entry in root.iterdir() if entry.name != _LOCK)
+    left = sorted(entry.name for entry in root.iterdir() if entry.name not in {_LOCK, "status.json"})
     if left:
         raise RunError(f"{root} holds {left[0]} and is no work folder: give a new or empty one")
     mark.write_text(json.dumps({"format": _FORMAT}) + "\n")

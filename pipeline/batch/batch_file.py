@@ -1,0 +1,226 @@
+"""The batch file: one TOML document that says all of a batch run.
+
+```toml
+[inputs]
+paths = ["tiles/*.laz"]
+crs = "EPSG:28992"
+footprints = "footprints.gpkg"
+[settings]
+method = "arrangement"
+[output]
+path = "models"
+[cluster]
+workers = 2
+```
+
+Paths are relative to the file's folder. All faults are told at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import SettingsError
+from pipeline.export.tile import MESHES
+from pipeline.parameters import Parameters, build, parameter
+from pipeline.runtime.isolation import IsolationLimits
+from pipeline.runtime.run import RunRequest
+from pipeline.settings import RunSettings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class InputsTable(Parameters):
+    """`[inputs]`: what is read."""
+
+    crs: str = parameter("", "The inputs' CRS, where their header has none or a wrong one.")
+    vertical_unit: str = parameter("", "Unit of elevations: m, ft or us-ft; empty as the header says.")
+    footprints: str = parameter("", "Building outlines to model; empty finds the buildings in the points.")
+    overrides: str = parameter("", "What to do with single buildings.")
+    aoi: str = parameter("", "Only what lies inside the polygons of this vector file.")
+    licence: str = parameter("", "Licence of the source data, written into the results.")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OutputTable(Parameters):
+    """`[output]`: what is written."""
+
+    path: str = parameter("", "The run directory.")
+    meshes: str = parameter("building", "One OBJ a building, one OBJ a tile, one GLB a tile, or none.", choices=MESHES)
+    overwrite: bool = parameter(False, "Replace a run that is already there and is not of this batch.")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorkTable(Parameters):
+    """`[work]`: what is remembered."""
+
+    path: str = parameter(
+        "",
+        "The work folder, on a file system that all workers share; empty takes the batch file's name with the ending "
+        ".work beside it.",
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ClusterTable(Parameters):
+    """`[cluster]`: who does it."""
+
+    workers: int = parameter(
+        2, "Processes of the embedded cluster; 0 runs serially in the driver.", minimum=0, maximum=1024
+    )
+    scheduler: str = parameter("", "A Dask scheduler to use in place of the embedded cluster.")
+    isolate: bool = parameter(
+        True, "Model buildings in supervised processes of their own, so that a bad one costs only itself."
+    )
+    building_timeout_s: float = parameter(
+        IsolationLimits.timeout_s,
+        "Seconds that a building may take in its child process.",
+        unit="s",
+        minimum=1.0,
+        maximum=86_400.0,
+    )
+    building_memory_gib: float = parameter(
+        IsolationLimits.memory_bytes / 2**30,
+        "Memory that a building's child process may take.",
+        unit="GiB",
+        minimum=0.5,
+        maximum=4096.0,
+    )
+
+
+TABLES: Mapping[str, type[Parameters]] = {
+    "inputs": InputsTable,
+    "output": OutputTable,
+    "work": WorkTable,
+    "cluster": ClusterTable,
+}
+"""Tables of a batch file beside `[settings]`."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Batch:
+    """A batch file, read."""
+
+    path: Path
+    """The file."""
+    inputs: InputsTable
+    """What is read, but for the paths."""
+    paths: tuple[str, ...]
+    """Files, folders or patterns, absolute."""
+    bbox: tuple[float, float, float, float] | None
+    """x_min, y_min, x_max, y_max in the CRS's units."""
+    output: OutputTable
+    """What is written."""
+    work: WorkTable
+    """What is remembered."""
+    cluster: ClusterTable
+    """Who does it."""
+    settings: RunSettings
+    """All settings."""
+
+    def whole(self, name: str) -> str:
+        """A path of the file as an absolute one; addresses with a scheme stay."""
+        return name if "://" in name else str((self.path.parent / name).resolve())
+
+    @property
+    def work_folder(self) -> str:
+        """The work folder."""
+        return self.whole(self.work.path) if self.work.path else str(self.path.with_suffix(".work"))
+
+    @property
+    def out(self) -> str:
+        """The run directory."""
+        return self.whole(self.output.path)
+
+    def request(self) -> RunRequest:
+        """What the engine is asked to do."""
+
+        def given(name: str) -> str | None:
+            return self.whole(name) if name else None
+
+        return RunRequest(
+            inputs=self.paths,
+            out=self.out,
+            settings=self.settings,
+            footprints=given(self.inputs.footprints),
+            overrides=given(self.inputs.overrides),
+            crs=self.inputs.crs or None,
+            vertical_unit=self.inputs.vertical_unit or None,
+            bbox=self.bbox,
+            aoi=given(self.inputs.aoi),
+            workers=self.cluster.workers,
+            scheduler=self.cluster.scheduler or None,
+            meshes=self.output.meshes,
+            licence=self.inputs.licence or None,
+            overwrite=self.output.overwrite,
+            work=self.work_folder,
+            isolate=self.cluster.isolate and bool(self.cluster.workers or self.cluster.scheduler),
+            building_timeout_s=self.cluster.building_timeout_s,
+            building_memory_bytes=round(self.cluster.building_memory_gib * 2**30),
+        )
+
+
+def read_batch(path: str | Path) -> Batch:
+    """Read a batch file.
+
+    Raises
+    ------
+    SettingsError
+        It cannot be read or parsed, or holds faults, all of which are listed.
+    """
+    file = Path(path).resolve()
+    try:
+        document = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError([f"batch file {path} cannot be read: {error.strerror or error}"]) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError([f"batch file {path} is no TOML: {error}"]) from error
+    faults: list[str] = []
+    known = (*TABLES, "settings")
+    faults.extend(
+        f"[{name}] is no table of a batch file: use one of {', '.join(known)}" for name in document if name not in known
+    )
+    tables = {name: document.get(name, {}) for name in known}
+    faults.extend(
+        f"{name} is {table!r}: use a table" for name, table in tables.items() if not isinstance(table, Mapping)
+    )
+    tables = {name: table if isinstance(table, Mapping) else {} for name, table in tables.items()}
+    inputs = dict(tables["inputs"])
+    paths, bbox = _paths(inputs.pop("paths", None), faults), _bbox(inputs.pop("bbox", None), faults)
+    built = {
+        name: build(kind, name, inputs if name == "inputs" else tables[name], faults) for name, kind in TABLES.items()
+    }
+    output = built["output"]
+    if output is not None and not output.path:
+        faults.append('[output] path is missing: give the run directory, such as path = "models"')
+    settings = RunSettings()
+    try:
+        settings = RunSettings.from_mapping(tables["settings"])
+    except SettingsError as error:
+        faults.extend(f"[settings] {fault}" for fault in error.faults)
+    if faults:
+        raise SettingsError(faults)
+    batch = Batch(path=file, paths=(), bbox=bbox, settings=settings, **built)
+    return dataclasses.replace(batch, paths=tuple(batch.whole(name) for name in paths))
+
+
+def _paths(value: Any, faults: list[str]) -> tuple[str, ...]:
+    if isinstance(value, list) and value and all(isinstance(entry, str) and entry for entry in value):
+        return tuple(value)
+    told = "missing" if value is None else repr(value)
+    faults.append(f'[inputs] paths is {told}: give a list of files, folders or patterns, such as ["tiles/*.laz"]')
+    return ()
+
+
+def _bbox(value: Any, faults: list[str]) -> tuple[float, float, float, float] | None:
+    if value is None:
+        return None
+    numbers = isinstance(value, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+    if numbers and len(value) == 4:
+        x_min, y_min, x_max, y_max = (float(v) for v in value)
+        return x_min, y_min, x_max, y_max
+    faults.append(f"[inputs] bbox is {value!r}: use [x_min, y_min, x_max, y_max]")
+    return None

@@ -1,0 +1,97 @@
+"""How long a run will still take, as a range: what was seen of its stages, and what was planned of the others."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+_UNSEEN = 2.0
+"""What nothing was seen of yet may take half as long as planned, or twice."""
+_SEEN = 1.25
+"""What was planned is off by this much even where stages before went as planned: buildings differ."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StageProgress:
+    """How far a stage is."""
+
+    done: int
+    """Units done."""
+    total: int
+    """Units of the stage."""
+    kept: int = 0
+    """Of those done, how many were done before and took no time now."""
+    seconds: float = 0.0
+    """Since the stage began; of one that is over, all that it took."""
+    over: bool = False
+    """Whether it is over."""
+
+
+def remaining_s(planned: Mapping[str, float], seen: Mapping[str, StageProgress]) -> tuple[float, float] | None:
+    """The least and the most seconds that a run is likely to take from now on.
+
+    Parameters
+    ----------
+    planned : mapping
+        Planned seconds of all stages, by name, in their order.
+    seen : mapping
+        Progress of those that began.
+
+    Returns
+    -------
+    (float, float) or None
+        None where nothing was planned.
+
+    Examples
+    --------
+    Half of the only stage took 50 s, by 100 tasks; and nothing was seen of another yet.
+
+    >>> [round(s) for s in remaining_s({"split": 80.0}, {"split": StageProgress(done=100, total=200, seconds=50.0)})]
+    [45, 55]
+    >>> [round(s) for s in remaining_s({"split": 80.0}, {})]
+    [40, 160]
+    """
+    if not planned:
+        return None
+    low = high = 0.0
+    spent = expected = 0.0
+    for name, seconds in planned.items():
+        stage = seen.get(name)
+        if stage is None:
+            continue
+        worked = stage.done - stage.kept
+        if stage.over:
+            if stage.total > stage.kept:
+                spent += stage.seconds
+                expected += seconds * (stage.total - stage.kept) / max(1, stage.total)
+            continue
+        left = stage.total - stage.done
+        if worked > 0:
+            own = stage.seconds / worked * left
+            # of n tasks of like kind the mean is known to one part in the root of n
+            spread = 1.0 / math.sqrt(worked)
+            low += own / (1.0 + spread)
+            high += own * (1.0 + spread)
+        else:
+            share = left / max(1, stage.total)
+            low += seconds * share / _UNSEEN
+            high += seconds * share * _UNSEEN
+    pace = spent / expected if expected > 0.0 else 1.0
+    doubt = _SEEN if expected > 0.0 else _UNSEEN
+    unseen = pace * sum(seconds for name, seconds in planned.items() if name not in seen)
+    return low + unseen / doubt, high + unseen * doubt
+
+
+def duration(seconds: float) -> str:
+    """A duration for people.
+
+    >>> duration(4.2), duration(95.0), duration(3 * 3600.0 + 120.0)
+    ('4 s', '1:35 min', '3:02 h')
+    """
+    if seconds < 60.0:
+        return f"{seconds:.0f} s"
+    whole = round(seconds)
+    if seconds < 3600.0:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    return f"{whole // 3600}:{whole % 3600 // 60:02d} h"

@@ -1,0 +1,68 @@
+"""A batch run: estimated, refused where it cannot work, run in its work folder, told while it runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from pipeline.batch.batch_file import Batch
+from pipeline.batch.estimates import estimate, refuse
+from pipeline.batch.status import StatusWriter
+from pipeline.errors import RunCancelledError
+from pipeline.runtime.events import Event, Listener, ignore, never
+from pipeline.runtime.executors import Executor
+from pipeline.runtime.run import RunSummary, run
+from pipeline.runtime.work_folder import refuse_held
+
+_READ = 1
+"""Inputs that are read in whole for the estimate of a run: it is to begin soon."""
+
+
+def run_batch(
+    batch: Batch,
+    on_event: Listener = ignore,
+    executor: Executor | None = None,
+    cancelled: Callable[[], bool] = never,
+) -> RunSummary:
+    """Run a batch, or go on with one that was cut off; what did not change since an earlier run is not done again.
+
+    Parameters
+    ----------
+    batch : Batch
+        What is to be done.
+    on_event : callable
+        Gets an `Event` for every stage, step and warning.
+    executor : Executor, optional
+        Where tasks run; by default what the batch asks for.
+    cancelled : callable
+        Asked several times a second, from another thread; once it is true the run ends as soon as it can.
+
+    Raises
+    ------
+    BatchRefusedError
+        It cannot work as it is planned.
+    RunError
+        Another process runs it, or its folders cannot be used.
+    InputError, SettingsError, ClusterError, RunCancelledError
+        As `pipeline.runtime.run.run`.
+    """
+    refuse_held(batch.work_folder)
+    planned = estimate(batch, _READ)
+    refuse(planned)
+    status = StatusWriter(batch.work_folder, str(batch.path), batch.out, planned.stage_s)
+
+    def listen(event: Event) -> None:
+        status.on_event(event)
+        told = event.kind == "progress" and not event.message
+        on_event(dataclasses.replace(event, message=status.told()) if told else event)
+
+    try:
+        summary = run(batch.request(), listen, executor, cancelled)
+    except (KeyboardInterrupt, RunCancelledError):
+        status.end("interrupted", "run the batch again, and it goes on from here")
+        raise
+    except BaseException as error:
+        status.end("failed", f"{type(error).__name__}: {error}".removesuffix(": "))
+        raise
+    status.end("incomplete" if summary.failed_tiles else "finished", f"digest {summary.digest}")
+    return summary

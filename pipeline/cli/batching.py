@@ -1,0 +1,101 @@
+"""City-scale runs from one file."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pipeline.batch.eta import duration
+from pipeline.cli.modelling import show_summary
+from pipeline.cli.options import AsJson, Quiet
+from pipeline.console import Console, ExitCode
+
+if TYPE_CHECKING:
+    from pipeline.batch.estimates import Estimate
+    from pipeline.batch.status import Status
+
+BatchFile = Annotated[str, typer.Argument(metavar="FILE", help="The batch file, TOML; docs/how_to/batch.md.")]
+
+
+def plan(
+    file: BatchFile,
+    read: Annotated[int, typer.Option(min=1, help="Inputs that are read in whole, to tell how many buildings.")] = 3,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what a batch run will take, and refuse what cannot work, before anything runs."""
+    with Console(as_json=as_json) as console:
+        from pipeline.batch.batch_file import read_batch
+        from pipeline.batch.estimates import estimate, refuse
+
+        batch = read_batch(file)
+        found = estimate(batch, read)
+        console.table(f"The plan of {file}", ("figure", "value"), _rows(found))
+        for warning in found.warnings:
+            console.warn(warning)
+        console.document(dataclasses.asdict(found))
+        refuse(found)
+
+
+def run(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """Run a batch; one that was cut off goes on where it stopped, and what did not change is not done again."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.batch.batch_file import read_batch
+        from pipeline.batch.running import run_batch
+
+        # whoever ends services by SIGTERM, as systemd and Kubernetes do, finds a run that can go on
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        summary = run_batch(read_batch(file), console.on_event)
+        show_summary(console, summary)
+        console.document(dataclasses.asdict(summary))
+        if summary.failed_tiles:
+            raise typer.Exit(ExitCode.TILES_FAILED)
+
+
+def status(file: BatchFile, as_json: AsJson = False) -> None:
+    """Tell how far a batch run is, also from another terminal, and after it died."""
+    with Console(as_json=as_json) as console:
+        from pipeline.batch.batch_file import read_batch
+        from pipeline.batch.status import read_status
+
+        found = read_status(read_batch(file).work_folder)
+        console.table(f"The run of {file}", ("figure", "value"), _told(found))
+        for warning in found.warnings:
+            console.warn(warning)
+        console.document(dataclasses.asdict(found))
+
+
+def _rows(found: Estimate) -> list[tuple[str, str]]:
+    limit = "" if found.worker_limit_bytes is None else f" of {found.worker_limit_bytes / 2**30:.1f}"
+    return [
+        ("inputs", f"files: {found.files}, {found.points / 1e6:,.1f} million points"),
+        ("tiles", f"{found.tiles} of {found.tile_size_m:g} m"),
+        ("buildings", f"about {found.buildings:,} ({found.buildings_from})"),
+        ("memory of a worker", f"{found.worker_bytes / 2**30:.1f}{limit} GiB"),
+        ("time", f"{duration(found.seconds[0])} to {duration(found.seconds[1])} with {found.workers} workers"),
+        ("work folder", f"{found.work_bytes / 1e9:.2f} GB{_of(found.work_free_bytes)}"),
+        ("results", f"{found.out_bytes / 1e9:.2f} GB{_of(found.out_free_bytes)}"),
+    ]
+
+
+def _of(free: int | None) -> str:
+    return "" if free is None else f" of {free / 1e9:.1f} GB that are free"
+
+
+def _told(found: Status) -> list[tuple[str, str]]:
+    rows = [("state", found.state), ("process", found.process), ("started", found.started_at)]
+    rows.append(("told", found.updated_at))
+    for name, stage in found.stages.items():
+        kept = f", {stage['kept']} of them before" if stage["kept"] else ""
+        rows.append((name, f"{stage['done']} of {stage['total']}{kept}, {duration(stage['seconds'])}"))
+    if found.buildings:
+        failed = f", {found.buildings['failed']} failed"
+        rows.append(("buildings", f"{found.buildings['done']} done{failed}, {found.buildings['queued']} queued"))
+    if found.rate_per_s is not None and found.state == "running":
+        rows.append(("rate", f"{found.rate_per_s:g} a second in {found.stage}"))
+    if found.remaining_s is not None:
+        rows.append(("still", f"{duration(found.remaining_s[0])} to {duration(found.remaining_s[1])}"))
+    rows.extend((name, text) for name, text in (("waiting", found.waiting), ("message", found.message)) if text)
+    return rows
