@@ -13,6 +13,7 @@ from typing import Any
 
 import typer
 
+from pipeline.batch.batch_file import TABLES
 from pipeline.console import EXIT_CODES
 from pipeline.evaluation.chapters import TITLES
 from pipeline.evaluation.definitions import DEFINITIONS
@@ -295,8 +296,36 @@ def measures() -> str:
     return "\n".join(lines)
 
 
+def batch_file() -> str:
+    """The page of the batch file."""
+    lines = [
+        NOTE,
+        "# The batch file",
+        "",
+        "TOML, for `gablework batch`; how it is used: [city-scale batches](../how_to/batch.md). Paths are relative to the",
+        "file. Beside these tables `[settings]` takes all [settings](settings.md) of a run. Unknown names and values out of",
+        "range are refused before anything runs, all faults at once.",
+    ]
+    own: dict[str, list[list[object]]] = {
+        "inputs": [
+            ["`paths`", "required", "", "a list", "Files, folders or patterns of point clouds."],
+            ["`bbox`", "none", "", "four numbers", "Only this rectangle: x_min, y_min, x_max, y_max in the CRS's units."],
+        ]
+    }
+    for name, kind in TABLES.items():
+        rows = own.get(name, []) + [
+            [f"`{field.name}`", toml(field.default), field.metadata["unit"], allowed(field), field.metadata["doc"]]
+            for field in dataclasses.fields(kind)
+        ]
+        about = (kind.__doc__ or "").strip().split(": ", 1)[-1]
+        lines += ["", f"## `[{name}]`", "", f"{about[:1].upper()}{about[1:]}", ""]
+        lines += table(["key", "default", "unit", "allowed", "meaning"], rows)
+    return "\n".join(lines) + "\n"
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
+    "batch_file.md": batch_file,
     "command_line.md": command_line,
     "exit_codes.md": exit_codes,
     "validity.md": validity,

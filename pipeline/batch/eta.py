@@ -79,7 +79,9 @@ def remaining_s(planned: Mapping[str, float], seen: Mapping[str, StageProgress])
             high += seconds * share * _UNSEEN
     pace = spent / expected if expected > 0.0 else 1.0
     doubt = _SEEN if expected > 0.0 else _UNSEEN
-    unseen = pace * sum(seconds for name, seconds in planned.items() if name not in seen)
+    names = list(planned)
+    begun = max((k for k, name in enumerate(names) if name in seen), default=-1)
+    unseen = pace * sum(planned[name] for name in names[begun + 1 :])
     return low + unseen / doubt, high + unseen * doubt
 
 

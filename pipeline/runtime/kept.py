@@ -25,7 +25,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import shapely
 
-from pipeline.errors import RunCancelledError
+from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.versions import fingerprint
 
@@ -149,10 +149,20 @@ def keep(work: Keeping[Task, Result, Told]) -> Kept[Told]:
     ------
     RunCancelledError
         The run was called off.
+    RunError
+        Scratch or results cannot be read or written; what was kept before stays.
     """
-    result = work.function(work.task)
-    told = work.told(result)
-    work.scratch.put_bytes(work.place.name, _packed(told, result))
+    try:
+        result = work.function(work.task)
+        told = work.told(result)
+        work.scratch.put_bytes(work.place.name, _packed(told, result))
+    except OSError as error:
+        work.scratch.check_cancelled()  # of a run that is over the folders may be gone
+        where = error.filename or work.scratch.root
+        told = error.strerror or f"a file could not be written whole ({error})"
+        raise RunError(
+            f"{where}: {told}, in stage {work.place.stage}. Free space or mend the storage, then run again"
+        ) from error
     return Kept(place=work.place, told=told)
 
 

@@ -19,6 +19,7 @@ process itself does so.
   "crash_once": {"ids": [...], "folder": "/f"}   SIGSEGV for the first process that comes to it, by a mark in the folder
   "pause": {"<stage>": "/folder", ...},     the stage's tasks write /folder/reached-<pid> and wait for /folder/go
   "kill": {"<stage>": "/folder", ...}       the first of the stage's tasks kills its process, by a mark in the folder
+  "full": {"<stage>": "/folder", ...}       the stage's tasks find the disk full as long as /folder/full is there
 }
 ```
 
@@ -30,6 +31,7 @@ split, reconstruct and publish, and outputs in the service's driver. A stage's t
 
 from __future__ import annotations
 
+import errno
 import functools
 import importlib.abc
 import importlib.machinery
@@ -151,6 +153,9 @@ def at_stage(stage: str) -> None:
     folder = FAULTS.get("kill", {}).get(stage)
     if folder is not None and first(folder, f"killed-{stage}"):
         os.kill(os.getpid(), signal.SIGKILL)
+    folder = FAULTS.get("full", {}).get(stage)
+    if folder is not None and Path(folder, "full").exists():
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), folder)
 
 
 def before(function: Callable[..., Any], happen: Callable[..., None]) -> Callable[..., Any]:
@@ -223,7 +228,7 @@ class Finder(importlib.abc.MetaPathFinder):
 
 
 if FAULTS:
-    unknown = set(FAULTS) - {*AT_MODELLING, "crash_gather", "crash_once", "pause", "kill"}
+    unknown = set(FAULTS) - {*AT_MODELLING, "crash_gather", "crash_once", "pause", "kill", "full"}
     if unknown:
         sys.exit(f"GABLEWORK_FAULTS knows no {', '.join(sorted(unknown))}")
     sys.meta_path.insert(0, Finder())

@@ -1,0 +1,109 @@
+"""gablework batch: plan, run, status, as a user types them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.runtime.work_folder import held_work
+from pipeline.synthetic.dataset import simulate
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A batch of one tile of some houses."""
+    folder = tmp_path_factory.mktemp("batch")
+    simulate("suburb", folder / "tiles", 3, size_m=(70.0, 70.0), density_per_m2=4.0)
+    (folder / "city.toml").write_text(
+        '[inputs]\npaths = ["tiles/*.laz"]\n[settings]\ntile_size_m = 40.0\n[output]\npath = "models"\n'
+        "[cluster]\nworkers = 0\n"
+    )
+    return folder
+
+
+def call(*words: str | Path) -> tuple[int, str, str]:
+    ended = CliRunner().invoke(app, ["batch", *map(str, words)])
+    return ended.exit_code, ended.stdout, ended.stderr
+
+
+def rows(text: str) -> dict[str, str]:
+    """The table of a command."""
+    lines = [line.split("│")[1:3] for line in text.splitlines() if line.startswith("│")]
+    return {name.strip(): value.strip() for name, value in lines}
+
+
+def test_a_batch_is_planned_run_and_told(folder: Path) -> None:
+    file = folder / "city.toml"
+    code, told, _ = call("plan", file)
+    assert code == 0
+    plan = rows(told)
+    assert plan["inputs"].startswith("files: 1, 0.0 million points")
+    assert "of 40 m" in plan["tiles"]
+    assert not (folder / "models").exists()
+    code, told, error = call("status", file)
+    assert code == 4
+    assert "this batch was never run" in error
+    code, told, _ = call("run", file, "--json")
+    assert code == 0
+    first = json.loads(told)
+    assert first["statuses"]["ok"] > 0
+    assert rows(call("status", file)[1])["state"] == "finished"
+    status = json.loads(call("status", file, "--json")[1])
+    assert status["buildings"]["done"] == first["counts"]["candidates"]
+    assert status["message"] == f"digest {first['digest']}"
+    again = json.loads(call("run", file, "--json")[1])
+    assert again["digest"] == first["digest"]
+    status = json.loads(call("status", file, "--json")[1])
+    assert all(stage["kept"] == stage["done"] for name, stage in status["stages"].items() if name != "join")
+
+
+def test_a_batch_that_somebody_runs_is_refused(folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "city.toml"
+    file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
+    with held_work(str(tmp_path / "city.work")):
+        code, _, error = call("run", file)
+    assert code == 4
+    assert "is at work already" in error
+
+
+@pytest.mark.parametrize(
+    ("command", "free", "words"),
+    [("plan", 10, "work folder"), ("run", 10, "work folder"), ("plan", 10**12, "")],
+)
+def test_what_does_not_fit_is_refused_before_anything_runs(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, free: int, words: str
+) -> None:
+    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: free)
+    file = tmp_path / "city.toml"
+    file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
+    code, _, error = call(command, file)
+    assert code == (4 if words else 0)
+    assert words in error
+    assert not (tmp_path / "models").exists()
+
+
+def test_a_tile_that_no_worker_can_hold_is_refused(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def small(*, workers: int, scheduler: str | None) -> tuple[int, int | None]:
+        return 2, 1_000_000
+
+    monkeypatch.setattr("pipeline.batch.estimates.memory_of_workers", small)
+    code, _, error = call("plan", folder / "city.toml")
+    assert code == 4
+    assert "Set a smaller tile_size_m, or give the workers more memory" in error
+
+
+@pytest.mark.parametrize("words", [["plan"], ["run"], ["status"]])
+def test_a_batch_file_with_faults_is_a_usage_error(tmp_path: Path, words: Sequence[str]) -> None:
+    file = tmp_path / "city.toml"
+    file.write_text("[input]\n")
+    code, _, error = call(*words, file)
+    assert code == 2
+    assert "[input] is no table of a batch file" in error
+    assert "[inputs] paths is missing" in error
