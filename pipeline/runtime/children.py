@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from pipeline.errors import RunError
+from pipeline.runtime.measured import charge
 from pipeline.runtime.supervised import SupervisedChild
 
 FRUITLESS_STARTS = 3
@@ -53,6 +54,8 @@ class _Children:
         except BaseException:
             self._end(child)
             raise
+        finally:
+            charge(child.spent_cpu_s())
         with self._lock:
             kept = child.alive and not self._closed
             if kept:

@@ -7,6 +7,7 @@ import os
 import pickle
 import resource
 import socket
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
@@ -24,10 +25,28 @@ class Measured(Generic[Result]):
 
     result: Result
     seconds: float
+    cpu_s: float
+    """CPU seconds of the task's own thread, and of the child processes that worked for it."""
+    began_s: float
+    """When it began, in seconds since 1970 by this machine's clock."""
     process: str
     """host:pid."""
     peak_bytes: int
     """Largest resident size of the process so far."""
+
+
+class _Account(threading.local):
+    """What child processes spent for the task that runs in this thread."""
+
+    cpu_s: float = 0.0
+
+
+_spent_by_children = _Account()
+
+
+def charge(cpu_s: float) -> None:
+    """Charge the task that runs in this thread with CPU seconds of a child process that worked for it."""
+    _spent_by_children.cpu_s += cpu_s
 
 
 def peak_of_process() -> tuple[str, int]:
@@ -37,11 +56,14 @@ def peak_of_process() -> tuple[str, int]:
 
 def measure(function: Callable[[Task], Result], task: Task) -> Measured[Result]:
     """Run one task and measure it."""
-    started = time.perf_counter()
+    _spent_by_children.cpu_s = 0.0
+    began_s, started, cpu_s = time.time(), time.perf_counter(), time.thread_time()
     result = function(task)
-    seconds = time.perf_counter() - started
+    seconds, cpu_s = time.perf_counter() - started, time.thread_time() - cpu_s + _spent_by_children.cpu_s
     process, peak_bytes = peak_of_process()
-    return Measured(result=result, seconds=seconds, process=process, peak_bytes=peak_bytes)
+    return Measured(
+        result=result, seconds=seconds, cpu_s=cpu_s, began_s=began_s, process=process, peak_bytes=peak_bytes
+    )
 
 
 def packed(function: Callable[[Task], Result], task: Task) -> bytes:

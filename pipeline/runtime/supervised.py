@@ -87,6 +87,8 @@ class SupervisedChild:
         self._nonsense = ""
         self.begun = 0
         """Items that it announced so far."""
+        self._told_cpu_s = 0.0
+        self._seen_cpu_s = 0.0
 
     @property
     def alive(self) -> bool:
@@ -101,6 +103,17 @@ class SupervisedChild:
         except self._is_gone:
             return 0
         return int(info.rss) - int(getattr(info, "shared", 0))
+
+    def spent_cpu_s(self) -> float:
+        """CPU seconds that it spent since this was last asked, its start included; of one that is gone as last seen."""
+        self._look_at_cpu()
+        spent, self._told_cpu_s = self._seen_cpu_s - self._told_cpu_s, self._seen_cpu_s
+        return spent
+
+    def _look_at_cpu(self) -> None:
+        with contextlib.suppress(self._is_gone):
+            times = self._watched.cpu_times()
+            self._seen_cpu_s = max(self._seen_cpu_s, times.user + times.system)
 
     def wait_until_ready(self, timeout_s: float, cancelled: Callable[[], bool]) -> str | None:
         """Wait for the child to have loaded what it needs.
@@ -199,6 +212,7 @@ class SupervisedChild:
 
     def kill(self) -> None:
         """Kill the process and all that it started; harmless where it is gone."""
+        self._look_at_cpu()
         if self._process.poll() is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
@@ -244,6 +258,7 @@ class SupervisedChild:
 
     def _how_it_ended(self) -> str:
         """Signal or exit code of a process whose pipe is closed."""
+        self._look_at_cpu()  # until it is waited for, the system remembers
         if self._nonsense:
             return self._nonsense
         try:
