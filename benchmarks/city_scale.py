@@ -1,0 +1,295 @@
+"""The engine at the scale of a city: efficiency, memory, what the driver costs, and what killed workers cost.
+
+    python -m benchmarks.city_scale --out DIR [--tiles 400] [--tile-size 0] [--workers 2]
+                                    [--mode traced|plain|apart] [--kill-every 30] [--label NAME] [--keep]
+
+makes the city of `city_tiles.py` in DIR/city<tiles> (minutes), runs the pipeline over it in processes of their own,
+looks at them from outside, and writes DIR/<label>.md (tables), DIR/<label>.json and DIR/<label>.trace.json (a row a
+task; `scaling_simulation.py` reads it). `traced` is the run of `gablework reconstruct` with an executor that keeps what
+each task took; `plain` is the command itself, looked at from outside only; `apart` is `traced` with the scheduler and
+the workers (`gablework worker`) as processes of their own, so that driver and scheduler can be told apart. With
+`--kill-every S` a worker's process is killed every S seconds, in turns.
+
+Efficiency is the CPU time of all task bodies, their child processes included, over wall-clock time times workers. On a
+machine that others use too it is told too small: the wall grows, the CPU time does not. So the share of the time in
+which the workers had a task (occupancy) and the share of all CPU time that was spent in tasks are told beside it;
+on a quiet machine efficiency is about their product.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import json
+import os
+import shutil
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.city_tiles import SUFFIX, make_city, square_of
+from benchmarks.entries import markdown_table
+from benchmarks.process_watch import DRIVER, NANNY, SCHEDULER, Watcher
+from benchmarks.traced_run import folder_bytes
+
+REQUIRED, WANTED = 0.80, 0.90
+_SCHEDULER_WAIT_S = 60.0
+RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state")
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+def command_of(arguments: argparse.Namespace, tiles: Path, run_dir: Path, scheduler: str | None) -> list[str]:
+    """What is started."""
+    if arguments.mode == "plain":
+        command = [sys.executable, "-m", "service.cli", "reconstruct", str(tiles), "--out", str(run_dir), "--overwrite"]
+        command += ["--workers", str(arguments.workers)]
+        if arguments.tile_size:
+            settings = run_dir.parent / f"{arguments.label}.toml"
+            settings.write_text(f"[settings]\ntile_size_m = {arguments.tile_size}\n", encoding="utf-8")
+            command += ["--settings", str(settings)]
+        return command
+    trace = run_dir.parent / f"{arguments.label}.trace.json"
+    command = [sys.executable, "-m", "benchmarks.traced_run", str(tiles), "--out", str(run_dir), "--trace", str(trace)]
+    command += ["--workers", str(arguments.workers), "--tile-size", str(arguments.tile_size)]
+    return command if scheduler is None else [*command, "--scheduler", scheduler]
+
+
+@contextlib.contextmanager
+def cluster_apart(workers: int, log: Path) -> Iterator[tuple[str, dict[int, str]]]:
+    """A scheduler and workers as processes of their own: the address, and the role of each by its id."""
+    address = f"tcp://127.0.0.1:{free_port()}"
+    dask = Path(sys.executable).parent / "dask"
+    with log.open("wb") as out, contextlib.ExitStack() as stack:
+
+        def started(command: Sequence[str]) -> int:
+            process = subprocess.Popen(command, stdout=out, stderr=out)
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+            return process.pid
+
+        port = address.rsplit(":", 1)[1]
+        roles = {
+            started(
+                [str(dask), "scheduler", "--host", "127.0.0.1", "--port", port, "--dashboard-address", "127.0.0.1:0"]
+            ): SCHEDULER
+        }
+        for _ in range(workers):
+            roles[started([sys.executable, "-m", "service.cli", "worker", "--scheduler", address])] = NANNY
+        end = time.monotonic() + _SCHEDULER_WAIT_S
+        while socket.socket().connect_ex(("127.0.0.1", int(port))) != 0:
+            if time.monotonic() > end:
+                raise SystemExit(f"the scheduler did not come: see {log}")
+            time.sleep(0.1)
+        yield address, roles
+
+
+def watched_run(arguments: argparse.Namespace, tiles: Path, run_dir: Path) -> dict[str, Any]:
+    """Run once and tell what was seen from outside."""
+    log = run_dir.parent / f"{arguments.label}.log"
+    with contextlib.ExitStack() as stack:
+        scheduler, roots = None, dict[int, str]()
+        if arguments.mode == "apart":
+            scheduler, roots = stack.enter_context(cluster_apart(arguments.workers, log.with_suffix(".cluster.log")))
+        out = stack.enter_context(log.open("wb"))
+        load_before = os.getloadavg()[0]
+        began = time.perf_counter()
+        process = subprocess.Popen(command_of(arguments, tiles, run_dir, scheduler), stdout=out, stderr=out)
+        watcher = stack.enter_context(Watcher({process.pid: DRIVER, **roots}, arguments.kill_every))
+        code = process.wait()
+        wall_s = time.perf_counter() - began
+    if code:
+        raise SystemExit(f"the run ended with exit code {code}: see {log}")
+    return {
+        "wall_s": wall_s,
+        "load_before": load_before,
+        "load_mean": statistics.fmean(watcher.load),
+        "killed": len(watcher.killed),
+        "roles": watcher.by_role(),
+    }
+
+
+def stage_rows(trace: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What each stage took: walls, CPU time of its tasks, when workers had nothing to do, what the driver spent."""
+    workers = trace["workers"]
+    marks = [line for line in trace["diary"] if line["kind"] in {"run", "stage", "finished"}]
+    rows = []
+    for mark, after in itertools.pairwise(marks):
+        own = [t for t in trace["tasks"] if mark["at_s"] <= t["began_s"] < after["at_s"]]
+        wall_s = after["at_s"] - mark["at_s"]
+        by_process: dict[str, list[dict[str, Any]]] = {}
+        for task in own:
+            by_process.setdefault(task["process"], []).append(task)
+        gaps = []
+        for done in by_process.values():
+            done.sort(key=lambda t: t["began_s"])
+            gaps += [b["began_s"] - a["began_s"] - a["seconds"] for a, b in itertools.pairwise(done)]
+        ends = sorted(max(t["began_s"] + t["seconds"] for t in done) for done in by_process.values())
+        rows.append(
+            {
+                "stage": mark["stage"],
+                "tasks": len(own),
+                "wall_s": wall_s,
+                "task_s": sum(t["seconds"] for t in own),
+                "task_cpu_s": sum(t["cpu_s"] for t in own),
+                "driver_cpu_s": after["cpu_s"] - mark["cpu_s"],
+                "idle_s": wall_s * workers - sum(t["seconds"] for t in own),
+                "head_s": (min(t["began_s"] for t in own) - mark["at_s"]) * workers if own else 0.0,
+                "between_s": sum(gaps),
+                "tail_s": sum(ends[-1] - end for end in ends) if own else 0.0,
+                "gap_s": statistics.median(gaps) if gaps else 0.0,
+                "longest_s": max((t["seconds"] for t in own), default=0.0),
+            }
+        )
+    return rows
+
+
+def stage_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The stages as a table; idle times are those of all workers together."""
+    seconds = {
+        "wall, s": "wall_s",
+        "tasks' wall, s": "task_s",
+        "tasks' CPU, s": "task_cpu_s",
+        "driver's CPU, s": "driver_cpu_s",
+        "idle, worker s": "idle_s",
+        "before the first": "head_s",
+        "between tasks": "between_s",
+        "behind the last": "tail_s",
+        "median gap, s": "gap_s",
+        "longest task, s": "longest_s",
+    }
+    return markdown_table(
+        ["stage", "tasks", *seconds],
+        [[row["stage"], str(row["tasks"]), *(f"{row[name]:.3g}" for name in seconds.values())] for row in rows],
+    )
+
+
+def sizes_told(trace: Mapping[str, Any]) -> str:
+    """Bytes of tasks and results as they travel."""
+    kept: dict[str, dict[str, list[int]]] = {}
+    for size in trace["sizes"]:
+        kept.setdefault(size["stage"], {}).setdefault(size["what"], []).append(size["bytes"])
+    rows = [
+        [stage, *(f"{statistics.fmean(found[what]):.0f}" if what in found else "" for what in ("task", "result"))]
+        for stage, found in kept.items()
+    ]
+    return markdown_table(["stage", "bytes a task", "bytes a result"], rows)
+
+
+def report(seen: Mapping[str, Any], trace: Mapping[str, Any] | None, run_dir: Path, workers: int) -> tuple[str, Any]:
+    """The tables, and the same as figures."""
+    manifest = json.loads((run_dir / "run.json").read_text(encoding="utf-8"))
+    counts = manifest["counts"]
+    buildings, points = counts["candidates"], counts["points"]
+    wall_s = seen["wall_s"]
+    results = {name: folder_bytes(run_dir / name) for name in RESULTS}
+    figures: dict[str, Any] = {
+        "buildings": buildings,
+        "points": points,
+        "tiles": counts["tiles"],
+        "wall_s": wall_s,
+        "buildings_a_second": buildings / wall_s,
+        "digest": manifest["content_sha256"],
+        "statuses": {name: counts[name] for name in ("ok", "fallback", "failed")},
+        "seen": dict(seen),
+        "result_bytes": results,
+    }
+    all_cpu_s = sum(cpu_s for _, cpu_s, _ in seen["roles"].values())
+    conditions = (
+        f"{counts['tiles']} lattice tiles, {buildings} buildings, {points} points; {workers} workers; "
+        f"load of the machine before {seen['load_before']:.1f}, mean {seen['load_mean']:.1f}; "
+        f"workers killed {seen['killed']}; digest {manifest['content_sha256'][:16]}."
+    )
+    speed = (
+        f"wall {wall_s:.1f} s, {buildings / wall_s:.1f} buildings a second, "
+        f"CPU of all processes {all_cpu_s:.1f} s ({all_cpu_s / wall_s:.2f} cores)."
+    )
+    lines = [conditions, "", speed]
+    if trace is not None:
+        cpu_s = sum(t["cpu_s"] for t in trace["tasks"])
+        busy_s = sum(t["seconds"] for t in trace["tasks"])
+        figures["task_cpu_s"], figures["task_s"] = cpu_s, busy_s
+        figures["efficiency"] = cpu_s / (wall_s * workers)
+        figures["occupancy"] = busy_s / (wall_s * workers)
+        figures["task_share_of_cpu"] = cpu_s / all_cpu_s
+        figures["stages"] = stage_rows(trace)
+        figures["scratch_bytes_a_point"] = max(trace["scratch_bytes"].values()) / points
+        held = "reached" if figures["efficiency"] >= WANTED else "required reached"
+        held = held if figures["efficiency"] >= REQUIRED else "missed"
+        told = (
+            f"efficiency {figures['efficiency']:.3f} ({held}; required {REQUIRED:g}, wanted {WANTED:g}), "
+            f"occupancy {figures['occupancy']:.3f}, tasks' share of all CPU time {figures['task_share_of_cpu']:.3f}; "
+            f"CPU of task bodies {cpu_s:.1f} s.  \n"
+            f"Scratch {figures['scratch_bytes_a_point']:.1f} bytes a point at most."
+        )
+        lines += ["", told, "", stage_table(figures["stages"]), sizes_told(trace)]
+    lines += [
+        "",
+        markdown_table(
+            ["processes", "how many", "CPU, s", "share of CPU", "largest peak, MB"],
+            [
+                [role, str(count), f"{cpu_s:.1f}", f"{cpu_s / all_cpu_s:.3f}", f"{peak / 1e6:.0f}"]
+                for role, (count, cpu_s, peak) in seen["roles"].items()
+            ],
+        ),
+        markdown_table(
+            ["results", "MB", "bytes a building"],
+            [[name, f"{size / 1e6:.1f}", f"{size / max(1, buildings):.0f}"] for name, size in results.items()],
+        ),
+    ]
+    return "\n".join(lines), figures
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--tiles", type=int, default=400)
+    parser.add_argument("--density", type=float, default=4.5)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--tile-size", type=float, default=0.0, help="of gablework's lattice; 0 leaves it the choice")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--mode", choices=("traced", "plain", "apart"), default="traced")
+    parser.add_argument("--kill-every", type=float, default=0.0, metavar="S")
+    parser.add_argument("--label", default="run")
+    parser.add_argument("--keep", action="store_true", help="leave the run directory")
+    wanted = parser.parse_args(arguments)
+    wanted.out = wanted.out.resolve()
+    tiles = wanted.out / f"city{wanted.tiles}"
+    city = square_of(wanted.tiles, 200.0, wanted.density, wanted.seed)
+    if len(list(tiles.glob(f"city_*{SUFFIX}"))) < wanted.tiles:
+        began = time.perf_counter()
+        made = make_city(city, tiles, os.cpu_count() or 1)
+        print(
+            f"{len(made)} tiles, {sum(t.buildings for t in made)} buildings, {sum(t.points for t in made)} points "
+            f"in {time.perf_counter() - began:.0f} s",
+            flush=True,
+        )
+    run_dir = wanted.out / f"{wanted.label}.run"
+    try:
+        seen = watched_run(wanted, tiles, run_dir)
+        trace_file = wanted.out / f"{wanted.label}.trace.json"
+        trace = None if wanted.mode == "plain" else json.loads(trace_file.read_text(encoding="utf-8"))
+        text, figures = report(seen, trace, run_dir, wanted.workers)
+    finally:
+        if not wanted.keep:
+            shutil.rmtree(run_dir, ignore_errors=True)
+    (wanted.out / f"{wanted.label}.md").write_text(text + "\n", encoding="utf-8")
+    (wanted.out / f"{wanted.label}.json").write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

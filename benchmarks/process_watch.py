@@ -1,0 +1,128 @@
+"""Who spends what in a tree of processes: CPU time and peak memory by role, looked at from outside.
+
+Looks come four times a second. The last one at a process that dies is at most a quarter of a second old, so its CPU
+time is told a little too small.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import signal
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
+
+import psutil
+
+LOOK_S = 0.25
+DRIVER, SCHEDULER, NANNY, WORKER, CHILD, OTHER = "driver", "scheduler", "nanny", "worker", "child", "other"
+ROLES = (DRIVER, SCHEDULER, NANNY, WORKER, CHILD, OTHER)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Seen:
+    """What was seen of one process."""
+
+    pid: int
+    role: str
+    cpu_s: float = 0.0
+    """User and system time, without children."""
+    peak_bytes: int = 0
+    """Largest resident size, VmHWM."""
+
+
+def role_of(command: Sequence[str], roots: dict[int, str], pid: int) -> str:
+    """What a process is, by its command line.
+
+    >>> role_of(["python", "-P", "-m", "pipeline.runtime.child", "7"], {}, 8)
+    'child'
+    """
+    if pid in roots:
+        return roots[pid]
+    told = " ".join(command)
+    if "pipeline.runtime.child" in told:
+        return CHILD
+    return WORKER if "spawn_main" in told else OTHER
+
+
+class Watcher:
+    """Looks at some processes and all below them; a context manager.
+
+    Parameters
+    ----------
+    roots : dict
+        Role of each process that is looked at, by its id.
+    kill_every_s : float
+        A worker is killed so often, in turns; 0 kills none.
+    """
+
+    def __init__(self, roots: dict[int, str], kill_every_s: float = 0.0) -> None:
+        self._roots = roots
+        self._kill_every_s = kill_every_s
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._look_on, daemon=True)
+        self._turn = 0
+        self.seen: dict[int, Seen] = {}
+        """All processes, by id."""
+        self.killed: list[int] = []
+        """Workers that were killed."""
+        self.load: list[float] = []
+        """The machine's load over one minute, at every look."""
+
+    def __enter__(self) -> Self:
+        """Begin to look."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Look no more."""
+        self._over.set()
+        self._thread.join()
+
+    def _look_on(self) -> None:
+        kill_at = time.monotonic() + self._kill_every_s
+        while not self._over.wait(LOOK_S):
+            for root in self._roots:
+                with contextlib.suppress(psutil.Error):
+                    top = psutil.Process(root)
+                    for process in (top, *top.children(recursive=True)):
+                        self._look_at(process)
+            self.load.append(os.getloadavg()[0])
+            if self._kill_every_s and time.monotonic() >= kill_at:
+                kill_at = time.monotonic() + self._kill_every_s
+                self._kill_one()
+
+    def _look_at(self, process: psutil.Process) -> None:
+        with contextlib.suppress(psutil.Error, OSError, ValueError):
+            seen = self.seen.get(process.pid)
+            if seen is None:
+                seen = Seen(pid=process.pid, role=role_of(process.cmdline(), self._roots, process.pid))
+                self.seen[process.pid] = seen
+            times = process.cpu_times()
+            seen.cpu_s = max(seen.cpu_s, times.user + times.system)
+            for line in Path(f"/proc/{process.pid}/status").read_text(encoding="ascii").splitlines():
+                if line.startswith("VmHWM:"):
+                    seen.peak_bytes = max(seen.peak_bytes, int(line.split()[1]) * 1024)
+
+    def _kill_one(self) -> None:
+        """Kill the next worker that is there."""
+        there = [pid for pid, seen in sorted(self.seen.items()) if seen.role == WORKER and psutil.pid_exists(pid)]
+        if there:
+            pid = there[self._turn % len(there)]
+            self._turn += 1
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+                self.killed.append(pid)
+
+    def by_role(self) -> dict[str, tuple[int, float, int]]:
+        """Of every role that was seen: how many processes, CPU seconds of all, and the largest peak in bytes."""
+        told = {}
+        for role in ROLES:
+            own = [seen for seen in self.seen.values() if seen.role == role]
+            if own:
+                told[role] = (len(own), sum(seen.cpu_s for seen in own), max(seen.peak_bytes for seen in own))
+        return told
