@@ -309,7 +309,13 @@ def batch_file() -> str:
     own: dict[str, list[list[object]]] = {
         "inputs": [
             ["`paths`", "required", "", "a list", "Files, folders or patterns of point clouds."],
-            ["`bbox`", "none", "", "four numbers", "Only this rectangle: x_min, y_min, x_max, y_max in the CRS's units."],
+            [
+                "`bbox`",
+                "none",
+                "",
+                "four numbers",
+                "Only this rectangle: x_min, y_min, x_max, y_max in the CRS's units.",
+            ],
         ]
     }
     for name, kind in TABLES.items():

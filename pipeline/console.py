@@ -6,6 +6,7 @@
 | elsewhere (a file, a pipe, CI) | tables | one log line an event, throttled |
 | `--json` | one JSON document | one JSON object an event, a line each |
 | `--quiet` | as above | warnings and errors only |
+| `GABLEWORK_LOG_JSON=1` | as above | one JSON object an event, with time, level, run and stage |
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 import sys
 import time
 import traceback
@@ -107,9 +109,26 @@ class Console:
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
         self._last_line_s: dict[str, float] = {}
+        self._log_json = False
 
     def __enter__(self) -> Self:
-        """Start to speak."""
+        """Start to speak.
+
+        Raises
+        ------
+        typer.Exit
+            `GABLEWORK_LOG_JSON` is neither 1 nor 0.
+        """
+        if os.environ.get("GABLEWORK_LOG_JSON"):
+            from pipeline.runtime import logs
+
+            try:
+                self._log_json = logs.wants_json()
+            except SettingsError as error:
+                self._tell_error(error, ExitCode.USAGE)
+                raise typer.Exit(ExitCode.USAGE) from error
+            if self._log_json:
+                logs.configure(as_json=True)
         return self
 
     def __exit__(
@@ -136,9 +155,11 @@ class Console:
     def on_event(self, event: Event) -> None:
         """Show an event of a run."""
         if event.kind == "warning":
-            self.warn(event.message)
+            self.warn(event.message, stage=event.stage)
         elif self.quiet:
             return
+        elif self._log_json:
+            self._log(event)
         elif self.as_json:
             print(json.dumps(dataclasses.asdict(event)), file=sys.stderr, flush=True)
         elif sys.stderr.isatty():
@@ -175,6 +196,13 @@ class Console:
         if not ended and now - self._last_line_s.get(event.stage, -LOG_INTERVAL_S) < LOG_INTERVAL_S:
             return
         self._last_line_s[event.stage] = now
+        if self._log_json:
+            from pipeline.runtime.logs import LOG
+
+            facts = {"stage": event.stage or None, "done": event.done, "total": event.total, "failed": event.failed}
+            level = "warning" if event.kind == "waiting" else "info"
+            getattr(LOG, level)(event.message or event.kind, extra=facts)
+            return
         counted = f"{event.done}/{event.total}" if event.total else str(event.done or "")
         words = [word for word in (event.stage, counted, event.message) if word]
         if words:
@@ -188,9 +216,13 @@ class Console:
 
     # --- what is said once -------------------------------------------------------------------------------------------
 
-    def warn(self, message: str) -> None:
+    def warn(self, message: str, stage: str = "") -> None:
         """Say on standard error what is usable but not as it should be."""
-        if self.as_json:
+        if self._log_json:
+            from pipeline.runtime.logs import LOG
+
+            LOG.warning(message, extra={"stage": stage or None})
+        elif self.as_json:
             print(json.dumps({"kind": "warning", "message": message}), file=sys.stderr, flush=True)
         elif self._bars is not None:
             self._bars.console.print(f"warning: {message}", style="yellow", markup=False, highlight=False)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipeline.cli import AsJson, app
+from pipeline.cli.options import TlsCa, TlsCert, TlsKey
 from pipeline.console import Console
 from pipeline.errors import RunError, SettingsError
 from pipeline.runtime.start_up import start_own_process
@@ -102,6 +103,9 @@ def serve(
     database_url: DatabaseUrl = None,
     workers: ServiceWorkers = None,
     scheduler: Scheduler = None,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     driver: Annotated[
         bool, typer.Option("--driver/--no-driver", help="Keep a driver beside it, or leave jobs to drivers elsewhere.")
     ] = True,
@@ -118,6 +122,7 @@ def serve(
 ) -> None:
     """Answer REST requests and the web page, with a job driver and a cluster beside it."""
     with Console(as_json=as_json) as console, _service_errors():
+        from pipeline.runtime.tls import given_tls
         from service.supervisor import serve as serve_until_told
 
         _log_to_stderr()
@@ -128,10 +133,16 @@ def serve(
             database_url=database_url,
             workers=workers,
             scheduler=scheduler,
+            tls_ca=tls_ca,
+            tls_cert=tls_cert,
+            tls_key=tls_key,
             public_url=public_url,
             input_roots=input_root,
             input_hosts=input_host,
         )
+
+        # told here, not by a driver that is started again and again
+        given_tls(settings.tls_ca, settings.tls_cert, settings.tls_key)
 
         def on_ready(url: str) -> None:
             console.say(f"gablework listens on {url}")
@@ -146,6 +157,9 @@ def drive(
     database_url: DatabaseUrl = None,
     workers: ServiceWorkers = None,
     scheduler: Scheduler = None,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     name: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name in logs and leases; default host and process.")
     ] = None,
@@ -158,7 +172,15 @@ def drive(
         from service.driver import run_driver
 
         _log_to_stderr()
-        settings = _settings(state=state, database_url=database_url, workers=workers, scheduler=scheduler)
+        settings = _settings(
+            state=state,
+            database_url=database_url,
+            workers=workers,
+            scheduler=scheduler,
+            tls_ca=tls_ca,
+            tls_cert=tls_cert,
+            tls_key=tls_key,
+        )
         code = run_driver(settings, name=name, parent_pipe=_STANDARD_INPUT if with_parent else None)
         if code:
             raise typer.Exit(code)

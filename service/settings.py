@@ -67,6 +67,11 @@ class ServiceSettings(BaseSettings):
 
     # the driver and its cluster
     scheduler: str | None = Field(default=None, description="Address of a Dask scheduler; default an embedded cluster.")
+    tls_ca: str | None = Field(
+        default=None, description="CA of the certificates of the cluster's processes, PEM; its traffic is TLS then."
+    )
+    tls_cert: str | None = Field(default=None, description="The driver's own certificate for the cluster, PEM.")
+    tls_key: str | None = Field(default=None, description="Its key, PEM, where it is not in the same file.")
     workers: int = Field(default=2, ge=1, description="Processes of the embedded cluster.")
     driver_jobs: int = Field(default=2, ge=1, description="Jobs that one driver runs at once.")
     lease_s: float = Field(

@@ -144,7 +144,8 @@ class StatusWriter:
         self._recent.append((now, event.done - stage.kept))
         while now - self._recent[0][0] > _RATE_WINDOW_S:
             self._recent.popleft()
-        self._failed += event.failed
+        if event.stage == _BUILDINGS:
+            self._failed = event.failed
         self.status = dataclasses.replace(self.status, stage=event.stage, waiting="")
 
     def _write(self) -> None:

@@ -15,6 +15,9 @@ from pipeline.cli.options import (
     Quiet,
     Scheduler,
     SettingsFile,
+    TlsCa,
+    TlsCert,
+    TlsKey,
     VerticalUnit,
     Workers,
 )
@@ -43,6 +46,9 @@ def classify(
     settings: SettingsFile = None,
     workers: Workers = 2,
     scheduler: Scheduler = None,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are already there.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -51,6 +57,7 @@ def classify(
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.classify import ClassifyRequest
         from pipeline.runtime.classify import classify as classify_files
+        from pipeline.runtime.tls import given_tls
         from pipeline.settings import RunSettings
 
         request = ClassifyRequest(
@@ -64,6 +71,7 @@ def classify(
             raster_cell=raster_cell,
             workers=workers,
             scheduler=scheduler,
+            tls=given_tls(tls_ca, tls_cert, tls_key),
             overwrite=overwrite,
         )
         summary = classify_files(request, console.on_event)

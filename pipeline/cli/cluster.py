@@ -6,11 +6,14 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli.options import LogJson, MetricsHost, MetricsPort, TlsCa, TlsCert, TlsKey
 from pipeline.console import Console
 
 
 def worker(
-    scheduler: Annotated[str, typer.Option(metavar="ADDRESS", help="The Dask scheduler, as tcp://host:8786.")],
+    scheduler: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="The Dask scheduler, as tcp://host:8786 or tls://host:8786.")
+    ],
     threads: Annotated[int, typer.Option(min=1, help="Tasks at once.")] = 1,
     memory_limit: Annotated[
         str, typer.Option(metavar="BYTES", help="Memory of the process, such as 4GiB; auto, or 0 for none.")
@@ -28,9 +31,17 @@ def worker(
     give_up_after: Annotated[
         float | None, typer.Option(metavar="S", min=0, help="End when the scheduler was away so long; default never.")
     ] = None,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    metrics_port: MetricsPort = None,
+    metrics_host: MetricsHost = "127.0.0.1",
+    log_json: LogJson = False,
 ) -> None:
     """Work for a Dask scheduler; on SIGTERM finish what runs, then leave."""
     with Console() as console:
+        from pipeline.runtime.logs import wants_json
+        from pipeline.runtime.tls import given_tls
         from pipeline.runtime.worker import WorkerOptions, serve_worker
 
         options = WorkerOptions(
@@ -42,5 +53,9 @@ def worker(
             host=host,
             drain_timeout_s=drain_timeout,
             give_up_after_s=give_up_after,
+            tls=given_tls(tls_ca, tls_cert, tls_key),
+            log_json=log_json or wants_json(),
+            metrics_port=metrics_port,
+            metrics_host=metrics_host,
         )
         serve_worker(options, console.say)

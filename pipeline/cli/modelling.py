@@ -25,10 +25,14 @@ from pipeline.cli.options import (
     Meshes,
     Method,
     Overwrite,
+    PerformanceReport,
     Points,
     Quiet,
     Scheduler,
     SettingsFile,
+    TlsCa,
+    TlsCert,
+    TlsKey,
     Truth,
     VerticalUnit,
     Workers,
@@ -64,18 +68,23 @@ def reconstruct(
     settings: SettingsFile = None,
     workers: Workers = 2,
     scheduler: Scheduler = None,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     meshes: Meshes = "building",
     licence: Licence = None,
     overwrite: Overwrite = False,
     isolate: Annotated[bool | None, Isolate] = None,
     building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
     building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
+    performance_report: PerformanceReport = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Reconstruct buildings from tiles into a run directory."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.run import RunRequest, run
+        from pipeline.runtime.tls import given_tls
 
         request = RunRequest(
             inputs=tuple(tiles),
@@ -89,6 +98,8 @@ def reconstruct(
             aoi=aoi,
             workers=workers,
             scheduler=scheduler,
+            tls=given_tls(tls_ca, tls_cert, tls_key),
+            performance_report=performance_report,
             meshes=meshes,
             licence=licence,
             overwrite=overwrite,
@@ -115,6 +126,9 @@ def rerun(
     ] = None,
     workers: Workers = 2,
     scheduler: Scheduler = None,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     isolate: Annotated[bool | None, Isolate] = None,
     building_timeout: BuildingTimeout = BUILDING_TIMEOUT_S,
     building_memory: BuildingMemory = BUILDING_MEMORY_GIB,
@@ -126,6 +140,7 @@ def rerun(
         from pipeline.runtime.isolation import IsolationLimits
         from pipeline.runtime.rerun import RerunRequest
         from pipeline.runtime.rerun import rerun as rerun_buildings
+        from pipeline.runtime.tls import given_tls
 
         serial = workers == 0 and scheduler is None
         limits = IsolationLimits(timeout_s=building_timeout, memory_bytes=round(building_memory * 2**30))
@@ -135,6 +150,7 @@ def rerun(
             only=tuple(only or ()),
             workers=workers,
             scheduler=scheduler,
+            tls=given_tls(tls_ca, tls_cert, tls_key),
             isolation=limits if (not serial if isolate is None else isolate) else None,
         )
         summary = rerun_buildings(request, console.on_event)
@@ -165,6 +181,9 @@ def compare(
     as_surveyed: AsSurveyed = False,
     workers: Workers = 2,
     scheduler: Scheduler = None,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     meshes: Meshes = "none",
     licence: Licence = None,
     overwrite: Overwrite = False,
@@ -182,6 +201,7 @@ def compare(
         from pipeline.report.evaluation_page import headline
         from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
         from pipeline.runtime.run import RunRequest
+        from pipeline.runtime.tls import given_tls
         from pipeline.settings import RunSettings, read_table
 
         table = read_table(settings)
@@ -200,6 +220,7 @@ def compare(
                 aoi=aoi,
                 workers=workers,
                 scheduler=scheduler,
+                tls=given_tls(tls_ca, tls_cert, tls_key),
                 meshes=meshes,
                 licence=licence,
                 overwrite=overwrite,

@@ -49,6 +49,29 @@ SettingsFile = Annotated[str | None, typer.Option(metavar="FILE", help="Settings
 Scheduler = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")
 ]
+TlsCa = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="CA of the cluster's certificates, PEM; default GABLEWORK_TLS_CA."),
+]
+TlsCert = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="This process's certificate for the cluster; default GABLEWORK_TLS_CERT."),
+]
+TlsKey = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="Its key, unless in the same file; default GABLEWORK_TLS_KEY."),
+]
+PerformanceReport = Annotated[
+    str | None, typer.Option(metavar="FILE", help="Write a page (HTML) about the workers' time.")
+]
+MetricsPort = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=1, max=65535, help="Show figures to Prometheus on this port, at /metrics."),
+]
+MetricsHost = Annotated[
+    str, typer.Option(metavar="ADDRESS", help="Address of these figures: whoever reaches it reads them.")
+]
+LogJson = Annotated[bool, typer.Option("--log-json", help="Log one JSON object a line; as GABLEWORK_LOG_JSON=1 does.")]
 Meshes = Annotated[
     Literal["building", "tile", "glb", "none"],
     typer.Option(help="One OBJ a building, one OBJ a tile, one GLB a tile, or none."),

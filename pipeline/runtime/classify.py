@@ -39,6 +39,7 @@ from pipeline.runtime.rasters import (
 from pipeline.runtime.run import RunRequest, calling_off, plan_inputs
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.stages import Stages, classes_in_use, given_footprints
+from pipeline.runtime.tls import TlsFiles
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile
 
@@ -69,6 +70,8 @@ class ClassifyRequest:
     """Processes of the embedded cluster; 0 runs serially in this process."""
     scheduler: str | None = None
     """Address of a Dask scheduler that takes the place of the embedded cluster."""
+    tls: TlsFiles | None = None
+    """Certificates for the cluster's traffic; by default those of the environment."""
     overwrite: bool = False
     """Replace files of the same names."""
 
@@ -164,7 +167,10 @@ def classify(
     with held_folder(out / _SCRATCH) as scratch_dir:
         scratch = Scratch(str(scratch_dir))
         engine = executor or executor_for(
-            workers=request.workers, scheduler=request.scheduler, local_directory=str(scratch_dir / "dask")
+            workers=request.workers,
+            scheduler=request.scheduler,
+            local_directory=str(scratch_dir / "dask"),
+            tls=request.tls,
         )
         with calling_off(scratch, cancelled) as called_off, engine:
             progress.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)

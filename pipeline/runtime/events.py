@@ -28,7 +28,7 @@ class Event:
     kept: int = 0
     """Of the units done, those that were kept from an earlier run; told once, as the stage begins."""
     failed: int = 0
-    """Of the units done since the event before, those that failed."""
+    """Of the units done, those that failed."""
 
 
 Listener = Callable[[Event], None]

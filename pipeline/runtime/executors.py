@@ -13,12 +13,16 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
-from pipeline.errors import ClusterError, VersionMismatchError
+from pipeline.errors import ClusterError, SettingsError, VersionMismatchError
 from pipeline.runtime import worker_setup
 from pipeline.runtime.events import Watch
 from pipeline.runtime.flight import SETTLE_INTERRUPTED_S, SETTLE_S, TICK_S, Flight, Lookout
 from pipeline.runtime.measured import Measured, Result, Task, measure, mismatch_told, peak_of_process
+from pipeline.runtime.needs import RESOURCE
+from pipeline.runtime.performance import PerformanceReport
+from pipeline.runtime.priorities import Traffic, priority_of
 from pipeline.runtime.serial import Executor, SerialExecutor
+from pipeline.runtime.tls import TlsFiles, check_address, given_tls, why_not
 from pipeline.runtime.versions import ENGINE, TALKING, WORKING, differences
 
 __all__ = [
@@ -54,16 +58,32 @@ class Cluster:
         Address of a scheduler that is already there.
     local_directory : str or None
         Where embedded workers spill; a temporary folder by default.
+    tls : TlsFiles or None
+        Certificates for all connections, also with embedded workers; by default those of the environment
+        (`GABLEWORK_TLS_…`), and where there are none what Dask's own configuration says.
+
+    Raises
+    ------
+    SettingsError
+        Certificates of the environment cannot be used.
     """
 
     _starting = threading.Lock()
 
-    def __init__(self, *, workers: int = 2, scheduler: str | None = None, local_directory: str | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        workers: int = 2,
+        scheduler: str | None = None,
+        local_directory: str | None = None,
+        tls: TlsFiles | None = None,
+    ) -> None:
         self._workers = workers
         self._scheduler = scheduler
         self._local_directory = local_directory
         self._embedded: Any = None
         self._mended_s = 0.0
+        self.tls = tls or given_tls()
 
     @property
     def embedded(self) -> bool:
@@ -92,6 +112,13 @@ class Cluster:
             return "Workers that die are started again by themselves; if they die again and again they lack memory"
         return f"Start one by gablework worker --scheduler {self.address}"
 
+    @property
+    def security(self) -> Any:
+        """What Dask is told of TLS; None leaves it to Dask's own configuration."""
+        from distributed import Security
+
+        return None if self.tls is None else Security(**self.tls.security)
+
     def mend(self, workers: int) -> None:
         """Start embedded workers anew that their keeper gave up: one that dies as soon as it starts is not restarted.
 
@@ -105,15 +132,21 @@ class Cluster:
         self._mended_s = time.monotonic()
         self._embedded.scale(self._workers)
 
-    def executor(self, priority: int = 0) -> DaskExecutor:
+    def executor(
+        self, priority: int = 0, *, traffic: Traffic = "interactive", performance_report: str | None = None
+    ) -> DaskExecutor:
         """An executor for one run.
 
         Parameters
         ----------
         priority : int
-            Tasks of a higher one go first where workers are scarce.
+            Of the runs of one kind, those with a higher one go first where workers are scarce.
+        traffic : {'interactive', 'batch'}
+            Tasks of interactive runs go before those of batch runs, whatever their priority.
+        performance_report : str, optional
+            Gets a page about the workers' time when the run is over.
         """
-        return DaskExecutor(self, priority=priority)
+        return DaskExecutor(self, priority=priority_of(traffic, priority), performance_report=performance_report)
 
     def __enter__(self) -> Self:
         """Start the embedded workers; connect to nothing yet.
@@ -128,6 +161,7 @@ class Cluster:
         import dask
         from distributed import LocalCluster
 
+        each_bytes = _share_bytes(self._workers)
         settings = {
             "distributed.admin.log-format": "%(message)s",
             "distributed.logging.distributed": "critical",
@@ -145,6 +179,8 @@ class Cluster:
                     local_directory=self._local_directory,
                     silence_logs="CRITICAL",
                     preload=[worker_setup.__name__],
+                    security=self.security,
+                    resources={RESOURCE: each_bytes},
                 )
         except (OSError, RuntimeError, TimeoutError) as error:
             raise ClusterError(f"the {self._workers} workers of this machine do not start: {error}") from error
@@ -169,18 +205,23 @@ class DaskExecutor:
     cluster : Cluster
         Where tasks go.
     priority : int
-        Tasks of a higher one go first where workers are scarce.
+        Tasks of a higher one go first where workers are scarce; `priority_of` knows which.
     owned : bool
         Whether the cluster lives and ends with this executor.
+    performance_report : str, optional
+        Gets a page about the workers' time, also of a run that breaks off: docs/how_to/watch_a_run.md.
     """
 
-    def __init__(self, cluster: Cluster, *, priority: int = 0, owned: bool = False) -> None:
+    def __init__(
+        self, cluster: Cluster, *, priority: int = 0, owned: bool = False, performance_report: str | None = None
+    ) -> None:
         self._cluster = cluster
         self._priority = priority
         self._owned = owned
         self._stack = contextlib.ExitStack()
         self._client: Any = None
         self._lookout: Lookout | None = None
+        self._report = None if performance_report is None else PerformanceReport(performance_report)
 
     def __enter__(self) -> Self:
         """Connect, and start the cluster if it is owned.
@@ -188,22 +229,34 @@ class DaskExecutor:
         Raises
         ------
         ClusterError
-            The scheduler does not answer.
+            The scheduler does not answer, or certificates and address do not go together.
         """
+        import dask
         from distributed import Client
 
         # what was entered before a fault is left again
         with contextlib.ExitStack() as stack:
             if self._owned:
                 stack.enter_context(self._cluster)
-            address = self._cluster.address
+            address, tls = self._cluster.address, self._cluster.tls
+            configured = bool(dask.config.get("distributed.comm.tls.ca-file", None))
+            check_address(address, tls, configured=configured)
+            security = self._cluster.security
+            given = {} if security is None else {"security": security}
             try:
-                client = Client(address, timeout=CONNECT_S, set_as_default=False)
-            except (OSError, TimeoutError, ValueError) as error:
+                client = Client(address, timeout=CONNECT_S, set_as_default=False, **given)
+            except (OSError, TimeoutError, ValueError, TypeError, RuntimeError) as error:
+                told = why_not(address, tls)
+                if not told and isinstance(error, TypeError | RuntimeError):
+                    raise
                 raise ClusterError(
-                    f"the scheduler {address} does not answer: {error}. Check the address, or use --workers"
+                    f"the scheduler {address} cannot be used: {told}"
+                    if told
+                    else f"the scheduler {address} does not answer: {error}. Check the address, or use --workers"
                 ) from error
             self._client = stack.enter_context(client)
+            if self._report is not None:
+                stack.enter_context(self._report)
             self._lookout = Lookout(client, address, self._cluster.mend, self._cluster.advice)
             self._stack = stack.pop_all()
         return self
@@ -286,7 +339,12 @@ class DaskExecutor:
             # workers that end with the run need not be waited for
             settle_s=SETTLE_INTERRUPTED_S if self._owned and self._cluster.embedded else SETTLE_S,
         )
-        yield from flight.results()
+        if self._report is None:
+            yield from flight.results()
+            return
+        for measured in flight.results():
+            self._report.add(stage, measured)
+            yield measured
 
     def _started(self) -> Lookout:
         if self._lookout is None:
@@ -359,9 +417,42 @@ def _plain(found: Mapping[str, Any]) -> dict[str, str]:
     return {"python": ".".join(major_minor), **{name: told[name] for name in wanted if name in told}}
 
 
-def executor_for(*, workers: int, scheduler: str | None, local_directory: str, priority: int = 0) -> Executor:
-    """The executor that a request asks for: serial without workers and scheduler, else Dask."""
+def _share_bytes(workers: int) -> int:
+    """Memory of one of several workers that share this machine, as Dask reckons it."""
+    from distributed.system import MEMORY_LIMIT
+
+    return int(MEMORY_LIMIT / max(1, workers))
+
+
+def executor_for(
+    *,
+    workers: int,
+    scheduler: str | None,
+    local_directory: str,
+    priority: int = 0,
+    traffic: Traffic = "interactive",
+    tls: TlsFiles | None = None,
+    performance_report: str | None = None,
+) -> Executor:
+    """The executor that a request asks for: serial without workers and scheduler, else Dask.
+
+    Parameters
+    ----------
+    workers, scheduler, local_directory, tls
+        As `Cluster` has them.
+    priority, traffic, performance_report
+        As `Cluster.executor` has them.
+
+    Raises
+    ------
+    SettingsError
+        A performance report is asked for where there are no workers, or certificates cannot be used.
+    """
     if workers == 0 and scheduler is None:
+        if performance_report is not None:
+            raise SettingsError(["a performance report tells the time of workers, and there are none: use --workers 1"])
         return SerialExecutor()
-    cluster = Cluster(workers=workers, scheduler=scheduler, local_directory=local_directory)
-    return DaskExecutor(cluster, priority=priority, owned=True)
+    cluster = Cluster(workers=workers, scheduler=scheduler, local_directory=local_directory, tls=tls)
+    return DaskExecutor(
+        cluster, priority=priority_of(traffic, priority), owned=True, performance_report=performance_report
+    )

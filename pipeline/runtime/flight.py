@@ -10,6 +10,7 @@ What may happen, and what comes of it:
 | no worker is left | told as `waiting`, again and again, until one is back |
 | the scheduler is lost, or is silent for long | `ClusterError` |
 | the run is called off | the tasks in flight are told, waited for with a bound, and taken back |
+| a task needs more memory than any worker announces | it runs where most is announced, alone; told |
 """
 
 from __future__ import annotations
@@ -24,7 +25,10 @@ from typing import Any, Generic
 
 from pipeline.errors import ClusterError, GableworkError, RunCancelledError, RunError
 from pipeline.runtime.events import Event, Watch
+from pipeline.runtime.logs import LOG, facts_of_task
 from pipeline.runtime.measured import Measured, Result, Task, measure_packed, packed
+from pipeline.runtime.needs import RESOURCE, announced_bytes, declared_bytes
+from pipeline.runtime.tallies import TALLIES
 from pipeline.runtime.versions import fingerprint
 
 TICK_S = 0.2
@@ -35,6 +39,8 @@ SETTLE_S = 30.0
 """Longest time that tasks in flight are waited for after the run was called off."""
 SETTLE_INTERRUPTED_S = 3.0
 """The same after an interrupt from the keyboard."""
+_AHEAD = 2
+"""Declared memory of the tasks in flight, by what all workers announce: as much runs, and as much is on its way."""
 _RESULT_S = 5.0
 _ENDED = frozenset({"finished", "error", "cancelled"})
 """A future that is pending is still to come, and one that is lost is made again."""
@@ -68,6 +74,8 @@ class Lookout:
     """It is told again after so long."""
     silence_s = 60.0
     """A scheduler that answers nothing for so long is lost."""
+    memory_s = 10.0
+    """What workers announce is asked again after so long, while somebody wants to know."""
     _every_s = 1.0
     _answer_s = 5.0
 
@@ -90,6 +98,23 @@ class Lookout:
         self._told_s: float | None = None
         self.threads = 0
         """Threads of the workers that take tasks, when last looked."""
+        self._asked_s = -1e9
+        self._announced: list[int] | None = None
+
+    def announced(self) -> list[int] | None:
+        """Memory that the workers announce, bytes, one entry a worker that does; None while no worker is there."""
+        now = self._clock()
+        if now - self._asked_s >= self.memory_s:
+            try:
+                identity = self._client.scheduler.identity
+                found = self._client.sync(identity, n_workers=-1, callback_timeout=self._answer_s)
+            except (OSError, TimeoutError):
+                # `look` tells whether it is lost; what was known still counts
+                self.check()
+            else:
+                self._announced = announced_bytes(found["workers"]) if found["workers"] else None
+            self._asked_s = self._clock()
+        return self._announced
 
     def check(self) -> None:
         """See that the scheduler is there.
@@ -165,7 +190,11 @@ class Flight(Generic[Task, Result]):
 
     def __post_init__(self) -> None:
         """Nothing is on its way yet."""
-        self._waiting = deque(range(len(self.tasks)))
+        self._needs = {n: need for n, task in enumerate(self.tasks) if (need := declared_bytes(task))}
+        self._waiting = deque(n for n in range(len(self.tasks)) if n not in self._needs)
+        self._large = deque(self._needs)
+        self._reserved: dict[Any, int] = {}
+        self._told = False
         self._suspects: deque[int] = deque()
         self._flying: dict[Any, int] = {}
         self._alone: Any = None
@@ -186,9 +215,10 @@ class Flight(Generic[Task, Result]):
             Workers died again and again on one task, also when it ran alone.
         """
         try:
-            while self._waiting or self._suspects or self._flying:
+            while self._large or self._waiting or self._suspects or self._flying:
                 self.watch.check_cancelled()
                 self.lookout.look(self.stage, self.watch)
+                self._reconsider()
                 self._submit()
                 self._wake.wait(TICK_S)
                 self._wake.clear()
@@ -211,23 +241,85 @@ class Flight(Generic[Task, Result]):
         """Send off what may fly now: a window of tasks, or a suspect all alone."""
         if self._suspects:
             if not self._flying and self._take_turn():
-                self._send(self._suspects.popleft())
+                number = self._suspects.popleft()
+                largest = max(self.lookout.announced() or (), default=0)
+                self._send(number, min(self._needs.get(number, 0), largest))
+            return
+        if self._alone is not None:
+            # the last suspect still flies: nothing may be blamed in its place
             return
         window = TASKS_A_THREAD * max(2, self.lookout.threads)
-        while self._waiting and len(self._flying) < window:
+        self._submit_large(window)
+        # those that wait for memory do not keep the others from going
+        while self._waiting and len(self._flying) - len(self._reserved) < window:
             self._send(self._waiting.popleft())
 
-    def _send(self, number: int) -> None:
+    def _submit_large(self, window: int) -> None:
+        """Send off tasks that need much memory: as many as the workers can take, and as many again on their way."""
+        if not self._large:
+            return
+        announced = self.lookout.announced()
+        if announced is None:
+            return
+        if not announced:
+            self._tell_once(
+                f"{len(self._large)} tasks of {self.stage} need much memory (up to {self._most()}) and no worker "
+                f"announces how much it has: they run anywhere. Use gablework worker, or dask worker --resources "
+                f"{RESOURCE}=BYTES"
+            )
+            while self._large and len(self._flying) < window:
+                self._send(self._large.popleft())
+            return
+        largest, room = max(announced), _AHEAD * sum(announced)
+        if max(self._needs[number] for number in self._large) > largest:
+            self._tell_once(
+                f"tasks of {self.stage} need up to {self._most()} of memory, the largest worker has "
+                f"{largest / 2**30:.1f} GiB: they run there with all that it has, and may be marked out_of_memory"
+            )
+        while self._large:
+            need = min(self._needs[self._large[0]], largest)
+            if self._reserved and sum(self._reserved.values()) + need > room:
+                return
+            self._send(self._large.popleft(), need)
+
+    def _reconsider(self) -> None:
+        """Take back tasks that wait for memory which no worker has any more; they are sent anew."""
+        if not self._reserved:
+            return
+        announced = self.lookout.announced()
+        if announced is None:
+            return
+        largest = max(announced, default=0)
+        for future, need in list(self._reserved.items()):
+            if need > largest and future.status not in _ENDED:
+                self._large.appendleft(self._flying[future])
+                self._drop(future, "sent again")
+
+    def _most(self) -> str:
+        return f"{max(self._needs.values()) / 2**30:.1f} GiB"
+
+    def _tell_once(self, message: str) -> None:
+        if not self._told:
+            self._told = True
+            self.watch.listener(Event(kind="warning", stage=self.stage, message=message))
+
+    def _send(self, number: int, need_bytes: int = 0) -> None:
         self._submitted += 1
+        task = packed(self.function, self.tasks[number])
         future = self.client.submit(
             measure_packed,
             fingerprint(),
-            packed(self.function, self.tasks[number]),
+            task,
+            self.stage,
             key=f"{self.stage}-{self._name}-{number}-{self._submitted}",
             pure=False,
             priority=self.priority,
+            resources={RESOURCE: need_bytes} if need_bytes else None,
         )
         self._flying[future] = number
+        if need_bytes:
+            self._reserved[future] = need_bytes
+        TALLIES.send(self.stage, len(task))
         future.add_done_callback(lambda _: self._wake.set())
 
     def _take_turn(self) -> bool:
@@ -267,7 +359,8 @@ class Flight(Generic[Task, Result]):
                 raise error
             if self._alone is not None:
                 raise RunError(self._blame(number)) from error
-            self._drop(future)
+            self._drop(future, "suspect")
+            LOG.warning("workers died of the task: it is tried alone", extra=self._facts(number))
             self._suspects.append(number)
             return
         try:
@@ -276,12 +369,18 @@ class Flight(Generic[Task, Result]):
             # its worker died with the result: it is made again, and looked at again
             self.lookout.check()
             return
-        self._drop(future)
+        self._drop(future, "done")
         self._end_turn()
         yield measured
 
-    def _drop(self, future: Any) -> None:
+    def _facts(self, number: int) -> dict[str, object]:
+        """The ids of a task, for the log."""
+        return {"stage": self.stage, **facts_of_task(self.tasks[number])}
+
+    def _drop(self, future: Any, outcome: str) -> None:
         del self._flying[future]
+        self._reserved.pop(future, None)
+        TALLIES.land(self.stage, outcome)
         future.release()
 
     def _blame(self, number: int) -> str:
@@ -312,7 +411,10 @@ class Flight(Generic[Task, Result]):
         except (OSError, TimeoutError):
             # the scheduler went away meanwhile, and the tasks with it
             pass
+        for _ in self._flying:
+            TALLIES.land(self.stage, "taken back")
         self._flying.clear()
+        self._reserved.clear()
 
     def _executing(self, futures: list[Any]) -> bool:
         """Whether any of these runs just now; those that only queue are taken back without a wait."""

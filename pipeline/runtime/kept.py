@@ -127,6 +127,11 @@ class Keeping(Generic[Task, Result, Told]):
     told: Callable[[Result], Told]
     """What of the result travels to the driver: little."""
 
+    @property
+    def memory_bytes(self) -> int:
+        """What the task declares to need."""
+        return int(getattr(self.task, "memory_bytes", 0))
+
     def __repr__(self) -> str:
         """The task alone, which is what people want to see."""
         return repr(self.task)
@@ -159,9 +164,9 @@ def keep(work: Keeping[Task, Result, Told]) -> Kept[Told]:
     except OSError as error:
         work.scratch.check_cancelled()  # of a run that is over the folders may be gone
         where = error.filename or work.scratch.root
-        told = error.strerror or f"a file could not be written whole ({error})"
+        why = error.strerror or f"a file could not be written whole ({error})"
         raise RunError(
-            f"{where}: {told}, in stage {work.place.stage}. Free space or mend the storage, then run again"
+            f"{where}: {why}, in stage {work.place.stage}. Free space or mend the storage, then run again"
         ) from error
     return Kept(place=work.place, told=told)
 

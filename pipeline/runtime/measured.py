@@ -12,7 +12,9 @@ import time
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from pipeline.errors import VersionMismatchError
+from pipeline.errors import GableworkError, RunCancelledError, VersionMismatchError
+from pipeline.runtime.logs import LOG, about, configure_once, facts_of_task
+from pipeline.runtime.tallies import TALLIES
 from pipeline.runtime.versions import differences, fingerprint, versions_here, versions_of
 
 Task = TypeVar("Task")
@@ -54,12 +56,30 @@ def peak_of_process() -> tuple[str, int]:
     return f"{socket.gethostname()}:{os.getpid()}", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def measure(function: Callable[[Task], Result], task: Task) -> Measured[Result]:
-    """Run one task and measure it."""
+def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> Measured[Result]:
+    """Run one task, count and measure it; what is logged meanwhile names it."""
     _spent_by_children.cpu_s = 0.0
     began_s, started, cpu_s = time.time(), time.perf_counter(), time.thread_time()
-    result = function(task)
-    seconds, cpu_s = time.perf_counter() - started, time.thread_time() - cpu_s + _spent_by_children.cpu_s
+    outcome = "failed"
+    TALLIES.begin()
+    try:
+        with about(stage=stage, **facts_of_task(task)):
+            try:
+                result = function(task)
+            except RunCancelledError:
+                outcome = "called off"
+                raise
+            except GableworkError as error:
+                LOG.error("the task failed: %s", error)
+                raise
+            except Exception:
+                LOG.exception("the task failed")
+                raise
+        outcome = "done"
+        cpu_s = time.thread_time() - cpu_s + _spent_by_children.cpu_s
+    finally:
+        seconds = time.perf_counter() - started
+        TALLIES.end(stage, outcome, seconds)
     process, peak_bytes = peak_of_process()
     return Measured(
         result=result, seconds=seconds, cpu_s=cpu_s, began_s=began_s, process=process, peak_bytes=peak_bytes
@@ -74,7 +94,7 @@ def packed(function: Callable[[Task], Result], task: Task) -> bytes:
     return pickle.dumps((function, task), protocol=pickle.HIGHEST_PROTOCOL)
 
 
-def measure_packed(client_fingerprint: str, task: bytes) -> Measured[Any]:
+def measure_packed(client_fingerprint: str, task: bytes, stage: str = "") -> Measured[Any]:
     """Run a packed task of a client and measure it, if this process runs what the client runs.
 
     Raises
@@ -83,12 +103,13 @@ def measure_packed(client_fingerprint: str, task: bytes) -> Measured[Any]:
         It does not: a worker that came late must not mix other versions into a result. Told before the task is
         unpacked, which may fail in strange ways then.
     """
+    configure_once()
     if client_fingerprint != fingerprint():
         process, _ = peak_of_process()
         told = differences(versions_of(client_fingerprint), versions_here())
         raise VersionMismatchError(mismatch_told([f"worker {process}: {', '.join(told)}"]))
     function, unpacked = pickle.loads(task)  # noqa: S301 - from the client, whose code the worker runs anyway
-    return measure(function, unpacked)
+    return measure(function, unpacked, stage)
 
 
 def mismatch_told(faults: list[str]) -> str:

@@ -24,13 +24,18 @@ from pipeline.runtime.gather import gather
 from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
 from pipeline.runtime.join import CandidateSite
 from pipeline.runtime.kept import Place, key_of, result_of
+from pipeline.runtime.logs import LOG
+from pipeline.runtime.needs import building_bytes
 from pipeline.runtime.overrides import OwnModelling
 from pipeline.runtime.scratch import Scratch
+from pipeline.runtime.tallies import TALLIES
 from pipeline.tiling import Tile, TileGrid
 
 _POINTS_PER_BATCH = 20_000
 _MAX_PER_BATCH = 64
 _BUNDLE_TIMEOUT_S = 60.0
+_LOST = frozenset({Reason.CRASHED, Reason.TIMED_OUT, Reason.OUT_OF_MEMORY, Reason.INTERNAL_ERROR})
+"""Reasons that lie with the processes or with gablework, not with the building's points: each is worth a look."""
 _NO_BUNDLE = "there is no bundle, since its points cannot be put together"
 
 
@@ -60,6 +65,12 @@ class BatchTask:
     """Outcomes of earlier batches of these candidates' tile: what is modelled there from the same input is taken."""
     compared: bool = False
     """Whether seconds are held against those of other methods: a method is then loaded before the clock starts."""
+
+    @property
+    def memory_bytes(self) -> int:
+        """What the process that models them may come to take: they come one after the other."""
+        limit_bytes = None if self.isolation is None else self.isolation.memory_bytes
+        return building_bytes(max((site.points for site in self.sites), default=0), limit_bytes)
 
     def way_of(self, site: CandidateSite) -> BatchTask:
         """The task with the method and the settings of one site."""
@@ -148,6 +159,12 @@ def model_batch(task: BatchTask) -> Batch:
         task.scratch.check_cancelled()  # a run that is over has no scratch any more
         raise
     each = [packed[index] for index in range(len(task.sites))]
+    for model in each:
+        building = model.told
+        TALLIES.building(building.status, building.reason)
+        if building.reason in _LOST:
+            facts = {"building": building.building_id, "tile": building.owner.key, "reason": building.reason}
+            LOG.warning("a building is lost", extra={**facts, "seconds": round(building.seconds, 3)})
     return Batch(
         told=tuple(model.told for model in each),
         stored={model.told.building_id: (model.made_from, model.stored) for model in each},

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 
 from pipeline.errors import CrsError, InputError
 from pipeline.io import ReadOptions, SourceInfo, open_source
+from pipeline.runtime.needs import WINDOW_BASE_BYTES
 from pipeline.scene import ClassesInUse
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile, TileGrid
@@ -177,15 +178,8 @@ def check_windows(plan: Plan, grid: TileGrid, points_by_tile: Mapping[Tile, int]
     """
     if limit_bytes is None:
         return
-    area = grid.size_mm**2
     for tile in points_by_tile:
-        window = grid.window(tile)
-        seen = 0.0
-        for other in grid.tiles_over(window):
-            core = grid.core(other)
-            width = min(core.x1_mm, window.x1_mm) - max(core.x0_mm, window.x0_mm)
-            depth = min(core.y1_mm, window.y1_mm) - max(core.y0_mm, window.y0_mm)
-            seen += points_by_tile.get(other, 0) * (width * depth / area)
+        seen = _points_in_window(grid, tile, points_by_tile)
         if seen * _BYTES_PER_POINT > limit_bytes:
             raise InputError(
                 plan.sources[0].path,
@@ -193,3 +187,30 @@ def check_windows(plan: Plan, grid: TileGrid, points_by_tile: Mapping[Tile, int]
                 f"{limit_bytes / 1e9:.1f} GB can take",
                 "Set a smaller tile_size_m, or give the workers more memory",
             )
+
+
+def window_bytes(grid: TileGrid, tile: Tile, points_by_tile: Mapping[Tile, int]) -> int:
+    """What a process that splits a tile comes to take, its own size included.
+
+    Parameters
+    ----------
+    grid : TileGrid
+        The lattice with the windows that the tiles are split in.
+    tile : Tile
+        The tile.
+    points_by_tile : mapping
+        Points of each tile.
+    """
+    return WINDOW_BASE_BYTES + int(_points_in_window(grid, tile, points_by_tile) * _BYTES_PER_POINT)
+
+
+def _points_in_window(grid: TileGrid, tile: Tile, points_by_tile: Mapping[Tile, int]) -> float:
+    """Points of a tile and its halo, as if those of each tile were spread evenly over it."""
+    window, area = grid.window(tile), grid.size_mm**2
+    seen = 0.0
+    for other in grid.tiles_over(window):
+        core = grid.core(other)
+        width = min(core.x1_mm, window.x1_mm) - max(core.x0_mm, window.x0_mm)
+        depth = min(core.y1_mm, window.y1_mm) - max(core.y0_mm, window.y0_mm)
+        seen += points_by_tile.get(other, 0) * (width * depth / area)
+    return seen

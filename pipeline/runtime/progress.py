@@ -107,7 +107,7 @@ class Progress:
         told: Callable[[Result], Told],
         weight: Callable[[Told], int] = lambda _: 1,
         total: int | None = None,
-        failed: Callable[[Told], int] = lambda _: 0,
+        failures: Callable[[Told], int] = lambda _: 0,
         *,
         quiet: bool = False,
     ) -> dict[Place, Told]:
@@ -127,7 +127,7 @@ class Progress:
             Progress of a task, by what it tells.
         total : int, optional
             Progress of all; the number of tasks by default.
-        failed : callable
+        failures : callable
             How much of a task's progress failed, by what it tells.
         quiet : bool
             Part of another stage: no event and no timing of its own.
@@ -138,13 +138,14 @@ class Progress:
         if not quiet:
             self.tell("stage", name, self._label, done=done, total=all_parts)
         found: dict[Place, Told] = {}
+        lost = 0
         for place in tasks:
             if scratch.has(place.name):
                 found[place] = told_of(scratch, place)
                 done += weight(found[place])
         if found and not quiet:
             kept = sum(map(weight, found.values()))
-            lost = sum(map(failed, found.values()))
+            lost = sum(map(failures, found.values()))
             message = f"{len(found)} of {len(tasks)} tasks were done before"
             self.tell("progress", name, message, done=done, total=all_parts, kept=kept, failed=lost)
         todo = [
@@ -159,8 +160,9 @@ class Progress:
                 found[landed.place] = landed.told
                 self.peaks[measured.process] = max(self.peaks.get(measured.process, 0), measured.peak_bytes)
                 done += weight(landed.told)
+                lost += failures(landed.told)
                 if not quiet:
-                    self.tell("progress", name, done=done, total=all_parts, failed=failed(landed.told))
+                    self.tell("progress", name, done=done, total=all_parts, failed=lost)
         if not quiet:
             self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started
         return {place: found[place] for place in tasks}

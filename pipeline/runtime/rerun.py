@@ -61,6 +61,7 @@ from pipeline.runtime.run import (
 )
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.stages import GivenFootprints, Models, Splits, Stages, given_footprints, points_by_tile
+from pipeline.runtime.tls import TlsFiles
 from pipeline.tiling import MM, Tile
 
 AROUND_M = 30.0
@@ -84,6 +85,8 @@ class RerunRequest:
     """Processes of the embedded cluster; 0 runs serially in this process."""
     scheduler: str | None = None
     """Address of a Dask scheduler that takes the place of the embedded cluster."""
+    tls: TlsFiles | None = None
+    """Certificates for the cluster's traffic; by default those of the environment."""
     isolation: IsolationLimits | None = None
     """Limits of the supervised children that model buildings; None models them in the workers themselves."""
 
@@ -161,7 +164,7 @@ def rerun(
     remove_folder(scratch_dir)
     scratch = Scratch(str(scratch_dir / uuid4().hex))
     engine = executor or executor_for(
-        workers=request.workers, scheduler=request.scheduler, local_directory=str(scratch_dir / "dask")
+        workers=request.workers, scheduler=request.scheduler, local_directory=str(scratch_dir / "dask"), tls=request.tls
     )
     scratch.create()
     try:

@@ -26,6 +26,7 @@ from pipeline.runtime.flight import TICK_S
 from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import Joined
+from pipeline.runtime.logs import about
 from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, read_manifest, write_manifest
 from pipeline.runtime.overrides import read_overrides
 from pipeline.runtime.plan import Plan, check_memory, make_plan
@@ -34,6 +35,7 @@ from pipeline.runtime.publish import QUARANTINE
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.stages import MODELS, Models, Splits, Stages, given_footprints
 from pipeline.runtime.stale import tidy
+from pipeline.runtime.tls import TlsFiles
 from pipeline.runtime.work_folder import held_work
 from pipeline.settings import RunSettings
 
@@ -72,6 +74,10 @@ class RunRequest:
     """Processes of the embedded cluster; 0 runs serially in this process."""
     scheduler: str | None = None
     """Address of a Dask scheduler that takes the place of the embedded cluster."""
+    tls: TlsFiles | None = None
+    """Certificates for the cluster's traffic; by default those of the environment."""
+    performance_report: str | None = None
+    """Gets a page about the workers' time; none by default."""
     meshes: str = "building"
     """One OBJ a building, one a tile, or none."""
     licence: str | None = None
@@ -255,10 +261,14 @@ def run_variants(
     with contextlib.ExitStack() as held:
         scratch = held.enter_context(_scratch(work_dir) if request.work is None else held_work(request.work))
         engine = executor or executor_for(
-            workers=request.workers, scheduler=request.scheduler, local_directory=str(Path(scratch.root, "dask"))
+            workers=request.workers,
+            scheduler=request.scheduler,
+            local_directory=str(Path(scratch.root, "dask")),
+            tls=request.tls,
+            performance_report=request.performance_report,
         )
         starting = time.perf_counter()
-        with calling_off(scratch, cancelled) as called_off, engine:
+        with about(run=scratch.name), calling_off(scratch, cancelled) as called_off, engine:
             shared.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)
             engine.prepare("plan", shared.watch)
             shared.timings["start workers"] = time.perf_counter() - starting

@@ -69,6 +69,11 @@ class Scratch:
     attempt: str = ""
     """Names the attempt at a run in a folder that outlives it; empty where the folder ends with the run."""
 
+    @property
+    def name(self) -> str:
+        """The folder's own name: what logs call the run."""
+        return Path(self.root).name
+
     def create(self) -> None:
         """Make the folder, once, by whoever starts the run; no task ever makes it again.
 

@@ -50,10 +50,9 @@ class SerialExecutor:
         RunCancelledError
             The watch called the run off.
         """
-        del stage
         for task in tasks:
             watch.check_cancelled()
-            yield measure(function, task)
+            yield measure(function, task, stage)
 
     @property
     def memory_limit_bytes(self) -> int | None:

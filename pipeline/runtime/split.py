@@ -61,6 +61,8 @@ class SplitTask:
     they overlap."""
     folder: str = "tiles"
     """Folder of the scratch for the outcome."""
+    memory_bytes: int = 0
+    """What the process that splits it comes to take; 0 where nobody reckoned."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

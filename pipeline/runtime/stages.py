@@ -37,7 +37,7 @@ from pipeline.runtime.modelling import (
 from pipeline.runtime.outlines import draw_outlines, outline_tasks
 from pipeline.runtime.overrides import Override, own_modelling
 from pipeline.runtime.overriding import EntryOutcome, accepts, layers_of, outcomes_of, overridden
-from pipeline.runtime.plan import Plan, check_windows, split_grid
+from pipeline.runtime.plan import Plan, check_windows, split_grid, window_bytes
 from pipeline.runtime.progress import Progress
 from pipeline.runtime.publish import QUARANTINE, Published, PublishTask, publish, retire
 from pipeline.runtime.scratch import Scratch
@@ -258,6 +258,7 @@ class Stages:
         classes, told = classes_in_use(ingested, trust=self.settings.general.classes == "trust")
         grid = split_grid(self.plan, self.settings, classes, footprints=footprints is not None)
         check_windows(self.plan, grid, tiles, self.executor.memory_limit_bytes)
+        all_tiles = tiles
         if only is not None:
             tiles = Counter({tile: points for tile, points in tiles.items() if tile in only})
         if told:
@@ -287,6 +288,7 @@ class Stages:
     ) -> Splits:
         """Split some tiles, each with its footprints."""
         content = content_by_tile(ingested)
+        points = points_by_tile(ingested)
         held = {tile: content_of_window(content, self.plan.grid, self.plan.grid.window(tile), tile) for tile in given}
         tasks = {}
         for tile, outlines in given.items():
@@ -298,6 +300,7 @@ class Stages:
                 scratch=self.scratch,
                 footprints=outlines,
                 folder=folder,
+                memory_bytes=window_bytes(grid, tile, points),
             )
             key = key_of(tile, grid, task.settings, classes, outlines, folder, held[tile])
             tasks[Place(folder, tile.key, key)] = task
@@ -484,7 +487,7 @@ class Stages:
             told_of_batch,
             weight=len,
             total=len(joined.candidates),
-            failed=_failed_of,
+            failures=_failed_of,
         )
         # only now: batches of before are what models are taken from where their input did not change
         drop_stale(self.scratch, stage, tasks)
@@ -537,7 +540,9 @@ class Stages:
         storage = LocalStorage(root=Path(run_dir))
         there = {Path(name).stem for name in storage.keys("state")}
         drop_stale(self.scratch, stage, [place for place in tasks if place.unit in there])
-        published = self.progress.kept(self.executor, "publish", publish, tasks, self.scratch, whole)
+        published = self.progress.kept(
+            self.executor, "publish", publish, tasks, self.scratch, whole, failures=lambda told: int(bool(told.error))
+        )
         for tile_key in sorted(there - {tile.key for tile in owners}):
             retire(storage, Tile.from_key(tile_key))
         for place, outcome in published.items():

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import logging
 import signal
 import time
 from collections.abc import Callable
 from typing import Any
 
 import dask
-from distributed import Nanny, Worker
+from distributed import Nanny, Security, Worker
 from distributed.core import Status
+from distributed.worker_memory import parse_memory_limit
 
-from pipeline.errors import ClusterError
-from pipeline.runtime import worker_setup
+from pipeline.errors import ClusterError, SettingsError
+from pipeline.runtime import logs, worker_setup
+from pipeline.runtime.needs import RESOURCE
+from pipeline.runtime.tls import TlsFiles, check_address, why_not
 
 _POLL_S = 0.1
 _HAND_OVER_S = 30.0
@@ -47,6 +51,31 @@ class WorkerOptions:
     """Longest time that a running task is waited for when told to end; None waits for its end."""
     give_up_after_s: float | None = None
     """End when the scheduler was away for so long; None keeps trying."""
+    tls: TlsFiles | None = None
+    """Certificates; without, Dask's own configuration is asked."""
+    log_json: bool = False
+    """Whether the lines of nanny and worker are JSON objects."""
+    metrics_port: int | None = None
+    """Where the worker shows its figures to Prometheus; None shows none."""
+    metrics_host: str = "127.0.0.1"
+    """On which address."""
+
+    @property
+    def memory_bytes(self) -> int | None:
+        """The memory limit, of which tasks declare their share; None where there is none.
+
+        Raises
+        ------
+        SettingsError
+            It is no number of bytes.
+        """
+        try:
+            limit = parse_memory_limit(self.memory_limit, self.threads, logger=logging.getLogger("distributed.worker"))
+        except (ValueError, TypeError, AssertionError) as error:
+            raise SettingsError(
+                [f"memory limit is {self.memory_limit!r}: use bytes such as 4GiB, a share such as 0.5, auto, or 0"]
+            ) from error
+        return None if limit is None else int(limit)
 
 
 class DrainingWorker(Worker):
@@ -83,13 +112,21 @@ def serve_worker(options: WorkerOptions, say: Callable[[str], None]) -> None:
     Raises
     ------
     ClusterError
-        The scheduler was away for longer than the options allow, or the worker cannot start.
+        The scheduler was away for longer than the options allow, the worker cannot start, or address and certificates
+        do not go together.
+    SettingsError
+        The memory limit is none.
     """
+    configured = bool(dask.config.get("distributed.comm.tls.ca-file", None))
+    check_address(options.scheduler, options.tls, configured=configured)
+    logs.configure(as_json=options.log_json)
     quiet = {
         "distributed.admin.log-format": "%(asctime)s %(name)s %(levelname)s %(message)s",
         "distributed.worker.daemon": True,
     }
     with dask.config.set(quiet):
+        if options.log_json:
+            logs.configure(as_json=True, also=("distributed",))
         asyncio.run(_serve(options, say))
 
 
@@ -103,6 +140,7 @@ async def _serve(options: WorkerOptions, say: Callable[[str], None]) -> None:
     for number in _STOPPING:
         asyncio.get_running_loop().add_signal_handler(number, on_signal)
     away_since_s = time.monotonic()
+    told = ""
     say(f"looking for the scheduler {options.scheduler}")
     while not stop.is_set():
         nanny = _nanny(options)
@@ -116,9 +154,13 @@ async def _serve(options: WorkerOptions, say: Callable[[str], None]) -> None:
                 away_since_s = time.monotonic()
         except OSError as error:
             away_s = time.monotonic() - away_since_s
+            why = await asyncio.to_thread(why_not, options.scheduler, options.tls)
+            if why and why != told:
+                told = why
+                say(f"the scheduler {options.scheduler} cannot be used: {why}")
             if options.give_up_after_s is not None and away_s > options.give_up_after_s:
                 raise ClusterError(
-                    f"the scheduler {options.scheduler} was away for {away_s:.0f} s: {error}. Check the address"
+                    f"the scheduler {options.scheduler} was away for {away_s:.0f} s: {why or error}. Check the address"
                 ) from error
         finally:
             await nanny.close()
@@ -127,6 +169,12 @@ async def _serve(options: WorkerOptions, say: Callable[[str], None]) -> None:
 
 def _nanny(options: WorkerOptions) -> Any:
     """A nanny that is not started yet."""
+    memory_bytes = options.memory_bytes
+    environment = {
+        worker_setup.METRICS_PORT: "" if options.metrics_port is None else str(options.metrics_port),
+        worker_setup.METRICS_HOST: options.metrics_host,
+        worker_setup.LOG: "json" if options.log_json else "plain",
+    }
     return Nanny(
         options.scheduler,
         nthreads=options.threads,
@@ -137,6 +185,9 @@ def _nanny(options: WorkerOptions) -> Any:
         worker_class=DrainingWorker,
         preload=[worker_setup.__name__],
         dashboard=False,
+        security=None if options.tls is None else Security(**options.tls.security),
+        resources=None if memory_bytes is None else {RESOURCE: memory_bytes},
+        env=environment,
     )
 
 

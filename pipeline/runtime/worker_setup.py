@@ -6,19 +6,30 @@ The stages are imported here, and so while the client still plans, not when the 
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 
+from pipeline.runtime import logs
 from pipeline.runtime.start_up import start_own_process
 
 STAGES = tuple(f"pipeline.runtime.{name}" for name in ("ingest", "split", "modelling", "publish"))
 """The modules of all tasks."""
+LOG = "GABLEWORK_WORKER_LOG"
+"""How `gablework worker` tells its worker to log: plain or json. Embedded workers log nothing unless asked for JSON."""
+METRICS_PORT, METRICS_HOST = "GABLEWORK_WORKER_METRICS_PORT", "GABLEWORK_WORKER_METRICS_HOST"
+"""Where `gablework worker` tells its worker to show its figures; no port shows none."""
 
 
 def dask_setup(worker: object) -> None:
-    """Leave signals to the nanny and import what tasks need.
+    """Leave signals to the nanny, import what tasks need, speak and show figures as the nanny was asked to.
 
     A Ctrl-C on a terminal and the stop of a service go to all processes of a group. The worker must outlive them:
     its nanny, or the process that embeds it, ends it once its tasks are settled.
+
+    Raises
+    ------
+    SettingsError
+        The port of the figures is taken.
     """
     del worker
     start_own_process()
@@ -27,6 +38,15 @@ def dask_setup(worker: object) -> None:
         signal.signal(number, _left_to_the_nanny)
     for name in STAGES:
         importlib.import_module(name)
+    if os.environ.get(LOG):
+        as_json = os.environ[LOG] == "json"
+        logs.configure(as_json=as_json, also=("distributed",) if as_json else ())
+    else:
+        logs.configure_once()
+    if os.environ.get(METRICS_PORT):
+        from pipeline.runtime.run_metrics import serve_metrics
+
+        serve_metrics(int(os.environ[METRICS_PORT]), host=os.environ.get(METRICS_HOST, "127.0.0.1"))
 
 
 def _left_to_the_nanny(number: int, frame: object) -> None:

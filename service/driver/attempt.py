@@ -165,6 +165,7 @@ def perform(held: HeldJob, shop: Workshop) -> tuple[str, dict[str, Any]]:
     shop.cluster.wait_until_there(held)
     held.tell(Event(kind="stage", stage="plan"))
     held.engine = shop.cluster.engine()
+    # its jobs are interactive traffic: they go before batch runs on the same scheduler
     done = work(held.engine.executor(job.priority))
     _check(held)
     shutil.rmtree(target, ignore_errors=True)

@@ -46,7 +46,7 @@ def test_it_tells_buildings_rate_and_what_is_left(writer: StatusWriter, clock: C
     writer.on_event(Event(kind="stage", stage="reconstruct", total=100))
     for k in range(10):
         clock.s += 1.0
-        writer.on_event(Event(kind="progress", stage="reconstruct", done=4 * (k + 1), total=100, failed=k % 2))
+        writer.on_event(Event(kind="progress", stage="reconstruct", done=4 * (k + 1), total=100, failed=(k + 1) // 2))
     with held_work(str(tmp_path)):
         found = read_status(str(tmp_path))
     assert found.state == "running"

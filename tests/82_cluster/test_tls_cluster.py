@@ -1,0 +1,203 @@
+"""A scheduler and workers that speak TLS only: the same content as without, and nobody else gets a word in."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from distributed import Client
+from processes import Programs, free_port, missing, program, wait_for
+
+from pipeline.errors import ClusterError
+from pipeline.runtime.events import Watch
+from pipeline.runtime.executors import Cluster
+from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.tls import VARIABLES, TlsFiles
+from pipeline.settings import RunSettings
+from pipeline.synthetic.dataset import simulate
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "55_runtime" / "on_workers"))
+
+import chores
+
+pytestmark = pytest.mark.slow
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "how_to" / "clusters.md"
+SETTINGS = {"tile_size_m": 40.0}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> TlsFiles:
+    """What the documented commands make."""
+    if shutil.which("openssl") is None:
+        missing("the program openssl is not installed")
+    folder = tmp_path_factory.mktemp("certificates")
+    lines = re.findall(r"^\$ ((?:openssl|printf) .*)$", PAGE.read_text(), re.MULTILINE)
+    assert len(lines) == 4
+    subprocess.run(["sh", "-e", "-c", "\n".join(lines)], cwd=folder, check=True, capture_output=True)
+    checked = subprocess.run(
+        ["openssl", "verify", "-x509_strict", "-CAfile", "ca.pem", "cluster.pem"], cwd=folder, check=False
+    )
+    assert checked.returncode == 0, "newer Pythons check certificates strictly"
+    names = {name: str(folder / f"{file}") for name, file in (("ca", "ca.pem"), ("cert", "cluster.pem"))}
+    return TlsFiles(**names, key=str(folder / "cluster.key"))
+
+
+@pytest.fixture(scope="module")
+def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated suburb of about 100 x 100 m."""
+    return simulate("suburb", tmp_path_factory.mktemp("suburb"), 3, size_m=(100.0, 100.0), density_per_m2=4.0).laz
+
+
+@pytest.fixture(scope="module")
+def digest(tile: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Of a run in one process."""
+    out = str(tmp_path_factory.mktemp("run") / "run")
+    settings = RunSettings.from_mapping(SETTINGS)
+    return run(RunRequest(inputs=(str(tile),), out=out, settings=settings, workers=0)).digest
+
+
+def options(files: TlsFiles) -> list[str]:
+    """Of our commands."""
+    return ["--tls-ca", files.ca, "--tls-cert", files.cert, "--tls-key", files.key]
+
+
+def start_scheduler(programs: Programs, files: TlsFiles | None, port: int) -> str:
+    """`dask scheduler`, with certificates or without; its address."""
+    command = [str(program("dask")), "scheduler", "--host", "127.0.0.1", "--port", str(port)]
+    if files is not None:
+        command += ["--tls-ca-file", files.ca, "--tls-cert", files.cert, "--tls-key", files.key]
+    programs.start("scheduler", [*command, "--dashboard-address", "127.0.0.1:0"]).wait_for_port(port)
+    return f"{'tcp' if files is None else 'tls'}://127.0.0.1:{port}"
+
+
+def variables(files: TlsFiles) -> dict[str, str]:
+    """Ours, by which all commands know the certificates."""
+    return {VARIABLES["ca"]: files.ca, VARIABLES["cert"]: files.cert, VARIABLES["key"]: files.key}
+
+
+def reconstruct(tile: Path, out: Path, *more: str, env: Mapping[str, str] | None = None) -> tuple[int, str]:
+    """`gablework reconstruct`: its exit code and what it said."""
+    settings = out.parent / "settings.toml"
+    settings.write_text("[settings]\n" + "".join(f"{name} = {value}\n" for name, value in SETTINGS.items()))
+    command = [sys.executable, "-m", "service.cli", "reconstruct", str(tile), "--out", str(out), *more]
+    done = subprocess.run(
+        [*command, "--settings", str(settings), "--json"],
+        env={**os.environ, **(env or {})},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_a_run_over_tls_gives_the_same_content_and_only_those_with_a_certificate_get_in(
+    programs: Programs, files: TlsFiles, tile: Path, digest: str, tmp_path: Path
+) -> None:
+    port = free_port()
+    address = start_scheduler(programs, files, port)
+    given = {"by-option": (options(files), {}), "by-environment": ([], variables(files))}
+    for name, (words, env) in given.items():
+        command = [sys.executable, "-m", "service.cli", "worker", "--scheduler", address, "--name", name, *words]
+        programs.start(name, command, env=env).wait_for_text(f"is at the scheduler {address}")
+
+    code, told = reconstruct(tile, tmp_path / "run", "--scheduler", address, *options(files))
+    assert code == 0, told
+    manifest = read_manifest(tmp_path / "run")
+    assert manifest.content_sha256 == digest
+
+    # Dask's own way to say it
+    own = {"DASK_DISTRIBUTED__COMM__TLS__CA_FILE": files.ca}
+    own |= {
+        "DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT": files.cert,
+        "DASK_DISTRIBUTED__COMM__TLS__CLIENT__KEY": files.key,
+    }
+    code, told = reconstruct(tile, tmp_path / "dask", "--scheduler", address, env=own)
+    assert code == 0, told
+    assert read_manifest(tmp_path / "dask").content_sha256 == digest
+
+    # every connection is encrypted, those between workers too
+    with Client(address, security=Cluster(scheduler=address, tls=files).security) as client:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+        assert len(workers) == 2
+        assert all(one.startswith("tls://") and told["nanny"].startswith("tls://") for one, told in workers.items())
+
+    for words, fault in (
+        (["--scheduler", address], "wants TLS and there are no certificates: give --tls-ca"),
+        (["--scheduler", f"tcp://127.0.0.1:{port}"], f"it speaks TLS: write tls://127.0.0.1:{port}"),
+        (["--scheduler", f"tcp://127.0.0.1:{port}", *options(files)], f"write tls://127.0.0.1:{port}"),
+    ):
+        code, told = reconstruct(tile, tmp_path / "refused", *words)
+        assert (code, fault in told) == (4, True), told
+    # a client that comes with the certificate of another CA, and one with none
+    other = tmp_path / "other"
+    other.mkdir()
+    for name in ("ca.pem", "ca.key"):
+        shutil.copy(Path(files.ca).with_name(name), other)
+    lines = re.findall(r"^\$ ((?:openssl|printf) .*)$", PAGE.read_text(), re.MULTILINE)
+    subprocess.run(["sh", "-e", "-c", "\n".join(lines)], cwd=other, check=True, capture_output=True)
+    stranger = TlsFiles(ca=files.ca, cert=str(other / "cluster.pem"), key=str(other / "cluster.key"))
+    with (
+        pytest.raises(ClusterError, match="does not accept our certificate"),
+        Cluster(scheduler=address, tls=stranger).executor(),
+    ):
+        pytest.fail("it connected")
+
+
+def test_a_tls_worker_says_what_is_wrong_with_a_scheduler_without_tls(programs: Programs, files: TlsFiles) -> None:
+    port = free_port()
+    start_scheduler(programs, None, port)
+    command = [sys.executable, "-m", "service.cli", "worker", "--scheduler", f"tls://127.0.0.1:{port}"]
+    worker = programs.start("worker", [*command, *options(files), "--give-up-after", "0"])
+    assert worker.ended() == 4
+    assert f"it does not speak TLS: write tcp://127.0.0.1:{port}" in worker.text
+
+
+def test_an_embedded_cluster_speaks_tls_where_certificates_are_given(
+    files: TlsFiles, tile: Path, digest: str, tmp_path: Path
+) -> None:
+    with Cluster(workers=2, tls=files) as cluster:
+        assert cluster.address.startswith("tls://")
+        with cluster.executor() as executor:
+            executor.prepare("double", Watch())
+            assert [m.result for m in executor.map("double", chores.double, [4], Watch())] == [8]
+            workers = executor._client.scheduler_info(n_workers=-1)["workers"]
+            assert all(address.startswith("tls://") for address in workers)
+        with (
+            pytest.raises(ClusterError, match="it speaks TLS"),
+            Cluster(scheduler=cluster.address.replace("tls://", "tcp://")).executor(),
+        ):
+            pytest.fail("it connected")
+    code, told = reconstruct(tile, tmp_path / "run", "--workers", "2", env=variables(files))
+    assert code == 0, told
+    assert json.loads(told[: told.rindex("}") + 1].split("\n{", 1)[0] if told.startswith("{") else "{}") is not None
+    assert read_manifest(tmp_path / "run").content_sha256 == digest
+
+
+def test_the_figures_and_the_lines_of_a_worker_name_what_it_did(programs: Programs, tile: Path, tmp_path: Path) -> None:
+    import httpx
+
+    port, figures = free_port(), free_port()
+    address = start_scheduler(programs, None, port)
+    command = [sys.executable, "-m", "service.cli", "worker", "--scheduler", address, "--log-json"]
+    worker = programs.start("worker", [*command, "--metrics-port", str(figures)])
+    worker.wait_for_text("is at the scheduler")
+    code, told = reconstruct(tile, tmp_path / "run", "--scheduler", address)
+    assert code == 0, told
+
+    def page() -> str:
+        return httpx.get(f"http://127.0.0.1:{figures}/metrics", timeout=60.0).text
+
+    counts = read_manifest(tmp_path / "run").counts
+    wait_for(lambda: 'gablework_tasks_worked_total{outcome="done",stage="publish"}' in page(), "the last stage")
+    buildings = re.findall(r"^gablework_buildings_total\{.*\} (\S+)$", page(), re.MULTILINE)
+    assert sum(map(float, buildings)) == counts["candidates"]
+    assert worker.stop() == 0
