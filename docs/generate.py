@@ -302,9 +302,9 @@ def batch_file() -> str:
         NOTE,
         "# The batch file",
         "",
-        "TOML, for `gablework batch`; how it is used: [city-scale batches](../how_to/batch.md). Paths are relative to the",
-        "file. Beside these tables `[settings]` takes all [settings](settings.md) of a run. Unknown names and values out of",
-        "range are refused before anything runs, all faults at once.",
+        "TOML, for `gablework batch`; how it is used: [city-scale batches](../how_to/batch.md). Paths are relative to",
+        "the file. Beside these tables `[settings]` takes all [settings](settings.md) of a run. Unknown names and",
+        "values out of range are refused before anything runs, all faults at once.",
     ]
     own: dict[str, list[list[object]]] = {
         "inputs": [

@@ -71,8 +71,8 @@ class Scratch:
 
     @property
     def name(self) -> str:
-        """The folder's own name: what logs call the run."""
-        return Path(self.root).name
+        """What logs call the run: the attempt, or the folder's own name."""
+        return self.attempt or Path(self.root).name
 
     def create(self) -> None:
         """Make the folder, once, by whoever starts the run; no task ever makes it again.

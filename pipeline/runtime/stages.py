@@ -258,7 +258,6 @@ class Stages:
         classes, told = classes_in_use(ingested, trust=self.settings.general.classes == "trust")
         grid = split_grid(self.plan, self.settings, classes, footprints=footprints is not None)
         check_windows(self.plan, grid, tiles, self.executor.memory_limit_bytes)
-        all_tiles = tiles
         if only is not None:
             tiles = Counter({tile: points for tile, points in tiles.items() if tile in only})
         if told:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from distributed import Client
-from processes import Programs, free_port, missing, program, wait_for
+from processes import Programs, free_port, missing, program
 
 from pipeline.errors import ClusterError
 from pipeline.runtime.events import Watch
@@ -178,26 +177,4 @@ def test_an_embedded_cluster_speaks_tls_where_certificates_are_given(
             pytest.fail("it connected")
     code, told = reconstruct(tile, tmp_path / "run", "--workers", "2", env=variables(files))
     assert code == 0, told
-    assert json.loads(told[: told.rindex("}") + 1].split("\n{", 1)[0] if told.startswith("{") else "{}") is not None
     assert read_manifest(tmp_path / "run").content_sha256 == digest
-
-
-def test_the_figures_and_the_lines_of_a_worker_name_what_it_did(programs: Programs, tile: Path, tmp_path: Path) -> None:
-    import httpx
-
-    port, figures = free_port(), free_port()
-    address = start_scheduler(programs, None, port)
-    command = [sys.executable, "-m", "service.cli", "worker", "--scheduler", address, "--log-json"]
-    worker = programs.start("worker", [*command, "--metrics-port", str(figures)])
-    worker.wait_for_text("is at the scheduler")
-    code, told = reconstruct(tile, tmp_path / "run", "--scheduler", address)
-    assert code == 0, told
-
-    def page() -> str:
-        return httpx.get(f"http://127.0.0.1:{figures}/metrics", timeout=60.0).text
-
-    counts = read_manifest(tmp_path / "run").counts
-    wait_for(lambda: 'gablework_tasks_worked_total{outcome="done",stage="publish"}' in page(), "the last stage")
-    buildings = re.findall(r"^gablework_buildings_total\{.*\} (\S+)$", page(), re.MULTILINE)
-    assert sum(map(float, buildings)) == counts["candidates"]
-    assert worker.stop() == 0

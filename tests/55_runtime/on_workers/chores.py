@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import time
@@ -53,3 +54,22 @@ def tasks_held(dask_worker: object) -> int:
 def fail(message: str) -> None:
     """Raise what no task of a run raises."""
     raise ZeroDivisionError(message)
+
+
+@dataclasses.dataclass(frozen=True)
+class Weighty:
+    """A task that declares memory."""
+
+    folder: str
+    name: str
+    memory_bytes: int
+
+
+def weigh(task: Weighty) -> str:
+    """Like `wait_for_mark`, of a task that declares memory."""
+    return wait_for_mark((task.folder, task.name))
+
+
+def memory_left(dask_worker: object) -> float:
+    """What a worker has left of the memory that it announced."""
+    return dask_worker.state.available_resources["MEMORY"]  # type: ignore[attr-defined,no-any-return]
