@@ -53,6 +53,8 @@ class InputFile:
     """Its size."""
     n_points: int | None = None
     """Points that were read from it; None until then, and for files that are no point clouds."""
+    bounds_m: tuple[float, float, float, float] | None = None
+    """Smallest easting and northing, largest easting and northing of these points in metres; None without points."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -81,6 +83,8 @@ class RunManifest:
     """How the inputs were to be read and the outputs written, beside the settings: what `gablework rerun` goes by."""
     source_licence: str | None = None
     """Licence of the source data in the user's words; None where none was given."""
+    lattice: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """tile_size_m, origin_x_m, origin_y_m: where the tiles lie, in metres."""
     tiles: tuple[str, ...] = ()
     """Keys of the tiles on the lattice, sorted."""
     failed_tiles: tuple[str, ...] = ()
@@ -137,12 +141,18 @@ class RunManifest:
             for name in ("started_at", "finished_at"):
                 if values.get(name) is not None:
                     values[name] = dt.datetime.fromisoformat(values[name])
-            values["inputs"] = tuple(InputFile(**entry) for entry in values.get("inputs", ()))
+            values["inputs"] = tuple(_input_file(entry) for entry in values.get("inputs", ()))
             for name in ("tiles", "failed_tiles", "warnings"):
                 values[name] = tuple(values.get(name, ()))
             return cls(**values)
         except (KeyError, TypeError, ValueError) as error:
             raise RunError(f"{source} is no manifest of a run ({error}): the run directory is damaged") from error
+
+
+def _input_file(entry: Mapping[str, Any]) -> InputFile:
+    """An input as JSON holds it; lists become tuples again."""
+    bounds = entry.get("bounds_m")
+    return InputFile(**{**entry, "bounds_m": None if bounds is None else tuple(bounds)})
 
 
 def _plain(value: Any) -> Any:

@@ -38,6 +38,7 @@ from pipeline.runtime.stale import tidy
 from pipeline.runtime.tls import TlsFiles
 from pipeline.runtime.work_folder import held_work
 from pipeline.settings import RunSettings
+from pipeline.tiling import MM
 
 FOOTPRINTS = "footprints.json"
 """What was wrong with the given footprints, one by one; there where footprints were given."""
@@ -253,6 +254,11 @@ def run_variants(
             started_at=started_at,
             crs=_crs_facts(reference),
             request=told_request(request),
+            lattice={
+                "tile_size_m": plan.grid.size_mm / MM,
+                "origin_x_m": plan.grid.origin_x_mm / MM,
+                "origin_y_m": plan.grid.origin_y_mm / MM,
+            },
             source_licence=request.licence,
         )
         for variant in variants
@@ -402,11 +408,20 @@ def _inputs_told(request: RunRequest, paths: Sequence[str], ingested: Sequence[I
             sha256=found.sha256,
             size_bytes=Path(path).stat().st_size,
             n_points=sum(found.points_by_tile.values()),
+            bounds_m=_plan_bounds_m(found),
         )
         for path, found in zip(paths, ingested, strict=True)
     ]
     inputs.extend(told_file(name) for name in (request.footprints, request.aoi, request.overrides) if name is not None)
     return tuple(inputs)
+
+
+def _plan_bounds_m(found: Ingested) -> tuple[float, float, float, float] | None:
+    """Where the kept points of an input lie."""
+    if found.bounds_mm is None:
+        return None
+    x0, y0, _, x1, y1, _ = found.bounds_mm
+    return x0 / MM, y0 / MM, x1 / MM, y1 / MM
 
 
 def told_file(name: str) -> InputFile:

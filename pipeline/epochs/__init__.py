@@ -1,0 +1,1 @@
+"""Two epochs of one place compared: which buildings are new, gone, raised, lowered, reshaped, unchanged."""

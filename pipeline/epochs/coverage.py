@@ -1,0 +1,110 @@
+"""Where an epoch has data: the bounds of its inputs, its tiles, its area of interest."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from pipeline.errors import GableworkError
+from pipeline.io.crs import SpatialReference
+from pipeline.io.footprints import read_area
+from pipeline.io.storage import sha256_of
+from pipeline.model import FloatArray
+from pipeline.runtime.manifest import RunManifest
+from pipeline.tiling import MM, Tile, TileGrid
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Coverage:
+    """Where a run has data, in metres."""
+
+    area: Any
+    """What the inputs, the tiles and the area of interest cover together; None where the run does not tell."""
+    failed: Any
+    """The tiles that failed; empty where none did."""
+    notes: tuple[str, ...]
+    """What is not known, a sentence each."""
+
+    def shrunk(self, edge_m: float) -> Coverage:
+        """Without what is nearer to the end of the data than `edge_m`."""
+        area = None if self.area is None else self.area.buffer(-edge_m, join_style="mitre")
+        return dataclasses.replace(self, area=area)
+
+    def share(self, footprints: Any) -> FloatArray:
+        """Share of each footprint, (n,), that is covered and not of a failed tile; 1 where nothing is known."""
+        share = np.ones(len(footprints)) if self.area is None else _share(footprints, self.area)
+        return share if self.failed.is_empty else np.maximum(share - _share(footprints, self.failed), 0.0)
+
+    def touches_failed(self, footprints: Any) -> Any:
+        """Which footprints, (n,) bool, reach into a tile that failed."""
+        return shapely.intersects(self.failed, footprints)
+
+
+def _share(footprints: Any, area: Any) -> FloatArray:
+    """Share of each footprint inside an area."""
+    shapely.prepare(area)
+    share = np.where(shapely.covers(area, footprints), 1.0, 0.0)
+    border = np.flatnonzero((share == 0.0) & shapely.intersects(area, footprints) & (shapely.area(footprints) > 0.0))
+    share[border] = shapely.area(shapely.intersection(footprints[border], area)) / shapely.area(footprints[border])
+    return share
+
+
+def coverage_of(manifest: RunManifest, reference: SpatialReference) -> Coverage:
+    """What a manifest tells of where its run has data.
+
+    Runs of earlier versions tell neither the lattice nor the bounds of their inputs; what they do not tell does not
+    narrow the coverage, and a note says so.
+    """
+    notes, area = [], None
+    bounds = [entry.bounds_m for entry in manifest.inputs if entry.bounds_m is not None]
+    if bounds:
+        area = shapely.union_all(shapely.box(*np.array(bounds).T))
+    failed: Any = shapely.Polygon()
+    if manifest.lattice and manifest.tiles:
+        tiles = _boxes(manifest, set(manifest.tiles))
+        area = tiles if area is None else shapely.intersection(area, tiles)
+        failed = _boxes(manifest, set(manifest.failed_tiles))
+    if area is None:
+        notes.append("run.json does not tell where its data lie: what is beyond them cannot be told from new or gone")
+    elif not bounds:
+        notes.append("run.json does not tell the bounds of its inputs: coverage is that of whole tiles")
+    aoi = manifest.request.get("aoi")
+    if aoi is not None and area is not None:
+        drawn = _area_of_interest(str(aoi), manifest, reference)
+        if drawn is None:
+            notes.append(f"its area of interest {aoi} is not there as the run read it: coverage is not cut to it")
+        else:
+            area = shapely.intersection(area, drawn)
+    return Coverage(area=area, failed=failed, notes=tuple(notes))
+
+
+def _boxes(manifest: RunManifest, keys: set[str]) -> Any:
+    """The tiles of some keys as one area."""
+    lattice = manifest.lattice
+    grid = TileGrid(
+        size_mm=round(lattice["tile_size_m"] * MM),
+        halo_mm=0,
+        origin_x_mm=round(lattice["origin_x_m"] * MM),
+        origin_y_mm=round(lattice["origin_y_m"] * MM),
+    )
+    cores = [grid.core(Tile.from_key(key)) for key in sorted(keys)]
+    return shapely.union_all([
+        shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM) for core in cores
+    ])
+
+
+def _area_of_interest(path: str, manifest: RunManifest, reference: SpatialReference) -> Any | None:
+    """The polygons of the file in metres; None where it is not there, or is another one by now."""
+    known = {entry.path: entry.sha256 for entry in manifest.inputs}
+    if not Path(path).is_file() or known.get(path) != sha256_of(path):
+        return None
+    try:
+        area = read_area(path, reference)
+    except GableworkError:
+        return None
+    unit_m = reference.horizontal_unit_m
+    return area if unit_m == 1.0 else shapely.transform(area, lambda xy: xy * unit_m)

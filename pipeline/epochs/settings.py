@@ -1,0 +1,130 @@
+"""What counts as a change: the thresholds of a comparison of two epochs."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import SettingsError
+from pipeline.parameters import Parameters, build, parameter
+
+TABLE = "diff"
+"""The table of the settings file."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DiffSettings(Parameters):
+    """From which size on a change is told."""
+
+    min_overlap_share: float = parameter(
+        0.25,
+        "Two footprints belong together where they share this part of the smaller one.",
+        minimum=0.01,
+        maximum=1.0,
+    )
+    min_iou: float = parameter(
+        0.2,
+        "Buildings that belong together but share less than this of their common area are told as gone and new.",
+        minimum=0.0,
+        maximum=0.9,
+    )
+    min_height_change_m: float = parameter(
+        0.5, "A roof surface counts as higher or lower from this difference on.", unit="m", minimum=0.02, maximum=50.0
+    )
+    sigmas: float = parameter(
+        3.0,
+        "And from this many standard deviations on, both epochs' together.",
+        minimum=0.0,
+        maximum=20.0,
+    )
+    uniform_share: float = parameter(
+        0.8,
+        "A building is raised (lowered) where this part of its roof is higher (lower).",
+        minimum=0.5,
+        maximum=1.0,
+    )
+    min_area_change_m2: float = parameter(
+        5.0,
+        "A building is reshaped where this much of its plan was added or removed, or has another roof.",
+        unit="m2",
+        minimum=0.1,
+        maximum=100_000.0,
+    )
+    min_volume_change_m3: float = parameter(
+        5.0, "And where this much volume came or went there.", unit="m3", minimum=0.0, maximum=1_000_000.0
+    )
+    min_width_m: float = parameter(
+        1.5,
+        "Parts that are narrower do not count: outlines and edges of roofs are not known better.",
+        unit="m",
+        minimum=0.2,
+        maximum=50.0,
+    )
+    spacings: float = parameter(
+        1.5, "Nor do parts that are narrower than this many point spacings.", minimum=0.0, maximum=10.0
+    )
+    min_covered_share: float = parameter(
+        0.95,
+        "Told as new or gone is only what lies with this part of its footprint where the other epoch has data.",
+        minimum=0.01,
+        maximum=1.0,
+    )
+    edge_m: float = parameter(
+        2.0,
+        "What is nearer to the end of an epoch's data counts as not covered by it.",
+        unit="m",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    vertical_shift_m: float = parameter(
+        0.0,
+        "Known difference of the epochs' elevations, NEW less OLD, that is no change of any building.",
+        unit="m",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+
+    def swapped(self) -> DiffSettings:
+        """The same with OLD and NEW exchanged."""
+        return dataclasses.replace(self, vertical_shift_m=-self.vertical_shift_m)
+
+
+def read_settings(path: str | None, options: Mapping[str, Any]) -> DiffSettings:
+    """The settings of a TOML file under those of the command line.
+
+    Parameters
+    ----------
+    path : str or None
+        A file with a `[diff]` table; None for the defaults.
+    options : mapping
+        Settings by name that stand above the file's; those that are None do not.
+
+    Raises
+    ------
+    SettingsError
+        The file cannot be read or parsed, or holds faults: all are told at once.
+    """
+    table: dict[str, Any] = {}
+    if path is not None:
+        try:
+            document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError) as error:
+            raise SettingsError([f"settings file {path} cannot be read: {error}"]) from error
+        except tomllib.TOMLDecodeError as error:
+            raise SettingsError([f"settings file {path} is no TOML: {error}"]) from error
+        found = document.get(TABLE)
+        if not isinstance(found, dict):
+            held = ", ".join(document) or "nothing"
+            raise SettingsError([f"settings file {path} has no [{TABLE}] table; it has {held}"])
+        table = dict(found)
+    table.update({name: value for name, value in options.items() if value is not None})
+    faults: list[str] = []
+    settings = build(DiffSettings, TABLE, table, faults)
+    if faults:
+        raise SettingsError(faults)
+    if not isinstance(settings, DiffSettings):
+        raise AssertionError("build gives settings or faults")
+    return settings
