@@ -18,4 +18,4 @@ _COMMANDS = (
 )
 for _command in _COMMANDS:
     app.command()(_command)
-app.add_typer(batch)
+app.add_typer(batch, name="batch")

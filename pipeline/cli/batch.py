@@ -1,16 +1,16 @@
-"""The group of commands for batch runs."""
+"""The group `gablework batch`: runs over whole surveys, and what changed between two of them."""
 
 from __future__ import annotations
 
 import typer
 
 from pipeline.cli.batching import plan, run, status
+from pipeline.cli.differing import diff
 
 batch = typer.Typer(
-    name="batch",
-    help="City-scale runs from one file: planned, watched, resumed, done again for what changed only.",
+    help="City-scale runs from one file: planned, watched, resumed, done again for what changed only; and their changes.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
-for _command in (plan, run, status):
+for _command in (plan, run, status, diff):
     batch.command()(_command)

@@ -212,6 +212,7 @@ def _joined(old: RoofFaces, new: RoofFaces) -> RoofFaces:
         rings=np.concatenate([old.rings, new.rings[1:] + len(old.xy)]),
         faces=np.concatenate([old.faces, new.faces[1:] + len(old.rings) - 1]),
         planes=np.concatenate([old.planes, new.planes]),
+        is_rough=np.concatenate([old.is_rough, new.is_rough]),
     )
 
 

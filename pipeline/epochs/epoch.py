@@ -1,6 +1,6 @@
 """One of the two runs: what its manifest tells, an index of all its buildings, and the records of some of them.
 
-Of the whole run only the index is held, some 40 bytes a building; geometry is read for a part of the plan at a time.
+Of the whole run only the index is held, some 50 bytes a building; geometry is read for a part of the plan at a time.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ COLUMNS = (
     *("touches_data_edge", "acquired_from", "acquired_to"),
 )
 """What is read of a building that is compared."""
-_PLANES = ("building_id", "geometry", "origin_x", "origin_y", "origin_z", "coefficients")
+ROUGH_TIMES = 2.5
+"""Points that scatter about a face this many times as much as the noise of its building are those of a tree, or of
+small things on a roof."""
+_PLANES = ("building_id", "geometry", "origin_x", "origin_y", "origin_z", "coefficients", "rmse_m")
 _BOX = ("xmin", "ymin", "xmax", "ymax")
 
 
@@ -116,11 +119,12 @@ class Epoch:
                 kept = pc.and_(pc.is_valid(owner), pc.is_valid(table["geometry"]))
                 parts.append(table.append_column("owner", owner).filter(kept))
         if not parts:
-            return _faces(_empty(self.schemas[1], _PLANES), self.reference), np.empty(0, np.int64)
+            return _faces(_empty(self.schemas[1], _PLANES), np.empty(0), self.reference), np.empty(0, np.int64)
         table = pa.concat_tables(parts)
         owners = table["owner"].to_numpy().astype(np.int64)
         order = np.argsort(owners, kind="stable")
-        return _faces(table.take(pa.array(order)), self.reference), owners[order]
+        noise_m = floats(buildings.table["noise_m"])[owners[order]]
+        return _faces(table.take(pa.array(order)), noise_m, self.reference), owners[order]
 
 
 def open_epoch(name: str, run_dir: str, filesystem: pafs.FileSystem | None = None) -> Epoch:
@@ -230,8 +234,8 @@ def _rejected(dataset: pads.Dataset, unit_m: float) -> Rejected:
     )
 
 
-def _faces(table: pa.Table, reference: SpatialReference) -> RoofFaces:
-    """Rows of the table of planes as faces in metres."""
+def _faces(table: pa.Table, noise_m: FloatArray, reference: SpatialReference) -> RoofFaces:
+    """Rows of the table of planes as faces in metres; `noise_m` (f,) is that of their buildings, nan if unknown."""
     horizontal, vertical = reference.horizontal_unit_m, reference.vertical_unit_m
     geometries = shapely.force_2d(shapely.from_wkb(np.array(table["geometry"].to_pylist(), dtype=object)))
     polygons, face_of = shapely.get_parts(geometries, return_index=True)
@@ -251,6 +255,7 @@ def _faces(table: pa.Table, reference: SpatialReference) -> RoofFaces:
         rings=_starts(ring_of, len(rings)),
         faces=_starts(face_of[polygon_of], table.num_rows),
         planes=planes,
+        is_rough=floats(table["rmse_m"]) > ROUGH_TIMES * noise_m,
     )
 
 

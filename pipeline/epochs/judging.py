@@ -14,6 +14,7 @@ from pipeline.epochs.roof_raster import (
     FORM_M2,
     FORM_M3,
     REMOVED_M2,
+    ROUGH_M2,
     SHIFT_M,
     UNIFORM_M,
 )
@@ -100,7 +101,7 @@ def judge(
     ----------
     old, new : Side
         What each epoch has of the groups.
-    figures : (g, 15) float64
+    figures : (g, 16) float64
         Of `compare_roofs`.
     limit : Limits
         What counts as a change.
@@ -143,6 +144,7 @@ def judge(
         doubts=(
             (Doubt.BLOCK_IN_OLD, old.has_block),
             (Doubt.BLOCK_IN_NEW, new.has_block),
+            (Doubt.ROUGH_PART, reshaped & ~hidden & (figures[:, ROUGH_M2] > (outline_m2 + figures[:, FORM_M2]) / 2.0)),
             (Doubt.NEAR_LIMIT, near & ~hidden),
             (Doubt.OVERLAPS_ANOTHER, overlapping & ~hidden),
             (Doubt.OTHER_UNITS, both & (old.count != new.count)),

@@ -24,8 +24,8 @@ MOST_CELLS = 4_000_000
 
 COMMON_M2, MEDIAN_M, UNIFORM_M, SHIFT_M, DIFFERENCE_M = 0, 1, 2, 3, 4
 ADDED_M2, REMOVED_M2, RAISED_M2, LOWERED_M2, FORM_M2 = 5, 6, 7, 8, 9
-GAINED_M3, LOST_M3, FORM_M3, MAX_RAISE_M, MAX_DROP_M = 10, 11, 12, 13, 14
-N_FIGURES = 15
+GAINED_M3, LOST_M3, FORM_M3, MAX_RAISE_M, MAX_DROP_M, ROUGH_M2 = 10, 11, 12, 13, 14, 15
+N_FIGURES = 16
 """Columns of the figures of `compare_roofs`."""
 
 _NOTHING = -1.0e30
@@ -43,6 +43,8 @@ class RoofFaces:
     """(f + 1,) int64, where each face begins in `rings`; the rings of a face are filled by the even-odd rule."""
     planes: FloatArray
     """(f, 5) float64: easting and northing of a place, elevation there, rise per metre of easting and of northing."""
+    is_rough: BoolArray
+    """(f,) bool, True where the points scatter about the face: it may stand on a tree."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,7 +71,7 @@ class RoofGroups:
 
 
 def compare_roofs(faces: RoofFaces, groups: RoofGroups, uniform_share: float, vertical_shift_m: float) -> FloatArray:
-    """Figures of each group, (g, 15) float64.
+    """Figures of each group, (g, 16) float64.
 
     Parameters
     ----------
@@ -84,12 +86,12 @@ def compare_roofs(faces: RoofFaces, groups: RoofGroups, uniform_share: float, ve
 
     Returns
     -------
-    (g, 15) float64
+    (g, 16) float64
         By column: area over which both epochs have a roof; the median difference there; the difference that
-        `uniform_share` of it reaches or surpasses, 0 where it has no one sign; the median again where that counts,
-        else 0 (the shift); mean absolute difference; areas added, removed, raised, lowered, and with another form (off
+        `uniform_share` of it reaches or surpasses, 0 where it has no one sign; the same where it counts, else 0 (the
+        shift); mean absolute difference; areas added, removed, raised, lowered, and with another form (off
         the shift); volume gained, lost, and of the parts with another form or outline; largest rise and drop of parts
-        that count. Median and mean are nan where there is no common roof.
+        that count; area of parts with another form or outline on rough faces. Median and mean are nan where there is no common roof.
     """
     figures = np.zeros((len(groups.starts) - 1, N_FIGURES))
     _compare_all(
@@ -97,6 +99,7 @@ def compare_roofs(faces: RoofFaces, groups: RoofGroups, uniform_share: float, ve
         faces.rings,
         faces.faces,
         faces.planes,
+        faces.is_rough,
         groups.starts,
         groups.face,
         groups.is_new,
@@ -118,6 +121,7 @@ def _compare_all(
     rings: IntArray,
     faces: IntArray,
     planes: FloatArray,
+    is_rough: BoolArray,
     starts: IntArray,
     face: IntArray,
     is_new: BoolArray,
@@ -140,10 +144,13 @@ def _compare_all(
             columns, rows = columns // 2 + 1, rows // 2 + 1
         before, after = np.full((rows, columns), _NOTHING), np.full((rows, columns), _NOTHING)
         own = np.zeros((rows, columns), np.bool_)
+        rough_before, rough_after = np.zeros((rows, columns), np.bool_), np.zeros((rows, columns), np.bool_)
         for entry in range(starts[group], starts[group + 1]):
-            heights = after if is_new[entry] else before
-            _fill(xy, rings, faces, planes, face[entry], heights, own, is_own[entry], west, south, cell)
-        _figures_of(before, after, own, cell, height_m[group], ground_m[group], share, shift, figures[group])
+            heights, rough = (after, rough_after) if is_new[entry] else (before, rough_before)
+            one = face[entry]
+            _fill(xy, rings, faces, planes, one, is_rough[one], heights, rough, own, is_own[entry], west, south, cell)
+        rough = rough_before | rough_after
+        _figures_of(before, after, own, rough, cell, height_m[group], ground_m[group], share, shift, figures[group])
 
 
 @njit(cache=True, nogil=True)
@@ -153,7 +160,9 @@ def _fill(
     faces: IntArray,
     planes: FloatArray,
     face: int,
+    is_rough: bool,
     heights: FloatArray,
+    rough: BoolArray,
     own: BoolArray,
     is_own: bool,
     west: float,
@@ -190,7 +199,8 @@ def _fill(
             for column in range(column_from, column_to):
                 x = west + (column + 0.5) * cell
                 z = planes[face, 2] + planes[face, 3] * (x - planes[face, 0]) + planes[face, 4] * (y - planes[face, 1])
-                heights[row, column] = max(heights[row, column], z)
+                if z > heights[row, column]:
+                    heights[row, column], rough[row, column] = z, is_rough
                 own[row, column] |= is_own
 
 
@@ -199,6 +209,7 @@ def _figures_of(
     before: FloatArray,
     after: FloatArray,
     own: BoolArray,
+    rough: BoolArray,
     cell: float,
     least_m: float,
     ground_m: FloatArray,
@@ -236,7 +247,7 @@ def _figures_of(
         rank = int(math.floor((1.0 - share) * (count - 1)))
         lowest, highest = ordered[rank], ordered[count - 1 - rank]
         uniform = lowest if lowest > 0.0 else (highest if highest < 0.0 else 0.0)
-        moved = median if abs(uniform) >= least_m else 0.0
+        moved = uniform if abs(uniform) >= least_m else 0.0
         figures[COMMON_M2] = count * area
         figures[MEDIAN_M], figures[UNIFORM_M], figures[SHIFT_M] = median, uniform, moved
         figures[DIFFERENCE_M] = total / count
@@ -265,9 +276,12 @@ def _figures_of(
                 figures[LOWERED_M2] += area
                 figures[LOST_M3] -= rise * area
                 figures[MAX_DROP_M] = max(figures[MAX_DROP_M], -rise)
-            if higher[row, column] or lower[row, column]:
+            formed = higher[row, column] or lower[row, column]
+            if formed:
                 figures[FORM_M2] += area
                 figures[FORM_M3] += abs(rise - moved) * area
+            if rough[row, column] and (formed or added[row, column] or removed[row, column]):
+                figures[ROUGH_M2] += area
 
 
 @njit(cache=True, nogil=True)

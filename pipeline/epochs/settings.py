@@ -41,7 +41,7 @@ class DiffSettings(Parameters):
         maximum=20.0,
     )
     uniform_share: float = parameter(
-        0.8,
+        0.9,
         "A building is raised (lowered) where this part of its roof is higher (lower).",
         minimum=0.5,
         maximum=1.0,
