@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
 from collections import Counter
 from typing import Any
 
@@ -22,6 +23,8 @@ SUMS = (
 LARGEST = 300
 """Rows of each class that are kept for the page."""
 _REACH_MM = 20_000
+HEIGHT_EDGES_M = tuple(0.5 * step for step in range(-24, 25))
+"""Borders of the classes in which rises and drops are counted; what is beyond counts in the outermost ones."""
 
 
 def size_of(table: pa.Table) -> Any:
@@ -55,6 +58,8 @@ class Summary:
         self.without_doubt: Counter[str] = Counter()
         self.flags: Counter[str] = Counter()
         self.sums: dict[str, Counter[str]] = {name: Counter() for name in SUMS}
+        self.heights: IntArray = np.zeros(len(HEIGHT_EDGES_M) - 1, np.int64)
+        self.acquired: dict[str, dt.datetime] = {}
         self._level: IntArray = np.zeros(2 * _REACH_MM + 1, np.int64)
         self._largest: dict[str, pa.Table] = {}
 
@@ -79,6 +84,21 @@ class Summary:
                 self._take_level(rows)
             else:
                 self._take_largest(change, rows)
+                self._take_heights(rows)
+        self._take_times(table)
+
+    def _take_heights(self, rows: pa.Table) -> None:
+        raised, dropped = (np.nan_to_num(floats(rows[name])) for name in ("max_raise_m", "max_drop_m"))
+        strongest = np.where(raised >= dropped, raised, -dropped)
+        counted = strongest[strongest != 0.0]
+        self.heights += np.histogram(np.clip(counted, HEIGHT_EDGES_M[0], HEIGHT_EDGES_M[-1]), HEIGHT_EDGES_M)[0]
+
+    def _take_times(self, table: pa.Table) -> None:
+        """The latest acquisition of the earlier epoch and the earliest of the later one."""
+        for name, extreme, better in (("old_acquired", pc.max, max), ("new_acquired", pc.min, min)):
+            found = extreme(table[name]).as_py()
+            if found is not None:
+                self.acquired[name] = found if name not in self.acquired else better(self.acquired[name], found)
 
     def _take_level(self, rows: pa.Table) -> None:
         known = floats(rows["height_change_m"])

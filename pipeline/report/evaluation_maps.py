@@ -96,20 +96,20 @@ def maps(evaluation: Evaluation) -> list[Map]:
     buildings, faces = evaluation.tables.get("buildings"), evaluation.tables.get("true_faces")
     made = []
     if evaluation.reference is None or buildings is None:
-        made.append(_draw("Models by status", _status_layers(evaluation)))
+        made.append(draw_map("Models by status", _status_layers(evaluation)))
     else:
         footprints = {one.building_id: one.footprint for one in evaluation.reference.buildings}
         geometries = [footprints.get(name) for name in buildings["building_id"].to_pylist()]
         false = _false_models(evaluation)
         if "outcome" in buildings.column_names and evaluation.reference.has_faces:
-            made.append(_draw("Buildings by outcome", [*_outcome_layers(buildings, geometries), false]))
+            made.append(draw_map("Buildings by outcome", [*_outcome_layers(buildings, geometries), false]))
         if {"n_points", "n_within"} <= set(buildings.column_names):
             layers = [*_share_layers(buildings, geometries), false]
-            made.append(_draw("Buildings by share of points within 0.2 m", layers))
+            made.append(draw_map("Buildings by share of points within 0.2 m", layers))
         if not made:
-            made.append(_draw("Buildings found", [*_found_layers(buildings, geometries), false]))
+            made.append(draw_map("Buildings found", [*_found_layers(buildings, geometries), false]))
     if faces is not None and "geometry" in faces.column_names:
-        made.append(_draw("Roof faces", _face_layers(faces, evaluation.tables.get("model_faces"))))
+        made.append(draw_map("Roof faces", _face_layers(faces, evaluation.tables.get("model_faces"))))
     return [one for one in made if one is not None]
 
 
@@ -217,7 +217,7 @@ def _face_layers(faces: pa.Table, model_faces: pa.Table | None) -> list[Layer]:
     return layers
 
 
-def _draw(title: str, layers: Sequence[Layer]) -> Map | None:
+def draw_map(title: str, layers: Sequence[Layer]) -> Map | None:
     """The layers in their order, the later ones over the earlier; None where there is nothing to draw."""
     drawn = [layer for layer in layers if layer.geometries]
     everything = [geometry for layer in drawn for geometry in layer.geometries if geometry is not None]
