@@ -10,8 +10,6 @@ DIR/epochs.md and DIR/<scene>/diff, and its lines into the page.
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import json
 import sys
 from pathlib import Path
 
@@ -48,6 +46,7 @@ def reconstructed(scene: Scene, name: str, seed: int, folder: Path, jobs: int) -
 
 
 def main() -> int:
+    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--only", nargs="+", default=list(CASES), choices=list(CASES))

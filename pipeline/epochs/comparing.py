@@ -87,9 +87,7 @@ def compare_epochs(old: Epoch, new: Epoch, settings: DiffSettings, on_part: OnPa
     coverages = tuple(epoch.coverage.shrunk(settings.edge_m) for epoch in (old, new))
     done = 0
     for part in parts_of(middles(boxes), GROUPS_A_PART):
-        sides = [
-            _members(epoch, k, groups, by_group[k], part) for k, epoch in enumerate((old, new))
-        ]
+        sides = [_members(epoch, k, groups, by_group[k], part) for k, epoch in enumerate((old, new))]
         before, after = (
             side_of(_own(one), one.own_group, len(part), epoch.reference.vertical_unit_m)
             for one, epoch in zip(sides, (old, new), strict=True)
@@ -150,8 +148,8 @@ def _own(members: _Members) -> Buildings:
 def _ranges(starts: IntArray, counts: IntArray) -> IntArray:
     """The whole numbers of many ranges one after the other."""
     ends = np.cumsum(counts)
-    ranges: IntArray = np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - counts, counts) + np.repeat(
-        starts, counts
+    ranges: IntArray = (
+        np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - counts, counts) + np.repeat(starts, counts)
     )
     return ranges
 
@@ -173,12 +171,12 @@ def _figures(
     first = 0
     for which, (one, (faces, owner)) in enumerate(zip(sides, found, strict=True)):
         begin = np.searchsorted(owner, np.arange(len(one.buildings.rows) + 1))
-        for places, group, is_own in ((one.own, one.own_group, True), (one.guests, one.guest_group, False)):
+        for places, of_group, own in ((one.own, one.own_group, True), (one.guests, one.guest_group, False)):
             counts = begin[places + 1] - begin[places]
             face = _ranges(begin[places], counts) + first
             for column, values in zip(
                 columns,
-                (np.repeat(group, counts), face, np.full(len(face), which == 1), np.full(len(face), is_own)),
+                (np.repeat(of_group, counts), face, np.full(len(face), which == 1), np.full(len(face), own)),
                 strict=True,
             ):
                 column.append(values)
@@ -334,7 +332,8 @@ def _table(
     }
     columns["change_id"] = _change_ids(before, after)
     arrays = [
-        _rounded(columns[name], _DIGITS) if isinstance(columns[name], np.ndarray) and columns[name].dtype.kind == "f"
+        _rounded(columns[name], _DIGITS)
+        if isinstance(columns[name], np.ndarray) and columns[name].dtype.kind == "f"
         else columns[name]
         for name in SCHEMA.names
     ]
@@ -344,9 +343,8 @@ def _table(
 
 def _difference(before: FloatArray, after: FloatArray, is_new: BoolArray, is_gone: BoolArray) -> FloatArray:
     """Later less earlier; what stands in one epoch alone counts from nothing where it is new or gone."""
-    found: FloatArray = np.where(is_new, 0.0, before)
-    found = np.where(is_gone, 0.0, after) - found
-    return found
+    difference: FloatArray = np.where(is_gone, 0.0, after) - np.where(is_new, 0.0, before)
+    return difference
 
 
 def _rounded(values: FloatArray, digits: int) -> pa.Array:

@@ -92,9 +92,9 @@ def _boxes(manifest: RunManifest, keys: set[str]) -> Any:
         origin_y_mm=round(lattice["origin_y_m"] * MM),
     )
     cores = [grid.core(Tile.from_key(key)) for key in sorted(keys)]
-    return shapely.union_all([
-        shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM) for core in cores
-    ])
+    return shapely.union_all(
+        [shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM) for core in cores]
+    )
 
 
 def _area_of_interest(path: str, manifest: RunManifest, reference: SpatialReference) -> Any | None:

@@ -140,8 +140,8 @@ def diff(
     shift_m = request.settings.vertical_shift_m
     if level.median_m is not None and abs(level.median_m) > _LEVEL_SHARE * least_m:
         warnings.append(
-            f"unchanged roofs of NEW lie {level.median_m:+.3f} m off those of OLD (median of {level.count}): if that is "
-            f"the surveys' and not the ground's, set vertical_shift_m to {shift_m + level.median_m:.3f}"
+            f"unchanged roofs of NEW lie {level.median_m:+.3f} m off those of OLD (median of {level.count}): if the "
+            f"surveys are that far apart, set vertical_shift_m to {shift_m + level.median_m:.3f}"
         )
     found = Diff(
         request=request,

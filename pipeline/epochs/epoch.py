@@ -148,11 +148,13 @@ def open_epoch(name: str, run_dir: str, filesystem: pafs.FileSystem | None = Non
     if manifest.status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
         raise RunError(f"{name}, the run in {run_dir}, is {manifest.status.value}: compare runs that ended")
     facts = dict(manifest.crs or {})
-    reference = SpatialReference(**{
-        key: facts[key]
-        for key in ("wkt", "name", "epsg", "horizontal_unit_m", "vertical_unit_m")
-        if facts.get(key) is not None
-    })
+    reference = SpatialReference(
+        **{
+            key: facts[key]
+            for key in ("wkt", "name", "epsg", "horizontal_unit_m", "vertical_unit_m")
+            if facts.get(key) is not None
+        }
+    )
     buildings = table_dataset(run_dir, "buildings", filesystem)
     planes = table_dataset(run_dir, "planes", filesystem)
     fragments = sorted(buildings.get_fragments(), key=lambda fragment: str(fragment.path))
@@ -207,9 +209,11 @@ def _boxes(tables: Sequence[pa.Table], unit_m: float) -> FloatArray:
 
 def floats(column: Any) -> FloatArray:
     """A column of numbers as float64, nan where it is null."""
-    values: FloatArray = column.cast(pa.float64()).to_numpy(zero_copy_only=False) if isinstance(
-        column, pa.Array
-    ) else column.cast(pa.float64()).to_numpy()
+    values: FloatArray = (
+        column.cast(pa.float64()).to_numpy(zero_copy_only=False)
+        if isinstance(column, pa.Array)
+        else column.cast(pa.float64()).to_numpy()
+    )
     return np.array(values, dtype=np.float64)
 
 
@@ -229,9 +233,7 @@ def _rejected(dataset: pads.Dataset, unit_m: float) -> Rejected:
         table = dataset.to_table(columns=["bbox", "area_m2", "height_m"])
     except (pa.ArrowInvalid, OSError) as error:
         raise RunError(f"rejected cannot be read as Parquet: {error}") from error
-    return Rejected(
-        boxes=_boxes([table], unit_m), area_m2=floats(table["area_m2"]), height_m=floats(table["height_m"])
-    )
+    return Rejected(boxes=_boxes([table], unit_m), area_m2=floats(table["area_m2"]), height_m=floats(table["height_m"]))
 
 
 def _faces(table: pa.Table, noise_m: FloatArray, reference: SpatialReference) -> RoofFaces:
@@ -243,13 +245,15 @@ def _faces(table: pa.Table, noise_m: FloatArray, reference: SpatialReference) ->
     xy, ring_of = shapely.get_coordinates(rings, return_index=True)
     coefficients = table["coefficients"].combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(-1, 4)
     rise_x, rise_y, up, offset = coefficients.T
-    planes = np.column_stack([
-        floats(table["origin_x"]) * horizontal,
-        floats(table["origin_y"]) * horizontal,
-        (floats(table["origin_z"]) - offset / up) * vertical,
-        -rise_x / up * vertical / horizontal,
-        -rise_y / up * vertical / horizontal,
-    ])
+    planes = np.column_stack(
+        [
+            floats(table["origin_x"]) * horizontal,
+            floats(table["origin_y"]) * horizontal,
+            (floats(table["origin_z"]) - offset / up) * vertical,
+            -rise_x / up * vertical / horizontal,
+            -rise_y / up * vertical / horizontal,
+        ]
+    )
     return RoofFaces(
         xy=xy * horizontal,
         rings=_starts(ring_of, len(rings)),

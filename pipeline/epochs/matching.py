@@ -159,17 +159,23 @@ def grouped(pairs: Pairs, old_m2: FloatArray, new_m2: FloatArray, settings: Diff
     smaller = np.minimum(old_m2[pairs.old], new_m2[pairs.new])
     kept = pairs.common_m2 >= settings.min_overlap_share * smaller
     count, labels = _components(pairs, kept, len(old_m2), len(new_m2))
-    common = np.bincount(labels[pairs.old[kept]], weights=pairs.common_m2[kept], minlength=count)
+    common = _summed(labels[pairs.old[kept]], pairs.common_m2[kept], count)
     areas = np.bincount(labels, weights=np.concatenate([old_m2, new_m2]), minlength=count)
     iou = np.divide(common, areas - common, out=np.zeros(count), where=areas > common)
     dissolved = (common > 0.0) & (iou < settings.min_iou)
     if dissolved.any():
         kept &= ~dissolved[labels[pairs.old]]
         count, labels = _components(pairs, kept, len(old_m2), len(new_m2))
-        common = np.bincount(labels[pairs.old[kept]], weights=pairs.common_m2[kept], minlength=count)
+        common = _summed(labels[pairs.old[kept]], pairs.common_m2[kept], count)
     return Groups(
         of_old=labels[: len(old_m2)], of_new=labels[len(old_m2) :], count=count, common_m2=common, pairs=pairs
     )
+
+
+def _summed(index: IntArray, values: FloatArray, count: int) -> FloatArray:
+    """Sums of values (n,) by an index (n,) in 0 to count - 1: (count,)."""
+    sums: FloatArray = np.bincount(index, weights=values, minlength=count).astype(np.float64)
+    return sums
 
 
 def _components(pairs: Pairs, kept: BoolArray, n_old: int, n_new: int) -> tuple[int, IntArray]:

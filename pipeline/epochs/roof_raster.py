@@ -91,7 +91,8 @@ def compare_roofs(faces: RoofFaces, groups: RoofGroups, uniform_share: float, ve
         `uniform_share` of it reaches or surpasses, 0 where it has no one sign; the same where it counts, else 0 (the
         shift); mean absolute difference; areas added, removed, raised, lowered, and with another form (off
         the shift); volume gained, lost, and of the parts with another form or outline; largest rise and drop of parts
-        that count; area of parts with another form or outline on rough faces. Median and mean are nan where there is no common roof.
+        that count; area of parts with another form or outline on rough faces. Median and mean are nan where there is no
+        common roof.
     """
     figures = np.zeros((len(groups.starts) - 1, N_FIGURES))
     _compare_all(
@@ -137,8 +138,8 @@ def _compare_all(
     for group in range(len(starts) - 1):
         west, south = boxes[group, 0], boxes[group, 1]
         cell = width_m[group] / CELLS_A_WIDTH
-        columns = int(math.ceil((boxes[group, 2] - west) / cell)) + 1
-        rows = int(math.ceil((boxes[group, 3] - south) / cell)) + 1
+        columns = math.ceil((boxes[group, 2] - west) / cell) + 1
+        rows = math.ceil((boxes[group, 3] - south) / cell) + 1
         while columns * rows > MOST_CELLS:
             cell *= 2.0
             columns, rows = columns // 2 + 1, rows // 2 + 1
@@ -177,8 +178,8 @@ def _fill(
     low, high = xy[first, 1], xy[first, 1]
     for corner in range(first, last):
         low, high = min(low, xy[corner, 1]), max(high, xy[corner, 1])
-    row_from = max(0, int(math.floor((low - south) / cell - 0.5)))
-    row_to = min(rows, int(math.ceil((high - south) / cell + 0.5)))
+    row_from = max(0, math.floor((low - south) / cell - 0.5))
+    row_to = min(rows, math.ceil((high - south) / cell + 0.5))
     crossings = np.empty(last - first)
     for row in range(row_from, row_to):
         y = south + (row + 0.5) * cell
@@ -194,8 +195,8 @@ def _fill(
             continue
         crossings[:count].sort()
         for pair in range(0, count - 1, 2):
-            column_from = max(0, int(math.ceil((crossings[pair] - west) / cell - 0.5)))
-            column_to = min(columns, int(math.ceil((crossings[pair + 1] - west) / cell - 0.5)))
+            column_from = max(0, math.ceil((crossings[pair] - west) / cell - 0.5))
+            column_to = min(columns, math.ceil((crossings[pair + 1] - west) / cell - 0.5))
             for column in range(column_from, column_to):
                 x = west + (column + 0.5) * cell
                 z = planes[face, 2] + planes[face, 3] * (x - planes[face, 0]) + planes[face, 4] * (y - planes[face, 1])
@@ -244,9 +245,9 @@ def _figures_of(
         ordered = np.sort(values[:count])
         # of an even number the mean of the middle two, so that exchanging the epochs only turns the sign
         median = 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2])
-        rank = int(math.floor((1.0 - share) * (count - 1)))
+        rank = math.floor((1.0 - share) * (count - 1))
         lowest, highest = ordered[rank], ordered[count - 1 - rank]
-        uniform = lowest if lowest > 0.0 else (highest if highest < 0.0 else 0.0)
+        uniform = lowest if lowest > 0.0 else min(highest, 0.0)
         moved = uniform if abs(uniform) >= least_m else 0.0
         figures[COMMON_M2] = count * area
         figures[MEDIAN_M], figures[UNIFORM_M], figures[SHIFT_M] = median, uniform, moved

@@ -122,9 +122,7 @@ def read_settings(path: str | None, options: Mapping[str, Any]) -> DiffSettings:
         table = dict(found)
     table.update({name: value for name, value in options.items() if value is not None})
     faults: list[str] = []
-    settings = build(DiffSettings, TABLE, table, faults)
-    if faults:
+    settings: DiffSettings | None = build(DiffSettings, TABLE, table, faults)
+    if faults or settings is None:
         raise SettingsError(faults)
-    if not isinstance(settings, DiffSettings):
-        raise AssertionError("build gives settings or faults")
     return settings

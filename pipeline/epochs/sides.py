@@ -93,7 +93,7 @@ def side_of(buildings: Buildings, group: IntArray, count: int, vertical_unit_m: 
 
     def total(values: FloatArray) -> FloatArray:
         known = np.isfinite(values)
-        sums = np.bincount(group[known], weights=values[known], minlength=count)
+        sums = np.bincount(group[known], weights=values[known], minlength=count).astype(np.float64)
         sums[np.bincount(group[known], minlength=count) == 0] = np.nan
         return sums
 

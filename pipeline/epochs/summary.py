@@ -57,7 +57,7 @@ class Summary:
         self.doubts: Counter[str] = Counter()
         self.without_doubt: Counter[str] = Counter()
         self.flags: Counter[str] = Counter()
-        self.sums: dict[str, Counter[str]] = {name: Counter() for name in SUMS}
+        self.sums: dict[str, dict[str, float]] = {name: dict.fromkeys(Change, 0.0) for name in SUMS}
         self.heights: IntArray = np.zeros(len(HEIGHT_EDGES_M) - 1, np.int64)
         self.acquired: dict[str, dt.datetime] = {}
         self._level: IntArray = np.zeros(2 * _REACH_MM + 1, np.int64)
@@ -67,9 +67,9 @@ class Summary:
         """Take in the rows of one part."""
         self.reasons.update(_counted(table["reason"]))
         self.relations.update(_counted(table["relation"]))
-        self.flags.update({
-            name: int(pc.sum(table[name]).as_py() or 0) for name in ("is_raised", "is_lowered", "is_reshaped")
-        })
+        self.flags.update(
+            {name: int(pc.sum(table[name]).as_py() or 0) for name in ("is_raised", "is_lowered", "is_reshaped")}
+        )
         for change, count in sorted(_counted(table["change"]).items()):
             rows = table.filter(pc.equal(table["change"], change))
             self.rows[change] += count

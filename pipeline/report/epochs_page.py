@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from pipeline.epochs.records import CHANGES, DOUBTS, INCOMPARABLE, Change, Doubt
 from pipeline.epochs.settings import DiffSettings
 from pipeline.epochs.summary import HEIGHT_EDGES_M, LARGEST
 from pipeline.epochs.writing import PARQUET
+from pipeline.evaluation.chapters import NOTHING as _NOTHING
 from pipeline.io.storage import LocalStorage
 from pipeline.report.epochs_map import COLOURS, MOST_CHANGED, MapRows
 from pipeline.report.epochs_pictures import HEIGHT_PX, NEW_LINE, OLD_LINE, WIDTH_PX, Case, cases
@@ -24,7 +25,6 @@ from pipeline.report.svg_chart import Axis, Ordinate, histogram_svg
 
 PAGE = "changes.html"
 """The file."""
-_NOTHING = "–"
 _DIGITS = 12
 
 _CELLS: tuple[tuple[str, str, int, bool], ...] = (
@@ -64,7 +64,7 @@ def page(diff: Diff, rows: MapRows) -> str:
     listed = [_row(row) for row in largest.to_pylist()]
     changed = sum(one["rows"] for name, one in told["changes"].items() if name != Change.UNCHANGED.value)
     return page_template("epochs.html").render(
-        title=f"{_name(diff.old)} to {_name(diff.new)}",
+        title=" to ".join(_names_of(diff.old.run_dir, diff.new.run_dir)),
         subject=_subject(diff),
         warnings=diff.warnings,
         cards=[(name, told["changes"][name.value], COLOURS[name], CHANGES[name]) for name in Change],
@@ -89,8 +89,17 @@ def page(diff: Diff, rows: MapRows) -> str:
     )
 
 
-def _name(epoch: Epoch) -> str:
-    return Path(epoch.run_dir.rstrip("/")).name or epoch.run_dir
+def _names_of(old: str, new: str) -> tuple[str, str]:
+    """The ends of two paths from where they differ on.
+
+    >>> _names_of("surveys/2019/run", "surveys/2024/run"), _names_of("a/old", "b/new")
+    (('2019', '2024'), ('old', 'new'))
+    """
+    before, after = (list(PurePath(path).parts) for path in (old, new))
+    while len(before) > 1 and len(after) > 1 and before[-1] == after[-1]:
+        before.pop()
+        after.pop()
+    return before[-1] if before else old, after[-1] if after else new
 
 
 def _subject(diff: Diff) -> str:

@@ -58,7 +58,9 @@ class _Model:
     faces: tuple[ViewedFace, ...]
 
 
-def cases(largest: pa.Table, old: Epoch, new: Epoch, old_filesystem: Any = None, new_filesystem: Any = None) -> list[Case]:
+def cases(
+    largest: pa.Table, old: Epoch, new: Epoch, old_filesystem: Any = None, new_filesystem: Any = None
+) -> list[Case]:
     """The largest changes of each class with their pictures, class by class.
 
     Parameters
@@ -123,9 +125,7 @@ def _case(row: Mapping[str, Any], before: list[_Model], after: list[_Model]) -> 
     )
 
 
-def _plan(
-    row: Mapping[str, Any], before: list[_Model], after: list[_Model], bounds: FloatArray
-) -> tuple[bytes, float]:
+def _plan(row: Mapping[str, Any], before: list[_Model], after: list[_Model], bounds: FloatArray) -> tuple[bytes, float]:
     """The outlines of both epochs over one another, and the width of the picture in metres."""
     figure, axes = blank(WIDTH_PX, HEIGHT_PX)
     colour = COLOURS[Change(row["change"])]
@@ -133,7 +133,11 @@ def _plan(
     axes.add_collection(PathCollection(paths_of(shape), facecolors=f"{colour}30", edgecolors="none"), autolim=False)
     for models, line, dashes in ((before, OLD_LINE, (0, (4, 2))), (after, NEW_LINE, "solid")):
         drawn = PathCollection(
-            paths_of([one.outline for one in models]), facecolors="none", edgecolors=line, linewidths=1.6, linestyles=dashes
+            paths_of([one.outline for one in models]),
+            facecolors="none",
+            edgecolors=line,
+            linewidths=1.6,
+            linestyles=dashes,
         )
         axes.add_collection(drawn, autolim=False)
     width_m = _frame(axes, bounds[:2], bounds[2:])
