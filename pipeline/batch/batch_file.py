@@ -29,6 +29,7 @@ from pipeline.export.tile import MESHES
 from pipeline.parameters import Parameters, build, parameter
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.run import RunRequest
+from pipeline.runtime.tls import given_tls
 from pipeline.settings import RunSettings
 
 
@@ -72,6 +73,13 @@ class ClusterTable(Parameters):
         2, "Processes of the embedded cluster; 0 runs serially in the driver.", minimum=0, maximum=1024
     )
     scheduler: str = parameter("", "A Dask scheduler to use in place of the embedded cluster.")
+    tls_ca: str = parameter("", "Certificate of the CA of all the cluster's processes, PEM; with tls_cert.")
+    tls_cert: str = parameter("", "The driver's certificate, PEM.")
+    tls_key: str = parameter("", "The driver's private key, PEM; empty where it lies with the certificate.")
+    performance_report: str = parameter("", "A page about the time of the workers, HTML; empty writes none.")
+    metrics_port: int = parameter(
+        0, "Shows the run's figures to Prometheus on this port of 127.0.0.1; 0 shows none.", minimum=0, maximum=65535
+    )
     isolate: bool = parameter(
         True, "Model buildings in supervised processes of their own, so that a bad one costs only itself."
     )
@@ -155,6 +163,9 @@ class Batch:
             scheduler=self.cluster.scheduler or None,
             meshes=self.output.meshes,
             licence=self.inputs.licence or None,
+            traffic="batch",
+            tls=given_tls(given(self.cluster.tls_ca), given(self.cluster.tls_cert), given(self.cluster.tls_key)),
+            performance_report=given(self.cluster.performance_report),
             overwrite=self.output.overwrite,
             work=self.work_folder,
             isolate=self.cluster.isolate and bool(self.cluster.workers or self.cluster.scheduler),

@@ -121,7 +121,7 @@ def estimate(batch: Batch, read: int = 3) -> Estimate:
         buildings, told = len(given_footprints(request.footprints, plan).polygons), "the given footprints"
     else:
         buildings, told = _objects(plan, paths, read)
-    workers, limit = memory_of_workers(workers=request.workers, scheduler=request.scheduler)
+    workers, limit = memory_of_workers(workers=request.workers, scheduler=request.scheduler, tls=request.tls)
     hands = max(1, min(workers, os.cpu_count() or 1) if request.scheduler is None else workers)
     side = plan.grid.size_mm / MM
     seen = ((side + 2.0 * plan.grid.halo_mm / MM) / side) ** 2

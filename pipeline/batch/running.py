@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 
@@ -12,6 +13,7 @@ from pipeline.errors import RunCancelledError
 from pipeline.runtime.events import Event, Listener, ignore, never
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.run import RunSummary, run
+from pipeline.runtime.run_metrics import RunMetrics, both, serve_metrics
 from pipeline.runtime.work_folder import refuse_held
 
 _READ = 1
@@ -50,6 +52,21 @@ def run_batch(
     planned = estimate(batch, _READ)
     refuse(planned)
     status = StatusWriter(batch.work_folder, str(batch.path), batch.out, planned.stage_s)
+    with contextlib.ExitStack() as shown:
+        if batch.cluster.metrics_port:
+            shown.callback(serve_metrics(batch.cluster.metrics_port))
+            on_event = both(RunMetrics(), on_event)
+        return _told(batch, status, on_event, executor, cancelled)
+
+
+def _told(
+    batch: Batch,
+    status: StatusWriter,
+    on_event: Listener,
+    executor: Executor | None,
+    cancelled: Callable[[], bool],
+) -> RunSummary:
+    """Run a batch and keep its status."""
 
     def listen(event: Event) -> None:
         status.on_event(event)

@@ -8,7 +8,7 @@ from pipeline.cli.batching import plan, run, status
 from pipeline.cli.differing import diff
 
 batch = typer.Typer(
-    help="City-scale runs from one file: planned, watched, resumed, done again for what changed only; and their changes.",
+    help="City-scale runs from one file: planned, watched, resumed, repeated for what changed; and what changed.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )

@@ -74,7 +74,9 @@ def parts_of(xy: FloatArray, most: int = ROWS_A_PART) -> Iterator[IntArray]:
         axis = int(span[1] > span[0])
         middle = float(np.median(xy[part, axis]))
         low = xy[part, axis] < middle
-        if len(part) <= most or span[axis] == 0.0 or not low.any():
+        if not low.any():  # more than half of them lie at the low end
+            low = xy[part, axis] <= middle
+        if len(part) <= most or span[axis] == 0.0:
             yield part
             continue
         stack += [part[~low], part[low]]

@@ -390,7 +390,7 @@ class DaskExecutor:
             raise VersionMismatchError(mismatch_told(faults))
 
 
-def memory_of_workers(*, workers: int, scheduler: str | None) -> tuple[int, int | None]:
+def memory_of_workers(*, workers: int, scheduler: str | None, tls: TlsFiles | None = None) -> tuple[int, int | None]:
     """How many workers a run would have now, and the memory limit of the smallest; nothing is started.
 
     Raises
@@ -405,7 +405,7 @@ def memory_of_workers(*, workers: int, scheduler: str | None) -> tuple[int, int 
 
         # as LocalCluster shares it out among workers of one thread
         return workers, int(MEMORY_LIMIT / workers)
-    with DaskExecutor(Cluster(scheduler=scheduler)) as executor:
+    with DaskExecutor(Cluster(scheduler=scheduler, tls=tls)) as executor:
         return executor.worker_count, executor.memory_limit_bytes
 
 

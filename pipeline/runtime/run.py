@@ -30,6 +30,7 @@ from pipeline.runtime.logs import about
 from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, read_manifest, write_manifest
 from pipeline.runtime.overrides import read_overrides
 from pipeline.runtime.plan import Plan, check_memory, make_plan
+from pipeline.runtime.priorities import Traffic
 from pipeline.runtime.progress import Progress
 from pipeline.runtime.publish import QUARANTINE
 from pipeline.runtime.scratch import Scratch
@@ -77,6 +78,8 @@ class RunRequest:
     """Address of a Dask scheduler that takes the place of the embedded cluster."""
     tls: TlsFiles | None = None
     """Certificates for the cluster's traffic; by default those of the environment."""
+    traffic: Traffic = "interactive"
+    """Whether somebody waits for the run; tasks of a `batch` go behind where workers are scarce."""
     performance_report: str | None = None
     """Gets a page about the workers' time; none by default."""
     meshes: str = "building"
@@ -270,6 +273,7 @@ def run_variants(
             workers=request.workers,
             scheduler=request.scheduler,
             local_directory=str(Path(scratch.root, "dask")),
+            traffic=request.traffic,
             tls=request.tls,
             performance_report=request.performance_report,
         )

@@ -37,7 +37,15 @@ def generator() -> ModuleType:
     return module
 
 
-GENERATED = ("settings.md", "command_line.md", "exit_codes.md", "validity.md", "service.md", "measures.md")
+GENERATED = (
+    "settings.md",
+    "batch_file.md",
+    "command_line.md",
+    "exit_codes.md",
+    "validity.md",
+    "service.md",
+    "measures.md",
+)
 
 
 @pytest.mark.parametrize("page", GENERATED)

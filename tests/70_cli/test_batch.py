@@ -90,7 +90,7 @@ def test_what_does_not_fit_is_refused_before_anything_runs(
 def test_a_tile_that_no_worker_can_hold_is_refused(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def small(*, workers: int, scheduler: str | None) -> tuple[int, int | None]:
+    def small(**_: object) -> tuple[int, int | None]:
         return 2, 1_000_000
 
     monkeypatch.setattr("pipeline.batch.estimates.memory_of_workers", small)
