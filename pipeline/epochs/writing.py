@@ -40,7 +40,8 @@ def parquet_sink(storage: LocalStorage, reference: SpatialReference) -> Iterator
     column = geo["columns"]["geometry"]
     with _writing(storage, PARQUET) as path:
         schema = SCHEMA.append(_BBOX)
-        with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        # without Arrow's own copy of the schema, which would hide the metadata that are known only at the end
+        with pq.ParquetWriter(path, schema, compression="zstd", store_schema=False) as writer:
 
             def take_in(table: pa.Table) -> None:
                 geometries = shapely.from_wkb(np.array(table["geometry"].to_pylist(), dtype=object))
