@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-VOID = {"meta", "img", "rect", "line", "circle", "polyline", "br"}
+VOID = {"meta", "img", "rect", "line", "circle", "polyline", "br", "input"}
 
 
 class Reader(HTMLParser):
