@@ -15,6 +15,8 @@ import typer
 
 from pipeline.batch.batch_file import TABLES
 from pipeline.console import EXIT_CODES
+from pipeline.epochs import records as changes_of
+from pipeline.epochs.settings import DiffSettings
 from pipeline.evaluation.chapters import TITLES
 from pipeline.evaluation.definitions import DEFINITIONS
 from pipeline.methods import METHODS
@@ -329,6 +331,72 @@ def batch_file() -> str:
     return "\n".join(lines) + "\n"
 
 
+def setting_row(field: dataclasses.Field[Any]) -> list[object]:
+    """A threshold of `gablework batch diff`."""
+    return [f"`{field.name}`", toml(field.default), field.metadata["unit"], allowed(field), field.metadata["doc"]]
+
+
+def changes() -> str:
+    """The page of changes: classes, columns, reasons, doubts, thresholds."""
+
+    def words(meanings: Mapping[Any, str]) -> list[list[object]]:
+        return [[f"`{word.value}`", meaning] for word, meaning in meanings.items()]
+
+    columns: list[list[object]] = [
+        [f"`{name}`", str(kind).replace("list<item: ", "list<").split("[")[0], meaning]
+        for name, kind, meaning in changes_of.COLUMNS
+    ]
+    lines = [
+        NOTE,
+        "# Changes between two epochs",
+        "",
+        "What `gablework batch diff` writes: [how to use it](../how_to/compare_epochs.md). A row of `changes.parquet`",
+        "is a building, or several that belong together because the epochs divide what stands there in another way.",
+        "`changes.geojson` has the same columns as properties, `changes.json` the sums and what is to be known.",
+        "",
+        "## Classes",
+        "",
+        *table(["`change`", "meaning"], words(changes_of.CHANGES)),
+        "",
+        "A building may be raised or lowered *and* reshaped: `is_raised`, `is_lowered` and `is_reshaped` tell all that",
+        "holds, `change` what moved more volume.",
+        "",
+        "## Reasons",
+        "",
+        "Why a building is `not_comparable`. The list is closed; of several reasons the first is told.",
+        "",
+        *table(["`reason`", "meaning"], words(changes_of.INCOMPARABLE)),
+        "",
+        "## Doubts",
+        "",
+        "What makes a verdict less certain than others; the list is closed, a row may have several.",
+        "",
+        *table(["`doubts`", "meaning"], words(changes_of.DOUBTS)),
+        "",
+        "## Relations",
+        "",
+        *table(["`relation`", "meaning"], words(changes_of.RELATIONS)),
+        "",
+        "## Columns",
+        "",
+        "Columns that end in `_m`, `_m2`, `_m3` are metres whatever the CRS; geometry is in the CRS's own units. Figures",
+        "of an epoch that has nothing there, and of models that do not exist, are null. A column `bbox` covers the",
+        "geometry.",
+        "",
+        *table(["column", "type", "meaning"], columns),
+        "",
+        "## Thresholds",
+        "",
+        "The table `[diff]` of a `--settings` file; it holds only what differs.",
+        "",
+        *table(
+            ["setting", "default", "unit", "allowed", "meaning"],
+            [setting_row(field) for field in dataclasses.fields(DiffSettings)],
+        ),
+    ]
+    return "\n".join(lines) + "\n"
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "settings.md": settings,
     "batch_file.md": batch_file,
@@ -337,6 +405,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "validity.md": validity,
     "service.md": service,
     "measures.md": measures,
+    "changes.md": changes,
 }
 """The generated pages by file name."""
 

@@ -12,6 +12,7 @@ from types import ModuleType
 
 import pytest
 
+from pipeline.epochs.settings import DiffSettings, read_settings
 from pipeline.export.records import SCHEMAS
 from pipeline.io import SpatialReference
 from pipeline.methods.fuzzy_sart import FuzzySartSettings
@@ -45,6 +46,7 @@ GENERATED = (
     "validity.md",
     "service.md",
     "measures.md",
+    "changes.md",
 )
 
 
@@ -117,11 +119,27 @@ def is_overrides(block: str) -> bool:
     return "[[building]]" in block
 
 
-@pytest.mark.parametrize(("page", "block"), [(page, block) for page, block in toml_blocks() if not is_overrides(block)])
+def is_of_a_comparison(block: str) -> bool:
+    return block.startswith("[diff]")
+
+
+@pytest.mark.parametrize(
+    ("page", "block"),
+    [(page, block) for page, block in toml_blocks() if not is_overrides(block) and not is_of_a_comparison(block)],
+)
 def test_a_settings_file_of_the_docs_is_valid(page: str, block: str) -> None:
     settings = RunSettings.from_mapping(tomllib.loads(block)["settings"])
     if page == "docs/methods/fuzzy_sart.md":
         assert settings.building.method == FuzzySartSettings.faithful()
+
+
+def test_the_thresholds_of_the_docs_are_valid(tmp_path: Path) -> None:
+    blocks = [block for _, block in toml_blocks() if is_of_a_comparison(block)]
+    assert blocks
+    for block in blocks:
+        path = tmp_path / "diff.toml"
+        path.write_text(block)
+        assert read_settings(str(path), {}) != DiffSettings()
 
 
 def test_the_overrides_files_of_the_docs_are_valid() -> None:

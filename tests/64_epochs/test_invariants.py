@@ -1,4 +1,4 @@
-"""What must not depend on which epoch comes first, on the order of rows, on tiles, on where the scene lies, on units."""
+"""What must not depend on which epoch comes first, on the order of rows, on tiles, on place and units."""
 
 from __future__ import annotations
 
@@ -15,7 +15,16 @@ from pipeline.epochs.settings import DiffSettings
 from pipeline.model import BuildingResult
 from pipeline.synthetic.roofs import RoofShape
 
-MIRRORED = {"new": "gone", "gone": "new", "raised": "lowered", "lowered": "raised"}
+MIRRORED = {
+    "new": "gone",
+    "gone": "new",
+    "raised": "lowered",
+    "lowered": "raised",
+    "only_old": "only_new",
+    "only_new": "only_old",
+    "split": "merged",
+    "merged": "split",
+}
 PAIRS = (
     *(("old", "new"), ("added", "removed"), ("raised_m2", "lowered_m2"), ("gained", "lost"), ("max_raise", "max_drop")),
     ("is_raised", "is_lowered"),
@@ -67,14 +76,9 @@ def mirrored(row: dict[str, Any]) -> dict[str, Any]:
                 other = name.replace(first, "*").replace(second, first).replace("*", second)
                 break
         if name in SIGNED and value is not None:
-            value = -value + 0.0
-        if name == "change":
-            value = MIRRORED.get(value, value)
-        if name == "relation":
-            value = {"only_old": "only_new", "only_new": "only_old", "split": "merged", "merged": "split"}.get(
-                value, value
-            )
-        found[other] = value
+            found[other] = -value + 0.0
+        else:
+            found[other] = MIRRORED.get(value, value) if name in {"change", "relation"} else value
     found.pop("change_id")
     return found
 
@@ -128,7 +132,7 @@ def test_moving_the_scene_moves_the_result(tmp_path: Path) -> None:
     here, there = found
     for name, row in here.items():
         assert figures(row) == figures(there[name]), name
-        moved = shapely.transform(shapely.from_wkb(row["geometry"]), lambda xy: xy + [3_217.0, -1_044.0])
+        moved = shapely.transform(shapely.from_wkb(row["geometry"]), lambda xy: xy + np.array([3_217.0, -1_044.0]))
         assert shapely.equals_exact(moved, shapely.from_wkb(there[name]["geometry"]), tolerance=1e-6, normalize=True)
 
 
