@@ -75,9 +75,34 @@ def with_password(url: str, password: str) -> str:
     return urlunsplit(parts._replace(netloc=f"{user}:{quote(password, safe='')}@{host}"))
 
 
+DASK_TLS: Mapping[str, tuple[str, ...]] = {
+    "GABLEWORK_TLS_CA": ("CA_FILE",),
+    "GABLEWORK_TLS_CERT": ("SCHEDULER__CERT", "WORKER__CERT", "CLIENT__CERT"),
+    "GABLEWORK_TLS_KEY": ("SCHEDULER__KEY", "WORKER__KEY", "CLIENT__KEY"),
+}
+"""What Dask's own scheduler calls the certificates of the cluster."""
+
+
+def dask_tls_of(given: Mapping[str, str]) -> dict[str, str]:
+    """Our names of the certificates in Dask's words, so that all roles are told alike; then it speaks TLS only.
+
+    >>> dask_tls_of({"GABLEWORK_TLS_CA": "/run/secrets/ca"})
+    {'DASK_DISTRIBUTED__COMM__TLS__CA_FILE': '/run/secrets/ca', 'DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION': 'True'}
+    >>> dask_tls_of({})
+    {}
+    """
+    named = {
+        f"DASK_DISTRIBUTED__COMM__TLS__{theirs}": given[ours]
+        for ours, names in DASK_TLS.items()
+        for theirs in names
+        if given.get(ours)
+    }
+    return {**named, "DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION": "True"} if named else {}
+
+
 def environment_of(given: Mapping[str, str]) -> dict[str, str]:
-    """The environment of the role: the password is read from its file."""
-    wanted = dict(given)
+    """The environment of the role: the password is read from its file, certificates are told to Dask."""
+    wanted = {**dask_tls_of(given), **given}
     secret = wanted.pop("GABLEWORK_DATABASE_PASSWORD_FILE", "")
     if secret:
         try:

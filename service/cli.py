@@ -141,8 +141,9 @@ def serve(
             input_hosts=input_host,
         )
 
-        # told here, not by a driver that is started again and again
-        given_tls(settings.tls_ca, settings.tls_cert, settings.tls_key)
+        if driver:
+            # told here, not by a driver that is started again and again
+            given_tls(settings.tls_ca, settings.tls_cert, settings.tls_key)
 
         def on_ready(url: str) -> None:
             console.say(f"gablework listens on {url}")

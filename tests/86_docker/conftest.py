@@ -10,7 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).parent))
 
-from container_files import Compose, Image, read_compose, read_image
+from container_files import Compose, Image, laid_over, read_compose, read_image
 from processes import open_folder, postgres_server, programs
 
 __all__ = ["open_folder", "postgres_server", "programs"]
@@ -34,3 +34,11 @@ def image() -> Image:
 def compose() -> Compose:
     """docker/compose.yaml."""
     return read_compose(ROOT / "docker" / "compose.yaml")
+
+
+@pytest.fixture(scope="session", params=["", "tls", "s3", "tls s3"], ids=["alone", "tls", "s3", "tls and s3"])
+def composed_files(request: pytest.FixtureRequest, compose: Compose) -> Compose:
+    """docker/compose.yaml alone, and with the files that may be laid over it."""
+    for name in request.param.split():
+        compose = laid_over(compose, read_compose(ROOT / "docker" / f"compose.{name}.yaml"))
+    return compose

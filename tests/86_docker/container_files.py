@@ -107,6 +107,20 @@ def read_compose(path: Path) -> Compose:
     return loaded
 
 
+def laid_over(base: Compose, other: Compose) -> dict[str, Any]:
+    """One compose file on top of another: mappings unite, lists grow, but a command takes the place of the other."""
+    united = dict(base)
+    for name, value in other.items():
+        below = united.get(name)
+        if isinstance(value, Mapping) and isinstance(below, Mapping):
+            united[name] = laid_over(below, value)
+        elif isinstance(value, list) and isinstance(below, list) and name != "command":
+            united[name] = [*below, *(entry for entry in value if entry not in below)]
+        else:
+            united[name] = value
+    return united
+
+
 def sent_to_the_builder(path: str, rules: str) -> bool:
     """Whether a file of the context passes .dockerignore: the last rule that matches it or a folder above decides."""
     sent = True

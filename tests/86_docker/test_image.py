@@ -13,10 +13,12 @@ from types import ModuleType
 
 import pytest
 import typer
-from container_files import Compose, Image, sent_to_the_builder
+from container_files import Compose, Image, read_compose, sent_to_the_builder
+from moto.server import ThreadedMotoServer
 from processes import program
 
 from pipeline import __version__
+from pipeline.runtime.tls import DASK_VARIABLES, VARIABLES
 from service.cli import app
 from service.settings import ServiceSettings
 
@@ -45,10 +47,11 @@ def test_hadolint_finds_nothing(root: Path) -> None:
     assert (found.returncode, found.stdout) == (0, "")
 
 
-def test_the_compose_file_keeps_the_schema(root: Path) -> None:
+@pytest.mark.parametrize("name", ["compose.yaml", "compose.tls.yaml", "compose.s3.yaml"])
+def test_the_compose_file_keeps_the_schema(root: Path, name: str) -> None:
     schema = ["--builtin-schema", "vendor.compose-spec"]
     found = subprocess.run(
-        [program("check-jsonschema"), *schema, root / "docker" / "compose.yaml"],
+        [program("check-jsonschema"), *schema, root / "docker" / name],
         capture_output=True,
         text=True,
         check=False,
@@ -92,6 +95,11 @@ def test_the_base_images_are_pinned_to_a_version_and_a_distribution(image: Image
     assert image.stage("environment").base == image.last.base
 
 
+def test_no_image_is_whatever_is_newest(composed_files: Compose) -> None:
+    images = {service["image"] for service in composed_files["services"].values()}
+    assert all(re.fullmatch(r"[\w/]+:\d[\w.-]*", image) for image in images), images
+
+
 def test_libraries_are_installed_by_hash(image: Image) -> None:
     (install, *_) = image.stage("environment").all("RUN")
     assert install.text.count("--require-hashes") == len(re.findall(r"pip install", install.text)) == 2
@@ -99,13 +107,13 @@ def test_libraries_are_installed_by_hash(image: Image) -> None:
         assert "pip install" not in one.text or "--no-index" in one.text
 
 
-def test_the_image_runs_as_a_user_without_rights(image: Image, compose: Compose) -> None:
+def test_the_image_runs_as_a_user_without_rights(image: Image, composed_files: Compose) -> None:
     user = image.last.only("USER").text
     assert re.fullmatch(r"[1-9]\d{4}:[1-9]\d{4}", user)
     assert f"--uid {user.split(':')[0]}" in image.last.only("RUN").text
     names = [one.name for one in image.last.instructions]
     assert "RUN" not in names[names.index("USER") :]
-    for name, service in compose["services"].items():
+    for name, service in composed_files["services"].items():
         assert service["read_only"] is True, name
         assert service["cap_drop"] == ["ALL"], name
         assert service["security_opt"] == ["no-new-privileges:true"], name
@@ -114,25 +122,29 @@ def test_the_image_runs_as_a_user_without_rights(image: Image, compose: Compose)
         assert service["deploy"]["resources"]["limits"]["memory"], name
 
 
-def test_only_the_api_is_published_and_only_on_this_machine(compose: Compose) -> None:
-    published = {name: service["ports"] for name, service in compose["services"].items() if "ports" in service}
+def test_only_the_api_is_published_and_only_on_this_machine(composed_files: Compose) -> None:
+    published = {name: service["ports"] for name, service in composed_files["services"].items() if "ports" in service}
     assert published == {"api": ["127.0.0.1:8000:8000"]}
-    assert compose["networks"]["inside"] == {"internal": True}
-    for name in ("postgres", "scheduler", "worker"):
-        assert compose["services"][name]["networks"] == ["inside"], name
+    assert composed_files["networks"]["inside"] == {"internal": True}
+    for name in composed_files["services"].keys() - {"api", "driver"}:
+        assert composed_files["services"][name]["networks"] == ["inside"], name
 
 
-def test_no_secret_is_in_the_environment(image: Image, compose: Compose) -> None:
-    given = {name: dict(service.get("environment", {})) for name, service in compose["services"].items()}
+def test_no_secret_is_in_the_environment(image: Image, composed_files: Compose) -> None:
+    given = {name: dict(service.get("environment", {})) for name, service in composed_files["services"].items()}
     given["image"] = dict(image.last.environment)
     for name, variables in given.items():
         for variable, value in variables.items():
-            if "PASSWORD" in variable or "SECRET" in variable or "KEY" in variable:
-                assert variable.endswith("_FILE"), f"{name} {variable}"
+            if any(word in variable for word in ("PASSWORD", "SECRET", "KEY", "CREDENTIALS", "CERT", "TLS")):
                 assert value.startswith("/run/secrets/"), f"{name} {variable}"
             assert not re.search(r"://[^/@]*:[^/@]*@", value), f"{name} {variable}"
-    names = {Path(value).name for variables in given.values() for v, value in variables.items() if v.endswith("_FILE")}
-    assert names == set(compose["secrets"])
+    # each service that reads a secret has it, and no other
+    for name, service in composed_files["services"].items():
+        words = [*given[name].values(), *service.get("command", [])]
+        read = {Path(word.rpartition("=")[2]).name for word in words if "/run/secrets/" in word}
+        assert read == set(service.get("secrets", [])), name
+    used = {secret for service in composed_files["services"].values() for secret in service.get("secrets", [])}
+    assert used == set(composed_files["secrets"])
 
 
 def test_every_service_of_ours_is_a_role(compose: Compose, entrypoint: ModuleType) -> None:
@@ -145,36 +157,38 @@ def test_the_default_command_is_a_role(image: Image, entrypoint: ModuleType) -> 
     assert image.last.only("CMD").words[0] in entrypoint.ROLES
 
 
-def test_every_role_is_a_command_that_exists_with_options_that_exist(compose: Compose, entrypoint: ModuleType) -> None:
+def test_every_role_is_a_command_that_exists_with_options_that_exist(
+    composed_files: Compose, entrypoint: ModuleType
+) -> None:
     commands = dict(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
     for role in ("api", "driver", "worker"):
-        _, command, *options = entrypoint.command_of(compose["services"][role]["command"])
+        _, command, *options = entrypoint.command_of(composed_files["services"][role]["command"])
         context = commands[command].make_context(command, list(options), resilient_parsing=False)
         assert context.command.name == command
     help_text = subprocess.run([program("dask"), "scheduler", "--help"], capture_output=True, text=True, check=True)
-    words = entrypoint.command_of(compose["services"]["scheduler"]["command"])
+    words = entrypoint.command_of(composed_files["services"]["scheduler"]["command"])
     assert words[:2] == ("dask", "scheduler")
     assert [word for word in words if word.startswith("--") and f"{word} " not in help_text.stdout] == []
 
 
-def test_every_variable_is_a_setting(image: Image, compose: Compose) -> None:
+def test_every_variable_is_a_setting(image: Image, composed_files: Compose) -> None:
     known = {f"GABLEWORK_{name.upper()}" for name in ServiceSettings.model_fields}
-    known |= {"GABLEWORK_KERNELS", "GABLEWORK_DATABASE_PASSWORD_FILE"}
+    known |= {"GABLEWORK_KERNELS", "GABLEWORK_DATABASE_PASSWORD_FILE", *VARIABLES.values()}
     given = set(image.last.environment)
     for role in OURS:
-        given |= set(compose["services"][role].get("environment", {}))
+        given |= set(composed_files["services"][role].get("environment", {}))
     assert {name for name in given if name.startswith("GABLEWORK_")} - known == set()
 
 
-def test_a_role_has_as_long_to_stop_as_it_may_take(compose: Compose) -> None:
-    services = compose["services"]
+def test_a_role_has_as_long_to_stop_as_it_may_take(composed_files: Compose) -> None:
+    services = composed_files["services"]
     drain_s = float(services["driver"]["environment"]["GABLEWORK_DRAIN_S"])
     for role in ("driver", "worker"):
         assert float(services[role]["stop_grace_period"].removesuffix("s")) > drain_s
 
 
-def test_a_worker_and_its_building_fit_into_the_container(compose: Compose) -> None:
-    services = compose["services"]
+def test_a_worker_and_its_building_fit_into_the_container(composed_files: Compose) -> None:
+    services = composed_files["services"]
     limit = services["worker"]["deploy"]["resources"]["limits"]["memory"]
     command = services["worker"]["command"]
     worker = command[command.index("--memory-limit") + 1]
@@ -214,6 +228,48 @@ def test_a_password_goes_from_its_file_into_the_url(entrypoint: ModuleType, tmp_
         entrypoint.environment_of({**given, "GABLEWORK_DATABASE_URL": "sqlite:///jobs.db"})
     with pytest.raises(SystemExit, match="No such file"):
         entrypoint.environment_of({**given, "GABLEWORK_DATABASE_PASSWORD_FILE": str(tmp_path / "none")})
+
+
+def test_certificates_are_told_to_dask_in_its_own_words(entrypoint: ModuleType) -> None:
+    given = {VARIABLES[name]: f"/run/secrets/{name}" for name in VARIABLES}
+    told = entrypoint.environment_of(given)
+    for name, theirs in DASK_VARIABLES.items():
+        assert {told[variable] for variable in theirs} == {f"/run/secrets/{name}"}
+    assert told["DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION"] == "True"
+    own = {"DASK_DISTRIBUTED__COMM__TLS__CA_FILE": "/mine"}
+    assert entrypoint.environment_of({**given, **own})["DASK_DISTRIBUTED__COMM__TLS__CA_FILE"] == "/mine"
+
+
+def test_address_and_certificates_go_together(composed_files: Compose) -> None:
+    services = composed_files["services"]
+    worker = services["worker"]["command"]
+    secure = "GABLEWORK_TLS_CA" in services["scheduler"].get("environment", {})
+    expected = f"{'tls' if secure else 'tcp'}://scheduler:8786"
+    assert worker[worker.index("--scheduler") + 1] == expected
+    assert services["driver"]["environment"]["GABLEWORK_SCHEDULER"] == expected
+    for role in ("driver", "worker"):
+        assert ("GABLEWORK_TLS_CA" in services[role].get("environment", {})) == secure
+
+
+def test_storage_is_found_by_the_variables_of_the_compose_file(root: Path, tmp_path: Path) -> None:
+    (given,) = {
+        tuple(sorted(read_compose(root / "docker" / "compose.s3.yaml")["services"][role]["environment"].items()))
+        for role in ("driver", "worker")
+    }
+    credentials = tmp_path / "s3_credentials"
+    credentials.write_text("[default]\naws_access_key_id = gablework\naws_secret_access_key = secret\n")
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    try:
+        _, port = server.get_host_and_port()
+        here = {"http://s3:8333": f"http://127.0.0.1:{port}", "/run/secrets/s3_credentials": str(credentials)}
+        env = {name: here.get(value, value) for name, value in given}
+        code = "import s3fs; fs = s3fs.S3FileSystem(); fs.mkdir('one'); fs.pipe('one/a', b'x'); print(fs.cat('one/a'))"
+        command, env = [sys.executable, "-c", code], {**env, "HOME": str(tmp_path)}
+        done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+        assert done.stdout.strip() == "b'x'", done.stderr
+    finally:
+        server.stop()
 
 
 def test_kernels_are_laid_out_once_and_can_be_written(entrypoint: ModuleType, tmp_path: Path) -> None:
