@@ -104,7 +104,7 @@ class Lookout:
     def announced(self) -> list[int] | None:
         """Memory that the workers announce, bytes, one entry a worker that does; None while no worker is there."""
         now = self._clock()
-        if now - self._asked_s >= self.memory_s:
+        if now - self._asked_s >= (self._every_s if self._announced is None else self.memory_s):
             try:
                 identity = self._client.scheduler.identity
                 found = self._client.sync(identity, n_workers=-1, callback_timeout=self._answer_s)
@@ -274,7 +274,7 @@ class Flight(Generic[Task, Result]):
         if max(self._needs[number] for number in self._large) > largest:
             self._tell_once(
                 f"tasks of {self.stage} need up to {self._most()} of memory, the largest worker has "
-                f"{largest / 2**30:.1f} GiB: they run there with all that it has, and may be marked out_of_memory"
+                f"{largest / 2**30:.1f} GiB: they run there with all that it has. Give it more, or add a larger one"
             )
         while self._large:
             need = min(self._needs[self._large[0]], largest)
