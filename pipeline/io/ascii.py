@@ -11,13 +11,13 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, SettingsError, UnreadableInputError
 from pipeline.io.gps_time import GpsTimeKind, kind_of
+from pipeline.io.readable import Readable
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
 from pipeline.model import FloatArray
 
@@ -62,7 +62,7 @@ class AsciiFile:
 
     Parameters
     ----------
-    path : Path
+    path : Readable
         The file.
     columns : str, optional
         Names of the columns, parted by spaces, such as `x y z - classification` or `x1 y1 z1 i1 x2 y2 z2 i2`;
@@ -80,7 +80,7 @@ class AsciiFile:
         If the columns do not fit the rows.
     """
 
-    def __init__(self, path: Path, columns: str | None = None, facts: FileFacts | None = None) -> None:
+    def __init__(self, path: Readable, columns: str | None = None, facts: FileFacts | None = None) -> None:
         self._path = path
         self._width = 0
         self._separator: str | None = None
@@ -147,7 +147,7 @@ class AsciiFile:
             problem = f"line {number} is {line[:60].decode(errors='replace').strip()!r}, not {self._width} numbers"
             raise UnreadableInputError(str(self._path), problem, "Remove or repair the line") from fault
 
-    def _look(self, path: Path) -> tuple[int, list[str], FloatArray]:
+    def _look(self, path: Readable) -> tuple[int, list[str], FloatArray]:
         """Lines of header, the names that the last of them gives, and the first rows."""
         names: list[str] = []
         with path.open("rb") as stream:

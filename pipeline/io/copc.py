@@ -7,7 +7,6 @@ hierarchy leads it into an endless loop.
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
@@ -16,6 +15,7 @@ from laspy.copc import CopcInfoVlr
 
 from pipeline.errors import UnreadableInputError
 from pipeline.io.laz_chunks import CHUNK_SIZE_LIMIT
+from pipeline.io.readable import Readable
 
 if TYPE_CHECKING:
     import laspy
@@ -59,7 +59,7 @@ def octree_info(header: laspy.LasHeader) -> OctreeInfo | None:
 
 
 def nodes_within(
-    path: Path, stream: BinaryIO, info: OctreeInfo, window: Window, file_size: int
+    path: Readable, stream: BinaryIO, info: OctreeInfo, window: Window, file_size: int
 ) -> npt.NDArray[np.void]:
     """The nodes that hold points and meet the window, in file order.
 

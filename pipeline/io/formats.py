@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
+from pipeline.io.readable import Readable
 
 MAGIC = {b"LASF": "las", b"ply\n": "ply", b"ply\r": "ply"}
 """Formats by their first bytes."""
@@ -32,7 +33,7 @@ VALID = "Valid are LAS and LAZ (.las, .laz, .copc.laz), PLY (.ply) and ASCII x y
 SNIFF_BYTES = 4096
 
 
-def first_bytes(path: Path) -> bytes:
+def first_bytes(path: Readable) -> bytes:
     """The first bytes of a file.
 
     Raises
@@ -58,7 +59,7 @@ def first_bytes(path: Path) -> bytes:
     return head
 
 
-def recognise_format(path: Path) -> str:
+def recognise_format(path: Readable) -> str:
     """las, ply or ascii.
 
     Raises
@@ -161,7 +162,7 @@ def _files_in(folder: Path) -> list[Path]:
     return files
 
 
-def _is_point_file(path: Path) -> bool:
+def _is_point_file(path: Readable) -> bool:
     """Whether a file found in a folder is meant, by its suffix, and text by its content."""
     suffix = path.suffix.lower()
     if path.name.startswith(".") or suffix not in POINT_SUFFIXES:

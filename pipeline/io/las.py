@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import laspy
@@ -22,6 +21,7 @@ from pipeline.io import copc
 from pipeline.io.gps_time import GpsTimeKind, kind_of
 from pipeline.io.las_header import REWRITE, header_crs, read_header_block
 from pipeline.io.laz_chunks import CHUNK_SIZE_LIMIT, ChunkTable, check_chunks, read_chunk_table
+from pipeline.io.readable import Readable
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class LasFile:
 
     Parameters
     ----------
-    path : Path
+    path : Readable
         The file.
     facts : FileFacts, optional
         Those of the same file, opened before: then neither the points of its last chunk nor a sample is decoded again.
@@ -60,7 +60,7 @@ class LasFile:
         If the header, the table of compressed chunks and the file's size do not fit one another.
     """
 
-    def __init__(self, path: Path, facts: FileFacts | None = None) -> None:
+    def __init__(self, path: Readable, facts: FileFacts | None = None) -> None:
         self._path = path
         self._warnings: list[str] = []
         self._block = read_header_block(path)

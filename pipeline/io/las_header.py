@@ -8,11 +8,11 @@ from __future__ import annotations
 import dataclasses
 import math
 import struct
-from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.crs import EPSG_UNITS_M
+from pipeline.io.readable import Readable
 
 if TYPE_CHECKING:
     import laspy
@@ -77,7 +77,7 @@ class HeaderBlock:
         return min([*later, self.file_size])
 
 
-def read_header_block(path: Path) -> HeaderBlock:
+def read_header_block(path: Readable) -> HeaderBlock:
     """The header of a LAS or LAZ file, checked.
 
     Raises
@@ -197,7 +197,7 @@ class HeaderCrs:
     """What could not be understood."""
 
 
-def header_crs(path: Path, header: laspy.LasHeader, block: HeaderBlock) -> HeaderCrs:
+def header_crs(path: Readable, header: laspy.LasHeader, block: HeaderBlock) -> HeaderCrs:
     """The CRS from WKT, which stands above GeoTIFF keys where a file has both."""
     import pyproj
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import struct
-from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 import lazrs
@@ -16,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import InconsistentInputError, UnreadableInputError
+from pipeline.io.readable import Readable
 
 if TYPE_CHECKING:
     from pipeline.io.las_header import HeaderBlock
@@ -45,7 +45,7 @@ class ChunkTable:
     """True where each chunk has a count of its own (COPC)."""
 
 
-def read_chunk_table(path: Path, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes) -> ChunkTable:
+def read_chunk_table(path: Readable, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes) -> ChunkTable:
     """The chunk table, checked against the header and the file's size without decoding a point.
 
     Raises
@@ -127,7 +127,7 @@ def _table_offset(stream: BinaryIO, block: HeaderBlock) -> int:
     return at
 
 
-def check_chunks(path: Path, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes, table: ChunkTable) -> None:
+def check_chunks(path: Readable, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes, table: ChunkTable) -> None:
     """Hold the header's count against the chunks, to the point.
 
     Raises
@@ -143,7 +143,7 @@ def check_chunks(path: Path, stream: BinaryIO, block: HeaderBlock, laszip_record
         _check_last_chunk(path, stream, block, laszip_record, table)
 
 
-def _check_layers(path: Path, stream: BinaryIO, block: HeaderBlock, table: ChunkTable) -> None:
+def _check_layers(path: Readable, stream: BinaryIO, block: HeaderBlock, table: ChunkTable) -> None:
     """Point formats 6 and above: a chunk has one record, its count, the sizes of its layers, and the layers.
 
     lazrs asks for as much memory as a layer's size says, so a damaged one must not get there.
@@ -175,7 +175,7 @@ def _check_layers(path: Path, stream: BinaryIO, block: HeaderBlock, table: Chunk
 
 
 def _check_last_chunk(
-    path: Path, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes, table: ChunkTable
+    path: Readable, stream: BinaryIO, block: HeaderBlock, laszip_record: bytes, table: ChunkTable
 ) -> None:
     """Older point formats: a chunk does not store its count, but its arithmetic coder uses up its bytes exactly.
 

@@ -9,7 +9,6 @@ import dataclasses
 import io
 import itertools
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ import numpy.typing as npt
 
 from pipeline.errors import EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.gps_time import GpsTimeKind, kind_of
+from pipeline.io.readable import Readable
 from pipeline.io.records import UNSORTED_CLASSES, FileFacts, PointRecords, Window
 
 SCALARS = {
@@ -84,7 +84,7 @@ class PlyFile:
 
     Parameters
     ----------
-    path : Path
+    path : Readable
         The file.
     facts : FileFacts, optional
         Those of the same file, opened before: then it is not read through again.
@@ -95,7 +95,7 @@ class PlyFile:
         If header and data do not fit one another, there are no vertices, or a coordinate is not finite.
     """
 
-    def __init__(self, path: Path, facts: FileFacts | None = None) -> None:
+    def __init__(self, path: Readable, facts: FileFacts | None = None) -> None:
         self._path = path
         with path.open("rb") as stream:
             self._byte_order, self._elements = _read_header(path, stream)
@@ -268,7 +268,7 @@ def _with_property(element: Element, name: str, kind: str) -> Element:
     return dataclasses.replace(element, properties=(*element.properties, (name, kind)))
 
 
-def promised_vertices(path: Path) -> int:
+def promised_vertices(path: Readable) -> int:
     """The number of vertices that the header promises; nothing else is read.
 
     Raises
@@ -281,7 +281,7 @@ def promised_vertices(path: Path) -> int:
     return _vertex_of(path, elements).count
 
 
-def _read_header(path: Path, stream: io.BufferedReader) -> tuple[str, list[Element]]:
+def _read_header(path: Readable, stream: io.BufferedReader) -> tuple[str, list[Element]]:
     """Byte order and elements; leaves the stream where the data begin."""
     byte_order: str | None = None
     elements: list[Element] = []
@@ -313,12 +313,12 @@ def _read_header(path: Path, stream: io.BufferedReader) -> tuple[str, list[Eleme
     raise UnreadableInputError(str(path), "truncated: the PLY header has no end or no format", FIX)
 
 
-def _damaged(path: Path, line: bytes) -> UnreadableInputError:
+def _damaged(path: Readable, line: bytes) -> UnreadableInputError:
     """The error for a line of the header that means nothing."""
     return UnreadableInputError(str(path), f"the PLY header has the line {line[:60]!r}", FIX)
 
 
-def _vertex_of(path: Path, elements: list[Element]) -> Element:
+def _vertex_of(path: Readable, elements: list[Element]) -> Element:
     """The vertex element, fit to be points."""
     name = str(path)
     found = [element for element in elements if element.name == "vertex"]

@@ -15,7 +15,9 @@ from pipeline.errors import CrsError, SettingsError
 from pipeline.io.crs import SpatialReference, resolve_reference
 from pipeline.io.formats import recognise_format
 from pipeline.io.gps_time import GpsTimeKind, utc_of
+from pipeline.io.readable import Readable
 from pipeline.io.records import FileFacts, PointFile, PointRecords, Window
+from pipeline.io.remote_file import file_at
 from pipeline.model import BoolArray, ByteArray, FloatArray, PointCloud
 
 if TYPE_CHECKING:
@@ -128,7 +130,7 @@ class SourceInfo:
     facts: FileFacts
     """What the file says about itself."""
 
-    def is_of(self, path: Path) -> bool:
+    def is_of(self, path: Readable) -> bool:
         """Whether a file is still the one that was looked at, by its size and its time."""
         try:
             now = path.stat()
@@ -140,23 +142,23 @@ class SourceInfo:
 class Reader(Protocol):
     """Opens a file of one format; faster with the facts of the same file, opened before."""
 
-    def __call__(self, path: Path, options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
+    def __call__(self, path: Readable, options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
         """The opened file."""
 
 
-def _open_las(path: Path, _options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
+def _open_las(path: Readable, _options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
     from pipeline.io.las import LasFile
 
     return LasFile(path, facts)
 
 
-def _open_ply(path: Path, _options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
+def _open_ply(path: Readable, _options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
     from pipeline.io.ply import PlyFile
 
     return PlyFile(path, facts)
 
 
-def _open_ascii(path: Path, options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
+def _open_ascii(path: Readable, options: ReadOptions, facts: FileFacts | None = None, /) -> PointFile:
     from pipeline.io.ascii import AsciiFile
 
     return AsciiFile(path, options.ascii_columns, facts)
@@ -175,7 +177,7 @@ class Source:
 
     Parameters
     ----------
-    path : Path
+    path : Readable
         The file.
     options : ReadOptions
         What the user says and wants.
@@ -183,7 +185,7 @@ class Source:
         Of the same file by the same options, opened before; not believed where the file was changed since.
     """
 
-    def __init__(self, path: Path, options: ReadOptions, known: SourceInfo | None = None) -> None:
+    def __init__(self, path: Readable, options: ReadOptions, known: SourceInfo | None = None) -> None:
         self._path = path
         self._options = options
         if known is not None and not known.is_of(path):
@@ -320,13 +322,15 @@ class Source:
         return 0 if beyond is None else int(beyond.sum())
 
 
-def open_source(path: str | Path, options: ReadOptions | None = None, known: SourceInfo | None = None) -> Source:
+def open_source(
+    path: str | Path | Readable, options: ReadOptions | None = None, known: SourceInfo | None = None
+) -> Source:
     """Open a LAS, LAZ, COPC, PLY or ASCII file, and check all that can be checked without reading it through.
 
     Parameters
     ----------
-    path : str or Path
-        The file.
+    path : str, Path or Readable
+        The file, or its URL.
     options : ReadOptions, optional
         Overrides and limits.
     known : SourceInfo, optional
@@ -343,10 +347,11 @@ def open_source(path: str | Path, options: ReadOptions | None = None, known: Sou
     CrsError
         The CRS is geographic or not understood.
     """
-    return Source(Path(path), options or ReadOptions(), known)
+    file = file_at(path) if isinstance(path, str | Path) else path
+    return Source(file, options or ReadOptions(), known)
 
 
-def _info_of(path: Path, file: PointFile, options: ReadOptions) -> SourceInfo:
+def _info_of(path: Readable, file: PointFile, options: ReadOptions) -> SourceInfo:
     """The facts of a file in metres, with the user's overrides."""
     facts = file.facts
     reference, told = resolve_reference(
@@ -386,7 +391,7 @@ def _info_of(path: Path, file: PointFile, options: ReadOptions) -> SourceInfo:
     )
 
 
-def _refuse_degrees(path: Path, facts: FileFacts, reference: SpatialReference) -> None:
+def _refuse_degrees(path: Readable, facts: FileFacts, reference: SpatialReference) -> None:
     """Refuse coordinates without a CRS that can only be degrees, before they are taken for metres."""
     x_min, y_min, _, x_max, y_max, _ = facts.bounds
     area = (x_max - x_min) * (y_max - y_min)

@@ -1,4 +1,8 @@
-"""Local storage: what is there is complete, because a thing gets its name only after its last byte is on the disk."""
+"""Storage: what is there is complete. In a folder a thing gets its name only after its last byte is on the disk.
+
+`Storage` is what a run directory stands on, in a folder (`LocalStorage`) or in an object store
+(`pipeline.io.object_storage`). `pipeline.io.storage_at` gives the one that a path or URL means.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,12 @@ import contextlib
 import dataclasses
 import hashlib
 import os
+import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path, PurePosixPath
+from typing import Protocol
 
 from pipeline.errors import RunError
 
@@ -26,6 +33,77 @@ def sha256_of(path: str | Path) -> str:
     return digest.hexdigest()
 
 
+def parts_of_key(key: str) -> tuple[str, ...]:
+    """The parts of a key: a relative path with forward slashes, such as `state/x85_y447.json`.
+
+    Raises
+    ------
+    RunError
+        If the key is empty, absolute or leads out of its storage.
+    """
+    parts = PurePosixPath(key)
+    if not parts.parts or parts.is_absolute() or ".." in parts.parts or "\\" in key:
+        raise RunError(f"{key!r} is no key: use a relative path with forward slashes and without ..")
+    return parts.parts
+
+
+class Puts(Protocol):
+    """Several things on their way into a storage."""
+
+    def put(self, key: str, content: bytes) -> None:
+        """Put bytes under a key now or soon; raises what became of earlier ones."""
+
+    def wait(self) -> None:
+        """Return when all that was put so far is there; raises what became of it."""
+
+
+class Storage(Protocol):
+    """Things by key, each whole or not there. All methods may be called twice, from several threads and processes.
+
+    They raise RunError, naming the key and the cause; local ones also OSError, as the disk tells it.
+    """
+
+    @property
+    def place(self) -> str:
+        """The folder or URL, for messages and for `storage_at`."""
+
+    def make(self) -> None:
+        """Make the folder, where the storage has such."""
+
+    def putting(self, key: str) -> AbstractContextManager[Path]:
+        """A temporary path, to be written by whoever writes best; put under the key when the block ends."""
+
+    def put(self, key: str, content: bytes) -> None:
+        """Put bytes under a key, in place of what stood there."""
+
+    def several(self, check: Callable[[], None]) -> AbstractContextManager[Puts]:
+        """Many puts, as fast as the storage takes them; all are there when the block ends.
+
+        `check` is called before each; what it raises ends the block.
+        """
+
+    def get(self, key: str) -> bytes:
+        """The bytes under a key."""
+
+    def has(self, key: str) -> bool:
+        """Whether something complete stands under the key."""
+
+    def size(self, key: str) -> int:
+        """Bytes of what stands under the key."""
+
+    def names(self) -> list[str]:
+        """The first parts of all keys, sorted; for people, since a listing may lag behind what was put."""
+
+    def keys(self, folder: str = "") -> list[str]:
+        """The keys in a folder and below, sorted; none where the folder is not there. It may lag, too."""
+
+    def delete(self, key: str) -> None:
+        """Remove what stands under a key, if anything does."""
+
+    def clear(self, names: Iterable[str]) -> None:
+        """Remove some things, and all in folders of these names."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LocalStorage:
     """Things by key in a folder. A key is a relative path with forward slashes, such as `state/x85_y447.json`."""
@@ -41,10 +119,22 @@ class LocalStorage:
         RunError
             If the key is empty, absolute or leads out of the folder.
         """
-        parts = PurePosixPath(key)
-        if not parts.parts or parts.is_absolute() or ".." in parts.parts or "\\" in key:
-            raise RunError(f"{key!r} is no key: use a relative path with forward slashes and without ..")
-        return self.root.joinpath(*parts.parts)
+        return self.root.joinpath(*parts_of_key(key))
+
+    @property
+    def place(self) -> str:
+        """The folder."""
+        return str(self.root)
+
+    def make(self) -> None:
+        """Make the folder.
+
+        Raises
+        ------
+        OSError
+            It cannot be made.
+        """
+        self.root.mkdir(parents=True, exist_ok=True)
 
     @contextlib.contextmanager
     def putting(self, key: str) -> Iterator[Path]:
@@ -79,6 +169,11 @@ class LocalStorage:
         with self.putting(key) as temporary:
             temporary.write_bytes(content)
 
+    @contextlib.contextmanager
+    def several(self, check: Callable[[], None]) -> Iterator[Puts]:
+        """Puts one after the other: a disk gains nothing by several at once."""
+        yield _OneByOne(self, check)
+
     def get(self, key: str) -> bytes:
         """The bytes under a key.
 
@@ -92,9 +187,18 @@ class LocalStorage:
         except FileNotFoundError:
             raise RunError(f"{key!r} is not in {self.root}") from None
 
-    def remove(self, key: str) -> None:
-        """Remove what stands under a key; nothing where there is nothing."""
-        self.path(key).unlink(missing_ok=True)
+    def size(self, key: str) -> int:
+        """Bytes of what stands under the key.
+
+        Raises
+        ------
+        RunError
+            If there is nothing.
+        """
+        try:
+            return self.path(key).stat().st_size
+        except FileNotFoundError:
+            raise RunError(f"{key!r} is not in {self.root}") from None
 
     def has(self, key: str) -> bool:
         """Whether something complete stands under the key."""
@@ -108,6 +212,48 @@ class LocalStorage:
             for path in top.rglob("*")
             if path.is_file() and path.suffix != TEMPORARY_SUFFIX
         )
+
+    def names(self) -> list[str]:
+        """What lies in the folder itself, hidden things too, sorted; nothing where it is not there."""
+        return sorted(path.name for path in self.root.iterdir()) if self.root.is_dir() else []
+
+    def delete(self, key: str) -> None:
+        """Remove what stands under a key, if anything does."""
+        self.path(key).unlink(missing_ok=True)
+
+    def clear(self, names: Iterable[str]) -> None:
+        """Remove files and whole folders.
+
+        Raises
+        ------
+        RunError
+            Something cannot be removed.
+        """
+        for name in names:
+            path = self.path(name)
+            try:
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
+            except OSError as error:
+                raise RunError(f"{path} cannot be removed: {error.strerror or error}") from error
+
+
+@dataclasses.dataclass(frozen=True)
+class _OneByOne:
+    """Puts that are done when they return."""
+
+    storage: LocalStorage
+    check: Callable[[], None]
+
+    def put(self, key: str, content: bytes) -> None:
+        """Put at once."""
+        self.check()
+        self.storage.put(key, content)
+
+    def wait(self) -> None:
+        """Return at once."""
 
 
 def _sync_folder(folder: Path) -> None:

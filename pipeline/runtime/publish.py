@@ -107,7 +107,7 @@ def publish(task: PublishTask) -> Published:
     }
     put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
     for name in sorted(before - files.keys()):
-        storage.remove(name)
+        storage.delete(name)
     return Published(tile=task.tile, n_files=len(files), error=error)
 
 
@@ -120,8 +120,8 @@ def files_of(storage: LocalStorage, tile: Tile) -> set[str]:
 def retire(storage: LocalStorage, tile: Tile) -> None:
     """Remove what a tile published that owns nothing any more: its files, then its state."""
     for name in sorted(files_of(storage, tile)):
-        storage.remove(name)
-    storage.remove(f"state/{tile.key}.json")
+        storage.delete(name)
+    storage.delete(f"state/{tile.key}.json")
 
 
 def _write(task: PublishTask, put: Put) -> dict[str, str]:

@@ -1,0 +1,61 @@
+"""Places: a folder of this machine or a URL, as storage and as a file system of Arrow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.io.object_storage import ObjectStorage
+from pipeline.io.storage import LocalStorage, Storage
+from pipeline.io.urls import is_url
+
+if TYPE_CHECKING:
+    import pyarrow.fs as pafs
+
+
+def storage_at(place: str | Path) -> Storage:
+    """The storage of a folder or URL.
+
+    Parameters
+    ----------
+    place : str or Path
+        A path, or such as `s3://bucket/prefix`.
+
+    Raises
+    ------
+    RunError
+        A URL where nothing can be stored.
+
+    >>> storage_at("s3://bucket/runs/a/").place
+    's3://bucket/runs/a'
+    """
+    if isinstance(place, str) and is_url(place):
+        return ObjectStorage(url=place)
+    return LocalStorage(root=Path(place).resolve())
+
+
+def place_below(place: str | Path, name: str) -> str:
+    """The folder or URL of something inside a place.
+
+    >>> place_below("s3://bucket/run", "quarantine")
+    's3://bucket/run/quarantine'
+    """
+    return f"{place}/{name}" if is_url(str(place)) else str(Path(place, name))
+
+
+def arrow_at(place: str | Path) -> tuple[pafs.FileSystem, str]:
+    """The file system of Arrow that reads a folder or URL, and the path in it.
+
+    Raises
+    ------
+    RunError
+        A URL that cannot be read so.
+    """
+    import pyarrow.fs as pafs
+
+    if not is_url(str(place)):
+        return pafs.LocalFileSystem(), str(place)
+    from pipeline.io.arrow_objects import ObjectHandler
+
+    storage = ObjectStorage(url=str(place))
+    return pafs.PyFileSystem(ObjectHandler(storage.url)), storage.url.partition("://")[2]

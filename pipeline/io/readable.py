@@ -1,0 +1,36 @@
+"""What the readers of point files ask of a file: a path of this machine answers it, and so does a file behind a URL."""
+
+from __future__ import annotations
+
+import io
+from typing import Literal, Protocol
+
+
+class FileStatus(Protocol):
+    """Size and time of a file."""
+
+    @property
+    def st_size(self) -> int:
+        """Bytes."""
+
+    @property
+    def st_mtime_ns(self) -> int:
+        """When it was last written, nanoseconds since 1970; 0 where nobody knows."""
+
+
+class Readable(Protocol):
+    """A file that can be opened at any place; as text it is what messages call it."""
+
+    @property
+    def name(self) -> str:
+        """The last part of its path."""
+
+    @property
+    def suffix(self) -> str:
+        """The ending of the name, with its dot."""
+
+    def stat(self) -> FileStatus:
+        """Size and time; raises OSError where there is no such file."""
+
+    def open(self, mode: Literal["rb"], /) -> io.BufferedReader:
+        """Its bytes."""

@@ -1,0 +1,318 @@
+"""A file behind a URL: read by ranges, as far as its header and some samples go, or fetched whole.
+
+LAZ is decoded from its first byte to its last, and a fetched file can be read again at no cost, so a run fetches each
+input into its scratch when its turn comes, and removes it when its points are there. The plan reads by ranges: headers
+and a few chunks are a small part of a tile. docs/how_to/object_storage.md has the measurement behind this.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime as dt
+import io
+import shutil
+import tempfile
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from email.utils import parsedate_to_datetime
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+from pipeline.errors import UnreadableInputError
+from pipeline.io.readable import Readable
+from pipeline.io.retries import POLICY, GaveUpError, RetryPolicy, ShortReadError, persistently
+from pipeline.io.urls import filesystem_of, is_url, name_in, shown
+
+BLOCK_BYTES = 1 << 18
+"""Read at least, and kept together."""
+BLOCKS_KEPT = 64
+"""Of one file, 16 MiB."""
+MOST_AHEAD = 32
+"""Blocks that are read at once where a file is read on and on: 8 MiB."""
+PIECE_BYTES = 1 << 24
+"""Fetched by one request: what a cut connection costs at most."""
+_FETCHES = 2
+"""A file that changes while it is fetched is fetched once more."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RemoteStatus:
+    """What a server tells of a file."""
+
+    st_size: int
+    """Bytes."""
+    st_mtime_ns: int
+    """When it was last written, nanoseconds since 1970; 0 where it is not told."""
+    etag: str
+    """Changes with the content; empty where it is not told."""
+
+
+class RemoteFile:
+    """A file behind a URL; the readers of point files take it for a path.
+
+    Parameters
+    ----------
+    url : str
+        `s3://`, `https://` or `http://`, with its query.
+    policy : RetryPolicy
+        How often and how long requests are made again.
+    """
+
+    def __init__(self, url: str, policy: RetryPolicy = POLICY) -> None:
+        self.url = url
+        self._policy = policy
+        self._filesystem = filesystem_of(url)
+        self._status: RemoteStatus | None = None
+        self._handle: Any = None
+        self._blocks: OrderedDict[int, bytes] = OrderedDict()
+        self._next_block, self._ahead = -1, 1
+        self._whole: tempfile._TemporaryFileWrapper[bytes] | None = None
+
+    def __str__(self) -> str:
+        """The URL without what may be secret."""
+        return shown(self.url)
+
+    @property
+    def name(self) -> str:
+        """The last part of its path."""
+        return name_in(self.url)
+
+    @property
+    def suffix(self) -> str:
+        """The ending of the name, with its dot."""
+        return PurePosixPath(self.name).suffix
+
+    def stat(self) -> RemoteStatus:
+        """Size and time, asked for once.
+
+        Raises
+        ------
+        UnreadableInputError
+            The server does not tell it.
+        """
+        if self._status is None:
+            self._status = self._asked()
+        return self._status
+
+    def _asked(self) -> RemoteStatus:
+        info = self._tried(lambda: self._filesystem.info(self.url))
+        if info.get("type", "file") != "file":
+            raise UnreadableInputError(str(self), "a folder, not a file", "End its name with / to take what is in it")
+        told = info.get("size")
+        # a server that makes a file as it sends it tells no size
+        size = Path(self._held()).stat().st_size if told is None else int(told)
+        return RemoteStatus(st_size=size, st_mtime_ns=_time_ns(info), etag=str(info.get("ETag") or ""))
+
+    def open(self, mode: Literal["rb"] = "rb", /) -> io.BufferedReader:
+        """Its bytes; whoever reads on and on reads larger pieces.
+
+        Raises
+        ------
+        UnreadableInputError
+            It cannot be reached.
+        """
+        del mode
+        self.stat()
+        if self._whole is not None:
+            return Path(self._held()).open("rb")
+        return io.BufferedReader(_Ranges(self), BLOCK_BYTES)
+
+    def read_at(self, begin: int, length: int) -> bytes:
+        """Some bytes, fewer where the file ends.
+
+        Raises
+        ------
+        UnreadableInputError
+            They cannot be had.
+        """
+        end = min(begin + length, self.stat().st_size)
+        parts = []
+        while begin < end:
+            block, at = divmod(begin, BLOCK_BYTES)
+            part = self._block(block)[at : at + end - begin]
+            parts.append(part)
+            begin += len(part)
+        return b"".join(parts)
+
+    def _block(self, number: int) -> bytes:
+        """One block, from memory or, with those that will be wanted next, from the server."""
+        if number not in self._blocks:
+            self._ahead = min(2 * self._ahead, MOST_AHEAD) if number == self._next_block else 1
+            begin = number * BLOCK_BYTES
+            content = self._range(begin, min(begin + self._ahead * BLOCK_BYTES, self.stat().st_size))
+            for k in range(0, len(content), BLOCK_BYTES):
+                self._blocks[number + k // BLOCK_BYTES] = content[k : k + BLOCK_BYTES]
+            self._next_block = number + -(-len(content) // BLOCK_BYTES)
+            while len(self._blocks) > BLOCKS_KEPT:
+                self._blocks.popitem(last=False)
+        self._blocks.move_to_end(number)
+        return self._blocks[number]
+
+    def _range(self, begin: int, end: int) -> bytes:
+        """The bytes from begin to before end, all of them."""
+        content: bytes = self._tried(lambda: self._requested(begin, end))
+        return content
+
+    def _requested(self, begin: int, end: int) -> bytes:
+        """One request for a range."""
+        if self._whole is None:
+            try:
+                if self._handle is None:
+                    size = self.stat().st_size
+                    self._handle = self._filesystem.open(
+                        self.url, "rb", block_size=BLOCK_BYTES, cache_type="none", size=size
+                    )
+                self._handle.seek(begin)
+                content: bytes = self._handle.read(end - begin)
+            except ValueError:  # what fsspec says of servers that send the whole file, whatever they are asked for
+                self._held()
+            except Exception:
+                self._handle = None
+                raise
+            else:
+                if len(content) != end - begin:
+                    self._handle = None
+                    raise ShortReadError(f"{len(content)} of {end - begin} bytes came")
+                return content
+        with Path(self._held()).open("rb") as stream:
+            stream.seek(begin)
+            return stream.read(end - begin)
+
+    def _held(self) -> str:
+        """A whole copy in a temporary file, which goes when this object goes: of a server that knows no ranges."""
+        if self._whole is None:
+            # closed by its own finaliser
+            copy = tempfile.NamedTemporaryFile(prefix="gablework-")  # noqa: SIM115
+            self._download(Path(copy.name))
+            self._whole = copy
+        return self._whole.name
+
+    def _download(self, target: Path) -> None:
+        """The whole file by one request."""
+        self._tried(lambda: self._filesystem.get_file(self.url, str(target)))
+
+    def fetch(self, target: Path, check: Callable[[], None] = lambda: None) -> None:
+        """Write the whole file to a path of this machine, piece by piece.
+
+        Parameters
+        ----------
+        target : Path
+            In a folder that is there.
+        check : callable
+            Called before each piece; what it raises ends the fetching.
+
+        Raises
+        ------
+        UnreadableInputError
+            It cannot be had, or changes again and again.
+        OSError
+            This machine's disk does not take it.
+        """
+        for _ in range(_FETCHES):
+            before = self.stat()
+            with target.open("wb") as stream:
+                for begin in range(0, before.st_size, PIECE_BYTES):
+                    check()
+                    if self._whole is not None:
+                        break
+                    stream.write(self._range(begin, min(begin + PIECE_BYTES, before.st_size)))
+            if self._whole is not None:
+                shutil.copyfile(self._held(), target)
+                return
+            self._status, self._handle = None, None
+            if self.stat() == before:
+                return
+        raise UnreadableInputError(str(self), "it changes while it is read", "Try again when nobody writes it any more")
+
+    def _tried(self, work: Callable[[], Any]) -> Any:
+        """What a request gives, tried again where that may help.
+
+        Raises
+        ------
+        UnreadableInputError
+            Naming the URL, what the server said and the fix.
+        """
+        try:
+            return persistently(work, self._policy)
+        except GaveUpError as error:
+            raise UnreadableInputError(str(self), f"cannot be fetched: {error.problem}", error.cause.fix) from None
+
+
+class _Ranges(io.RawIOBase):
+    """A remote file as a raw stream.
+
+    Parameters
+    ----------
+    file : RemoteFile
+        What is read.
+    """
+
+    def __init__(self, file: RemoteFile) -> None:
+        self._file = file
+        self._at = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._file.stat().st_size}[whence]
+        if start + offset < 0:
+            raise OSError(22, f"byte {start + offset} of {self._file} is before its first")
+        self._at = start + offset
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def readinto(self, buffer: Any, /) -> int:
+        view = memoryview(buffer).cast("B")
+        content = self._file.read_at(self._at, len(view))
+        view[: len(content)] = content
+        self._at += len(content)
+        return len(content)
+
+
+def _time_ns(info: dict[str, Any]) -> int:
+    """When a file was written, by what S3 or HTTP tell."""
+    told = info.get("LastModified") or info.get("Last-Modified")
+    if isinstance(told, str):
+        try:
+            told = parsedate_to_datetime(told)
+        except ValueError:
+            return 0
+    return int(told.timestamp()) * 1_000_000_000 if isinstance(told, dt.datetime) else 0
+
+
+def file_at(location: str | Path) -> Readable:
+    """A file of this machine, or behind a URL."""
+    return RemoteFile(str(location)) if is_url(location) else Path(location)
+
+
+@contextlib.contextmanager
+def on_this_machine(location: str | Path, folder: Path | None = None) -> Iterator[Path]:
+    """A file as a path of this machine, for libraries that know nothing else: fetched where it lies behind a URL.
+
+    Parameters
+    ----------
+    location : str or Path
+        The file.
+    folder : Path, optional
+        Where a fetched copy lies while the block runs; a temporary folder by default.
+
+    Raises
+    ------
+    UnreadableInputError
+        It cannot be fetched.
+    """
+    if not is_url(location):
+        yield Path(location)
+        return
+    file = RemoteFile(str(location))
+    with tempfile.TemporaryDirectory(prefix="gablework-", dir=folder) as held:
+        path = Path(held, Path(file.name or "file").name)
+        file.fetch(path)
+        yield path

@@ -1,0 +1,153 @@
+"""URLs of files, and the fsspec file system that answers for each.
+
+What a store needs to know (endpoint, profile, region, keys) comes from the environment, as botocore reads it, and is
+never part of a URL, a task or `run.json`. Of a URL nothing is told that could be secret.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+from urllib.parse import unquote, urlsplit, urlunsplit
+
+from pipeline.errors import RunError
+
+CONNECT_S = 10.0
+"""A server that does not take a connection within so long is not there."""
+READ_S = 60.0
+"""One that says nothing for so long will say nothing any more: a request moves 16 MiB at most."""
+
+
+def _s3_options() -> dict[str, Any]:
+    """How s3fs is to behave. Retries are ours alone: three layers of them would multiply."""
+    return {
+        "anon": os.environ.get("AWS_NO_SIGN_REQUEST", "").upper() in {"YES", "TRUE", "1"},
+        "use_listings_cache": False,
+        "config_kwargs": {
+            "connect_timeout": CONNECT_S,
+            "read_timeout": READ_S,
+            "retries": {"total_max_attempts": 1},
+        },
+    }
+
+
+def _http_options() -> dict[str, Any]:
+    """How fsspec's HTTP is to behave: no limit on a whole download, but on each silence."""
+    import aiohttp
+
+    timeout = aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_S, sock_read=READ_S)
+    # proxies as everywhere: HTTPS_PROXY, NO_PROXY
+    return {"client_kwargs": {"timeout": timeout, "trust_env": True}, "use_listings_cache": False}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scheme:
+    """What stands before `://`."""
+
+    options: Callable[[], dict[str, Any]]
+    """Of the file system, made when it is used."""
+    module: str
+    """What must be installed."""
+    extra: str | None = None
+    """The extra of the package that brings it; None where it is always there."""
+    stores: bool = False
+    """Whether things can be put there, and are listed."""
+
+
+SCHEMES: Mapping[str, Scheme] = MappingProxyType(
+    {
+        "s3": Scheme(options=_s3_options, module="s3fs", extra="s3", stores=True),
+        "https": Scheme(options=_http_options, module="aiohttp"),
+        "http": Scheme(options=_http_options, module="aiohttp"),
+    }
+)
+"""The schemes that are understood."""
+
+
+def is_url(text: object) -> bool:
+    """Whether something names a thing elsewhere, not a file of this machine.
+
+    >>> is_url("s3://bucket/a.laz"), is_url("tiles/a.laz"), is_url("C:/a.laz")
+    (True, False, False)
+    """
+    return isinstance(text, str) and "://" in text
+
+
+def scheme_of(url: str) -> Scheme:
+    """The scheme of a URL.
+
+    Raises
+    ------
+    RunError
+        It is none of `SCHEMES`.
+    """
+    name = url.partition("://")[0].lower()
+    if name not in SCHEMES:
+        raise RunError(f"{shown(url)}: {name}:// is not understood. Use {', '.join(SCHEMES)}://, or a path")
+    return SCHEMES[name]
+
+
+def shown(location: str) -> str:
+    """A path as it is; a URL without user and password, and with a mark in place of its query.
+
+    The query of a signed URL is a secret, that of a download service tells its files apart: the mark does so, too,
+    and tells nothing.
+
+    >>> shown("tiles/a.laz"), shown("s3://bucket/a.laz"), shown("https://me:pw@host/a.laz")
+    ('tiles/a.laz', 's3://bucket/a.laz', 'https://host/a.laz')
+    >>> shown("https://host/get?file=a.laz")
+    'https://host/get?query-d3f60cba'
+    """
+    if not is_url(location):
+        return location
+    try:
+        parts = urlsplit(location)
+    except ValueError:
+        return location.partition("://")[0] + "://…"
+    if location.lower().startswith("s3://"):
+        return location
+    mark = f"query-{hashlib.sha256(parts.query.encode()).hexdigest()[:8]}" if parts.query else ""
+    return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, mark, ""))
+
+
+def has_mark(location: str) -> bool:
+    """Whether a told URL had a query, and so cannot be opened again."""
+    return is_url(location) and "?query-" in location
+
+
+def name_in(location: str) -> str:
+    """The last part of a path or URL, without its query.
+
+    >>> name_in("https://host/a%20b.laz?token=1"), name_in("s3://bucket/tiles/"), name_in("tiles/a.laz")
+    ('a b.laz', '', 'a.laz')
+    """
+    if not is_url(location):
+        return location.rpartition("/")[2]
+    if location.lower().startswith("s3://"):
+        return location.rpartition("/")[2]
+    return unquote(urlsplit(location).path).rpartition("/")[2]
+
+
+def filesystem_of(url: str) -> Any:
+    """The fsspec file system of a URL; one instance serves a whole process.
+
+    Raises
+    ------
+    RunError
+        The scheme is unknown, or its library is not installed.
+    """
+    scheme = scheme_of(url)
+    import fsspec
+
+    name = url.partition("://")[0].lower()
+    try:
+        filesystem = fsspec.filesystem(name, **scheme.options())
+    except ImportError as error:
+        fix = f"Install gablework[{scheme.extra}]" if scheme.extra else f"Install {scheme.module}"
+        raise RunError(f"{shown(url)}: {name}:// needs {scheme.module}, which is not installed. {fix}") from error
+    filesystem.retries = 1  # s3fs has a loop of its own around each request
+    return filesystem
