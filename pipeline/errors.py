@@ -8,7 +8,7 @@ GableworkError
 │   ├── EmptyInputError          no usable point left
 │   └── CrsError                 geographic, contradictory or unknown coordinate reference system
 ├── SettingsError         one or more settings are out of range: lists all faults at once
-├── RunError              a run directory that cannot be written, read or resumed
+├── RunError              a run directory, in a folder or an object store, that cannot be written, read or resumed
 │   ├── RunCancelledError        whoever started the run called it off
 │   └── ClusterError             the scheduler does not answer, or was lost while the run was under way
 │       └── VersionMismatchError     client, scheduler and workers do not run the same versions
@@ -47,6 +47,12 @@ class InputError(GableworkError):
         self.problem = problem
         self.fix = fix
         super().__init__(f"{self.path}: {problem}. {fix}")
+
+    def of(self, path: str, copy: str) -> InputError:
+        """The same of a file by the name that the user knows, in place of that of a copy of it."""
+        if path == copy:
+            return self
+        return type(self)(path, self.problem.replace(copy, path), self.fix.replace(copy, path))
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         """Survive pickling between Dask processes."""

@@ -6,9 +6,13 @@ import os
 import shutil
 from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
+
+if TYPE_CHECKING:
+    from object_store import FaultyProxy
 
 # The same examples in every run: a change fails by what it changed, not by the draw. To search for new ones:
 # HYPOTHESIS_PROFILE=search make unit
@@ -59,3 +63,41 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
         report.outcome = "failed"
         report.longrepr = f"{item.nodeid} needs ../shared/data and was skipped, but {REQUIRED}=1: {report.longrepr}"
     return report
+
+
+@pytest.fixture(scope="session")
+def s3_server() -> Generator[str]:
+    """The URL of an S3 server that lasts as long as the tests."""
+    pytest.importorskip("s3fs", reason="the extra s3 is not installed")
+    from object_store import moto_server
+
+    with moto_server() as url:
+        yield url
+
+
+@pytest.fixture
+def s3(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> Generator[FaultyProxy]:
+    """An object store as the environment of this process names it, behind a proxy that a test may make faulty."""
+    import s3fs
+    from object_store import FaultyProxy, environment
+
+    with FaultyProxy(s3_server) as proxy:
+        for name, value in environment(proxy.endpoint).items():
+            monkeypatch.setenv(name, value)
+        # an instance that is there already knows another server
+        s3fs.S3FileSystem.clear_instance_cache()
+        yield proxy
+        s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.fixture
+def bucket(s3: FaultyProxy) -> str:
+    """The URL of a bucket of its own."""
+    from uuid import uuid4
+
+    import s3fs
+
+    name = f"tests-{uuid4().hex[:12]}"
+    s3fs.S3FileSystem().mkdir(name)
+    s3.seen.clear()
+    return f"s3://{name}"

@@ -29,6 +29,7 @@ from pipeline.cli.options import (
     Points,
     Quiet,
     Scheduler,
+    Scratch,
     SettingsFile,
     TlsCa,
     TlsCert,
@@ -46,9 +47,12 @@ if TYPE_CHECKING:
 
 def reconstruct(
     tiles: Annotated[
-        list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
+        list[str],
+        typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY, ASCII files; folders, URLs, tile indexes."),
     ],
-    out: Annotated[str, typer.Option(metavar="RUN", help="The run directory to write.")],
+    out: Annotated[
+        str, typer.Option(metavar="RUN", help="The run directory to write; a folder, or s3://bucket/prefix.")
+    ],
     method: Method = None,
     preset: Annotated[
         Literal["robust", "faithful"] | None,
@@ -71,6 +75,7 @@ def reconstruct(
     tls_ca: TlsCa = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
+    scratch: Scratch = None,
     meshes: Meshes = "building",
     licence: Licence = None,
     overwrite: Overwrite = False,
@@ -100,6 +105,7 @@ def reconstruct(
             scheduler=scheduler,
             tls=given_tls(tls_ca, tls_cert, tls_key),
             performance_report=performance_report,
+            scratch=scratch,
             meshes=meshes,
             licence=licence,
             overwrite=overwrite,
@@ -162,7 +168,8 @@ def rerun(
 
 def compare(
     tiles: Annotated[
-        list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
+        list[str],
+        typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY, ASCII files; folders, URLs, tile indexes."),
     ],
     methods: Annotated[
         list[str],
@@ -281,13 +288,15 @@ def replay(
     """Model one quarantined building again, from its bundle alone."""
     with Console(as_json=as_json) as console:
         from pipeline import __version__
+        from pipeline.io.remote_file import on_this_machine
         from pipeline.runtime.bundle import read_bundle
         from pipeline.runtime.isolation import IsolationLimits
         from pipeline.runtime.replay import replay as replay_building
         from pipeline.runtime.replay import replay_row, write_replay
 
         limits = IsolationLimits(timeout_s=building_timeout, memory_bytes=round(building_memory * 2**30))
-        found = read_bundle(bundle)
+        with on_this_machine(bundle) as file:
+            found = read_bundle(str(file))
         if found.incident.engine_version != __version__:
             console.warn(f"it happened to gablework {found.incident.engine_version}; this is {__version__}")
         console.say(f"{found.candidate.building_id} in its run: {found.incident.reason}, {found.incident.detail}")

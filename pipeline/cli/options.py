@@ -72,6 +72,13 @@ MetricsHost = Annotated[
     str, typer.Option(metavar="ADDRESS", help="Address of these figures: whoever reaches it reads them.")
 ]
 LogJson = Annotated[bool, typer.Option("--log-json", help="Log one JSON object a line; as GABLEWORK_LOG_JSON=1 does.")]
+Scratch = Annotated[
+    str | None,
+    typer.Option(
+        metavar="DIR",
+        help="Folder for what is neither input nor result, the same for all workers; default beside the results.",
+    ),
+]
 Meshes = Annotated[
     Literal["building", "tile", "glb", "none"],
     typer.Option(help="One OBJ a building, one OBJ a tile, one GLB a tile, or none."),

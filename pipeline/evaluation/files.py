@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from pipeline.errors import SettingsError
 from pipeline.evaluation.evaluate import Evaluation, evaluate
@@ -14,6 +13,7 @@ from pipeline.evaluation.reading import read_models
 from pipeline.evaluation.reference import Reference
 from pipeline.evaluation.reference_points import read_points_reference
 from pipeline.evaluation.reference_truth import read_truth_reference
+from pipeline.io import storage_at
 from pipeline.io.source import ReadOptions
 from pipeline.runtime.manifest import NAME as MANIFEST
 from pipeline.runtime.manifest import read_manifest
@@ -126,7 +126,7 @@ def _ground(files: Sequence[str], models: ModelSet, reference: Reference, option
         return GroundOfFiles(files, options)
     if models.kind != "run":
         return None
-    if not (Path(models.path) / MANIFEST).exists():  # simulated truth, or tables alone: nothing there found ground
+    if not storage_at(models.path).has(MANIFEST):  # simulated truth, or tables alone: nothing there found ground
         return None
     settings = read_manifest(models.path).settings
     sections = {name: table for name, table in settings.items() if name != "general"}

@@ -137,7 +137,12 @@ def parquet_bytes(table: pa.Table) -> bytes:
     return data
 
 
-def table_dataset(run_dir: str, table_name: str, filesystem: pafs.FileSystem | None = None) -> pads.Dataset:
+def table_dataset(
+    run_dir: str,
+    table_name: str,
+    filesystem: pafs.FileSystem | None = None,
+    tiles: Sequence[str] | None = None,
+) -> pads.Dataset:
     """All files of one table of a run, `tile` added as a text column from the folders' names.
 
     Parameters
@@ -148,6 +153,8 @@ def table_dataset(run_dir: str, table_name: str, filesystem: pafs.FileSystem | N
         buildings, planes or rejected.
     filesystem : pyarrow.fs.FileSystem, optional
         Where the run lies; local by default.
+    tiles : sequence of str, optional
+        Keys of the tiles that have files, which are then not looked for.
 
     Raises
     ------
@@ -156,11 +163,12 @@ def table_dataset(run_dir: str, table_name: str, filesystem: pafs.FileSystem | N
     """
     filesystem = filesystem or pafs.LocalFileSystem()
     folder = f"{str(run_dir).rstrip('/')}/{table_name}"
-    if filesystem.get_file_info(folder).type != pafs.FileType.Directory:
+    if tiles is None and filesystem.get_file_info(folder).type != pafs.FileType.Directory:
         raise RunError(f"{folder} is no folder: give the directory that a run wrote")
     partitioning = pads.partitioning(pa.schema([("tile", pa.string())]), flavor="hive")
     schema = stored_schema(table_name).append(pa.field("tile", pa.string()))
-    return pads.dataset(folder, schema=schema, filesystem=filesystem, format="parquet", partitioning=partitioning)
+    files = folder if tiles is None else [f"{folder}/tile={tile}/part-0.parquet" for tile in tiles]
+    return pads.dataset(files, schema=schema, filesystem=filesystem, format="parquet", partitioning=partitioning)
 
 
 def read_table(run_dir: str, table_name: str, filesystem: pafs.FileSystem | None = None) -> pa.Table:

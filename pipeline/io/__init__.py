@@ -2,9 +2,11 @@
 
 from pipeline.io.crs import SpatialReference
 from pipeline.io.footprints import Footprints, read_area, read_footprints
-from pipeline.io.formats import find_inputs
+from pipeline.io.inputs import find_inputs
+from pipeline.io.places import arrow_at, place_below, storage_at
 from pipeline.io.source import ReadOptions, Source, SourceInfo, open_source
-from pipeline.io.storage import LocalStorage, sha256_of
+from pipeline.io.storage import LocalStorage, Storage, sha256_of
+from pipeline.io.urls import is_url, shown
 
 __all__ = [
     "Footprints",
@@ -13,9 +15,15 @@ __all__ = [
     "Source",
     "SourceInfo",
     "SpatialReference",
+    "Storage",
+    "arrow_at",
     "find_inputs",
+    "is_url",
     "open_source",
+    "place_below",
     "read_area",
     "read_footprints",
     "sha256_of",
+    "shown",
+    "storage_at",
 ]

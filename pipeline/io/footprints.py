@@ -18,6 +18,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import CrsError, EmptyInputError, InconsistentInputError, UnreadableInputError
 from pipeline.io.crs import SpatialReference, horizontal_part, horizontal_unit_of, parse_crs
+from pipeline.io.urls import shown
 from pipeline.io.vector_layer import VectorLayer, read_layer
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def read_footprints(
     Parameters
     ----------
     path : str or Path
-        GeoPackage, GeoJSON (WGS 84 unless it says otherwise), Shapefile or GeoParquet.
+        Path or URL of a GeoPackage, GeoJSON (WGS 84 unless it says otherwise), Shapefile or GeoParquet.
     reference : SpatialReference
         The run's CRS and units.
     layer : str, optional
@@ -143,13 +144,13 @@ def read_footprints(
     CrsError
         If its coordinates are degrees and the run's CRS is unknown, or a CRS is not understood.
     """
-    name = str(path)
+    name = shown(str(path))
     told: list[str] = []
 
     def boxes(own: str | None) -> npt.NDArray[np.float64] | None:
         return None if area is None else _boxes(area, own if crs is None else crs, reference, name)
 
-    found = read_layer(Path(path), layer, None if area is None else boxes)
+    found = read_layer(path, layer, None if area is None else boxes)
     problems: dict[int, tuple[str, str]] = {}
     repairs: dict[int, str] = {}
     geometries = _polygons_only(found, problems)

@@ -1,10 +1,7 @@
-"""Which format a file has, by what it begins with and by its name; and which files a list of paths means."""
+"""Which format a file has, by what it begins with and by its name; and which files of a folder are point files."""
 
 from __future__ import annotations
 
-import glob
-import os
-from collections.abc import Iterable
 from pathlib import Path
 
 from pipeline.errors import EmptyInputError, UnreadableInputError
@@ -110,45 +107,14 @@ def _is_number(field: bytes) -> bool:
     return True
 
 
-def find_inputs(paths: Iterable[str | Path]) -> list[Path]:
-    """The point files that paths, folders and glob patterns mean, each once, sorted by path.
-
-    Of a folder (not of the folders in it) its LAS, LAZ and PLY files are taken, and of its text files those that look
-    like points. A file that is named is taken whatever its name.
+def files_in(folder: Path) -> list[Path]:
+    """The point files of a folder.
 
     Raises
     ------
     UnreadableInputError
-        If a path is not there or may not be read, a folder holds no point files or a pattern meets none.
+        If it cannot be read, or holds none.
     """
-    found: dict[str, Path] = {}
-    for entry in paths:
-        for path in _files_of(entry):
-            found.setdefault(os.path.realpath(path), path)
-    if not found:
-        raise UnreadableInputError(
-            "inputs", "no input files are given", "Name files, folders or patterns such as tiles/*.laz"
-        )
-    return sorted(found.values(), key=lambda path: path.as_posix())
-
-
-def _files_of(entry: str | Path) -> list[Path]:
-    """The files of one path, folder or pattern."""
-    path = Path(entry)
-    if path.is_dir():
-        return _files_in(path)
-    if not path.exists() and glob.has_magic(str(entry)):
-        met = [Path(name) for name in glob.glob(str(entry), recursive=True)]  # noqa: PTH207 - pathlib knows no absolute patterns
-        files = [file for file in met if file.is_file()]
-        if not files:
-            raise UnreadableInputError(str(entry), "the pattern meets no files", "Check the pattern and the folder")
-        return files
-    first_bytes(path)
-    return [path]
-
-
-def _files_in(folder: Path) -> list[Path]:
-    """The point files of a folder."""
     try:
         entries = [path for path in folder.iterdir() if path.is_file()]
     except OSError as fault:

@@ -313,6 +313,6 @@ def on_this_machine(location: str | Path, folder: Path | None = None) -> Iterato
         return
     file = RemoteFile(str(location))
     with tempfile.TemporaryDirectory(prefix="gablework-", dir=folder) as held:
-        path = Path(held, Path(file.name or "file").name)
+        path = Path(held, f"file{file.suffix}")
         file.fetch(path)
         yield path

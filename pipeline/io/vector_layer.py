@@ -15,9 +15,11 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pipeline.errors import UnreadableInputError
+from pipeline.errors import InputError, UnreadableInputError
 from pipeline.io.formats import first_bytes
 from pipeline.io.nearby import BATCH, Boxes, Nearby
+from pipeline.io.remote_file import on_this_machine
+from pipeline.io.urls import is_url, shown
 
 VALID = (
     "Valid are GeoPackage (.gpkg), GeoJSON (.geojson, .json), Shapefile (.shp with .shx and .dbf) "
@@ -47,13 +49,13 @@ class VectorLayer:
     """Polygons of the file that were passed over, since they lie off the boxes."""
 
 
-def read_layer(path: Path, layer: str | None, boxes: Boxes | None = None) -> VectorLayer:
+def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None) -> VectorLayer:
     """The one layer of a file that can hold polygons, or the named one.
 
     Parameters
     ----------
-    path : Path
-        The file; its first bytes tell its format.
+    path : str or Path
+        The file, or its URL: then it is fetched for as long as it is read. Its first bytes tell its format.
     layer : str, optional
         The layer; of GeoParquet the geometry column.
     boxes : callable, optional
@@ -64,6 +66,18 @@ def read_layer(path: Path, layer: str | None, boxes: Boxes | None = None) -> Vec
     UnreadableInputError
         The file cannot be read as vector data, or the layer is not there.
     """
+    told = shown(str(path))
+    if is_url(path) and told.lower().endswith(".shp"):
+        raise UnreadableInputError(told, "a Shapefile is several files", "Give a GeoPackage, or fetch its files first")
+    with on_this_machine(path) as file:
+        try:
+            return _read(file, layer, boxes)
+        except InputError as fault:
+            raise fault.of(told, str(file)) from fault
+
+
+def _read(path: Path, layer: str | None, boxes: Boxes | None) -> VectorLayer:
+    """The layer of a file of this machine."""
     head = first_bytes(path)
     if head.startswith(PARQUET_MAGIC):
         from pipeline.io.geoparquet import read_geoparquet

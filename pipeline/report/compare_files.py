@@ -87,7 +87,8 @@ def compare_files(
         )
         for variant in request.variants
     ]
-    points = PointFiles(paths=tuple(sorted(str(path) for path in find_inputs(request.run.inputs))), options=options)
+    paths = find_inputs(request.run.inputs, only_files=request.run.only_files)
+    points = PointFiles(paths=tuple(paths), options=options)
     written = write_comparison(summary.out, runs, points=points, on_step=step)
     told = json.dumps(comparison_facts(request, summary), indent=1, ensure_ascii=False).encode()
     LocalStorage(root=Path(summary.out)).put(SUMMARY, told)

@@ -20,6 +20,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
+from pipeline.io import arrow_at
 from pipeline.model import RoofType, Status
 from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, drawn_path, lambert, shaded
 from pipeline.report.table import run_statistics
@@ -63,13 +64,13 @@ def render_run(
     Parameters
     ----------
     run_dir : str or Path
-        The run directory: a local path, or a path of `filesystem`.
+        The run directory: a path or URL, or a path of `filesystem`.
     png_path : str or Path
         The local file to write.
     truth : str or Path, optional
         A local run directory of true models, whose footprints are drawn as dashed lines.
     filesystem : pyarrow.fs.FileSystem, optional
-        Where the run lies; local by default.
+        Where the run lies; by default as `run_dir` says.
     dpi : int
         Pixels an inch of a picture of 20 by 10.5 inches.
 
@@ -78,7 +79,7 @@ def render_run(
     RunError
         The directory holds no run, or the picture cannot be written.
     """
-    run = str(run_dir)
+    filesystem, run = arrow_at(run_dir) if filesystem is None else (filesystem, str(run_dir))
     buildings = read_table(run, "buildings", filesystem)
     planes = read_table(run, "planes", filesystem)
     rejected = read_table(run, "rejected", filesystem)
@@ -112,9 +113,9 @@ def _geometries(table: pa.Table) -> Any:
     return shapely.from_wkb(np.array(table["geometry"].to_pylist(), dtype=object))
 
 
-def _units(run_dir: str, filesystem: pafs.FileSystem | None) -> tuple[float, float]:
+def _units(run_dir: str, filesystem: pafs.FileSystem) -> tuple[float, float]:
     """Metres in a horizontal and in a vertical unit; 1 where the run has no manifest, as truth has none."""
-    held = (filesystem or pafs.LocalFileSystem()).get_file_info(f"{run_dir.rstrip('/')}/{NAME}")
+    held = filesystem.get_file_info(f"{run_dir.rstrip('/')}/{NAME}")
     crs = {} if held.type == pafs.FileType.NotFound else read_manifest(run_dir, filesystem).crs or {}
     return float(crs.get("horizontal_unit_m", 1.0)), float(crs.get("vertical_unit_m", 1.0))
 
@@ -226,14 +227,13 @@ def _solids(
     buildings: pa.Table,
     window: Window,
     units: tuple[float, float],
-    filesystem: pafs.FileSystem | None,
+    filesystem: pafs.FileSystem,
 ) -> list[list[ViewedFace]]:
     """The faces of the buildings in a window, in metres about its corner, from the run's CityJSON files."""
     footprints = _geometries(buildings)
     inside = shapely.intersects(shapely.centroid(footprints), shapely.box(*window))
     rows = buildings.filter(pa.array(inside))
     kinds = dict(zip(rows["building_id"].to_pylist(), rows["roof_type"].to_pylist(), strict=True))
-    filesystem = filesystem or pafs.LocalFileSystem()
     models = []
     for tile in sorted(set(rows["tile"].to_pylist())):
         path = f"{run_dir.rstrip('/')}/cityjson/tile={tile}/part-0.city.jsonl"

@@ -12,6 +12,7 @@ import pyarrow.fs as pafs
 from rich.table import Table
 
 from pipeline.export.geoparquet import table_dataset
+from pipeline.io import arrow_at
 from pipeline.model import RoofType, Status
 
 QUANTILES = (("p10", 0.1), ("p50", 0.5), ("p90", 0.9), ("max", 1.0))
@@ -27,9 +28,9 @@ def run_statistics(run_dir: str, filesystem: pafs.FileSystem | None = None) -> d
     Parameters
     ----------
     run_dir : str
-        The run directory: a local path, or a path of `filesystem`.
+        The run directory: a path or URL, or a path of `filesystem`.
     filesystem : pyarrow.fs.FileSystem, optional
-        Where the run lies; local by default.
+        Where the run lies; by default as `run_dir` says.
 
     Returns
     -------
@@ -44,6 +45,8 @@ def run_statistics(run_dir: str, filesystem: pafs.FileSystem | None = None) -> d
     RunError
         The directory holds no run.
     """
+    if filesystem is None:
+        filesystem, run_dir = arrow_at(run_dir)
     table = table_dataset(run_dir, "buildings", filesystem).to_table(columns=list(_COLUMNS))
     rejected = table_dataset(run_dir, "rejected", filesystem).to_table(columns=["reason"])
     statuses = Counter(table["status"].to_pylist())

@@ -15,9 +15,7 @@ import platform
 import zipfile
 import zlib
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 import shapely
@@ -25,6 +23,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline import __version__
 from pipeline.errors import UnreadableInputError
+from pipeline.io import place_below, storage_at
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings, method_named
 from pipeline.model import Candidate, FloatArray
@@ -72,12 +71,24 @@ class Bundle:
     """For its coordinates and units on the way out."""
 
 
-def write_bundle(folder: str, bundle: Bundle) -> Path:
+def write_bundle(folder: str, bundle: Bundle) -> str:
     """Write `<folder>/<building_id>.bundle`, whole or not at all; one that is there is replaced.
+
+    Parameters
+    ----------
+    folder : str
+        A path or URL.
+    bundle : Bundle
+        What is kept.
+
+    Returns
+    -------
+    str
+        Where it is.
 
     Raises
     ------
-    OSError
+    OSError, RunError
         It cannot be written.
     """
     candidate = bundle.candidate
@@ -106,24 +117,21 @@ def write_bundle(folder: str, bundle: Bundle) -> Path:
         "incident": incident,
         "reference": dataclasses.asdict(bundle.reference),
     }
-    target = Path(folder, candidate.building_id + SUFFIX)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.{uuid4().hex}")
-    try:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("bundle.json", json.dumps(document, indent=1, allow_nan=False))
-            archive.writestr("stderr.txt", stderr)
-            arrays = {"points": candidate.points, "ground": candidate.ground, "split_returns": candidate.split_returns}
-            for name in _OPTIONAL:
-                if len(getattr(candidate, name)):
-                    arrays[name] = getattr(candidate, name)
-            for name, array in arrays.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    np.lib.format.write_array(member, np.ascontiguousarray(array), (1, 0), allow_pickle=False)
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return target
+    name = candidate.building_id + SUFFIX
+    with (
+        storage_at(folder).putting(name) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
+        archive.writestr("bundle.json", json.dumps(document, indent=1, allow_nan=False))
+        archive.writestr("stderr.txt", stderr)
+        arrays = {"points": candidate.points, "ground": candidate.ground, "split_returns": candidate.split_returns}
+        for name in _OPTIONAL:
+            if len(getattr(candidate, name)):
+                arrays[name] = getattr(candidate, name)
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.ascontiguousarray(array), (1, 0), allow_pickle=False)
+    return place_below(folder, name)
 
 
 def read_bundle(path: str) -> Bundle:

@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from uuid import uuid4
 
-from pipeline.errors import RunError, SettingsError
+from pipeline.errors import InputError, RunError, SettingsError
 from pipeline.export.raster import RasterLattice
-from pipeline.io import SpatialReference
+from pipeline.io import SpatialReference, is_url, shown
 from pipeline.runtime.classified_files import (
     ClassifiedFile,
     ClassifiedTask,
@@ -151,6 +151,9 @@ def classify(
         vertical_unit=request.vertical_unit,
     )
     plan, paths = plan_inputs(run_request, request.settings, progress)
+    for path in paths:
+        if is_url(path):
+            raise InputError(shown(path), "classify reads files of this machine only", "Fetch it first")
     for info in plan.sources:
         check_writable(info)
     footprints = None if request.footprints is None else given_footprints(request.footprints, plan)

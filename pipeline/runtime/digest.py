@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ import pyarrow.fs as pafs
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_dataset
 from pipeline.export.records import KEYS
+from pipeline.io import arrow_at
 
 NOT_CONTENT = frozenset({"tile", "mesh_path", "input_hash"})
 """Columns that may differ between tilings of one result."""
@@ -35,24 +36,28 @@ _HASH_BYTES = hashlib.sha256().digest_size
 Fixed = npt.NDArray[np.uint8]
 
 
-def run_digest(run_dir: str, filesystem: pafs.FileSystem | None = None) -> str:
+def run_digest(run_dir: str, filesystem: pafs.FileSystem | None = None, tiles: Sequence[str] | None = None) -> str:
     """The sha256 of a run's content in hexadecimal.
 
     Parameters
     ----------
     run_dir : str
-        The run directory: a local path, or a path of `filesystem`.
+        The run directory: a path or URL, or a path of `filesystem`.
     filesystem : pyarrow.fs.FileSystem, optional
-        Where the run lies; local by default.
+        Where the run lies; by default as `run_dir` says.
+    tiles : sequence of str, optional
+        Keys of the tiles that have tables, which are then not looked for.
 
     Raises
     ------
     RunError
         The directory lacks one of the tables, a table lacks its key, or an object comes twice.
     """
+    if filesystem is None:
+        filesystem, run_dir = arrow_at(run_dir)
     whole = hashlib.sha256(b"gablework content 1\n")
     for name, key in KEYS.items():
-        keys, hashes = _row_hashes(run_dir, name, key, filesystem)
+        keys, hashes = _row_hashes(run_dir, name, key, filesystem, tiles)
         order = np.lexsort(tuple(reversed(keys)))
         _check_unique(name, key, keys, order)
         whole.update(f"{name} {len(order)}\n".encode())
@@ -62,10 +67,10 @@ def run_digest(run_dir: str, filesystem: pafs.FileSystem | None = None) -> str:
 
 
 def _row_hashes(
-    run_dir: str, name: str, key: tuple[str, ...], filesystem: pafs.FileSystem | None
+    run_dir: str, name: str, key: tuple[str, ...], filesystem: pafs.FileSystem, tiles: Sequence[str] | None
 ) -> tuple[list[npt.NDArray[Any]], Fixed]:
     """The key columns of a table, and the hash of every row, shape (n, 32)."""
-    dataset = table_dataset(run_dir, name, filesystem)
+    dataset = table_dataset(run_dir, name, filesystem, tiles)
     columns = [column for column in dataset.schema.names if column not in NOT_CONTENT]
     key_parts: list[list[npt.NDArray[Any]]] = [[] for _ in key]
     hash_parts = [np.empty((0, _HASH_BYTES), np.uint8)]

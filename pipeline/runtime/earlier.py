@@ -16,10 +16,10 @@ from pipeline import __version__
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_dataset
 from pipeline.export.records import KEYS
-from pipeline.io.storage import sha256_of
+from pipeline.io.urls import has_mark, is_url, shown
 from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
-from pipeline.runtime.run import OVERRIDES, RunRequest
+from pipeline.runtime.run import OVERRIDES, RunRequest, told_file
 from pipeline.settings import RunSettings
 
 REJECTED = "rejected"
@@ -95,6 +95,11 @@ def earlier_run(run_dir: str) -> Earlier:
     RunError
         It holds no finished run of this version that tells how it was asked for.
     """
+    if is_url(run_dir):
+        raise RunError(
+            f"{run_dir}: only runs in folders are changed in place, since new files are made beside the old "
+            "ones and renamed. Copy the run to a folder of this machine, or run the whole again"
+        )
     root = Path(run_dir).resolve()
     manifest = read_manifest(root)
     if manifest.status is not RunStatus.FINISHED:
@@ -121,6 +126,9 @@ def request_of(manifest: RunManifest) -> RunRequest:
     if settings.settings_hash != manifest.settings_hash:
         raise RunError("the settings in run.json are not those of its settings_hash: it was changed by hand")
     told = manifest.request
+    hidden = [entry.path for entry in manifest.inputs if has_mark(entry.path)]
+    if hidden:
+        raise RunError(f"{hidden[0]}: run.json keeps no queries of URLs, so this cannot be fetched again. {_AGAIN}")
     return RunRequest(
         inputs=tuple(entry.path for entry in manifest.inputs if entry.n_points is not None),
         out="",
@@ -138,13 +146,13 @@ def check_points(manifest: RunManifest, paths: Sequence[str], ingested: Sequence
     """Refuse points that are not those of the run."""
     known = {entry.path: entry.sha256 for entry in manifest.inputs}
     for path, found in zip(paths, ingested, strict=True):
-        if known.get(path) != found.sha256:
-            raise RunError(f"{path} is not the file that the run read: its content changed. {_AGAIN}")
+        if known.get(shown(path)) != found.sha256:
+            raise RunError(f"{shown(path)} is not the file that the run read: its content changed. {_AGAIN}")
 
 
 def check_outlines(manifest: RunManifest, request: RunRequest) -> None:
     """Refuse footprints, or an area of interest, that are not those of the run."""
     known = {entry.path: entry.sha256 for entry in manifest.inputs if entry.n_points is None}
     for path in (request.footprints, request.aoi):
-        if path is not None and known.get(path) != sha256_of(path):
-            raise RunError(f"{path} is not the file that the run read. {_AGAIN}")
+        if path is not None and known.get(shown(path)) != told_file(path).sha256:
+            raise RunError(f"{shown(path)} is not the file that the run read. {_AGAIN}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import shutil
 from collections import Counter
 from pathlib import Path
 from uuid import uuid4
@@ -15,8 +16,9 @@ from uuid import uuid4
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import InconsistentInputError
-from pipeline.io import ReadOptions, SourceInfo, open_source
+from pipeline.errors import InconsistentInputError, InputError
+from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
+from pipeline.io.remote_file import RemoteFile
 from pipeline.io.storage import sha256_of
 from pipeline.model import IntArray, PointCloud
 from pipeline.runtime.scratch import POINT, Scratch
@@ -36,7 +38,7 @@ class IngestTask:
     part: str
     """Names the file's parts in scratch; no two inputs share one."""
     path: str
-    """The file."""
+    """The file, or its URL with its query."""
     options: ReadOptions
     """CRS, units, area of interest, dropped classes."""
     grid: TileGrid
@@ -109,7 +111,7 @@ def to_records(cloud: PointCloud, path: str) -> npt.NDArray[np.void]:
 
 
 def ingest(task: IngestTask) -> Ingested:
-    """Read one file and bucket its points by tile.
+    """Read one file and bucket its points by tile; one behind a URL is fetched into scratch for as long as it takes.
 
     Returns
     -------
@@ -124,6 +126,26 @@ def ingest(task: IngestTask) -> Ingested:
         The run was called off.
     """
     task.scratch.check_cancelled()
+    if not is_url(task.path):
+        return _ingested(task)
+    file = RemoteFile(task.path)
+    copy = task.scratch.path("fetched", uuid4().hex, f"points{file.suffix}")
+    try:
+        known = task.known if task.known is not None and task.known.is_of(file) else None
+        file.fetch(copy, task.scratch.check_cancelled)
+        if known is not None:
+            now = copy.stat()
+            same = (now.st_size, file.stat().st_mtime_ns) == (known.file_size, known.modified_ns)
+            known = dataclasses.replace(known, modified_ns=now.st_mtime_ns) if same else None
+        return _ingested(dataclasses.replace(task, path=str(copy), known=known))
+    except InputError as fault:
+        raise fault.of(shown(task.path), str(copy)) from None
+    finally:
+        shutil.rmtree(copy.parent, ignore_errors=True)
+
+
+def _ingested(task: IngestTask) -> Ingested:
+    """The same of a file of this machine."""
     source = open_source(task.path, task.options, task.known)
     suffix = f".{uuid4().hex}.part"
     counts: Counter[Tile] = Counter()

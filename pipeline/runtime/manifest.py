@@ -19,6 +19,7 @@ import pyarrow.fs as pafs
 
 from pipeline.errors import RunError
 from pipeline.export.tile import Put, put_local
+from pipeline.io import arrow_at
 
 NAME = "run.json"
 """File name of the manifest in the run directory."""
@@ -189,18 +190,20 @@ def read_manifest(run_dir: str | Path, filesystem: pafs.FileSystem | None = None
     Parameters
     ----------
     run_dir : str or Path
-        The run directory: a local path, or a path of `filesystem`.
+        The run directory: a path or URL, or a path of `filesystem`.
     filesystem : pyarrow.fs.FileSystem, optional
-        Where the run lies; local by default.
+        Where the run lies; by default as `run_dir` says.
 
     Raises
     ------
     RunError
         There is none, or it cannot be read.
     """
+    if filesystem is None:
+        filesystem, run_dir = arrow_at(run_dir)
     path = f"{str(run_dir).rstrip('/')}/{NAME}"
     try:
-        with (filesystem or pafs.LocalFileSystem()).open_input_stream(path) as stream:
+        with filesystem.open_input_stream(path) as stream:
             text = stream.read().decode()
     except FileNotFoundError:
         raise RunError(f"{path} does not exist: give the directory that a run wrote") from None

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 import shapely
 
-from pipeline.errors import GableworkError, RunCancelledError
+from pipeline.errors import GableworkError, RunCancelledError, RunError
 from pipeline.export.records import CandidateFacts
 from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
@@ -364,8 +364,9 @@ def _kept(task: BatchTask, candidate: Candidate | None, result: BuildingResult, 
     )
     try:
         write_bundle(task.quarantine, bundle)
-    except OSError as error:
-        detail = f"{result.reason_detail}; there is no bundle: {error.strerror or error}"
+    except (OSError, RunError) as error:
+        told = (error.strerror if isinstance(error, OSError) else None) or error
+        detail = f"{result.reason_detail}; there is no bundle: {told}"
         return dataclasses.replace(result, reason_detail=detail)
     return result
 

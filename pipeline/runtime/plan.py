@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
-from pipeline.errors import CrsError, InputError
-from pipeline.io import ReadOptions, SourceInfo, open_source
+import shapely
+
+from pipeline.errors import CrsError, EmptyInputError, InputError
+from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
 from pipeline.runtime.needs import WINDOW_BASE_BYTES
 from pipeline.scene import ClassesInUse
 from pipeline.settings import RunSettings
@@ -15,6 +18,8 @@ from pipeline.tiling import MM, Tile, TileGrid
 
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
 _POINTS_PER_WINDOW = 12_000_000
+_ASKED_AT_ONCE = 8
+"""Files elsewhere whose headers are read together: a header takes some ten requests, tens of milliseconds each."""
 _BYTES_PER_POINT = 220
 """Measured peak of a split above the size of its process, bytes a point of the window, at 3 and 5 million points."""
 
@@ -72,7 +77,7 @@ def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings)
     InputError
         An input cannot be used, or two inputs disagree about their CRS.
     """
-    sources = tuple(open_source(path, options).info for path in sorted(paths))
+    sources = _looked_at(sorted(paths), options)
     first = sources[0].reference
     warnings = [f"{info.path}: {text}" for info in sources for text in info.warnings]
     for info in sources[1:]:
@@ -106,6 +111,61 @@ def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings)
         window_bytes=int(density * (size + 2.0 * halo_m) ** 2 * _BYTES_PER_POINT),
         warnings=tuple(warnings),
     )
+
+
+def _looked_at(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, ...]:
+    """What the inputs say of themselves; of those elsewhere some are asked at once, since that is mostly waiting."""
+
+    def look(path: str) -> SourceInfo:
+        return open_source(path, options).info
+
+    if not any(is_url(path) for path in paths):
+        return tuple(look(path) for path in paths)
+    with ThreadPoolExecutor(_ASKED_AT_ONCE, thread_name_prefix="gablework-plan") as threads:
+        return tuple(threads.map(look, paths))
+
+
+def without_far_files(plan: Plan, paths: Sequence[str]) -> tuple[Plan, list[str]]:
+    """The plan without files elsewhere that lie off --bbox and --aoi by their headers: they need not be fetched.
+
+    Parameters
+    ----------
+    plan : Plan
+        Of all files.
+    paths : sequence of str
+        These.
+
+    Returns
+    -------
+    tuple of Plan and list of str
+        Those that are left; files of this machine always are.
+
+    Raises
+    ------
+    EmptyInputError
+        None is left.
+    """
+    window = plan.options.window
+    if window is None:
+        return plan, list(paths)
+    unit = plan.sources[0].reference.horizontal_unit_m
+    wanted = shapely.box(window.x_min, window.y_min, window.x_max, window.y_max)
+    of_path = {info.path: info for info in plan.sources}
+    near = []
+    for path in paths:
+        info = of_path[shown(path)]
+        x_min, y_min, _, x_max, y_max, _ = (value / unit for value in info.bounds_m)
+        # headers are believed to a unit; a file of this machine costs a read and no more
+        if not is_url(path) or shapely.box(x_min - 1.0, y_min - 1.0, x_max + 1.0, y_max + 1.0).intersects(wanted):
+            near.append(path)
+    if not near:
+        raise EmptyInputError(
+            shown(paths[0]), f"all {len(paths)} inputs lie off --bbox and --aoi", "Check them, and their CRS"
+        )
+    kept = {shown(path) for path in near}
+    sources = tuple(info for info in plan.sources if info.path in kept)
+    points = sum(info.point_count for info in sources)
+    return dataclasses.replace(plan, sources=sources, points=points), near
 
 
 def check_memory(plan: Plan, limit_bytes: int | None) -> None:

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import shapely
 
-from pipeline.errors import RunCancelledError
+from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.records import RecordContext, RejectedObject
 from pipeline.export.tile import Put, write_tile
-from pipeline.io import LocalStorage
+from pipeline.io import Storage, storage_at
+from pipeline.io.storage import Puts
 from pipeline.model import Status
 from pipeline.runtime.bundle import SUFFIX
 from pipeline.runtime.join import RejectedSite
@@ -82,18 +83,14 @@ def publish(task: PublishTask) -> Published:
     RunCancelledError
         The run was called off, or is over: whoever comes so late must not touch what another run may have written.
     """
-    storage = LocalStorage(root=Path(task.run_dir))
-
-    def put(key: str, content: bytes) -> None:
-        task.scratch.check_cancelled()
-        storage.put(key, content)
-
+    storage = storage_at(task.run_dir)
     task.scratch.check_cancelled()
     files: dict[str, str] = {}
     error = ""
     try:
         if task.batches or task.rejected or task.empty_tables:
-            files = _write(task, put)
+            with storage.several(task.scratch.check_cancelled) as puts:
+                files = _write(task, _tables_last(puts))
     except RunCancelledError:
         raise
     except Exception as fault:  # noqa: BLE001 - told in the tile's state, the manifest and the exit code
@@ -105,19 +102,35 @@ def publish(task: PublishTask) -> Published:
         "error": error,
         "files": files,
     }
-    put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
+    task.scratch.check_cancelled()
+    try:
+        storage.put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
+    except (RunError, OSError) as fault:
+        # a tile without its state is not finished, which is what the manifest will say of it
+        return Published(tile=task.tile, n_files=0, error=error or f"its state: {fault}")
     for name in sorted(before - files.keys()):
         storage.delete(name)
     return Published(tile=task.tile, n_files=len(files), error=error)
 
 
-def files_of(storage: LocalStorage, tile: Tile) -> set[str]:
+def _tables_last(puts: Puts) -> Put:
+    """Puts that are under way together, but no table before all meshes are there: rows name them."""
+
+    def put(key: str, content: bytes) -> None:
+        if not key.startswith("meshes/"):
+            puts.wait()
+        puts.put(key, content)
+
+    return put
+
+
+def files_of(storage: Storage, tile: Tile) -> set[str]:
     """The files that a tile's state names; none where it has no state yet."""
     key = f"state/{tile.key}.json"
     return set(json.loads(storage.get(key))["files"]) if storage.has(key) else set()
 
 
-def retire(storage: LocalStorage, tile: Tile) -> None:
+def retire(storage: Storage, tile: Tile) -> None:
     """Remove what a tile published that owns nothing any more: its files, then its state."""
     for name in sorted(files_of(storage, tile)):
         storage.delete(name)

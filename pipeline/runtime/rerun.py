@@ -50,16 +50,15 @@ from pipeline.runtime.progress import Progress
 from pipeline.runtime.publish import QUARANTINE, rejected_object
 from pipeline.runtime.run import (
     OVERRIDES,
-    SCRATCH,
     RunRequest,
     calling_off,
     plan_inputs,
     put_json,
-    remove_folder,
     told_file,
     told_request,
 )
 from pipeline.runtime.scratch import Scratch
+from pipeline.runtime.scratch_folder import SCRATCH, remove_folder
 from pipeline.runtime.stages import GivenFootprints, Models, Splits, Stages, given_footprints, points_by_tile
 from pipeline.runtime.tls import TlsFiles
 from pipeline.tiling import MM, Tile

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import datetime as dt
 import json
-import shutil
 import threading
 import time
 from collections import Counter
@@ -14,11 +13,23 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from uuid import uuid4
 
+import shapely
+
 from pipeline import __version__
 from pipeline.errors import RunCancelledError, RunError, SettingsError
-from pipeline.io import LocalStorage, ReadOptions, SpatialReference, find_inputs, open_source
+from pipeline.io import (
+    ReadOptions,
+    SpatialReference,
+    find_inputs,
+    is_url,
+    open_source,
+    sha256_of,
+    shown,
+    storage_at,
+)
 from pipeline.io.footprints import read_area
-from pipeline.io.storage import sha256_of
+from pipeline.io.remote_file import on_this_machine
+from pipeline.io.tile_index import TileIndex
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.executors import Executor, executor_for, peak_of_process
@@ -29,11 +40,12 @@ from pipeline.runtime.join import Joined
 from pipeline.runtime.logs import about
 from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, read_manifest, write_manifest
 from pipeline.runtime.overrides import read_overrides
-from pipeline.runtime.plan import Plan, check_memory, make_plan
+from pipeline.runtime.plan import Plan, check_memory, make_plan, without_far_files
 from pipeline.runtime.priorities import Traffic
 from pipeline.runtime.progress import Progress
-from pipeline.runtime.publish import QUARANTINE
+from pipeline.runtime.publish import QUARANTINE, Published
 from pipeline.runtime.scratch import Scratch
+from pipeline.runtime.scratch_folder import check_scratch, remove_folder, scratch_folder
 from pipeline.runtime.stages import MODELS, Models, Splits, Stages, given_footprints
 from pipeline.runtime.stale import tidy
 from pipeline.runtime.tls import TlsFiles
@@ -45,7 +57,6 @@ FOOTPRINTS = "footprints.json"
 """What was wrong with the given footprints, one by one; there where footprints were given."""
 OVERRIDES = "overrides.json"
 """What became of each entry of the overrides; there where overrides were given."""
-SCRATCH = "scratch"
 
 _RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state", QUARANTINE)
 
@@ -55,9 +66,9 @@ class RunRequest:
     """What is to be done."""
 
     inputs: tuple[str, ...]
-    """Files, folders or patterns."""
+    """Files, folders, patterns, URLs or tile indexes."""
     out: str
-    """The run directory; new or empty, unless `overwrite`."""
+    """The run directory, a folder or `s3://bucket/prefix`; new or empty, unless `overwrite`."""
     settings: RunSettings = dataclasses.field(default_factory=RunSettings)
     """All settings."""
     footprints: str | None = None
@@ -82,6 +93,12 @@ class RunRequest:
     """Whether somebody waits for the run; tasks of a `batch` go behind where workers are scarce."""
     performance_report: str | None = None
     """Gets a page about the workers' time; none by default."""
+    scratch: str | None = None
+    """A folder for what is neither input nor result, the same for all workers; by default the run directory, or a
+    temporary folder of this machine where that is a URL."""
+    only_files: bool = False
+    """Take each input for the path of a file and follow neither folders, patterns, URLs nor tile indexes: for inputs
+    that strangers name."""
     meshes: str = "building"
     """One OBJ a building, one a tile, or none."""
     licence: str | None = None
@@ -112,7 +129,7 @@ class RunSummary:
     """What a run found."""
 
     run_dir: str
-    """Where the results are."""
+    """Where the results are: a path, or a URL."""
     digest: str
     """sha256 of the content."""
     statuses: dict[str, int]
@@ -236,6 +253,8 @@ def run_variants(
         As `run`.
     """
     started_at = dt.datetime.now(tz=dt.UTC)
+    if request.work is None:
+        check_scratch(work_dir, request.scratch, request.scheduler)
     shared = Progress(on_event)
     began = time.perf_counter()
     settings = _common_settings(variants)
@@ -268,7 +287,9 @@ def run_variants(
     ]
     shared.timings["plan"] = time.perf_counter() - began
     with contextlib.ExitStack() as held:
-        scratch = held.enter_context(_scratch(work_dir) if request.work is None else held_work(request.work))
+        scratch = held.enter_context(
+            _scratch(work_dir, request.scratch) if request.work is None else held_work(request.work)
+        )
         engine = executor or executor_for(
             workers=request.workers,
             scheduler=request.scheduler,
@@ -285,9 +306,11 @@ def run_variants(
             check_memory(plan, engine.memory_limit_bytes)
             # nothing of an earlier run goes before all that can be checked is checked
             for run_dir, manifest in zip(run_dirs, manifests, strict=True):
-                if request.work is None or not _is_of_work(run_dir, request.work):
-                    _clear_results(run_dir)
-                write_manifest(run_dir, manifest, LocalStorage(root=run_dir).put)
+                # whoever reads meanwhile sees that the directory is being changed
+                known = request.work is not None and _is_of_work(run_dir, request.work)
+                write_manifest(run_dir, manifest, storage_at(run_dir).put)
+                if not known:
+                    storage_at(run_dir).clear((*_RESULTS, FOOTPRINTS, OVERRIDES))
                 if footprints is not None:
                     put_json(run_dir, FOOTPRINTS, footprints.report)
             for path in stale:
@@ -321,7 +344,7 @@ def run_variants(
                 ]
                 modelled = [own.reconstruct(joined) for own in each]
                 published = [
-                    own.publish(splits, joined, models, reference, str(run_dir))
+                    own.publish(splits, joined, models, reference, run_dir)
                     for own, models, run_dir in zip(each, modelled, run_dirs, strict=True)
                 ]
                 found = [_Counted.of(models) for models in modelled]
@@ -333,16 +356,16 @@ def run_variants(
                 for k, (run_dir, manifest) in enumerate(zip(run_dirs, manifests, strict=True)):
                     warnings = (progresses[k] if progresses else shared).warnings
                     broken = dataclasses.replace(manifest, status=status, warnings=(*warnings, message))
-                    write_manifest(run_dir, broken, LocalStorage(root=run_dir).put)
+                    write_manifest(run_dir, broken, storage_at(run_dir).put)
                 raise
             if request.work is not None:
                 tidy(scratch, joined, {f"{MODELS}-{v.settings.settings_hash[:16]}" for v in variants}, run_dirs)
-    inputs = _inputs_told(request, paths, ingested)
+    inputs = _inputs_told(request, paths, ingested, plan)
     driver, peak_bytes = peak_of_process()
     outcomes = []
     for k, (run_dir, own) in enumerate(zip(run_dirs, progresses, strict=True)):
         finishing = time.perf_counter()
-        digest = run_digest(str(run_dir))
+        digest = run_digest(run_dir, tiles=_with_tables(run_dir, joined, modelled[k], published[k]))
         own.timings["digest"] = time.perf_counter() - finishing
         # of several variants each is told with what it took alone: the shared stages and its own
         alone = len(variants) == 1
@@ -366,10 +389,10 @@ def run_variants(
                 warnings=tuple(own.warnings),
                 content_sha256=digest,
             ),
-            LocalStorage(root=run_dir).put,
+            storage_at(run_dir).put,
         )
         summary = RunSummary(
-            run_dir=str(run_dir),
+            run_dir=run_dir,
             digest=digest,
             statuses=dict(found[k].statuses),
             reasons=dict(found[k].reasons),
@@ -404,13 +427,16 @@ def _common_settings(variants: Sequence[RunVariant]) -> RunSettings:
     return first
 
 
-def _inputs_told(request: RunRequest, paths: Sequence[str], ingested: Sequence[Ingested]) -> tuple[InputFile, ...]:
+def _inputs_told(
+    request: RunRequest, paths: Sequence[str], ingested: Sequence[Ingested], plan: Plan
+) -> tuple[InputFile, ...]:
     """The inputs as the manifest tells them."""
+    sizes = {info.path: info.file_size for info in plan.sources}
     inputs = [
         InputFile(
-            path=path,
+            path=shown(path),
             sha256=found.sha256,
-            size_bytes=Path(path).stat().st_size,
+            size_bytes=sizes[shown(path)],
             n_points=sum(found.points_by_tile.values()),
             bounds_m=_plan_bounds_m(found),
         )
@@ -430,15 +456,19 @@ def _plan_bounds_m(found: Ingested) -> tuple[float, float, float, float] | None:
 
 def told_file(name: str) -> InputFile:
     """A file beside the point clouds as the manifest tells it."""
-    path = Path(name).resolve()
-    return InputFile(path=str(path), sha256=sha256_of(path), size_bytes=path.stat().st_size)
+    with on_this_machine(name) as path:
+        return InputFile(path=_told_path(name), sha256=sha256_of(path), size_bytes=path.stat().st_size)
+
+
+def _told_path(name: str) -> str:
+    return shown(name) if is_url(name) else str(Path(name).resolve())
 
 
 def told_request(request: RunRequest) -> dict[str, object]:
     """What of a request `run.json` keeps, so that single buildings of the run can be modelled again."""
 
     def whole(path: str | None) -> str | None:
-        return None if path is None else str(Path(path).resolve())
+        return None if path is None else _told_path(path)
 
     return {
         "footprints": whole(request.footprints),
@@ -452,10 +482,10 @@ def told_request(request: RunRequest) -> dict[str, object]:
     }
 
 
-def put_json(run_dir: Path, name: str, content: object) -> None:
+def put_json(run_dir: str | Path, name: str, content: object) -> None:
     """Write a document of a run directory, whole or not at all."""
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    LocalStorage(root=run_dir).put(name, text.encode())
+    storage_at(run_dir).put(name, text.encode())
 
 
 @contextlib.contextmanager
@@ -497,18 +527,30 @@ def calling_off(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Cal
 
 def plan_inputs(request: RunRequest, settings: RunSettings, progress: Progress) -> tuple[Plan, list[str]]:
     """The plan and the input files in order."""
-    # workers elsewhere do not share this process's folder
-    paths = sorted(str(path.resolve()) for path in find_inputs(request.inputs))
     options = ReadOptions(
         crs=request.crs,
         vertical_unit=request.vertical_unit,
         bbox=request.bbox,
         class_table=settings.class_codes.table,
     )
+
+    def cut(index: TileIndex) -> Sequence[str]:
+        """The files of an index that the window may need: the others are neither opened nor fetched."""
+        if request.bbox is None and request.aoi is None:
+            return index.locations
+        reference = open_source(index.locations[0], options).info.reference
+        area = None if request.aoi is None else read_area(request.aoi, reference)
+        if request.bbox is not None:
+            box = shapely.box(*request.bbox)
+            area = box if area is None else box & area
+        return index.within(area, reference)
+
+    paths = find_inputs(request.inputs, only_files=request.only_files, cut=cut)
     if request.aoi is not None:
         reference = open_source(paths[0], options).info.reference
         options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
     plan = make_plan(paths, options, settings)
+    plan, paths = without_far_files(plan, paths)
     for warning in plan.warnings:
         progress.warn("plan", warning)
     if not any(info.has_returns for info in plan.sources):
@@ -517,10 +559,9 @@ def plan_inputs(request: RunRequest, settings: RunSettings, progress: Progress) 
 
 
 @contextlib.contextmanager
-def _scratch(work_dir: str) -> Iterator[Scratch]:
+def _scratch(work_dir: str, wanted: str | None) -> Iterator[Scratch]:
     """A scratch folder for the duration of a run."""
-    folder = Path(work_dir).resolve() / SCRATCH
-    remove_folder(folder)
+    folder = scratch_folder(work_dir, wanted)
     scratch = Scratch(str(folder / uuid4().hex))
     scratch.create()
     try:
@@ -529,7 +570,7 @@ def _scratch(work_dir: str) -> Iterator[Scratch]:
         remove_folder(folder)
 
 
-def _is_of_work(run_dir: Path, work: str) -> bool:
+def _is_of_work(run_dir: str, work: str) -> bool:
     """Whether a run directory was written from this very work folder, so that what is there is known there."""
     try:
         told = read_manifest(run_dir).request.get("work")
@@ -538,20 +579,30 @@ def _is_of_work(run_dir: Path, work: str) -> bool:
     return told == str(Path(work).resolve())
 
 
-def _checked(out: str, *, overwrite: bool, work: str | None = None) -> Path:
-    """The run directory, which may be written.
+def _with_tables(run_dir: str, joined: Joined, models: Models, published: Sequence[Published]) -> list[str] | None:
+    """The tiles that have tables in an object store, so that their digest needs no listing; None to list.
+
+    A store may list what is there some time after it was put.
+    """
+    if not is_url(run_dir) or any(outcome.error for outcome in published):
+        return None
+    owners = {tile.key for tile in models.places} | {site.owner.key for site in joined.rejected}
+    return sorted(owners) or sorted(outcome.tile.key for outcome in published)[:1]
+
+
+def _checked(out: str, *, overwrite: bool, work: str | None = None) -> str:
+    """The run directory, which may be written: a path, or a URL.
 
     Raises
     ------
     RunError
-        It holds something and `overwrite` is not asked for, it is no local path, or it cannot be written.
+        It holds something and `overwrite` is not asked for, or it cannot be written.
     """
-    if "://" in out:
-        raise RunError(f"{out} is no local path: this version writes local run directories only")
-    run_dir = Path(out).resolve()
+    storage = storage_at(out)
+    run_dir = storage.place
     try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        left = sorted(entry.name for entry in run_dir.iterdir())
+        storage.make()
+        left = storage.names()
         if left and not overwrite and not (work is not None and _is_of_work(run_dir, work)):
             raise RunError(f"{run_dir} is not empty ({left[0]} …): give another --out, or --overwrite")
         if left and NAME not in left:
@@ -559,41 +610,6 @@ def _checked(out: str, *, overwrite: bool, work: str | None = None) -> Path:
     except OSError as error:
         raise RunError(f"{run_dir} cannot be written: {error.strerror or error}. Give another --out") from error
     return run_dir
-
-
-def remove_folder(folder: Path) -> None:
-    """Remove a folder of scratch: renamed first, so that no late task of an earlier run finds it and fills it again.
-
-    Raises
-    ------
-    RunError
-        It cannot be renamed.
-    """
-    if folder.exists():
-        doomed = folder.with_name(f".{folder.name}.{uuid4().hex}")
-        try:
-            folder.rename(doomed)
-        except OSError as error:
-            raise RunError(f"{folder} cannot be removed: {error.strerror or error}") from error
-        shutil.rmtree(doomed, ignore_errors=True)
-
-
-def _clear_results(run_dir: Path) -> None:
-    """Remove what an earlier run left.
-
-    Raises
-    ------
-    RunError
-        Something cannot be removed.
-    """
-    for name in (*_RESULTS, FOOTPRINTS, OVERRIDES):
-        try:
-            if (run_dir / name).is_file():
-                (run_dir / name).unlink()
-            elif (run_dir / name).exists():
-                shutil.rmtree(run_dir / name)
-        except OSError as error:
-            raise RunError(f"{run_dir / name} cannot be removed: {error.strerror or error}") from error
 
 
 def _crs_facts(reference: SpatialReference) -> dict[str, object]:

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
+from uuid import uuid4
 
 import shapely
 from shapely import MultiPolygon, Polygon
@@ -16,7 +17,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline import __version__
 from pipeline.errors import EmptyInputError, InconsistentInputError
 from pipeline.export.records import RecordContext
-from pipeline.io import LocalStorage, SpatialReference
+from pipeline.io import SpatialReference, shown, storage_at
 from pipeline.io.footprints import read_footprints
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import Status
@@ -118,7 +119,7 @@ def given_footprints(path: str, plan: Plan) -> GivenFootprints:
         attributes=tuple(json.dumps(found.attributes[k], ensure_ascii=False) for k in inside),
         warnings=tuple(warnings),
         report={
-            "path": path,
+            "path": shown(path),
             "used": len(inside),
             "off_the_data": polygons - len(inside),
             "repaired": sum(issue.action != "left out" for issue in issues),
@@ -220,31 +221,33 @@ class Stages:
                 options=self.plan.options,
                 grid=self.plan.grid,
                 scratch=self.scratch,
-                known=known.get(path),
+                known=known[shown(path)],
             )
-            file = Path(path).stat()
-            key = key_of(path, file.st_size, file.st_mtime_ns, task.options, task.grid)
+            file = known[shown(path)]
+            # what nobody can tell to be the same is read again
+            written = file.modified_ns or uuid4().hex
+            key = key_of(path, file.file_size, written, task.options, task.grid)
             tasks[Place("ingest", task.part, key)] = task
         clear_points(self.scratch, tasks)
         ingested = list(self.progress.kept(self.executor, "ingest", ingest, tasks, self.scratch, whole).values())
         for found in ingested:
             for warning in found.warnings:
-                self.progress.warn("ingest", f"{found.path}: {warning}")
+                self.progress.warn("ingest", f"{shown(found.path)}: {warning}")
         kept = sum(sum(found.points_by_tile.values()) for found in ingested)
         if kept == 0:
             causes = Counter[str]()
             for found in ingested:
                 causes.update(found.dropped)
-            told = ", ".join(f"{count} {cause}" for cause, count in causes.items() if count)
+            lost = ", ".join(f"{count} {cause}" for cause, count in causes.items() if count)
             raise EmptyInputError(
-                paths[0],
-                f"no usable point is left ({told or 'none in the files'})",
+                shown(paths[0]),
+                f"no usable point is left ({lost or 'none in the files'})",
                 "Check --bbox and --aoi; points that are withheld or of the noise classes 7 and 18 are never used",
             )
         spread = spread_m(ingested)
         if spread < _LINE_SPREAD_M:
             raise InconsistentInputError(
-                paths[0],
+                shown(paths[0]),
                 f"all {kept} points lie on one line (they stray {spread:.3f} m from it)",
                 "Check the columns and the scale of the file",
             )
@@ -536,7 +539,7 @@ class Stages:
             key = key_of(run_dir, task.batches, task.rejected, _told_context(context), task.meshes, task.empty_tables)
             tasks[Place(stage, tile.key, key)] = task
         # what somebody removed from the run directory is published again
-        storage = LocalStorage(root=Path(run_dir))
+        storage = storage_at(run_dir)
         there = {Path(name).stem for name in storage.keys("state")}
         drop_stale(self.scratch, stage, [place for place in tasks if place.unit in there])
         published = self.progress.kept(

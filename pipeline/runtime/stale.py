@@ -51,7 +51,7 @@ def clear_tiles(scratch: Scratch, folder: str, wanted: Iterable[Place]) -> None:
             shutil.rmtree(tile, ignore_errors=True)
 
 
-def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Sequence[Path]) -> None:
+def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Sequence[str]) -> None:
     """Remove what a finished run has no more use for: models by other settings, points of units that are no more.
 
     Parameters
@@ -62,10 +62,10 @@ def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Se
         Its candidates.
     models : collection of str
         Stages of its models.
-    run_dirs : sequence of Path
+    run_dirs : sequence of str
         Where it published.
     """
-    published = {publishing(str(run_dir)) for run_dir in run_dirs}
+    published = {publishing(run_dir) for run_dir in run_dirs}
     for stage in Path(scratch.root, FOLDER).glob("*"):
         by_others = stage.name.startswith("models-") and stage.name not in models
         if by_others or (stage.name.startswith("publish-") and stage.name not in published):

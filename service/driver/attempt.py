@@ -234,6 +234,7 @@ def run_request(
     """
     return RunRequest(
         inputs=tuple(str(tile.path) for tile in tiles),
+        only_files=True,  # a tile of a stranger that reads as a tile index would else be followed wherever it leads
         out=str(out),
         settings=RunSettings.from_mapping(request.settings),
         footprints=None if outlines is None else str(outlines.path),

@@ -12,6 +12,7 @@ from pipeline.evaluation.reading.cityjson import is_cityjson, read_cityjson_file
 from pipeline.evaluation.reading.collected import Collected, Kind
 from pipeline.evaluation.reading.obj import read_obj_files
 from pipeline.evaluation.reading.run import is_run, read_run
+from pipeline.io import is_url, shown
 
 CITYJSON = (".city.json", ".json")
 CITYJSONSEQ = (".city.jsonl", ".jsonl")
@@ -36,8 +37,8 @@ def read_models(path: str | Path) -> ModelSet:
     Parameters
     ----------
     path : str or Path
-        A run directory, the truth of a simulated data set, a CityJSON, CityJSONSeq or OBJ file, or a folder of such
-        files of one kind, also in folders within.
+        A run directory, or its URL; the truth of a simulated data set, a CityJSON, CityJSONSeq or OBJ file, or a folder
+        of such files of one kind, also in folders within.
 
     Raises
     ------
@@ -46,6 +47,10 @@ def read_models(path: str | Path) -> ModelSet:
     RunError
         If a run directory is damaged.
     """
+    if isinstance(path, str) and is_url(path):
+        if is_run(path):
+            return read_run(path)
+        raise InputError(shown(path), "no run directory is there", "Give one, or fetch the files of other programs")
     place = Path(path)
     if not place.exists():
         raise InputError(str(place), "nothing is there", f"Give one of: {_readable()}")

@@ -21,6 +21,7 @@ from pipeline.evaluation.reading.collected import Collected, model_of
 from pipeline.evaluation.reading.surfaces import assemble
 from pipeline.evaluation.reading.told_types import told_roof_type
 from pipeline.io.crs import SpatialReference, parse_crs, resolve_reference
+from pipeline.io.readable import Readable
 from pipeline.model import FloatArray, RoofType, Status
 
 VERSIONS = ("1.0", "1.1", "2.0")
@@ -129,13 +130,13 @@ def read_cityjsonseq_file(path: Path, into: Collected) -> None:
 
 
 def features(
-    path: Path, into: Collected, units_m: tuple[float, float] | None = None
+    path: Readable, into: Collected, units_m: tuple[float, float] | None = None
 ) -> Iterator[tuple[Object, Places, str]]:
     """The features of a CityJSONSeq file, with their vertices, and where they are, for messages.
 
     Parameters
     ----------
-    path : Path
+    path : Readable
         The file. A line of metadata may come again: it holds from there on.
     into : Collected
         Is told of the coordinate reference system.
@@ -177,11 +178,11 @@ def features(
         raise _unreadable(path, "the file is empty")
 
 
-def _unreadable(path: Path, problem: str, fix: str = _FIX) -> InputError:
+def _unreadable(path: Readable, problem: str, fix: str = _FIX) -> InputError:
     return UnreadableInputError(str(path), problem, fix)
 
 
-def _broken(path: Path, where: str, fault: Exception) -> InputError:
+def _broken(path: Readable, where: str, fault: Exception) -> InputError:
     """What a fault of a file's content becomes."""
     told = f"{fault} is missing" if isinstance(fault, KeyError) else str(fault)
     return _unreadable(path, f"{where}{told}")
@@ -201,7 +202,9 @@ def _triples(vertices: Any) -> FloatArray:
     return array
 
 
-def _frame(path: Path, where: str, header: Any, into: Collected, units_m: tuple[float, float] | None = None) -> Frame:
+def _frame(
+    path: Readable, where: str, header: Any, into: Collected, units_m: tuple[float, float] | None = None
+) -> Frame:
     """The frame of a header.
 
     Raises
@@ -235,7 +238,7 @@ def _frame(path: Path, where: str, header: Any, into: Collected, units_m: tuple[
         raise _broken(path, where, fault) from fault
 
 
-def _reference(path: Path, metadata: Object, into: Collected) -> SpatialReference:
+def _reference(path: Readable, metadata: Object, into: Collected) -> SpatialReference:
     """The coordinate reference system and its units; metres where there is none.
 
     Raises

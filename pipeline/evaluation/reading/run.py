@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -22,20 +22,32 @@ from pipeline.evaluation.reading.collected import Collected
 from pipeline.evaluation.reading.raw import MILLIMETRES_PER_METRE, RawPart
 from pipeline.evaluation.reading.surfaces import GRID_M
 from pipeline.export.geoparquet import read_table
+from pipeline.io import arrow_at, is_url, place_below, storage_at
 from pipeline.io.crs import resolve_reference
+from pipeline.io.remote_file import file_at
 from pipeline.model import FaceKind, RoofType, Solid, SolidFace, Status
 from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
 
+_CONDITIONS = "conditions.parquet"
 Solids = dict[str, tuple[tuple[Solid, ...], tuple[float, float, float]]]
 
 
-def is_run(path: Path) -> bool:
-    """Whether a folder is a run directory, or laid out like one."""
-    return path.is_dir() and ((path / NAME).is_file() or (path / "buildings").is_dir())
+def is_run(place: str | Path) -> bool:
+    """Whether a folder or URL is a run directory, or laid out like one."""
+    if not is_url(place):
+        path = Path(place)
+        return path.is_dir() and ((path / NAME).is_file() or (path / "buildings").is_dir())
+    storage = storage_at(place)
+    return storage.has(NAME) or bool(storage.keys("buildings"))
 
 
-def read_run(path: Path) -> ModelSet:
+def read_run(place: str | Path) -> ModelSet:
     """The buildings of a run directory, or of the truth that `simulate` writes, in metres.
+
+    Parameters
+    ----------
+    place : str or Path
+        The folder, or its URL.
 
     Raises
     ------
@@ -45,10 +57,11 @@ def read_run(path: Path) -> ModelSet:
         If its CityJSONSeq or the table of conditions is damaged.
     """
     into = Collected()
-    units_m = _units_m(path, into)
-    rows = read_table(str(path), "buildings").to_pylist()
-    surfaces = _surfaces(path, units_m)
-    solids = _solids(path, units_m, into)
+    units_m = _units_m(place, into)
+    filesystem, folder = arrow_at(place)
+    rows = read_table(folder, "buildings", filesystem).to_pylist()
+    surfaces = _surfaces(place, units_m)
+    solids = _solids(place, units_m, into)
     for row in rows:
         shapes, origin = solids.get(row["building_id"], ((), (0.0, 0.0, 0.0)))
         into.add(
@@ -67,18 +80,19 @@ def read_run(path: Path) -> ModelSet:
         )
     methods = sorted({row["method"] for row in rows})
     into.has_footprints = any(row["source_id"] is not None for row in rows)
-    return into.finish(name=" and ".join(methods) or _method(path), kind="run", path=str(path))
+    return into.finish(name=" and ".join(methods) or _method(place), kind="run", path=str(place))
 
 
-def _method(path: Path) -> str:
+def _method(place: str | Path) -> str:
     """The method of a run that has no record."""
-    return read_manifest(path).method if (path / NAME).is_file() else path.name
+    return read_manifest(place).method if storage_at(place).has(NAME) else PurePosixPath(place).name
 
 
-def _units_m(path: Path, into: Collected) -> tuple[float, float]:
+def _units_m(place: str | Path, into: Collected) -> tuple[float, float]:
     """Metres a horizontal and a vertical unit, from run.json, else from the tables' own metadata."""
-    if (path / NAME).is_file():
-        manifest = read_manifest(path)
+    storage = storage_at(place)
+    if storage.has(NAME):
+        manifest = read_manifest(place)
         into.note(f"made by gablework {manifest.engine_version} with settings {manifest.settings_hash[:12]}")
         if manifest.status is not RunStatus.FINISHED:
             into.note(f"the run is {manifest.status.value}: not all of its buildings may be there")
@@ -86,20 +100,22 @@ def _units_m(path: Path, into: Collected) -> tuple[float, float]:
         if crs.get("wkt"):
             into.is_at(f"EPSG:{crs['epsg']}" if crs.get("epsg") else str(crs.get("name")))
         return float(crs.get("horizontal_unit_m", 1.0)), float(crs.get("vertical_unit_m", 1.0))
-    part = next(iter(sorted((path / "buildings").glob("*/*.parquet"))), None)
-    if part is None:
+    key = next((key for key in storage.keys("buildings") if key.endswith(".parquet")), None)
+    if key is None:
         return 1.0, 1.0
+    part = place_below(place, key)
+    filesystem, file = arrow_at(part)
     try:
-        metadata = pq.read_schema(part).metadata or {}
+        metadata = pq.read_schema(file, filesystem=filesystem).metadata or {}
         projjson = json.loads(metadata.get(b"geo", b"{}")).get("columns", {}).get("geometry", {}).get("crs")
     except (pa.ArrowInvalid, OSError, ValueError) as error:
-        raise UnreadableInputError(str(part), str(error), "Write the folder again") from error
+        raise UnreadableInputError(part, str(error), "Write the folder again") from error
     if projjson is None:
         into.note("no coordinate reference system in the tables: coordinates are taken as metres")
         return 1.0, 1.0
     import pyproj
 
-    reference, _ = resolve_reference(path=str(part), header_crs=pyproj.CRS.from_json_dict(projjson))
+    reference, _ = resolve_reference(path=part, header_crs=pyproj.CRS.from_json_dict(projjson))
     into.is_at(reference.name if reference.epsg is None else f"EPSG:{reference.epsg}")
     return reference.horizontal_unit_m, reference.vertical_unit_m
 
@@ -114,18 +130,19 @@ def _in_metres(wkb: bytes | None, units_m: tuple[float, float]) -> Polygon | Mul
     return shapely.transform(geometry, lambda xy: np.round(xy * units_m[0], 3))
 
 
-def _surfaces(path: Path, units_m: tuple[float, float]) -> dict[str, list[RoofSurface]]:
+def _surfaces(place: str | Path, units_m: tuple[float, float]) -> dict[str, list[RoofSurface]]:
     """Roof faces by building, in the order of their planes. Pieces of one plane that touch are one."""
     horizontal, vertical = units_m
-    groups = _groups(path)
+    groups = _groups(place)
+    filesystem, folder = arrow_at(place)
     surfaces: dict[str, list[RoofSurface]] = {}
-    for row in read_table(str(path), "planes").to_pylist():
+    for row in read_table(folder, "planes", filesystem).to_pylist():
         if not row["geometry"]:
             continue
         normal_x, normal_y, normal_z, offset = row["coefficients"]
         if not (math.isfinite(sum(row["coefficients"])) and normal_z > 0.0):
             raise RunError(
-                f"{path}: plane {row['plane_id']} of {row['building_id']} has the coefficients {row['coefficients']}: "
+                f"{place}: plane {row['plane_id']} of {row['building_id']} has the coefficients {row['coefficients']}: "
                 "a roof plane looks up. Write the run again"
             )
         geometry = _in_metres(row["geometry"], units_m)
@@ -151,27 +168,29 @@ def _surfaces(path: Path, units_m: tuple[float, float]) -> dict[str, list[RoofSu
     return surfaces
 
 
-def _groups(path: Path) -> dict[str, list[int]]:
+def _groups(place: str | Path) -> dict[str, list[int]]:
     """The groups of each building's planes, where the truth tells them."""
-    table = path / "conditions.parquet"
-    if not table.is_file():
+    if not storage_at(place).has(_CONDITIONS):
         return {}
+    table = place_below(place, _CONDITIONS)
+    filesystem, file = arrow_at(table)
     try:
-        rows = pq.read_table(table, columns=["building_id", "groups"]).to_pylist()
+        rows = pq.read_table(file, columns=["building_id", "groups"], filesystem=filesystem).to_pylist()
     except (pa.ArrowInvalid, OSError) as error:
-        raise UnreadableInputError(str(table), str(error), "Simulate the data set again") from error
+        raise UnreadableInputError(table, str(error), "Simulate the data set again") from error
     return {row["building_id"]: row["groups"] for row in rows}
 
 
-def _solids(path: Path, units_m: tuple[float, float], into: Collected) -> Solids:
+def _solids(place: str | Path, units_m: tuple[float, float], into: Collected) -> Solids:
     """Solids by building, each with its origin."""
-    folder = path / "cityjson"
-    if not folder.is_dir():
+    keys = [key for key in storage_at(place).keys("cityjson") if key.endswith(".city.jsonl")]
+    if not keys:
         into.note("no folder cityjson in the run: solids are unknown")
         return {}
     found: Solids = {}
     told = Collected()
-    for file in sorted(folder.glob("*/*.city.jsonl")):
+    for key in keys:
+        file = file_at(place_below(place, key))
         for feature, places, where in features(file, told, units_m):
             try:
                 name = feature["id"]
