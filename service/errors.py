@@ -2,7 +2,7 @@
 
 ```
 ServiceError
-├── NoSuchJobError, NoSuchProcessError, NoSuchUploadError, NoSuchBuildingError, NoSuchOutputError
+├── NoSuchJobError, NoSuchProcessError, NoSuchUploadError, NoSuchBuildingError, NoSuchOutputError, NoSuchScheduleError
 ├── ResultNotReadyError      the job is not over yet, or was dismissed
 ├── RequestError             inputs that do not fit the process: lists all faults at once
 ├── InputRefusedError        an input that is not allowed: a path outside the roots, a host that is not listed
@@ -10,10 +10,13 @@ ServiceError
 │   ├── TooLargeError        an upload or a body with too many bytes or points
 │   ├── NoSpaceError         the disk of the state folder is full
 │   ├── QueueFullError       too many jobs wait
+│   ├── TooManySchedulesError a key has all the schedules that it may have
 │   └── TooManyRequestsError too many requests of one client
 ├── UnauthorizedError        no key, or one that is not known
 ├── ForbiddenError           a key without the scope
 ├── UploadInUseError         an upload that jobs which are not over still need
+├── ScheduleBusyError        a run was asked for while a job of the schedule is under way
+├── ChangedMeanwhileError    what is to be changed is not any more what the client saw
 ├── LeaseLostError           a driver's claim on a job has passed to another
 ├── StoreError               the database does not answer, or is not migrated
 └── StartUpError             settings with which the service must not start
@@ -47,6 +50,10 @@ class NoSuchBuildingError(ServiceError):
 
 class NoSuchOutputError(ServiceError):
     """The process has no such output, or the job was asked not to make it."""
+
+
+class NoSuchScheduleError(ServiceError):
+    """The schedule does not exist, or belongs to another key."""
 
 
 class ResultNotReadyError(ServiceError):
@@ -87,6 +94,10 @@ class QueueFullError(LimitError):
     """Too many jobs wait already."""
 
 
+class TooManySchedulesError(LimitError):
+    """A key has all the schedules that it may have."""
+
+
 class TooManyRequestsError(LimitError):
     """Too many requests of one client.
 
@@ -113,6 +124,27 @@ class ForbiddenError(ServiceError):
 
 class UploadInUseError(ServiceError):
     """An upload that jobs which are not over still need; the message names how many."""
+
+
+class ScheduleBusyError(ServiceError):
+    """A run was asked for while a job of the schedule is under way.
+
+    Parameters
+    ----------
+    message : str
+        What runs.
+    job_id : str
+        The job that is under way.
+    """
+
+    def __init__(self, message: str, job_id: str) -> None:
+        self.job_id = job_id
+        self.members = {"jobID": job_id}
+        super().__init__(message)
+
+
+class ChangedMeanwhileError(ServiceError):
+    """What is to be changed is not any more what the client saw; the message names both versions."""
 
 
 class StoreError(ServiceError):

@@ -95,6 +95,12 @@ class JobRequest:
     title: str | None = None
     """The user's words."""
 
+    @property
+    def upload_ids(self) -> list[str]:
+        """Ids of the uploads among its inputs, each once, in order."""
+        references = [*self.tiles, *([] if self.footprints is None else [self.footprints])]
+        return sorted({reference.value for reference in references if reference.kind == "upload"})
+
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON values."""
         return dataclasses.asdict(self)
@@ -166,6 +172,8 @@ class Job:
     """Why it failed."""
     summary: Mapping[str, Any] | None = None
     """Counts, digest and timings of the run, once successful."""
+    schedule_id: str | None = None
+    """The schedule that it came of; it may be gone by now."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -65,12 +65,20 @@ KINDS: Mapping[type[Exception], Kind] = {
     errors.NoSuchUploadError: Kind(status=404, type_uri=f"{OWN}no-such-upload", title="No such upload"),
     errors.NoSuchBuildingError: Kind(status=404, type_uri=f"{OWN}no-such-building", title="No such building"),
     errors.NoSuchOutputError: Kind(status=404, type_uri=f"{OWN}no-such-output", title="No such output"),
+    errors.NoSuchScheduleError: Kind(status=404, type_uri=f"{OWN}no-such-schedule", title="No such schedule"),
+    errors.ScheduleBusyError: Kind(
+        status=409, type_uri=f"{OWN}schedule-busy", title="A job of the schedule is under way"
+    ),
+    errors.TooManySchedulesError: Kind(status=409, type_uri=f"{OWN}too-many-schedules", title="Too many schedules"),
+    errors.ChangedMeanwhileError: Kind(
+        status=412, type_uri=f"{OWN}changed-meanwhile", title="Somebody else has changed it"
+    ),
     errors.ResultNotReadyError: Kind(status=404, type_uri=f"{OGC}result-not-ready", title="The results are not ready"),
     errors.RequestError: Kind(status=400, type_uri=f"{OWN}invalid-request", title="The request does not fit"),
     errors.InputRefusedError: Kind(status=403, type_uri=f"{OWN}input-refused", title="The input is not allowed here"),
     errors.TooLargeError: Kind(status=413, type_uri=f"{OWN}too-large", title="More than this service takes"),
     errors.NoSpaceError: Kind(status=507, type_uri=f"{OWN}no-space", title="The disk is full"),
-    errors.UploadInUseError: Kind(status=409, type_uri=f"{OWN}upload-in-use", title="Jobs still need the upload"),
+    errors.UploadInUseError: Kind(status=409, type_uri=f"{OWN}upload-in-use", title="The upload is still needed"),
     errors.StoreError: _AWAY,
     errors.QueueFullError: Kind(status=429, type_uri=f"{OWN}queue-full", title="Too many jobs wait", retry=True),
     errors.TooManyRequestsError: Kind(
@@ -124,7 +132,9 @@ def kind_of(error: Exception) -> Kind:
     return next((KINDS[base] for base in type(error).__mro__ if base in KINDS), INTERNAL)
 
 
-def document(kind: Kind, detail: str, instance: str, faults: Sequence[str] = ()) -> dict[str, Any]:
+def document(
+    kind: Kind, detail: str, instance: str, faults: Sequence[str] = (), members: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """The members of a problem document; `errors` only where several things can be wrong at once."""
     found: dict[str, Any] = {
         "type": kind.type_uri,
@@ -135,7 +145,7 @@ def document(kind: Kind, detail: str, instance: str, faults: Sequence[str] = ())
     }
     if faults:
         found["errors"] = [_encodable(fault) for fault in faults]
-    return found
+    return found | dict(members or {})
 
 
 def _encodable(text: str) -> str:
@@ -149,11 +159,16 @@ def failure_document(failure: JobFailure, instance: str) -> dict[str, Any]:
 
 
 def answer(
-    kind: Kind, detail: str, instance: str, faults: Sequence[str] = (), headers: Mapping[str, str] | None = None
+    kind: Kind,
+    detail: str,
+    instance: str,
+    faults: Sequence[str] = (),
+    headers: Mapping[str, str] | None = None,
+    members: Mapping[str, Any] | None = None,
 ) -> JSONResponse:
-    """A response with a problem document."""
+    """A response with a problem document; `members` are those of the kind alone."""
     return JSONResponse(
-        document(kind, detail, instance, faults),
+        document(kind, detail, instance, faults, members),
         status_code=kind.status,
         headers=dict(headers or {}),
         media_type=MEDIA_TYPE,
@@ -176,7 +191,7 @@ def answer_error(error: Exception, instance: str) -> JSONResponse:
         return answer(kind, "The database does not answer; nothing was lost, try again.", instance, (), headers)
     if kind is INTERNAL:
         return answer(kind, "The service has logged what happened; please report it.", instance)
-    return answer(kind, str(error) or kind.title, instance, faults, headers)
+    return answer(kind, str(error) or kind.title, instance, faults, headers, getattr(error, "members", None))
 
 
 def validation_faults(error: RequestValidationError) -> list[str]:

@@ -23,7 +23,7 @@ from pipeline.errors import SettingsError
 
 FACTS = (
     *("job", "attempt", "driver", "reference"),
-    *("run", "stage", "tile", "batch", "building", "reason"),
+    *("schedule", "run", "stage", "tile", "batch", "building", "reason"),
     *("seconds", "memory_bytes", "done", "total", "failed"),
 )
 """What a line may tell beside its message, in this order."""

@@ -1,8 +1,9 @@
-"""The process: slots that claim and work, signals, draining, the janitor."""
+"""The process: slots that claim and work, the clock of the schedules, signals, draining, the janitor."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import secrets
 import signal
@@ -21,6 +22,7 @@ from service.driver.janitor import tidy
 from service.driver.logs import configure, quieten
 from service.errors import LeaseLostError, StoreError
 from service.files import StateFolder
+from service.schedules import Outcome
 from service.settings import ServiceSettings
 from service.store import JobStore
 
@@ -106,17 +108,18 @@ class Driver:
             threading.Thread(target=self._slot, name=f"slot-{number}", daemon=True)
             for number in range(self._settings.driver_jobs)
         ]
+        clock = threading.Thread(target=self._keep_time, name="clock", daemon=True)
         janitor = threading.Thread(target=self._tidy, name="janitor", daemon=True)
         if self._parent_pipe is not None:
             threading.Thread(target=self._watch_parent, name="parent", daemon=True).start()
-        starter = threading.Thread(target=self._start, args=([*slots, janitor],), name="start", daemon=True)
+        starter = threading.Thread(target=self._start, args=([*slots, clock, janitor],), name="start", daemon=True)
         starter.start()
         self._wait_for_stop()
         with self._lock:
             self._stopping.set()
         clean = self._drain()
         starter.join(_TICK_S)
-        for thread in [*slots, janitor]:
+        for thread in [*slots, clock, janitor]:
             if thread.ident is not None:
                 thread.join(1.0 if clean else _TICK_S)
         self._cluster.close()
@@ -243,6 +246,42 @@ class Driver:
             with self._lock:
                 del self._held[job.job_id]
         return True
+
+    # --- the clock of the schedules
+
+    def _keep_time(self) -> None:
+        """Look which schedules are due, again and again; every driver does so, and each slot is one driver's."""
+        pause = FIRST_PAUSE_S
+        while not self._stopping.is_set():
+            try:
+                self._tick()
+            except StoreError as error:
+                LOG.warning("the schedules cannot be read, again in %g s: %s", pause, error, extra=self._facts)
+            except Exception:  # noqa: BLE001 - a clock that stood still would leave a driver that looks alive
+                LOG.exception("an unexpected fault with the schedules, again in %g s", pause, extra=self._facts)
+            else:
+                pause = FIRST_PAUSE_S
+                self._stopping.wait(self._settings.poll_s)
+                continue
+            self._stopping.wait(pause)
+            pause = min(LONGEST_PAUSE_S, 2.0 * pause)
+
+    def _tick(self) -> None:
+        """Decide what is due, and log it.
+
+        Raises
+        ------
+        StoreError
+            The database does not answer.
+        """
+        settings = self._settings
+        for run in self._store.schedules.tick(
+            max_queued=settings.max_queued, max_queued_per_key=settings.max_queued_per_key
+        ):
+            level = logging.WARNING if run.outcome in {Outcome.MISSED, Outcome.FAILED} else logging.INFO
+            told = "schedule %s, %d slots up to %s: %s: %s"
+            facts = self._facts | {"schedule": run.schedule_id, "job": run.job_id}
+            LOG.log(level, told, run.schedule_id, run.slots, run.slot, run.outcome, run.message, extra=facts)
 
     # --- the janitor
 

@@ -1,6 +1,7 @@
-"""Jobs, events, uploads and keys in SQL: SQLite by default, the same code on PostgreSQL."""
+"""Jobs, events, uploads, schedules and keys in SQL: SQLite by default, the same code on PostgreSQL."""
 
 from service.store.job_store import JobStore
 from service.store.queries import JobFilter
+from service.store.schedules import ScheduleFilter
 
-__all__ = ["JobFilter", "JobStore"]
+__all__ = ["JobFilter", "JobStore", "ScheduleFilter"]

@@ -12,10 +12,11 @@ from service.keys import Key
 from service.store import changes, claims, keys, queries, submissions, uploads
 from service.store.database import LOCK_SUBMISSIONS, Database
 from service.store.queries import JobFilter
+from service.store.schedule_store import ScheduleStore
 
 
 class JobStore:
-    """Jobs, events, uploads and keys; one a process, safe to share between its threads.
+    """Jobs, events, uploads, schedules and keys; one a process, safe to share between its threads.
 
     Every method is a transaction of its own and may raise `StoreError` when the database does not answer.
     The time is always the database's: machines whose clocks differ agree on leases.
@@ -33,6 +34,8 @@ class JobStore:
 
     def __init__(self, url: str) -> None:
         self._database = Database(url)
+        self.schedules = ScheduleStore(self._database)
+        """Schedules, and what became of their slots."""
 
     def __enter__(self) -> Self:
         """For `with`: closes the connections at the end."""
@@ -324,13 +327,13 @@ class JobStore:
         Raises
         ------
         UploadInUseError
-            Jobs that wait or run need it.
+            Jobs that wait or run, or schedules, need it.
         """
         with self._database.write() as connection:
             uploads.remove(connection, upload_id)
 
     def expired_uploads(self, now: dt.datetime) -> builtins.list[Upload]:
-        """Uploads whose time is over and that no waiting or running job needs."""
+        """Uploads whose time is over and that no waiting or running job and no schedule needs."""
         with self._database.read() as connection:
             return uploads.expired(connection, now)
 

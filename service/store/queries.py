@@ -30,6 +30,8 @@ class JobFilter:
     """Only these; none given: all."""
     process_ids: Collection[str] = ()
     """Only these; none given: all."""
+    schedule_id: str | None = None
+    """Only jobs of this schedule."""
     created_from: dt.datetime | None = None
     """Created at this time or later; with a time zone."""
     created_to: dt.datetime | None = None
@@ -78,6 +80,8 @@ def conditions(criteria: JobFilter, now: dt.datetime) -> list[sa.ColumnElement[b
         found.append(JOBS.c.status.in_([JobStatus(status).value for status in criteria.statuses]))
     if criteria.process_ids:
         found.append(JOBS.c.process_id.in_([storable(name) for name in criteria.process_ids]))
+    if criteria.schedule_id is not None:
+        found.append(JOBS.c.schedule_id == storable(criteria.schedule_id))
     if criteria.created_from is not None:
         found.append(JOBS.c.created_at >= criteria.created_from)
     if criteria.created_to is not None:

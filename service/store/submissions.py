@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import uuid
+from collections.abc import Sequence
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
@@ -38,7 +39,15 @@ def check_queue(connection: Connection, owner: str | None, *, max_queued: int, m
         )
 
 
-def insert(connection: Connection, request: JobRequest, *, owner: str | None, priority: int, now: dt.datetime) -> str:
+def insert(
+    connection: Connection,
+    request: JobRequest,
+    *,
+    owner: str | None,
+    priority: int,
+    now: dt.datetime,
+    schedule_id: str | None = None,
+) -> str:
     """Store a new job; its id.
 
     Raises
@@ -64,6 +73,7 @@ def insert(connection: Connection, request: JobRequest, *, owner: str | None, pr
             attempt=0,
             lost_attempts=0,
             last_event=1,
+            schedule_id=schedule_id,
         )
     )
     connection.execute(
@@ -80,17 +90,28 @@ def insert(connection: Connection, request: JobRequest, *, owner: str | None, pr
             message="waits for a driver",
         )
     )
-    references = [*request.tiles, *([] if request.footprints is None else [request.footprints])]
-    needed = sorted({reference.value for reference in references if reference.kind == "upload"})
-    # held until the commit: who removes an upload looks for jobs that need it afterwards
-    stored = sa.select(UPLOADS.c.upload_id).where(UPLOADS.c.upload_id.in_([storable(name) for name in needed]))
-    found = set(connection.execute(stored.with_for_update(read=True)).scalars()) if needed else set()
-    missing = [name for name in needed if name not in found]
-    if missing:
-        raise NoSuchUploadError(f"there is no upload {missing[0]!r} (any more): send the file again")
+    needed = request.upload_ids
+    hold_uploads(connection, needed)
     if needed:
         connection.execute(sa.insert(JOB_UPLOADS), [{"job_id": job_id, "upload_id": name} for name in needed])
     return job_id
+
+
+def hold_uploads(connection: Connection, needed: Sequence[str]) -> None:
+    """See to it that uploads stay until the commit: who removes one looks for those who need it afterwards.
+
+    Raises
+    ------
+    NoSuchUploadError
+        One of them is gone.
+    """
+    if not needed:
+        return
+    stored = sa.select(UPLOADS.c.upload_id).where(UPLOADS.c.upload_id.in_([storable(name) for name in needed]))
+    found = set(connection.execute(stored.with_for_update(read=True)).scalars())
+    missing = [name for name in needed if name not in found]
+    if missing:
+        raise NoSuchUploadError(f"there is no upload {missing[0]!r} (any more): send the file again")
 
 
 def dismiss(connection: Connection, job_id: str, owner: str | None, now: dt.datetime) -> None:

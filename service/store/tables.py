@@ -66,13 +66,18 @@ JOBS = sa.Table(
     sa.Column("fault_detail", sa.Text),
     sa.Column("summary", sa.JSON(none_as_null=True)),
     sa.Column("last_event", sa.Integer, nullable=False),
+    sa.Column("schedule_id", sa.String(32)),
 )
-"""One row a job. `duration_ms` is set when a job that was started is over; `last_event` is its events' counter."""
+"""One row a job. `duration_ms` is set when a job that was started is over; `last_event` is its events' counter.
+
+`schedule_id` is no foreign key: a job stays when its schedule goes, and still tells what it came of.
+"""
 
 sa.Index("jobs_in_line", JOBS.c.status, JOBS.c.priority.desc(), JOBS.c.created_at, JOBS.c.job_id)
 sa.Index("jobs_by_lease", JOBS.c.status, JOBS.c.lease_until)
 sa.Index("jobs_by_age", JOBS.c.created_at, JOBS.c.job_id)
 sa.Index("jobs_by_owner", JOBS.c.owner, JOBS.c.created_at)
+sa.Index("jobs_by_schedule", JOBS.c.schedule_id, JOBS.c.status)
 
 EVENTS = sa.Table(
     "job_events",
@@ -127,3 +132,68 @@ KEYS = sa.Table(
     sa.Column("revoked_at", UtcTime),
 )
 """One row a key; the key itself is stored nowhere."""
+
+SCHEDULES = sa.Table(
+    "schedules",
+    METADATA,
+    sa.Column("schedule_id", sa.String(32), primary_key=True),
+    sa.Column("owner", sa.String(64)),
+    sa.Column("title", sa.Text),
+    sa.Column("cron", sa.String(200), nullable=False),
+    sa.Column("time_zone", sa.String(128), nullable=False),
+    sa.Column("process_id", sa.String(64), nullable=False),
+    sa.Column("request", sa.JSON, nullable=False),
+    sa.Column("priority", sa.Integer, nullable=False),
+    sa.Column("missed", sa.String(16), nullable=False),
+    sa.Column("grace_s", sa.Float, nullable=False),
+    sa.Column("overlap", sa.String(16), nullable=False),
+    sa.Column("is_paused", sa.Boolean, nullable=False),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("created_at", UtcTime, nullable=False),
+    sa.Column("updated_at", UtcTime, nullable=False),
+    sa.Column("decided_until", UtcTime, nullable=False),
+    sa.Column("next_at", UtcTime),
+    sa.Column("waiting_slot", UtcTime),
+    sa.Column("last_number", sa.Integer, nullable=False),
+    sa.Column("submitted", sa.BigInteger, nullable=False),
+    sa.Column("skipped", sa.BigInteger, nullable=False),
+    sa.Column("missed_slots", sa.BigInteger, nullable=False),
+    sa.Column("failed", sa.BigInteger, nullable=False),
+)
+"""One row a schedule. `last_number` is its runs' counter; the four last columns count its slots by outcome."""
+
+sa.Index("schedules_by_next", SCHEDULES.c.next_at)
+sa.Index("schedules_by_age", SCHEDULES.c.created_at, SCHEDULES.c.schedule_id)
+sa.Index("schedules_by_owner", SCHEDULES.c.owner, SCHEDULES.c.created_at)
+
+SCHEDULE_RUNS = sa.Table(
+    "schedule_runs",
+    METADATA,
+    sa.Column(
+        "schedule_id", sa.String(32), sa.ForeignKey("schedules.schedule_id", ondelete="CASCADE"), primary_key=True
+    ),
+    sa.Column("number", sa.Integer, primary_key=True),
+    sa.Column("trigger", sa.String(16), nullable=False),
+    sa.Column("outcome", sa.String(16), nullable=False),
+    sa.Column("slot", UtcTime),
+    sa.Column("first_slot", UtcTime),
+    sa.Column("slots", sa.Integer, nullable=False),
+    sa.Column("is_counted", sa.Boolean, nullable=False),
+    sa.Column("job_id", sa.String(32)),
+    sa.Column("at", UtcTime, nullable=False),
+    sa.Column("message", sa.Text, nullable=False),
+    sa.UniqueConstraint("schedule_id", "slot", name="one_fate_a_slot"),
+)
+"""What became of slots and of runs by hand, which have no slot. No slot can be decided twice."""
+
+SCHEDULE_UPLOADS = sa.Table(
+    "schedule_uploads",
+    METADATA,
+    sa.Column(
+        "schedule_id", sa.String(32), sa.ForeignKey("schedules.schedule_id", ondelete="CASCADE"), primary_key=True
+    ),
+    sa.Column("upload_id", sa.String(32), primary_key=True),
+)
+"""Which schedule needs which upload."""
+
+sa.Index("schedule_uploads_by_upload", SCHEDULE_UPLOADS.c.upload_id)

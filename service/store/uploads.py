@@ -11,7 +11,7 @@ from service.errors import NoSuchUploadError, UploadInUseError
 from service.files import is_id
 from service.jobs import JobStatus, Upload
 from service.store.records import storable, upload_of
-from service.store.tables import JOB_UPLOADS, JOBS, UPLOADS
+from service.store.tables import JOB_UPLOADS, JOBS, SCHEDULE_UPLOADS, UPLOADS
 
 _NOT_OVER = [status.value for status in JobStatus if not status.is_over]
 
@@ -61,26 +61,33 @@ def remove(connection: Connection, upload_id: str) -> None:
     Raises
     ------
     UploadInUseError
-        Jobs that wait or run need it.
+        Jobs that wait or run, or schedules, need it.
     """
     if not is_id(upload_id):
         return
     connection.execute(sa.select(UPLOADS).where(UPLOADS.c.upload_id == upload_id).with_for_update())
     # a statement of its own: only now it sees the jobs that were submitted while we waited
-    needing = connection.execute(sa.select(sa.func.count()).select_from(_needed(upload_id).subquery())).scalar_one()
-    if needing:
-        raise UploadInUseError(f"{needing} jobs that are not over need the upload {upload_id}: dismiss them first")
+    jobs = connection.execute(sa.select(sa.func.count()).select_from(_needed(upload_id).subquery())).scalar_one()
+    if jobs:
+        raise UploadInUseError(f"{jobs} jobs that are not over need the upload {upload_id}: dismiss them first")
+    planned = sa.select(sa.func.count()).where(SCHEDULE_UPLOADS.c.upload_id == upload_id)
+    schedules = connection.execute(planned).scalar_one()
+    if schedules:
+        raise UploadInUseError(f"{schedules} schedules need the upload {upload_id}: remove or change them first")
     connection.execute(sa.delete(UPLOADS).where(UPLOADS.c.upload_id == upload_id))
 
 
 def expired(connection: Connection, now: dt.datetime) -> list[Upload]:
-    """Uploads whose time is over and that no waiting or running job needs."""
+    """Uploads whose time is over and that no waiting or running job and no schedule needs."""
+    planned = sa.exists(
+        sa.select(SCHEDULE_UPLOADS.c.schedule_id).where(SCHEDULE_UPLOADS.c.upload_id == UPLOADS.c.upload_id)
+    )
     needed = sa.exists(
         sa.select(JOBS.c.job_id)
         .join(JOB_UPLOADS, JOB_UPLOADS.c.job_id == JOBS.c.job_id)
         .where(JOB_UPLOADS.c.upload_id == UPLOADS.c.upload_id, JOBS.c.status.in_(_NOT_OVER))
     )
-    old = sa.select(UPLOADS).where(UPLOADS.c.expires_at <= now, ~needed).order_by(UPLOADS.c.expires_at)
+    old = sa.select(UPLOADS).where(UPLOADS.c.expires_at <= now, ~needed, ~planned).order_by(UPLOADS.c.expires_at)
     return [upload_of(row) for row in connection.execute(old)]
 
 

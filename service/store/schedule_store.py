@@ -1,0 +1,183 @@
+"""The schedules of a store: every method is one transaction, committed when it returns."""
+
+from __future__ import annotations
+
+import builtins
+import datetime as dt
+import functools
+
+from service.jobs import Job
+from service.schedules import Definition, Outcome, Schedule, ScheduleRun
+from service.store import queries, schedules, ticks
+from service.store.database import LOCK_SUBMISSIONS, Database
+from service.store.schedules import ScheduleFilter
+from service.store.ticks import LineLimits
+
+MOST_A_TICK = 200
+"""Schedules that one tick decides; the next tick goes on."""
+
+
+class ScheduleStore:
+    """Schedules and what became of their slots; `JobStore.schedules`.
+
+    The time is the database's: replicas whose clocks differ agree on what is due.
+
+    Parameters
+    ----------
+    database : Database
+        The store's own.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    # --- what clients do
+
+    def create(self, definition: Definition, *, owner: str | None, most: int) -> Schedule:
+        """Make a schedule; its first slot is the first one after now.
+
+        Parameters
+        ----------
+        definition : Definition
+            What is to be run, and when; checked already.
+        owner : str or None
+            The key that makes it; None where keys are not used.
+        most : int
+            How many schedules the key may have, or all may have together where keys are not used.
+
+        Raises
+        ------
+        TooManySchedulesError
+            The key has as many as it may have.
+        NoSuchUploadError
+            The request names an upload that is gone.
+        """
+        with self._database.write() as connection:
+            # counting and adding: nobody else adds in between
+            self._database.lock(connection, LOCK_SUBMISSIONS)
+            now = self._database.now(connection)
+            schedule_id = schedules.insert(connection, definition, owner=owner, most=most, now=now)
+            return schedules.get(connection, schedule_id, None)
+
+    def get(self, schedule_id: str, *, owner: str | None = None) -> Schedule:
+        """One schedule; with an owner only its own.
+
+        Raises
+        ------
+        NoSuchScheduleError
+            It does not exist, or belongs to another key.
+        """
+        with self._database.read() as connection:
+            return schedules.get(connection, schedule_id, owner)
+
+    def list(self, criteria: ScheduleFilter) -> builtins.list[Schedule]:
+        """The schedules that fit, newest first."""
+        with self._database.read() as connection:
+            return schedules.listed(connection, criteria)
+
+    def change(self, schedule_id: str, definition: Definition, *, version: int, owner: str | None = None) -> Schedule:
+        """Change what the client says of a schedule whose version the client saw.
+
+        Slots up to now stay as they were decided; one that is due and not decided yet is not missed, but gone with the
+        old times.
+
+        Raises
+        ------
+        NoSuchScheduleError
+            It does not exist, or belongs to another key.
+        ChangedMeanwhileError
+            It has another version by now.
+        NoSuchUploadError
+            The request names an upload that is gone.
+        """
+        with self._database.write() as connection:
+            now = self._database.now(connection)
+            schedules.change(connection, schedule_id, definition, owner=owner, version=version, now=now)
+            return schedules.get(connection, schedule_id, owner)
+
+    def remove(self, schedule_id: str, *, owner: str | None = None) -> None:
+        """Forget a schedule and what became of its slots; its jobs stay, one that runs goes on.
+
+        Raises
+        ------
+        NoSuchScheduleError
+            It does not exist, or belongs to another key.
+        """
+        with self._database.write() as connection:
+            schedules.remove(connection, schedule_id, owner)
+
+    def runs(
+        self, schedule_id: str, *, owner: str | None = None, limit: int = 100, offset: int = 0
+    ) -> builtins.list[ScheduleRun]:
+        """What became of a schedule's slots and runs by hand, latest first.
+
+        Raises
+        ------
+        NoSuchScheduleError
+            The schedule does not exist, or belongs to another key.
+        """
+        with self._database.read() as connection:
+            return schedules.runs(connection, schedule_id, owner, limit=limit, offset=offset)
+
+    def run_now(self, schedule_id: str, *, owner: str | None = None, max_queued: int, max_queued_per_key: int) -> Job:
+        """Make a job now, whatever the clock says; also of a schedule that is paused.
+
+        Raises
+        ------
+        NoSuchScheduleError
+            It does not exist, or belongs to another key.
+        ScheduleBusyError
+            A job of it is under way.
+        QueueFullError
+            Too many jobs wait.
+        """
+        limits = self._limits(max_queued, max_queued_per_key)
+        with self._database.write() as connection:
+            now = self._database.now(connection)
+            job_id = ticks.run_by_hand(connection, schedule_id, owner, now=now, limits=limits)
+            return queries.get(connection, job_id, None)
+
+    def counts(self) -> tuple[dict[str, int], dict[Outcome, int]]:
+        """Schedules by state (`active`, `paused`), and the slots of all of them by outcome."""
+        with self._database.read() as connection:
+            return schedules.counts(connection)
+
+    # --- what drivers do
+
+    def tick(
+        self, *, max_queued: int, max_queued_per_key: int, now: dt.datetime | None = None
+    ) -> builtins.list[ScheduleRun]:
+        """Decide every slot that has passed: make jobs, skip, or tell what was missed. Any number of drivers may do so.
+
+        Each schedule is a transaction of its own, in which its slots are decided and its job is made.
+
+        Parameters
+        ----------
+        max_queued, max_queued_per_key : int
+            Most jobs that may wait, of all and of one key.
+        now : datetime, optional
+            The present; by default the database's clock, read once.
+
+        Returns
+        -------
+        list of ScheduleRun
+            What became of the slots that this call decided.
+        """
+        # most looks find nothing: they take no lock
+        with self._database.read() as connection:
+            at = self._database.now(connection) if now is None else now
+            if not ticks.something_is_due(connection, at):
+                return []
+        limits = self._limits(max_queued, max_queued_per_key)
+        told: list[ScheduleRun] = []
+        for _ in range(MOST_A_TICK):
+            with self._database.write() as connection:
+                found = ticks.decide_first(connection, now=at, limits=limits)
+            if found is None:
+                break
+            told += found
+        return told
+
+    def _limits(self, max_queued: int, max_queued_per_key: int) -> LineLimits:
+        lock = functools.partial(self._database.lock, number=LOCK_SUBMISSIONS)
+        return LineLimits(max_queued=max_queued, max_queued_per_key=max_queued_per_key, lock=lock)

@@ -1,0 +1,31 @@
+"""Schedules in the store, on a real PostgreSQL."""
+
+from __future__ import annotations
+
+import pytest
+from schedule_contract import HOUR, LIMITS, NOON, ScheduleContract, jobs_of, make
+
+from service.store import JobStore
+
+pytestmark = pytest.mark.slow
+
+
+class TestSchedulesOnPostgres(ScheduleContract):
+    """All of the contract, on PostgreSQL."""
+
+    @pytest.fixture
+    def url(self, postgres_url: str) -> str:
+        return postgres_url
+
+
+def test_a_schedule_that_another_decides_is_passed_over_and_not_waited_for(postgres_url: str) -> None:
+    with JobStore(postgres_url) as store:
+        store.migrate()
+        held, free = make(store), make(store)
+        with store._database.write() as connection:
+            connection.exec_driver_sql(f"SELECT 1 FROM schedules WHERE schedule_id = '{held.schedule_id}' FOR UPDATE")
+            told = store.schedules.tick(now=NOON + HOUR, **LIMITS)
+            assert [run.schedule_id for run in told] == [free.schedule_id]
+        told = store.schedules.tick(now=NOON + HOUR, **LIMITS)
+        assert [run.schedule_id for run in told] == [held.schedule_id]
+        assert [len(jobs_of(store, one)) for one in (held, free)] == [1, 1]
