@@ -26,7 +26,7 @@ from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
 
 COLUMNS = (
     *("building_id", "source_id", "status", "roof_type", "geometry", "ground_z", "ridge_z", "height_m"),
-    *("volume_m3", "rmse_m", "point_spacing_m", "noise_m", "ridge_z_sigma_m"),
+    *("volume_m3", "rmse_m", "point_spacing_m", "noise_m", "ridge_z_sigma_m", "unexplained_m2"),
     *("touches_data_edge", "acquired_from", "acquired_to"),
 )
 """What is read of a building that is compared."""

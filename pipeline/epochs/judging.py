@@ -131,6 +131,8 @@ def judge(
     change[hidden] = Change.NOT_COMPARABLE.value
     ratio = _ratio(figures, part_m2, limit, settings)
     ratio[~both | old.has_failed | new.has_failed] = np.nan
+    half_m2 = (outline_m2 + figures[:, FORM_M2]) / 2.0
+    unexplained_m2 = np.maximum(old.unexplained_m2, new.unexplained_m2)
     near = (ratio >= 1.0 / NEAR) & (ratio < NEAR)
     overlapping = (only_old | only_new) & (seen.overlapped > OVERLAPS_SHARE)
     return Verdicts(
@@ -144,7 +146,8 @@ def judge(
         doubts=(
             (Doubt.BLOCK_IN_OLD, old.has_block),
             (Doubt.BLOCK_IN_NEW, new.has_block),
-            (Doubt.ROUGH_PART, reshaped & ~hidden & (figures[:, ROUGH_M2] > (outline_m2 + figures[:, FORM_M2]) / 2.0)),
+            (Doubt.ROUGH_PART, reshaped & ~hidden & (figures[:, ROUGH_M2] > half_m2)),
+            (Doubt.UNEXPLAINED_PART, reshaped & ~hidden & (unexplained_m2 >= half_m2)),
             (Doubt.NEAR_LIMIT, near & ~hidden),
             (Doubt.OVERLAPS_ANOTHER, overlapping & ~hidden),
             (Doubt.OTHER_UNITS, both & (old.count != new.count)),

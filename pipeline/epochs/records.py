@@ -90,6 +90,7 @@ class Doubt(StrEnum):
     BLOCK_IN_OLD = "block_in_old"
     BLOCK_IN_NEW = "block_in_new"
     ROUGH_PART = "rough_part"
+    UNEXPLAINED_PART = "unexplained_part"
     NEAR_LIMIT = "near_limit"
     OVERLAPS_ANOTHER = "overlaps_another"
     OTHER_UNITS = "other_units"
@@ -99,6 +100,7 @@ DOUBTS: Mapping[Doubt, str] = {
     Doubt.BLOCK_IN_OLD: "the model of OLD is a block in place of its roof (`fallback`)",
     Doubt.BLOCK_IN_NEW: "the model of NEW is a block in place of its roof (`fallback`)",
     Doubt.ROUGH_PART: "most of what changed are roof faces about which the points scatter: it may be a tree",
+    Doubt.UNEXPLAINED_PART: "a model has roof without points (`unexplained_m2`) of half of what changed or more",
     Doubt.NEAR_LIMIT: "`change_ratio` is between 2/3 and 3/2: a little more or less would be told otherwise",
     Doubt.OVERLAPS_ANOTHER: "new or gone, but more than a tenth of it overlaps a building of the other epoch",
     Doubt.OTHER_UNITS: "the epochs divide what stands there into another number of buildings",

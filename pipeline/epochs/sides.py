@@ -37,6 +37,8 @@ class Side:
     """(g,) float64, standard deviation of the roofs' elevations, of the worst model; 0 where nothing is known."""
     spacing_m: FloatArray
     """(g,) float64, largest point spacing; 0 where it is unknown."""
+    unexplained_m2: FloatArray
+    """(g,) float64, plan area of roof without points; 0 where it is unknown."""
     has_failed: BoolArray
     """(g,) bool, some building has no model."""
     has_block: BoolArray
@@ -112,6 +114,7 @@ def side_of(buildings: Buildings, group: IntArray, count: int, vertical_unit_m: 
         ridge_m=extreme(floats(table["ridge_z"]) * vertical_unit_m, np.maximum, -np.inf),
         sigma_m=extreme(sigma_m, np.maximum, 0.0),
         spacing_m=extreme(floats(table["point_spacing_m"]), np.maximum, 0.0),
+        unexplained_m2=np.nan_to_num(total(floats(table["unexplained_m2"]))),
         has_failed=some(status == Status.FAILED.value),
         has_block=some(is_block),
         at_edge=some(table["touches_data_edge"].to_numpy(zero_copy_only=False).astype(np.bool_)),

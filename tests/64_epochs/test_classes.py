@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -109,6 +110,17 @@ def test_a_known_shift_of_the_surveys_is_no_change(compare: Compare) -> None:
     found = compare([house("a1")], [house("a2", eave=5.8)], DiffSettings(vertical_shift_m=0.8))
     assert one(found)["change"] == "unchanged"
     assert one(found)["height_change_m"] == pytest.approx(0.0, abs=2e-3)
+
+
+def test_a_part_that_may_be_a_tree_and_a_roof_without_points_are_told_as_doubts(compare: Compare) -> None:
+    flat: dict[str, Any] = {"shape": RoofShape.FLAT, "azimuth": 90.0, "sigma": 0.03}
+    grown = house("a2", 2.0, length=16.0, **flat)
+    rough = dataclasses.replace(grown, planes=(dataclasses.replace(grown.planes[0], rmse_m=0.2),))
+    bare = dataclasses.replace(grown, quality=dataclasses.replace(grown.quality, unexplained_m2=30.0))
+    before = house("a1", length=12.0, **flat)
+    for after, doubts in ((grown, []), (rough, ["rough_part"]), (bare, ["unexplained_part"])):
+        row = one(compare([before], [after]))
+        assert (row["change"], row["doubts"]) == ("reshaped", doubts)
 
 
 def test_one_building_that_is_modelled_as_two_did_not_change(compare: Compare) -> None:
