@@ -209,6 +209,10 @@ async def _start(nanny: Any, options: WorkerOptions) -> None:
         cause = error.__cause__ or error
         if isinstance(cause, OSError):
             raise cause from error
+        # what TLS says of a scheduler that speaks first comes in many kinds
+        why = await asyncio.to_thread(why_not, options.scheduler, options.tls)
+        if why:
+            raise ConnectionError(why) from error
         raise ClusterError(f"the worker for {options.scheduler} does not start: {cause}") from error
 
 

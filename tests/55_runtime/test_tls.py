@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import ssl
 import threading
@@ -20,6 +21,7 @@ from cryptography.hazmat.primitives.serialization import (
 from pipeline.errors import ClusterError, SettingsError
 from pipeline.runtime.executors import Cluster
 from pipeline.runtime.tls import VARIABLES, TlsFiles, check_address, given_tls, why_not
+from pipeline.runtime.worker import WorkerOptions, _start
 
 
 class Authority:
@@ -194,3 +196,24 @@ def test_a_look_at_the_port_tells_why_a_connection_failed(
     # nothing to tell: it is as it should be, or nobody is there
     assert why_not(f"tls://{secure}", ours) == why_not(f"tcp://{plain}", None) == ""
     assert why_not("tls://127.0.0.1:9", ours) == why_not("inproc://somewhere", None) == ""
+
+
+class Unwilling:
+    """A nanny that does not start, in Dask's own words for a scheduler that speaks before TLS does."""
+
+    def __await__(self) -> Iterator[None]:
+        raise ValueError("IOStream is not idle; cannot convert to SSL")
+        yield
+
+
+def test_a_worker_goes_on_looking_where_the_port_explains_why_it_did_not_start(
+    authority: Authority, doors: list[Door]
+) -> None:
+    doors.append(Door(None))
+    files = authority.files()
+    plain = WorkerOptions(scheduler=f"tls://127.0.0.1:{doors[0].port}", tls=files)
+    with pytest.raises(ConnectionError, match="does not speak TLS: write tcp://"):
+        asyncio.run(_start(Unwilling(), plain))
+    nobody = WorkerOptions(scheduler="tls://127.0.0.1:9", tls=files)
+    with pytest.raises(ClusterError, match="does not start: IOStream is not idle"):
+        asyncio.run(_start(Unwilling(), nobody))
