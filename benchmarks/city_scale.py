@@ -8,7 +8,7 @@ looks at them from outside, and writes DIR/<label>.md (tables), DIR/<label>.json
 task; `scaling_simulation.py` reads it). `traced` is the run of `gablework reconstruct` with an executor that keeps what
 each task took; `plain` is the command itself, looked at from outside only; `apart` is `traced` with the scheduler and
 the workers (`gablework worker`) as processes of their own, so that driver and scheduler can be told apart. With
-`--kill-every S` a worker's process is killed every S seconds, in turns.
+`--kill-every S` a worker's process is killed every S seconds, in turns, from when the run has its workers.
 
 Efficiency is the CPU time of all task bodies, their child processes included, over wall-clock time times workers. On a
 machine that others use too it is told too small: the wall grows, the CPU time does not. So the share of the time in
@@ -106,7 +106,9 @@ def watched_run(arguments: argparse.Namespace, tiles: Path, run_dir: Path) -> di
         load_before = os.getloadavg()[0]
         began = time.perf_counter()
         process = subprocess.Popen(command_of(arguments, tiles, run_dir, scheduler), stdout=out, stderr=out)
-        watcher = stack.enter_context(Watcher({process.pid: DRIVER, **roots}, arguments.kill_every))
+        # it is written when the workers are there: one that dies before ends the run
+        begun = run_dir / "run.json"
+        watcher = stack.enter_context(Watcher({process.pid: DRIVER, **roots}, arguments.kill_every, begun.exists))
         code = process.wait()
         wall_s = time.perf_counter() - began
     if code:

@@ -12,7 +12,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -58,11 +58,16 @@ class Watcher:
         Role of each process that is looked at, by its id.
     kill_every_s : float
         A worker is killed so often, in turns; 0 kills none.
+    may_kill : callable
+        From when on.
     """
 
-    def __init__(self, roots: dict[int, str], kill_every_s: float = 0.0) -> None:
+    def __init__(
+        self, roots: dict[int, str], kill_every_s: float = 0.0, may_kill: Callable[[], bool] = lambda: True
+    ) -> None:
         self._roots = roots
         self._kill_every_s = kill_every_s
+        self._may_kill = may_kill
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._look_on, daemon=True)
         self._turn = 0
@@ -92,7 +97,7 @@ class Watcher:
                     for process in (top, *top.children(recursive=True)):
                         self._look_at(process)
             self.load.append(os.getloadavg()[0])
-            if self._kill_every_s and time.monotonic() >= kill_at:
+            if self._kill_every_s and time.monotonic() >= kill_at and self._may_kill():
                 kill_at = time.monotonic() + self._kill_every_s
                 self._kill_one()
 

@@ -160,25 +160,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     diary = Diary(wanted.out / "scratch")
     place = tempfile.mkdtemp(prefix="gablework-dask-")
     began_s = time.time()
+    found: dict[str, Any] = {"began_s": began_s, "workers": wanted.workers, "diary": diary.lines}
+    executor = TracingExecutor(executor_for(workers=wanted.workers, scheduler=wanted.scheduler, local_directory=place))
     try:
-        inner = executor_for(workers=wanted.workers, scheduler=wanted.scheduler, local_directory=place)
-        executor = TracingExecutor(inner)
-        summary = run(request, diary, executor)
+        found["summary"] = dataclasses.asdict(run(request, diary, executor))
     finally:
         shutil.rmtree(place, ignore_errors=True)
-    found = {
-        "began_s": began_s,
-        "ended_s": time.time(),
-        "workers": wanted.workers,
-        "driver_cpu_s": time.process_time(),
-        "tracing_cpu_s": executor.sizing_s + diary.weighing_s,
-        "summary": dataclasses.asdict(summary),
-        "diary": diary.lines,
-        "scratch_bytes": diary.scratch_bytes,
-        "sizes": executor.sizes,
-        "tasks": executor.tasks,
-    }
-    wanted.trace.write_text(json.dumps(found) + "\n", encoding="utf-8")
+        # of a run that broke off, too
+        found |= {
+            "ended_s": time.time(),
+            "driver_cpu_s": time.process_time(),
+            "tracing_cpu_s": executor.sizing_s + diary.weighing_s,
+            "scratch_bytes": diary.scratch_bytes,
+            "sizes": executor.sizes,
+            "tasks": executor.tasks,
+        }
+        wanted.trace.write_text(json.dumps(found) + "\n", encoding="utf-8")
     return 0
 
 

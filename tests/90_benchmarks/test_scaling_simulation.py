@@ -1,0 +1,160 @@
+"""The simulation of the task graph: limits that can be reckoned by hand, and traces that it gives again."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.engine_costs import fitted
+from benchmarks.scaling_simulation import (
+    ALL,
+    Change,
+    Engine,
+    Machine,
+    Stage,
+    city_run,
+    city_stages,
+    most_workers,
+    replayed,
+    run_stage,
+    simulate,
+)
+
+
+def stage(count: int, seconds: float = 1.0, **other: float) -> Stage:
+    return Stage(name="split", before_s=0.0, durations_s=np.full(count, seconds), **other)
+
+
+def test_tasks_that_cost_nothing_else_fill_all_workers() -> None:
+    found = simulate([stage(100)], Machine(workers=10))
+    assert found.wall_s == pytest.approx(10.0)
+    assert found.efficiency == pytest.approx(1.0)
+
+
+def test_the_longest_first_is_kept() -> None:
+    times = np.array([5.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    ended_s, _, _ = run_stage(Stage(name="split", before_s=0.0, durations_s=times), Machine(workers=2), 0.0)
+    assert ended_s == pytest.approx(5.0)
+    ended_s, _, _ = run_stage(Stage(name="split", before_s=0.0, durations_s=times[::-1]), Machine(workers=2), 0.0)
+    assert ended_s == pytest.approx(7.0)
+
+
+def test_a_slow_driver_bounds_the_rate_whatever_the_workers() -> None:
+    for workers in (10, 1000):
+        found = simulate([stage(2000, 0.01, driver_s=0.01)], Machine(workers=workers))
+        assert found.wall_s == pytest.approx(2000 * 0.01, rel=0.02)
+        assert found.driver_s == pytest.approx(20.0)
+
+
+def test_a_slow_scheduler_bounds_the_rate_whatever_the_workers() -> None:
+    found = simulate([stage(2000, 0.01, scheduler_s=0.02)], Machine(workers=1000))
+    assert found.wall_s == pytest.approx(2000 * 0.02, rel=0.02)
+
+
+def test_bytes_of_results_cost_scheduler_and_driver() -> None:
+    found = simulate([stage(500, 0.01, result_bytes=1e6)], Machine(workers=100, byte_s=2e-8))
+    assert found.wall_s == pytest.approx(500 * 0.02, rel=0.05)
+    assert found.driver_s == pytest.approx(10.0)
+
+
+def test_shared_storage_bounds_what_all_workers_read() -> None:
+    found = simulate([stage(1000, 0.01, stored_bytes=1e8)], Machine(workers=500, storage_bytes_s=1e9))
+    assert found.wall_s == pytest.approx(1000 * 1e8 / 1e9, rel=0.02)
+
+
+def test_a_barrier_waits_for_the_last_task() -> None:
+    uneven = Stage(name="split", before_s=0.0, durations_s=np.array([3.0, 1.0]))
+    found = simulate([uneven, uneven], Machine(workers=2))
+    assert found.wall_s == pytest.approx(6.0)
+    assert found.stages_s["split"] == pytest.approx(6.0)
+
+
+def test_a_window_smaller_than_the_workers_leaves_some_idle() -> None:
+    full = simulate([stage(400, 1.0, driver_s=0.02)], Machine(workers=40, tasks_a_thread=3))
+    scant = simulate([stage(400, 1.0, driver_s=0.02)], Machine(workers=40, tasks_a_thread=1))
+    assert scant.wall_s > 1.01 * full.wall_s
+
+
+def engine() -> Engine:
+    rng = np.random.default_rng(4)
+    names = ("ingest", "split", "join", "outline", "reconstruct", "publish")
+    return Engine(
+        times={name: rng.uniform(0.5, 1.5, 60) for name in names},
+        buildings=2000,
+        files=60,
+        points=8_000_000,
+        tiles=60,
+        plan_s=0.01,
+        join=(1e-3, 1.0),
+        digest_s=1e-4,
+        driver_s=1e-3,
+        scheduler_s=1e-3,
+        byte_s=1e-9,
+        result_bytes=dict.fromkeys(names, 1000.0),
+        start_s=1.0,
+        tile_m=500.0,
+    )
+
+
+def test_a_city_ten_times_as_large_has_ten_times_the_tasks_and_the_work() -> None:
+    small, large = (city_stages(engine(), n, Change()) for n in (2000, 20_000))
+    for a, b in zip(small[:-1], large[:-1], strict=True):
+        assert len(b.durations_s) == 10 * len(a.durations_s)
+        assert b.durations_s.sum() == pytest.approx(10 * a.durations_s.sum(), rel=0.1)
+
+
+def test_changes_move_work_and_lose_none() -> None:
+    plain = city_stages(engine(), 20_000, Change())
+    moved = city_stages(engine(), 20_000, Change(joined_in_driver=0.1, digest_in_driver=0.1, plan_in_driver=0.1))
+    work = [sum(s.before_s + s.durations_s.sum() for s in stages) for stages in (plain, moved)]
+    assert work[1] == pytest.approx(work[0], rel=1e-9)
+    batched = city_stages(engine(), 20_000, Change(tasks_a_batch=4.0))
+    assert sum(len(s.durations_s) for s in batched) < sum(len(s.durations_s) for s in plain)
+    assert sum(s.durations_s.sum() for s in batched) == pytest.approx(sum(s.durations_s.sum() for s in plain))
+
+
+def test_efficiency_falls_with_workers_and_less_where_the_driver_does_less() -> None:
+    plain = [city_run(engine(), 50_000, n, Change(), math.inf).efficiency for n in (2, 50, 500)]
+    better = [city_run(engine(), 50_000, n, ALL, math.inf).efficiency for n in (2, 50, 500)]
+    assert plain == sorted(plain, reverse=True)
+    assert better[2] > plain[2]
+    assert all(0.0 < value <= 1.0 for value in (*plain, *better))
+
+
+def test_the_largest_number_of_workers_is_found_by_halves() -> None:
+    outcome = city_run(engine(), 2000, 1, Change(), math.inf)
+
+    def run_with(workers: int) -> object:
+        return dataclasses.replace(outcome, workers=workers, wall_s=1.0, busy_s=workers * (1.0 - workers / 1000))
+
+    assert most_workers(run_with, 0.8, 1000) == pytest.approx(200, rel=0.06)
+
+
+def test_a_trace_is_given_again() -> None:
+    def task(stage: str, process: str, began_s: float, seconds: float) -> dict[str, object]:
+        back = {"back_s": began_s + seconds}
+        return {"stage": stage, "process": process, "began_s": began_s, "seconds": seconds, "cpu_s": seconds, **back}
+
+    names = ("ingest", "split", "join", "outline", "reconstruct", "publish")
+    diary = [{"kind": "run", "stage": "plan", "at_s": 0.0, "cpu_s": 0.0}]
+    tasks = []
+    for k, name in enumerate(names):
+        start = 5.0 + 10.0 * k
+        diary.append({"kind": "stage", "stage": name, "at_s": start, "cpu_s": 0.0})
+        tasks += [
+            task(name, "a", start + 1.0, 4.0),
+            task(name, "a", start + 5.0, 4.0),
+            task(name, "b", start + 1.0, 9.0),
+        ]
+    diary.append({"kind": "finished", "stage": "", "at_s": 65.0, "cpu_s": 0.0})
+    simulated, measured = replayed({"workers": 2, "diary": diary, "tasks": tasks})
+    assert measured == pytest.approx(60.0)
+    assert simulated == pytest.approx(60.0)
+
+
+def test_a_line_through_costs_is_found() -> None:
+    rows = [{"buildings": n, "cpu_s": 2e-4 * n**1.1} for n in (10, 100, 1000)]
+    assert fitted(rows, "cpu_s") == pytest.approx((2e-4, 1.1))
