@@ -167,6 +167,7 @@ class Cluster:
             "distributed.logging.distributed": "critical",
             # a suspect is tried alone before it is blamed, so it need not take many workers with it
             "distributed.scheduler.allowed-failures": 1,
+            **worker_setup.LEAN_LOOP,
         }
         try:
             # the configuration is the process's own, not the thread's, and workers copy it as they start

@@ -123,6 +123,7 @@ def serve_worker(options: WorkerOptions, say: Callable[[str], None]) -> None:
     quiet = {
         "distributed.admin.log-format": "%(asctime)s %(name)s %(levelname)s %(message)s",
         "distributed.worker.daemon": True,
+        **worker_setup.LEAN_LOOP,
     }
     with dask.config.set(quiet):
         if options.log_json:

@@ -10,10 +10,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import dask
 import pytest
 from distributed import Client
 
 from pipeline.errors import ClusterError, RunCancelledError, RunError, VersionMismatchError
+from pipeline.runtime import worker_setup
 from pipeline.runtime.events import Event, Watch
 from pipeline.runtime.executors import Cluster, Measured, SerialExecutor, executor_for
 from pipeline.runtime.flight import Lookout
@@ -55,6 +57,13 @@ def test_every_task_gives_its_result(cluster: Cluster) -> None:
         executor.prepare("double", Watch())
         results = [measured.result for measured in executor.map("double", chores.double, range(50), Watch())]
     assert sorted(results) == [2 * n for n in range(50)]
+
+
+def test_workers_do_not_spend_their_time_on_looking_at_themselves(cluster: Cluster) -> None:
+    with Client(cluster.address, set_as_default=False) as client:
+        for name, wanted in worker_setup.LEAN_LOOP.items():
+            assert set(client.run(dask.config.get, name).values()) == {wanted}
+    assert dask.config.get("distributed.worker.profile.enabled")  # this process's own settings are left alone
 
 
 def test_several_runs_share_one_cluster_at_once(cluster: Cluster) -> None:
