@@ -1,39 +1,36 @@
-"""Join: fragments become whole surfaces by union-find over the facets that cross tile borders; then they are judged."""
+"""Join: fragments become whole surfaces by union-find over the facets that cross tile borders; then they are judged.
+
+The tiles have finished what no other tile sees, and hand on the rest by columns. Here one tile is read at a time, its
+sites are made, and its columns wait for those of the others. No object is made of a fragment.
+"""
 
 from __future__ import annotations
 
 import base64
+import collections
 import dataclasses
 import hashlib
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.model import IntArray, Reason
+from pipeline.model import IntArray
+from pipeline.runtime.border_facets import united_by_name
+from pipeline.runtime.finished_surfaces import Finished, finished
+from pipeline.runtime.open_fragments import TileSurfaces
 from pipeline.runtime.overrides import Override
 from pipeline.runtime.split import Split
-from pipeline.terrain.candidates import (
-    CandidateSettings,
-    Surfaces,
-    Verdict,
-    is_object,
-    judge_surface,
-    unite_levels,
-)
-from pipeline.terrain.facets import FacetKind
-from pipeline.terrain.surfaces import N_SUMS, Fragments, Sum
+from pipeline.terrain.candidates import NOWHERE, CandidateSettings, Surfaces, Verdict, judge_surface
+from pipeline.terrain.surfaces import N_SUMS, Sum
 from pipeline.tiling import MM, Tile, TileGrid
 
-NOWHERE = 2**62
-"""Coordinate of the smallest point of a surface that has none."""
 
-_NOT_JUDGED = Verdict(reason=Reason.TOO_FEW_POINTS, detail="ground, a step between levels, or a surface without points")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class PointRange:
     """A run of points in the sorted points of one tile."""
 
@@ -44,7 +41,7 @@ class PointRange:
     """Folder of the scratch that holds the tile's points."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class CandidateSite:
     """Where the points of one candidate lie."""
 
@@ -70,7 +67,7 @@ class CandidateSite:
     """What the user said of this building, as far as it took effect; None where nothing was."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class RejectedSite:
     """An object that was judged to be no building."""
 
@@ -117,207 +114,160 @@ def object_id(crs_name: str, lowest_point_mm: Sequence[int]) -> str:
     return base64.b32encode(digest[:15]).decode().lower()
 
 
-def _roots(count: int, pairs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Smallest member of the set of each of `count` elements under the unions of `pairs` (n, 2)."""
-    parent = list(range(count))
+class _Waiting:
+    """What waits of all tiles, by columns: of each a list with an array a tile; fragments and steps are counted on."""
 
-    def find(k: int) -> int:
-        while parent[k] != k:
-            parent[k] = parent[parent[k]]
-            k = parent[k]
-        return k
+    def __init__(self) -> None:
+        self._columns: dict[str, list[npt.NDArray[Any]]] = collections.defaultdict(list)
+        self.fragments = 0
+        self.steps = 0
 
-    for a, b in pairs.tolist():
-        root_a, root_b = find(a), find(b)
-        if root_a != root_b:
-            parent[max(root_a, root_b)] = min(root_a, root_b)
-    return np.array([find(k) for k in range(count)], np.int64)
+    def add(self, tile: int, found: TileSurfaces) -> None:
+        """Take what waits of one more tile, by its number."""
+        held = np.flatnonzero(found.ranges[:, 1] > found.ranges[:, 0])
+        new: dict[str, npt.NDArray[Any]] = {
+            "kind": found.kind,
+            "sums": found.sums,
+            "boxes": found.boxes_mm,
+            "points": found.lowest_point_mm,
+            "ranges": np.column_stack((held + self.fragments, np.full(len(held), tile), found.ranges[held])),
+            "names": found.facets.names,
+            "holders": found.facets.holders + np.int64(self.fragments),
+            "step_names": found.step_facets.names,
+            "step_holders": found.step_facets.holders + np.int64(self.steps),
+            "along": found.along_steps + np.array([self.fragments, self.steps], np.int64),
+        }
+        for name, column in new.items():
+            if len(column):
+                self._columns[name].append(column)
+        self.fragments += len(found.kind)
+        self.steps += found.steps
+
+    def take(self, name: str, *shape: int, dtype: npt.DTypeLike = np.int64) -> npt.NDArray[Any]:
+        """A column of all tiles, with rows of that shape; it is held no longer."""
+        parts = self._columns.pop(name, [])
+        return np.concatenate(parts) if parts else np.empty((0, *shape), dtype)
 
 
-def _crossing_pairs(splits: Sequence[Split], offsets: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Pairs of fragments (n, 2) that hold the same facet."""
-    keys = np.concatenate([s.fragments.crossing_keys for s in splits if s.fragments is not None])
-    owners = np.concatenate(
-        [s.fragments.crossing_fragment + offset for s, offset in zip(splits, offsets, strict=True) if s.fragments]
-    )
-    if len(keys) == 0:
-        return np.empty((0, 2), np.int64)
-    order = np.lexsort(keys.T[::-1])
-    keys, owners = keys[order], owners[order]
-    same = np.flatnonzero((keys[1:] == keys[:-1]).all(axis=1))
-    pairs = np.column_stack((owners[same], owners[same + 1])).astype(np.int64)
-    return np.unique(pairs, axis=0)
-
-
-def whole_surfaces(splits: Sequence[Split]) -> tuple[Surfaces, npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Unite the fragments of all tiles.
-
-    Parameters
-    ----------
-    splits : sequence of Split
-        All tiles, each with fragments.
-
-    Returns
-    -------
-    Surfaces
-        Whole surfaces with their sums.
-    (f,) int64
-        The surface of every fragment, tile after tile.
-    (t + 1,) int64
-        Where each tile's fragments start in that list.
-    """
-    counts = [0 if s.fragments is None else len(s.fragments.kind) for s in splits]
-    offsets = np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
-    total = int(offsets[-1])
-    described = [s.fragments for s in splits if s.fragments is not None]
-    if total == 0:
-        empty = np.empty(0, np.int64)
-        nothing = Surfaces(
-            kind=np.empty(0, np.int8),
-            sums=np.empty((0, N_SUMS), np.int64),
-            boxes_mm=np.empty((0, 4), np.int64),
-            lowest_point_mm=np.empty((0, 3), np.int64),
-            along_steps=np.empty((0, 3), np.int64),
-        )
-        return nothing, empty, offsets
-    roots = _roots(total, _crossing_pairs(splits, offsets[:-1]))
+def _whole_surfaces(waiting: _Waiting) -> tuple[Surfaces, IntArray]:
+    """Unite fragments of several tiles to whole surfaces; and the ranges of their points, as `finished` takes them."""
+    count, steps = waiting.fragments, waiting.steps
+    roots = united_by_name(count, waiting.take("names", 2, dtype=np.uint64), waiting.take("holders"))
+    step = united_by_name(steps, waiting.take("step_names", 2, dtype=np.uint64), waiting.take("step_holders"))
     members, surface = np.unique(roots, return_inverse=True)
+    surface = surface.reshape(-1)
     k = len(members)
     sums = np.zeros((k, N_SUMS), np.int64)
-    np.add.at(sums, surface, np.concatenate([f.sums for f in described]))
-    fragment_boxes = np.concatenate([f.boxes_mm for f in described])
+    np.add.at(sums, surface, waiting.take("sums", N_SUMS))
     boxes = np.empty((k, 4), np.int64)
     boxes[:, :2], boxes[:, 2:] = NOWHERE, -NOWHERE
-    np.minimum.at(boxes[:, :2], surface, fragment_boxes[:, :2])
-    np.maximum.at(boxes[:, 2:], surface, fragment_boxes[:, 2:])
-    points = np.concatenate([f.lowest_point_mm for f in described])
+    of_fragments = waiting.take("boxes", 4)
+    np.minimum.at(boxes[:, :2], surface, of_fragments[:, :2])
+    np.maximum.at(boxes[:, 2:], surface, of_fragments[:, 2:])
+    del of_fragments
+    points = waiting.take("points", 3)
     order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], surface))
-    _, first = np.unique(surface[order], return_index=True)
-    along = [
-        f.along_steps + np.array([offset, offset, 0])
-        for f, offset in _with_offsets(splits, offsets)
-        if len(f.along_steps)
-    ]
-    pairs = _summed_pairs(np.concatenate(along), surface) if along else np.empty((0, 3), np.int64)
+    first = order[np.searchsorted(surface[order], np.arange(k))]
+    along = waiting.take("along", 2)
+    pairs = np.unique(surface[along[:, 0]] * max(1, steps) + step[along[:, 1]])
     whole = Surfaces(
-        kind=np.concatenate([f.kind for f in described])[members],
+        kind=waiting.take("kind", dtype=np.int8)[members],
         sums=sums,
         boxes_mm=boxes,
-        lowest_point_mm=points[order][first],
-        along_steps=pairs,
+        lowest_point_mm=points[first],
+        along_steps=np.column_stack((pairs // max(1, steps), pairs % max(1, steps))),
     )
-    return whole, surface.astype(np.int64), offsets
+    ranges = waiting.take("ranges", 4)
+    ranges[:, 0] = surface[ranges[:, 0]]
+    return whole, ranges
 
 
-def _with_offsets(splits: Sequence[Split], offsets: npt.NDArray[np.int64]) -> list[tuple[Fragments, int]]:
-    """Each tile's fragments and where they start."""
-    return [(s.fragments, int(o)) for s, o in zip(splits, offsets, strict=False) if s.fragments is not None]
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Sites:
+    """Makes sites of what is finished."""
 
+    grid: TileGrid
+    settings: CandidateSettings
+    crs_name: str
+    candidates: list[CandidateSite] = dataclasses.field(default_factory=list)
+    rejected: list[RejectedSite] = dataclasses.field(default_factory=list)
 
-def _summed_pairs(along: IntArray, surface: npt.NDArray[np.int64]) -> IntArray:
-    """Rows (surface, step, length) with one row a pair of whole surfaces."""
-    pairs = np.column_stack((surface[along[:, 0]], surface[along[:, 1]]))
-    unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
-    lengths = np.zeros(len(unique), np.int64)
-    np.add.at(lengths, inverse.ravel(), along[:, 2])
-    return np.column_stack((unique, lengths))
-
-
-def _ranges_by_key(splits: Sequence[Split], surface_of: dict[tuple[int, int], int]) -> dict[int, list[PointRange]]:
-    """Point ranges of every surface that has points; `surface_of` maps (tile index, key) to it."""
-    ranges: dict[int, list[PointRange]] = {}
-    for t, s in enumerate(splits):
-        for j, key in enumerate(s.keys.tolist()):
-            where = surface_of.get((t, key))
-            if where is not None:
-                ranges.setdefault(where, []).append(
-                    PointRange(tile=s.tile, start=int(s.starts[j]), stop=int(s.starts[j + 1]))
+    def add(self, found: Finished, tiles: Sequence[Tile]) -> None:
+        """The sites of what was finished somewhere; `tiles` by their numbers there."""
+        of_candidates = _site_ranges(found.candidate_ranges, len(found.candidate_points_mm), tiles)
+        for point, ranges in zip(found.candidate_points_mm.tolist(), of_candidates, strict=True):
+            self.candidates.append(
+                CandidateSite(
+                    building_id=object_id(self.crs_name, point),
+                    owner=self.grid.tile_of(point[0], point[1]),
+                    ranges=ranges,
+                    points=sum(part.stop - part.start for part in ranges),
                 )
-    return ranges
+            )
+        of_rejected = _site_ranges(found.rejected_ranges, len(found.kind), tiles)
+        for k, (point, ranges) in enumerate(zip(found.lowest_point_mm.tolist(), of_rejected, strict=True)):
+            sums = found.sums[k]
+            verdict = judge_surface(int(found.kind[k]), sums, self.settings)
+            assert verdict is not None
+            self.rejected.append(
+                RejectedSite(
+                    object_id=object_id(self.crs_name, point),
+                    owner=self.grid.tile_of(point[0], point[1]),
+                    verdict=verdict,
+                    box_mm=tuple(found.boxes_mm[k].tolist()),
+                    area_m2=float(sums[Sum.AREA2]) / 2e6,
+                    height_m=float(sums[Sum.HEIGHT]) / max(1, int(sums[Sum.VERTICES])) / 1000.0,
+                    points=int(sums[Sum.POINTS]),
+                    ranges=ranges,
+                )
+            )
 
 
-def join(splits: Sequence[Split], grid: TileGrid, settings: CandidateSettings, crs_name: str) -> Joined:
-    """Unite, judge, and say where each candidate's points lie.
+def _site_ranges(ranges: IntArray, count: int, tiles: Sequence[Tile]) -> Iterator[tuple[PointRange, ...]]:
+    """Point ranges of each of `count` sites, by tile, then start; `ranges` as in `Finished`."""
+    place = np.empty(len(tiles), np.int64)
+    place[sorted(range(len(tiles)), key=tiles.__getitem__)] = np.arange(len(tiles))
+    ordered = ranges[np.lexsort((ranges[:, 2], place[ranges[:, 1]], ranges[:, 0]))]
+    first = np.searchsorted(ordered[:, 0], np.arange(count + 1)).tolist()
+    for begin, end in itertools.pairwise(first):
+        yield tuple(
+            PointRange(tile=tiles[tile], start=start, stop=stop) for _, tile, start, stop in ordered[begin:end].tolist()
+        )
+
+
+def join(splits: Iterable[Split], grid: TileGrid, settings: CandidateSettings, crs_name: str) -> Joined:
+    """Finish the surfaces that several tiles see, and say where each candidate's points lie.
 
     Parameters
     ----------
-    splits : sequence of Split
-        All tiles, in any order.
+    splits : iterable of Split
+        All tiles, in any order; one is held at a time.
     grid : TileGrid
         The lattice, for the owners.
     settings : CandidateSettings
-        What makes a surface a candidate.
+        What makes a surface a candidate: those of the splits.
     crs_name : str
         Goes into the ids.
     """
-    splits = sorted(splits, key=lambda s: s.tile)
-    surfaces, surface_of_fragment, offsets = whole_surfaces(splits)
-    count = len(surfaces.kind)
-    verdicts: list[Verdict | None] = []
-    for k in range(count):
-        kind = int(surfaces.kind[k])
-        judged = kind in {FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN}
-        verdict = judge_surface(kind, surfaces.sums[k], settings) if judged else _NOT_JUDGED
-        if verdict is None and surfaces.lowest_point_mm[k, 0] == NOWHERE:
-            verdict = _NOT_JUDGED
-        verdicts.append(verdict)
-    leader = unite_levels(surfaces, verdicts, settings)
-    group: dict[tuple[int, int], int] = {}
-    # those that are rejected keep their points, too: the user may know better
-    listed = [is_object(int(surfaces.kind[k]), surfaces.sums[k], settings) for k in range(count)]
-    for t in range(len(splits)):
-        for local, fragment in enumerate(range(int(offsets[t]), int(offsets[t + 1]))):
-            surface = int(surface_of_fragment[fragment])
-            lead = int(leader[surface])
-            if lead >= 0 or listed[surface]:
-                group[t, local] = lead if lead >= 0 else surface
-    ranges = _ranges_by_key(splits, group)
-    lowest: dict[int, tuple[int, ...]] = {}
-    for k in np.flatnonzero(leader >= 0).tolist():
-        point = tuple(int(v) for v in surfaces.lowest_point_mm[k])
-        lead = int(leader[k])
-        lowest[lead] = min(lowest.get(lead, point), point)
-    candidates = [
-        CandidateSite(
-            building_id=object_id(crs_name, lowest[lead]),
-            owner=grid.tile_of(lowest[lead][0], lowest[lead][1]),
-            ranges=tuple(found),
-            points=sum(r.stop - r.start for r in found),
-        )
-        for lead, found in ranges.items()
-        if lead in lowest
-    ]
-    rejected, small = [], 0
-    for k, verdict in enumerate(verdicts):
-        kind = int(surfaces.kind[k])
-        if verdict is None or int(leader[k]) >= 0 or kind in {FacetKind.STEP, FacetKind.GROUND}:
-            continue
-        point = tuple(int(v) for v in surfaces.lowest_point_mm[k])
-        if not listed[k] or point[0] == NOWHERE:
-            small += 1
-            continue
-        sums = surfaces.sums[k]
-        rejected.append(
-            RejectedSite(
-                object_id=object_id(crs_name, point),
-                owner=grid.tile_of(point[0], point[1]),
-                verdict=verdict,
-                box_mm=tuple(int(v) for v in surfaces.boxes_mm[k]),  # type: ignore[arg-type]
-                area_m2=float(sums[Sum.AREA2]) / 2e6,
-                height_m=float(sums[Sum.HEIGHT]) / max(1, int(sums[Sum.VERTICES])) / 1000.0,
-                points=int(sums[Sum.POINTS]),
-                ranges=tuple(ranges.get(k, ())),
-            )
-        )
+    waiting, tiles, small = _Waiting(), list[Tile](), 0
+    sites = _Sites(grid=grid, settings=settings, crs_name=crs_name)
+    for split in splits:
+        if split.surfaces is not None:
+            sites.add(split.surfaces.done, [split.tile])
+            small += split.surfaces.done.small
+            waiting.add(len(tiles), split.surfaces)
+        tiles.append(split.tile)
+    rest = finished(*_whole_surfaces(waiting), settings)
+    sites.add(rest, tiles)
     return Joined(
-        candidates=tuple(sorted(candidates, key=lambda c: (-c.points, c.building_id))),
-        rejected=tuple(sorted(rejected, key=lambda r: r.object_id)),
-        small_fragments=small,
+        candidates=tuple(sorted(sites.candidates, key=lambda c: (-c.points, c.building_id))),
+        rejected=tuple(sorted(sites.rejected, key=lambda r: r.object_id)),
+        small_fragments=small + rest.small,
     )
 
 
 def join_footprints(
-    splits: Sequence[Split],
+    splits: Iterable[Split],
     grid: TileGrid,
     numbers: Mapping[Tile, Sequence[int]],
     footprints: Sequence[Polygon | MultiPolygon],
@@ -329,7 +279,7 @@ def join_footprints(
 
     Parameters
     ----------
-    splits : sequence of Split
+    splits : iterable of Split
         All tiles, in any order.
     grid : TileGrid
         The lattice, for the owners.
@@ -342,13 +292,16 @@ def join_footprints(
     attributes : sequence of str or None, optional
         Their columns, each as the text of a JSON object.
     """
-    splits = sorted(splits, key=lambda s: s.tile)
-    number_of = {(t, key): numbers[s.tile][key] for t, s in enumerate(splits) for key in s.keys.tolist()}
-    ranges = _ranges_by_key(splits, number_of)
+    ranges: dict[int, list[PointRange]] = {}
     lowest: dict[int, tuple[int, ...]] = {}
-    for s in splits:
-        for key, point in zip(s.keys.tolist(), s.lowest_points_mm.tolist(), strict=True):
+    for s in sorted(splits, key=lambda s: s.tile):
+        if s.footprints is None:
+            continue
+        held = s.footprints
+        starts = held.starts.tolist()
+        for j, (key, point) in enumerate(zip(held.keys.tolist(), held.lowest_points_mm.tolist(), strict=True)):
             owner = numbers[s.tile][key]
+            ranges.setdefault(owner, []).append(PointRange(tile=s.tile, start=starts[j], stop=starts[j + 1]))
             lowest[owner] = min(lowest.get(owner, tuple(point)), tuple(point))
     candidates = []
     for number, (footprint, source_id) in enumerate(zip(footprints, source_ids, strict=True)):

@@ -16,6 +16,7 @@ from numba import njit
 from shapely import MultiPolygon, Polygon
 
 from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
+from pipeline.runtime.open_fragments import TileSurfaces, open_fragments
 from pipeline.runtime.scratch import POINT, Scratch
 from pipeline.scene import (
     APRON_M,
@@ -23,6 +24,7 @@ from pipeline.scene import (
     GROUND_CLASS,
     ClassesInUse,
     SceneSettings,
+    SplitTile,
     WindowPoints,
     lattice_of,
     split_tile,
@@ -30,7 +32,6 @@ from pipeline.scene import (
 )
 from pipeline.spatial_hash import first_of_each
 from pipeline.terrain.ground import Terrain, ground_points
-from pipeline.terrain.surfaces import Fragments
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 if TYPE_CHECKING:
@@ -66,19 +67,27 @@ class SplitTask:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class FootprintPoints:
+    """Where the points of given footprints lie in a tile's sorted points; k of them hold some."""
+
+    starts: npt.NDArray[np.int64]
+    """(k + 1,) int64, where the points of each start."""
+    keys: npt.NDArray[np.int64]
+    """(k,) int64, the footprint's place in the task."""
+    lowest_points_mm: npt.NDArray[np.int64]
+    """(k, 3) int64, lexicographically smallest point of each."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Split:
     """The small descriptors of one tile that travel to the driver."""
 
     tile: Tile
     """The tile."""
-    fragments: Fragments | None
-    """Surface fragments; None where footprints were given or the tile has no points."""
-    starts: npt.NDArray[np.int64]
-    """(k + 1,) int64, where each fragment's (or footprint's) points start in the tile's sorted points."""
-    keys: npt.NDArray[np.int64]
-    """(k,) int64, the fragment's number, or the footprint's place in the task."""
-    lowest_points_mm: npt.NDArray[np.int64]
-    """(k, 3) int64, lexicographically smallest point of each."""
+    surfaces: TileSurfaces | None
+    """What the join needs of the tile's surfaces; None where footprints were given."""
+    footprints: FootprintPoints | None
+    """The points in given footprints; None where none were given."""
     points: int
     """Points of the core, without duplicates."""
     duplicates: int
@@ -219,12 +228,12 @@ def split(task: SplitTask) -> Split:
     loaded = load_window(task.scratch, task.grid, task.tile)
     points = loaded.points
     core, window = task.grid.core(task.tile), task.grid.window(task.tile)
-    fragments: Fragments | None = None
     task.scratch.check_cancelled()
+    result: SplitTile | None = None
     if task.footprints is None:
         result = split_tile(points, core, window, task.settings, task.classes)
         index, owner = result.core_index, result.point_fragment.astype(np.int64)
-        fragments, terrain, occupied, outliers = result.fragments, result.terrain, result.occupied, result.outliers
+        terrain, occupied, outliers = result.terrain, result.occupied, result.outliers
     else:
         wanted = core.grown(math.ceil(task.settings.terrain_m(footprints=True) * MM))
         terrain, kept, occupied = terrain_of(points, window, task.settings, task.classes, wanted)
@@ -241,12 +250,16 @@ def split(task: SplitTask) -> Split:
     outcome = hashlib.sha256()
     keys, starts, lowest = _store(task, loaded.core[index[assigned]], owner[assigned], outcome)
     _store_terrain(task, terrain, occupied, core, outcome)
+    surfaces, footprints = None, None
+    if result is None:
+        footprints = FootprintPoints(starts=starts, keys=keys, lowest_points_mm=lowest)
+    else:
+        cut, judging = task.settings.surfaces, task.settings.candidates
+        surfaces = open_fragments(result.fragments, keys, starts, task.tile, task.grid, cut, judging)
     return Split(
         tile=task.tile,
-        fragments=fragments,
-        starts=starts,
-        keys=keys,
-        lowest_points_mm=lowest,
+        surfaces=surfaces,
+        footprints=footprints,
         points=len(loaded.core),
         duplicates=loaded.duplicates,
         outliers=outliers,

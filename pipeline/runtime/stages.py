@@ -7,6 +7,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeVar
 from uuid import uuid4
@@ -369,9 +370,9 @@ class Stages:
             for site in sites
         }
 
-    def _descriptors(self, splits: Splits) -> list[Split]:
-        """The descriptors of all tiles."""
-        return [result_of(self.scratch, place) for place in splits.places.values()]
+    def _descriptors(self, splits: Splits) -> Iterator[Split]:
+        """The descriptors of all tiles, read one after the other."""
+        return (result_of(self.scratch, place) for _, place in sorted(splits.places.items(), key=itemgetter(0)))
 
     def join(self, splits: Splits, footprints: GivenFootprints | None, reference: SpatialReference) -> Joined:
         """Whole surfaces, judged."""

@@ -33,7 +33,8 @@ _S32, _S40, _S48, _S56 = np.uint64(32), np.uint64(40), np.uint64(48), np.uint64(
 
 
 @njit(cache=True, nogil=True)
-def _mixed(state: np.uint64, word: np.uint64) -> np.uint64:
+def mixed(state: np.uint64, word: np.uint64) -> np.uint64:
+    """A state of 64 bits after one more word; for each state another permutation of the words."""
     z = (state ^ word) + _GAMMA
     z = (z ^ (z >> _S30)) * _MIX_1
     z = (z ^ (z >> _S27)) * _MIX_2
@@ -68,14 +69,14 @@ def zone_sums(
             | (np.uint64(point.return_count) << _S40)
             | (np.uint64(point.classification) << _S48)
         )
-        first = _mixed(np.uint64(0), np.uint64(point.x))
-        first = _mixed(first, np.uint64(point.y))
-        first = _mixed(first, np.uint64(point.z))
-        first = _mixed(first, gps_bits[i])
-        first = _mixed(first, small)
+        first = mixed(np.uint64(0), np.uint64(point.x))
+        first = mixed(first, np.uint64(point.y))
+        first = mixed(first, np.uint64(point.z))
+        first = mixed(first, gps_bits[i])
+        first = mixed(first, small)
         sums[column, row, 0] += np.uint64(1)
         sums[column, row, 1] += first
-        sums[column, row, 2] += _mixed(_SECOND, first)
+        sums[column, row, 2] += mixed(_SECOND, first)
     return sums
 
 

@@ -10,13 +10,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from enum import IntEnum
 
 import numpy as np
+from numba import njit
 
-from pipeline.model import IntArray, KindArray, Reason
+from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, Reason
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.surfaces import Sum
+
+NOWHERE = 2**62
+"""Coordinate of the smallest point of a surface that has none."""
+SOLID = (FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN)
+"""Kinds of the surfaces that are judged."""
+_BLOCK = 65_536
+"""Surfaces that are judged at once: what that takes on the way stays below 20 MB, however many there are."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,12 +106,46 @@ class Surfaces:
     boxes_mm: IntArray
     """(k, 4) xmin, ymin, xmax, ymax."""
     lowest_point_mm: IntArray
-    """(k, 3) smallest assigned point; 2^62 where there is none."""
+    """(k, 3) smallest assigned point; NOWHERE where there is none."""
     along_steps: IntArray
-    """(s, 3) surface, step, shared length in mm; one row a pair."""
+    """(s, 2) surface and step; one row a pair. Steps are told apart by their numbers, which need not be those of
+    surfaces."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fault(IntEnum):
+    """The first rule that a surface breaks."""
+
+    NONE = 0
+    """It is a candidate."""
+    TOO_SMALL = 1
+    TOO_LOW = 2
+    CROWN = 3
+    """A crown by its kind."""
+    ROUGH = 4
+    """Too little of it is planar."""
+    COVERED = 5
+    """Too many earlier returns above it."""
+    TOO_NARROW = 6
+    NO_WALLS = 7
+    BELOW_Z_AVG = 8
+    NOT_JUDGED = 9
+    """Ground, a step between levels, or a surface without points."""
+
+
+REASONS = {
+    Fault.TOO_SMALL: Reason.TOO_SMALL,
+    Fault.TOO_LOW: Reason.TOO_LOW,
+    Fault.CROWN: Reason.VEGETATION,
+    Fault.ROUGH: Reason.VEGETATION,
+    Fault.COVERED: Reason.VEGETATION,
+    Fault.TOO_NARROW: Reason.TOO_NARROW,
+    Fault.NO_WALLS: Reason.NO_WALLS,
+    Fault.BELOW_Z_AVG: Reason.BELOW_Z_AVG,
+}
+"""What records say of each fault that is told."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
 class Verdict:
     """What is said of a surface that is no candidate."""
 
@@ -112,35 +155,92 @@ class Verdict:
     """The measured figure and the threshold."""
 
 
-def _figures(sums: IntArray) -> dict[str, float]:
-    """The measures of one surface in metres and shares."""
-    facets_mm2 = float(sums[Sum.AREA2]) / 2.0
-    outline_mm = max(1, int(sums[Sum.BOUNDARY]))
+def _figures(sums: IntArray) -> dict[str, FloatArray]:
+    """The measures of surfaces (k, N_SUMS) in metres and shares, each (k,)."""
+    facets_mm2 = sums[:, Sum.AREA2] / 2.0
+    outline_mm = np.maximum(1, sums[:, Sum.BOUNDARY])
     # the facets end at the outermost points, half a spacing inside the edges: grown by that (Steiner's formula)
-    half_mm = 0.5 * math.sqrt(2.0 * facets_mm2 / max(1, int(sums[Sum.FACETS])))
+    half_mm = 0.5 * np.sqrt(2.0 * facets_mm2 / np.maximum(1, sums[:, Sum.FACETS]))
     area_mm2 = facets_mm2 + half_mm * outline_mm + math.pi * half_mm * half_mm
     grown_outline_mm = outline_mm + 2.0 * math.pi * half_mm
-    judged = max(1, int(sums[Sum.PLANAR] + sums[Sum.ROUGH]))
-    vertices = max(1, int(sums[Sum.VERTICES]))
-    mean_mm = float(sums[Sum.HEIGHT]) / vertices
+    known = sums[:, Sum.PLANAR] + sums[:, Sum.ROUGH]
+    vertices = np.maximum(1, sums[:, Sum.VERTICES])
+    mean_mm = sums[:, Sum.HEIGHT] / vertices
     # heights over a slope are uniform between eave and ridge: the ridge lies sqrt(3) standard deviations above the mean
-    spread_mm = math.sqrt(max(0.0, 3.0 * (float(sums[Sum.HEIGHT2]) / vertices - mean_mm * mean_mm)))
+    spread_mm = np.sqrt(np.maximum(0.0, 3.0 * (sums[:, Sum.HEIGHT2] / vertices - mean_mm * mean_mm)))
     return {
         "area_m2": area_mm2 / 1e6,
         "height_m": mean_mm / 1000.0,
         "top_m": (mean_mm + spread_mm) / 1000.0,
         "width_m": 2.0 * area_mm2 / grown_outline_mm / 1000.0,
-        "planar_share": float(sums[Sum.PLANAR]) / judged,
-        "judged": float(sums[Sum.PLANAR] + sums[Sum.ROUGH]),
-        "canopy_share": float(sums[Sum.CANOPY]) / max(1, int(sums[Sum.CANOPY] + sums[Sum.POINTS])),
-        "wall_share": float(sums[Sum.WALL]) / outline_mm,
-        "top_share": float(sums[Sum.WALL_TOP]) / max(1, int(sums[Sum.WALL])),
-        "step_share": float(sums[Sum.STEP]) / outline_mm,
+        "planar_share": sums[:, Sum.PLANAR] / np.maximum(1, known),
+        "judged": known.astype(np.float64),
+        "canopy_share": sums[:, Sum.CANOPY] / np.maximum(1, sums[:, Sum.CANOPY] + sums[:, Sum.POINTS]),
+        "wall_share": sums[:, Sum.WALL] / outline_mm,
+        "top_share": sums[:, Sum.WALL_TOP] / np.maximum(1, sums[:, Sum.WALL]),
+        "step_share": sums[:, Sum.STEP] / outline_mm,
     }
 
 
+def _limits(
+    kind: KindArray, f: dict[str, FloatArray], settings: CandidateSettings
+) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Which surfaces are surely roofs, and the least area (m2) and width (m) that is asked of each."""
+    sure = (f["judged"] > 0) & (f["planar_share"] >= settings.sure_planar_share)
+    sure &= f["canopy_share"] <= settings.max_canopy_share
+    slender = f["height_m"] > settings.max_slenderness * f["width_m"]
+    sure &= (f["area_m2"] >= settings.doubtful_area_m2) | ~slender
+    doubtful = (kind != FacetKind.BUILDING) & ~sure
+    least_m2 = np.where(doubtful, max(settings.min_area_m2, settings.doubtful_area_m2), settings.min_area_m2)
+    return sure, least_m2, settings.min_width_m * np.where(sure, 0.5, 1.0)
+
+
+def _faults(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> KindArray:
+    """The first fault of each of some surfaces, by their kind and sums alone."""
+    f = _figures(sums)
+    sure, least_m2, width_m = _limits(kind, f, settings)
+    # the first rule that holds decides
+    rules = [
+        (f["area_m2"] < least_m2, Fault.TOO_SMALL),
+        (kind == FacetKind.BUILDING, Fault.NONE),
+        (f["top_m"] < settings.min_height_m, Fault.TOO_LOW),
+        (kind == FacetKind.CROWN, Fault.CROWN),
+        ((f["judged"] > 0) & (f["planar_share"] < settings.min_planar_share), Fault.ROUGH),
+        (f["canopy_share"] > settings.max_canopy_share, Fault.COVERED),
+        (f["width_m"] < width_m, Fault.TOO_NARROW),
+        (f["wall_share"] < settings.min_wall_share, Fault.NO_WALLS),
+        (~sure & (f["top_share"] < settings.min_top_share), Fault.BELOW_Z_AVG),
+    ]
+    found = np.select([held for held, _ in rules], [np.int8(fault) for _, fault in rules], np.int8(Fault.NONE))
+    return found.astype(np.int8)
+
+
+def judge_surfaces(surfaces: Surfaces, settings: CandidateSettings) -> KindArray:
+    """What speaks against each whole surface.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+        Whole surfaces of any kind.
+    settings : CandidateSettings
+        The thresholds.
+
+    Returns
+    -------
+    (k,) int8
+        The first Fault of each; NOT_JUDGED for ground, steps, and for what would be a candidate without points.
+    """
+    found = np.full(len(surfaces.kind), Fault.NOT_JUDGED, np.int8)
+    solid = np.flatnonzero(np.isin(surfaces.kind, SOLID))
+    for start in range(0, len(solid), _BLOCK):
+        block = solid[start : start + _BLOCK]
+        found[block] = _faults(surfaces.kind[block], surfaces.sums[block], settings)
+    found[(found == Fault.NONE) & (surfaces.lowest_point_mm[:, 0] == NOWHERE)] = Fault.NOT_JUDGED
+    return found
+
+
 def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Verdict | None:
-    """Why one whole surface is no candidate; None where it is one.
+    """Why one whole surface is no candidate, in words; None where it is one.
 
     Parameters
     ----------
@@ -151,84 +251,85 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
     settings : CandidateSettings
         The thresholds.
     """
-    f = _figures(sums)
-    sure = f["judged"] > 0 and f["planar_share"] >= settings.sure_planar_share
-    sure = sure and f["canopy_share"] <= settings.max_canopy_share
-    slender = f["height_m"] > settings.max_slenderness * f["width_m"]
-    sure = sure and (f["area_m2"] >= settings.doubtful_area_m2 or not slender)
-    least_m2 = settings.min_area_m2
-    if kind != FacetKind.BUILDING and not sure:
-        least_m2 = max(least_m2, settings.doubtful_area_m2)
-    if f["area_m2"] < least_m2:
-        return Verdict(reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {least_m2:g}")
-    if kind == FacetKind.BUILDING:
+    kinds = np.array([kind], np.int8)
+    fault = Fault(int(_faults(kinds, sums[None], settings)[0]))
+    if fault == Fault.NONE:
         return None
-    if f["top_m"] < settings.min_height_m:
-        return Verdict(
-            reason=Reason.TOO_LOW,
-            detail=f"top {f['top_m']:.2f} m above the terrain, at least {settings.min_height_m:g}",
-        )
-    if kind == FacetKind.CROWN:
-        return Verdict(
-            reason=Reason.VEGETATION,
-            detail=f"a crown: most of what surrounds its vertices is rough, planar share {f['planar_share']:.2f}",
-        )
-    if f["judged"] > 0 and f["planar_share"] < settings.min_planar_share:
-        return Verdict(
-            reason=Reason.VEGETATION,
-            detail=f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}",
-        )
-    if f["canopy_share"] > settings.max_canopy_share:
-        return Verdict(
-            reason=Reason.VEGETATION,
-            detail=f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}",
-        )
-    width_m = settings.min_width_m * (0.5 if sure else 1.0)
-    if f["width_m"] < width_m:
-        return Verdict(reason=Reason.TOO_NARROW, detail=f"mean width {f['width_m']:.2f} m, at least {width_m:g}")
-    if f["wall_share"] < settings.min_wall_share:
-        return Verdict(
-            reason=Reason.NO_WALLS,
-            detail=f"walls along {f['wall_share']:.2f} of the outline, at least {settings.min_wall_share:g}",
-        )
-    if not sure and f["top_share"] < settings.min_top_share:
-        z_avg = float(sums[Sum.WALLS_Z_MX]) / max(1, int(sums[Sum.WALLS])) / 1000.0
-        own = float(sums[Sum.WALLS_OWN_Z]) / max(1, int(sums[Sum.WALLS])) / 1000.0
-        return Verdict(
-            reason=Reason.BELOW_Z_AVG,
-            detail=f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g} "
-            f"(own {own:.2f} m, Z_avg {z_avg:.2f} m)",
-        )
-    return None
+    figures = _figures(sums[None])
+    _, least, least_width = _limits(kinds, figures, settings)
+    f = {name: float(values[0]) for name, values in figures.items()}
+    walls = max(1, int(sums[Sum.WALLS]))
+    z_avg, own = float(sums[Sum.WALLS_Z_MX]) / walls / 1000.0, float(sums[Sum.WALLS_OWN_Z]) / walls / 1000.0
+    details = {
+        Fault.TOO_SMALL: f"area {f['area_m2']:.1f} m2, at least {least[0]:g}",
+        Fault.TOO_LOW: f"top {f['top_m']:.2f} m above the terrain, at least {settings.min_height_m:g}",
+        Fault.CROWN: f"a crown: most of what surrounds its vertices is rough, planar share {f['planar_share']:.2f}",
+        Fault.ROUGH: f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}",
+        Fault.COVERED: f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}",
+        Fault.TOO_NARROW: f"mean width {f['width_m']:.2f} m, at least {least_width[0]:g}",
+        Fault.NO_WALLS: f"walls along {f['wall_share']:.2f} of the outline, at least {settings.min_wall_share:g}",
+        Fault.BELOW_Z_AVG: f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g} "
+        f"(own {own:.2f} m, Z_avg {z_avg:.2f} m)",
+    }
+    return Verdict(reason=REASONS[fault], detail=details[fault])
 
 
-def is_object(kind: int, sums: IntArray, settings: CandidateSettings) -> bool:
-    """Whether a surface is large enough to be listed at all, as candidate or rejected."""
-    large_enough = bool(sums[Sum.AREA2] >= 2e6 * settings.min_object_area_m2)
-    return kind in {FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN} and large_enough
+def are_objects(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> BoolArray:
+    """Which surfaces (k,) are large enough to be listed at all, as candidate or rejected."""
+    large_enough: BoolArray = sums[:, Sum.AREA2] >= 2e6 * settings.min_object_area_m2
+    return np.isin(kind, SOLID) & large_enough
 
 
-def _joins(kind: int, sums: IntArray, verdict: Verdict | None, settings: CandidateSettings) -> bool:
-    """Whether a surface is roof-like and mostly bounded by steps, as a dormer, a lift house or an upper storey."""
+def may_join(kind: KindArray, sums: IntArray, faults: KindArray, settings: CandidateSettings) -> BoolArray:
+    """Which surfaces (k,) are roof-like and mostly bounded by steps, as a dormer, a lift house or an upper storey."""
     f = _figures(sums)
-    small_roof = verdict is None or (
-        verdict.reason in {Reason.TOO_SMALL, Reason.TOO_NARROW, Reason.BELOW_Z_AVG}
-        and f["top_m"] >= settings.min_height_m
-        and f["planar_share"] >= settings.min_planar_share
-        and f["canopy_share"] <= settings.max_canopy_share
-    )
-    return kind in {FacetKind.OBJECT, FacetKind.BUILDING} and small_roof and f["step_share"] >= settings.unite_share
+    small_roof = np.isin(faults, (Fault.TOO_SMALL, Fault.TOO_NARROW, Fault.BELOW_Z_AVG))
+    small_roof &= f["top_m"] >= settings.min_height_m
+    small_roof &= f["planar_share"] >= settings.min_planar_share
+    small_roof &= f["canopy_share"] <= settings.max_canopy_share
+    roof_like = (faults == Fault.NONE) | small_roof
+    joins: BoolArray = np.isin(kind, (FacetKind.OBJECT, FacetKind.BUILDING)) & roof_like
+    return joins & (f["step_share"] >= settings.unite_share)
 
 
-def unite_levels(surfaces: Surfaces, verdicts: list[Verdict | None], settings: CandidateSettings) -> IntArray:
+@njit(cache=True, nogil=True)
+def _largest_beside(
+    joining: IntArray,
+    steps: IntArray,
+    roofs: IntArray,
+    first: IntArray,
+    rank: IntArray,
+    boxes: IntArray,
+    reach_mm: int,
+    leader: IntArray,
+) -> None:
+    """Set the leader of each joining surface (row by row with one of its steps) to the largest larger roof beside it.
+
+    The roofs of step s are `roofs[first[s]:first[s + 1]]`, by rank.
+    """
+    for i in range(joining.size):
+        k = joining[i]
+        # one step can run through a whole town: only roofs that come near count
+        x0, y0, x1, y1 = boxes[k, 0] - reach_mm, boxes[k, 1] - reach_mm, boxes[k, 2] + reach_mm, boxes[k, 3] + reach_mm
+        for j in range(first[steps[i]], first[steps[i] + 1]):
+            roof = roofs[j]
+            if rank[roof] >= rank[k]:
+                break
+            if boxes[roof, 0] <= x1 and boxes[roof, 2] >= x0 and boxes[roof, 1] <= y1 and boxes[roof, 3] >= y0:
+                if leader[k] < 0 or rank[roof] < rank[leader[k]]:
+                    leader[k] = roof
+                break
+
+
+def unite_levels(surfaces: Surfaces, faults: KindArray, settings: CandidateSettings) -> IntArray:
     """The candidate that each surface belongs to: its own index, or that of a larger roof across a step.
 
     Parameters
     ----------
     surfaces : Surfaces
         Whole surfaces.
-    verdicts : list of Verdict or None
-        One a surface.
+    faults : (k,) int8
+        From `judge_surfaces`.
     settings : CandidateSettings
         `unite_share`.
 
@@ -238,45 +339,28 @@ def unite_levels(surfaces: Surfaces, verdicts: list[Verdict | None], settings: C
         Index of the surface that leads the candidate; -1 for surfaces that belong to none.
     """
     count = len(surfaces.kind)
-    leader = np.array([k if verdicts[k] is None else -1 for k in range(count)], np.int64)
+    is_roof = faults == Fault.NONE
+    leader = np.where(is_roof, np.arange(count), -1)
     # the largest first; equal areas by the smallest point, so that numbering does not matter
     order = np.lexsort((*surfaces.lowest_point_mm.T[::-1], -surfaces.sums[:, Sum.AREA2]))
     rank = np.empty(count, np.int64)
     rank[order] = np.arange(count)
-    roofs_at: dict[int, list[int]] = {}
-    steps_of: dict[int, list[int]] = {}
-    for surface, step, _length in surfaces.along_steps.tolist():
-        steps_of.setdefault(surface, []).append(step)
-        if verdicts[surface] is None:
-            roofs_at.setdefault(step, []).append(surface)
-    ranked = {step: np.array(sorted(roofs, key=lambda k: rank[k]), np.int64) for step, roofs in roofs_at.items()}
-    reach_mm = round(settings.unite_reach_m * 1000)
-    for k in sorted(steps_of):
-        if not _joins(int(surfaces.kind[k]), surfaces.sums[k], verdicts[k], settings):
-            continue
-        x0, y0, x1, y1 = (int(v) for v in surfaces.boxes_mm[k])
-        best = -1
-        for step in steps_of[k]:
-            roofs = ranked.get(step, np.empty(0, np.int64))
-            boxes = surfaces.boxes_mm[roofs]
-            # one step can run through a whole town: only roofs that come near count
-            near = (
-                (boxes[:, 0] <= x1 + reach_mm)
-                & (boxes[:, 2] >= x0 - reach_mm)
-                & (boxes[:, 1] <= y1 + reach_mm)
-                & (boxes[:, 3] >= y0 - reach_mm)
-                & (rank[roofs] < rank[k])
-            )
-            if near.any():
-                first = int(roofs[int(near.argmax())])
-                if best < 0 or rank[first] < rank[best]:
-                    best = first
-        if best >= 0:
-            leader[k] = best
+    surface = surfaces.along_steps[:, 0]
+    numbers, step = np.unique(surfaces.along_steps[:, 1], return_inverse=True)
+    step = step.reshape(-1)
+    at_roof = np.flatnonzero(is_roof[surface])
+    at_roof = at_roof[np.lexsort((rank[surface[at_roof]], step[at_roof]))]
+    first = np.searchsorted(step[at_roof], np.arange(len(numbers) + 1))
+    beside, place = np.unique(surface, return_inverse=True)
+    joins = may_join(surfaces.kind[beside], surfaces.sums[beside], faults[beside], settings)[place.reshape(-1)]
+    _largest_beside(
+        surface[joins], step[joins], surface[at_roof], first, rank, surfaces.boxes_mm,
+        round(settings.unite_reach_m * 1000), leader,
+    )  # fmt: skip
     # a leader may itself have joined a larger one: follow to the end; ranks strictly fall, so there is no cycle
-    for k in range(count):
-        top = int(leader[k])
-        while top >= 0 and int(leader[top]) != top:
-            top = int(leader[top])
-        leader[k] = top
-    return leader
+    led = np.flatnonzero(leader >= 0)
+    while True:
+        further = leader[leader[led]]
+        if (further == leader[led]).all():
+            return leader
+        leader[led] = further

@@ -98,6 +98,11 @@ class SurfaceSettings(Parameters):
         """How far a fragment's facets look: two facets and their circumcircles."""
         return 4.0 * self.max_circumradius_m + 2.0 * self.thinning_m
 
+    @property
+    def far_mm(self) -> int:
+        """How far the vertices are that a point may refer to: a tile looks at all facets with one so near its core."""
+        return round(2 * self.thinning_m * 1000)
+
 
 @njit(cache=True, nogil=True)
 def sum_fragments(
@@ -284,7 +289,7 @@ def fragments_of(
         round(settings.steep_m * 1000),
         round(settings.step_height_m * 1000),
     )  # fmt: skip
-    far_mm = round(2 * settings.thinning_m * 1000)
+    far_mm = settings.far_mm
     near, shared = marks(x, y, tin.facets, kinds, core, far_mm)
     considered = with_vertex(tin.facets, near)
     label, fragment_kind = label_fragments(kinds, tin.neighbours, considered)

@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from slow_join import slowly_judged
 
 from pipeline.errors import SettingsError
 from pipeline.model import IntArray, Reason
 from pipeline.terrain.candidates import (
+    NOWHERE,
+    REASONS,
     CandidateSettings,
+    Fault,
     Surfaces,
     Verdict,
-    is_object,
+    are_objects,
     judge_surface,
+    judge_surfaces,
     unite_levels,
 )
 from pipeline.terrain.facets import FacetKind
@@ -159,12 +164,64 @@ def test_building_by_trusted_classes_needs_only_its_area() -> None:
     ],
 )
 def test_an_object_is_a_surface_of_some_size_above_the_ground(kind: FacetKind, area_m2: float, listed: bool) -> None:
-    assert is_object(kind, sums_of({Sum.AREA2: round(area_m2 * 2e6)}), SETTINGS) is listed
+    sums = sums_of({Sum.AREA2: round(area_m2 * 2e6)})
+    assert are_objects(np.array([kind], np.int8), sums[None], SETTINGS).tolist() == [listed]
 
 
 def test_a_share_beyond_one_is_refused() -> None:
     with pytest.raises(SettingsError, match=r"min_planar_share is 1\.5"):
         CandidateSettings(min_planar_share=1.5)
+
+
+columns = st.integers(0, 10**9)
+some_sums = st.fixed_dictionaries(
+    {
+        Sum.FACETS: st.integers(0, 5000),
+        Sum.AREA2: st.one_of(columns, st.sampled_from([8_000_000, 6_100_000, 36_000_000, 60_000_000])),
+        Sum.VERTICES: st.integers(0, 500),
+        Sum.HEIGHT: st.integers(0, 400 * 9000),
+        Sum.HEIGHT2: st.integers(0, 400 * 9000**2),
+        Sum.PLANAR: st.integers(0, 400),
+        Sum.ROUGH: st.integers(0, 400),
+        Sum.BOUNDARY: st.integers(0, 200_000),
+        Sum.WALL: st.integers(0, 200_000),
+        Sum.WALL_TOP: st.integers(0, 200_000),
+        Sum.STEP: st.integers(0, 200_000),
+        Sum.WALLS: st.integers(0, 200),
+        Sum.WALLS_Z_MX: st.integers(-(10**6), 10**6),
+        Sum.WALLS_OWN_Z: st.integers(-(10**6), 10**6),
+        Sum.POINTS: st.integers(0, 5000),
+        Sum.CANOPY: st.integers(0, 2000),
+    }
+)
+"""Anything, and more often than by chance what lies at a threshold or passes most of them."""
+nearly_roofs = st.tuples(some_sums, st.sets(st.sampled_from(list(Sum)), max_size=4)).map(
+    lambda drawn: {column: drawn[0][column] for column in drawn[1]}
+)
+
+
+@settings(deadline=None, max_examples=300)
+@given(
+    rows=st.lists(st.one_of(some_sums, nearly_roofs), min_size=1, max_size=8),
+    kinds=st.lists(st.sampled_from(FacetKind), min_size=8, max_size=8),
+    somewhere=st.lists(st.booleans(), min_size=8, max_size=8),
+)
+def test_many_surfaces_are_judged_like_each_on_its_own(
+    rows: list[dict[Sum, int]], kinds: list[FacetKind], somewhere: list[bool]
+) -> None:
+    surfaces = surfaces_of(rows, [], [int(kind) for kind in kinds[: len(rows)]])
+    surfaces.lowest_point_mm[~np.array(somewhere[: len(rows)])] = NOWHERE
+    found = judge_surfaces(surfaces, SETTINGS)
+    for k, kind in enumerate(kinds[: len(rows)]):
+        if kind in {FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN}:
+            verdict = slowly_judged(kind, surfaces.sums[k], SETTINGS)
+            assert judge_surface(kind, surfaces.sums[k], SETTINGS) == verdict
+            if verdict is None:
+                assert found[k] == (Fault.NONE if somewhere[k] else Fault.NOT_JUDGED)
+            else:
+                assert REASONS[Fault(found[k])] == verdict.reason
+        else:
+            assert found[k] == Fault.NOT_JUDGED
 
 
 # -- levels ------------------------------------------------------------------------------------------------------------
@@ -177,18 +234,12 @@ def surfaces_of(rows: list[dict[Sum, int]], along: list[tuple[int, int]], kinds:
         sums=np.array([sums_of(changes) for changes in rows]).reshape(count, N_SUMS),
         boxes_mm=np.zeros((count, 4), np.int64),
         lowest_point_mm=np.array([[1000 * k, 0, 0] for k in range(count)], np.int64).reshape(count, 3),
-        along_steps=np.array([(s, step, 1000) for s, step in along], np.int64).reshape(-1, 3),
+        along_steps=np.array(along, np.int64).reshape(-1, 2),
     )
 
 
 def leaders(surfaces: Surfaces) -> list[int]:
-    verdicts = [
-        Verdict(reason=Reason.TOO_FEW_POINTS, detail="a step")
-        if kind == FacetKind.STEP
-        else judge_surface(int(kind), sums, SETTINGS)
-        for kind, sums in zip(surfaces.kind, surfaces.sums, strict=True)
-    ]
-    return [int(k) for k in unite_levels(surfaces, verdicts, SETTINGS)]
+    return [int(k) for k in unite_levels(surfaces, judge_surfaces(surfaces, SETTINGS), SETTINGS)]
 
 
 DORMER = {Sum.AREA2: 12_000_000, Sum.BOUNDARY: 10_000, Sum.WALL: 9000, Sum.WALL_TOP: 9000, Sum.STEP: 9000}
@@ -268,6 +319,10 @@ def drawn(members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int,
 link_lists = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 3)), max_size=14)
 
 
+def is_solid(kind: int) -> bool:
+    return kind not in {FacetKind.STEP, FacetKind.GROUND}
+
+
 def slow_twin(surfaces: Surfaces) -> list[int]:
     """Climb from each surface to the largest larger candidate across a step, while it is one that joins."""
     found = []
@@ -275,20 +330,21 @@ def slow_twin(surfaces: Surfaces) -> list[int]:
         here: int = k
         while True:
             sums, kind = surfaces.sums[here], surfaces.kind[here]
-            verdict = None if kind == FacetKind.STEP else judge_surface(int(kind), sums, SETTINGS)
-            accepted = kind != FacetKind.STEP and verdict is None
+            verdict = judge_surface(int(kind), sums, SETTINGS) if is_solid(kind) else None
+            accepted = is_solid(kind) and verdict is None
             roof_like = accepted or (
                 verdict is not None and verdict.reason in {Reason.TOO_SMALL, Reason.TOO_NARROW, Reason.BELOW_Z_AVG}
             )
             larger = []
-            if roof_like and kind != FacetKind.GROUND and 2 * sums[Sum.STEP] >= sums[Sum.BOUNDARY]:
-                steps = {step for s, step, _ in surfaces.along_steps.tolist() if s == here}
-                for s, step, _ in surfaces.along_steps.tolist():
+            if roof_like and 2 * sums[Sum.STEP] >= sums[Sum.BOUNDARY]:
+                steps = {step for s, step in surfaces.along_steps.tolist() if s == here}
+                for s, step in surfaces.along_steps.tolist():
                     other = surfaces.sums[s, Sum.AREA2]
                     is_larger = other > sums[Sum.AREA2] or (other == sums[Sum.AREA2] and s < here)
                     if (
                         step in steps
                         and is_larger
+                        and is_solid(surfaces.kind[s])
                         and judge_surface(int(surfaces.kind[s]), surfaces.sums[s], SETTINGS) is None
                     ):
                         larger.append((-int(other), s))
@@ -320,9 +376,7 @@ def test_every_leader_is_a_candidate_that_leads_itself(
             assert found[lead] == lead
             assert judge_surface(int(surfaces.kind[lead]), surfaces.sums[lead], SETTINGS) is None
         else:
-            assert surfaces.kind[k] == FacetKind.STEP or judge_surface(
-                int(surfaces.kind[k]), surfaces.sums[k], SETTINGS
-            )
+            assert not is_solid(surfaces.kind[k]) or judge_surface(int(surfaces.kind[k]), surfaces.sums[k], SETTINGS)
 
 
 @settings(deadline=None, max_examples=200)

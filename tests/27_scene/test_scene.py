@@ -12,12 +12,11 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from slow_join import WholeSplit, whole_surfaces
 
-from pipeline.model import IntArray, Reason
-from pipeline.runtime.join import whole_surfaces
-from pipeline.runtime.split import Split
+from pipeline.model import IntArray
 from pipeline.scene import ClassesInUse, SceneSettings, SplitTile, WindowPoints, lattice_of, split_tile
-from pipeline.terrain.candidates import CandidateSettings, Surfaces, Verdict, judge_surface, unite_levels
+from pipeline.terrain.candidates import CandidateSettings, Surfaces, judge_surfaces, unite_levels
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.ground import GroundSettings
 from pipeline.terrain.lattice import NO_DATA
@@ -73,21 +72,18 @@ def split_whole(
 
 def surfaces_of(f: Fragments) -> Surfaces:
     return Surfaces(
-        kind=f.kind, sums=f.sums, boxes_mm=f.boxes_mm, lowest_point_mm=f.lowest_point_mm, along_steps=f.along_steps
+        kind=f.kind,
+        sums=f.sums,
+        boxes_mm=f.boxes_mm,
+        lowest_point_mm=f.lowest_point_mm,
+        along_steps=f.along_steps[:, :2],
     )
-
-
-def judged(fragments: Fragments) -> list[Verdict | None]:
-    step = Verdict(reason=Reason.TOO_FEW_POINTS, detail="a step")
-    return [
-        step if kind == FacetKind.STEP else judge_surface(int(kind), sums, CandidateSettings())
-        for kind, sums in zip(fragments.kind, fragments.sums, strict=True)
-    ]
 
 
 def candidate_of_points(found: SplitTile) -> IntArray:
     """Leader of the candidate of every point of the window, -1 where none; the core is the window."""
-    leader = unite_levels(surfaces_of(found.fragments), judged(found.fragments), CandidateSettings())
+    surfaces = surfaces_of(found.fragments)
+    leader = unite_levels(surfaces, judge_surfaces(surfaces, CandidateSettings()), CandidateSettings())
     out = np.full(found.core_index.max() + 1, -1, np.int64)
     assigned = found.point_fragment >= 0
     out[found.core_index[assigned]] = leader[found.point_fragment[assigned]]
@@ -336,20 +332,9 @@ def test_every_stage_widens_the_support() -> None:
 # -- tiles -------------------------------------------------------------------------------------------------------------
 
 
-def described(tile: Tile, found: SplitTile) -> Split:
-    """What the join reads of a split."""
-    nothing = np.empty(0, np.int64)
-    return Split(
-        tile=tile,
-        fragments=found.fragments,
-        starts=np.zeros(1, np.int64),
-        keys=nothing,
-        lowest_points_mm=np.empty((0, 3), np.int64),
-        points=len(found.core_index),
-        duplicates=0,
-        outliers=found.outliers,
-        audit=(0, 0, 0),
-    )
+def described(tile: Tile, found: SplitTile) -> WholeSplit:
+    """What the slow join reads of a split."""
+    return WholeSplit(tile=tile, fragments=found.fragments, starts=np.zeros(1, np.int64), keys=np.empty(0, np.int64))
 
 
 def in_tiles(

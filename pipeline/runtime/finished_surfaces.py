@@ -1,0 +1,87 @@
+"""Whole surfaces are judged and grouped to candidates and rejected objects: columns in, columns out.
+
+What no neighbour can see of is finished by the task of its tile, all else by the join: with one function, so that
+nobody can tell who did it. It gives for each connected set of surfaces what it gives for all of them together, since
+judging looks at one surface, and uniting only along steps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pipeline.model import IntArray, KindArray
+from pipeline.terrain.candidates import (
+    NOWHERE,
+    SOLID,
+    CandidateSettings,
+    Surfaces,
+    are_objects,
+    judge_surfaces,
+    unite_levels,
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Finished:
+    """Candidates and rejected objects, by columns; c and r of them."""
+
+    candidate_points_mm: IntArray
+    """(c, 3) smallest point of each candidate."""
+    candidate_ranges: IntArray
+    """(p, 4) candidate, tile, start, stop: points in the sorted points of a tile; tiles are numbered by the caller."""
+    kind: KindArray
+    """(r,) FacetKind of each rejected object."""
+    sums: IntArray
+    """(r, N_SUMS) columns as in Sum."""
+    boxes_mm: IntArray
+    """(r, 4) xmin, ymin, xmax, ymax."""
+    lowest_point_mm: IntArray
+    """(r, 3) smallest point."""
+    rejected_ranges: IntArray
+    """(q, 4) rejected object, tile, start, stop: the user may know better and want its points."""
+    small: int
+    """Surfaces below the size of an object: counted, not listed."""
+
+
+def finished(surfaces: Surfaces, ranges: IntArray, settings: CandidateSettings) -> Finished:
+    """Judge whole surfaces, and unite levels to candidates.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+        All of one or more sets that no step connects with any other surface.
+    ranges : (p, 4) int64
+        Surface, tile, start, stop of runs of their points.
+    settings : CandidateSettings
+        What makes a surface a candidate.
+    """
+    leader = unite_levels(surfaces, judge_surfaces(surfaces, settings), settings)
+    points = surfaces.lowest_point_mm
+    led = np.flatnonzero(leader >= 0)
+    leads, candidate = np.unique(leader[led], return_inverse=True)
+    candidate = candidate.reshape(-1)
+    order = np.lexsort((*points[led].T[::-1], candidate))
+    smallest = led[order[np.searchsorted(candidate[order], np.arange(len(leads)))]]
+    rest = np.isin(surfaces.kind, SOLID) & (leader < 0)
+    rejected = np.flatnonzero(rest & are_objects(surfaces.kind, surfaces.sums, settings) & (points[:, 0] != NOWHERE))
+    return Finished(
+        candidate_points_mm=points[smallest],
+        candidate_ranges=_ranges_of(ranges, led, candidate, len(leader)),
+        kind=surfaces.kind[rejected],
+        sums=surfaces.sums[rejected],
+        boxes_mm=surfaces.boxes_mm[rejected],
+        lowest_point_mm=points[rejected],
+        rejected_ranges=_ranges_of(ranges, rejected, np.arange(len(rejected)), len(leader)),
+        small=int(rest.sum()) - len(rejected),
+    )
+
+
+def _ranges_of(ranges: IntArray, members: IntArray, site: IntArray, count: int) -> IntArray:
+    """The ranges of some of `count` surfaces, with the number of each one's site in place of its own."""
+    site_of = np.full(count, -1, np.int64)
+    site_of[members] = site
+    found = site_of[ranges[:, 0]]
+    held = found >= 0
+    return np.column_stack((found[held], ranges[held, 1:]))
