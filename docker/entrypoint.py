@@ -120,6 +120,9 @@ def lay_out_kernels(given: Mapping[str, str]) -> None:
         unfinished = Path(f"{target}.{os.getpid()}")
         # contents alone: who owns the copies may write them
         shutil.copytree(source, unfinished, copy_function=shutil.copyfile)
+        # folders come with their rights; numba passes by a folder that it cannot write, and compiles all again
+        for folder in (unfinished, *(path for path in unfinished.rglob("*") if path.is_dir())):
+            folder.chmod(0o755)
         unfinished.rename(target)
 
 

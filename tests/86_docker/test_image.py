@@ -277,10 +277,12 @@ def test_kernels_are_laid_out_once_and_can_be_written(entrypoint: ModuleType, tm
     source.mkdir(parents=True)
     (source / "kernel.nbc").write_bytes(b"compiled")
     (source / "kernel.nbc").chmod(0o444)
+    source.chmod(0o555)
     given = {"GABLEWORK_KERNELS": str(tmp_path / "image"), "NUMBA_CACHE_DIR": str(tmp_path / "run")}
     entrypoint.lay_out_kernels(given)
     laid = tmp_path / "run" / "geometry_1" / "kernel.nbc"
     assert laid.read_bytes() == b"compiled"
+    assert laid.parent.stat().st_mode & 0o777 == laid.parent.parent.stat().st_mode & 0o777 == 0o755
     laid.write_bytes(b"newer")
     entrypoint.lay_out_kernels(given)
     assert laid.read_bytes() == b"newer"
