@@ -41,9 +41,15 @@ def facet_names(keys: IntArray) -> npt.NDArray[np.uint64]:
     return names
 
 
-@njit(cache=True, nogil=True)
 def united(count: int, one: IntArray, other: IntArray) -> IntArray:
     """Smallest member (count,) int64 of the set of each of `count` elements, after uniting `one[i]` and `other[i]`."""
+    # one layout, so that the kernel is compiled once
+    return _united(count, np.ascontiguousarray(one), np.ascontiguousarray(other))
+
+
+@njit(cache=True, nogil=True)
+def _united(count: int, one: IntArray, other: IntArray) -> IntArray:
+    """Kernel of `united`."""
     parent = np.arange(count)
     for i in range(one.size):
         a, b = one[i], other[i]

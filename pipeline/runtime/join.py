@@ -25,7 +25,7 @@ from pipeline.runtime.finished_surfaces import Finished, finished
 from pipeline.runtime.open_fragments import TileSurfaces
 from pipeline.runtime.overrides import Override
 from pipeline.runtime.split import Split
-from pipeline.terrain.candidates import NOWHERE, CandidateSettings, Surfaces, Verdict, judge_surface
+from pipeline.terrain.candidates import NOWHERE, CandidateSettings, Surfaces, Verdict, verdicts
 from pipeline.terrain.surfaces import N_SUMS, Sum
 from pipeline.tiling import MM, Tile, TileGrid
 
@@ -191,6 +191,7 @@ class _Sites:
     crs_name: str
     candidates: list[CandidateSite] = dataclasses.field(default_factory=list)
     rejected: list[RejectedSite] = dataclasses.field(default_factory=list)
+    tiles: dict[Tile, Tile] = dataclasses.field(default_factory=dict)
 
     def add(self, found: Finished, tiles: Sequence[Tile]) -> None:
         """The sites of what was finished somewhere; `tiles` by their numbers there."""
@@ -199,28 +200,33 @@ class _Sites:
             self.candidates.append(
                 CandidateSite(
                     building_id=object_id(self.crs_name, point),
-                    owner=self.grid.tile_of(point[0], point[1]),
+                    owner=self._owner(point),
                     ranges=ranges,
                     points=sum(part.stop - part.start for part in ranges),
                 )
             )
+        judged = verdicts(found.kind, found.sums, self.settings)
         of_rejected = _site_ranges(found.rejected_ranges, len(found.kind), tiles)
-        for k, (point, ranges) in enumerate(zip(found.lowest_point_mm.tolist(), of_rejected, strict=True)):
-            sums = found.sums[k]
-            verdict = judge_surface(int(found.kind[k]), sums, self.settings)
+        lowest, boxes = found.lowest_point_mm.tolist(), found.boxes_mm.tolist()
+        for verdict, point, box, sums, ranges in zip(judged, lowest, boxes, found.sums, of_rejected, strict=True):
             assert verdict is not None
             self.rejected.append(
                 RejectedSite(
                     object_id=object_id(self.crs_name, point),
-                    owner=self.grid.tile_of(point[0], point[1]),
+                    owner=self._owner(point),
                     verdict=verdict,
-                    box_mm=tuple(found.boxes_mm[k].tolist()),
+                    box_mm=tuple(box),
                     area_m2=float(sums[Sum.AREA2]) / 2e6,
                     height_m=float(sums[Sum.HEIGHT]) / max(1, int(sums[Sum.VERTICES])) / 1000.0,
                     points=int(sums[Sum.POINTS]),
                     ranges=ranges,
                 )
             )
+
+    def _owner(self, point_mm: Sequence[int]) -> Tile:
+        """The tile of a point; one object for all sites of a tile, since these are many."""
+        tile = self.grid.tile_of(point_mm[0], point_mm[1])
+        return self.tiles.setdefault(tile, tile)
 
 
 def _site_ranges(ranges: IntArray, count: int, tiles: Sequence[Tile]) -> Iterator[tuple[PointRange, ...]]:

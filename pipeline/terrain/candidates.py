@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterator, Mapping
 from enum import IntEnum
 
 import numpy as np
@@ -251,27 +252,48 @@ def judge_surface(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
     settings : CandidateSettings
         The thresholds.
     """
-    kinds = np.array([kind], np.int8)
-    fault = Fault(int(_faults(kinds, sums[None], settings)[0]))
-    if fault == Fault.NONE:
-        return None
-    figures = _figures(sums[None])
-    _, least, least_width = _limits(kinds, figures, settings)
-    f = {name: float(values[0]) for name, values in figures.items()}
-    walls = max(1, int(sums[Sum.WALLS]))
-    z_avg, own = float(sums[Sum.WALLS_Z_MX]) / walls / 1000.0, float(sums[Sum.WALLS_OWN_Z]) / walls / 1000.0
-    details = {
-        Fault.TOO_SMALL: f"area {f['area_m2']:.1f} m2, at least {least[0]:g}",
-        Fault.TOO_LOW: f"top {f['top_m']:.2f} m above the terrain, at least {settings.min_height_m:g}",
-        Fault.CROWN: f"a crown: most of what surrounds its vertices is rough, planar share {f['planar_share']:.2f}",
-        Fault.ROUGH: f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}",
-        Fault.COVERED: f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}",
-        Fault.TOO_NARROW: f"mean width {f['width_m']:.2f} m, at least {least_width[0]:g}",
-        Fault.NO_WALLS: f"walls along {f['wall_share']:.2f} of the outline, at least {settings.min_wall_share:g}",
-        Fault.BELOW_Z_AVG: f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g} "
-        f"(own {own:.2f} m, Z_avg {z_avg:.2f} m)",
-    }
-    return Verdict(reason=REASONS[fault], detail=details[fault])
+    return next(verdicts(np.array([kind], np.int8), sums[None], settings))
+
+
+def verdicts(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> Iterator[Verdict | None]:
+    """Of each of some surfaces (k,), (k, N_SUMS), as of `judge_surface`."""
+    for start in range(0, len(kind), _BLOCK):
+        own = slice(start, start + _BLOCK)
+        faults, figures = _faults(kind[own], sums[own], settings), _figures(sums[own])
+        _, least_m2, width_m = _limits(kind[own], figures, settings)
+        figures |= {"least_m2": least_m2, "least_width_m": width_m}
+        walls = np.maximum(1, sums[own, Sum.WALLS])
+        figures |= {"z_avg": sums[own, Sum.WALLS_Z_MX] / walls / 1000.0}
+        figures |= {"own": sums[own, Sum.WALLS_OWN_Z] / walls / 1000.0}
+        names = list(figures)
+        for fault, row in zip(faults.tolist(), np.column_stack(list(figures.values())).tolist(), strict=True):
+            yield _told(Fault(fault), dict(zip(names, row, strict=True)), settings)
+
+
+def _told(fault: Fault, f: Mapping[str, float], settings: CandidateSettings) -> Verdict | None:
+    """A fault in words, with the figure and the threshold."""
+    match fault:
+        case Fault.NONE:
+            return None
+        case Fault.TOO_SMALL:
+            detail = f"area {f['area_m2']:.1f} m2, at least {f['least_m2']:g}"
+        case Fault.TOO_LOW:
+            detail = f"top {f['top_m']:.2f} m above the terrain, at least {settings.min_height_m:g}"
+        case Fault.CROWN:
+            share = f["planar_share"]
+            detail = f"a crown: most of what surrounds its vertices is rough, planar share {share:.2f}"
+        case Fault.ROUGH:
+            detail = f"planar share {f['planar_share']:.2f}, at least {settings.min_planar_share:g}"
+        case Fault.COVERED:
+            detail = f"canopy share {f['canopy_share']:.2f}, at most {settings.max_canopy_share:g}"
+        case Fault.TOO_NARROW:
+            detail = f"mean width {f['width_m']:.2f} m, at least {f['least_width_m']:g}"
+        case Fault.NO_WALLS:
+            detail = f"walls along {f['wall_share']:.2f} of the outline, at least {settings.min_wall_share:g}"
+        case _:
+            detail = f"at the top of {f['top_share']:.2f} of its walls, at least {settings.min_top_share:g} "
+            detail += f"(own {f['own']:.2f} m, Z_avg {f['z_avg']:.2f} m)"
+    return Verdict(reason=REASONS[fault], detail=detail)
 
 
 def are_objects(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> BoolArray:
