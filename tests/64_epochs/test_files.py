@@ -9,6 +9,7 @@ from typing import Any
 import geopandas
 import geoparquet_validator
 import numpy as np
+import pyarrow.fs as pafs
 import pyarrow.parquet as pq
 import pytest
 import shapely
@@ -215,3 +216,12 @@ def test_every_word_of_a_closed_list_has_a_meaning() -> None:
         assert all(table.values())
     assert all(meaning for _, _, meaning in COLUMNS)
     assert np.isfinite(EXTENT).all()
+
+
+def test_runs_may_lie_in_another_file_system(pair: tuple[str, str], tmp_path: Path) -> None:
+    here = run(pair, tmp_path / "here")
+    there = pafs.SubTreeFileSystem(str(tmp_path), pafs.LocalFileSystem())
+    told = run(("old", "new"), tmp_path / "there", old_filesystem=there, new_filesystem=there)
+    assert told["changes"] == here["changes"]
+    table, other = (pq.read_table(tmp_path / name / "changes.parquet") for name in ("here", "there"))
+    assert table.equals(other)
