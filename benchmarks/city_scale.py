@@ -39,7 +39,7 @@ from benchmarks.process_watch import DRIVER, NANNY, SCHEDULER, Watcher
 from benchmarks.traced_run import folder_bytes
 
 REQUIRED, WANTED = 0.80, 0.90
-_SCHEDULER_WAIT_S = 60.0
+_SCHEDULER_WAIT_S = 300.0
 RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state")
 
 
@@ -48,6 +48,18 @@ def free_port() -> int:
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         return int(found.getsockname()[1])
+
+
+def wait_for_listener(port: int, log: Path) -> None:
+    """Return once somebody listens on a port of this machine."""
+    end = time.monotonic() + _SCHEDULER_WAIT_S
+    while True:
+        with socket.socket() as asking:
+            if asking.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        if time.monotonic() > end:
+            raise SystemExit(f"the scheduler did not come: see {log}")
+        time.sleep(0.1)
 
 
 def command_of(arguments: argparse.Namespace, tiles: Path, run_dir: Path, scheduler: str | None) -> list[str]:
@@ -87,11 +99,7 @@ def cluster_apart(workers: int, log: Path) -> Iterator[tuple[str, dict[int, str]
         }
         for _ in range(workers):
             roles[started([sys.executable, "-m", "service.cli", "worker", "--scheduler", address])] = NANNY
-        end = time.monotonic() + _SCHEDULER_WAIT_S
-        while socket.socket().connect_ex(("127.0.0.1", int(port))) != 0:
-            if time.monotonic() > end:
-                raise SystemExit(f"the scheduler did not come: see {log}")
-            time.sleep(0.1)
+        wait_for_listener(int(port), log)
         yield address, roles
 
 

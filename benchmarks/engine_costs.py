@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from benchmarks.city_scale import free_port
+from benchmarks.city_scale import free_port, wait_for_listener
 from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions
 from pipeline.runtime.events import Watch, ignore
@@ -78,7 +78,7 @@ def cluster_of(count: int, log: Path) -> Iterator[tuple[Cluster, psutil.Process]
             stack.callback(process.terminate)
             if command[0] == str(dask):
                 scheduler = psutil.Process(process.pid)
-                time.sleep(2.0)  # workers would try again by themselves, but not soon
+                wait_for_listener(int(port), log)
         yield Cluster(scheduler=address), scheduler
 
 

@@ -37,7 +37,11 @@ _SEED = 20
 _HALO_M = 240.0
 """Of unclassified points; `SceneSettings.support_m`."""
 STAGES = ("ingest", "split", "join", "outline", "reconstruct", "publish")
+GROUPED = frozenset({"ingest", "join", "outline", "reconstruct"})
 REQUIRED = 0.80
+_LARGE = 5_000_000
+"""Of cities with more buildings only the larger numbers of workers are simulated: a minute each."""
+_LARGE_WORKERS = 100
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -244,7 +248,7 @@ class Engine:
     join: tuple[float, float]
     """Factor and exponent of the join's CPU seconds by buildings."""
     digest_s: float
-    """Of the driver, a building."""
+    """Of the driver, a building: digest, sums and the removal of scratch at the end."""
     driver_s: float
     """Of the driver, a task."""
     scheduler_s: float
@@ -274,7 +278,9 @@ def measured_engine(trace: Mapping[str, Any], costs: Mapping[str, Any], tile_m: 
         stage: float(np.mean([s["bytes"] for s in trace["sizes"] if s["stage"] == stage and s["what"] == "result"]))
         for stage in STAGES
     }
-    timings = trace["summary"]["timings_s"]
+    # CPU time, since others may have used the machine: from the last tile's result to the end
+    told = {(line["kind"], line["stage"]): line["cpu_s"] for line in trace["diary"]}
+    ending_s = told["finished", ""] - told["progress", "publish"]
     return Engine(
         times=times,
         buildings=counts["candidates"],
@@ -284,7 +290,7 @@ def measured_engine(trace: Mapping[str, Any], costs: Mapping[str, Any], tile_m: 
         # its CPU time up to the first task, but for what it took to start
         plan_s=max(0.0, lines["ingest"]["cpu_s"] - trace["diary"][0]["cpu_s"]) / files,
         join=(costs["join"]["cpu_s"][0], costs["join"]["cpu_s"][1]),
-        digest_s=timings["digest"] / counts["candidates"],
+        digest_s=ending_s / counts["candidates"],
         driver_s=driver_s,
         scheduler_s=scheduler_s,
         byte_s=beyond_s / 2.0 / large["result_bytes"],
@@ -309,7 +315,7 @@ class Change:
     plan_in_driver: float = 1.0
     """Share of the look at the inputs that stays in the driver."""
     tasks_a_batch: float = 1.0
-    """So many batches of buildings become one."""
+    """So many tasks become one, but those of whole tiles: input files, units, outlines, batches of buildings."""
     drivers: int = 1
     """Runs side by side, each with a scheduler and a share of the workers."""
     tasks_a_thread: int = TASKS_A_THREAD
@@ -323,7 +329,7 @@ def city_stages(engine: Engine, buildings: int, change: Change, seed: int = _SEE
     points_a_file, points_a_tile = engine.points / engine.files, engine.points / engine.tiles
     window = (1.0 + 2.0 * _HALO_M / engine.tile_m) ** 2
     stored = {
-        "ingest": POINT.itemsize * points_a_file * 1.15,
+        "ingest": POINT.itemsize * points_a_file * 1.15 * change.tasks_a_batch,
         "split": POINT.itemsize * points_a_tile * (window + 0.3),
         "reconstruct": POINT.itemsize * 20_000 * 1.5 * change.tasks_a_batch,
     }
@@ -338,7 +344,7 @@ def city_stages(engine: Engine, buildings: int, change: Change, seed: int = _SEE
         seen = engine.times[name]
         count = max(1, round(len(seen) * factor))
         durations = random.choice(seen, count)
-        if name == "reconstruct" and change.tasks_a_batch != 1.0:
+        if name in GROUPED and change.tasks_a_batch != 1.0:
             count = max(1, round(count / change.tasks_a_batch))
             durations = np.array([part.sum() for part in np.array_split(durations, count)])
         if name in {"split", "reconstruct"}:
@@ -385,16 +391,17 @@ def city_run(engine: Engine, buildings: int, workers: int, change: Change, stora
 REGIONS = Change(join_share=0.3, joined_in_driver=0.05, split_bytes_share=0.07)
 """Descriptors 14 times smaller, closed surfaces judged in the split, regions of 64 tiles joined in tasks."""
 ALL = dataclasses.replace(REGIONS, digest_in_driver=0.02, plan_in_driver=0.05, tasks_a_batch=4.0)
+PLAIN, CHANGED = "as it is", "with all changes"
 CHANGES: Mapping[str, Change] = {
     "as it is": Change(),
     "window twice as large": Change(tasks_a_thread=2 * TASKS_A_THREAD),
-    "batches of buildings four times larger": Change(tasks_a_batch=4.0),
+    "tasks four times larger": Change(tasks_a_batch=4.0),
     "small descriptors": Change(join_share=0.3, split_bytes_share=0.07),
     "join by regions, in tasks": REGIONS,
     "digest by tile": Change(digest_in_driver=0.02),
     "inputs looked at in tasks": Change(plan_in_driver=0.05),
-    "all but window": ALL,
-    "all, and four runs side by side": dataclasses.replace(ALL, drivers=4),
+    "all of these but the window": ALL,
+    "the same, four runs side by side": dataclasses.replace(ALL, drivers=4),
 }
 """What moves the point where it stops scaling."""
 
@@ -404,6 +411,17 @@ def scaling_rows(
 ) -> list[Outcome]:
     """A city on more and more workers."""
     return [city_run(engine, buildings, count, change, storage_bytes_s) for count in workers]
+
+
+def curves(engine: Engine, wanted: argparse.Namespace) -> dict[tuple[int, str], list[Outcome]]:
+    """Cities on more and more workers, as the engine is and with all changes."""
+    storage = wanted.storage_mb_s * 1e6 if wanted.storage_mb_s else math.inf
+    found = {}
+    for buildings in wanted.buildings:
+        workers = [n for n in wanted.workers if buildings < _LARGE or n >= _LARGE_WORKERS]
+        for label, change in ((PLAIN, Change()), (CHANGED, ALL)):
+            found[buildings, label] = scaling_rows(engine, buildings, workers, change, storage)
+    return found
 
 
 def most_workers(run_with: Callable[[int], Outcome], least: float, limit: int) -> int:
@@ -438,64 +456,61 @@ def changes_table(engine: Engine, buildings: int, workers: int, storage_bytes_s:
     )
 
 
-def tables(engine: Engine, wanted: argparse.Namespace, replays: Sequence[tuple[str, int, float, float]]) -> str:
+def curve_table(buildings: int, found: Sequence[Outcome]) -> str:
+    """A city on more and more workers."""
+    rows = []
+    for one in found:
+        slowest = sorted(one.stages_s.items(), key=lambda item: -item[1])[:3]
+        slow = ", ".join(f"{name} {seconds / one.wall_s:.0%}" for name, seconds in slowest)
+        cells = outcome_cells(one)
+        rows.append([str(one.workers), cells[0], f"{buildings / one.wall_s:.0f}", *cells[1:], slow])
+    heads = ["workers", "wall, min", "buildings a second", "efficiency", "driver at work", "scheduler at work"]
+    return markdown_table([*heads, "stages that take most"], rows)
+
+
+def tables(
+    engine: Engine,
+    wanted: argparse.Namespace,
+    replays: Sequence[tuple[str, int, float, float]],
+    found: Mapping[tuple[int, str], Sequence[Outcome]],
+) -> str:
     """All that is told."""
     storage = wanted.storage_mb_s * 1e6 if wanted.storage_mb_s else math.inf
-    parts = [
-        "## Replayed\n",
-        markdown_table(
-            ["trace", "workers", "simulated, s", "measured, s", "error"],
-            [
-                [name, str(count), f"{a:.1f}", f"{b:.1f}", f"{100 * (a / b - 1):+.1f} %"]
-                for name, count, a, b in replays
-            ],
-        ),
-    ]
-    for buildings in wanted.buildings:
-        parts.append(f"\n## {buildings} buildings, as it is\n")
-        rows = []
-        for found in scaling_rows(engine, buildings, wanted.workers, Change(), storage):
-            slowest = sorted(found.stages_s.items(), key=lambda item: -item[1])[:3]
-            slow = ", ".join(f"{name} {seconds / found.wall_s:.0%}" for name, seconds in slowest)
-            cells = outcome_cells(found)
-            rows.append([str(found.workers), cells[0], f"{buildings / found.wall_s:.0f}", *cells[1:], slow])
-        heads = ["workers", "wall, min", "buildings a second", "efficiency", "driver at work", "scheduler at work"]
-        parts.append(markdown_table([*heads, "stages that take most"], rows))
-    middle = wanted.buildings[len(wanted.buildings) // 2]
-    parts.append(f"\n## What moves it: {middle} buildings, {wanted.workers[-1]} workers\n")
-    parts.append(changes_table(engine, middle, wanted.workers[-1], storage))
-    parts.append(f"\n## A limit of the storage: {middle} buildings, {wanted.workers[-1]} workers, all changes\n")
+    rows = [[name, str(n), f"{a:.1f}", f"{b:.1f}", f"{100 * (a / b - 1):+.1f} %"] for name, n, a, b in replays]
+    parts = ["## Replayed\n", markdown_table(["trace", "workers", "simulated, s", "measured, s", "error"], rows)]
+    for (buildings, label), outcomes in found.items():
+        parts += [f"\n## {buildings} buildings, {label}\n", curve_table(buildings, outcomes)]
+    middle, most = wanted.buildings[len(wanted.buildings) // 2], wanted.workers[-1]
+    parts.append(f"\n## What moves it: {middle} buildings, {most} workers\n")
+    parts.append(changes_table(engine, middle, most, storage))
+    parts.append(f"\n## A limit of the storage: {middle} buildings, {most} workers, {CHANGED}\n")
     rows = []
     for mb_s in (math.inf, 10_000.0, 3_000.0, 1_000.0, 300.0):
-        found = city_run(engine, middle, wanted.workers[-1], ALL, mb_s * 1e6)
-        rows.append(
-            ["none" if math.isinf(mb_s) else f"{mb_s:g}", f"{found.wall_s / 60:.1f}", f"{found.efficiency:.2f}"]
-        )
+        limited = city_run(engine, middle, most, ALL, mb_s * 1e6)
+        rows.append(["none" if math.isinf(mb_s) else f"{mb_s:g}", *outcome_cells(limited)[:2]])
     parts.append(markdown_table(["MB a second", "wall, min", "efficiency"], rows))
     return "\n".join(parts)
 
 
-def draw(engine: Engine, wanted: argparse.Namespace, path: Path) -> None:
+def draw(found: Mapping[tuple[int, str], Sequence[Outcome]], path: Path) -> None:
     """Efficiency by workers, as it is and with all changes."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    storage = wanted.storage_mb_s * 1e6 if wanted.storage_mb_s else math.inf
     figure, axis = plt.subplots(figsize=(6.4, 3.8), dpi=120)
-    for number, buildings in enumerate(wanted.buildings):
-        for change, style, label in ((Change(), "-", "as it is"), (ALL, "--", "with all changes")):
-            found = scaling_rows(engine, buildings, wanted.workers, change, storage)
-            axis.plot(
-                wanted.workers,
-                [one.efficiency for one in found],
-                style,
-                color=f"C{number}",
-                marker="o",
-                markersize=3,
-                label=f"{buildings:,} buildings, {label}",
-            )
+    cities = list(dict.fromkeys(buildings for buildings, _ in found))
+    for (buildings, label), outcomes in found.items():
+        axis.plot(
+            [one.workers for one in outcomes],
+            [one.efficiency for one in outcomes],
+            "-" if label == PLAIN else "--",
+            color=f"C{cities.index(buildings)}",
+            marker="o",
+            markersize=3,
+            label=f"{buildings:,} buildings, {label}",
+        )
     axis.axhline(REQUIRED, color="0.6", linewidth=0.8)
     axis.set_xscale("log")
     axis.set_ylim(0.0, 1.0)
@@ -525,11 +540,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     replays = [(name, trace["workers"], *replayed(trace)) for name, trace in traces.items()]
     costs = json.loads(wanted.costs.read_text(encoding="utf-8"))
     engine = measured_engine(next(iter(traces.values())), costs, wanted.tile_size)
-    text = tables(engine, wanted, replays)
+    found = curves(engine, wanted)
+    text = tables(engine, wanted, replays, found)
     wanted.out.mkdir(parents=True, exist_ok=True)
     (wanted.out / "scaling.md").write_text(text + "\n", encoding="utf-8")
     if wanted.figure is not None:
-        draw(engine, wanted, wanted.figure)
+        draw(found, wanted.figure)
     print(text)
     return 0
 
