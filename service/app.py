@@ -16,7 +16,7 @@ from service.files import StateFolder
 from service.guard import Guard
 from service.metrics import Measured, Metrics
 from service.rate_limits import RateLimiter
-from service.routes import buildings, events, health, jobs, landing, processes, results, uploads
+from service.routes import buildings, events, health, jobs, landing, processes, results, schedules, uploads
 from service.routes.events import Streams
 from service.routes.submission import WRITERS
 from service.settings import ServiceSettings
@@ -28,6 +28,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     uploads.router,
     jobs.router,
     events.router,
+    schedules.router,
     results.router,
     buildings.router,
     health.router,

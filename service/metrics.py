@@ -1,4 +1,4 @@
-"""What Prometheus reads: requests, their duration, jobs by status, how long the oldest one waits, event streams."""
+"""What Prometheus reads: requests, their duration, jobs by status, the oldest one's wait, schedules, event streams."""
 
 from __future__ import annotations
 
@@ -36,6 +36,20 @@ class _Jobs(Collector):
             "Since when the job that waits longest waits; 0 where none does.",
             value=self._oldest_s(counts.get(JobStatus.ACCEPTED, 0)),
         )
+        states, slots = self._store.schedules.counts()
+        schedules = GaugeMetricFamily("gablework_schedules", "Schedules by state.", labels=["state"])
+        for state, count in states.items():
+            schedules.add_metric([state], count)
+        yield schedules
+        # a gauge: what a schedule counts goes when it is removed
+        fates = GaugeMetricFamily(
+            "gablework_schedule_slots",
+            "Slots of the schedules that are there, by what became of them.",
+            labels=["outcome"],
+        )
+        for outcome, count in slots.items():
+            fates.add_metric([outcome.value], count)
+        yield fates
         yield GaugeMetricFamily("gablework_event_streams", "Event streams that are open.", value=self._streams())
 
     def _oldest_s(self, waiting: int) -> float:

@@ -23,6 +23,7 @@ TAGS = (
     {"name": "processes", "description": "What can be done, and how to ask for it."},
     {"name": "uploads", "description": "Files that jobs read."},
     {"name": "jobs", "description": "What was asked for: status, events, dismissal."},
+    {"name": "schedules", "description": "What is run again and again: when, and what became of each time."},
     {"name": "results", "description": "What came out: files and single buildings."},
 )
 """Chapters of the document."""

@@ -60,6 +60,9 @@ class ServiceSettings(BaseSettings):
     # limits
     max_queued: int = Field(default=1000, gt=0, description="Most jobs that may wait; more are refused.")
     max_queued_per_key: int = Field(default=200, gt=0, description="Most jobs of one key that may wait.")
+    max_schedules_per_key: int = Field(
+        default=100, gt=0, description="Most schedules of one key, or of all together where keys are not used."
+    )
     rate_limit: str = Field(
         default="6000/minute", description="Requests of one key or address, in the notation of the library limits."
     )

@@ -47,6 +47,40 @@ def _object(required: tuple[str, ...], **properties: Any) -> dict[str, Any]:
     return {"type": "object", "required": list(required), "properties": properties}
 
 
+_SCHEDULE_FIELDS: Mapping[str, dict[str, Any]] = {
+    "title": {**_TEXT, "nullable": True, "maxLength": 500, "description": "Also of its jobs that have none."},
+    "cron": {
+        **_TEXT,
+        "maxLength": 200,
+        "description": "Minute, hour, day of the month, month, day of the week, as in Debian's cron; or @hourly, "
+        "@daily, @weekly, @monthly, @yearly.",
+        "example": "30 2 * * *",
+    },
+    "timeZone": {**_TEXT, "description": "A name of the IANA database. Default UTC.", "example": "Europe/Amsterdam"},
+    "missed": {
+        "type": "string",
+        "enum": ["run-latest", "skip"],
+        "description": "What becomes of slots that no driver saw in time: the latest is run once, or none is. All "
+        "others are told as missed. Default run-latest.",
+    },
+    "graceSeconds": {
+        "type": "number",
+        "minimum": 0,
+        "maximum": 2_592_000,
+        "description": "How late a slot may be seen and still count as seen in time. Default 300.",
+    },
+    "overlap": {
+        "type": "string",
+        "enum": ["skip", "wait"],
+        "description": "What becomes of a slot that comes while a job of the schedule is under way: it is told as "
+        "skipped, or waits until that job is over, or until a later slot takes its place. Default skip.",
+    },
+    "processID": {"type": "string", "enum": ["reconstruct", "compare"], "description": "Default reconstruct."},
+    "execute": {**reference("Execute")},
+    "paused": {"type": "boolean", "description": "Whether the clock is left alone. Default false."},
+}
+"""What a client may say of a schedule."""
+
 SCHEMAS: Mapping[str, dict[str, Any]] = {
     "Link": _object(("href", "rel"), href=_TEXT, rel=_TEXT, type=_TEXT, title=_TEXT),
     "Problem": _object(
@@ -57,6 +91,7 @@ SCHEMAS: Mapping[str, dict[str, Any]] = {
         detail={**_TEXT, "description": "What happened, with the value and the fix."},
         instance={**_TEXT, "description": "The path that was asked."},
         errors={"type": "array", "items": _TEXT, "description": "Every fault, where there can be several."},
+        jobID={**_TEXT, "description": "Of `schedule-busy`: the job that is under way."},
     ),
     "LandingPage": _object(("title", "links"), title=_TEXT, description=_TEXT, links=_LINKS),
     "Conformance": _object(("conformsTo",), conformsTo={"type": "array", "items": {"type": "string", "format": "uri"}}),
@@ -128,6 +163,7 @@ SCHEMAS: Mapping[str, dict[str, Any]] = {
         finished=_TIME,
         updated=_TIME,
         priority={"type": "integer"},
+        scheduleID={**_TEXT, "description": "The schedule that it came of; it may be gone."},
         attempt={"type": "integer"},
         summary={"type": "object"},
         exception=reference("Problem"),
@@ -229,6 +265,50 @@ SCHEMAS: Mapping[str, dict[str, Any]] = {
         links=_LINKS,
     ),
     "UploadList": _object(("uploads", "links"), uploads={"type": "array", "items": reference("Upload")}, links=_LINKS),
+    "ScheduleRequest": {**_object(("cron", "execute"), **_SCHEDULE_FIELDS), "additionalProperties": False},
+    "SchedulePatch": {**_object((), **_SCHEDULE_FIELDS), "additionalProperties": False, "minProperties": 1},
+    "ScheduleRun": _object(
+        ("number", "trigger", "outcome", "slots", "at", "message", "links"),
+        number={"type": "integer", "minimum": 1, "description": "Counts up within the schedule."},
+        trigger={"type": "string", "enum": ["clock", "hand"]},
+        outcome={"type": "string", "enum": ["submitted", "waiting", "skipped", "missed", "failed"]},
+        slot={**_TIME, "description": "When it was due, of several that were missed together the last one."},
+        firstSlot={**_TIME, "description": "The first of several that were missed together."},
+        slots={"type": "integer", "minimum": 1, "description": "How many they are."},
+        moreSlots={"type": "boolean", "description": "Whether they are more than that: they were not all counted."},
+        jobID={**_TEXT, "description": "The job that was made, or the one that was under way."},
+        at={**_TIME, "description": "When this was decided."},
+        message=_TEXT,
+        links=_LINKS,
+    ),
+    "ScheduleRunList": _object(
+        ("runs", "links"), runs={"type": "array", "items": reference("ScheduleRun")}, links=_LINKS
+    ),
+    "Schedule": _object(
+        ("scheduleID", "version", "state", "cron", "timeZone", "processID", "nextTimes", "counts", "links"),
+        scheduleID=_TEXT,
+        version={"type": "integer", "minimum": 1, "description": "Counts the client's changes; the ETag."},
+        state={"type": "string", "enum": ["active", "paused"]},
+        created=_TIME,
+        updated=_TIME,
+        nextTimes={
+            "type": "array",
+            "items": _TIME,
+            "description": "Times to come, with the offset that the zone has then; none while it is paused.",
+        },
+        waiting={**_TIME, "description": "The slot that waits for a job to end."},
+        lastRun=reference("ScheduleRun"),
+        counts={
+            "type": "object",
+            "additionalProperties": {"type": "integer", "minimum": 0},
+            "description": "Slots and runs by hand since the schedule was made: submitted, skipped, missed, failed.",
+        },
+        links=_LINKS,
+        **{name: schema for name, schema in _SCHEDULE_FIELDS.items() if name != "paused"},
+    ),
+    "ScheduleList": _object(
+        ("schedules", "links"), schedules={"type": "array", "items": reference("Schedule")}, links=_LINKS
+    ),
     "Health": _object(
         ("status",),
         status={"type": "string", "enum": ["ok", "unavailable"]},
@@ -269,3 +349,45 @@ JOB_MADE = document(
     headers={"Location": {"description": "The job.", "schema": {"type": "string"}}},
 )
 """What both ways to submit a job answer."""
+
+SCHEDULE_ID = "6b5a4f3e2d1c0b9a87416b5e0d9c2a3f"
+"""The schedule of the examples."""
+
+SCHEDULE_REQUEST_EXAMPLE = {
+    "title": "every night",
+    "cron": "30 2 * * *",
+    "timeZone": "Europe/Amsterdam",
+    "execute": EXECUTE_EXAMPLE,
+}
+
+SCHEDULE_RUN_EXAMPLE = {
+    "number": 17,
+    "trigger": "clock",
+    "outcome": "submitted",
+    "slot": "2026-03-01T01:30:00.000Z",
+    "slots": 1,
+    "jobID": JOB_ID,
+    "at": "2026-03-01T01:30:00.412Z",
+    "message": "in time",
+    "links": [{"href": f"http://127.0.0.1:8000/jobs/{JOB_ID}", "rel": "monitor", "type": "application/json"}],
+}
+
+SCHEDULE_EXAMPLE = {
+    "scheduleID": SCHEDULE_ID,
+    "version": 1,
+    "title": "every night",
+    "state": "active",
+    "cron": "30 2 * * *",
+    "timeZone": "Europe/Amsterdam",
+    "missed": "run-latest",
+    "graceSeconds": 300.0,
+    "overlap": "skip",
+    "processID": "reconstruct",
+    "execute": EXECUTE_EXAMPLE,
+    "created": "2026-02-01T09:30:00.000Z",
+    "updated": "2026-02-01T09:30:00.000Z",
+    "nextTimes": ["2026-03-02T02:30:00+01:00", "2026-03-03T02:30:00+01:00"],
+    "lastRun": SCHEDULE_RUN_EXAMPLE,
+    "counts": {"submitted": 16, "skipped": 1, "missed": 0, "failed": 0},
+    "links": [{"href": f"http://127.0.0.1:8000/schedules/{SCHEDULE_ID}", "rel": "self", "type": "application/json"}],
+}

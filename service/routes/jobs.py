@@ -177,6 +177,7 @@ def jobs(
     statuses: Annotated[
         list[str] | None, Query(alias="status", description=f"Only with these: {', '.join(_STATUSES)}.")
     ] = None,
+    schedule_id: Annotated[str | None, Query(alias="scheduleID", description="Only of this schedule.")] = None,
     created: Annotated[
         str | None,
         Query(alias="datetime", description="Created then: an RFC 3339 time, or `a/b`, `../b`, `a/..`."),
@@ -203,6 +204,7 @@ def jobs(
         *(("type", word) for word in _listed(kind)),
         *(("processID", word) for word in _listed(process_ids)),
         *(("status", word) for word in wanted),
+        ("scheduleID", schedule_id),
         ("datetime", created),
         ("minDuration", min_duration),
         ("maxDuration", max_duration),
@@ -214,6 +216,7 @@ def jobs(
             owner=caller.owner,
             statuses=[JobStatus(word) for word in wanted],
             process_ids=_listed(process_ids),
+            schedule_id=schedule_id,
             created_from=first,
             created_to=last,
             min_duration_s=min_duration,

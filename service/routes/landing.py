@@ -73,6 +73,7 @@ def landing_page(base: str) -> dict[str, Any]:
             link(f"{base}/conformance", f"{RELATIONS}conformance", "What of OGC API - Processes is met"),
             link(f"{base}/processes", f"{RELATIONS}processes", "The processes"),
             link(f"{base}/jobs", f"{RELATIONS}job-list", "The jobs"),
+            link(f"{base}/schedules", "schedules", "The schedules"),
         ],
     }
 
@@ -98,7 +99,7 @@ UNBUILT = """<!doctype html>
 <p>The service runs. Its web page is not built: run <code>npm ci &amp;&amp; npm run build</code> in
 <code>service/viewer</code>, then load this page again.</p>
 <p><a href="?f=json">Landing page</a>, <a href="openapi.json">OpenAPI</a>, <a href="processes">processes</a>,
-<a href="jobs">jobs</a>.</p>
+<a href="jobs">jobs</a>, <a href="schedules">schedules</a>.</p>
 </body>
 </html>
 """

@@ -104,7 +104,7 @@ async def execute(
 ) -> JSONResponse:
     """Submit a job. It always runs asynchronously: the answer comes at once and tells where to look."""
     chosen = process_named(processID)
-    inputs, outputs = _split(body)
+    inputs, outputs = execute_parts(body)
     draft = chosen.draft(inputs, outputs, settings)
     async with Submission(
         store=store, folder=folder, settings=settings, caller=caller, threads=request.app.state.submitting
@@ -116,7 +116,7 @@ async def execute(
     return JSONResponse(status_info(job, base), status_code=201, headers=headers)
 
 
-def _split(body: Mapping[str, Any]) -> tuple[dict[str, Any], list[str] | None]:
+def execute_parts(body: Mapping[str, Any]) -> tuple[dict[str, Any], list[str] | None]:
     """Inputs and wanted outputs of an execute request.
 
     Raises

@@ -43,6 +43,8 @@ def status_info(job: Job, base: str, *, with_request: bool = True) -> dict[str, 
     ]
     if with_request:
         links.insert(1, link(place, "monitor", "This job"))
+    if job.schedule_id is not None:
+        links.append(link(f"{base}/schedules/{job.schedule_id}", "schedule", "The schedule that it came of"))
     if job.status is JobStatus.SUCCESSFUL:
         links += [
             link(f"{place}/results", f"{RELATIONS}results", "The results"),
@@ -68,6 +70,7 @@ def status_info(job: Job, base: str, *, with_request: bool = True) -> dict[str, 
         "finished": timestamp(job.finished_at),
         "updated": timestamp(job.updated_at),
         "priority": job.priority or None,
+        "scheduleID": job.schedule_id,
         "attempt": job.attempt or None,
         "summary": None if job.summary is None else dict(job.summary),
         "exception": None if job.failure is None else failure_document(job.failure, f"/jobs/{job.job_id}"),

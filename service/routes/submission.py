@@ -1,12 +1,12 @@
-"""From a checked draft to a job in the line, or to nothing at all: what was stored for a refused call goes again."""
+"""From a draft to a job in the line, to a schedule, or to nothing at all: what a refused call stored goes again."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeVar
 
 import anyio
 import anyio.to_thread
@@ -16,11 +16,14 @@ from service.drafts import Draft, Inline
 from service.errors import ForbiddenError, UploadInUseError
 from service.fetching import resolve_inputs
 from service.files import StateFolder
-from service.jobs import InputReference, Job
+from service.jobs import InputReference, Job, JobRequest
 from service.keys import Scope
 from service.settings import ServiceSettings
 from service.store import JobStore
 from service.uploads import receive, remove_file
+
+Made = TypeVar("Made")
+"""What a checked request becomes: a job, or a schedule."""
 
 WRITERS = 3
 """Threads that write jobs: few, for writers wait for one another, and those who only look are not to wait for them."""
@@ -64,6 +67,35 @@ class Submission:
         QueueFullError
             Too many jobs wait.
         """
+
+        def create(request: JobRequest) -> Job:
+            return self.store.create(
+                request,
+                owner=self.caller.key_id,
+                priority=draft.priority,
+                max_queued=self.settings.max_queued,
+                max_queued_per_key=self.settings.max_queued_per_key,
+            )
+
+        return await self.checked(draft, create)
+
+    async def checked(self, draft: Draft, write: Callable[[JobRequest], Made]) -> Made:
+        """Check all that is checked before a job is taken, then write what is to be made of the request.
+
+        Parameters
+        ----------
+        draft : Draft
+            What is asked for.
+        write : callable
+            Writes a job, or a schedule of jobs; runs in one of the threads that write.
+
+        Raises
+        ------
+        RequestError, InputRefusedError, NoSuchUploadError
+            An input cannot be had.
+        ForbiddenError
+            A priority that this key may not ask for.
+        """
         if draft.priority > 0 and Scope.ADMIN not in self.caller.scopes:
             raise ForbiddenError(
                 f"priority is {draft.priority}: this needs the scope {Scope.ADMIN}, use 0 or less with this key"
@@ -71,18 +103,14 @@ class Submission:
         stored: dict[Inline, InputReference] = {}
         for inline in draft.inline:
             stored[inline] = await self.keep(_once(inline.content), inline.filename)
-        return await anyio.to_thread.run_sync(self._create, draft, stored, limiter=self.threads)
 
-    def _create(self, draft: Draft, stored: dict[Inline, InputReference]) -> Job:
-        request = draft.request(stored)
-        resolve_inputs(request, store=self.store, folder=self.folder, settings=self.settings, owner=self.caller.owner)
-        return self.store.create(
-            request,
-            owner=self.caller.key_id,
-            priority=draft.priority,
-            max_queued=self.settings.max_queued,
-            max_queued_per_key=self.settings.max_queued_per_key,
-        )
+        def check_and_write() -> Made:
+            request = draft.request(stored)
+            owner = self.caller.owner
+            resolve_inputs(request, store=self.store, folder=self.folder, settings=self.settings, owner=owner)
+            return write(request)
+
+        return await anyio.to_thread.run_sync(check_and_write, limiter=self.threads)
 
     async def __aenter__(self) -> Self:
         """Nothing is stored yet."""
