@@ -66,28 +66,24 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 
 @pytest.fixture(scope="session")
-def s3_server() -> Generator[str]:
-    """The URL of an S3 server that lasts as long as the tests."""
+def s3_proxy() -> Generator[FaultyProxy]:
+    """An S3 server behind a proxy, for as long as the tests last."""
     pytest.importorskip("s3fs", reason="the extra s3 is not installed")
-    from object_store import moto_server
+    from object_store import FaultyProxy, moto_server
 
-    with moto_server() as url:
-        yield url
+    with moto_server() as url, FaultyProxy(url) as proxy:
+        yield proxy
 
 
 @pytest.fixture
-def s3(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> Generator[FaultyProxy]:
+def s3(s3_proxy: FaultyProxy, monkeypatch: pytest.MonkeyPatch) -> FaultyProxy:
     """An object store as the environment of this process names it, behind a proxy that a test may make faulty."""
-    import s3fs
-    from object_store import FaultyProxy, environment
+    from object_store import environment
 
-    with FaultyProxy(s3_server) as proxy:
-        for name, value in environment(proxy.endpoint).items():
-            monkeypatch.setenv(name, value)
-        # an instance that is there already knows another server
-        s3fs.S3FileSystem.clear_instance_cache()
-        yield proxy
-        s3fs.S3FileSystem.clear_instance_cache()
+    for name, value in environment(s3_proxy.endpoint).items():
+        monkeypatch.setenv(name, value)
+    s3_proxy.reset()
+    return s3_proxy
 
 
 @pytest.fixture
@@ -95,9 +91,9 @@ def bucket(s3: FaultyProxy) -> str:
     """The URL of a bucket of its own."""
     from uuid import uuid4
 
-    import s3fs
+    from pipeline.io.urls import filesystem_of
 
-    name = f"tests-{uuid4().hex[:12]}"
-    s3fs.S3FileSystem().mkdir(name)
-    s3.seen.clear()
-    return f"s3://{name}"
+    url = f"s3://tests-{uuid4().hex[:12]}"
+    filesystem_of(url).mkdir(url)
+    s3.reset()
+    return url

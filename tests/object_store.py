@@ -10,7 +10,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, Self
 
 SECRET = "wJalrXUtnFEMI-not-a-real-key"
 """The secret key of the tests: it must be found nowhere."""
@@ -85,7 +85,7 @@ class FaultyProxy:
     endpoint: str = ""
     _lock: threading.Lock = dataclasses.field(default_factory=threading.Lock)
 
-    def __enter__(self) -> FaultyProxy:
+    def __enter__(self) -> Self:
         proxy = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -94,7 +94,7 @@ class FaultyProxy:
             def handle_one(self) -> None:
                 proxy._handle(self)
 
-            do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = handle_one
+            do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = handle_one  # noqa: N815 - the library's names
 
             def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the library's name
                 del format, args
@@ -115,6 +115,11 @@ class FaultyProxy:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
+
+    def reset(self) -> None:
+        """Pass everything, and begin to count."""
+        self.script = lambda _: "pass"
+        self.seen = []
 
     def count(self, what: str = "", method: str = "", path: str = "") -> int:
         """How many requests of a kind came: by what became of them, their method, a part of their path."""

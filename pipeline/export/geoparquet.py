@@ -167,6 +167,8 @@ def table_dataset(
         raise RunError(f"{folder} is no folder: give the directory that a run wrote")
     partitioning = pads.partitioning(pa.schema([("tile", pa.string())]), flavor="hive")
     schema = stored_schema(table_name).append(pa.field("tile", pa.string()))
+    if tiles is not None and not tiles:
+        return pads.dataset(schema.empty_table())
     files = folder if tiles is None else [f"{folder}/tile={tile}/part-0.parquet" for tile in tiles]
     return pads.dataset(files, schema=schema, filesystem=filesystem, format="parquet", partitioning=partitioning)
 

@@ -116,7 +116,7 @@ class RemoteFile:
         self.stat()
         if self._whole is not None:
             return Path(self._held()).open("rb")
-        return io.BufferedReader(_Ranges(self), BLOCK_BYTES)
+        return io.BufferedReader(_Ranges(self))
 
     def read_at(self, begin: int, length: int) -> bytes:
         """Some bytes, fewer where the file ends.
@@ -139,8 +139,9 @@ class RemoteFile:
         """One block, from memory or, with those that will be wanted next, from the server."""
         if number not in self._blocks:
             self._ahead = min(2 * self._ahead, MOST_AHEAD) if number == self._next_block else 1
+            ahead = next((k for k in range(1, self._ahead) if number + k in self._blocks), self._ahead)
             begin = number * BLOCK_BYTES
-            content = self._range(begin, min(begin + self._ahead * BLOCK_BYTES, self.stat().st_size))
+            content = self._range(begin, min(begin + ahead * BLOCK_BYTES, self.stat().st_size))
             for k in range(0, len(content), BLOCK_BYTES):
                 self._blocks[number + k // BLOCK_BYTES] = content[k : k + BLOCK_BYTES]
             self._next_block = number + -(-len(content) // BLOCK_BYTES)

@@ -97,7 +97,7 @@ def names_points(text: str) -> bool:
     >>> names_points("tiles/a.LAZ"), names_points("https://host/get?tile=7"), names_points("1.0 2.0 3.0")
     (True, True, False)
     """
-    return is_url(text) or name_in(text.strip()).lower().endswith(POINT_SUFFIXES)
+    return is_url(text) or text.partition("?")[0].strip().lower().endswith(POINT_SUFFIXES)
 
 
 def is_index(file: Readable) -> bool:

@@ -582,12 +582,15 @@ def _is_of_work(run_dir: str, work: str) -> bool:
 def _with_tables(run_dir: str, joined: Joined, models: Models, published: Sequence[Published]) -> list[str] | None:
     """The tiles that have tables in an object store, so that their digest needs no listing; None to list.
 
-    A store may list what is there some time after it was put.
+    A store may list what is there some time after it was put. Of tiles that failed nobody knows what was put, so that
+    the store must be asked; where all of them failed it has no folder to list.
     """
-    if not is_url(run_dir) or any(outcome.error for outcome in published):
+    tiles = sorted(outcome.tile.key for outcome in published)
+    failed = {outcome.tile.key for outcome in published if outcome.error}
+    owners = {tile.key for tile in models.places} | {site.owner.key for site in joined.rejected} or set(tiles[:1])
+    if not is_url(run_dir) or (failed and not owners <= failed):
         return None
-    owners = {tile.key for tile in models.places} | {site.owner.key for site in joined.rejected}
-    return sorted(owners) or sorted(outcome.tile.key for outcome in published)[:1]
+    return sorted(owners - failed)
 
 
 def _checked(out: str, *, overwrite: bool, work: str | None = None) -> str:

@@ -1,0 +1,207 @@
+"""Files behind URLs: read by ranges or fetched, from servers of every temper."""
+
+from __future__ import annotations
+
+import http.server
+import os
+import re
+import threading
+
+import laspy
+import numpy as np
+import pytest
+
+from pipeline.errors import UnreadableInputError
+from pipeline.io import ReadOptions, open_source
+from pipeline.io.remote_file import BLOCK_BYTES, BLOCKS_KEPT, RemoteFile, file_at, on_this_machine
+from pipeline.io.retries import RetryPolicy
+
+QUICK = RetryPolicy(attempts=3, first_wait_s=0.01, longest_wait_s=0.01)
+CONTENT = np.random.default_rng(3).bytes(3_000_000)
+
+
+class Site:
+    """A web server for one file, and how it behaves."""
+
+    def __init__(self) -> None:
+        self.content = CONTENT
+        self.ranges = True
+        self.tells_size = True
+        self.faults: list[int] = []
+        self.etag = '"1"'
+        self.asked: list[tuple[str, str | None]] = []
+        site = self
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def do_HEAD(self) -> None:
+                self._answer(with_body=False)
+
+            def do_GET(self) -> None:
+                self._answer(with_body=True)
+
+            def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the library's name
+                pass
+
+            def _answer(self, *, with_body: bool) -> None:
+                wanted = self.headers.get("Range")
+                site.asked.append((self.command, wanted))
+                body, status = site.content, 200
+                if site.faults:
+                    body, status = b"", site.faults.pop(0)
+                elif wanted and site.ranges:
+                    first, last = (int(v) for v in re.fullmatch(r"bytes=(\d+)-(\d+)", wanted).groups())
+                    body, status = body[first : last + 1], 206
+                self.send_response(status)
+                self.send_header("ETag", site.etag)
+                if site.tells_size:
+                    self.send_header("Content-Length", str(len(body)))
+                    self.send_header("Accept-Ranges", "bytes" if site.ranges else "none")
+                else:
+                    self.send_header("Connection", "close")
+                    self.close_connection = True
+                if status == 206:
+                    self.send_header("Content-Range", f"bytes {first}-{last}/{len(site.content)}")
+                self.end_headers()
+                if with_body:
+                    self.wfile.write(body)
+
+        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.server.daemon_threads = True
+        self.url = f"http://127.0.0.1:{self.server.server_address[1]}/tiles/a.laz"
+
+
+@pytest.fixture
+def site():
+    site = Site()
+    thread = threading.Thread(target=site.server.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    yield site
+    site.server.shutdown()
+    site.server.server_close()
+    thread.join()
+
+
+def test_a_part_is_read_without_the_rest(site):
+    with file_at(site.url).open("rb") as stream:
+        stream.seek(2_000_000)
+        assert stream.read(1000) == CONTENT[2_000_000:2_001_000]
+        assert stream.seek(-10, os.SEEK_END) == len(CONTENT) - 10
+        assert stream.read() == CONTENT[-10:]
+    ranges = [asked for method, asked in site.asked if method == "GET"]
+    assert len(ranges) == 2
+    assert all(asked is not None for asked in ranges)
+
+
+def test_whoever_reads_on_reads_larger_pieces_and_each_byte_once(site):
+    with file_at(site.url).open("rb") as stream:
+        parts = list(iter(lambda: stream.read(10_000), b""))
+    assert b"".join(parts) == CONTENT
+    requests = [asked for method, asked in site.asked if method == "GET"]
+    assert len(requests) < len(CONTENT) / BLOCK_BYTES / 2
+    spans = [[int(v) for v in asked.removeprefix("bytes=").split("-")] for asked in requests]
+    assert sum(last - first + 1 for first, last in spans) == len(CONTENT)
+
+
+def test_memory_is_bounded_however_much_is_read(site):
+    site.content = CONTENT * 10
+    file = RemoteFile(site.url)
+    with file.open("rb") as stream:
+        while stream.read(1 << 20):
+            assert sum(map(len, file._blocks.values())) <= BLOCKS_KEPT * BLOCK_BYTES
+
+
+@pytest.mark.parametrize(("ranges", "tells_size"), [(True, True), (False, True), (False, False)])
+def test_a_file_is_fetched_from_servers_that_know_ranges_and_others(site, tmp_path, ranges, tells_size):
+    site.ranges, site.tells_size = ranges, tells_size
+    file = RemoteFile(site.url, QUICK)
+    file.fetch(tmp_path / "copy")
+    assert (tmp_path / "copy").read_bytes() == CONTENT
+    assert file.stat().st_size == len(CONTENT)
+    with file.open("rb") as stream:
+        stream.seek(1_000_000)
+        assert stream.read(10) == CONTENT[1_000_000:1_000_010]
+
+
+def test_busy_servers_are_asked_again_and_counted(site, tmp_path):
+    site.faults = [503, 429]
+    RemoteFile(site.url, QUICK).fetch(tmp_path / "copy")
+    assert (tmp_path / "copy").read_bytes() == CONTENT
+
+
+def test_what_cannot_be_fetched_is_told_by_url_status_and_fix_without_its_secrets(site):
+    site.faults = [404] * 9
+    with pytest.raises(UnreadableInputError, match=r"a\.laz\?query-.*: cannot be fetched: .*404.*Check the name"):
+        RemoteFile(f"{site.url}?token=hidden", QUICK).stat()
+    site.faults = [503] * 99
+    with pytest.raises(UnreadableInputError, match=r"the server is busy at all of 3 attempts .*503") as told:
+        RemoteFile(site.url.replace("http://", "http://me:hidden@") + "?token=hidden", QUICK).stat()
+    assert "hidden" not in str(told.value)
+    assert told.value.__cause__ is None
+
+
+def test_a_server_that_is_not_there_is_told():
+    with pytest.raises(UnreadableInputError, match="the connection broke at all of 3 attempts"):
+        RemoteFile("http://127.0.0.1:9/a.laz", QUICK).stat()
+
+
+def test_a_file_that_changes_once_is_fetched_again_and_one_that_never_rests_is_refused(site, tmp_path):
+    file = RemoteFile(site.url, QUICK)
+    file.stat()
+    site.content, site.etag = CONTENT[:2_000_000], '"2"'
+    with pytest.raises(UnreadableInputError):  # its end is not there any more
+        file.read_at(2_500_000, 10)
+
+    class Restless(RemoteFile):
+        def read_at(self, begin, length):
+            raise NotImplementedError
+
+        def _range(self, begin, end):
+            content = super()._range(begin, end)
+            if changes and changes.pop():
+                site.etag = f'"{len(changes)}-{begin}"'
+            return content
+
+    changes = [False, True]
+    Restless(site.url, QUICK).fetch(tmp_path / "copy")
+    assert (tmp_path / "copy").read_bytes() == site.content
+    changes = [True] * 9
+    with pytest.raises(UnreadableInputError, match="changes while it is read"):
+        Restless(site.url, QUICK).fetch(tmp_path / "copy")
+
+
+def test_fetching_stops_when_the_run_is_called_off(site, tmp_path):
+    def check() -> None:
+        raise InterruptedError("called off")
+
+    with pytest.raises(InterruptedError):
+        RemoteFile(site.url).fetch(tmp_path / "copy", check)
+    assert [method for method, _ in site.asked] == ["HEAD"]
+
+
+def test_a_copy_for_libraries_goes_when_it_was_used(site):
+    with on_this_machine(f"{site.url}?x=1") as path:
+        assert path.read_bytes() == CONTENT
+        assert path.suffix == ".laz"
+    assert not path.parent.exists()
+
+
+def test_the_header_and_the_points_of_a_remote_tile_are_those_of_the_local_one(site, tmp_path):
+    rng = np.random.default_rng(1)
+    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    las.header.scales, las.header.offsets = [0.01] * 3, [0.0] * 3
+    for name in "xyz":
+        setattr(las, name, rng.uniform(0.0, 300.0, 400_000))
+    las.write(tmp_path / "a.laz")
+    site.content = (tmp_path / "a.laz").read_bytes()
+    here, there = (open_source(place, ReadOptions(crs="EPSG:28992")) for place in (tmp_path / "a.laz", site.url))
+    assert there.info.bounds_m == here.info.bounds_m
+    assert there.info.point_count == here.info.point_count
+    assert there.info.path == site.url
+    looked_at = sum(
+        int(last) - int(first) + 1 for _, asked in site.asked if asked for first, last in [asked[6:].split("-")]
+    )
+    assert looked_at <= len(site.content)
+    clouds = [np.vstack([cloud.xyz for cloud in source.chunks()]) for source in (here, there)]
+    assert np.array_equal(*clouds)
