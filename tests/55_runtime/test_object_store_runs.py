@@ -6,6 +6,7 @@ import json
 import tempfile
 from pathlib import Path
 
+import geopandas
 import pytest
 import shapely
 from object_store import SECRET
@@ -235,20 +236,19 @@ def test_an_input_that_vanishes_after_the_plan_is_told_by_its_url(tile, bucket, 
     assert "suburb.laz: cannot be fetched" in manifest.warnings[-1]
 
 
-def test_only_what_an_area_needs_is_fetched(local, tile, bucket, s3):
+def test_only_what_an_area_needs_is_fetched(local, tile, bucket, s3, tmp_path):
+    manifest = read_manifest(local.run_dir)
     x_min, y_min, *_ = shapely.total_bounds([model.footprint for model in read_models(local.run_dir).models]).tolist()
     bbox = (x_min, y_min, x_min + 30.0, y_min + 30.0)
     far = f"{bucket}/in/far.laz"
     filesystem_of(far).cp_file(tile, far)
     square = shapely.box(x_min - 900.0, y_min - 900.0, x_min - 500.0, y_min - 500.0)
-    features = [
-        {"type": "Feature", "properties": {"location": name}, "geometry": shapely.geometry.mapping(outline)}
-        for name, outline in (("in/suburb.laz", shapely.box(*bbox)), ("in/far.laz", square))
-    ]
-    index = json.dumps({"type": "FeatureCollection", "features": features}).encode()
-    storage_at(bucket).put("index.geojson", index)
+    columns = {"location": ["in/suburb.laz", "in/far.laz"]}
+    index = geopandas.GeoDataFrame(columns, geometry=[shapely.box(*bbox), square], crs=manifest.crs["wkt"])
+    index.to_file(tmp_path / "index.gpkg")
+    storage_at(bucket).put("index.gpkg", (tmp_path / "index.gpkg").read_bytes())
     s3.reset()
-    run(RunRequest(inputs=(f"{bucket}/index.geojson",), out=f"{bucket}/run", bbox=bbox, workers=0))
+    run(RunRequest(inputs=(f"{bucket}/index.gpkg",), out=f"{bucket}/run", bbox=bbox, workers=0))
     assert s3.count(path="far.laz") == 0
     assert [entry.path for entry in read_manifest(f"{bucket}/run").inputs] == [tile]
     # without an index the headers tell
