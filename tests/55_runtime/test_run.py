@@ -236,11 +236,6 @@ def test_a_tile_that_cannot_be_written_costs_only_itself(
     assert sorted({row["tile"] for row in rows(hurt.run_dir, "buildings")}) == tiles[1:]
 
 
-def test_an_object_store_is_refused_at_once(suburb: Path, reconstruct: Any) -> None:
-    with pytest.raises(RunError, match=r"s3://bucket/run is no local path"):
-        reconstruct(suburb, out="s3://bucket/run")
-
-
 def test_a_meadow_has_no_building_and_ends_well(tmp_path: Path, reconstruct: Any) -> None:
     rng = np.random.default_rng(1)
     las = laspy.create(point_format=6, file_version="1.4")

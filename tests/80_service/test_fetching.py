@@ -18,8 +18,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import InputError, RunCancelledError, UnreadableInputError
+from pipeline.runtime.run import plan_inputs
+from pipeline.runtime.stages import Progress
 from service import downloads
 from service.downloads import ATTEMPTS, LONGEST_PAUSE_S, PASSING, pause_s
+from service.driver.attempt import run_request
 from service.errors import (
     InputRefusedError,
     NoSuchUploadError,
@@ -597,3 +600,15 @@ def test_what_is_fetched_is_examined_like_an_upload(web: World, server: tuple[st
     server[1].content = b"LASF" + b"\0" * 500
     with pytest.raises(InputError, match=r"^a\.laz: "):
         web.materialise(url(f"{server[0]}/good/a.laz"))
+
+
+def test_a_tile_that_reads_as_a_tile_index_leads_nowhere(tmp_path: Path) -> None:
+    secret = tmp_path / "others.laz"
+    secret.write_bytes(b"LASF")
+    tile = tmp_path / "tiles.txt"
+    tile.write_text(f"{secret}\ns3://bucket/others.laz\n")
+    fetched = Fetched(reference=InputReference(kind="upload", value="u"), path=tile, points=0, sha256=None)
+    request = run_request(JobRequest(tiles=()), [fetched], None, tmp_path / "run", ServiceSettings())
+    with pytest.raises(InputError, match=r"tiles\.txt: ") as refused:
+        plan_inputs(request, request.settings, Progress(lambda _: None))
+    assert "others.laz" not in str(refused.value)
