@@ -130,10 +130,15 @@ def watched_run(arguments: argparse.Namespace, tiles: Path, run_dir: Path) -> di
     }
 
 
+def is_mark(line: Mapping[str, Any]) -> bool:
+    """Whether a line of the diary begins a stage or ends the run; workers that are back are told as of the run, too."""
+    return line["kind"] in {"stage", "finished"} or (line["kind"] == "run" and line["stage"] == "plan")
+
+
 def stage_rows(trace: Mapping[str, Any]) -> list[dict[str, Any]]:
     """What each stage took: walls, CPU time of its tasks, when workers had nothing to do, what the driver spent."""
     workers = trace["workers"]
-    marks = [line for line in trace["diary"] if line["kind"] in {"run", "stage", "finished"}]
+    marks = [line for line in trace["diary"] if is_mark(line)]
     rows = []
     for mark, after in itertools.pairwise(marks):
         own = [t for t in trace["tasks"] if mark["at_s"] <= t["began_s"] < after["at_s"]]

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.city_scale import is_mark
 from benchmarks.entries import markdown_table
 from pipeline.model import FloatArray
 from pipeline.runtime.flight import TASKS_A_THREAD
@@ -203,7 +204,7 @@ def own_times(trace: Mapping[str, Any], name: str) -> dict[str, FloatArray]:
 
 def marks(trace: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     """When each stage began and ended; those of the driver alone, too."""
-    lines = [line for line in trace["diary"] if line["kind"] in {"run", "stage", "finished"}]
+    lines = [line for line in trace["diary"] if is_mark(line)]
     times = [(line["stage"] or "end", line["at_s"]) for line in lines]
     found = {name: (at_s, after_s) for (name, at_s), (_, after_s) in itertools.pairwise(times)}
     return {"plan": found["plan"], **{name: found[name] for name in STAGES if name in found}}

@@ -121,6 +121,7 @@ def task(stage: str, process: str, began_s: float, seconds: float, cpu_s: float)
 
 def small_trace() -> dict[str, object]:
     marks = [("run", "plan", 0.0, 0.0), ("stage", "split", 1.0, 0.5), ("finished", "", 11.0, 1.5)]
+    marks.insert(2, ("run", "split", 3.0, 0.6))  # workers that are back: no stage of its own
     return {
         "workers": 2,
         "diary": [{"kind": k, "stage": s, "at_s": at, "cpu_s": cpu, "message": ""} for k, s, at, cpu in marks],
