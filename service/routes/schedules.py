@@ -155,8 +155,9 @@ async def change_schedule(
 ) -> JSONResponse:
     """Change what is given; the rest stays. Slots while it is paused are not missed: nobody wants them."""
     before = await run_in_threadpool(store.schedules.get, schedule_id, owner=caller.owner)
-    _check_version(if_match, before)
     plan = read_plan(body, before.definition, settings)
+    # a precondition counts only for a request that would succeed without it
+    _check_version(if_match, before)
     draft = plan.draft
 
     def change(definition: Definition) -> Schedule:

@@ -21,6 +21,9 @@ from hypothesis import HealthCheck, Phase, given
 from schemathesis.generation import GenerationMode
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
+from pipeline.schedule import Cron
+from service.schedules import Definition
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "80_service"))
 
 import finished_runs
@@ -57,6 +60,15 @@ class Ids:
         sent = service.client.post("/uploads?filename=points.xyz", content=points)
         assert sent.status_code == 201, sent.text
         self._upload = sent.json()["uploadID"]
+        self._schedules = itertools.cycle([self._schedule() for _ in range(3)])
+
+    def _schedule(self) -> str:
+        asked = finished_runs.JobRequest(tiles=(finished_runs.InputReference(kind="upload", value=self._upload),))
+        definition = Definition(cron=Cron("30 2 * * *", "Europe/Amsterdam"), request=asked)
+        return self._service.store.schedules.create(definition, owner=None, most=10**6).schedule_id
+
+    def _execute(self) -> dict[str, Any]:
+        return {"inputs": {"tiles": [{"href": f"/uploads/{self._upload}"}], "crs": "EPSG:28992"}}
 
     def _waiting(self) -> str:
         tile = finished_runs.InputReference(kind="path", value="/srv/tile.laz")
@@ -69,9 +81,18 @@ class Ids:
             return
         process = next(self._processes)
         if case.path.endswith("/execution") and mode is GenerationMode.POSITIVE:
-            case.body = {"inputs": {"tiles": [{"href": f"/uploads/{self._upload}"}], "crs": "EPSG:28992"}}
+            case.body = self._execute()
             if process == "compare":
                 case.body["inputs"]["methods"] = ["fuzzy-sart", "fuzzy-sart:faithful"]
+        if case.path.startswith("/schedules") and mode is GenerationMode.POSITIVE and isinstance(case.body, dict):
+            # what a schema cannot say of the words that were made up, and what a client would send
+            fitting = {"cron": "*/5 * * * *", "timeZone": "America/New_York", "execute": self._execute()}
+            is_new = case.path == "/schedules"
+            case.body |= {name: value for name, value in fitting.items() if is_new or name in case.body}
+            if case.body.get("processID") == "compare":
+                del case.body["processID"]
+        if "scheduleID" in parameters:
+            parameters["scheduleID"] = self._schedule() if case.method == "DELETE" else next(self._schedules)
         if "processID" in parameters:
             parameters["processID"] = process
         if mode is GenerationMode.POSITIVE and "method" in (case.query or {}):
