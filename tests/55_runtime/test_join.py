@@ -316,6 +316,45 @@ def test_fragments_of_any_sums_and_links_are_joined_as_by_the_slow_join(
     assert found == slow
 
 
+def by_hand(tile: Tile, kinds: list[int], facets: list[tuple[int, int]], along: list[tuple[int, int]]) -> WholeSplit:
+    """Steps, and roofs whose size is told by the tile's column; facets (number, fragment) around the origin."""
+    count = len(kinds)
+    roof = {Sum.FACETS: 100, Sum.VERTICES: 50, Sum.HEIGHT: 50 * 6000, Sum.PLANAR: 50, Sum.BOUNDARY: 20_000}
+    roof |= {Sum.AREA2: 60_000_000 + 1000 * tile.column, Sum.WALL: 20_000, Sum.WALL_TOP: 20_000, Sum.STEP: 15_000}
+    sums = np.zeros((count, N_SUMS), np.int64)
+    for column, value in roof.items():
+        sums[:, column] = value
+    held = [k for k, kind in enumerate(kinds) if kind != FacetKind.STEP]
+    points = np.full((count, 3), NOWHERE, np.int64)
+    points[held] = np.array([[1000 * tile.column, 1000 * tile.row, k] for k in held], np.int64).reshape(-1, 3)
+    return WholeSplit(
+        tile=tile,
+        fragments=Fragments(
+            kind=np.array(kinds, np.int8),
+            sums=sums,
+            boxes_mm=np.array([[-500, -500, 500, 500]] * count, np.int64),
+            lowest_point_mm=points,
+            crossing_keys=np.array([facet_at(600 * n - 700, 0) for n, _ in facets], np.int64).reshape(-1, 6),
+            crossing_fragment=np.array([k for _, k in facets], np.int32),
+            along_steps=np.array([(*pair, 800) for pair in along], np.int64).reshape(-1, 3),
+        ),
+        keys=np.array(held, np.int64),
+        starts=np.arange(len(held) + 1, dtype=np.int64) * 10,
+    )
+
+
+def test_a_step_unites_roofs_of_two_tiles_through_a_third_in_which_nothing_lies_along_it() -> None:
+    roof, step = FacetKind.OBJECT, FacetKind.STEP
+    west = by_hand(TILES[0], [roof, step], [(0, 1)], [(0, 1)])
+    east = by_hand(TILES[3], [roof, step], [(1, 1)], [(0, 1)])
+    middle = by_hand(TILES[1], [step], [(0, 0), (1, 0)], [])
+    slow, found = both_joins([west, middle, east], CORNER, CUT, EASY)
+    assert found == slow
+    assert [len(site.ranges) for site in found.candidates] == [2]
+    _, without = both_joins([west, east], CORNER, CUT, EASY)
+    assert [len(site.ranges) for site in without.candidates] == [1, 1]
+
+
 def test_no_tiles_have_no_sites() -> None:
     assert join([], CORNER, EASY, CRS) == Joined(candidates=(), rejected=(), small_fragments=0)
 
