@@ -355,3 +355,17 @@ def test_nothing_is_cut_off_on_narrow_screens(
     assert box["width"] > 0.4 * width
     assert of_hue(opened.pixels(), "gable").any()
     opened.page.screenshot(path=tmp_path / f"{width}-{scheme}.png", full_page=True)
+
+
+def test_a_job_that_came_of_a_schedule_is_marked_in_the_list(visit: Open, service: str, tile: Path) -> None:
+    with httpx.Client(base_url=service, timeout=60.0) as client:
+        upload = client.post("uploads", params={"filename": tile.name}, content=tile.read_bytes()).raise_for_status()
+        inputs = {"tiles": [{"href": f"uploads/{upload.json()['uploadID']}"}]}
+        asked = {"title": "every night", "cron": "@daily", "paused": True, "execute": {"inputs": inputs}}
+        schedule = client.post("schedules", json=asked).raise_for_status().json()["scheduleID"]
+        job = client.post(f"schedules/{schedule}/run").raise_for_status().json()["jobID"]
+        entry = visit(service).page.locator(f".job[href='#/jobs/{job}']")
+        expect(entry.locator(".job-title")).to_have_text("every night")
+        expect(entry.locator(".job-schedule")).to_have_text("scheduled")
+        client.delete(f"jobs/{job}").raise_for_status()
+        client.delete(f"schedules/{schedule}").raise_for_status()

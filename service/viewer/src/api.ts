@@ -38,6 +38,8 @@ export interface StatusInfo {
   updated?: string;
   title?: string;
   stage?: string;
+  /** The schedule that the job came of. */
+  scheduleID?: string;
   links?: Link[];
   request?: unknown;
   /** Of a comparison: what came out of each run, by its label. */

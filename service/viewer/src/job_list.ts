@@ -79,6 +79,9 @@ export class JobList {
       el("span", { class: "job-title" }, titleOf(job)),
       el("span", { class: `chip chip-${job.status}` }, STATUS_WORDS[job.status] + running),
       el("span", { class: "job-when" }, job.created === undefined ? "" : ago(new Date(job.created), now)),
+      job.scheduleID === undefined
+        ? null
+        : el("span", { class: "job-schedule", title: `Of schedule ${job.scheduleID}` }, "scheduled"),
     );
   }
 }
