@@ -7,9 +7,9 @@ Scopes are steps, each includes those before it:
 
 | scope | may |
 |---|---|
-| read | see the service's own pages, and its own jobs, uploads, results and events |
-| submit | also send and remove its own uploads, submit jobs, dismiss and remove its own jobs |
-| admin | all of this with everybody's jobs and uploads |
+| read | see the service's own pages, and its own jobs, schedules, uploads, results and events |
+| submit | also send and remove its own uploads, submit, dismiss and remove its own jobs; its own schedules |
+| admin | all of this with everybody's jobs, schedules and uploads |
 
 Keys are made, listed and revoked on the machine itself (`gablework keys`), never over HTTP.
 """

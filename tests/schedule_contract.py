@@ -16,10 +16,12 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
+from alembic import command
 from store_contract import claim, request, submit, upload
 
 from pipeline.errors import SettingsError
-from pipeline.schedule import Cron, Missed, Overlap, time_zone
+from pipeline.schedule import Cron, Missed, Overlap, passed_slots, time_zone
+from service import migrations
 from service.errors import (
     ChangedMeanwhileError,
     NoSuchScheduleError,
@@ -34,8 +36,8 @@ from service.jobs import Job, JobStatus
 from service.keys import Scope, new_key
 from service.schedules import Definition, Outcome, Schedule, ScheduleRun, Trigger
 from service.store import JobFilter, JobStore, ScheduleFilter
+from service.store.slot_book import MAX_KEPT
 from service.store.tables import SCHEDULE_RUNS, SCHEDULES
-from service.store.ticks import MAX_KEPT
 
 MINUTE, HOUR, DAY = dt.timedelta(minutes=1), dt.timedelta(hours=1), dt.timedelta(days=1)
 NOON = dt.datetime(2030, 6, 1, 12, tzinfo=dt.UTC)
@@ -87,6 +89,37 @@ class ScheduleContract:
         with JobStore(url) as store:
             store.migrate()
             yield store
+
+    # --- the tables
+
+    def test_a_database_of_the_first_revision_is_brought_on_with_its_jobs(self, url: str) -> None:
+        with JobStore(url) as store:
+            if store._database.is_sqlite:
+                Path(store._database._url.database or "").parent.mkdir(parents=True)
+            with store._database.write() as connection:
+                config = migrations._config()
+                config.attributes["connection"] = connection
+                command.upgrade(config, "0001")
+                job_id, at = "a" * 32, dt.datetime(2026, 1, 1, tzinfo=dt.UTC)
+                values = {"job_id": job_id, "process_id": "reconstruct", "status": "accepted", "priority": 0}
+                values |= {"request": request().as_dict(), "message": "waits", "progress": 0, "stage": ""}
+                values |= {"created_at": at, "updated_at": at, "dismiss_requested": False, "attempt": 0}
+                values |= {"lost_attempts": 0, "last_event": 1}
+                table = sa.Table("jobs", sa.MetaData(), autoload_with=connection)
+                assert "schedule_id" not in table.c
+                connection.execute(sa.insert(table).values(**values))
+            with pytest.raises(StoreError, match="revision 0001, this version needs"):
+                store.check()
+            store.migrate()
+            store.check()
+            found = store.get(job_id)
+            assert (found.schedule_id, found.created_at, found.request) == (None, at, request())
+            assert claim(store).job_id == job_id
+            with store._database.write() as connection:
+                config.attributes["connection"] = connection
+                command.downgrade(config, "0001")
+                assert "schedules" not in sa.inspect(connection).get_table_names()
+                assert connection.execute(sa.select(table.c.job_id)).scalar_one() == job_id
 
     # --- made, read, changed, removed
 
@@ -181,12 +214,23 @@ class ScheduleContract:
         with pytest.raises(ChangedMeanwhileError, match="has version 2, the change is for version 1"):
             book.change(made.schedule_id, made.definition, version=1)
 
-    def test_other_times_count_from_the_change_on(self, store: JobStore) -> None:
-        made = make(store, at=store.now() - 3 * HOUR)
-        changed = store.schedules.change(made.schedule_id, definition("15 3 * * *"), version=1)
+    def test_other_times_count_from_the_change_on_and_what_nobody_saw_before_is_told(self, store: JobStore) -> None:
+        full_hour = store.now().replace(minute=0, second=0, microsecond=0)
+        made = make(store, at=full_hour - 3 * HOUR)
+        # by other words than its times nothing is decided
+        renamed = store.schedules.change(made.schedule_id, dataclasses.replace(made.definition, title="x"), version=1)
+        assert (renamed.decided_until, renamed.next_at) == (made.decided_until, made.next_at)
+        assert runs_of(store, made) == []
+        changed = store.schedules.change(made.schedule_id, definition("15 3 * * *"), version=2)
         assert changed.decided_until == changed.updated_at >= made.updated_at
         assert changed.next_at == changed.definition.cron.next_time(changed.updated_at)
         assert tick(store, changed.updated_at) == []
+        (missed,) = runs_of(store, made)
+        passed = passed_slots(made.definition.cron, made.decided_until, changed.updated_at)
+        assert passed is not None
+        assert (missed.outcome, missed.first_slot, missed.slot) == (Outcome.MISSED, passed.first, passed.latest)
+        assert changed.counts[Outcome.MISSED] == missed.slots == passed.earlier + 1 >= 3
+        assert jobs_of(store, made) == []
 
     def test_a_schedule_that_is_paused_is_never_due_and_what_passes_meanwhile_is_not_missed(
         self, store: JobStore
@@ -208,7 +252,7 @@ class ScheduleContract:
         made = make(store, at=later - HOUR)
         assert len(tick(store, later)) == 1
         # the database's own clock is ten days behind
-        changed = store.schedules.change(made.schedule_id, made.definition, version=1)
+        changed = store.schedules.change(made.schedule_id, definition("*/30 * * * *"), version=1)
         assert changed.decided_until == later
         assert tick(store, later - 5 * DAY) == []
 
@@ -517,7 +561,7 @@ class ScheduleContract:
             raise StoreError("the connection was cut")
 
         with monkeypatch.context() as patched:
-            patched.setattr(ticks._Book, "close", broken)
+            patched.setattr(ticks.SlotBook, "close", broken)
             with pytest.raises(StoreError):
                 tick(store, NOON + HOUR)
         assert jobs_of(store, made) == []

@@ -8,7 +8,7 @@ import functools
 
 from service.jobs import Job
 from service.schedules import Definition, Outcome, Schedule, ScheduleRun
-from service.store import queries, schedules, ticks
+from service.store import queries, schedule_changes, schedules, ticks
 from service.store.database import LOCK_SUBMISSIONS, Database
 from service.store.schedules import ScheduleFilter
 from service.store.ticks import LineLimits
@@ -56,7 +56,7 @@ class ScheduleStore:
             # counting and adding: nobody else adds in between
             self._database.lock(connection, LOCK_SUBMISSIONS)
             now = self._database.now(connection)
-            schedule_id = schedules.insert(connection, definition, owner=owner, most=most, now=now)
+            schedule_id = schedule_changes.insert(connection, definition, owner=owner, most=most, now=now)
             return schedules.get(connection, schedule_id, None)
 
     def get(self, schedule_id: str, *, owner: str | None = None) -> Schedule:
@@ -78,8 +78,8 @@ class ScheduleStore:
     def change(self, schedule_id: str, definition: Definition, *, version: int, owner: str | None = None) -> Schedule:
         """Change what the client says of a schedule whose version the client saw.
 
-        Slots up to now stay as they were decided; one that is due and not decided yet is not missed, but gone with the
-        old times.
+        Where the times change, they count from now on; slots that have passed by the old times, and that no driver saw,
+        are told as missed.
 
         Raises
         ------
@@ -92,7 +92,7 @@ class ScheduleStore:
         """
         with self._database.write() as connection:
             now = self._database.now(connection)
-            schedules.change(connection, schedule_id, definition, owner=owner, version=version, now=now)
+            schedule_changes.change(connection, schedule_id, definition, owner=owner, version=version, now=now)
             return schedules.get(connection, schedule_id, owner)
 
     def remove(self, schedule_id: str, *, owner: str | None = None) -> None:
@@ -104,7 +104,7 @@ class ScheduleStore:
             It does not exist, or belongs to another key.
         """
         with self._database.write() as connection:
-            schedules.remove(connection, schedule_id, owner)
+            schedule_changes.remove(connection, schedule_id, owner)
 
     def runs(
         self, schedule_id: str, *, owner: str | None = None, limit: int = 100, offset: int = 0

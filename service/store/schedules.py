@@ -1,23 +1,20 @@
-"""Schedules in the database: made, read, changed, removed. Within a transaction."""
+"""Reading schedules and what became of their slots. Within a transaction."""
 
 from __future__ import annotations
 
 import dataclasses
-import datetime as dt
-import uuid
 from typing import Any, Literal
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from pipeline.schedule import Cron, Missed, Overlap
-from service.errors import ChangedMeanwhileError, NoSuchScheduleError, TooManySchedulesError
+from service.errors import NoSuchScheduleError
 from service.files import is_id
 from service.jobs import JobRequest, JobStatus
 from service.schedules import COUNTED, Definition, Outcome, Schedule, ScheduleRun, Trigger
 from service.store.records import storable
-from service.store.submissions import hold_uploads
-from service.store.tables import JOBS, SCHEDULE_RUNS, SCHEDULE_UPLOADS, SCHEDULES
+from service.store.tables import JOBS, SCHEDULE_RUNS, SCHEDULES
 
 COLUMN_OF = {
     Outcome.SUBMITTED: "submitted",
@@ -44,111 +41,6 @@ class ScheduleFilter:
     """Most schedules to list."""
     offset: int = 0
     """Schedules to pass over."""
-
-
-def insert(connection: Connection, definition: Definition, *, owner: str | None, most: int, now: dt.datetime) -> str:
-    """Store a new schedule; its id.
-
-    Raises
-    ------
-    TooManySchedulesError
-        The key has as many as it may have.
-    NoSuchUploadError
-        It names an upload that is gone.
-    """
-    own = sa.select(sa.func.count()).select_from(SCHEDULES)
-    own = own if owner is None else own.where(SCHEDULES.c.owner == owner)
-    found = connection.execute(own).scalar_one()
-    if found >= most:
-        raise TooManySchedulesError(
-            f"there are {found} schedules and {most} may be: remove one, or raise GABLEWORK_MAX_SCHEDULES_PER_KEY"
-        )
-    schedule_id = uuid.uuid4().hex
-    connection.execute(
-        sa.insert(SCHEDULES).values(
-            schedule_id=schedule_id,
-            owner=owner,
-            version=1,
-            created_at=now,
-            updated_at=now,
-            decided_until=now,
-            last_number=0,
-            **dict.fromkeys(COLUMN_OF.values(), 0),
-            **_columns(definition, now),
-        )
-    )
-    _need_uploads(connection, schedule_id, definition)
-    return schedule_id
-
-
-def change(
-    connection: Connection,
-    schedule_id: str,
-    definition: Definition,
-    *,
-    owner: str | None,
-    version: int,
-    now: dt.datetime,
-) -> None:
-    """Change what the client says, if nobody else did since. Slots before now are decided by that.
-
-    Raises
-    ------
-    NoSuchScheduleError
-        It does not exist, or belongs to another key.
-    ChangedMeanwhileError
-        It has another version by now.
-    NoSuchUploadError
-        It names an upload that is gone.
-    """
-    row = lock(connection, schedule_id, owner)
-    if row.version != version:
-        raise ChangedMeanwhileError(
-            f"schedule {schedule_id} has version {row.version}, the change is for version {version}: "
-            "read it again, then change it"
-        )
-    # a clock that was put back brings no slot a second time
-    decided_until = max(now, row.decided_until)
-    values = _columns(definition, decided_until) | {
-        "version": version + 1,
-        "updated_at": now,
-        "decided_until": decided_until,
-    }
-    if definition.is_paused and row.waiting_slot is not None:
-        end_waiting(connection, row, outcome=Outcome.MISSED, now=now, message="paused while this slot waited")
-        values |= {"waiting_slot": None, "missed_slots": row.missed_slots + 1}
-    connection.execute(sa.update(SCHEDULES).where(SCHEDULES.c.schedule_id == schedule_id).values(**values))
-    connection.execute(sa.delete(SCHEDULE_UPLOADS).where(SCHEDULE_UPLOADS.c.schedule_id == schedule_id))
-    _need_uploads(connection, schedule_id, definition)
-
-
-def end_waiting(
-    connection: Connection,
-    row: sa.Row[Any],
-    *,
-    outcome: Outcome,
-    now: dt.datetime,
-    message: str,
-    job_id: str | None = None,
-) -> int:
-    """Tell what became of the slot that waited; the number of its run."""
-    waited = sa.and_(SCHEDULE_RUNS.c.schedule_id == row.schedule_id, SCHEDULE_RUNS.c.slot == row.waiting_slot)
-    told = {"outcome": outcome.value, "at": now, "message": message, "job_id": job_id}
-    connection.execute(sa.update(SCHEDULE_RUNS).where(waited).values(**told))
-    return int(connection.execute(sa.select(SCHEDULE_RUNS.c.number).where(waited)).scalar_one())
-
-
-def remove(connection: Connection, schedule_id: str, owner: str | None) -> None:
-    """Forget a schedule and what became of its slots; its jobs stay.
-
-    Raises
-    ------
-    NoSuchScheduleError
-        It does not exist, or belongs to another key.
-    """
-    lock(connection, schedule_id, owner)
-    for table in (SCHEDULE_RUNS, SCHEDULE_UPLOADS, SCHEDULES):
-        connection.execute(sa.delete(table).where(table.c.schedule_id == schedule_id))
 
 
 def lock(connection: Connection, schedule_id: str, owner: str | None) -> sa.Row[Any]:
@@ -271,32 +163,6 @@ def run_of(row: sa.Row[Any]) -> ScheduleRun:
         at=row.at,
         message=row.message,
     )
-
-
-def _columns(definition: Definition, decided_until: dt.datetime) -> dict[str, Any]:
-    """What the client says, as columns; when it is due next follows from that."""
-    cron = definition.cron
-    return {
-        "title": None if definition.title is None else storable(definition.title),
-        "cron": storable(cron.expression, 200),
-        "time_zone": storable(cron.time_zone, 128),
-        "process_id": storable(definition.request.process_id, 64),
-        "request": definition.request.as_dict(),
-        "priority": definition.priority,
-        "missed": definition.missed.value,
-        "grace_s": definition.grace_s,
-        "overlap": definition.overlap.value,
-        "is_paused": definition.is_paused,
-        "next_at": None if definition.is_paused else cron.next_time(decided_until),
-    }
-
-
-def _need_uploads(connection: Connection, schedule_id: str, definition: Definition) -> None:
-    needed = definition.request.upload_ids
-    hold_uploads(connection, needed)
-    if needed:
-        rows = [{"schedule_id": schedule_id, "upload_id": name} for name in needed]
-        connection.execute(sa.insert(SCHEDULE_UPLOADS), rows)
 
 
 def _row(connection: Connection, schedule_id: str, owner: str | None, *, locked: bool) -> sa.Row[Any]:

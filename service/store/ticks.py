@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 from collections.abc import Callable
-from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
@@ -19,12 +18,9 @@ from pipeline.schedule import Decision, PassedSlots, decide, passed_slots
 from service.errors import ForbiddenError, ScheduleBusyError, ServiceError
 from service.schedules import Outcome, Schedule, ScheduleRun, Trigger
 from service.store import schedules
-from service.store.records import storable
+from service.store.slot_book import SlotBook
 from service.store.submissions import check_queue, insert
-from service.store.tables import KEYS, SCHEDULE_RUNS, SCHEDULES
-
-MAX_KEPT = 1000
-"""Runs of a schedule that are kept; its counts go on."""
+from service.store.tables import KEYS, SCHEDULES
 
 BROKEN_PAUSE = dt.timedelta(hours=1)
 """A schedule that this machine cannot read is looked at again after so long."""
@@ -53,7 +49,7 @@ def decide_first(connection: Connection, *, now: dt.datetime, limits: LineLimits
     row = connection.execute(line.limit(1).with_for_update(skip_locked=True)).one_or_none()
     if row is None:
         return None
-    book = _Book(connection, row, now)
+    book = SlotBook(connection, row, now)
     busy_with = schedules.busy_job(connection, row.schedule_id)
     try:
         schedule = schedules.schedule_of(row)
@@ -97,68 +93,15 @@ def run_by_hand(
         raise ScheduleBusyError(
             f"job {busy_with} of this schedule is under way: wait until it is over, or dismiss it", busy_with
         )
-    book = _Book(connection, row, now)
+    book = SlotBook(connection, row, now)
     job_id = _submit(connection, schedules.schedule_of(row), now, limits)
     book.add(Outcome.SUBMITTED, None, trigger=Trigger.HAND, job_id=job_id, message="run by hand")
     book.close()
     return job_id
 
 
-class _Book:
-    """Writes down what becomes of one schedule's slots; the row is locked."""
-
-    def __init__(self, connection: Connection, row: sa.Row[Any], now: dt.datetime) -> None:
-        self.connection = connection
-        self.row = row
-        self.now = now
-        self.told: list[ScheduleRun] = []
-        self._number = row.last_number
-        self._counts = {outcome: getattr(row, column) for outcome, column in schedules.COLUMN_OF.items()}
-
-    def add(self, outcome: Outcome, slot: dt.datetime | None, *, message: str, **values: Any) -> None:
-        """What became of a slot; of the one that waited, its row changes."""
-        message = storable(message)
-        number = None
-        if slot is not None and slot == self.row.waiting_slot:
-            number = schedules.end_waiting(
-                self.connection,
-                self.row,
-                outcome=outcome,
-                now=self.now,
-                message=message,
-                job_id=values.get("job_id"),
-            )
-        run = ScheduleRun(
-            schedule_id=self.row.schedule_id,
-            number=self._number + 1 if number is None else number,
-            outcome=outcome,
-            slot=slot,
-            at=self.now,
-            message=message,
-            **{"trigger": Trigger.CLOCK, **values},
-        )
-        if number is None:
-            self._number = run.number
-            self.connection.execute(sa.insert(SCHEDULE_RUNS).values(**dataclasses.asdict(run)))
-        if outcome in self._counts:
-            self._counts[outcome] += run.slots
-        self.told.append(run)
-
-    def close(self, **values: Any) -> None:
-        """Write the schedule's own row; forget its oldest runs."""
-        counted = {schedules.COLUMN_OF[outcome]: count for outcome, count in self._counts.items()}
-        one = SCHEDULES.c.schedule_id == self.row.schedule_id
-        self.connection.execute(sa.update(SCHEDULES).where(one).values(last_number=self._number, **counted, **values))
-        old = sa.and_(
-            SCHEDULE_RUNS.c.schedule_id == self.row.schedule_id,
-            SCHEDULE_RUNS.c.number <= self._number - MAX_KEPT,
-            SCHEDULE_RUNS.c.outcome != Outcome.WAITING.value,
-        )
-        self.connection.execute(sa.delete(SCHEDULE_RUNS).where(old))
-
-
 def _write(
-    book: _Book,
+    book: SlotBook,
     schedule: Schedule,
     passed: PassedSlots | None,
     decision: Decision,
@@ -189,7 +132,7 @@ def _write(
             book.add(Outcome.SUBMITTED, decision.run, job_id=job_id, message=_lateness(decision.run, book.now))
 
 
-def _write_unreadable(book: _Book, why: str) -> None:
+def _write_unreadable(book: SlotBook, why: str) -> None:
     """A time zone that another machine knew and this one does not: told, and looked at again later."""
     row = book.row
     if row.waiting_slot is not None:
@@ -204,7 +147,7 @@ def _write_unreadable(book: _Book, why: str) -> None:
     )
 
 
-def _write_missed(book: _Book, passed: PassedSlots, decision: Decision) -> None:
+def _write_missed(book: SlotBook, passed: PassedSlots, decision: Decision) -> None:
     """One row for all that were missed together."""
     last = decision.late or passed.before_latest
     if last is None:

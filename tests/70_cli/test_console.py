@@ -121,7 +121,15 @@ def test_json_events_are_a_line_each(capsys: pytest.CaptureFixture[str]) -> None
     console.on_event(Event(kind="stage", stage="split", total=4))
     console.on_event(Event(kind="warning", message="no vertical unit"))
     events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
-    assert events[0] == {"kind": "stage", "stage": "split", "done": 0, "total": 4, "message": "", "failed": 0}
+    assert events[0] == {
+        "kind": "stage",
+        "stage": "split",
+        "done": 0,
+        "total": 4,
+        "message": "",
+        "kept": 0,
+        "failed": 0,
+    }
     assert events[1] == {"kind": "warning", "message": "no vertical unit"}
 
 

@@ -20,7 +20,7 @@ from service.routes.documented import SCHEMAS
 from service.routes.schedule_requests import FIELDS, LONGEST_GRACE_S
 from service.schedules import Definition, Outcome
 from service.settings import ServiceSettings
-from service.store.ticks import MAX_KEPT
+from service.store.slot_book import MAX_KEPT
 
 
 @pytest.fixture(scope="module")

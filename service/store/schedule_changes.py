@@ -1,0 +1,166 @@
+"""Schedules as clients make, change and remove them. Within a transaction."""
+
+from __future__ import annotations
+
+import datetime as dt
+import uuid
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import Connection
+
+from pipeline.errors import SettingsError
+from pipeline.schedule import Cron, passed_slots
+from service.errors import ChangedMeanwhileError, TooManySchedulesError
+from service.schedules import Definition, Outcome
+from service.store.records import storable
+from service.store.schedules import COLUMN_OF, lock
+from service.store.slot_book import SlotBook
+from service.store.submissions import hold_uploads
+from service.store.tables import SCHEDULE_RUNS, SCHEDULE_UPLOADS, SCHEDULES
+
+
+def insert(connection: Connection, definition: Definition, *, owner: str | None, most: int, now: dt.datetime) -> str:
+    """Store a new schedule; its id.
+
+    Raises
+    ------
+    TooManySchedulesError
+        The key has as many as it may have.
+    NoSuchUploadError
+        It names an upload that is gone.
+    """
+    own = sa.select(sa.func.count()).select_from(SCHEDULES)
+    own = own if owner is None else own.where(SCHEDULES.c.owner == owner)
+    found = connection.execute(own).scalar_one()
+    if found >= most:
+        raise TooManySchedulesError(
+            f"there are {found} schedules and {most} may be: remove one, or raise GABLEWORK_MAX_SCHEDULES_PER_KEY"
+        )
+    schedule_id = uuid.uuid4().hex
+    connection.execute(
+        sa.insert(SCHEDULES).values(
+            schedule_id=schedule_id,
+            owner=owner,
+            version=1,
+            created_at=now,
+            updated_at=now,
+            decided_until=now,
+            last_number=0,
+            **dict.fromkeys(COLUMN_OF.values(), 0),
+            next_at=_next_at(definition, now),
+            **_columns(definition),
+        )
+    )
+    _need_uploads(connection, schedule_id, definition)
+    return schedule_id
+
+
+def change(
+    connection: Connection,
+    schedule_id: str,
+    definition: Definition,
+    *,
+    owner: str | None,
+    version: int,
+    now: dt.datetime,
+) -> None:
+    """Change what the client says, if nobody else did since.
+
+    Where the times change, slots that have passed undecided are missed.
+
+    Raises
+    ------
+    NoSuchScheduleError
+        It does not exist, or belongs to another key.
+    ChangedMeanwhileError
+        It has another version by now.
+    NoSuchUploadError
+        It names an upload that is gone.
+    """
+    row = lock(connection, schedule_id, owner)
+    if row.version != version:
+        raise ChangedMeanwhileError(
+            f"schedule {schedule_id} has version {row.version}, the change is for version {version}: "
+            "read it again, then change it"
+        )
+    book = SlotBook(connection, row, now)
+    values = _columns(definition) | {"version": version + 1, "updated_at": now}
+    if _times_of(definition) != (row.cron, row.time_zone, row.is_paused):
+        _miss_passed(book)
+        # a clock that was put back brings no slot a second time
+        decided_until = max(now, row.decided_until)
+        values |= {"decided_until": decided_until, "next_at": _next_at(definition, decided_until)}
+    if definition.is_paused and row.waiting_slot is not None:
+        book.add(Outcome.MISSED, row.waiting_slot, message="the schedule was paused while this slot waited")
+        values["waiting_slot"] = None
+    book.close(**values)
+    connection.execute(sa.delete(SCHEDULE_UPLOADS).where(SCHEDULE_UPLOADS.c.schedule_id == schedule_id))
+    _need_uploads(connection, schedule_id, definition)
+
+
+def _miss_passed(book: SlotBook) -> None:
+    """Tell the slots that have passed by the times that are to be changed, and that no driver saw."""
+    row = book.row
+    try:
+        passed = None if row.is_paused else passed_slots(Cron(row.cron, row.time_zone), row.decided_until, book.now)
+    except SettingsError:
+        # a zone that this machine does not know: it is changed for that very reason
+        return
+    if passed is not None:
+        book.add(
+            Outcome.MISSED,
+            passed.latest,
+            first_slot=passed.first,
+            slots=passed.earlier + 1,
+            is_counted=passed.is_counted,
+            message="no driver looked before the times of the schedule were changed",
+        )
+
+
+def remove(connection: Connection, schedule_id: str, owner: str | None) -> None:
+    """Forget a schedule and what became of its slots; its jobs stay.
+
+    Raises
+    ------
+    NoSuchScheduleError
+        It does not exist, or belongs to another key.
+    """
+    lock(connection, schedule_id, owner)
+    for table in (SCHEDULE_RUNS, SCHEDULE_UPLOADS, SCHEDULES):
+        connection.execute(sa.delete(table).where(table.c.schedule_id == schedule_id))
+
+
+def _columns(definition: Definition) -> dict[str, Any]:
+    """What the client says, as columns."""
+    cron, zone, is_paused = _times_of(definition)
+    return {
+        "title": None if definition.title is None else storable(definition.title),
+        "cron": cron,
+        "time_zone": zone,
+        "process_id": storable(definition.request.process_id, 64),
+        "request": definition.request.as_dict(),
+        "priority": definition.priority,
+        "missed": definition.missed.value,
+        "grace_s": definition.grace_s,
+        "overlap": definition.overlap.value,
+        "is_paused": is_paused,
+    }
+
+
+def _times_of(definition: Definition) -> tuple[str, str, bool]:
+    """What decides when it is due, as columns: cron, time zone, whether it is paused."""
+    cron = definition.cron
+    return storable(cron.expression, 200), storable(cron.time_zone, 128), definition.is_paused
+
+
+def _next_at(definition: Definition, decided_until: dt.datetime) -> dt.datetime | None:
+    return None if definition.is_paused else definition.cron.next_time(decided_until)
+
+
+def _need_uploads(connection: Connection, schedule_id: str, definition: Definition) -> None:
+    needed = definition.request.upload_ids
+    hold_uploads(connection, needed)
+    if needed:
+        rows = [{"schedule_id": schedule_id, "upload_id": name} for name in needed]
+        connection.execute(sa.insert(SCHEDULE_UPLOADS), rows)
