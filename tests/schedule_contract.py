@@ -37,7 +37,7 @@ from service.keys import Scope, new_key
 from service.schedules import Definition, Outcome, Schedule, ScheduleRun, Trigger
 from service.store import JobFilter, JobStore, ScheduleFilter
 from service.store.slot_book import MAX_KEPT
-from service.store.tables import SCHEDULE_RUNS, SCHEDULES
+from service.store.tables import SCHEDULE_RUNS, SCHEDULES, UPLOADS
 
 MINUTE, HOUR, DAY = dt.timedelta(minutes=1), dt.timedelta(hours=1), dt.timedelta(days=1)
 NOON = dt.datetime(2030, 6, 1, 12, tzinfo=dt.UTC)
@@ -432,6 +432,17 @@ class ScheduleContract:
         assert store.counts()[JobStatus.ACCEPTED] == 1
         # the next slot is tried again
         assert tick(store, NOON + 2 * HOUR) == [(Outcome.SUBMITTED, NOON + 2 * HOUR, 1)]
+
+    def test_an_upload_that_is_gone_against_all_rules_is_told_and_leaves_no_half_a_job(self, store: JobStore) -> None:
+        sent = upload(store)
+        made = make(store, request=request(sent.upload_id, "upload"))
+        with store._database.write() as connection:
+            connection.execute(sa.delete(UPLOADS))
+        (told,) = store.schedules.tick(now=NOON + HOUR, **LIMITS)
+        assert (told.outcome, told.job_id) == (Outcome.FAILED, None)
+        assert sent.upload_id in told.message
+        assert jobs_of(store, made) == []
+        assert store.schedules.get(made.schedule_id).counts[Outcome.FAILED] == 1
 
     def test_a_revoked_key_runs_nothing_more(self, store: JobStore) -> None:
         key, _ = new_key("old", Scope.SUBMIT, now=store.now())
