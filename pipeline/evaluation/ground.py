@@ -23,6 +23,7 @@ from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.reference import Reference, ReferencePoints
 from pipeline.evaluation.subsets import Subset, measured
 from pipeline.io import ReadOptions, open_source
+from pipeline.io.remote_file import file_at
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.scene import GROUND_CLASS, SceneSettings
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
@@ -167,7 +168,7 @@ class GroundOfFiles:
 
     def __init__(self, paths: Sequence[str | Path], options: ReadOptions | None = None) -> None:
         self._options = dataclasses.replace(options or ReadOptions(), keep_withheld=True, drop_classes=())
-        self._paths = [Path(path) for path in paths]
+        self._paths = [file_at(path) for path in paths]
         self._bounds = [open_source(path, self._options).info.bounds_m for path in self._paths]
 
     def __call__(self, points: ReferencePoints) -> BoolArray:

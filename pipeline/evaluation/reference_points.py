@@ -21,6 +21,8 @@ from pipeline.evaluation.reference import Reference, ReferencePoints
 from pipeline.io import ReadOptions, open_source
 from pipeline.io.crs import SpatialReference
 from pipeline.io.footprints import read_footprints
+from pipeline.io.readable import Readable
+from pipeline.io.remote_file import file_at
 from pipeline.io.source import Source
 from pipeline.model import RoofType
 from pipeline.quality.residuals import TopSurface, plan_index
@@ -132,12 +134,12 @@ def read_points_reference(
     )
     index = plan_index(areas)
     return Reference(
-        name=", ".join(Path(path).name for path in tiles),
+        name=", ".join(file_at(path).name for path in tiles),
         kind="points",
         buildings=buildings,
         has_faces=False,
         outlines="given" if footprints is not None else "raster",
-        tiles=tuple(functools.partial(_read_tile, Path(path), options, index) for path in tiles),
+        tiles=tuple(functools.partial(_read_tile, file_at(path), options, index) for path in tiles),
         bounds=bounds,
         extent=None if footprints is not None or not buildings else extent,
         has_ground=bool(classes[GROUND_CLASS]),
@@ -202,7 +204,7 @@ def _check_classes(sources: Sequence[Source], classes: Counts) -> None:
         )
 
 
-def _read_tile(path: Path, options: ReadOptions, index: TopSurface) -> ReferencePoints:
+def _read_tile(path: Readable, options: ReadOptions, index: TopSurface) -> ReferencePoints:
     """The points of a tile; of class 6 those inside a footprint are roof."""
     clouds = list(open_source(path, options).chunks())
     if not clouds:

@@ -96,7 +96,7 @@ def _files_at(url: str, cut: Cut) -> list[str]:
         lists = scheme_of(url).stores
     except RunError as error:
         raise UnreadableInputError(shown(url), "its scheme is not understood", str(error)) from None
-    pattern = lists and glob.has_magic(url)
+    pattern = lists and glob.has_magic(url) and not filesystem_of(url).isfile(url)
     if pattern or url.endswith("/"):
         if not lists:
             raise UnreadableInputError(

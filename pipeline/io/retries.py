@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, TypeVar
 
+from pipeline.errors import GableworkError
+
 Result = TypeVar("Result")
 
 _LONGEST_DETAIL = 300
@@ -317,6 +319,8 @@ def persistently(
         check()
         try:
             return work()
+        except GableworkError:
+            raise  # told already, after attempts of its own
         except Exception as error:
             if is_local(error):
                 raise

@@ -144,6 +144,11 @@ def test_a_folder_and_a_pattern_of_a_bucket_are_listed(bucket):
     assert names(find_inputs([f"{bucket}/t/**/c.laz", f"{bucket}/u/e.laz"])) == ["c.laz", "e.laz"]
 
 
+def test_an_object_that_is_named_like_a_pattern_is_a_file(bucket):
+    put(f"{bucket}/tile[1].laz")
+    assert find_inputs([f"{bucket}/tile[1].laz"]) == [f"{bucket}/tile[1].laz"]
+
+
 def test_what_is_not_in_a_bucket_is_told(bucket):
     put(f"{bucket}/t/notes.txt", b"no points\n")
     for entry, told in (

@@ -130,6 +130,17 @@ def test_busy_servers_are_asked_again_and_counted(site, tmp_path):
     assert (tmp_path / "copy").read_bytes() == CONTENT
 
 
+def test_attempts_do_not_multiply_where_ranges_are_not_known(site):
+    site.ranges = False
+    file = RemoteFile(site.url, QUICK)
+    file.stat()
+    site.asked.clear()
+    site.faults = [200, *[503] * 99]
+    with pytest.raises(UnreadableInputError, match="the server is busy at all of 3 attempts"):
+        file.read_at(1_000_000, 10)
+    assert len(site.asked) <= 2 * QUICK.attempts
+
+
 def test_what_cannot_be_fetched_is_told_by_url_status_and_fix_without_its_secrets(site):
     site.faults = [404] * 9
     with pytest.raises(UnreadableInputError, match=r"a\.laz\?query-.*: cannot be fetched: .*404.*Check the name"):

@@ -59,6 +59,18 @@ def test_all_commands_that_read_tiles_or_runs_take_urls(scene: Path, bucket: str
     assert facts["info"]["path"] == tile
 
 
+def test_points_to_measure_against_may_lie_in_a_bucket(tmp_path: Path, bucket: str) -> None:
+    words = ("simulate", "gable", "--out", str(tmp_path), "--size", "40", "40", "--with-classes", "--quiet")
+    assert invoke(*words)[0] == 0
+    tile = str(tmp_path / "gable.laz")
+    storage_at(bucket).put("gable.laz", Path(tile).read_bytes())
+    document("reconstruct", tile, "--out", str(tmp_path / "run"), "--workers", "0")
+    here, there = (
+        document("evaluate", str(tmp_path / "run"), "--points", place) for place in (tile, f"{bucket}/gable.laz")
+    )
+    assert there["measures"] == here["measures"]
+
+
 def test_a_bundle_in_a_bucket_is_replayed(bucket: str) -> None:
     storage_at(bucket).put("run/quarantine/a.bundle", b"no bundle")
     code, _, said = invoke("replay", f"{bucket}/run/quarantine/a.bundle")
