@@ -117,9 +117,9 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
         "incident": incident,
         "reference": dataclasses.asdict(bundle.reference),
     }
-    name = candidate.building_id + SUFFIX
+    key = candidate.building_id + SUFFIX
     with (
-        storage_at(folder).putting(name) as temporary,
+        storage_at(folder).putting(key) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,
     ):
         archive.writestr("bundle.json", json.dumps(document, indent=1, allow_nan=False))
@@ -131,7 +131,7 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.ascontiguousarray(array), (1, 0), allow_pickle=False)
-    return place_below(folder, name)
+    return place_below(folder, key)
 
 
 def read_bundle(path: str) -> Bundle:

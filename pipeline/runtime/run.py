@@ -255,6 +255,8 @@ def run_variants(
     started_at = dt.datetime.now(tz=dt.UTC)
     if request.work is None:
         check_scratch(work_dir, request.scratch, request.scheduler)
+    for variant in variants:
+        storage_at(variant.out)  # a URL where nothing can be stored is told before anything is read
     shared = Progress(on_event)
     began = time.perf_counter()
     settings = _common_settings(variants)

@@ -13,12 +13,15 @@ from object_store import SECRET
 
 from pipeline.errors import EmptyInputError, InputError, RunError, UnreadableInputError
 from pipeline.evaluation.reading import read_models
-from pipeline.export.tile import write_tile
-from pipeline.io import storage_at
+from pipeline.export.geoparquet import read_table
+from pipeline.io import arrow_at, storage_at
+from pipeline.io.remote_file import on_this_machine
 from pipeline.io.retries import persistently
 from pipeline.io.urls import filesystem_of
 from pipeline.report.table import run_statistics
+from pipeline.runtime import modelling
 from pipeline.runtime import publish as publishing
+from pipeline.runtime.bundle import read_bundle
 from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.manifest import RunStatus, read_manifest
@@ -187,7 +190,6 @@ def test_a_run_that_breaks_off_says_so(tile, bucket, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         run(request(tile, bucket))
     assert read_manifest(f"{bucket}/run").status is RunStatus.CANCELLED
-    assert write_tile is not fail
 
 
 def test_nothing_of_the_credentials_or_of_signed_urls_is_kept(tile, bucket, s3):
@@ -201,6 +203,23 @@ def test_nothing_of_the_credentials_or_of_signed_urls_is_kept(tile, bucket, s3):
     assert b"very-hidden" not in kept
     assert SECRET.encode() not in kept
     assert b"suburb.laz?query-" in storage.get("run.json")
+
+
+def test_bundles_of_poisonous_buildings_go_into_the_bucket(tile, bucket, monkeypatch, s3, quick):
+    def fail(*_args, **_kwargs):
+        raise ZeroDivisionError("poison")
+
+    monkeypatch.setattr(modelling, "reconstruct_building", fail)
+    summary = run(request(tile, bucket))
+    kept = [key for key in storage_at(f"{bucket}/run").keys("quarantine") if key.endswith(".bundle")]
+    assert len(kept) == summary.statuses["failed"] > 0
+    with on_this_machine(f"{bucket}/run/{kept[0]}") as path:
+        assert read_bundle(str(path)).incident.detail == "ZeroDivisionError: poison"
+    s3.script = lambda asked: "busy" if "quarantine" in asked.path and asked.method == "PUT" else "pass"
+    assert run(request(tile, bucket, overwrite=True)).statuses == summary.statuses
+    filesystem, folder = arrow_at(f"{bucket}/run")
+    rows = read_table(folder, "buildings", filesystem)["reason_detail"].to_pylist()
+    assert all("there is no bundle: s3://" in detail for detail in rows)
 
 
 def test_scratch_is_on_this_machine_and_goes(tile, bucket, tmp_path, monkeypatch):

@@ -75,7 +75,7 @@ def bundle() -> Bundle:
 @pytest.fixture
 def path(bundle: Bundle, tmp_path: Path) -> Path:
     """The bundle as a file."""
-    return write_bundle(str(tmp_path / "quarantine"), bundle)
+    return Path(write_bundle(str(tmp_path / "quarantine"), bundle))
 
 
 def rewritten(path: Path, **members: bytes) -> str:

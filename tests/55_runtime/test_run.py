@@ -236,6 +236,12 @@ def test_a_tile_that_cannot_be_written_costs_only_itself(
     assert sorted({row["tile"] for row in rows(hurt.run_dir, "buildings")}) == tiles[1:]
 
 
+@pytest.mark.parametrize("out", ["ftp://host/run", "https://host/run"])
+def test_a_place_where_nothing_can_be_stored_is_refused_at_once(suburb: Path, reconstruct: Any, out: str) -> None:
+    with pytest.raises(RunError, match=rf"{out}: .*Use "):
+        reconstruct(suburb.with_name("missing.laz"), out=out)
+
+
 def test_a_meadow_has_no_building_and_ends_well(tmp_path: Path, reconstruct: Any) -> None:
     rng = np.random.default_rng(1)
     las = laspy.create(point_format=6, file_version="1.4")
