@@ -137,7 +137,8 @@ def ingest(task: IngestTask) -> Ingested:
             now = copy.stat()
             same = (now.st_size, file.stat().st_mtime_ns) == (known.file_size, known.modified_ns)
             known = dataclasses.replace(known, modified_ns=now.st_mtime_ns) if same else None
-        return _ingested(dataclasses.replace(task, path=str(copy), known=known))
+        found = _ingested(dataclasses.replace(task, path=str(copy), known=known))
+        return dataclasses.replace(found, path=shown(task.path))
     except InputError as fault:
         raise fault.of(shown(task.path), str(copy)) from None
     finally:

@@ -24,6 +24,8 @@ _LOCK = "lock"
 _SCRATCH = "scratch"
 _MARK = "work.json"
 _FORMAT = 1
+_OF_A_RUN = ("dask", "fetched")
+"""Folders of scratch that a process leaves behind only where it was killed."""
 
 
 @contextlib.contextmanager
@@ -67,7 +69,8 @@ def held_work(folder: str) -> Iterator[Scratch]:
         os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()} since {now}".encode(), 0)
         scratch = Scratch(str(root / _SCRATCH), attempt=uuid4().hex)
         scratch.create()
-        shutil.rmtree(Path(scratch.root, "dask"), ignore_errors=True)  # left by a process that was killed
+        for left in _OF_A_RUN:
+            shutil.rmtree(Path(scratch.root, left), ignore_errors=True)
         yield scratch
     finally:
         os.close(handle)
