@@ -100,7 +100,7 @@ def shown(location: str) -> str:
     >>> shown("tiles/a.laz"), shown("s3://bucket/a.laz"), shown("https://me:pw@host/a.laz")
     ('tiles/a.laz', 's3://bucket/a.laz', 'https://host/a.laz')
     >>> shown("https://host/get?file=a.laz")
-    'https://host/get?query-d3f60cba'
+    'https://host/get?query-8e09d103'
     """
     if not is_url(location):
         return location

@@ -17,7 +17,7 @@ from pipeline.io.storage import Puts
 from pipeline.model import Status
 from pipeline.runtime.bundle import SUFFIX
 from pipeline.runtime.join import RejectedSite
-from pipeline.runtime.kept import Place
+from pipeline.runtime.kept import Place, told_of
 from pipeline.runtime.modelling import StoredResult, stored_results
 from pipeline.runtime.scratch import Scratch
 from pipeline.tiling import MM, Tile
@@ -39,6 +39,8 @@ class PublishTask:
     """Objects of this tile that are no buildings."""
     context: RecordContext
     meshes: str
+    again: bool = False
+    """Whether the tile was published there before: what it no longer has is removed."""
     empty_tables: bool = False
     """Whether to write tables without rows, where nothing at all was found: every run has tables."""
 
@@ -52,6 +54,8 @@ class Published:
     """How many it has; their digests are in its state."""
     error: str = ""
     """Why the tile failed; empty where it did not."""
+    warning: str = ""
+    """What went wrong beside it."""
 
 
 def rejected_object(site: RejectedSite) -> RejectedObject:
@@ -95,7 +99,10 @@ def publish(task: PublishTask) -> Published:
         raise
     except Exception as fault:  # noqa: BLE001 - told in the tile's state, the manifest and the exit code
         error = f"{type(fault).__name__}: {fault}"
-    before = files_of(storage, task.tile)
+    before = files_of(storage, task.tile) if task.again else set()
+    task.scratch.check_cancelled()
+    bundles, lost = _put_bundles(task, storage)
+    files |= bundles
     state = {
         "tile": task.tile.key,
         "state": "failed" if error else "done",
@@ -110,7 +117,7 @@ def publish(task: PublishTask) -> Published:
         return Published(tile=task.tile, n_files=0, error=error or f"its state: {fault}")
     for name in sorted(before - files.keys()):
         storage.delete(name)
-    return Published(tile=task.tile, n_files=len(files), error=error)
+    return Published(tile=task.tile, n_files=len(files), error=error, warning=lost)
 
 
 def _tables_last(puts: Puts) -> Put:
@@ -142,13 +149,6 @@ def _write(task: PublishTask, put: Put) -> dict[str, str]:
     stored: list[StoredResult] = []
     for place in task.batches:
         stored.extend(stored_results(task.scratch, place))
-    bundles: dict[str, str] = {}
-    for entry in stored:
-        bundle = Path(task.scratch.root, QUARANTINE, f"{entry.result.building_id}{SUFFIX}")
-        if entry.result.status is Status.FAILED and bundle.is_file():
-            content = bundle.read_bytes()
-            put(f"{QUARANTINE}/{bundle.name}", content)
-            bundles[f"{QUARANTINE}/{bundle.name}"] = hashlib.sha256(content).hexdigest()
     context = dataclasses.replace(task.context, facts={entry.result.building_id: entry.facts for entry in stored})
     files = write_tile(
         task.run_dir,
@@ -159,4 +159,26 @@ def _write(task: PublishTask, put: Put) -> dict[str, str]:
         meshes=task.meshes,
         put=put,
     )
-    return {**files.digests, **bundles}
+    return dict(files.digests)
+
+
+def _put_bundles(task: PublishTask, storage: Storage) -> tuple[dict[str, str], str]:
+    """Put the bundles of buildings that cost their process; the sha256 of each by its path, and what went wrong.
+
+    A bundle is for whoever looks for the cause: that one is missing does not cost the tile.
+    """
+    bundles: dict[str, str] = {}
+    lost = ""
+    for place in task.batches:
+        for model in told_of(task.scratch, place):
+            bundle = Path(task.scratch.root, QUARANTINE, f"{model.building_id}{SUFFIX}")
+            if model.status != Status.FAILED.value or not bundle.is_file():
+                continue
+            content = bundle.read_bytes()
+            try:
+                storage.put(f"{QUARANTINE}/{bundle.name}", content)
+            except (RunError, OSError) as fault:
+                lost = f"there is no bundle of {model.building_id}: {fault}"
+                continue
+            bundles[f"{QUARANTINE}/{bundle.name}"] = hashlib.sha256(content).hexdigest()
+    return bundles, lost

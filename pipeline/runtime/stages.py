@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from operator import itemgetter
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 from uuid import uuid4
 
@@ -525,6 +525,9 @@ class Stages:
         owners = sorted({*models.places, *rejected, *splits.places})
         context = self.record_context(reference)
         stage = publishing(run_dir)
+        storage = storage_at(run_dir)
+        # a folder of scratch that ends with its run begins with an empty run directory, which need not be listed
+        there = {PurePosixPath(name).stem for name in storage.keys("state")} if self.scratch.attempt else set()
         tasks = {}
         for tile in owners:
             task = PublishTask(
@@ -535,13 +538,12 @@ class Stages:
                 rejected=tuple(rejected.get(tile, ())),
                 context=context,
                 meshes=self.meshes,
+                again=tile.key in there,
                 empty_tables=not models.places and not rejected and tile == owners[0],
             )
             key = key_of(run_dir, task.batches, task.rejected, _told_context(context), task.meshes, task.empty_tables)
             tasks[Place(stage, tile.key, key)] = task
         # what somebody removed from the run directory is published again
-        storage = storage_at(run_dir)
-        there = {Path(name).stem for name in storage.keys("state")}
         drop_stale(self.scratch, stage, [place for place in tasks if place.unit in there])
         published = self.progress.kept(
             self.executor, "publish", publish, tasks, self.scratch, whole, failures=lambda told: int(bool(told.error))
@@ -549,6 +551,8 @@ class Stages:
         for tile_key in sorted(there - {tile.key for tile in owners}):
             retire(storage, Tile.from_key(tile_key))
         for place, outcome in published.items():
+            if outcome.warning:
+                self.progress.warn("publish", outcome.warning)
             if outcome.error:
                 self.progress.warn("publish", f"tile {outcome.tile.key} failed: {outcome.error}")
                 Path(self.scratch.root, place.name).unlink(missing_ok=True)  # to be tried again by whoever goes on

@@ -197,8 +197,8 @@ def test_a_command_logs_its_events_as_json_lines_where_the_environment_asks(
 # --- the page about the workers' time --------------------------------------------------------------------------------
 
 
-def took(seconds: float, started_s: float, process: str = "host:1") -> Measured[int]:
-    return Measured(result=0, seconds=seconds, process=process, peak_bytes=2**28, started_s=started_s)
+def took(seconds: float, began_s: float, process: str = "host:1") -> Measured[int]:
+    return Measured(result=0, seconds=seconds, cpu_s=seconds, process=process, peak_bytes=2**28, began_s=began_s)
 
 
 def test_the_page_tells_stages_processes_and_the_longest_tasks(tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ def test_a_run_on_workers_leaves_the_page_and_its_tallies(tmp_path: Path) -> Non
     before = TALLIES.sent["double"]
     with Cluster(workers=1) as cluster, cluster.executor(performance_report=str(path)) as executor:
         measured = list(executor.map("double", chores.double, range(20), Watch()))
-    assert all(one.started_s > 1e9 for one in measured)
+    assert all(one.began_s > 1e9 for one in measured)
     assert TALLIES.sent["double"] - before == 20
     assert TALLIES.in_flight["double"] == 0
     assert "<td>double</td><td>20</td>" in path.read_text()
