@@ -6,7 +6,7 @@ makes a city in tiles (`city_tiles.py`), runs it with a work folder, and then ag
 undone before the next:
 
 - touched: a file is written again with the same points;
-- one building: the points of one place of 12 m in the middle of a tile lie 1 m higher;
+- one building: what is high within 6 m around a high point near the middle of a file lies 1 m higher;
 - flown again: all points of a tile have other noise (1 cm), as after a new flight.
 
 A change is right when the digest afterwards is that of a run that knows nothing of any other; `--check` makes one.
@@ -65,11 +65,12 @@ HEADER = ("change", "files read", "tiles split", "tiles published", "buildings m
 
 
 def one_building(las: laspy.LasData) -> None:
-    """A place of 12 m in the middle of the tile lies 1 m higher."""
-    x, y = np.array(las.x), np.array(las.y)
-    near = np.hypot(x - 0.5 * (x.min() + x.max()), y - 0.5 * (y.min() + y.max())) < 6.0
-    z = np.array(las.z)
-    z[near & (z > np.median(z) + 2.5)] += 1.0
+    """What is high around the high point nearest to the middle of the tile lies 1 m higher."""
+    x, y, z = np.array(las.x), np.array(las.y), np.array(las.z)
+    from_middle = np.hypot(x - 0.5 * (x.min() + x.max()), y - 0.5 * (y.min() + y.max()))
+    high = z > np.median(z) + 4.0
+    place = np.flatnonzero(high)[from_middle[high].argmin()]
+    z[high & (np.hypot(x - x[place], y - y[place]) < 6.0)] += 1.0
     las.z = z
 
 
@@ -103,7 +104,7 @@ def measured(what: str, tiles: Path, folder: Path, workers: int, *, fresh: bool 
     request = RunRequest(
         inputs=(str(tiles),),
         out=str(out),
-        settings=RunSettings.from_mapping({"classes": "ignore", "tile_size_m": 200.0}),
+        settings=RunSettings.from_mapping({"classes": "ignore"}),
         workers=workers,
         overwrite=fresh,
         work=None if fresh else str(folder / "work"),
@@ -116,7 +117,7 @@ def measured(what: str, tiles: Path, folder: Path, workers: int, *, fresh: bool 
         what=what,
         done={name: done[name] for name in STAGES},
         total={name: total[name] for name in STAGES},
-        modelled=counts["candidates"] - counts["reused"] if done["reconstruct"] else 0,
+        modelled=counts["candidates"] - counts["reused"],
         buildings=counts["candidates"],
         seconds=time.perf_counter() - began,
         digest=summary.digest,

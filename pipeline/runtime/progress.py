@@ -108,6 +108,7 @@ class Progress:
         weight: Callable[[Told], int] = lambda _: 1,
         total: int | None = None,
         failures: Callable[[Told], int] = lambda _: 0,
+        landed_here: Callable[[Told], None] = lambda _: None,
         *,
         quiet: bool = False,
     ) -> dict[Place, Told]:
@@ -129,6 +130,8 @@ class Progress:
             Progress of all; the number of tasks by default.
         failures : callable
             How much of a task's progress failed, by what it tells.
+        landed_here : callable
+            Gets what those tasks tell that ran now.
         quiet : bool
             Part of another stage: no event and no timing of its own.
         """
@@ -158,6 +161,7 @@ class Progress:
             for measured in running:
                 landed = measured.result
                 found[landed.place] = landed.told
+                landed_here(landed.told)
                 self.peaks[measured.process] = max(self.peaks.get(measured.process, 0), measured.peak_bytes)
                 done += weight(landed.told)
                 lost += failures(landed.told)

@@ -635,24 +635,23 @@ class _Counted:
     reasons: Counter[str]
     roof_types: Counter[str]
     faces: int
-    reused: int
+    made: int
     seconds: dict[str, float]
 
     @classmethod
     def of(cls, models: Models) -> _Counted:
         statuses, reasons, roof_types = Counter[str](), Counter[str](), Counter[str]()
         seconds: dict[str, float] = {}
-        faces = reused = 0
+        faces = 0
         for model in models.each():
             statuses[model.status] += 1
             if model.reason is not None:
                 reasons[model.reason] += 1
             roof_types[model.roof_type] += 1
             faces += model.faces
-            reused += model.reused
             seconds[model.building_id] = model.seconds
         return cls(
-            statuses=statuses, reasons=reasons, roof_types=roof_types, faces=faces, reused=reused, seconds=seconds
+            statuses=statuses, reasons=reasons, roof_types=roof_types, faces=faces, made=models.made, seconds=seconds
         )
 
 
@@ -676,7 +675,7 @@ def _counts(
         "fallback": by_status["fallback"],
         "failed": by_status["failed"],
         "rejected": len(joined.rejected),
-        "reused": found.reused,
+        "reused": sum(by_status.values()) - found.made,
         "small_surfaces": joined.small_fragments,
         "roof_faces": found.faces,
         "class_6_in_candidates": sum(s.audit[0] for s in splits.told),

@@ -183,6 +183,8 @@ class Models:
     """Where the outcomes are kept, by owner tile."""
     scratch: Scratch
     """Where that is."""
+    made: int
+    """How many were modelled now; the others were taken from before, since nothing that they are made from changed."""
 
     def each(self) -> Iterator[Modelled]:
         """What is told of each, tile after tile; nothing is held."""
@@ -481,6 +483,12 @@ class Stages:
                     compared=self.compared,
                 )
         largest_first = sorted(tasks.items(), key=lambda item: -sum(site.points for site in item[1].sites))
+        made = 0
+
+        def count(models: Sequence[Modelled]) -> None:
+            nonlocal made
+            made += sum(not model.reused for model in models)
+
         self.progress.kept(
             self.executor,
             "reconstruct",
@@ -491,10 +499,11 @@ class Stages:
             weight=len,
             total=len(joined.candidates),
             failures=_failed_of,
+            landed_here=count,
         )
         # only now: batches of before are what models are taken from where their input did not change
         drop_stale(self.scratch, stage, tasks)
-        return Models(places=places, scratch=self.scratch)
+        return Models(places=places, scratch=self.scratch, made=made)
 
     def record_context(self, reference: SpatialReference) -> RecordContext:
         """Facts of the run for its records."""

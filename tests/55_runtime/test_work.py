@@ -141,6 +141,7 @@ def test_a_run_after_a_finished_one_does_nothing_again(place: Place) -> None:
     again = place.run()
     assert not place.tasks
     assert again.digest == first.digest
+    assert again.counts["reused"] == again.counts["candidates"]
     assert {**again.counts, "reused": 0} == first.counts
     assert files_of(place.folder / "run") == before
 
@@ -186,6 +187,7 @@ def test_models_of_input_that_did_not_change_are_taken_again(place: Place) -> No
     assert place.tasks["reconstruct"] > 0
     remade = again.counts["candidates"] - again.counts["reused"]
     assert 0 < remade < again.counts["candidates"] / 2
+    assert place.run().counts["reused"] == again.counts["candidates"]
 
 
 def test_a_file_that_is_gone_and_one_that_is_new(place: Place) -> None:

@@ -200,11 +200,10 @@ FAULTS = (
     Fault("SIGTERM", terminate, INTERRUPTED, "interrupted", stages=("split", "reconstruct")),
     Fault("worker's process killed", kill_worker, 0, "finished"),
     Fault("scheduler killed", kill_scheduler, REFUSED, "failed", external=True),
-    Fault("disk full", fill_disk, REFUSED, "failed", stages=("ingest", "split", "reconstruct")),
-    Fault("disk full", fill_disk, 1, "incomplete", stages=("publish",)),
+    Fault("disk full", fill_disk, REFUSED, "failed"),
     Fault("a second driver", second_driver, 0, "finished", stages=("reconstruct",)),
 )
-ENDINGS = {0: "done", 1: "tiles failed", REFUSED: "error", INTERRUPTED: "interrupted", KILLED: "killed"}
+ENDINGS = {0: "done", REFUSED: "error", INTERRUPTED: "interrupted", KILLED: "killed"}
 
 
 def strike(run: BatchRun, fault: Fault, stage: str, undisturbed: str) -> Row:
