@@ -12,6 +12,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from faults import asked
 from processes import Program, Programs, lives, program, wait_for
 
 from service.files import StateFolder
@@ -168,14 +169,18 @@ def test_a_driver_ends_when_its_parent_is_gone(site: Site, tmp_path: Path) -> No
     )
     ours, theirs = os.pipe()
     command = [sys.executable, str(script), str(ours)]
+    gate = tmp_path / "gate"
+    gate.mkdir()
+    held = asked.environment(pause={"split": str(gate)})
     child = subprocess.Popen(
-        command, env={**os.environ, **site.environment, "GABLEWORK_LEASE_S": "600"}, pass_fds=[ours]
+        command, env={**os.environ, **site.environment, **held, "GABLEWORK_LEASE_S": "600"}, pass_fds=[ours]
     )
     try:
         os.close(ours)
-        wait_for(lambda: site.store.get(job.job_id).stage == "split" or child.poll() is not None, "a run", DEADLINE_S)
+        wait_for(lambda: any(gate.glob("reached-*")) or child.poll() is not None, "a run", DEADLINE_S)
         grandchildren = psutil.Process(child.pid).children(recursive=True)
         os.close(theirs)
+        (gate / "go").touch()
         assert child.wait(DEADLINE_S) == 0
     finally:
         child.kill()
