@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 from alembic import command
-from store_contract import claim, request, submit, upload
+from store_contract import DatabaseContract, claim, request, submit, upload
 
 from pipeline.errors import SettingsError
 from pipeline.schedule import Cron, Missed, Overlap, passed_slots, time_zone
@@ -77,18 +76,8 @@ def end(store: JobStore, job: Job) -> None:
     assert store.get(job.job_id).status is JobStatus.DISMISSED
 
 
-class ScheduleContract:
-    """Each database brings its `url`."""
-
-    @pytest.fixture
-    def url(self) -> str:
-        raise NotImplementedError
-
-    @pytest.fixture
-    def store(self, url: str) -> Iterator[JobStore]:
-        with JobStore(url) as store:
-            store.migrate()
-            yield store
+class ScheduleContract(DatabaseContract):
+    """What a store of schedules does, whatever the database."""
 
     # --- the tables
 

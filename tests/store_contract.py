@@ -90,7 +90,7 @@ def statuses(store: JobStore, job: Job) -> list[JobStatus | None]:
     return [event.status for event in store.events(job.job_id) if event.kind == "status"]
 
 
-class StoreContract:
+class DatabaseContract:
     """Each database brings its `url`."""
 
     @pytest.fixture
@@ -102,6 +102,10 @@ class StoreContract:
         with JobStore(url) as store:
             store.migrate()
             yield store
+
+
+class StoreContract(DatabaseContract):
+    """What a store of jobs does, whatever the database."""
 
     # --- the tables
 

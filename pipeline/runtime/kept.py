@@ -126,6 +126,8 @@ class Keeping(Generic[Task, Result, Told]):
     """Of the run."""
     told: Callable[[Result], Told]
     """What of the result travels to the driver: little."""
+    stage: str
+    """What people call the stage."""
 
     @property
     def memory_bytes(self) -> int:
@@ -166,7 +168,7 @@ def keep(work: Keeping[Task, Result, Told]) -> Kept[Told]:
         where = error.filename or work.scratch.root
         why = error.strerror or f"a file could not be written whole ({error})"
         raise RunError(
-            f"{where}: {why}, in stage {work.place.stage}. Free space or mend the storage, then run again"
+            f"{where}: {why}, in stage {work.stage}. Free space or mend the storage, then run again"
         ) from error
     return Kept(place=work.place, told=told)
 
@@ -221,10 +223,6 @@ class Keeper:
     def keys(self, stage: str, unit: str) -> set[str]:
         """Keys of the outcomes that are kept of a unit."""
         return {entry.name for entry in _entries(self._scratch, f"{FOLDER}/{stage}/{unit}") if entry.name[0] != "."}
-
-    def has(self, place: Place) -> bool:
-        """Whether an outcome is kept."""
-        return self._scratch.has(place.name)
 
     def drop_others(self, stage: str, unit: str, wanted: Iterable[str]) -> None:
         """Remove the outcomes of a unit but those of some keys."""

@@ -152,7 +152,7 @@ class Progress:
             message = f"{len(found)} of {len(tasks)} tasks were done before"
             self.tell("progress", name, message, done=done, total=all_parts, kept=kept, failed=lost)
         todo = [
-            Keeping(function=function, task=task, place=place, scratch=scratch, told=told)
+            Keeping(function=function, task=task, place=place, scratch=scratch, told=told, stage=name)
             for place, task in tasks.items()
             if place not in found
         ]

@@ -138,7 +138,9 @@ def no_space(task: int) -> int:
 def keeping(folder: Path, function: Callable[[int], int] = double, key: str = "k") -> Keeping[int, int, int]:
     scratch = Scratch(str(folder))
     scratch.create()
-    return Keeping(function=function, task=21, place=Place("stage", "unit", key), scratch=scratch, told=whole)
+    return Keeping(
+        function=function, task=21, place=Place("stage", "unit", key), scratch=scratch, told=whole, stage="split"
+    )
 
 
 def test_an_outcome_is_kept_with_what_it_tells(tmp_path: Path) -> None:
@@ -146,17 +148,17 @@ def test_an_outcome_is_kept_with_what_it_tells(tmp_path: Path) -> None:
     assert keep(work).told == "42"
     assert (told_of(work.scratch, work.place), result_of(work.scratch, work.place)) == ("42", 42)
     keeper = Keeper(work.scratch)
-    assert (keeper.units("stage"), keeper.keys("stage", "unit"), keeper.has(work.place)) == (["unit"], {"k"}, True)
+    assert (keeper.units("stage"), keeper.keys("stage", "unit")) == (["unit"], {"k"})
     keeper.drop_others("stage", "unit", ["k"])
-    assert keeper.has(work.place)
+    assert keeper.keys("stage", "unit") == {"k"}
     keeper.drop_others("stage", "unit", [])
-    assert not keeper.has(work.place)
+    assert not keeper.keys("stage", "unit")
     with pytest.raises(RunCancelledError, match="is gone"):
         result_of(work.scratch, work.place)
 
 
 def test_a_full_disk_names_stage_place_and_fix(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"/full: No space left on device, in stage stage\. Free space"):
+    with pytest.raises(RunError, match=r"/full: No space left on device, in stage split\. Free space"):
         keep(keeping(tmp_path, no_space))
     assert not list(tmp_path.rglob("k*"))
 
