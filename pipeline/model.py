@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any
 
@@ -47,6 +48,32 @@ class Reason(StrEnum):
     VEGETATION = "vegetation"
     TOO_NARROW = "too_narrow"
     OVERRIDDEN = "overridden"
+
+
+REASONS: Mapping[Reason, str] = {
+    Reason.TOO_FEW_POINTS: "fewer points than a plane needs; or fewer than `minimum_points`, of which the model "
+    "explains less than three quarters",
+    Reason.NO_PLANE: "no plane passed the refinement",
+    Reason.NO_PARTITION: "the planes could not be turned into roof faces",
+    Reason.INVALID_SOLID: "the solid broke a validity rule; `validity_codes` tells which",
+    Reason.TOO_COMPLEX: "the counted work passed its bound",
+    Reason.NO_FOOTPRINT: "no outline could be made from the points",
+    Reason.INTERNAL_ERROR: "a fault of gablework in this one building; the detail names the exception; kept as a "
+    "bundle",
+    Reason.CRASHED: "its process died at it, twice, the second time alone; the detail tells the signal or the exit "
+    "code; kept as a bundle",
+    Reason.TIMED_OUT: "it took longer than the limit that protects the run (`--building-timeout`); kept as a bundle",
+    Reason.OUT_OF_MEMORY: "it took more memory than its process may have (`--building-memory`), or the machine had no "
+    "more; kept as a bundle",
+    Reason.TOO_SMALL: "plan area below the smallest building",
+    Reason.TOO_LOW: "height above ground below the lowest building",
+    Reason.BELOW_Z_AVG: "the surface lies below the Z_avg of the walls around it: a street, a yard",
+    Reason.NO_WALLS: "too little of its outline is wall: a mound, a bank",
+    Reason.VEGETATION: "rough, many returns, ground seen beneath",
+    Reason.TOO_NARROW: "narrower than a building: a wall, a hedge, a wire",
+    Reason.OVERRIDDEN: "the user's overrides say that it is no building; the detail is their note",
+}
+"""What the reasons mean, in words of the records' reference."""
 
 
 class RoofType(StrEnum):

@@ -30,6 +30,7 @@ from pipeline.parameters import Parameters, build, parameter
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.run import RunRequest
 from pipeline.runtime.tls import given_tls
+from pipeline.schedule import Cron, Missed, Overlap
 from pipeline.settings import RunSettings
 
 
@@ -52,6 +53,7 @@ class OutputTable(Parameters):
     path: str = parameter("", "The run directory.")
     meshes: str = parameter("building", "One OBJ a building, one OBJ a tile, one GLB a tile, or none.", choices=MESHES)
     overwrite: bool = parameter(False, "Replace a run that is already there and is not of this batch.")
+    report: bool = parameter(True, "Write run.html, the page about the run, when it is over.")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -99,11 +101,38 @@ class ClusterTable(Parameters):
     )
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ScheduleTable(Parameters):
+    """`[schedule]`: when it is done, by `gablework batch schedule`."""
+
+    cron: str = parameter("", "Minute, hour, day, month, day of the week, such as 30 2 * * *; empty has no times.")
+    time_zone: str = parameter("UTC", "The zone of these times, such as Europe/Amsterdam.")
+    missed: str = parameter(
+        Missed.RUN_LATEST.value,
+        "Of times that nobody saw, the latest is run once, or none is.",
+        choices=tuple(one.value for one in Missed),
+    )
+    overlap: str = parameter(
+        Overlap.SKIP.value,
+        "A time that comes while a run is under way is skipped, or run when that is over.",
+        choices=tuple(one.value for one in Overlap),
+    )
+    grace_s: float = parameter(
+        300.0,
+        "How late a time may be seen and still count as seen in time.",
+        unit="s",
+        minimum=1.0,
+        maximum=86_400.0,
+    )
+    paused: bool = parameter(False, "Leave the clock alone.")
+
+
 TABLES: Mapping[str, type[Parameters]] = {
     "inputs": InputsTable,
     "output": OutputTable,
     "work": WorkTable,
     "cluster": ClusterTable,
+    "schedule": ScheduleTable,
 }
 """Tables of a batch file beside `[settings]`."""
 
@@ -126,6 +155,8 @@ class Batch:
     """What is remembered."""
     cluster: ClusterTable
     """Who does it."""
+    schedule: ScheduleTable
+    """When it is done."""
     settings: RunSettings
     """All settings."""
 
@@ -207,6 +238,7 @@ def read_batch(path: str | Path) -> Batch:
     output = built["output"]
     if output is not None and not output.path:
         faults.append('[output] path is missing: give the run directory, such as path = "models"')
+    faults.extend(_times_faults(built["schedule"]))
     settings = RunSettings()
     try:
         settings = RunSettings.from_mapping(tables["settings"])
@@ -216,6 +248,16 @@ def read_batch(path: str | Path) -> Batch:
         raise SettingsError(faults)
     batch = Batch(path=file, paths=(), bbox=bbox, settings=settings, **built)
     return dataclasses.replace(batch, paths=tuple(batch.whole(name) for name in paths))
+
+
+def _times_faults(table: ScheduleTable | None) -> list[str]:
+    if table is None or not table.cron:
+        return []
+    try:
+        Cron(table.cron, table.time_zone)
+    except SettingsError as error:
+        return [f"[schedule] {fault}" for fault in error.faults]
+    return []
 
 
 def _paths(value: Any, faults: list[str]) -> tuple[str, ...]:

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from pipeline.batch.batch_file import Batch
 from pipeline.batch.estimates import estimate, refuse
 from pipeline.batch.status import StatusWriter
-from pipeline.errors import RunCancelledError
+from pipeline.errors import GableworkError, RunCancelledError
+from pipeline.report.run_page import write_run_page
 from pipeline.runtime.events import Event, Listener, ignore, never
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.run import RunSummary, run
@@ -82,4 +83,16 @@ def _told(
         status.end("failed", f"{type(error).__name__}: {error}".removesuffix(": "))
         raise
     status.end("incomplete" if summary.failed_tiles else "finished", f"digest {summary.digest}")
+    if batch.output.report:
+        _write_report(summary, on_event)
     return summary
+
+
+def _write_report(summary: RunSummary, on_event: Listener) -> None:
+    """Write the page about a run; a run that is whole does not fail for it."""
+    on_event(Event(kind="stage", stage="report"))
+    try:
+        write_run_page(summary.run_dir)
+    except (GableworkError, OSError) as error:
+        message = f"the run is whole, its report could not be written: {error}. Write it by gablework report"
+        on_event(Event(kind="warning", stage="report", message=message))

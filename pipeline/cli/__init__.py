@@ -4,7 +4,7 @@ from pipeline.cli.app import app
 from pipeline.cli.batch import batch
 from pipeline.cli.classifying import classify
 from pipeline.cli.cluster import worker
-from pipeline.cli.measuring import digest, evaluate, inspect
+from pipeline.cli.measuring import digest, evaluate, inspect, report
 from pipeline.cli.modelling import compare, reconstruct, replay, rerun
 from pipeline.cli.options import AsJson
 from pipeline.cli.simulating import demo, simulate, warm_up
@@ -13,7 +13,7 @@ __all__ = ["AsJson", "app"]
 
 # as `gablework --help` lists them
 _COMMANDS = (
-    *(reconstruct, rerun, compare, classify, inspect, evaluate, digest, replay),
+    *(reconstruct, rerun, compare, classify, inspect, evaluate, report, digest, replay),
     *(simulate, demo, warm_up, worker),
 )
 for _command in _COMMANDS:

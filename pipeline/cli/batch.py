@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from pipeline.cli.batching import plan, run, status
+from pipeline.cli.batching import plan, run, schedule, status
 from pipeline.cli.differing import diff
 
 batch = typer.Typer(
@@ -12,5 +12,5 @@ batch = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
 )
-for _command in (plan, run, status, diff):
+for _command in (plan, run, status, schedule, diff):
     batch.command()(_command)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime as dt
 import signal
+import threading
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,10 +16,12 @@ from pipeline.cli.options import AsJson, Quiet
 from pipeline.console import Console, ExitCode
 
 if TYPE_CHECKING:
+    from pipeline.batch.batch_file import Batch
     from pipeline.batch.estimates import Estimate
     from pipeline.batch.status import Status
 
 BatchFile = Annotated[str, typer.Argument(metavar="FILE", help="The batch file, TOML; docs/how_to/batch.md.")]
+_NEXT = 3
 
 
 def plan(
@@ -32,7 +36,7 @@ def plan(
 
         batch = read_batch(file)
         found = estimate(batch, read)
-        console.table(f"The plan of {file}", ("figure", "value"), _rows(found))
+        console.table(f"The plan of {file}", ("figure", "value"), [*_rows(found), *_times(batch)])
         for warning in found.warnings:
             console.warn(warning)
         console.document(dataclasses.asdict(found))
@@ -60,11 +64,48 @@ def status(file: BatchFile, as_json: AsJson = False) -> None:
         from pipeline.batch.batch_file import read_batch
         from pipeline.batch.status import read_status
 
-        found = read_status(read_batch(file).work_folder)
-        console.table(f"The run of {file}", ("figure", "value"), _told(found))
+        batch = read_batch(file)
+        found = read_status(batch.work_folder)
+        console.table(f"The run of {file}", ("figure", "value"), [*_told(found), *_times(batch)])
         for warning in found.warnings:
             console.warn(warning)
         console.document(dataclasses.asdict(found))
+
+
+def schedule(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """Run a batch at the times of its table [schedule], until this command is ended; a missed time is told."""
+    with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.batch.scheduled import keep_schedule
+
+        ending = threading.Event()
+
+        def end(number: int, frame: object) -> None:
+            del number, frame
+            ending.set()
+
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, end)
+        keep_schedule(file, ending, console.on_event)
+
+
+def _times(batch: Batch) -> list[tuple[str, str]]:
+    """The next times, and what became of the last one."""
+    from pipeline.batch.scheduled import read_schedule
+    from pipeline.schedule import Cron
+
+    if not batch.schedule.cron:
+        return []
+    told = "paused"
+    if not batch.schedule.paused:
+        cron = Cron(batch.schedule.cron, batch.schedule.time_zone)
+        told = ", ".join(f"{at:%Y-%m-%d %H:%M %Z}" for at in cron.next_times(dt.datetime.now(tz=dt.UTC), _NEXT))
+    rows = [("next times", told)]
+    state = read_schedule(batch.work_folder)
+    if state is not None and state.entries:
+        last = state.entries[-1]
+        rows.append(("last time", f"{last.slot}: {last.outcome.value}{last.message and ', '}{last.message}"))
+        rows.append(("times so far", ", ".join(f"{count} {name}" for name, count in state.counts.items())))
+    return rows
 
 
 def _rows(found: Estimate) -> list[tuple[str, str]]:

@@ -45,7 +45,7 @@ def diff(
         from pipeline.epochs.diff import DiffRequest
         from pipeline.epochs.diff import diff as compare_runs
         from pipeline.epochs.settings import read_settings
-        from pipeline.report.epochs_map import MapRows
+        from pipeline.report.epochs_map import epochs_map, gathering
         from pipeline.report.epochs_page import write_page
         from pipeline.runtime.events import Event
 
@@ -62,16 +62,16 @@ def diff(
         def on_part(done: int, total: int) -> None:
             console.on_event(Event(kind="progress", stage="compare", done=done, total=total))
 
-        rows = MapRows()
+        drawn = epochs_map()
         found = compare_runs(
             DiffRequest(old=old, new=new, out=out, settings=chosen, geojson=geojson),
             on_part,
-            take_in=(rows.add,) if page else (),
+            take_in=(gathering(drawn),) if page else (),
         )
         written = [*found.written]
         if page:
             console.on_event(Event(kind="stage", stage="page"))
-            written.append(write_page(found, rows))
+            written.append(write_page(found, drawn))
         _show(console, found)
         for path in written:
             console.say(f"written: {path}")

@@ -60,6 +60,19 @@ def digest(
         console.document({"run": run, "content_sha256": content})
 
 
+def report(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="A run directory, a folder or a URL.")],
+    as_json: AsJson = False,
+) -> None:
+    """Write the page about a finished run, RUN/run.html: map, failures by reason, slowest buildings, time, memory."""
+    with Console(as_json=as_json) as console:
+        from pipeline.report.run_page import write_run_page
+
+        written = write_run_page(run)
+        console.say(f"the report is {written}")
+        console.document({"run": run, "written": written})
+
+
 def evaluate(
     models: Annotated[
         str, typer.Argument(metavar="MODELS", help="A run directory; CityJSON, CityJSONSeq or OBJ of any program.")

@@ -17,7 +17,8 @@ from pipeline.epochs.summary import HEIGHT_EDGES_M, LARGEST
 from pipeline.epochs.writing import PARQUET
 from pipeline.evaluation.chapters import NOTHING as _NOTHING
 from pipeline.io.storage import LocalStorage
-from pipeline.report.epochs_map import COLOURS, MOST_CHANGED, MapRows
+from pipeline.report.class_map import MOST_DRAWN, ClassMap
+from pipeline.report.epochs_map import COLOURS
 from pipeline.report.epochs_pictures import HEIGHT_PX, NEW_LINE, OLD_LINE, WIDTH_PX, Case, cases
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
@@ -40,14 +41,14 @@ _CELLS: tuple[tuple[str, str, int, bool], ...] = (
 """Columns of the table: header, column, decimals, whether the sign is told."""
 
 
-def write_page(diff: Diff, rows: MapRows) -> Path:
+def write_page(diff: Diff, rows: ClassMap) -> Path:
     """Write `changes.html`; images and styles are in it.
 
     Parameters
     ----------
     diff : Diff
         What was found.
-    rows : MapRows
+    rows : ClassMap
         What the map shows, gathered while the rows were written.
     """
     storage = LocalStorage(root=Path(diff.request.out))
@@ -55,7 +56,7 @@ def write_page(diff: Diff, rows: MapRows) -> Path:
     return storage.path(PAGE)
 
 
-def page(diff: Diff, rows: MapRows) -> str:
+def page(diff: Diff, rows: ClassMap) -> str:
     """The page as text."""
     told = diff.as_dict()
     drawn = rows.map(diff.new.reference.horizontal_unit_m)
@@ -71,7 +72,7 @@ def page(diff: Diff, rows: MapRows) -> str:
         level=told["level"],
         map=None if drawn is None else {"uri": data_uri(drawn.png), "it": drawn},
         left_out=rows.left_out,
-        most_changed=MOST_CHANGED,
+        most_drawn=MOST_DRAWN,
         chart=_chart(diff),
         reasons=[(INCOMPARABLE[Incomparable(name)], count) for name, count in told["reasons"].items()],
         doubts=[(DOUBTS[Doubt(name)], count) for name, count in told["doubts"].items()],

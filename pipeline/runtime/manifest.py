@@ -23,6 +23,10 @@ from pipeline.io import arrow_at
 
 NAME = "run.json"
 """File name of the manifest in the run directory."""
+PAGE = "run.html"
+"""File name of the page about the run, where one was written: it tells of the manifest beside it and no other."""
+SLOWEST = 50
+"""Buildings whose seconds the manifest keeps: those that took longest."""
 FORMAT = 1
 """Version of the run directory's layout; a reader refuses others."""
 
@@ -56,6 +60,16 @@ class InputFile:
     """Points that were read from it; None until then, and for files that are no point clouds."""
     bounds_m: tuple[float, float, float, float] | None = None
     """Smallest easting and northing, largest easting and northing of these points in metres; None without points."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SlowBuilding:
+    """A building that took long."""
+
+    building_id: str
+    """Its id."""
+    seconds: float
+    """Of the clock, to model it; of the run that modelled it, where it was taken from an earlier one."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -96,6 +110,8 @@ class RunManifest:
     """Wall-clock seconds by stage."""
     peak_memory_bytes: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Largest resident memory by process."""
+    slowest: tuple[SlowBuilding, ...] = ()
+    """Those that took longest, the slowest first."""
     warnings: tuple[str, ...] = ()
     """What was told while running."""
     content_sha256: str | None = None
@@ -143,6 +159,7 @@ class RunManifest:
                 if values.get(name) is not None:
                     values[name] = dt.datetime.fromisoformat(values[name])
             values["inputs"] = tuple(_input_file(entry) for entry in values.get("inputs", ()))
+            values["slowest"] = tuple(SlowBuilding(**entry) for entry in values.get("slowest", ()))
             for name in ("tiles", "failed_tiles", "warnings"):
                 values[name] = tuple(values.get(name, ()))
             return cls(**values)

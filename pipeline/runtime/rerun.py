@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime as dt
+import heapq
 import itertools
 import json
 import time
@@ -41,7 +42,7 @@ from pipeline.runtime.gather import gather
 from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import CandidateSite, Joined, RejectedSite
-from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
+from pipeline.runtime.manifest import PAGE, SLOWEST, RunManifest, RunStatus, SlowBuilding, write_manifest
 from pipeline.runtime.modelling import Modelled, StoredResult
 from pipeline.runtime.overrides import Override, read_overrides
 from pipeline.runtime.overriding import WARNING, EntryOutcome
@@ -403,6 +404,7 @@ def _written(
     # whoever reads now, or after a power cut, sees that the directory is being changed
     changing = dataclasses.replace(earlier.manifest, status=RunStatus.RUNNING, content_sha256=None)
     write_manifest(root, changing, storage.put)
+    storage.clear((PAGE,))
     try:
         for tile, update in prepared.items():
             for path in update.digests:
@@ -471,5 +473,13 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
         request={**earlier.manifest.request, "overrides": told_request(request)["overrides"]},
         inputs=tuple(inputs),
         counts=dict(counts),
+        slowest=_slowest(earlier, found, modelled),
         warnings=tuple(warnings),
     )
+
+
+def _slowest(earlier: Earlier, found: _Found, modelled: Sequence[Modelled]) -> tuple[SlowBuilding, ...]:
+    """Those that took longest, of the buildings that stayed and of those that were modelled again."""
+    stayed = [one for one in earlier.manifest.slowest if one.building_id not in found.changed]
+    again = [SlowBuilding(building_id=m.building_id, seconds=round(m.seconds, 3)) for m in modelled]
+    return tuple(heapq.nlargest(SLOWEST, (*stayed, *again), key=lambda one: (one.seconds, one.building_id)))

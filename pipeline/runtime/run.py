@@ -38,15 +38,24 @@ from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import Joined
 from pipeline.runtime.logs import about
-from pipeline.runtime.manifest import NAME, InputFile, RunManifest, RunStatus, read_manifest, write_manifest
+from pipeline.runtime.manifest import (
+    NAME,
+    PAGE,
+    InputFile,
+    RunManifest,
+    RunStatus,
+    read_manifest,
+    write_manifest,
+)
 from pipeline.runtime.overrides import read_overrides
 from pipeline.runtime.plan import Plan, check_memory, make_plan, without_far_files
 from pipeline.runtime.priorities import Traffic
 from pipeline.runtime.progress import Progress
 from pipeline.runtime.publish import QUARANTINE, Published
+from pipeline.runtime.run_counts import Counted, told_counts
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.scratch_folder import check_scratch, remove_folder, scratch_folder
-from pipeline.runtime.stages import MODELS, Models, Splits, Stages, given_footprints
+from pipeline.runtime.stages import MODELS, Models, Stages, given_footprints
 from pipeline.runtime.stale import tidy
 from pipeline.runtime.tls import TlsFiles
 from pipeline.runtime.work_folder import held_work
@@ -171,7 +180,7 @@ class VariantOutcome:
     summary: RunSummary
     """As of a run."""
     seconds: dict[str, float]
-    """Wall-clock seconds of each building, by its id."""
+    """Wall-clock seconds of each building, by its id; empty where there is but one variant."""
 
 
 def run(
@@ -311,8 +320,7 @@ def run_variants(
                 # whoever reads meanwhile sees that the directory is being changed
                 known = request.work is not None and _is_of_work(run_dir, request.work)
                 write_manifest(run_dir, manifest, storage_at(run_dir).put)
-                if not known:
-                    storage_at(run_dir).clear((*_RESULTS, FOOTPRINTS, OVERRIDES))
+                storage_at(run_dir).clear((PAGE,) if known else (*_RESULTS, FOOTPRINTS, OVERRIDES, PAGE))
                 if footprints is not None:
                     put_json(run_dir, FOOTPRINTS, footprints.report)
             for path in stale:
@@ -349,7 +357,7 @@ def run_variants(
                     own.publish(splits, joined, models, reference, run_dir)
                     for own, models, run_dir in zip(each, modelled, run_dirs, strict=True)
                 ]
-                found = [_Counted.of(models) for models in modelled]
+                found = [Counted.of(models, each_told=len(variants) > 1) for models in modelled]
             except BaseException as error:
                 scratch.cancel()
                 off = isinstance(error, RunCancelledError | KeyboardInterrupt)
@@ -375,7 +383,7 @@ def run_variants(
         own.peaks[driver] = peak_bytes
         tiles = [outcome.tile.key for outcome in published[k]]
         failed_tiles = [outcome.tile.key for outcome in published[k] if outcome.error]
-        counts = _counts(plan, ingested, splits, joined, found[k])
+        counts = told_counts(plan, ingested, splits, joined, found[k])
         write_manifest(
             run_dir,
             dataclasses.replace(
@@ -388,6 +396,7 @@ def run_variants(
                 counts=counts,
                 timings_s={name: round(seconds, 3) for name, seconds in own.timings.items()},
                 peak_memory_bytes=own.peaks,
+                slowest=found[k].slowest,
                 warnings=tuple(own.warnings),
                 content_sha256=digest,
             ),
@@ -624,61 +633,4 @@ def _crs_facts(reference: SpatialReference) -> dict[str, object]:
         "wkt": reference.wkt,
         "horizontal_unit_m": reference.horizontal_unit_m,
         "vertical_unit_m": reference.vertical_unit_m,
-    }
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Counted:
-    """What a run counts of its models."""
-
-    statuses: Counter[str]
-    reasons: Counter[str]
-    roof_types: Counter[str]
-    faces: int
-    made: int
-    seconds: dict[str, float]
-
-    @classmethod
-    def of(cls, models: Models) -> _Counted:
-        statuses, reasons, roof_types = Counter[str](), Counter[str](), Counter[str]()
-        seconds: dict[str, float] = {}
-        faces = 0
-        for model in models.each():
-            statuses[model.status] += 1
-            if model.reason is not None:
-                reasons[model.reason] += 1
-            roof_types[model.roof_type] += 1
-            faces += model.faces
-            seconds[model.building_id] = model.seconds
-        return cls(
-            statuses=statuses, reasons=reasons, roof_types=roof_types, faces=faces, made=models.made, seconds=seconds
-        )
-
-
-def _counts(
-    plan: Plan, ingested: Sequence[Ingested], splits: Splits, joined: Joined, found: _Counted
-) -> dict[str, int]:
-    """The counts of run.json."""
-    by_status = found.statuses
-    dropped: Counter[str] = Counter()
-    for entry in ingested:
-        dropped.update(entry.dropped)
-    return {
-        "points_promised": plan.points,
-        "points": sum(s.points for s in splits.told),
-        **{f"dropped_{cause}": count for cause, count in sorted(dropped.items())},
-        "duplicates": sum(s.duplicates for s in splits.told),
-        "outliers": sum(s.outliers for s in splits.told),
-        "tiles": len(splits.told),
-        "candidates": sum(by_status.values()),
-        "ok": by_status["ok"],
-        "fallback": by_status["fallback"],
-        "failed": by_status["failed"],
-        "rejected": len(joined.rejected),
-        "reused": sum(by_status.values()) - found.made,
-        "small_surfaces": joined.small_fragments,
-        "roof_faces": found.faces,
-        "class_6_in_candidates": sum(s.audit[0] for s in splits.told),
-        "other_classes_in_candidates": sum(s.audit[1] for s in splits.told),
-        "class_6_elsewhere": sum(s.audit[2] for s in splits.told),
     }

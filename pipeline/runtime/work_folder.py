@@ -23,6 +23,8 @@ from pipeline.runtime.scratch import Scratch
 _LOCK = "lock"
 _SCRATCH = "scratch"
 _MARK = "work.json"
+_BESIDE = {_LOCK, "status.json"}
+"""What a batch may have written before the folder was made."""
 _FORMAT = 1
 _OF_A_RUN = ("dask", "fetched")
 """Folders of scratch that a process leaves behind only where it was killed."""
@@ -48,17 +50,50 @@ def held_work(folder: str) -> Iterator[Scratch]:
         Another process works there, or the folder is none of ours, or cannot be written.
     """
     root = Path(folder).resolve()
+    make_work(root)
+    with held_lock(root, _LOCK):
+        scratch = Scratch(str(root / _SCRATCH), attempt=uuid4().hex)
+        scratch.create()
+        for left in _OF_A_RUN:
+            shutil.rmtree(Path(scratch.root, left), ignore_errors=True)
+        yield scratch
+
+
+def make_work(root: Path) -> None:
+    """Make a work folder where it is not there.
+
+    Raises
+    ------
+    RunError
+        The folder is none of ours, or cannot be written.
+    """
     try:
         root.mkdir(parents=True, exist_ok=True)
         _check_mark(root)
-        handle = os.open(root / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise RunError(f"{root} cannot be written: {error.strerror or error}. Give another work folder") from error
+
+
+@contextlib.contextmanager
+def held_lock(root: Path, name: str) -> Iterator[None]:
+    """Hold a file in a work folder until the block ends.
+
+    Raises
+    ------
+    RunError
+        Another process holds it, or the folder cannot be written or knows no locks.
+    """
+    try:
+        handle = os.open(root / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:
         raise RunError(f"{root} cannot be written: {error.strerror or error}. Give another work folder") from error
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise RunError(f"{root} is at work already ({_holder(root)}): wait for it, or end it first") from None
+            raise RunError(
+                f"{root} is at work already ({_holder(root / name)}): wait for it, or end it first"
+            ) from None
         except OSError as error:
             raise RunError(
                 f"{root} is on a file system without locks ({error.strerror or error}): "
@@ -67,11 +102,7 @@ def held_work(folder: str) -> Iterator[Scratch]:
         now = dt.datetime.now(tz=dt.UTC).isoformat(timespec="seconds")
         os.ftruncate(handle, 0)
         os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()} since {now}".encode(), 0)
-        scratch = Scratch(str(root / _SCRATCH), attempt=uuid4().hex)
-        scratch.create()
-        for left in _OF_A_RUN:
-            shutil.rmtree(Path(scratch.root, left), ignore_errors=True)
-        yield scratch
+        yield
     finally:
         os.close(handle)
 
@@ -85,13 +116,13 @@ def refuse_held(folder: str) -> None:
         One does.
     """
     if is_held(folder):
-        raise RunError(f"{folder} is at work already ({_holder(Path(folder))}): wait for it, or end it first")
+        raise RunError(f"{folder} is at work already ({_holder(Path(folder, _LOCK))}): wait for it, or end it first")
 
 
-def _holder(root: Path) -> str:
-    """Who holds a folder, as the holder says."""
+def _holder(lock: Path) -> str:
+    """Who holds a lock, as the holder says."""
     try:
-        return (root / _LOCK).read_text(errors="replace").strip() or "by another process"
+        return lock.read_text(errors="replace").strip() or "by another process"
     except OSError:
         return "by another process"
 
@@ -133,7 +164,7 @@ def _check_mark(root: Path) -> None:
         if found != _FORMAT:
             raise RunError(f"{root} was made by another version (format {found!r}): remove it, or give another folder")
         return
-    left = sorted(entry.name for entry in root.iterdir() if entry.name not in {_LOCK, "status.json"})
+    left = sorted(entry.name for entry in root.iterdir() if entry.name not in _BESIDE)
     if left:
         raise RunError(f"{root} holds {left[0]} and is no work folder: give a new or empty one")
     mark.write_text(json.dumps({"format": _FORMAT}) + "\n")

@@ -12,11 +12,12 @@ from types import ModuleType
 
 import pytest
 
+from pipeline.batch.batch_file import read_batch
 from pipeline.epochs.settings import DiffSettings, read_settings
 from pipeline.export.records import SCHEMAS
 from pipeline.io import SpatialReference
 from pipeline.methods.fuzzy_sart import FuzzySartSettings
-from pipeline.model import Reason, RoofType, Status
+from pipeline.model import REASONS, Reason, RoofType, Status
 from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.overrides import overrides_of
@@ -123,9 +124,24 @@ def is_of_a_comparison(block: str) -> bool:
     return block.startswith("[diff]")
 
 
+def is_of_a_schedule(block: str) -> bool:
+    return block.startswith("[schedule]")
+
+
+@pytest.mark.parametrize("block", [block for _, block in toml_blocks() if is_of_a_schedule(block)])
+def test_times_of_the_docs_are_valid(block: str, tmp_path: Path) -> None:
+    file = tmp_path / "city.toml"
+    file.write_text(f'[inputs]\npaths = ["tiles"]\n[output]\npath = "models"\n{block}')
+    assert read_batch(file).schedule.cron
+
+
 @pytest.mark.parametrize(
     ("page", "block"),
-    [(page, block) for page, block in toml_blocks() if not is_overrides(block) and not is_of_a_comparison(block)],
+    [
+        (page, block)
+        for page, block in toml_blocks()
+        if not is_overrides(block) and not is_of_a_comparison(block) and not is_of_a_schedule(block)
+    ],
 )
 def test_a_settings_file_of_the_docs_is_valid(page: str, block: str) -> None:
     settings = RunSettings.from_mapping(tomllib.loads(block)["settings"])
@@ -169,6 +185,8 @@ def test_every_reason_status_and_roof_type_is_told() -> None:
     text = (DOCS / "reference" / "records.md").read_text()
     reasons = text.split("## Reasons")[1]
     assert re.findall(r"^\| `(\w+)` \|", reasons, re.MULTILINE) == [reason.value for reason in Reason]
+    told = re.findall(r"^\| `\w+` \| \w+ \| (.*) \|$", reasons, re.MULTILINE)
+    assert [re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text) for text in told] == [REASONS[reason] for reason in Reason]
     status = text.split("## Status")[1].split("## Reasons")[0]
     assert re.findall(r"^\| `(\w+)` \|", status, re.MULTILINE) == [entry.value for entry in Status]
     row = re.search(r"^\| `roof_type`.*$", text, re.MULTILINE)

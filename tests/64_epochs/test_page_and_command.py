@@ -21,8 +21,8 @@ from pipeline.cli import app
 from pipeline.console import ExitCode
 from pipeline.epochs.diff import DiffRequest, diff
 from pipeline.epochs.records import SCHEMA, Change
-from pipeline.report import epochs_map
-from pipeline.report.epochs_map import COLOURS, MapRows
+from pipeline.report import class_map
+from pipeline.report.epochs_map import COLOURS, epochs_map, gathering
 from pipeline.report.epochs_page import page
 
 
@@ -101,8 +101,8 @@ def test_runs_that_cannot_be_compared_end_with_their_code(pair: tuple[Path, Path
 
 
 def test_the_page_holds_all_that_it_shows(pair: tuple[Path, Path], tmp_path: Path) -> None:
-    rows = MapRows()
-    made = diff(DiffRequest(old=str(pair[0]), new=str(pair[1]), out=str(tmp_path / "out")), take_in=(rows.add,))
+    rows = epochs_map()
+    made = diff(DiffRequest(old=str(pair[0]), new=str(pair[1]), out=str(tmp_path / "out")), take_in=(gathering(rows),))
     text = page(made, rows)
     read = Reader(text)
     assert read.open == []
@@ -128,22 +128,22 @@ def test_text_of_the_users_is_no_markup(pair: tuple[Path, Path], tmp_path: Path)
 
     evil = dataclasses.replace(house("e2"), source_id="<script>alert(1)</script>")
     new = write_epoch(tmp_path / "new", [evil])
-    rows = MapRows()
+    rows = epochs_map()
     made = diff(
         DiffRequest(old=str(write_epoch(tmp_path / "o", [])), new=str(new), out=str(tmp_path / "out")),
-        take_in=(rows.add,),
+        take_in=(gathering(rows),),
     )
     assert "<script>alert" not in page(made, rows)
 
 
 def test_a_map_of_very_many_buildings_keeps_its_bounds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(epochs_map, "MOST_UNCHANGED", 20)
-    monkeypatch.setattr(epochs_map, "MOST_CHANGED", 10)
+    monkeypatch.setattr(class_map, "MOST_ORDINARY", 20)
+    monkeypatch.setattr(class_map, "MOST_DRAWN", 10)
     houses = [house(f"h{k}_1", 30.0 * (k % 10), 30.0 * (k // 10)) for k in range(40)]
     added = [house(f"n{k}_2", 30.0 * (k % 10), 300.0 + 30.0 * (k // 10), length=10.0 + k / 10.0) for k in range(25)]
-    rows = MapRows()
+    rows = epochs_map()
     runs = write_epoch(tmp_path / "old", houses), write_epoch(tmp_path / "new", [*houses, *added])
-    made = diff(DiffRequest(old=str(runs[0]), new=str(runs[1]), out=str(tmp_path / "out")), take_in=(rows.add,))
+    made = diff(DiffRequest(old=str(runs[0]), new=str(runs[1]), out=str(tmp_path / "out")), take_in=(gathering(rows),))
     assert made.summary.rows == {"new": 25, "unchanged": 40}
     drawn = rows.map(1.0)
     assert drawn is not None
@@ -153,10 +153,10 @@ def test_a_map_of_very_many_buildings_keeps_its_bounds(monkeypatch: pytest.Monke
 
 
 def test_a_comparison_of_nothing_has_a_page_too(tmp_path: Path) -> None:
-    rows = MapRows()
+    rows = epochs_map()
     runs = [str(write_epoch(tmp_path / name, [])) for name in ("old", "new")]
-    made = diff(DiffRequest(old=runs[0], new=runs[1], out=str(tmp_path / "out")), take_in=(rows.add,))
+    made = diff(DiffRequest(old=runs[0], new=runs[1], out=str(tmp_path / "out")), take_in=(gathering(rows),))
     assert rows.map(1.0) is None
     assert Reader(page(made, rows)).all("table") != []
-    rows.add(SCHEMA.empty_table())
+    gathering(rows)(SCHEMA.empty_table())
     assert isinstance(made.summary.largest, pa.Table)

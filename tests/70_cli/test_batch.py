@@ -52,6 +52,7 @@ def test_a_batch_is_planned_run_and_told(folder: Path) -> None:
     assert code == 0
     first = json.loads(told)
     assert first["statuses"]["ok"] > 0
+    assert (folder / "models" / "run.html").is_file()
     assert rows(call("status", file)[1])["state"] == "finished"
     status = json.loads(call("status", file, "--json")[1])
     assert status["buildings"]["done"] == first["counts"]["candidates"]

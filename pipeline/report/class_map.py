@@ -1,0 +1,131 @@
+"""A map of buildings by class, of a street or of a whole country, gathered part by part within bounds of memory.
+
+What is ordinary lies beneath; what is not is drawn over it, one by one, so that a map of a city still shows it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+
+from pipeline.model import FloatArray
+from pipeline.report.evaluation_maps import Entry, Layer, Map, draw_map
+
+MOST_DRAWN, MOST_ORDINARY = 30_000, 20_000
+"""Footprints that are drawn. Of more that are not ordinary the largest are; where more are ordinary, the cells that
+hold some of them are drawn in their place."""
+CELLS_ACROSS = 300
+"""Cells along the longer side of the map."""
+
+ROWS = pa.schema([("class", pa.string()), ("geometry", pa.binary()), ("size", pa.float64()), ("id", pa.string())])
+"""What a part of the map is: class, footprint as WKB, what the rows are ordered by, and the row's name."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MapClass:
+    """One class."""
+
+    name: str
+    """As the rows tell it."""
+    label: str
+    """As the legend tells it."""
+    colour: str
+    """As #rrggbb."""
+    hatched: bool = False
+    """Whether it is hatched."""
+
+
+class ClassMap:
+    """Gathers what a map shows.
+
+    Parameters
+    ----------
+    title : str
+        Of the map.
+    ordinary : MapClass
+        The class that lies beneath.
+    others : sequence of MapClass
+        The classes that are drawn over it, the most important one last.
+    """
+
+    def __init__(self, title: str, ordinary: MapClass, others: Sequence[MapClass]) -> None:
+        self._title, self._ordinary, self._others = title, ordinary, tuple(others)
+        self._drawn: list[pa.Table] = []
+        self._beneath: list[Any] = []
+        self._middles: list[FloatArray] = []
+        self._count: Counter[str] = Counter()
+        self.left_out = 0
+        """Rows that are too many and too small to be drawn."""
+
+    def add(self, rows: pa.Table) -> None:
+        """Take in a part, with the columns of `ROWS`."""
+        is_ordinary = pc.equal(rows["class"], self._ordinary.name)
+        drawn = rows.filter(pc.invert(is_ordinary))
+        self._count.update(drawn["class"].to_pylist())
+        self._drawn.append(drawn)
+        if sum(len(one) for one in self._drawn) > 2 * MOST_DRAWN:
+            self._drawn = [self._largest()]
+        found = shapely.from_wkb(np.array(rows.filter(is_ordinary)["geometry"].to_pylist(), dtype=object))
+        found = found[~shapely.is_missing(found)]
+        bounds = shapely.bounds(found).reshape(-1, 4)
+        self._middles.append((bounds[:, :2] + bounds[:, 2:]) / 2.0)
+        self._beneath.append(found)
+        if self.ordinary > MOST_ORDINARY:
+            self._beneath = []
+
+    @property
+    def ordinary(self) -> int:
+        """Number of ordinary rows with a geometry."""
+        return sum(len(one) for one in self._middles)
+
+    def _largest(self) -> pa.Table:
+        """The largest rows; of equal ones those that come first by name."""
+        table = pa.concat_tables(self._drawn)
+        order = pc.sort_indices(table, sort_keys=[("size", "descending"), ("id", "ascending")])
+        self.left_out += max(0, len(table) - MOST_DRAWN)
+        return table.take(order[:MOST_DRAWN])
+
+    def map(self, unit_m: float) -> Map | None:
+        """The map; None where nothing has geometry.
+
+        Parameters
+        ----------
+        unit_m : float
+            Metres a unit of the geometries.
+        """
+        layers = []
+        if self.ordinary:
+            layers.append(_layer(self._ordinary, self._cells_or_footprints(), self.ordinary, unit_m))
+        if self._drawn:
+            table = self._largest()
+            for one in self._others:
+                rows = table.filter(pc.equal(table["class"], one.name))["geometry"].to_pylist()
+                geometries = shapely.from_wkb(np.array(rows, dtype=object))
+                if len(geometries):
+                    layers.append(_layer(one, geometries, self._count[one.name], unit_m))
+        return draw_map(self._title, layers)
+
+    def _cells_or_footprints(self) -> Any:
+        """The ordinary footprints, or the cells that hold some."""
+        if self.ordinary <= MOST_ORDINARY:
+            return np.concatenate(self._beneath)
+        middles = np.concatenate(self._middles)
+        low = middles.min(axis=0)
+        side = float(np.max(middles.max(axis=0) - low)) / CELLS_ACROSS
+        cells = np.unique(np.floor((middles - low) / side).astype(np.int64), axis=0)
+        corner = low + cells * side
+        return shapely.box(corner[:, 0], corner[:, 1], corner[:, 0] + side, corner[:, 1] + side)
+
+
+def _layer(kind: MapClass, geometries: Any, count: int, unit_m: float) -> Layer:
+    if unit_m != 1.0:
+        geometries = shapely.transform(geometries, lambda xy: xy * unit_m)
+    entry = Entry(label=kind.label, colour=kind.colour, count=count, hatched=kind.hatched)
+    return Layer(entry=entry, geometries=list(geometries), filled=not kind.hatched)

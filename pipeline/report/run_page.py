@@ -1,0 +1,271 @@
+"""A finished run as one HTML file: outcome, map, failures by reason, slowest buildings, time, memory, inputs."""
+
+from __future__ import annotations
+
+import datetime as dt
+import heapq
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+
+from pipeline.errors import RunError
+from pipeline.evaluation.chapters import NOTHING
+from pipeline.export.geoparquet import table_dataset
+from pipeline.io import arrow_at, storage_at
+from pipeline.model import REASONS, Reason, Status
+from pipeline.report.class_map import MOST_DRAWN, ROWS, ClassMap, MapClass
+from pipeline.report.evaluation_maps import BAD, FAIR, GOOD, MISSING
+from pipeline.report.page_template import page_template
+from pipeline.report.pictures import data_uri
+from pipeline.report.table import QUANTILES, run_statistics
+from pipeline.runtime.manifest import NAME, PAGE, RunManifest, RunStatus, read_manifest
+from pipeline.tiling import MM, Tile, TileGrid
+
+LISTED = 500
+"""Buildings without a roof of their own that the page lists one by one: those without any model first, then the
+largest. All of them are in the table `buildings`."""
+INPUTS, PROCESSES = 200, 20
+"""Inputs and processes that the page lists; `run.json` has all."""
+_EXAMPLES = 3
+_DIGITS = 12
+_FAILED_TILE = "failed tile"
+_REJECTED, _REUSED = "#9aa3ab", "#46586a"
+_COLUMNS = (
+    *("building_id", "source_id", "status", "reason", "reason_detail", "roof_type", "geometry"),
+    *("footprint_area_m2", "n_points", "n_planes", "tile"),
+)
+_FIGURES = {
+    "rmse_m": "RMSE of the points, m",
+    "p95_m": "95 % of the points within, m",
+    "coverage": "share of points with a roof",
+    "density_per_m2": "points a m²",
+    "height_m": "height, m",
+}
+_STATUSES = {
+    Status.OK: ("models", GOOD, "closed, valid solids with a roof of the method"),
+    Status.FALLBACK: ("blocks", FAIR, "the roof could not be delivered, a block stands in its place"),
+    Status.FAILED: ("no model", MISSING, "the record and its reason remain"),
+}
+
+
+def write_run_page(run_dir: str) -> str:
+    """Write `run.html` into a run directory.
+
+    Parameters
+    ----------
+    run_dir : str
+        A path, or a URL.
+
+    Returns
+    -------
+    str
+        Where the page is; images, styles and scripts are in it.
+
+    Raises
+    ------
+    RunError
+        There is no finished run, or the page cannot be written.
+    """
+    storage = storage_at(run_dir)
+    storage.put(PAGE, run_page(run_dir).encode())
+    return f"{storage.place}/{PAGE}"
+
+
+def run_page(run_dir: str) -> str:
+    """The page as text.
+
+    Raises
+    ------
+    RunError
+        There is no finished run.
+    """
+    manifest = read_manifest(run_dir)
+    if manifest.status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
+        raise RunError(f"{run_dir} is {manifest.status.value}: a report tells of a run that is over, run it to its end")
+    seen = _Seen({one.building_id for one in manifest.slowest})
+    filesystem, path = arrow_at(run_dir)
+    dataset = table_dataset(path, "buildings", filesystem)
+    try:
+        for batch in dataset.to_batches(columns=list(_COLUMNS)):
+            seen.add(pa.Table.from_batches([batch]))
+    except (pa.ArrowInvalid, OSError) as error:
+        raise RunError(f"the buildings of {run_dir} cannot be read as Parquet: {error}") from error
+    statistics = run_statistics(path, filesystem)
+    seen.map.add(_failed_tiles(manifest))
+    drawn = seen.map.map(float((manifest.crs or {}).get("horizontal_unit_m") or 1.0))
+    return page_template("run.html").render(
+        run=manifest,
+        subject=_subject(run_dir, manifest),
+        cards=_cards(manifest, statistics),
+        map=None if drawn is None else {"uri": data_uri(drawn.png), "it": drawn},
+        left_out=seen.map.left_out,
+        most_drawn=MOST_DRAWN,
+        without_outline=seen.without_outline,
+        reasons=_reasons(statistics, seen),
+        listed=seen.listed(),
+        not_ok=sum(statistics["statuses"][one.value] for one in (Status.FALLBACK, Status.FAILED)),
+        slowest=[_slow(one.building_id, one.seconds, seen.slow.get(one.building_id)) for one in manifest.slowest],
+        stages=_stages(manifest),
+        peaks=_peaks(manifest)[:PROCESSES],
+        processes=len(manifest.peak_memory_bytes),
+        statistics=statistics,
+        quantiles=[(label, statistics["quantiles"][name]) for name, label in _FIGURES.items()],
+        quantile_names=[name for name, _ in QUANTILES],
+        rejected=[(reason, REASONS[Reason(reason)], n) for reason, n in statistics["rejected_reasons"].items()],
+        inputs=manifest.inputs[:INPUTS],
+        digits=_DIGITS,
+        nothing=NOTHING,
+        manifest_name=NAME,
+    )
+
+
+class _Seen:
+    """What the page takes from the rows of all buildings, part by part."""
+
+    def __init__(self, slow: set[str]) -> None:
+        label, colour, _ = _STATUSES[Status.OK]
+        others = [
+            MapClass(name=one.value, label=_STATUSES[one][0], colour=_STATUSES[one][1])
+            for one in (Status.FALLBACK, Status.FAILED)
+        ]
+        tiles = MapClass(name=_FAILED_TILE, label="tile that could not be published", colour=BAD, hatched=True)
+        self.map = ClassMap(
+            "Buildings by status", MapClass(name=Status.OK.value, label=label, colour=colour), [tiles, *others]
+        )
+        self.slow: dict[str, Mapping[str, Any]] = {}
+        """Rows of the slowest buildings by id."""
+        self.examples: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+        """A few ids by status and reason, the first by name."""
+        self.without_outline = 0
+        """Buildings that are on no map."""
+        self._slow = pa.array(sorted(slow), pa.string())
+        self._not_ok: list[tuple[bool, float, str, Mapping[str, Any]]] = []
+
+    def add(self, rows: pa.Table) -> None:
+        """Take in a part."""
+        area = pc.fill_null(rows["footprint_area_m2"], 0.0)
+        columns = [rows["status"], rows["geometry"], area, rows["building_id"]]
+        self.map.add(pa.table(columns, names=ROWS.names).cast(ROWS))
+        self.without_outline += rows["geometry"].null_count
+        for row in rows.filter(pc.is_in(rows["building_id"], self._slow)).to_pylist():
+            self.slow[row["building_id"]] = row
+        for row in rows.filter(pc.not_equal(rows["status"], Status.OK.value)).to_pylist():
+            known = row["status"], row["reason"]
+            self.examples[known] = heapq.nsmallest(_EXAMPLES, (*self.examples[known], row["building_id"]))
+            failed = row["status"] == Status.FAILED.value
+            self._not_ok.append((failed, row["footprint_area_m2"] or 0.0, row["building_id"], row))
+        if len(self._not_ok) > 2 * LISTED:
+            self._not_ok = self._first()
+
+    def _first(self) -> list[tuple[bool, float, str, Mapping[str, Any]]]:
+        return heapq.nsmallest(LISTED, self._not_ok, key=lambda one: (not one[0], -one[1], one[2]))
+
+    def listed(self) -> list[dict[str, Any]]:
+        """The rows of buildings without a roof of their own that are told one by one."""
+        return [_told(row) for *_, row in self._first()]
+
+
+def _told(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A building as a line of a table."""
+    place = None if row["geometry"] is None else shapely.point_on_surface(shapely.from_wkb(row["geometry"]))
+    return {
+        "id": row["building_id"],
+        "source_id": row["source_id"] or "",
+        "status": row["status"],
+        "reason": row["reason"] or "",
+        "detail": row["reason_detail"] or "",
+        "roof_type": row["roof_type"],
+        "area": row["footprint_area_m2"],
+        "points": row["n_points"],
+        "planes": row["n_planes"],
+        "tile": row["tile"],
+        "place": "" if place is None or place.is_empty else f"{place.x:.0f} {place.y:.0f}",
+    }
+
+
+def _slow(building_id: str, seconds: float, row: Mapping[str, Any] | None) -> dict[str, Any]:
+    """A slow building; one whose tile failed has no row."""
+    told = {"id": building_id} if row is None else _told(row)
+    return told | {"seconds": seconds, "is_there": row is not None}
+
+
+def _failed_tiles(manifest: RunManifest) -> pa.Table:
+    """The squares of tiles whose buildings are not in the tables."""
+    lattice, names = manifest.lattice, manifest.failed_tiles
+    unit_m = float((manifest.crs or {}).get("horizontal_unit_m") or 1.0)
+    squares = []
+    for name in names if lattice else ():
+        grid = TileGrid(
+            size_mm=round(lattice["tile_size_m"] * MM),
+            origin_x_mm=round(lattice["origin_x_m"] * MM),
+            origin_y_mm=round(lattice["origin_y_m"] * MM),
+            halo_mm=0,
+        )
+        core = grid.core(Tile.from_key(name))
+        edges = [value / MM / unit_m for value in (core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm)]
+        squares.append(shapely.to_wkb(shapely.box(*edges)))
+    n = len(squares)
+    return pa.table([[_FAILED_TILE] * n, squares, [np.inf] * n, list(names)[:n]], schema=ROWS)
+
+
+def _subject(run_dir: str, manifest: RunManifest) -> str:
+    """What was run, in a sentence."""
+    took = "" if manifest.finished_at is None else f", in {_length(manifest.finished_at - manifest.started_at)}"
+    points = manifest.counts.get("points", 0)
+    return (
+        f"{run_dir}: {points / 1e6:,.1f} million points in {len(manifest.tiles):,} tiles, "
+        f"begun {manifest.started_at:%Y-%m-%d %H:%M %Z}{took}."
+    )
+
+
+def _length(time: dt.timedelta) -> str:
+    """A length of time in words.
+
+    >>> _length(dt.timedelta(seconds=42)), _length(dt.timedelta(hours=27, minutes=4))
+    ('42 s', '27 h 4 min')
+    """
+    minutes = round(time.total_seconds() / 60.0)
+    if minutes < 2:
+        return f"{time.total_seconds():.0f} s"
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _cards(manifest: RunManifest, statistics: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+    """The figures that stand on top: number, name, colour, meaning."""
+    cards = []
+    for status, (name, colour, meaning) in _STATUSES.items():
+        share = statistics["shares"][status.value]
+        told = meaning if share is None else f"{share:.1%} of all; {meaning}"
+        cards.append((f"{statistics['statuses'][status.value]:,}", name, colour, told))
+    cards.append((f"{statistics['rejected']:,}", "rejected", _REJECTED, "objects that were judged to be no buildings"))
+    reused = manifest.counts.get("reused", 0)
+    if reused:
+        cards.append((f"{reused:,}", "taken over", _REUSED, "models of an earlier run whose input did not change"))
+    return cards
+
+
+def _reasons(statistics: Mapping[str, Any], seen: _Seen) -> list[tuple[str, str, str, int, str, list[str]]]:
+    """Status, reason, meaning, count, share of all candidates, a few ids; those without a model first."""
+    found = []
+    for status in (Status.FAILED.value, Status.FALLBACK.value):
+        for reason, count in statistics["reasons"].get(status, {}).items():
+            share = f"{count / statistics['candidates']:.2%}"
+            found.append((status, reason, REASONS[Reason(reason)], count, share, sorted(seen.examples[status, reason])))
+    return found
+
+
+def _peaks(manifest: RunManifest) -> list[tuple[str, int]]:
+    """Processes with their largest memory, the largest first."""
+    return sorted(manifest.peak_memory_bytes.items(), key=lambda item: (-item[1], item[0]))
+
+
+def _stages(manifest: RunManifest) -> list[tuple[str, float, float]]:
+    """Seconds of the stages in the order in which they ran, each with its share of the longest one."""
+    seconds = {name: value for name, value in manifest.timings_s.items() if name != "total"}
+    most = max(seconds.values(), default=0.0) or 1.0
+    return [(name, value, value / most) for name, value in seconds.items()]

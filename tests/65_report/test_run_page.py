@@ -1,0 +1,169 @@
+"""The page about a run: what is told is what the run holds, whatever its size, and text is never markup."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import small_buildings as small
+from page_reader import Reader, count
+
+from pipeline.cli import app
+from pipeline.errors import RunError
+from pipeline.model import Reason, Status
+from pipeline.report import class_map, run_page
+from pipeline.report.run_page import write_run_page
+from pipeline.runtime.manifest import (
+    PAGE,
+    SLOWEST,
+    InputFile,
+    RunManifest,
+    RunStatus,
+    SlowBuilding,
+    read_manifest,
+    write_manifest,
+)
+
+
+def change(run: Path, **values: Any) -> RunManifest:
+    manifest = dataclasses.replace(read_manifest(run), **values)
+    write_manifest(run, manifest)
+    return manifest
+
+
+def page_of(run: Path) -> tuple[str, Reader]:
+    where = write_run_page(str(run))
+    assert where == f"{run.resolve()}/{PAGE}"
+    text = Path(where).read_text(encoding="utf-8")
+    read = Reader(text)
+    assert read.open == []
+    return text, read
+
+
+def words(read: Reader) -> str:
+    return " ".join(" ".join(read.texts).split())
+
+
+def test_the_page_tells_what_the_run_holds(street_run: Path) -> None:
+    change(
+        street_run, timings_s={"split": 3.0, "reconstruct": 6.0, "total": 9.5}, peak_memory_bytes={"driver": 5 * 10**8}
+    )
+    _, read = page_of(street_run)
+    told = words(read)
+    for text in ("too few points", "invalid solid", "500 MB", "Failures by reason"):
+        assert text in told
+    assert "25.00%" in told
+    assert sum("bar-of" in (one.get("class") or "") for one in read.all("i")) == 2
+    pictures = [one for one in read.all("img") if (one["alt"] or "").startswith("Map:")]
+    assert len(pictures) == 1
+    png = base64.b64decode(str(pictures[0]["src"]).split(",")[1])
+    colours = {status: colour for status, (_, colour, _) in run_page._STATUSES.items()}
+    assert count(png, colours[Status.OK]) > 100
+    assert count(png, colours[Status.FALLBACK]) > 100
+    links = [
+        one.get(name) for tag in ("img", "script", "link", "a") for one in read.all(tag) for name in ("src", "href")
+    ]
+    assert all(link is None or link.startswith(("data:image/png;base64,", "#")) for link in links)
+
+
+def test_the_slowest_are_told_with_what_they_are_and_lost_ones_without(street_run: Path) -> None:
+    name = small.gable().building_id
+    slowest = (SlowBuilding(building_id="gone", seconds=9.0), SlowBuilding(building_id=name, seconds=1.5))
+    manifest = change(
+        street_run, slowest=slowest, status=RunStatus.INCOMPLETE, tiles=("x0_y0",), failed_tiles=("x0_y0",)
+    )
+    assert read_manifest(street_run) == manifest
+    _, read = page_of(street_run)
+    told = words(read)
+    assert "gone 9.00 in a tile that could not be published" in told
+    assert f"{name} 1.50" in told
+    assert "1 of 1 tiles could not be published" in told
+
+
+def test_a_failed_tile_is_on_the_map(street_run: Path) -> None:
+    lattice = {"tile_size_m": 100.0, "origin_x_m": 0.0, "origin_y_m": 0.0}
+    change(
+        street_run, status=RunStatus.INCOMPLETE, tiles=("x850_y4471",), failed_tiles=("x850_y4471",), lattice=lattice
+    )
+    _, read = page_of(street_run)
+    (seen,) = (one["alt"] for one in read.all("img"))
+    assert "tile that could not be published: 1" in str(seen)
+
+
+def test_feet_are_drawn_in_metres(make_run: Callable[..., Path]) -> None:
+    from small_runs import street
+
+    scales = []
+    for unit_m in (1.0, 0.3048):
+        _, read = page_of(make_run(street(), f"run{unit_m}", unit_m))
+        scales.append([text.strip() for text in read.texts if text.strip().endswith(" m")])
+    assert scales[0] != []
+    assert scales[0] == scales[1]
+
+
+def test_a_run_of_nothing_has_a_page_too(make_run: Callable[..., Path]) -> None:
+    _, read = page_of(make_run([]))
+    assert read.all("img") == []
+    assert "Failures by reason" not in words(read)
+
+
+def test_text_of_the_users_is_no_markup(make_run: Callable[..., Path]) -> None:
+    evil = "<script>alert(1)</script>"
+    failed = dataclasses.replace(small.failed(), reason_detail=evil, source_id=evil)
+    run = make_run([failed])
+    inputs = (InputFile(path=evil, sha256="0" * 64, size_bytes=1),)
+    change(run, warnings=(evil,), source_licence=evil, inputs=inputs)
+    text, _ = page_of(run)
+    assert "alert(1)" in text
+    assert "<script>alert" not in text
+
+
+def test_what_is_listed_is_bounded_those_without_a_model_first(
+    make_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_page, "LISTED", 3)
+    monkeypatch.setattr(class_map, "MOST_ORDINARY", 2)
+    blocks = [dataclasses.replace(small.courtyard(), building_id=f"b{k}") for k in range(9)]
+    assert blocks[0].status in {Status.FALLBACK, Status.OK}
+    blocks = [dataclasses.replace(b, status=Status.FALLBACK, reason=Reason.INVALID_SOLID) for b in blocks]
+    failed = [dataclasses.replace(small.failed(), building_id=f"f{k}") for k in range(2)]
+    _, read = page_of(make_run([*blocks, *failed]))
+    table = [one for one in read.all("div") if one.get("aria-label") == "Buildings without a roof of their own"]
+    assert len(table) == 1
+    listed = words(read).split("One by one")[1]
+    assert "3 of 11" in listed
+    assert all(name in listed for name in ("f0", "f1"))
+    assert listed.index("f1") < listed.index("b0")
+    assert "b1 " not in listed
+
+
+@pytest.mark.parametrize("status", [RunStatus.RUNNING, RunStatus.FAILED])
+def test_a_run_that_is_not_over_has_no_page(street_run: Path, status: RunStatus) -> None:
+    change(street_run, status=status)
+    with pytest.raises(RunError, match=f"is {status.value}: a report tells of a run that is over"):
+        write_run_page(str(street_run))
+    assert not (street_run / PAGE).exists()
+
+
+def test_the_command_writes_it_and_names_it(street_run: Path, tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["report", str(street_run)])
+    assert (done.exit_code, done.stderr.strip()[-8:] or done.stdout.strip()[-8:]) == (0, PAGE)
+    assert (street_run / PAGE).is_file()
+    assert CliRunner().invoke(app, ["report", str(tmp_path / "nowhere")]).exit_code == 4
+
+
+def test_a_manifest_without_the_slowest_is_read(street_run: Path) -> None:
+    text = (street_run / "run.json").read_text()
+    assert '"slowest": []' in text
+    (street_run / "run.json").write_text(text.replace('"slowest": [],', ""))
+    assert read_manifest(street_run).slowest == ()
+    assert SLOWEST > 0
