@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from pipeline.batch.batch_file import Batch
 from pipeline.batch.estimates import estimate, refuse
-from pipeline.batch.status import StatusWriter
+from pipeline.batch.status import StatusWriter, buildings_before
 from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.report.run_page import write_run_page
 from pipeline.runtime.events import Event, Listener, ignore, never
@@ -50,7 +50,7 @@ def run_batch(
         As `pipeline.runtime.run.run`.
     """
     refuse_held(batch.work_folder)
-    planned = estimate(batch, _READ)
+    planned = estimate(batch, _READ, buildings_before(batch.work_folder))
     refuse(planned)
     status = StatusWriter(batch.work_folder, str(batch.path), batch.out, planned.stage_s)
     with contextlib.ExitStack() as shown:

@@ -214,3 +214,11 @@ def read_status(work_folder: str) -> Status:
         message = f"cut off after {status.updated_at}: run the batch again, and it goes on from there"
         return dataclasses.replace(status, state="dead", remaining_s=None, message=message)
     return status
+
+
+def buildings_before(work_folder: str) -> int:
+    """How many buildings the run before had; 0 where none came so far."""
+    try:
+        return int(read_status(work_folder).buildings.get("total", 0))
+    except RunError:
+        return 0

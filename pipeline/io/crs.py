@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import CrsError
@@ -152,6 +153,15 @@ def horizontal_unit_of(crs: pyproj.CRS, *, path: str) -> float:
     return units.pop()
 
 
+@functools.lru_cache(maxsize=64)
+def _epsg_of(text: str) -> int | None:
+    """The EPSG code of a CRS that is written somehow; looking for it takes milliseconds, and tiles agree."""
+    import pyproj
+
+    code: int | None = pyproj.CRS.from_user_input(text).to_epsg()
+    return code
+
+
 def resolve_reference(
     *,
     path: str,
@@ -220,7 +230,7 @@ def resolve_reference(
     reference = SpatialReference(
         wkt=chosen.to_wkt("WKT2_2019"),
         name=chosen.name,
-        epsg=chosen.to_epsg(),
+        epsg=_epsg_of(chosen.srs),
         horizontal_unit_m=horizontal_m,
         vertical_unit_m=vertical_m,
     )

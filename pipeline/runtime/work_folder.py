@@ -18,6 +18,7 @@ from pathlib import Path
 from uuid import uuid4
 
 from pipeline.errors import RunError
+from pipeline.runtime.kept import FOLDER
 from pipeline.runtime.scratch import Scratch
 
 _LOCK = "lock"
@@ -26,6 +27,9 @@ _MARK = "work.json"
 _BESIDE = {_LOCK, "status.json"}
 """What a batch may have written before the folder was made."""
 _FORMAT = 1
+_BOOT = "boot"
+_DISTRUSTED_S = 300.0
+"""Ten times as long as systems keep what is not on the disk yet."""
 _OF_A_RUN = ("dask", "fetched")
 """Folders of scratch that a process leaves behind only where it was killed."""
 
@@ -54,9 +58,36 @@ def held_work(folder: str) -> Iterator[Scratch]:
     with held_lock(root, _LOCK):
         scratch = Scratch(str(root / _SCRATCH), attempt=uuid4().hex)
         scratch.create()
+        _distrust_the_last(root, scratch)
         for left in _OF_A_RUN:
             shutil.rmtree(Path(scratch.root, left), ignore_errors=True)
         yield scratch
+
+
+def _distrust_the_last(root: Path, scratch: Scratch) -> None:
+    """Forget what was kept shortly before this machine was started anew.
+
+    What a process wrote outlives it, but not a loss of power: the system writes to the disk up to half a minute later
+    (`vm.dirty_expire_centisecs`), names before contents. So of an outcome that was kept within minutes of the end
+    nobody knows whether it is whole.
+    """
+    file, now = root / _BOOT, boot_id()
+    before = file.read_text() if file.is_file() else now
+    if before != now:
+        kept = {path: path.stat().st_mtime for path in Path(scratch.root, FOLDER).glob("*/*/*")}
+        last = max(kept.values(), default=0.0)
+        for path, written in kept.items():
+            if written > last - _DISTRUSTED_S:
+                path.unlink()
+    file.write_text(now)
+
+
+def boot_id() -> str:
+    """What differs each time that this machine is started; empty where the system does not tell it."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
 
 
 def make_work(root: Path) -> None:
@@ -142,15 +173,6 @@ def is_held(folder: str) -> bool:
     finally:
         os.close(handle)
     return False
-
-
-def clear_work(scratch: Scratch) -> None:
-    """Forget what was kept: by another name first, so that no late task finds it."""
-    for entry in Path(scratch.root).iterdir():
-        if entry.is_dir() and entry.name != "attempts":
-            doomed = entry.with_name(f".{entry.name}.{uuid4().hex}")
-            entry.rename(doomed)
-            shutil.rmtree(doomed, ignore_errors=True)
 
 
 def _check_mark(root: Path) -> None:

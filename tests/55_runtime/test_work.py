@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Generator, Sequence
@@ -237,6 +238,25 @@ def test_what_a_task_left_half_done_is_no_result(place: Place) -> None:
     (bucket.parent / f"{'0' * 16}.bin").write_bytes(bucket.read_bytes())
     (bucket.parent / f"{'1' * 16}.{'2' * 32}.part").write_bytes(bucket.read_bytes())
     assert place.run().digest == whole.digest
+
+
+def test_what_was_kept_shortly_before_a_loss_of_power_is_done_again(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = place.run()
+    kept = sorted((place.folder / "work" / "scratch" / "kept").glob("*/*/*"))
+    old = [path for path in kept if path.parent.parent.name.startswith(("ingest", "tiles"))]
+    for path in old:
+        os.utime(path, ns=(0, path.stat().st_mtime_ns - 400 * 10**9))
+    late = next(path for path in kept if path.parent.parent.name.startswith("models-"))
+    late.write_bytes(late.read_bytes()[:20])
+    place.tasks.clear()
+    monkeypatch.setattr("pipeline.runtime.work_folder.boot_id", lambda: "another boot")
+    assert place.run().digest == whole.digest
+    assert set(place.tasks) == {"join", "outline", "reconstruct", "publish"}
+    place.tasks.clear()
+    assert place.run().digest == whole.digest
+    assert not place.tasks
 
 
 def test_two_runs_do_not_work_in_one_folder(place: Place) -> None:
