@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import enum
+import functools
 import hashlib
 import pickle
 import struct
@@ -59,6 +60,12 @@ def key_of(*parts: object) -> str:
     return digest.hexdigest()[:_KEY_DIGITS]
 
 
+@functools.cache
+def _names_of(kind: Any) -> tuple[str, ...]:
+    """The fields of a dataclass; keys of a city's tasks ask for them a million times."""
+    return tuple(field.name for field in dataclasses.fields(kind))
+
+
 def _add(update: Callable[[bytes], None], value: object) -> None:
     if value is None or isinstance(value, bool | int | str | bytes | dt.date):
         text = value if isinstance(value, bytes) else str(value).encode()
@@ -68,7 +75,7 @@ def _add(update: Callable[[bytes], None], value: object) -> None:
     elif isinstance(value, float):
         update(b"float " + struct.pack("<d", value))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        names = [field.name for field in dataclasses.fields(value)]
+        names = _names_of(type(value))
         update(f"{type(value).__name__} {len(names)} ".encode())
         for name in names:
             _add(update, name)
