@@ -4,7 +4,7 @@
 
 A scheduler of its own process serves so many workers, all of them in one more process (they have nothing to do), and
 tasks that do nothing go through `DaskExecutor` as those of a run do. Told are the CPU seconds of the scheduler and of
-the driver a task, with small results and with large ones. With `--city` its tiles are split, the fragments are
+the driver a task, with small results and with large ones. With `--city` its tiles are split, what they hand on is
 laid side by side so many times, and the CPU time and the memory of the join are told; a straight line is fitted to the
 logarithms. DIR/engine_costs.json is what `scaling_simulation.py` reads.
 """
@@ -18,6 +18,7 @@ import dataclasses
 import gc
 import json
 import multiprocessing
+import pickle
 import resource
 import subprocess
 import sys
@@ -33,9 +34,12 @@ import psutil
 from benchmarks.city_scale import free_port, wait_for_listener
 from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions
+from pipeline.model import IntArray
 from pipeline.runtime.events import Watch, ignore
 from pipeline.runtime.executors import Cluster, DaskExecutor, executor_for
 from pipeline.runtime.join import NOWHERE, join
+from pipeline.runtime.kept import result_of
+from pipeline.runtime.open_fragments import BorderFacets
 from pipeline.runtime.plan import Plan, make_plan
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.split import Split
@@ -44,6 +48,8 @@ from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
 
 _WAIT_S = 120.0
+_ODD = 0x9E3779B97F4A7C15
+"""Spreads small numbers over 64 bits (the golden ratio)."""
 _WARM_TASKS = 200
 
 
@@ -129,7 +135,7 @@ def cost_of_tasks(count: int, tasks: int, size_bytes: int, log: Path) -> dict[st
 
 
 def splits_of(folder: Path, tile_size_m: float) -> tuple[Plan, list[Split], int]:
-    """The fragments of a city, and how many buildings it has after the units were told apart."""
+    """The descriptors of a city's tiles, and how many buildings it has after the units were told apart."""
     settings = RunSettings.from_mapping({"classes": "ignore", "tile_size_m": tile_size_m})
     tiles = sorted(str(path) for path in folder.glob("*.laz"))
     plan = make_plan(tiles, ReadOptions(), settings)
@@ -142,62 +148,86 @@ def splits_of(folder: Path, tile_size_m: float) -> tuple[Plan, list[Split], int]
         stages = Stages(
             settings=settings, meshes="none", plan=plan, progress=Progress(ignore), executor=executor, scratch=scratch
         )
-        splits = stages.split(stages.ingest(tiles), None)
-        joined = stages.join(splits, None, plan.sources[0].reference)
+        found = stages.split(stages.ingest(tiles), None)
+        splits = [result_of(scratch, place) for _, place in sorted(found.places.items())]
+        joined = stages.join(found, None, plan.sources[0].reference)
     return plan, splits, len(joined.candidates)
 
 
 def moved(split: Split, columns: int, size_mm: int) -> Split:
-    """The same fragments so many tiles farther east; a copy that shares no memory."""
-    shift = columns * size_mm
-    found = split.fragments
+    """The same surfaces so many tiles farther east; a copy that shares no memory."""
+    tile = Tile(split.tile.column + columns, split.tile.row)
+    found = split.surfaces
     if found is None:
-        return dataclasses.replace(split, tile=Tile(split.tile.column + columns, split.tile.row))
-    keys, boxes, lowest = found.crossing_keys.copy(), found.boxes_mm.copy(), found.lowest_point_mm.copy()
-    keys[:, 0::2] += shift
-    lowest[lowest[:, 0] != NOWHERE, 0] += shift
-    some = boxes[:, 0] <= boxes[:, 2]
-    boxes[some, 0] += shift
-    boxes[some, 2] += shift
-    fragments = dataclasses.replace(
+        return dataclasses.replace(split, tile=tile)
+    shift = columns * size_mm
+
+    def points(places: IntArray) -> IntArray:
+        copy = places.copy()
+        copy[copy[:, 0] != NOWHERE, 0] += shift
+        return copy
+
+    def boxes(places: IntArray) -> IntArray:
+        copy = places.copy()
+        copy[np.ix_(copy[:, 0] <= copy[:, 2], (0, 2))] += shift
+        return copy
+
+    def facets(held: BorderFacets) -> BorderFacets:
+        # names are digests: another city has others, and those of one stay equal among themselves
+        return BorderFacets(names=held.names ^ np.uint64(columns * _ODD % 2**64), holders=held.holders.copy())
+
+    done = dataclasses.replace(
+        found.done,
+        candidate_points_mm=points(found.done.candidate_points_mm),
+        candidate_ranges=found.done.candidate_ranges.copy(),
+        sums=found.done.sums.copy(),
+        boxes_mm=boxes(found.done.boxes_mm),
+        lowest_point_mm=points(found.done.lowest_point_mm),
+        rejected_ranges=found.done.rejected_ranges.copy(),
+    )
+    surfaces = dataclasses.replace(
         found,
-        kind=found.kind.copy(),
+        done=done,
         sums=found.sums.copy(),
-        boxes_mm=boxes,
-        lowest_point_mm=lowest,
-        crossing_keys=keys,
-        crossing_fragment=found.crossing_fragment.copy(),
+        boxes_mm=boxes(found.boxes_mm),
+        lowest_point_mm=points(found.lowest_point_mm),
+        ranges=found.ranges.copy(),
+        facets=facets(found.facets),
+        step_facets=facets(found.step_facets),
         along_steps=found.along_steps.copy(),
     )
-    return dataclasses.replace(
-        split,
-        tile=Tile(split.tile.column + columns, split.tile.row),
-        fragments=fragments,
-        starts=split.starts.copy(),
-        keys=split.keys.copy(),
-        lowest_points_mm=split.lowest_points_mm + np.array([shift, 0, 0]),
-    )
+    return dataclasses.replace(split, tile=tile, surfaces=surfaces)
 
 
 def cost_of_join(plan: Plan, splits: Sequence[Split], buildings: int, times: int) -> dict[str, Any]:
     """CPU seconds and memory of the join of a city laid side by side so many times; in a process of its own."""
     columns = [split.tile.column for split in splits]
     stride = max(columns) - min(columns) + 3
-    before = psutil.Process().memory_info().rss
-    city = [moved(split, stride * k, plan.grid.size_mm) for k in range(times) for split in splits]
     gc.collect()
-    held = psutil.Process().memory_info().rss - before
+    before = psutil.Process().memory_info().rss
+    making_s = 0.0
+
+    def city() -> Iterator[Split]:
+        # one at a time, as the driver reads them
+        nonlocal making_s
+        for k in range(times):
+            for split in splits:
+                began_s = time.process_time()
+                one = moved(split, stride * k, plan.grid.size_mm)
+                making_s += time.process_time() - began_s
+                yield one
+
     began = time.process_time()
-    joined = join(city, plan.grid, RunSettings().scene.candidates, "EPSG:25832")
-    cpu_s = time.process_time() - began
+    joined = join(city(), plan.grid, RunSettings().scene.candidates, "EPSG:25832")
+    cpu_s = time.process_time() - began - making_s
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
     return {
         "buildings": times * buildings,
         "candidates": len(joined.candidates),
-        "tiles": len(city),
-        "fragments": sum(0 if split.fragments is None else len(split.fragments.kind) for split in city),
+        "tiles": times * len(splits),
+        "fragments": times * sum(0 if split.surfaces is None else len(split.surfaces.kind) for split in splits),
         "cpu_s": cpu_s,
-        "splits_bytes": held,
+        "splits_bytes": times * sum(len(pickle.dumps(split, protocol=pickle.HIGHEST_PROTOCOL)) for split in splits),
         "peak_bytes": peak,
     }
 

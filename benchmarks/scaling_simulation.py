@@ -7,7 +7,8 @@
 The traces come from `city_scale.py`, the costs from `engine_costs.py`. A stage's tasks draw their CPU times from those
 of the first trace, as many a building as there were; the engine's order (largest first), its window of tasks in flight,
 its barriers between stages and its steps in the driver are kept. Driver, scheduler and storage serve one after the
-other: a task costs the driver a submission and a result, the scheduler an assignment and a completion, a byte of a
+other: a task costs the driver what the driver's CPU time in its stage of the first trace comes to (keys, packing,
+submission, result; never less than a task that does nothing), the scheduler an assignment and a completion, a byte of a
 result its way through both, a byte of scratch its share of the bandwidth. `--storage-mb-s 0` sets no limit to it.
 
 Every trace is also replayed: its own tasks with the wall-clock times that they had there, by as many workers. How far
@@ -250,8 +251,8 @@ class Engine:
     """Factor and exponent of the join's CPU seconds by buildings."""
     digest_s: float
     """Of the driver, a building: digest, sums and the removal of scratch at the end."""
-    driver_s: float
-    """Of the driver, a task."""
+    driver_s: Mapping[str, float]
+    """Of the driver, a task, by stage."""
     scheduler_s: float
     """Of the scheduler, a task."""
     byte_s: float
@@ -292,7 +293,7 @@ def measured_engine(trace: Mapping[str, Any], costs: Mapping[str, Any], tile_m: 
         plan_s=max(0.0, lines["ingest"]["cpu_s"] - trace["diary"][0]["cpu_s"]) / files,
         join=(costs["join"]["cpu_s"][0], costs["join"]["cpu_s"][1]),
         digest_s=ending_s / counts["candidates"],
-        driver_s=driver_s,
+        driver_s=_driver_costs(trace, costs, driver_s, scheduler_s),
         scheduler_s=scheduler_s,
         byte_s=beyond_s / 2.0 / large["result_bytes"],
         result_bytes=results,
@@ -301,16 +302,35 @@ def measured_engine(trace: Mapping[str, Any], costs: Mapping[str, Any], tile_m: 
     )
 
 
+def _driver_costs(
+    trace: Mapping[str, Any], costs: Mapping[str, Any], least_s: float, scheduler_s: float
+) -> dict[str, float]:
+    """What a task of each stage costs the driver, from its CPU time in that stage.
+
+    The trace's driver holds the scheduler, too: its tasks, and what it takes with nothing to do, are taken away, and of
+    the join what the driver does alone.
+    """
+    tasks = own_times(trace, "cpu_s")
+    lines = [line for line in trace["diary"] if is_mark(line)]
+    idle = costs["tasks"][0]["scheduler_idle_share"]
+    factor, exponent = costs["join"]["cpu_s"]
+    found = dict.fromkeys(STAGES, least_s)
+    for line, after in itertools.pairwise(lines):
+        count = len(tasks.get(line["stage"], ()))
+        if count:
+            own_s = after["cpu_s"] - line["cpu_s"] - idle * (after["at_s"] - line["at_s"])
+            if line["stage"] == "join":
+                own_s -= factor * trace["summary"]["counts"]["candidates"] ** exponent
+            found[line["stage"]] = max(least_s, own_s / count - scheduler_s)
+    return found
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Change:
     """What is done otherwise; as the engine is by default."""
 
-    join_share: float = 1.0
-    """Share of the join's work that is left, all told."""
     joined_in_driver: float = 1.0
-    """Share of that which stays in the driver; the rest is tasks of 64 tiles."""
-    split_bytes_share: float = 1.0
-    """Size of what a split sends to the driver."""
+    """Share of the join that stays in the driver; the rest is tasks of 64 tiles."""
     digest_in_driver: float = 1.0
     """Share of the digest that stays in the driver."""
     plan_in_driver: float = 1.0
@@ -334,7 +354,7 @@ def city_stages(engine: Engine, buildings: int, change: Change, seed: int = _SEE
         "split": POINT.itemsize * points_a_tile * (window + 0.3),
         "reconstruct": POINT.itemsize * 20_000 * 1.5 * change.tasks_a_batch,
     }
-    joining_s = engine.join[0] * buildings ** engine.join[1] * change.join_share
+    joining_s = engine.join[0] * buildings ** engine.join[1]
     n_files, n_tiles = max(1, round(engine.files * factor)), max(1, round(engine.tiles * factor))
     before = {
         "ingest": engine.start_s + engine.plan_s * n_files * change.plan_in_driver,
@@ -360,15 +380,14 @@ def city_stages(engine: Engine, buildings: int, change: Change, seed: int = _SEE
             durations = np.concatenate((np.full(regions, in_tasks / regions), durations))
         elif in_tasks:
             durations = durations + in_tasks / count
-        bytes_a_result = engine.result_bytes[name] * (change.split_bytes_share if name == "split" else 1.0)
         stages.append(
             Stage(
                 name=name,
                 before_s=before.get(name, 0.0),
                 durations_s=durations,
-                driver_s=engine.driver_s,
+                driver_s=engine.driver_s[name],
                 scheduler_s=engine.scheduler_s,
-                result_bytes=bytes_a_result,
+                result_bytes=engine.result_bytes[name],
                 stored_bytes=stored.get(name, 0.0),
             )
         )
@@ -389,15 +408,14 @@ def city_run(engine: Engine, buildings: int, workers: int, change: Change, stora
     return simulate(city_stages(engine, max(1, buildings // share), change), machine)
 
 
-REGIONS = Change(join_share=0.3, joined_in_driver=0.05, split_bytes_share=0.07)
-"""Descriptors 14 times smaller, closed surfaces judged in the split, regions of 64 tiles joined in tasks."""
+REGIONS = Change(joined_in_driver=0.05)
+"""Regions of 64 tiles joined in tasks."""
 ALL = dataclasses.replace(REGIONS, digest_in_driver=0.02, plan_in_driver=0.05, tasks_a_batch=4.0)
 PLAIN, CHANGED = "as it is", "with all changes"
 CHANGES: Mapping[str, Change] = {
     "as it is": Change(),
     "window twice as large": Change(tasks_a_thread=2 * TASKS_A_THREAD),
     "tasks four times larger": Change(tasks_a_batch=4.0),
-    "small descriptors": Change(join_share=0.3, split_bytes_share=0.07),
     "join by regions, in tasks": REGIONS,
     "digest by tile": Change(digest_in_driver=0.02),
     "inputs looked at in tasks": Change(plan_in_driver=0.05),

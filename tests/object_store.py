@@ -8,6 +8,7 @@ import http.client
 import logging
 import re
 import threading
+import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Self
@@ -76,6 +77,7 @@ class FaultyProxy:
     | `lost` | it is passed on, and the connection is closed in place of the answer |
     | `half` | it is passed on, and the connection is closed after half of the answer |
     | `silent` | it is passed on, and nothing is said until the client goes away |
+    | `late` | it is passed on, and answered after a quarter of a second |
     """
 
     target: str
@@ -142,11 +144,13 @@ class FaultyProxy:
             _answer(client, status, [("Content-Type", "application/xml")], text)
             return
         status, headers, content, length = self._passed_on(client, body)
-        if what == "lost":
-            return
+        if what == "lost" or (what == "half" and client.command == "HEAD"):
+            return  # what has no body is not cut in half
         if what == "silent":
             client.connection.recv(1)  # until the client closes its end
             return
+        if what == "late":
+            time.sleep(0.25)
         if what == "half":
             _answer(client, status, headers, content[: len(content) // 2], promised=len(content))
             return

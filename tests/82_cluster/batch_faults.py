@@ -14,8 +14,10 @@ from typing import Any
 import pyarrow.dataset as pads
 from deployment import Gates, kill_process
 from faults import asked
+from object_store import FaultyProxy, environment
 from processes import Program, Programs, free_port, program
 
+from pipeline.io.urls import filesystem_of
 from pipeline.runtime.digest import run_digest
 
 STAGES = ("ingest", "split", "reconstruct", "publish")
@@ -38,6 +40,8 @@ class BatchRun:
         Whether scheduler and workers are processes of their own.
     faults : mapping, optional
         Further faults, as `tests/faults` understands them.
+    store, bucket : optional
+        An object store that holds input and results in place of the folder.
     """
 
     def __init__(
@@ -48,15 +52,24 @@ class BatchRun:
         *,
         external: bool = False,
         faults: Mapping[str, Any] | None = None,
+        store: FaultyProxy | None = None,
+        bucket: str = "",
     ) -> None:
         folder.mkdir()
         self.folder = folder
         self.gates = Gates(folder / "gates")
         self.full = folder / "full"
         self.full.mkdir()
+        self.store = store
         self._programs = programs
+        self.out = str(folder / "models")
+        inputs = str(tiles)
+        if store is not None:
+            self.out, inputs = f"{bucket}/models", f"{bucket}/in/{tiles.name}"
+            filesystem_of(inputs).put_file(str(tiles), inputs)
         self._environment = {
             "OPENBLAS_NUM_THREADS": "1",
+            **({} if store is None else environment(store.endpoint)),
             **asked.environment(pause=self.gates.asked, full=dict.fromkeys(STAGES, str(self.full)), **(faults or {})),
         }
         self.port = free_port()
@@ -65,8 +78,9 @@ class BatchRun:
         cluster = f'scheduler = "tcp://127.0.0.1:{self.port}"' if external else "workers = 2"
         self.file = folder / "batch.toml"
         self.file.write_text(
-            f"[inputs]\npaths = [{json.dumps(str(tiles))}]\n[settings]\ntile_size_m = 60.0\n"
-            f'[output]\npath = "models"\n[cluster]\n{cluster}\nbuilding_timeout_s = 60.0\n'
+            f"[inputs]\npaths = [{json.dumps(inputs)}]\n[settings]\ntile_size_m = 60.0\n"
+            f"[output]\npath = {json.dumps(self.out)}\nmeshes = {json.dumps('building' if store is None else 'tile')}\n"
+            f"[cluster]\n{cluster}\nbuilding_timeout_s = 60.0\n"
         )
         if external:
             self.start_scheduler()
@@ -102,11 +116,11 @@ class BatchRun:
     @property
     def digest(self) -> str:
         """Of the content of the results."""
-        return run_digest(str(self.folder / "models"))
+        return run_digest(self.out)
 
     def buildings(self) -> dict[str, tuple[str, str | None]]:
         """Status and reason of every building."""
-        rows = pads.dataset(self.folder / "models" / "buildings").to_table(["building_id", "status", "reason"])
+        rows = pads.dataset(Path(self.out, "buildings")).to_table(["building_id", "status", "reason"])
         return {row["building_id"]: (row["status"], row["reason"]) for row in rows.to_pylist()}
 
 
@@ -178,6 +192,26 @@ def second_driver(run: BatchRun, driver: Program, pid: int) -> None:
     run.gates.open()
 
 
+def every(what: str, *, of: int) -> Callable[[BatchRun, Program, int], None]:
+    """From now on something becomes of one in so many of the store's requests."""
+
+    def strike_store(run: BatchRun, driver: Program, pid: int) -> None:
+        assert run.store is not None
+        run.store.reset()
+        run.store.script = lambda request: what if request.number % of == 0 else "pass"
+        run.gates.open()
+
+    return strike_store
+
+
+def silent_at_first(run: BatchRun, driver: Program, pid: int) -> None:
+    """The first two requests are never answered."""
+    assert run.store is not None
+    run.store.reset()
+    run.store.script = lambda request: "silent" if request.number <= 2 else "pass"
+    run.gates.open()
+
+
 @dataclasses.dataclass(frozen=True)
 class Fault:
     """Something that goes wrong while a batch run is in a stage."""
@@ -191,7 +225,12 @@ class Fault:
     stages: Sequence[str] = STAGES
     external: bool = False
     """Whether scheduler and workers are processes of their own."""
+    in_store: bool = False
+    """Whether input and results lie in an object store, which it strikes."""
 
+
+TOUCHED = ("ingest", "publish")
+"""Stages that use the store."""
 
 FAULTS = (
     Fault("driver killed, its embedded cluster too", kill_driver, KILLED, "dead"),
@@ -202,6 +241,12 @@ FAULTS = (
     Fault("scheduler killed", kill_scheduler, REFUSED, "failed", external=True),
     Fault("disk full", fill_disk, REFUSED, "failed"),
     Fault("a second driver", second_driver, 0, "finished", stages=("reconstruct",)),
+    Fault("store: 1 of 6 requests refused as busy", every("busy", of=6), 0, "finished", TOUCHED, in_store=True),
+    Fault("store: 1 of 6 answers lost", every("lost", of=6), 0, "finished", ("publish",), in_store=True),
+    Fault("store: 1 of 6 answers cut in half", every("half", of=6), 0, "finished", ("ingest",), in_store=True),
+    Fault("store: all answers late", every("late", of=1), 0, "finished", ("publish",), in_store=True),
+    Fault("store: two requests never answered", silent_at_first, 0, "finished", TOUCHED, in_store=True),
+    Fault("store: no access any more", every("denied", of=1), REFUSED, "failed", TOUCHED, in_store=True),
 )
 ENDINGS = {0: "done", REFUSED: "error", INTERRUPTED: "interrupted", KILLED: "killed"}
 
@@ -218,6 +263,8 @@ def strike(run: BatchRun, fault: Fault, stage: str, undisturbed: str) -> Row:
     told = [f"{ENDINGS[code]}, {first['state']}"]
     run.gates.open()
     (run.full / "full").unlink(missing_ok=True)
+    if run.store is not None:
+        run.store.reset()
     before = first["stages"].get("reconstruct", {"done": 0})["done"]
     twice = "no"
     if first["state"] != "finished":

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from batch_faults import FAULTS, BatchRun, Fault, Row, markdown, strike
+from object_store import FaultyProxy
 from processes import Programs, program
 
 from pipeline.synthetic.dataset import simulate
@@ -58,8 +59,18 @@ def test_a_batch_run_outlives(
     table: list[Row],
     tmp_path: Path,
     programs: Programs,
+    s3: FaultyProxy,
+    bucket: str,
 ) -> None:
-    run = BatchRun(programs, tmp_path / "run", tiles, external=fault.external)
+    run = BatchRun(
+        programs,
+        tmp_path / "run",
+        tiles,
+        external=fault.external,
+        faults={"impatient": 2.0} if fault.in_store else None,
+        store=s3 if fault.in_store else None,
+        bucket=bucket,
+    )
     row = strike(run, fault, stage, undisturbed.digest)
     table.append(row)
     assert row.first.endswith(fault.state), row

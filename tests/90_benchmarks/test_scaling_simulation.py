@@ -15,6 +15,7 @@ from benchmarks.scaling_simulation import (
     Engine,
     Machine,
     Stage,
+    _driver_costs,
     city_run,
     city_stages,
     most_workers,
@@ -90,13 +91,28 @@ def engine() -> Engine:
         plan_s=0.01,
         join=(1e-3, 1.0),
         digest_s=1e-4,
-        driver_s=1e-3,
+        driver_s=dict.fromkeys(names, 1e-3),
         scheduler_s=1e-3,
         byte_s=1e-9,
         result_bytes=dict.fromkeys(names, 1000.0),
         start_s=1.0,
         tile_m=500.0,
     )
+
+
+def test_a_task_costs_the_driver_what_its_stage_did() -> None:
+    names = ("ingest", "split", "join", "outline", "reconstruct", "publish")
+    diary = [{"kind": "run", "stage": "plan", "at_s": 0.0, "cpu_s": 0.0}]
+    diary += [{"kind": "stage", "stage": name, "at_s": 10.0 * k, "cpu_s": 1.0 * k} for k, name in enumerate(names)]
+    diary.append({"kind": "finished", "stage": "", "at_s": 60.0, "cpu_s": 6.0})
+    tasks = [{"stage": name, "began_s": 0.0, "cpu_s": 1.0} for name in names for _ in range(50)]
+    trace = {"diary": diary, "tasks": tasks, "summary": {"counts": {"candidates": 100}}}
+    costs = {"tasks": [{"scheduler_idle_share": 0.02}], "join": {"cpu_s": (5e-3, 1.0)}}
+    found = _driver_costs(trace, costs, 0.001, 0.004)
+    # of 1 s in each stage .2 s are idle, and .5 s of the join are the driver's own step; 50 tasks, 4 ms the scheduler's
+    assert found["split"] == pytest.approx(0.8 / 50 - 0.004)
+    assert found["join"] == pytest.approx(0.3 / 50 - 0.004)
+    assert _driver_costs(trace, costs, 0.02, 0.004) == dict.fromkeys(names, 0.02)
 
 
 def test_a_city_ten_times_as_large_has_ten_times_the_tasks_and_the_work() -> None:

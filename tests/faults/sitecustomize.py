@@ -20,6 +20,7 @@ process itself does so.
   "pause": {"<stage>": "/folder", ...},     the stage's tasks write /folder/reached-<pid> and wait for /folder/go
   "kill": {"<stage>": "/folder", ...}       the first of the stage's tasks kills its process, by a mark in the folder
   "full": {"<stage>": "/folder", ...}       the stage's tasks find the disk full as long as /folder/full is there
+  "impatient": 2.0                          object stores may say nothing for so many seconds only
 }
 ```
 
@@ -59,6 +60,9 @@ STAGES = {
 
 BUILDINGS = "pipeline.reconstruct"
 """The module that models one building."""
+
+URLS = "pipeline.io.urls"
+"""The module that knows how long a server may be silent."""
 
 
 def crash() -> None:
@@ -176,6 +180,9 @@ def wrap(module: ModuleType) -> None:
         happen = functools.partial(_of_candidate, at_modelling)
         module._reconstruct = before(module._reconstruct, happen)  # type: ignore[attr-defined]
         return
+    if module.__name__ == URLS:
+        module.READ_S = FAULTS.get("impatient", module.READ_S)  # type: ignore[attr-defined]
+        return
     function, stage = STAGES[module.__name__]
     setattr(module, function, before(getattr(module, function), lambda *_: at_stage(stage)))
     if stage == "reconstruct":
@@ -211,7 +218,7 @@ class Finder(importlib.abc.MetaPathFinder):
     """Finds the modules that are to be wrapped, once each."""
 
     def __init__(self) -> None:
-        self._open = {*STAGES, BUILDINGS}
+        self._open = {*STAGES, BUILDINGS, URLS}
 
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -228,7 +235,7 @@ class Finder(importlib.abc.MetaPathFinder):
 
 
 if FAULTS:
-    unknown = set(FAULTS) - {*AT_MODELLING, "crash_gather", "crash_once", "pause", "kill", "full"}
+    unknown = set(FAULTS) - {*AT_MODELLING, "crash_gather", "crash_once", "pause", "kill", "full", "impatient"}
     if unknown:
         sys.exit(f"GABLEWORK_FAULTS knows no {', '.join(sorted(unknown))}")
     sys.meta_path.insert(0, Finder())
