@@ -217,6 +217,7 @@ def cost_of_join(plan: Plan, splits: Sequence[Split], buildings: int, times: int
                 making_s += time.process_time() - began_s
                 yield one
 
+    join(iter(splits), plan.grid, RunSettings().scene.candidates, "EPSG:25832")  # kernels are loaded once
     began = time.process_time()
     joined = join(city(), plan.grid, RunSettings().scene.candidates, "EPSG:25832")
     cpu_s = time.process_time() - began - making_s

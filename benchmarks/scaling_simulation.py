@@ -247,8 +247,9 @@ class Engine:
     tiles: int
     plan_s: float
     """Of the driver, a file."""
-    join: tuple[float, float]
-    """Factor and exponent of the join's CPU seconds by buildings."""
+    join_s: float
+    """Of the driver, a building: from the end of the splits to the first task of the join. `engine_costs.py` tells that
+    it grows no faster than the city."""
     digest_s: float
     """Of the driver, a building: digest, sums and the removal of scratch at the end."""
     driver_s: Mapping[str, float]
@@ -291,7 +292,7 @@ def measured_engine(trace: Mapping[str, Any], costs: Mapping[str, Any], tile_m: 
         tiles=counts["tiles"],
         # its CPU time up to the first task, but for what it took to start
         plan_s=max(0.0, lines["ingest"]["cpu_s"] - trace["diary"][0]["cpu_s"]) / files,
-        join=(costs["join"]["cpu_s"][0], costs["join"]["cpu_s"][1]),
+        join_s=_alone_s(trace, "join") / counts["candidates"],
         digest_s=ending_s / counts["candidates"],
         driver_s=_driver_costs(trace, costs, driver_s, scheduler_s),
         scheduler_s=scheduler_s,
@@ -300,6 +301,12 @@ def measured_engine(trace: Mapping[str, Any], costs: Mapping[str, Any], tile_m: 
         start_s=2.0,
         tile_m=tile_m,
     )
+
+
+def _alone_s(trace: Mapping[str, Any], stage: str) -> float:
+    """Seconds that the driver works alone before a stage's first task."""
+    first_s = min((task["began_s"] for task in trace["tasks"] if task["stage"] == stage), default=0.0)
+    return max(0.0, first_s - marks(trace)[stage][0])
 
 
 def _driver_costs(
@@ -313,14 +320,16 @@ def _driver_costs(
     tasks = own_times(trace, "cpu_s")
     lines = [line for line in trace["diary"] if is_mark(line)]
     idle = costs["tasks"][0]["scheduler_idle_share"]
-    factor, exponent = costs["join"]["cpu_s"]
     found = dict.fromkeys(STAGES, least_s)
+    # what comes behind the last result is the digest's
+    last = {line["stage"]: line for line in trace["diary"] if line["kind"] == "progress"}
     for line, after in itertools.pairwise(lines):
         count = len(tasks.get(line["stage"], ()))
+        after = last.get(line["stage"], after) if line["stage"] == "publish" else after  # noqa: PLW2901
         if count:
             own_s = after["cpu_s"] - line["cpu_s"] - idle * (after["at_s"] - line["at_s"])
             if line["stage"] == "join":
-                own_s -= factor * trace["summary"]["counts"]["candidates"] ** exponent
+                own_s -= _alone_s(trace, "join")
             found[line["stage"]] = max(least_s, own_s / count - scheduler_s)
     return found
 
@@ -354,7 +363,7 @@ def city_stages(engine: Engine, buildings: int, change: Change, seed: int = _SEE
         "split": POINT.itemsize * points_a_tile * (window + 0.3),
         "reconstruct": POINT.itemsize * 20_000 * 1.5 * change.tasks_a_batch,
     }
-    joining_s = engine.join[0] * buildings ** engine.join[1]
+    joining_s = engine.join_s * buildings
     n_files, n_tiles = max(1, round(engine.files * factor)), max(1, round(engine.tiles * factor))
     before = {
         "ingest": engine.start_s + engine.plan_s * n_files * change.plan_in_driver,

@@ -89,7 +89,7 @@ def engine() -> Engine:
         points=8_000_000,
         tiles=60,
         plan_s=0.01,
-        join=(1e-3, 1.0),
+        join_s=1e-3,
         digest_s=1e-4,
         driver_s=dict.fromkeys(names, 1e-3),
         scheduler_s=1e-3,
@@ -105,9 +105,13 @@ def test_a_task_costs_the_driver_what_its_stage_did() -> None:
     diary = [{"kind": "run", "stage": "plan", "at_s": 0.0, "cpu_s": 0.0}]
     diary += [{"kind": "stage", "stage": name, "at_s": 10.0 * k, "cpu_s": 1.0 * k} for k, name in enumerate(names)]
     diary.append({"kind": "finished", "stage": "", "at_s": 60.0, "cpu_s": 6.0})
-    tasks = [{"stage": name, "began_s": 0.0, "cpu_s": 1.0} for name in names for _ in range(50)]
+    tasks = [
+        {"stage": name, "began_s": 10.0 * k + (0.5 if name == "join" else 0.0), "cpu_s": 1.0}
+        for k, name in enumerate(names)
+        for _ in range(50)
+    ]
     trace = {"diary": diary, "tasks": tasks, "summary": {"counts": {"candidates": 100}}}
-    costs = {"tasks": [{"scheduler_idle_share": 0.02}], "join": {"cpu_s": (5e-3, 1.0)}}
+    costs = {"tasks": [{"scheduler_idle_share": 0.02}]}
     found = _driver_costs(trace, costs, 0.001, 0.004)
     # of 1 s in each stage .2 s are idle, and .5 s of the join are the driver's own step; 50 tasks, 4 ms the scheduler's
     assert found["split"] == pytest.approx(0.8 / 50 - 0.004)
