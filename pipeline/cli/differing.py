@@ -14,10 +14,11 @@ if TYPE_CHECKING:
 
 
 def diff(
-    old: Annotated[str, typer.Argument(metavar="OLD", help="The run directory of the earlier epoch.")],
-    new: Annotated[str, typer.Argument(metavar="NEW", help="The run directory of the later epoch.")],
+    old: Annotated[str, typer.Argument(metavar="OLD", help="Run directory of the earlier epoch, a folder or a URL.")],
+    new: Annotated[str, typer.Argument(metavar="NEW", help="Run directory of the later epoch, a folder or a URL.")],
     out: Annotated[
-        str, typer.Option(metavar="DIR", help="Write changes.parquet, .geojson, .json and .html into this folder.")
+        str,
+        typer.Option(metavar="DIR", help="Folder or URL of changes.parquet, .geojson, .json and .html."),
     ],
     settings: Annotated[
         str | None, typer.Option(metavar="FILE", help="Thresholds as TOML; docs/reference/changes.md.")
@@ -42,9 +43,10 @@ def diff(
 ) -> None:
     """Tell new, gone, raised, lowered, reshaped and unchanged buildings between two runs of one place."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.epochs.diff import DiffRequest
+        from pipeline.epochs.diff import DiffRequest, refuse_run_as_out
         from pipeline.epochs.diff import diff as compare_runs
         from pipeline.epochs.settings import read_settings
+        from pipeline.io.places import made_here, place_below
         from pipeline.report.epochs_map import epochs_map, gathering
         from pipeline.report.epochs_page import write_page
         from pipeline.runtime.events import Event
@@ -62,20 +64,23 @@ def diff(
         def on_part(done: int, total: int) -> None:
             console.on_event(Event(kind="progress", stage="compare", done=done, total=total))
 
+        refuse_run_as_out(out, (old, new))
         drawn = epochs_map()
-        found = compare_runs(
-            DiffRequest(old=old, new=new, out=out, settings=chosen, geojson=geojson),
-            on_part,
-            take_in=(gathering(drawn),) if page else (),
-        )
-        written = [*found.written]
-        if page:
-            console.on_event(Event(kind="stage", stage="page"))
-            written.append(write_page(found, drawn))
+        with made_here(out) as folder:
+            found = compare_runs(
+                DiffRequest(old=old, new=new, out=folder, settings=chosen, geojson=geojson),
+                on_part,
+                take_in=(gathering(drawn),) if page else (),
+            )
+            written = [*found.written]
+            if page:
+                console.on_event(Event(kind="stage", stage="page"))
+                written.append(write_page(found, drawn))
+        places = [place_below(out, path.name) for path in written]
         _show(console, found)
-        for path in written:
-            console.say(f"written: {path}")
-        console.document(found.as_dict() | {"written": [str(path) for path in written]})
+        for place in places:
+            console.say(f"written: {place}")
+        console.document(found.as_dict() | {"written": places})
 
 
 def _show(console: Console, found: Diff) -> None:

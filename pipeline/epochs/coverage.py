@@ -15,7 +15,6 @@ from pipeline.io.footprints import read_area
 from pipeline.io.storage import sha256_of
 from pipeline.model import FloatArray
 from pipeline.runtime.manifest import RunManifest
-from pipeline.tiling import MM, Tile, TileGrid
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -65,9 +64,9 @@ def coverage_of(manifest: RunManifest, reference: SpatialReference) -> Coverage:
         area = shapely.union_all(shapely.box(*np.array(bounds).T))
     failed: Any = shapely.Polygon()
     if manifest.lattice and manifest.tiles:
-        tiles = _boxes(manifest, set(manifest.tiles))
+        tiles = shapely.union_all(manifest.squares(sorted(manifest.tiles)))
         area = tiles if area is None else shapely.intersection(area, tiles)
-        failed = _boxes(manifest, set(manifest.failed_tiles))
+        failed = shapely.union_all(manifest.squares(sorted(manifest.failed_tiles)))
     if area is None:
         notes.append("run.json does not tell where its data lie: what is beyond them cannot be told from new or gone")
     elif not bounds:
@@ -80,21 +79,6 @@ def coverage_of(manifest: RunManifest, reference: SpatialReference) -> Coverage:
         else:
             area = shapely.intersection(area, drawn)
     return Coverage(area=area, failed=failed, notes=tuple(notes))
-
-
-def _boxes(manifest: RunManifest, keys: set[str]) -> Any:
-    """The tiles of some keys as one area."""
-    lattice = manifest.lattice
-    grid = TileGrid(
-        size_mm=round(lattice["tile_size_m"] * MM),
-        halo_mm=0,
-        origin_x_mm=round(lattice["origin_x_m"] * MM),
-        origin_y_mm=round(lattice["origin_y_m"] * MM),
-    )
-    cores = [grid.core(Tile.from_key(key)) for key in sorted(keys)]
-    return shapely.union_all(
-        [shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM) for core in cores]
-    )
 
 
 def _area_of_interest(path: str, manifest: RunManifest, reference: SpatialReference) -> Any | None:

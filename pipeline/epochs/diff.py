@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.fs as pafs
 
 from pipeline.epochs.agreement import check_agreement
 from pipeline.epochs.comparing import OnPart, compare_epochs
@@ -19,6 +18,7 @@ from pipeline.epochs.settings import DiffSettings
 from pipeline.epochs.summary import Summary
 from pipeline.epochs.writing import GEOJSON, JSON, PARQUET, GeoJson, geojson_sink, parquet_sink
 from pipeline.errors import RunError
+from pipeline.io import is_url
 from pipeline.io.storage import LocalStorage
 
 FORMAT = 1
@@ -31,7 +31,7 @@ class DiffRequest:
     """What is to be compared, and how."""
 
     old: str
-    """The run directory of the earlier epoch: a local path, or a path of its file system."""
+    """The run directory of the earlier epoch: a path or a URL."""
     new: str
     """That of the later one."""
     out: str
@@ -40,10 +40,6 @@ class DiffRequest:
     """What counts as a change."""
     geojson: GeoJson = "changed"
     """Which rows `changes.geojson` holds."""
-    old_filesystem: pafs.FileSystem | None = None
-    """Where OLD lies; local by default."""
-    new_filesystem: pafs.FileSystem | None = None
-    """Where NEW lies; local by default."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -73,6 +69,22 @@ class Diff:
             "warnings": list(self.warnings),
             **self.summary.as_dict(),
         }
+
+
+def refuse_run_as_out(out: str, runs: Sequence[str]) -> None:
+    """Refuse to write among the files of a run.
+
+    Raises
+    ------
+    RunError
+        The place of the results is that of a run.
+    """
+
+    def whole(place: str) -> str:
+        return place.rstrip("/") if is_url(place) else str(Path(place).resolve())
+
+    if whole(out) in {whole(run) for run in runs}:
+        raise RunError(f"{out} is one of the runs that are compared: give --out a folder of its own")
 
 
 def _told(epoch: Epoch) -> dict[str, Any]:
@@ -112,12 +124,10 @@ def diff(
     CrsError
         The runs are of different reference systems or units.
     """
+    refuse_run_as_out(request.out, (request.old, request.new))
     storage = LocalStorage(root=Path(request.out))
-    sources = {Path(path).resolve() for path in (request.old, request.new)}
-    if storage.root.resolve() in sources:
-        raise RunError(f"{request.out} is one of the runs that are compared: give --out a folder of its own")
-    old = open_epoch("OLD", request.old, request.old_filesystem)
-    new = open_epoch("NEW", request.new, request.new_filesystem)
+    old = open_epoch("OLD", request.old)
+    new = open_epoch("NEW", request.new)
     warnings = list(check_agreement(old, new))
     reference = new.reference if new.reference.wkt is not None else old.reference
     summary = Summary()

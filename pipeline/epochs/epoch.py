@@ -13,13 +13,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as pads
-import pyarrow.fs as pafs
 import shapely
 
 from pipeline.epochs.coverage import Coverage, coverage_of
 from pipeline.epochs.roof_raster import RoofFaces
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_dataset
+from pipeline.io import arrow_at
 from pipeline.io.crs import SpatialReference
 from pipeline.model import FloatArray, IntArray
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
@@ -89,6 +89,8 @@ class Epoch:
     """The files of the table of planes by tile."""
     schemas: tuple[pa.Schema, pa.Schema]
     """Of the tables of buildings and of planes."""
+    table: pads.Dataset
+    """The table of buildings."""
 
     def __len__(self) -> int:
         """Number of buildings."""
@@ -127,7 +129,7 @@ class Epoch:
         return _faces(table.take(pa.array(order)), noise_m, self.reference), owners[order]
 
 
-def open_epoch(name: str, run_dir: str, filesystem: pafs.FileSystem | None = None) -> Epoch:
+def open_epoch(name: str, run_dir: str) -> Epoch:
     """Open a run that is to be compared.
 
     Parameters
@@ -135,16 +137,14 @@ def open_epoch(name: str, run_dir: str, filesystem: pafs.FileSystem | None = Non
     name : str
         OLD or NEW, for messages.
     run_dir : str
-        The run directory: a local path, or a path of `filesystem`.
-    filesystem : pyarrow.fs.FileSystem, optional
-        Where the run lies; local by default.
+        The run directory, a path or a URL.
 
     Raises
     ------
     RunError
         It holds no run that ended, or a damaged one.
     """
-    manifest = read_manifest(run_dir, filesystem)
+    manifest = read_manifest(run_dir)
     if manifest.status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
         raise RunError(f"{name}, the run in {run_dir}, is {manifest.status.value}: compare runs that ended")
     facts = dict(manifest.crs or {})
@@ -155,8 +155,9 @@ def open_epoch(name: str, run_dir: str, filesystem: pafs.FileSystem | None = Non
             if facts.get(key) is not None
         }
     )
-    buildings = table_dataset(run_dir, "buildings", filesystem)
-    planes = table_dataset(run_dir, "planes", filesystem)
+    filesystem, path = arrow_at(run_dir)
+    buildings = table_dataset(path, "buildings", filesystem)
+    planes = table_dataset(path, "planes", filesystem)
     fragments = sorted(buildings.get_fragments(), key=lambda fragment: str(fragment.path))
     planes_of: dict[str, list[Any]] = {}
     for fragment in sorted(planes.get_fragments(), key=lambda fragment: str(fragment.path)):
@@ -172,10 +173,11 @@ def open_epoch(name: str, run_dir: str, filesystem: pafs.FileSystem | None = Non
         boxes=_boxes(tables, reference.horizontal_unit_m),
         files=np.repeat(np.arange(len(tables)), counts),
         places=np.concatenate([np.arange(count) for count in counts]) if len(counts) else np.empty(0, np.int64),
-        rejected=_rejected(table_dataset(run_dir, "rejected", filesystem), reference.horizontal_unit_m),
+        rejected=_rejected(table_dataset(path, "rejected", filesystem), reference.horizontal_unit_m),
         fragments=fragments,
         planes=planes_of,
         schemas=(buildings.schema, planes.schema),
+        table=buildings,
     )
 
 

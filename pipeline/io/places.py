@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +35,25 @@ def storage_at(place: str | Path) -> Storage:
     if isinstance(place, str) and is_url(place):
         return ObjectStorage(url=place)
     return LocalStorage(root=Path(place).resolve())
+
+
+@contextlib.contextmanager
+def made_here(place: str) -> Iterator[str]:
+    """A folder of this machine for results that go to a place: the folder itself, or one whose files go to the URL.
+
+    Yields
+    ------
+    str
+        The folder. Where the block ends without an error its files are put; of a URL only then anything is.
+    """
+    if not is_url(place):
+        yield place
+        return
+    storage = storage_at(place)
+    with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
+        yield folder
+        for path in sorted(path for path in Path(folder).rglob("*") if path.is_file()):
+            storage.put(path.relative_to(folder).as_posix(), path.read_bytes())
 
 
 def place_below(place: str | Path, name: str) -> str:

@@ -61,7 +61,7 @@ def page(diff: Diff, rows: ClassMap) -> str:
     told = diff.as_dict()
     drawn = rows.map(diff.new.reference.horizontal_unit_m)
     largest = diff.summary.largest
-    pictures = cases(largest, diff.old, diff.new, diff.request.old_filesystem, diff.request.new_filesystem)
+    pictures = cases(largest, diff.old, diff.new)
     listed = [_row(row) for row in largest.to_pylist()]
     changed = sum(one["rows"] for name, one in told["changes"].items() if name != Change.UNCHANGED.value)
     return page_template("epochs.html").render(

@@ -15,7 +15,6 @@ from matplotlib.collections import PathCollection
 
 from pipeline.epochs.epoch import Epoch
 from pipeline.epochs.records import Change
-from pipeline.export.geoparquet import table_dataset
 from pipeline.model import FloatArray, RoofType
 from pipeline.report.epochs_map import COLOURS
 from pipeline.report.perspective import View, ViewedFace, draw_view, projected
@@ -58,9 +57,7 @@ class _Model:
     faces: tuple[ViewedFace, ...]
 
 
-def cases(
-    largest: pa.Table, old: Epoch, new: Epoch, old_filesystem: Any = None, new_filesystem: Any = None
-) -> list[Case]:
+def cases(largest: pa.Table, old: Epoch, new: Epoch) -> list[Case]:
     """The largest changes of each class with their pictures, class by class.
 
     Parameters
@@ -69,25 +66,23 @@ def cases(
         Rows in descending order of size, class by class.
     old, new : Epoch
         Where the models are read.
-    old_filesystem, new_filesystem : pyarrow.fs.FileSystem, optional
-        Where the runs lie; local by default.
     """
     rows: list[dict[str, Any]] = []
     for change in _CLASSES:
         rows += largest.filter(pc.equal(largest["change"], change.value)).slice(0, A_CLASS).to_pylist()
-    before = _models(old, {name for row in rows for name in row["old_ids"]}, old_filesystem)
-    after = _models(new, {name for row in rows for name in row["new_ids"]}, new_filesystem)
+    before = _models(old, {name for row in rows for name in row["old_ids"]})
+    after = _models(new, {name for row in rows for name in row["new_ids"]})
     return [
         _case(row, [before[name] for name in row["old_ids"]], [after[name] for name in row["new_ids"]]) for row in rows
     ]
 
 
-def _models(epoch: Epoch, names: set[str], filesystem: Any) -> dict[str, _Model]:
+def _models(epoch: Epoch, names: set[str]) -> dict[str, _Model]:
     """The models of some buildings, in metres, by name."""
     if not names:
         return {}
     chosen = pc.field("building_id").isin(pa.array(sorted(names), pa.string()))
-    table = table_dataset(epoch.run_dir, "buildings", filesystem).to_table(columns=list(_COLUMNS), filter=chosen)
+    table = epoch.table.to_table(columns=list(_COLUMNS), filter=chosen)
     horizontal, vertical = epoch.reference.horizontal_unit_m, epoch.reference.vertical_unit_m
     found = {}
     for row in table.to_pylist():

@@ -24,7 +24,6 @@ from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
 from pipeline.report.table import QUANTILES, run_statistics
 from pipeline.runtime.manifest import NAME, PAGE, RunManifest, RunStatus, read_manifest
-from pipeline.tiling import MM, Tile, TileGrid
 
 LISTED = 500
 """Buildings without a roof of their own that the page lists one by one: those without any model first, then the
@@ -97,7 +96,7 @@ def run_page(run_dir: str) -> str:
         raise RunError(f"the buildings of {run_dir} cannot be read as Parquet: {error}") from error
     statistics = run_statistics(path, filesystem)
     seen.map.add(_failed_tiles(manifest))
-    drawn = seen.map.map(float((manifest.crs or {}).get("horizontal_unit_m") or 1.0))
+    drawn = seen.map.map(_unit_m(manifest))
     return page_template("run.html").render(
         run=manifest,
         subject=_subject(run_dir, manifest),
@@ -195,22 +194,17 @@ def _slow(building_id: str, seconds: float, row: Mapping[str, Any] | None) -> di
 
 
 def _failed_tiles(manifest: RunManifest) -> pa.Table:
-    """The squares of tiles whose buildings are not in the tables."""
-    lattice, names = manifest.lattice, manifest.failed_tiles
-    unit_m = float((manifest.crs or {}).get("horizontal_unit_m") or 1.0)
-    squares = []
-    for name in names if lattice else ():
-        grid = TileGrid(
-            size_mm=round(lattice["tile_size_m"] * MM),
-            origin_x_mm=round(lattice["origin_x_m"] * MM),
-            origin_y_mm=round(lattice["origin_y_m"] * MM),
-            halo_mm=0,
-        )
-        core = grid.core(Tile.from_key(name))
-        edges = [value / MM / unit_m for value in (core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm)]
-        squares.append(shapely.to_wkb(shapely.box(*edges)))
+    """The squares of tiles whose buildings are not in the tables, in the CRS's units."""
+    unit_m = _unit_m(manifest)
+    squares = shapely.transform(np.array(manifest.squares(manifest.failed_tiles), object), lambda xy: xy / unit_m)
     n = len(squares)
-    return pa.table([[_FAILED_TILE] * n, squares, [np.inf] * n, list(names)[:n]], schema=ROWS)
+    rows = [[_FAILED_TILE] * n, list(shapely.to_wkb(squares)), [np.inf] * n, list(manifest.failed_tiles)[:n]]
+    return pa.table(rows, schema=ROWS)
+
+
+def _unit_m(manifest: RunManifest) -> float:
+    """Metres a unit of the geometries."""
+    return float((manifest.crs or {}).get("horizontal_unit_m") or 1.0)
 
 
 def _subject(run_dir: str, manifest: RunManifest) -> str:

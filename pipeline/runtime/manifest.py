@@ -10,16 +10,18 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 import pyarrow.fs as pafs
+import shapely
 
 from pipeline.errors import RunError
 from pipeline.export.tile import Put, put_local
 from pipeline.io import arrow_at
+from pipeline.tiling import MM, Tile, TileGrid
 
 NAME = "run.json"
 """File name of the manifest in the run directory."""
@@ -123,6 +125,19 @@ class RunManifest:
             value = getattr(self, name)
             if value is not None and value.tzinfo is None:
                 raise RunError(f"{name} is {value.isoformat()}: give a time zone")
+
+    def squares(self, keys: Iterable[str]) -> list[Any]:
+        """The tiles of some keys as squares in metres, in their order; none where the lattice is not known."""
+        if not self.lattice:
+            return []
+        grid = TileGrid(
+            size_mm=round(self.lattice["tile_size_m"] * MM),
+            halo_mm=0,
+            origin_x_mm=round(self.lattice["origin_x_m"] * MM),
+            origin_y_mm=round(self.lattice["origin_y_m"] * MM),
+        )
+        cores = (grid.core(Tile.from_key(key)) for key in keys)
+        return [shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM) for core in cores]
 
     def to_json(self) -> str:
         """The manifest as JSON text for people and programs."""

@@ -9,16 +9,19 @@ from typing import Any
 import geopandas
 import geoparquet_validator
 import numpy as np
-import pyarrow.fs as pafs
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import shapely
 from epochs_by_hand import EXTENT, UTM, house, write_epoch
+from typer.testing import CliRunner
 
+from pipeline.cli import app
 from pipeline.epochs.diff import DiffRequest, diff
 from pipeline.epochs.records import CHANGES, COLUMNS, DOUBTS, INCOMPARABLE, RELATIONS, Change
 from pipeline.epochs.settings import DiffSettings, read_settings
 from pipeline.errors import CrsError, RunError, SettingsError
+from pipeline.io import storage_at
 from pipeline.runtime.manifest import RunStatus
 
 
@@ -218,10 +221,35 @@ def test_every_word_of_a_closed_list_has_a_meaning() -> None:
     assert np.isfinite(EXTENT).all()
 
 
-def test_runs_may_lie_in_another_file_system(pair: tuple[str, str], tmp_path: Path) -> None:
-    here = run(pair, tmp_path / "here")
-    there = pafs.SubTreeFileSystem(str(tmp_path), pafs.LocalFileSystem())
-    told = run(("old", "new"), tmp_path / "there", old_filesystem=there, new_filesystem=there)
-    assert told["changes"] == here["changes"]
-    table, other = (pq.read_table(tmp_path / name / "changes.parquet") for name in ("here", "there"))
-    assert table.equals(other)
+def test_runs_may_lie_in_an_object_store_and_the_results_too(
+    pair: tuple[str, str], tmp_path: Path, bucket: str
+) -> None:
+    for place in pair:
+        for path in Path(place).rglob("*"):
+            if path.is_file():
+                key = path.relative_to(place).as_posix()
+                storage_at(f"{bucket}/{Path(place).name}").put(key, path.read_bytes())
+    urls = [f"{bucket}/{Path(place).name}" for place in pair]
+    here = CliRunner().invoke(app, ["batch", "diff", *pair, "--out", str(tmp_path / "here"), "--json"])
+    there = CliRunner().invoke(app, ["batch", "diff", *urls, "--out", f"{bucket}/told", "--json"])
+    assert (here.exit_code, there.exit_code) == (0, 0), there.stderr
+    told = json.loads(there.stdout)
+    assert told["changes"] == json.loads(here.stdout)["changes"]
+    assert told["old"]["run"] == urls[0]
+    names = sorted(path.name for path in (tmp_path / "here").iterdir())
+    assert told["written"] == [f"{bucket}/told/{Path(place).name}" for place in json.loads(here.stdout)["written"]]
+    assert sorted(storage_at(f"{bucket}/told").keys()) == names
+    got = pq.read_table(pa.BufferReader(storage_at(f"{bucket}/told").get("changes.parquet")))
+    assert got.equals(pq.read_table(tmp_path / "here" / "changes.parquet"))
+
+
+def test_what_fails_puts_nothing_into_a_store(pair: tuple[str, str], bucket: str) -> None:
+    words = ["batch", "diff", pair[0], f"{bucket}/nowhere", "--out", f"{bucket}/told"]
+    assert CliRunner().invoke(app, words).exit_code == 4
+    for path in Path(pair[0]).rglob("*.*"):
+        storage_at(f"{bucket}/run").put(path.relative_to(pair[0]).as_posix(), path.read_bytes())
+    words = ["batch", "diff", pair[0], f"{bucket}/run", "--out", f"{bucket}/run/"]
+    refused = CliRunner().invoke(app, words)
+    assert refused.exit_code == 4
+    assert "is one of the runs that are compared" in refused.stderr
+    assert storage_at(f"{bucket}/told").keys() == []

@@ -10,6 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
+from pipeline.io import storage_at
+from pipeline.runtime.digest import run_digest
 from pipeline.runtime.work_folder import held_work
 from pipeline.synthetic.dataset import simulate
 
@@ -61,6 +63,22 @@ def test_a_batch_is_planned_run_and_told(folder: Path) -> None:
     assert again["digest"] == first["digest"]
     status = json.loads(call("status", file, "--json")[1])
     assert all(stage["kept"] == stage["done"] for name, stage in status["stages"].items() if name != "join")
+
+
+def test_a_tile_index_and_a_bucket_are_inputs_and_results_of_a_batch(folder: Path, tmp_path: Path, bucket: str) -> None:
+    (tmp_path / "index").mkdir()
+    tile = next((folder / "tiles").glob("*.laz"))
+    (tmp_path / "index" / "tiles.txt").write_text(f"# the survey\n{tile}\n")
+    file = tmp_path / "city.toml"
+    text = (folder / "city.toml").read_text().replace("tiles/*.laz", "index/tiles.txt")
+    file.write_text(text.replace('"models"', f'"{bucket}/models"'))
+    assert rows(call("plan", file)[1])["inputs"].startswith("files: 1, ")
+    code, told, error = call("run", file, "--json")
+    assert code == 0, error
+    assert json.loads(told)["digest"] == run_digest(f"{bucket}/models")
+    assert b"Failures" not in storage_at(f"{bucket}/models").get("run.html")
+    again = json.loads(call("run", file, "--json")[1])
+    assert (again["digest"], again["counts"]["reused"]) == (json.loads(told)["digest"], again["counts"]["candidates"])
 
 
 def test_a_batch_that_somebody_runs_is_refused(folder: Path, tmp_path: Path) -> None:
