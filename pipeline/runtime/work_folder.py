@@ -69,25 +69,26 @@ def _distrust_the_last(root: Path, scratch: Scratch) -> None:
 
     What a process wrote outlives it, but not a loss of power: the system writes to the disk up to half a minute later
     (`vm.dirty_expire_centisecs`), names before contents. So of an outcome that was kept within minutes of the end
-    nobody knows whether it is whole.
+    nobody knows whether it is whole. Where another machine goes on, the folder lies on a server of files, which has
+    what was closed.
     """
-    file, now = root / _BOOT, boot_id()
-    before = file.read_text() if file.is_file() else now
-    if before != now:
+    file, host, now = root / _BOOT, socket.gethostname(), boot_id()
+    before = file.read_text().split() if file.is_file() else [host, now]
+    if before[:1] == [host] and before[1:] != [now]:
         kept = {path: path.stat().st_mtime for path in Path(scratch.root, FOLDER).glob("*/*/*")}
         last = max(kept.values(), default=0.0)
         for path, written in kept.items():
             if written > last - _DISTRUSTED_S:
                 path.unlink()
-    file.write_text(now)
+    file.write_text(f"{host} {now}")
 
 
 def boot_id() -> str:
-    """What differs each time that this machine is started; empty where the system does not tell it."""
+    """What differs each time that this machine is started; `unknown` where the system does not tell it."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
-        return ""
+        return "unknown"
 
 
 def make_work(root: Path) -> None:

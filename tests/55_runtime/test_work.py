@@ -251,10 +251,19 @@ def test_what_was_kept_shortly_before_a_loss_of_power_is_done_again(
     late = next(path for path in kept if path.parent.parent.name.startswith("models-"))
     late.write_bytes(late.read_bytes()[:20])
     place.tasks.clear()
-    monkeypatch.setattr("pipeline.runtime.work_folder.boot_id", lambda: "another boot")
+    monkeypatch.setattr("pipeline.runtime.work_folder.boot_id", lambda: "another-boot")
     assert place.run().digest == whole.digest
     assert set(place.tasks) == {"join", "outline", "reconstruct", "publish"}
     place.tasks.clear()
+    assert place.run().digest == whole.digest
+    assert not place.tasks
+
+
+def test_another_machine_goes_on_with_all_that_was_kept(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = place.run()
+    place.tasks.clear()
+    monkeypatch.setattr("pipeline.runtime.work_folder.boot_id", lambda: "another-boot")
+    monkeypatch.setattr("socket.gethostname", lambda: "elsewhere")
     assert place.run().digest == whole.digest
     assert not place.tasks
 
