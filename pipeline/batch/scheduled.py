@@ -245,8 +245,8 @@ def keep_schedule(
 ) -> None:
     """Run a batch at its times until it is to end; the run that is under way then is interrupted and waited for.
 
-    The batch file is read again before every look at the clock: changed times count from then on, and a file with
-    faults changes nothing.
+    The batch file is read again before every look at the clock: changed times count from the look before on, and a
+    file with faults changes nothing.
 
     Parameters
     ----------
@@ -374,7 +374,7 @@ class _Keeper:
                 self._tell(f"{told}, {entry.message}" if entry.message else told, kind)
 
     def _reread(self) -> None:
-        """Take the batch file's changes; times that passed before are decided by the old ones."""
+        """Take the batch file's changes: new times count from the last look at the clock on."""
         written = _written(self._batch.path)
         if written == self._written:
             return
