@@ -16,7 +16,7 @@ from pipeline.cli import app
 
 COMMANDS = (
     *("reconstruct", "rerun", "compare", "classify", "inspect", "simulate", "digest"),
-    *("evaluate", "warm-up", "demo", "replay", "worker", "batch"),
+    *("evaluate", "warm-up", "demo", "replay", "report", "worker", "batch"),
 )
 
 
