@@ -96,7 +96,7 @@ class Estimate:
     """What cannot work, each with the fix; a run is not begun where there is any."""
 
 
-def estimate(batch: Batch, read: int = 3, known: int = 0) -> Estimate:
+def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Estimate:
     """Estimate a batch run.
 
     Parameters
@@ -105,8 +105,8 @@ def estimate(batch: Batch, read: int = 3, known: int = 0) -> Estimate:
         What is to be done.
     read : int
         Inputs that are read in whole to tell how many buildings there are.
-    known : int
-        Buildings that an earlier run of the batch had, in place of reading; 0 where there was none.
+    known : tuple of int
+        Buildings that an earlier run of the batch had, and its points: where these are as many now, nothing is read.
 
     Raises
     ------
@@ -121,8 +121,8 @@ def estimate(batch: Batch, read: int = 3, known: int = 0) -> Estimate:
     tiles = _tiles(plan)
     if request.footprints is not None:
         buildings, told = len(given_footprints(request.footprints, plan).polygons), "the given footprints"
-    elif known:
-        buildings, told = known, "as many as in the run before"
+    elif known[0] and known[1] == plan.points:
+        buildings, told = known[0], "as many as in the run before"
     else:
         buildings, told = _objects(plan, paths, read)
     workers, limit = memory_of_workers(workers=request.workers, scheduler=request.scheduler, tls=request.tls)

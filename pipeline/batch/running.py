@@ -52,7 +52,7 @@ def run_batch(
     refuse_held(batch.work_folder)
     planned = estimate(batch, _READ, buildings_before(batch.work_folder))
     refuse(planned)
-    status = StatusWriter(batch.work_folder, str(batch.path), batch.out, planned.stage_s)
+    status = StatusWriter(batch.work_folder, str(batch.path), batch.out, planned.stage_s, points=planned.points)
     with contextlib.ExitStack() as shown:
         if batch.cluster.metrics_port:
             shown.callback(serve_metrics(batch.cluster.metrics_port))

@@ -1,4 +1,4 @@
-"""A batch that runs at its times: what its process remembers of them, and the process itself.
+"""The process that runs a batch at its times.
 
 When a time is due, and what becomes of it, is told by `pipeline.schedule`; every run is a process of its own.
 """
@@ -8,28 +8,26 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime as dt
-import json
+import fcntl
+import os
+import select
 import signal
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping
-from enum import StrEnum
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.batch.batch_file import Batch, ScheduleTable, read_batch
+from pipeline.batch.batch_file import Batch, read_batch
+from pipeline.batch.schedule_state import NAME, Entry, Outcome, ScheduleState, iso, look, read_schedule
 from pipeline.errors import RunError, SettingsError
 from pipeline.io import LocalStorage
 from pipeline.runtime.events import Event, EventKind, Listener, ignore
 from pipeline.runtime.work_folder import held_lock, is_held, make_work
-from pipeline.schedule import Cron, Missed, Overlap, PassedSlots, decide, passed_slots
+from pipeline.schedule import Cron
 
-NAME = "schedule.json"
-"""File in the work folder: up to when all times are decided, what became of them, and of the runs."""
-LOCK = "schedule.lock"
-KEPT = 500
-"""Entries that are remembered; the counts go on."""
+LOCK, RUN_LOCK = "schedule.lock", "run.lock"
+"""Files there that are held by whoever keeps the schedule, and by the run that it started."""
 LONGEST_SLEEP_S = 30.0
 """The clock may be put forward, the batch file may change, a run by hand may end: it is looked after that long."""
 _RUN_LOOK_S = 2.0
@@ -38,183 +36,12 @@ _BEHIND_S = 0.05
 """A time is looked for a little after it, so that it has passed."""
 
 
-class Outcome(StrEnum):
-    """What became of a time, or of a run."""
-
-    RAN = "ran"
-    """A run was made, and ended well."""
-    INCOMPLETE = "incomplete"
-    """A run was made, and some tiles failed."""
-    FAILED = "failed"
-    """A run was made, and ended with an error."""
-    INTERRUPTED = "interrupted"
-    """A run was made, and cut off; where the schedule itself was ended, it goes on when that is started again."""
-    SKIPPED = "skipped"
-    """A run was still under way."""
-    MISSED = "missed"
-    """Nobody saw it in time, a later time took its place, or the schedule was paused while it waited."""
-
-
-_BY_CODE = {0: Outcome.RAN, 1: Outcome.INCOMPLETE, 130: Outcome.INTERRUPTED, -signal.SIGINT: Outcome.INTERRUPTED}
+_BY_CODE = {
+    0: Outcome.RAN,
+    1: Outcome.INCOMPLETE,
+    **dict.fromkeys((130, 143, -signal.SIGINT, -signal.SIGTERM), Outcome.INTERRUPTED),
+}
 """Exit codes of `gablework batch run`; all others failed."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Entry:
-    """What became of a time, of several that were missed together, or of a run that went on."""
-
-    outcome: Outcome
-    """What became of it."""
-    slot: str | None
-    """When it was due, ISO 8601 in UTC; of several the last one."""
-    slots: int = 1
-    """How many there were."""
-    is_counted: bool = True
-    """Whether `slots` is exact; else there were more."""
-    at: str
-    """When this was decided, of a run when it ended."""
-    started_at: str | None = None
-    """When its run began; None where there was none."""
-    exit_code: int | None = None
-    """Of its run."""
-    message: str = ""
-    """Why, in a sentence."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ScheduleState:
-    """What is remembered between two looks at the clock."""
-
-    decided_until: dt.datetime
-    """Up to when all times are decided."""
-    waiting: dt.datetime | None = None
-    """The time that waits for a run to end."""
-    running: dt.datetime | None = None
-    """The time whose run is under way, or was cut off together with this process."""
-    counts: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """Times by outcome."""
-    entries: tuple[Entry, ...] = ()
-    """The newest, in order."""
-
-    def with_entry(self, entry: Entry) -> ScheduleState:
-        """With one thing more to tell."""
-        counts = {**self.counts, entry.outcome.value: self.counts.get(entry.outcome.value, 0) + entry.slots}
-        return dataclasses.replace(self, counts=counts, entries=(*self.entries, entry)[-KEPT:])
-
-    def to_json(self) -> str:
-        """As the file holds it."""
-        told = dataclasses.asdict(self)
-        for name in ("decided_until", "waiting", "running"):
-            told[name] = _iso(getattr(self, name))
-        return json.dumps(told, indent=1) + "\n"
-
-    @classmethod
-    def from_json(cls, text: str) -> ScheduleState:
-        """As it was written.
-
-        Raises
-        ------
-        ValueError
-            It is damaged.
-        """
-        try:
-            told = json.loads(text)
-            until = dt.datetime.fromisoformat(told["decided_until"])
-            entries = tuple(Entry(**{**entry, "outcome": Outcome(entry["outcome"])}) for entry in told["entries"])
-            return cls(
-                decided_until=until,
-                waiting=_time(told["waiting"]),
-                running=_time(told["running"]),
-                counts=told["counts"],
-                entries=entries,
-            )
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{type(error).__name__}: {error}") from error
-
-
-def look(
-    state: ScheduleState, table: ScheduleTable, now: dt.datetime, *, is_busy: bool
-) -> tuple[ScheduleState, dt.datetime | None]:
-    """Decide the times that have passed.
-
-    Parameters
-    ----------
-    state : ScheduleState
-        What is remembered.
-    table : ScheduleTable
-        When the batch is to run.
-    now : datetime
-        The present, with a time zone.
-    is_busy : bool
-        Whether a run of this batch is under way, also one that somebody started by hand.
-
-    Returns
-    -------
-    ScheduleState
-        With what became of them.
-    datetime or None
-        The time that is to be run now.
-    """
-    if table.paused:
-        if state.waiting is not None:
-            state = state.with_entry(_missed(state.waiting, now, "the schedule was paused while it waited"))
-        return dataclasses.replace(state, decided_until=max(now, state.decided_until), waiting=None), None
-    passed = passed_slots(Cron(table.cron, table.time_zone), state.decided_until, now)
-    decision = decide(
-        passed,
-        waiting=state.waiting,
-        is_busy=is_busy,
-        now=now,
-        missed=Missed(table.missed),
-        overlap=Overlap(table.overlap),
-        grace=dt.timedelta(seconds=table.grace_s),
-    )
-    if passed is not None and passed.before_latest is not None:
-        state = state.with_entry(_missed_before(passed, now))
-    if decision.late is not None:
-        state = state.with_entry(_missed(decision.late, now, "it was seen too late"))
-    if decision.replaced is not None:
-        state = state.with_entry(_missed(decision.replaced, now, "a later time took its place while it waited"))
-    if decision.skipped is not None:
-        message = "a run was still under way"
-        entry = Entry(outcome=Outcome.SKIPPED, slot=_iso(decision.skipped), at=str(_iso(now)), message=message)
-        state = state.with_entry(entry)
-    # a clock that was put back brings no time a second time
-    return dataclasses.replace(state, decided_until=max(now, state.decided_until), waiting=decision.waits), decision.run
-
-
-def _missed(slot: dt.datetime, now: dt.datetime, message: str) -> Entry:
-    return Entry(outcome=Outcome.MISSED, slot=_iso(slot), at=str(_iso(now)), message=message)
-
-
-def _missed_before(passed: PassedSlots, now: dt.datetime) -> Entry:
-    return Entry(
-        outcome=Outcome.MISSED,
-        slot=_iso(passed.before_latest),
-        slots=passed.earlier,
-        is_counted=passed.is_counted,
-        at=str(_iso(now)),
-        message=f"nobody looked from {_iso(passed.first)} on",
-    )
-
-
-def read_schedule(work_folder: str) -> ScheduleState | None:
-    """What is remembered of a batch's times; None where it was never run by them.
-
-    Raises
-    ------
-    RunError
-        It cannot be read.
-    """
-    path = Path(work_folder, NAME)
-    try:
-        return ScheduleState.from_json(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise RunError(
-            f"{path} cannot be read: {error}. Remove it to begin anew; times until then are not known"
-        ) from error
 
 
 class Run(Protocol):
@@ -230,29 +57,69 @@ class Run(Protocol):
         """Its exit code, when it is over."""
 
 
-def start_run(batch: Batch) -> Run:
-    """Start a run as a process of its own, in its own group: an interrupt from the keyboard reaches it by us alone."""
-    command = [sys.executable, "-m", "pipeline.cli", "batch", "run", str(batch.path)]
-    return subprocess.Popen(command, process_group=0)  # noqa: S603 -- our own interpreter and program
+def start_run(batch: Batch, words: Sequence[str] = ()) -> Run:
+    """Start a run as a process of its own.
+
+    It is in a group of its own, so that an interrupt from the keyboard reaches it by us alone, and holds `RUN_LOCK`
+    from its first moment on: whoever keeps the schedule after us knows of a run that outlived us. What it prints at
+    its end is told by the report and the status.
+
+    Parameters
+    ----------
+    batch : Batch
+        What is run.
+    words : sequence of str
+        Further options of the command.
+    """
+    command = [sys.executable, "-m", "pipeline.cli", "batch", "run", str(batch.path), *words]
+    lock = os.open(Path(batch.work_folder, RUN_LOCK), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return subprocess.Popen(command, process_group=0, pass_fds=(lock,), stdout=subprocess.DEVNULL)  # noqa: S603
+    finally:
+        os.close(lock)
+
+
+class Ending:
+    """Tells that a schedule is to end; may be set by a signal's handler, also while somebody sleeps by it."""
+
+    def __init__(self) -> None:
+        self._is_set = False
+        self._reads, self._writes = os.pipe()
+        os.set_blocking(self._writes, False)
+
+    def set(self) -> None:
+        """End it."""
+        self._is_set = True
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._writes, b".")
+
+    def is_set(self) -> bool:
+        """Whether it is to end."""
+        return self._is_set
+
+    def wait(self, seconds: float) -> None:
+        """Sleep, unless it is to end."""
+        select.select([self._reads], [], [], seconds)
 
 
 def keep_schedule(
     path: str | Path,
-    ending: threading.Event,
+    ending: Ending,
     on_event: Listener = ignore,
     start: Callable[[Batch], Run] = start_run,
     now: Callable[[], dt.datetime] = lambda: dt.datetime.now(tz=dt.UTC),
 ) -> None:
     """Run a batch at its times until it is to end; the run that is under way then is interrupted and waited for.
 
-    The batch file is read again before every look at the clock: changed times count from the look before on, and a
-    file with faults changes nothing.
+    The batch file is read again before every look at the clock. Changed times count from the change on; while the
+    file has faults nothing is run, and each time that passes is told as failed.
 
     Parameters
     ----------
     path : str or Path
         The batch file, with a table `[schedule]`.
-    ending : threading.Event
+    ending : Ending
         Set by others where it is to end.
     on_event : callable
         Gets an `Event` for what becomes of each time.
@@ -270,17 +137,21 @@ def keep_schedule(
     """
     keeper = _Keeper(batch=_scheduled(path), listener=on_event, start=start, now=now)
     with keeper.held():
-        while not ending.is_set():
-            keeper.step()
-            ending.wait(keeper.sleep_s())
-        keeper.interrupt()
+        try:
+            while not ending.is_set():
+                keeper.step()
+                ending.wait(keeper.sleep_s())
+        finally:
+            keeper.interrupt()
 
 
-def _scheduled(path: str | Path) -> Batch:
-    """A batch that has times."""
+def _scheduled(path: str | Path, folder: Path | None = None) -> Batch:
+    """A batch that has times, and the work folder that it had."""
     batch = read_batch(path)
     if not batch.schedule.cron:
         raise SettingsError([f'[schedule] cron is missing in {path}: say when, such as cron = "30 2 * * *"'])
+    if folder is not None and batch.work_folder != str(folder):
+        raise SettingsError([f"[work] path is another folder than {folder}: start the schedule anew"])
     return batch
 
 
@@ -293,9 +164,11 @@ class _Keeper:
         self._batch, self._listener, self._start, self._now = batch, listener, start, now
         self._folder = Path(batch.work_folder)
         self._written = _written(batch.path)
+        self._refused = ""
         self._run: Run | None = None
         self._began = ""
         self._state = ScheduleState(decided_until=now())
+        self._on_disk: ScheduleState | None = None
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
@@ -303,25 +176,51 @@ class _Keeper:
         make_work(self._folder)
         with held_lock(self._folder, LOCK):
             self._state = read_schedule(str(self._folder)) or self._state
-            self._save(self._state)
+            if self._state.times not in {"", self._times}:  # changed while nobody looked: they count from now on
+                self._state = dataclasses.replace(self._state, decided_until=self._now(), waiting=None)
+            self._put(dataclasses.replace(self._state, times=self._times))
             if self._batch.schedule.paused:
                 self._tell("the schedule is paused")
             yield
 
+    @property
+    def _times(self) -> str:
+        return f"{self._batch.schedule.cron} {self._batch.schedule.time_zone}"
+
     def step(self) -> None:
         """Look at the clock once."""
-        self._reread()
         now, state = self._now(), self._ended(self._state)
-        is_busy = self._run is not None or is_held(str(self._folder))
-        due = None if is_busy else state.running  # cut off together with the process that kept the schedule
-        is_busy = is_busy or due is not None
-        state, slot = look(state, self._batch.schedule, now, is_busy=is_busy)
-        due = due or slot
-        self._save(dataclasses.replace(state, running=due or state.running))
-        if due is not None:
-            self._began = str(_iso(now))
-            self._tell(f"the run of {_iso(due)} begins")
+        before, written_at = self._batch.schedule, self._reread()
+        table = self._batch.schedule
+        is_busy = self._run is not None or is_held(str(self._folder)) or is_held(str(self._folder), RUN_LOCK)
+        # what was cut off together with the process that kept the schedule goes first
+        cut = None if is_busy or table.paused or self._refused else state.running
+        is_taken, slot = is_busy or state.running is not None, None
+        if written_at is not None:
+            # what passed before the file was written is decided by what it said then
+            until = min(now, max(written_at, state.decided_until))
+            state, slot = look(state, before, until, is_busy=is_taken)
+        state, later = look(state, table, now, is_busy=is_taken or slot is not None)
+        slot = slot or later
+        if slot is not None and self._refused:
+            state, slot = state.with_entry(self._failed(slot, f"the batch file is refused: {self._refused}")), None
+        due = cut or slot
+        state = dataclasses.replace(state, running=due or state.running, times=self._times)
+        # a run that is not written down would be forgotten if we were killed; it is tried again at the next look
+        if self._put(state) and due is not None:
+            self._begin(due)
+
+    def _begin(self, due: dt.datetime) -> None:
+        self._began = str(iso(self._now()))
+        self._tell(f"the run of {iso(due)} begins")
+        try:
             self._run = self._start(self._batch)
+        except OSError as error:
+            entry = self._failed(due, f"it could not be started: {error}")
+            self._put(dataclasses.replace(self._state.with_entry(entry), running=None))
+
+    def _failed(self, slot: dt.datetime, message: str) -> Entry:
+        return Entry(outcome=Outcome.FAILED, slot=iso(slot), at=str(iso(self._now())), message=message)
 
     def sleep_s(self) -> float:
         """How long nothing needs to be looked at."""
@@ -340,8 +239,9 @@ class _Keeper:
             self._run.send_signal(signal.SIGINT)
             self._run.wait()
             due, state = self._state.running, self._ended(self._state)
-            was_cut = state.entries[-1].outcome is Outcome.INTERRUPTED
-            self._save(dataclasses.replace(state, running=due if was_cut else None))
+            # only what is known to be whole is not to be gone on with
+            is_whole = state.entries[-1].outcome is Outcome.RAN
+            self._put(dataclasses.replace(state, running=None if is_whole else due))
 
     def _ended(self, state: ScheduleState) -> ScheduleState:
         """With what became of the run, where it is over."""
@@ -352,44 +252,55 @@ class _Keeper:
         outcome = _BY_CODE.get(code, Outcome.FAILED)
         entry = Entry(
             outcome=outcome,
-            slot=_iso(state.running),
-            at=str(_iso(self._now())),
+            slot=iso(state.running),
+            at=str(iso(self._now())),
             started_at=self._began,
             exit_code=code,
             message="" if outcome is Outcome.RAN else f"its exit code was {code}",
         )
         return dataclasses.replace(state.with_entry(entry), running=None)
 
-    def _save(self, state: ScheduleState) -> None:
-        """Write what is to be remembered, and tell what is new of it."""
-        before = self._state.entries
-        self._state = state
-        LocalStorage(root=self._folder).put(NAME, state.to_json().encode())
-        known = set(before)
+    def _put(self, state: ScheduleState) -> bool:
+        """Keep what is to be remembered, and tell what is new of it; whether it is written down.
+
+        Up to when all times are decided is no news as long as none has passed, so it alone is not written.
+        """
+        before, self._state = self._state, state
+        known = set(before.entries)
         for entry in state.entries:
             if entry not in known:
                 many = "" if entry.slots == 1 else f" and {entry.slots - 1} before it"
                 told = f"{entry.slot}{many}: {entry.outcome.value}"
                 kind: EventKind = "run" if entry.outcome is Outcome.RAN else "warning"
                 self._tell(f"{told}, {entry.message}" if entry.message else told, kind)
+        last, paused = self._on_disk, self._batch.schedule.paused
+        if last is not None and not paused and dataclasses.replace(state, decided_until=last.decided_until) == last:
+            return True
+        try:
+            LocalStorage(root=self._folder).put(NAME, state.to_json().encode())
+        except (OSError, RunError) as error:
+            self._tell(f"{NAME} cannot be written, so no run is started: {error}", "warning")
+            return False
+        self._on_disk = state
+        return True
 
-    def _reread(self) -> None:
-        """Take the batch file's changes: new times count from the last look at the clock on."""
+    def _reread(self) -> dt.datetime | None:
+        """Take the batch file's changes; when it was written, where it has any."""
         written = _written(self._batch.path)
         if written == self._written:
-            return
+            return None
         self._written = written
         try:
-            changed = _scheduled(self._batch.path)
+            changed = _scheduled(self._batch.path, self._folder)
         except SettingsError as error:
-            self._tell(f"the changed batch file is not used: {error}", "warning")
-            return
-        if changed.work_folder != str(self._folder):
-            self._tell("the changed batch file is not used: it names another work folder. Start anew", "warning")
-            return
+            self._refused = str(error)
+            self._tell(f"nothing is run as long as the batch file is refused: {error}", "warning")
+            return None
+        self._refused = ""
         if changed.schedule != self._batch.schedule:
             self._tell("the times changed")
         self._batch = changed
+        return None if written is None else dt.datetime.fromtimestamp(written[0] / 1e9, tz=dt.UTC)
 
     def _tell(self, message: str, kind: EventKind = "run") -> None:
         self._listener(Event(kind=kind, stage="schedule", message=message))
@@ -402,11 +313,3 @@ def _written(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_mtime_ns, found.st_size
-
-
-def _iso(time: dt.datetime | None) -> str | None:
-    return None if time is None else time.astimezone(dt.UTC).isoformat(timespec="seconds")
-
-
-def _time(text: str | None) -> dt.datetime | None:
-    return None if text is None else dt.datetime.fromisoformat(text)

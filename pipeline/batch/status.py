@@ -45,6 +45,8 @@ class Status:
     """ISO 8601, UTC."""
     updated_at: str
     """Of this status."""
+    points: int = 0
+    """Of all inputs, by their headers."""
     stage: str = ""
     """Under way, or the last one."""
     stages: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
@@ -80,6 +82,8 @@ class StatusWriter:
         Seconds, monotonic; replaced in tests.
     now : callable
         The time of day with a time zone; replaced in tests.
+    points : int
+        Of all inputs, by their headers.
     """
 
     def __init__(
@@ -90,6 +94,8 @@ class StatusWriter:
         planned: Mapping[str, float],
         clock: Callable[[], float] = time.monotonic,
         now: Callable[[], dt.datetime] = lambda: dt.datetime.now(tz=dt.UTC),
+        *,
+        points: int = 0,
     ) -> None:
         self._storage = LocalStorage(root=Path(work_folder))
         self._planned = dict(planned)
@@ -104,6 +110,7 @@ class StatusWriter:
             state="running",
             batch=batch,
             out=out,
+            points=points,
             process=f"{os.getpid()} on {socket.gethostname()}",
             started_at=started,
             updated_at=started,
@@ -202,23 +209,24 @@ def read_status(work_folder: str) -> Status:
         There is none, or it cannot be read.
     """
     path = Path(work_folder, NAME)
+    names = {field.name for field in dataclasses.fields(Status)}
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
+        status = Status(**{name: value for name, value in found.items() if name in names})
     except FileNotFoundError:
         raise RunError(f"{path} does not exist: this batch was never run") from None
-    except (OSError, json.JSONDecodeError) as error:
-        raise RunError(f"{path} cannot be read: {error}") from error
-    names = {field.name for field in dataclasses.fields(Status)}
-    status = Status(**{name: value for name, value in found.items() if name in names})
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise RunError(f"{path} cannot be read: {error}. Run the batch again: it writes a new one") from error
     if status.state == "running" and not is_held(work_folder):
         message = f"cut off after {status.updated_at}: run the batch again, and it goes on from there"
         return dataclasses.replace(status, state="dead", remaining_s=None, message=message)
     return status
 
 
-def buildings_before(work_folder: str) -> int:
-    """How many buildings the run before had; 0 where none came so far."""
+def buildings_before(work_folder: str) -> tuple[int, int]:
+    """How many buildings the run before had, and of how many points; zeros where nobody knows."""
     try:
-        return int(read_status(work_folder).buildings.get("total", 0))
+        status = read_status(work_folder)
     except RunError:
-        return 0
+        return 0, 0
+    return int((status.buildings or {}).get("total", 0)), status.points

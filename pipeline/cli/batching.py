@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+import functools
+import json
 import signal
-import threading
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -62,35 +64,51 @@ def status(file: BatchFile, as_json: AsJson = False) -> None:
     """Tell how far a batch run is, also from another terminal, and after it died."""
     with Console(as_json=as_json) as console:
         from pipeline.batch.batch_file import read_batch
-        from pipeline.batch.status import read_status
+        from pipeline.batch.status import NAME, read_status
 
         batch = read_batch(file)
+        if batch.schedule.cron and not Path(batch.work_folder, NAME).exists():
+            console.table(f"The run of {file}", ("figure", "value"), [("state", "never run"), *_times(batch)])
+            console.document({"state": "never run", "schedule": _scheduled(batch)})
+            return
         found = read_status(batch.work_folder)
         console.table(f"The run of {file}", ("figure", "value"), [*_told(found), *_times(batch)])
         for warning in found.warnings:
             console.warn(warning)
-        console.document(dataclasses.asdict(found))
+        console.document(dataclasses.asdict(found) | {"schedule": _scheduled(batch)})
 
 
 def schedule(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
     """Run a batch at the times of its table [schedule], until this command is ended; a missed time is told."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.batch.scheduled import keep_schedule
+        from pipeline.batch.batch_file import read_batch
+        from pipeline.batch.scheduled import Ending, keep_schedule, start_run
 
-        ending = threading.Event()
+        ending = Ending()
 
         def end(number: int, frame: object) -> None:
             del number, frame
             ending.set()
 
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, end)
-        keep_schedule(file, ending, console.on_event)
+        batch = read_batch(file)
+        words = [word for word, is_so in (("--json", as_json), ("--quiet", quiet)) if is_so]
+        keep_schedule(file, ending, console.on_event, functools.partial(start_run, words=words))
+        console.document(_scheduled(batch) or {})
+
+
+def _scheduled(batch: Batch) -> dict[str, Any] | None:
+    """What is remembered of a batch's times, as plain JSON values."""
+    from pipeline.batch.schedule_state import read_schedule
+
+    state = read_schedule(batch.work_folder)
+    return None if state is None else json.loads(state.to_json())
 
 
 def _times(batch: Batch) -> list[tuple[str, str]]:
     """The next times, and what became of the last one."""
-    from pipeline.batch.scheduled import read_schedule
+    from pipeline.batch.schedule_state import read_schedule
     from pipeline.schedule import Cron
 
     if not batch.schedule.cron:

@@ -61,6 +61,9 @@ class ClassMap:
         self._beneath: list[Any] = []
         self._middles: list[FloatArray] = []
         self._count: Counter[str] = Counter()
+        self._n_drawn = 0
+        self.ordinary = 0
+        """Ordinary rows with a geometry."""
         self.left_out = 0
         """Rows that are too many and too small to be drawn."""
 
@@ -70,20 +73,18 @@ class ClassMap:
         drawn = rows.filter(pc.invert(is_ordinary))
         self._count.update(drawn["class"].to_pylist())
         self._drawn.append(drawn)
-        if sum(len(one) for one in self._drawn) > 2 * MOST_DRAWN:
+        self._n_drawn += len(drawn)
+        if self._n_drawn > 2 * MOST_DRAWN:
             self._drawn = [self._largest()]
+            self._n_drawn = len(self._drawn[0])
         found = shapely.from_wkb(np.array(rows.filter(is_ordinary)["geometry"].to_pylist(), dtype=object))
         found = found[~shapely.is_missing(found)]
         bounds = shapely.bounds(found).reshape(-1, 4)
         self._middles.append((bounds[:, :2] + bounds[:, 2:]) / 2.0)
         self._beneath.append(found)
+        self.ordinary += len(found)
         if self.ordinary > MOST_ORDINARY:
             self._beneath = []
-
-    @property
-    def ordinary(self) -> int:
-        """Number of ordinary rows with a geometry."""
-        return sum(len(one) for one in self._middles)
 
     def _largest(self) -> pa.Table:
         """The largest rows; of equal ones those that come first by name."""

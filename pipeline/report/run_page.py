@@ -92,9 +92,9 @@ def run_page(run_dir: str) -> str:
     try:
         for batch in dataset.to_batches(columns=list(_COLUMNS)):
             seen.add(pa.Table.from_batches([batch]))
+        statistics = run_statistics(path, filesystem)
     except (pa.ArrowInvalid, OSError) as error:
-        raise RunError(f"the buildings of {run_dir} cannot be read as Parquet: {error}") from error
-    statistics = run_statistics(path, filesystem)
+        raise RunError(f"the tables of {run_dir} cannot be read as Parquet: {error}") from error
     seen.map.add(_failed_tiles(manifest))
     drawn = seen.map.map(_unit_m(manifest))
     return page_template("run.html").render(
@@ -115,7 +115,7 @@ def run_page(run_dir: str) -> str:
         statistics=statistics,
         quantiles=[(label, statistics["quantiles"][name]) for name, label in _FIGURES.items()],
         quantile_names=[name for name, _ in QUANTILES],
-        rejected=[(reason, REASONS[Reason(reason)], n) for reason, n in statistics["rejected_reasons"].items()],
+        rejected=[(reason, _meaning(reason), n) for reason, n in statistics["rejected_reasons"].items()],
         inputs=manifest.inputs[:INPUTS],
         digits=_DIGITS,
         nothing=NOTHING,
@@ -243,13 +243,18 @@ def _cards(manifest: RunManifest, statistics: Mapping[str, Any]) -> list[tuple[s
     return cards
 
 
+def _meaning(reason: str) -> str:
+    """What a reason means; of one that a later version wrote nothing is known."""
+    return REASONS[Reason(reason)] if reason in set(Reason) else ""
+
+
 def _reasons(statistics: Mapping[str, Any], seen: _Seen) -> list[tuple[str, str, str, int, str, list[str]]]:
     """Status, reason, meaning, count, share of all candidates, a few ids; those without a model first."""
     found = []
     for status in (Status.FAILED.value, Status.FALLBACK.value):
         for reason, count in statistics["reasons"].get(status, {}).items():
             share = f"{count / statistics['candidates']:.2%}"
-            found.append((status, reason, REASONS[Reason(reason)], count, share, sorted(seen.examples[status, reason])))
+            found.append((status, reason, _meaning(reason), count, share, sorted(seen.examples[status, reason])))
     return found
 
 

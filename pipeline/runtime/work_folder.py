@@ -18,6 +18,7 @@ from pathlib import Path
 from uuid import uuid4
 
 from pipeline.errors import RunError
+from pipeline.io import LocalStorage
 from pipeline.runtime.kept import FOLDER
 from pipeline.runtime.scratch import Scratch
 
@@ -73,14 +74,15 @@ def _distrust_the_last(root: Path, scratch: Scratch) -> None:
     what was closed.
     """
     file, host, now = root / _BOOT, socket.gethostname(), boot_id()
-    before = file.read_text().split() if file.is_file() else [host, now]
+    # of a folder that does not tell nobody knows; a new one has nothing that could be distrusted
+    before = file.read_text(errors="replace").split() if file.is_file() else [host]
     if before[:1] == [host] and before[1:] != [now]:
-        kept = {path: path.stat().st_mtime for path in Path(scratch.root, FOLDER).glob("*/*/*")}
-        last = max(kept.values(), default=0.0)
-        for path, written in kept.items():
-            if written > last - _DISTRUSTED_S:
+        kept = [path for path in Path(scratch.root, FOLDER).glob("*/*/*") if path.name[0] != "."]
+        last = max((path.stat().st_mtime for path in kept), default=0.0)
+        for path in kept:
+            if path.stat().st_mtime > last - _DISTRUSTED_S:
                 path.unlink()
-    file.write_text(f"{host} {now}")
+    LocalStorage(root=root).put(_BOOT, f"{host} {now}".encode())
 
 
 def boot_id() -> str:
@@ -159,10 +161,10 @@ def _holder(lock: Path) -> str:
         return "by another process"
 
 
-def is_held(folder: str) -> bool:
+def is_held(folder: str, lock: str = _LOCK) -> bool:
     """Whether some process of this machine, or of one that shares the folder's locks, works there just now."""
     try:
-        handle = os.open(Path(folder, _LOCK), os.O_RDWR | os.O_CLOEXEC)
+        handle = os.open(Path(folder, lock), os.O_RDWR | os.O_CLOEXEC)
     except OSError:
         return False
     try:

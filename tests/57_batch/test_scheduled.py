@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import datetime as dt
+import json
 import os
 import signal
-import threading
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,8 @@ import pytest
 
 from pipeline.batch import scheduled
 from pipeline.batch.batch_file import Batch, ScheduleTable, read_batch
-from pipeline.batch.scheduled import KEPT, Outcome, ScheduleState, keep_schedule, look, read_schedule
+from pipeline.batch.schedule_state import KEPT, NAME, Outcome, ScheduleState, look, read_schedule
+from pipeline.batch.scheduled import Ending, keep_schedule
 from pipeline.errors import RunError, SettingsError
 from pipeline.runtime.events import Event
 from pipeline.runtime.work_folder import held_lock, held_work, make_work
@@ -87,18 +88,16 @@ def test_a_clock_that_is_put_back_brings_no_time_again() -> None:
     assert look(state, table, AT + HOUR / 60, is_busy=False)[1] is None
 
 
-@pytest.mark.parametrize(
-    ("zone", "day", "count"), [("Europe/Amsterdam", "2026-03-29", 1), ("Europe/Amsterdam", "2026-10-25", 1)]
-)
-def test_a_nightly_run_comes_once_on_the_days_that_shift_the_clock(zone: str, day: str, count: int) -> None:
-    table = ScheduleTable(cron="30 2 * * *", time_zone=zone)
+@pytest.mark.parametrize("day", ["2026-03-29", "2026-10-25"])
+def test_a_nightly_run_comes_once_on_the_days_that_shift_the_clock(day: str) -> None:
+    table = ScheduleTable(cron="30 2 * * *", time_zone="Europe/Amsterdam")
     now = dt.datetime.fromisoformat(f"{day}T00:00:00+01:00")
     state, due = ScheduleState(decided_until=now), []
     for _ in range(24 * 12):
         now += dt.timedelta(minutes=5)
         state, slot = look(state, table, now, is_busy=False)
         due += [slot] if slot else []
-    assert (len(due), state.entries) == (count, ())
+    assert (len(due), state.entries) == (1, ())
 
 
 def test_what_is_remembered_is_bounded_and_survives_writing() -> None:
@@ -107,6 +106,10 @@ def test_what_is_remembered_is_bounded_and_survives_writing() -> None:
         state, _ = look(state, table, AT + (k + 1) * HOUR, is_busy=True)
     assert (len(state.entries), state.counts) == (KEPT, {"skipped": KEPT + 20})
     assert ScheduleState.from_json(state.to_json()) == state
+    told = json.loads(state.to_json())
+    for damage in ({"running": "2026-03-01T02:00:00"}, {"counts": 7}, {"entries": [{"outcome": "lost"}]}):
+        with pytest.raises(ValueError, match=r"time zone|not iterable|'lost'"):
+            ScheduleState.from_json(json.dumps(told | damage))
     with pytest.raises(ValueError, match="entries"):
         ScheduleState.from_json('{"decided_until": "2026-01-01T00:00:00+00:00", "waiting": null, "running": null}')
 
@@ -119,6 +122,7 @@ class FakeRun:
 
     def __init__(self) -> None:
         self.code: int | None = None
+        self.ends_with = 130
         self.signals: list[int] = []
 
     def poll(self) -> int | None:
@@ -126,14 +130,14 @@ class FakeRun:
 
     def send_signal(self, sig: int, /) -> None:
         self.signals.append(sig)
-        self.code = 130
+        self.code = self.ends_with
 
     def wait(self) -> int:
         assert self.code is not None
         return self.code
 
 
-class Days(threading.Event):
+class Days(Ending):
     """A clock that goes on while the schedule sleeps, and does at each look what the test says."""
 
     def __init__(self, steps: list[Callable[[], None]]) -> None:
@@ -150,14 +154,12 @@ class Days(threading.Event):
         self.runs.append(FakeRun())
         return self.runs[-1]
 
-    def wait(self, timeout: float | None = None) -> bool:
-        assert timeout is not None
-        assert 0.0 < timeout <= scheduled.LONGEST_SLEEP_S
-        if not self._steps:
+    def wait(self, seconds: float) -> None:
+        assert 0.0 < seconds <= scheduled.LONGEST_SLEEP_S
+        if self._steps:
+            self._steps.pop(0)()
+        else:
             self.set()
-            return True
-        self._steps.pop(0)()
-        return False
 
     def go(self, path: Path) -> None:
         keep_schedule(path, self, self.events.append, self.start, self.now)
@@ -230,29 +232,160 @@ def test_a_second_process_is_refused(file: Path) -> None:
         Days([]).go(file)
 
 
-def test_changed_times_count_from_then_on_and_a_broken_file_changes_nothing(file: Path) -> None:
-    def write(text: str) -> Callable[[], None]:
-        def change() -> None:
-            file.write_text(text)
-            os.utime(file, ns=(days.time.microsecond, round(days.time.timestamp()) * 10**9))
+def write(days: Days, file: Path, text: str) -> Callable[[], None]:
+    """Change the batch file at the clock's time."""
 
-        return change
+    def change() -> None:
+        file.write_text(text)
+        os.utime(file, ns=(0, round(days.time.timestamp()) * 10**9))
 
+    return change
+
+
+def test_times_before_a_change_are_decided_by_the_old_ones_later_ones_by_the_new(file: Path) -> None:
     days = Days([])
+    os.utime(file, ns=(0, 0))
     days._steps = [
-        write(FILE.replace("0 *", "15 *")),
-        lambda: days.later(0.5),
-        write(FILE.replace("0 *", "77 *")),
-        lambda: days.later(0.25),
+        lambda: days.later(0.45),
+        write(days, file, FILE.replace("0 *", "58 *")),  # at 01:57
+        lambda: days.later(0.1),
         lambda: setattr(days.runs[0], "code", 0),
-        write(FILE + "paused = true\n"),
+        lambda: days.later(1.0),
+        lambda: setattr(days.runs[1], "code", 0),
+        write(days, file, FILE.replace("0 *", "50 *") + "paused = true\n"),
         lambda: days.later(2.0),
     ]
     days.go(file)
-    assert [entry.slot for entry in state_of(file).entries] == ["2026-03-01T02:15:00+00:00"]
-    messages = [event.message for event in days.events if event.kind == "warning"]
-    assert len(messages) == 1
-    assert "its minute is '77'" in messages[0]
+    slots = [entry.slot for entry in state_of(file).entries]
+    assert slots == ["2026-03-01T01:58:00+00:00", "2026-03-01T02:58:00+00:00"]
+
+
+def test_a_time_that_was_overslept_counts_by_what_the_file_said_then(file: Path) -> None:
+    days = Days([])
+    os.utime(file, ns=(0, 0))
+
+    def overslept() -> None:
+        days.later(0.75)  # from 01:30 to 02:15, and the file is written then
+        write(days, file, FILE.replace("0 *", "10 *"))()
+
+    days._steps = [overslept, lambda: setattr(days.runs[0], "code", 0)]
+    days.go(file)
+    assert [entry.slot for entry in state_of(file).entries] == ["2026-03-01T02:00:00+00:00"]
+
+
+def test_other_times_of_a_schedule_that_was_down_count_from_its_start_on(file: Path) -> None:
+    Days([]).go(file)
+    file.write_text(FILE.replace("0 *", "45 *"))
+    days = Days([])
+    days.time = AT
+    days.go(file)
+    assert (days.runs, state_of(file).entries) == ([], ())
+
+
+def test_a_broken_file_runs_nothing_and_every_time_is_told_until_it_is_mended(file: Path) -> None:
+    days = Days([])
+    days._steps = [
+        write(days, file, FILE.replace("0 *", "77 *")),
+        lambda: days.later(0.5),
+        write(days, file, FILE + '[work]\npath = "elsewhere"\n'),
+        lambda: days.later(1.0),
+        write(days, file, FILE),
+        lambda: days.later(1.0),
+        lambda: setattr(days.runs[0], "code", 0),
+    ]
+    days.go(file)
+    assert [(entry.outcome, entry.slot) for entry in state_of(file).entries] == [
+        (Outcome.FAILED, "2026-03-01T02:00:00+00:00"),
+        (Outcome.FAILED, "2026-03-01T03:00:00+00:00"),
+        (Outcome.RAN, "2026-03-01T04:00:00+00:00"),
+    ]
+    assert "its minute is '77'" in state_of(file).entries[0].message
+    assert "[work] path is another folder" in state_of(file).entries[1].message
+
+
+def test_a_paused_schedule_goes_on_with_a_run_that_was_cut_off_only_when_it_is_resumed(file: Path) -> None:
+    days = Days([])
+    days._steps = [lambda: days.later(0.5)]
+    days.go(file)
+    file.write_text(FILE + "paused = true\n")
+    paused = Days([])
+    paused.go(file)
+    assert (paused.runs, state_of(file).running) == ([], AT)
+    file.write_text(FILE)
+    again = Days([])
+    again.time = AT + HOUR / 4
+    again._steps = [lambda: setattr(again.runs[0], "code", 0)]
+    again.go(file)
+    assert (len(again.runs), state_of(file).running) == (1, None)
+
+
+@pytest.mark.parametrize(("code", "goes_on"), [(0, False), (1, True), (4, True), (130, True), (-15, True), (143, True)])
+def test_only_a_run_that_is_whole_is_not_gone_on_with(file: Path, code: int, goes_on: bool) -> None:
+    days = Days([])
+
+    def ends() -> None:
+        days.runs[0].ends_with = code
+
+    days._steps = [lambda: days.later(0.5), ends]
+    days.go(file)
+    assert (state_of(file).running is not None) is goes_on
+
+
+def test_a_full_disk_starts_nothing_and_ends_nothing(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    days = Days([])
+    real = scheduled.LocalStorage.put
+
+    def full(self: object, key: str, content: bytes) -> None:
+        raise OSError(28, "No space left on device")
+
+    days._steps = [
+        lambda: monkeypatch.setattr(scheduled.LocalStorage, "put", full),
+        lambda: days.later(0.5),
+        lambda: days.later(0.1),
+        lambda: monkeypatch.setattr(scheduled.LocalStorage, "put", real),
+        lambda: setattr(days.runs[0], "code", 0),
+    ]
+    days.go(file)
+    assert [(entry.outcome, entry.slot) for entry in state_of(file).entries] == [
+        (Outcome.RAN, "2026-03-01T02:00:00+00:00")
+    ]
+    assert any("cannot be written, so no run is started" in event.message for event in days.events)
+
+
+def test_a_run_that_cannot_be_started_is_told(file: Path) -> None:
+    class Poor(Days):
+        def start(self, batch: Batch) -> FakeRun:
+            assert batch.schedule.cron
+            raise OSError(12, "Cannot allocate memory")
+
+    days = Poor([])
+    days._steps = [lambda: days.later(0.5)]
+    days.go(file)
+    (entry,) = state_of(file).entries
+    assert (entry.outcome, "Cannot allocate memory" in entry.message) == (Outcome.FAILED, True)
+
+
+def test_a_run_that_outlived_the_process_before_is_waited_for(file: Path) -> None:
+    days = Days([])
+    days._steps = [lambda: days.later(0.5)]
+    days.go(file)
+    work = file.with_suffix(".work")
+    again = Days([])
+    again.time = AT + HOUR / 4
+    with held_lock(work, scheduled.RUN_LOCK):
+        again.go(file)
+    assert (again.runs, state_of(file).running) == ([], AT)
+
+
+def test_an_end_is_told_also_while_somebody_sleeps_by_it() -> None:
+    ending = Ending()
+    before = signal.signal(signal.SIGUSR1, lambda *_: ending.set())
+    try:
+        os.kill(os.getpid(), signal.SIGUSR1)
+        ending.wait(3600.0)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert ending.is_set()
 
 
 def test_a_batch_without_times_is_refused(file: Path) -> None:
@@ -274,6 +407,6 @@ def test_times_are_checked_with_the_file(file: Path) -> None:
 def test_what_is_remembered_and_damaged_is_named(file: Path) -> None:
     work = file.with_suffix(".work")
     make_work(work)
-    (work / scheduled.NAME).write_text("{")
+    (work / NAME).write_text("{")
     with pytest.raises(RunError, match=r"schedule\.json cannot be read"):
         Days([]).go(file)

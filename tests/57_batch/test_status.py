@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.batch.eta import StageProgress, remaining_s
-from pipeline.batch.status import NAME, StatusWriter, read_status
+from pipeline.batch.status import NAME, StatusWriter, buildings_before, read_status
 from pipeline.errors import RunError
 from pipeline.runtime.events import Event
 from pipeline.runtime.work_folder import held_work
@@ -129,3 +129,11 @@ def test_a_machine_that_was_slow_so_far_is_expected_to_stay_slow() -> None:
 
     assert after(20.0)[0] == pytest.approx(2.0 * after(10.0)[0])
     assert after(10.0)[0] < 130.0 < after(10.0)[1]
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"state": "running"}', "\udcff"])
+def test_a_damaged_status_is_named_and_stops_no_run(tmp_path: Path, text: str) -> None:
+    (tmp_path / NAME).write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(RunError, match=r"status\.json cannot be read"):
+        read_status(str(tmp_path))
+    assert buildings_before(str(tmp_path)) == (0, 0)

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
@@ -24,7 +26,6 @@ from pipeline.report import class_map, run_page
 from pipeline.report.run_page import write_run_page
 from pipeline.runtime.manifest import (
     PAGE,
-    SLOWEST,
     InputFile,
     RunManifest,
     RunStatus,
@@ -166,4 +167,18 @@ def test_a_manifest_without_the_slowest_is_read(street_run: Path) -> None:
     assert '"slowest": []' in text
     (street_run / "run.json").write_text(text.replace('"slowest": [],', ""))
     assert read_manifest(street_run).slowest == ()
-    assert SLOWEST > 0
+
+
+def test_a_reason_of_a_later_version_is_told_by_its_name(street_run: Path) -> None:
+    part = street_run / "buildings" / "tile=t2" / "part-0.parquet"
+    table = pq.read_table(part, partitioning=None)
+    place = table.schema.get_field_index("reason")
+    later = pa.array([None if reason is None else "too_shiny" for reason in table["reason"].to_pylist()], pa.string())
+    pq.write_table(table.set_column(place, table.schema.field(place), later), part)
+    assert "too shiny" in words(page_of(street_run)[1])
+
+
+def test_a_damaged_table_is_named(street_run: Path) -> None:
+    (street_run / "rejected" / "tile=t1" / "part-0.parquet").write_bytes(b"torn")
+    with pytest.raises(RunError, match="cannot be read as Parquet"):
+        write_run_page(str(street_run))

@@ -9,7 +9,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from pipeline.batch.batch_file import read_batch
+from pipeline.batch.estimates import estimate
+from pipeline.batch.status import buildings_before
 from pipeline.cli import app
+from pipeline.errors import RunError
 from pipeline.io import storage_at
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.work_folder import held_work
@@ -79,6 +83,50 @@ def test_a_tile_index_and_a_bucket_are_inputs_and_results_of_a_batch(folder: Pat
     assert b"Failures" not in storage_at(f"{bucket}/models").get("run.html")
     again = json.loads(call("run", file, "--json")[1])
     assert (again["digest"], again["counts"]["reused"]) == (json.loads(told)["digest"], again["counts"]["candidates"])
+
+
+def test_the_report_is_that_of_the_last_run_or_none(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "city.toml"
+    text = (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
+    file.write_text(text)
+    assert call("run", file)[0] == 0
+    page = tmp_path / "models" / "run.html"
+    assert page.is_file()
+    file.write_text(text.replace("[output]\n", "[output]\nreport = false\n"))
+    assert call("run", file)[0] == 0
+    assert not page.exists()
+
+    def fails(run_dir: str) -> str:
+        raise RunError(f"{run_dir} is full")
+
+    monkeypatch.setattr("pipeline.batch.running.write_run_page", fails)
+    file.write_text(text)
+    code, _, error = call("run", file)
+    assert code == 0
+    assert "the run is whole, its report could not be written" in error
+
+
+def test_a_batch_of_other_points_is_looked_at_again(folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "city.toml"
+    text = (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
+    file.write_text(text)
+    assert call("run", file)[0] == 0
+    batch, (count, points) = read_batch(file), buildings_before(str(tmp_path / "city.work"))
+    found = estimate(batch, 1, (count, points))
+    assert (found.buildings, found.buildings_from) == (count, "as many as in the run before")
+    assert estimate(batch, 1, (count, points + 1)).buildings_from.startswith("raised objects in 1 of 1")
+
+
+def test_times_are_told_before_the_first_run(folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "city.toml"
+    text = (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
+    file.write_text(text + '[schedule]\ncron = "30 2 * * *"\ntime_zone = "Europe/Amsterdam"\n')
+    code, told, _ = call("status", file)
+    assert (code, rows(told)["state"]) == (0, "never run")
+    assert rows(told)["next times"].count("02:30 CE") == 3
+    assert "next times" in rows(call("plan", file)[1])
 
 
 def test_a_batch_that_somebody_runs_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from typing import Any
 import pyarrow.dataset as pads
 from deployment import Gates, kill_process
 from faults import asked
-from object_store import FaultyProxy, environment
+from object_store import FaultyProxy
+from object_store import environment as environment_of
 from processes import Program, Programs, free_port, program
 
 from pipeline.io.urls import filesystem_of
@@ -67,9 +68,9 @@ class BatchRun:
         if store is not None:
             self.out, inputs = f"{bucket}/models", f"{bucket}/in/{tiles.name}"
             filesystem_of(inputs).put_file(str(tiles), inputs)
-        self._environment = {
+        self.environment = {
             "OPENBLAS_NUM_THREADS": "1",
-            **({} if store is None else environment(store.endpoint)),
+            **({} if store is None else environment_of(store.endpoint)),
             **asked.environment(pause=self.gates.asked, full=dict.fromkeys(STAGES, str(self.full)), **(faults or {})),
         }
         self.port = free_port()
@@ -91,11 +92,11 @@ class BatchRun:
     def start_scheduler(self) -> None:
         """Start the scheduler, also again."""
         command = [str(program("dask")), "scheduler", "--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard"]
-        self.scheduler = self._programs.start("scheduler", command, env=self._environment)
+        self.scheduler = self._programs.start("scheduler", command, env=self.environment)
         self.scheduler.wait_for_port(self.port)
 
     def _start(self, name: str, *arguments: str) -> Program:
-        return self._programs.start(name, [str(program("gablework")), *arguments], env=self._environment)
+        return self._programs.start(name, [str(program("gablework")), *arguments], env=self.environment)
 
     def start(self) -> Program:
         """Begin the run, or go on with it."""
