@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -39,6 +40,7 @@ class Site:
 
     def __init__(self, folder: Path, tile: Path, programs: Programs, database_url: str | None) -> None:
         self.tile = tile
+        self._gate = folder.with_name("gate")
         self._programs = programs
         self.settings = ServiceSettings(state=folder, database_url=database_url, input_roots=(tile.parent,))
         self.folder = StateFolder(folder)
@@ -55,9 +57,17 @@ class Site:
             "OPENBLAS_NUM_THREADS": "1",
         }
 
-    def driver(self, name: str, **settings: str) -> Program:
+    def driver(self, name: str, *, held: bool = False, **settings: str) -> Program:
+        """A driver; its tasks are held where they split, as long as `let_go` was not called, where that is wanted."""
         environment = {**self.environment, **{f"GABLEWORK_{key.upper()}": value for key, value in settings.items()}}
+        if held:
+            self._gate.mkdir()
+            environment |= asked.environment(pause={"split": str(self._gate)})
         return self._programs.start(name, [str(program("gablework")), "driver", "--name", name], env=environment)
+
+    def let_go(self) -> None:
+        """Let the tasks go on that are held."""
+        (self._gate / "go").touch()
 
     def submit(self) -> Job:
         request = JobRequest(tiles=(InputReference(kind="path", value=str(self.tile)),))
@@ -74,12 +84,9 @@ class Site:
 
         return wait_for(is_over, f"the end of {self.store.get(job.job_id)}", DEADLINE_S)
 
-    def stage(self, job: Job, stage: str, driver: Program) -> Job:
-        def reached() -> Job | None:
-            found = self.store.get(job.job_id)
-            return found if found.stage == stage and found.status is JobStatus.RUNNING else None
-
-        return driver.wait_for(reached, f"stage {stage}", DEADLINE_S)
+    def held(self, driver: Program) -> None:
+        """Wait until a task of the driver is held."""
+        driver.wait_for(lambda: any(self._gate.glob("reached-*")), "a task that splits", DEADLINE_S)
 
 
 @pytest.fixture(params=["sqlite", "postgres"])
@@ -93,8 +100,8 @@ def site(request: pytest.FixtureRequest, tmp_path: Path, tile: Path, programs: P
 
 def test_a_killed_drivers_job_is_finished_once_by_another(site: Site) -> None:
     job = site.submit()
-    first = site.driver("first")
-    site.stage(job, "split", first)
+    first = site.driver("first", held=True)
+    site.held(first)
     children = first.children()
     first.kill(group=False)
     # its workers do not outlive it
@@ -115,9 +122,12 @@ def test_a_killed_drivers_job_is_finished_once_by_another(site: Site) -> None:
 @pytest.mark.parametrize("site", ["sqlite"], indirect=True)
 def test_a_driver_that_is_told_to_end_gives_its_job_back_and_another_takes_it_at_once(site: Site) -> None:
     job = site.submit()
-    first = site.driver("first", drain_s="0", lease_s="600")
-    site.stage(job, "split", first)
-    assert first.stop() == 0
+    first = site.driver("first", held=True, drain_s="0", lease_s="600")
+    site.held(first)
+    os.kill(first.pid, signal.SIGTERM)
+    first.wait_for(lambda: "the job is given back" in first.text, "the job given back")
+    site.let_go()
+    assert first.ended() == 0
     waiting = site.store.get(job.job_id)
     assert (waiting.status, waiting.lost_attempts) == (JobStatus.ACCEPTED, 0)
     wait_for(lambda: not first.children(), "the end of the workers")
@@ -145,13 +155,14 @@ def test_a_driver_that_drains_finishes_its_job_first(site: Site) -> None:
 @pytest.mark.parametrize("site", ["sqlite"], indirect=True)
 def test_a_dismissed_job_stops_within_seconds_and_its_files_are_gone(site: Site) -> None:
     job = site.submit()
-    driver = site.driver("one")
-    site.stage(job, "split", driver)
+    driver = site.driver("one", held=True)
+    site.held(driver)
     began = time.monotonic()
     assert site.store.dismiss(job.job_id).dismiss_requested
     assert site.over(job, driver).status is JobStatus.DISMISSED
     print(f"dismissed after {time.monotonic() - began:.2f} s")
     assert not site.folder.job(job.job_id).exists()
+    site.let_go()
     following = site.submit()
     assert site.over(following, driver).status is JobStatus.SUCCESSFUL
 
