@@ -41,6 +41,10 @@ CONNECT_S = 20.0
 _ANSWER_S = 30.0
 _MEND_S = 5.0
 _CLOSE_S = 30.0
+_NEVER = "365 days"
+"""So long after a worker's death Dask looks whether one of its name is there, and ends its keeper if not: also where
+the worker came back long ago, died again just now, and is being started. That death would be blamed on its task.
+Keepers that gave up are told by their status (`Cluster.mend`)."""
 
 
 class Cluster:
@@ -83,6 +87,7 @@ class Cluster:
         self._local_directory = local_directory
         self._embedded: Any = None
         self._mended_s = 0.0
+        self._while_running = contextlib.ExitStack()
         self.tls = tls or given_tls()
 
     @property
@@ -129,8 +134,19 @@ class Cluster:
         """
         if self._embedded is None or workers >= self._workers or time.monotonic() - self._mended_s < _MEND_S:
             return
+        from distributed import Status
+
+        embedded = self._embedded
+
+        def forget() -> None:
+            for name, keeper in list(embedded.workers.items()):
+                if keeper.status in (Status.closed, Status.failed):
+                    del embedded.workers[name]
+
         self._mended_s = time.monotonic()
-        self._embedded.scale(self._workers)
+        # both in the cluster's own thread, one after the other
+        embedded.loop.add_callback(forget)
+        embedded.scale(self._workers)
 
     def executor(
         self, priority: int = 0, *, traffic: Traffic = "interactive", performance_report: str | None = None
@@ -185,6 +201,7 @@ class Cluster:
                 )
         except (OSError, RuntimeError, TimeoutError) as error:
             raise ClusterError(f"the {self._workers} workers of this machine do not start: {error}") from error
+        self._while_running.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": _NEVER}))
         return self
 
     def __exit__(
@@ -193,6 +210,7 @@ class Cluster:
         """End the embedded workers."""
         if self._embedded is not None:
             embedded, self._embedded = self._embedded, None
+            self._while_running.close()
             # what does not end in time ends with this process
             with contextlib.suppress(TimeoutError):
                 embedded.close(timeout=_CLOSE_S)

@@ -12,7 +12,7 @@ from typing import Any
 
 import dask
 import pytest
-from distributed import Client
+from distributed import Client, Status
 
 from pipeline.errors import ClusterError, RunCancelledError, RunError, VersionMismatchError
 from pipeline.runtime import worker_setup
@@ -109,6 +109,25 @@ def test_tasks_under_suspicion_are_tried_alone_and_none_is_lost(cluster: Cluster
     with cluster.executor() as executor:
         results = [measured.result for measured in executor.map("die", chores.die_at_first, tasks, Watch())]
     assert sorted(results) == list(range(12))
+
+
+def test_a_keeper_stays_while_it_starts_its_worker_anew_and_one_that_gave_up_is_replaced(tmp_path: Path) -> None:
+    # Dask would end it where nobody of the worker's name is there at the time
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 ms"}):
+        with Cluster(workers=1) as one, one.executor() as executor:
+            keeper = one._embedded.workers[0]
+            found = [
+                measured.result
+                for measured in executor.map("die", chores.die_at_first, [(str(tmp_path), 7, 1)], Watch())
+            ]
+            assert found == [7]
+            assert one._embedded.workers[0] is keeper
+            assert keeper.status == Status.running
+            one._embedded.sync(keeper.close)
+            left = [measured.result for measured in executor.map("double", chores.double, range(3), Watch())]
+            assert sorted(left) == [0, 2, 4]
+            assert one._embedded.workers.get(0) is not keeper
+        assert dask.config.get("distributed.deploy.lost-worker-timeout") == "1 ms"
 
 
 def test_higher_priorities_go_first(tmp_path: Path) -> None:
