@@ -98,7 +98,7 @@ unit: $(VENV)/.test-stamp $(VENV)/.warm-stamp
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile --durations=15
 
 slow: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m slow --durations=15
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m slow --numprocesses 2 --dist loadfile --durations=15
 
 viewer: service/viewer/dist/index.html
 
