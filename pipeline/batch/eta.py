@@ -10,6 +10,8 @@ _UNSEEN = 2.0
 """What nothing was seen of yet may take half as long as planned, or twice."""
 _SEEN = 1.25
 """What was planned is off by this much even where stages before went as planned: buildings differ."""
+_KNOWN = 0.05
+"""Of a stage of which less was done the plan still counts: of 6,565 buildings ten took 2 s, the others 28 s."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,13 +58,14 @@ def remaining_s(planned: Mapping[str, float], seen: Mapping[str, StageProgress])
         return None
     low = high = 0.0
     spent = expected = 0.0
-    for name, seconds in planned.items():
+    # of stages that no rate is known of, what was seen of them counts all the same
+    for name, seconds in {**dict.fromkeys(seen, 0.0), **planned}.items():
         stage = seen.get(name)
         if stage is None:
             continue
         worked = stage.done - stage.kept
         if stage.over:
-            if stage.total > stage.kept:
+            if name in planned and stage.total > stage.kept:
                 spent += stage.seconds
                 expected += seconds * (stage.total - stage.kept) / max(1, stage.total)
             continue
@@ -71,8 +74,13 @@ def remaining_s(planned: Mapping[str, float], seen: Mapping[str, StageProgress])
             own = stage.seconds / worked * left
             # of n tasks of like kind the mean is known to one part in the root of n
             spread = 1.0 / math.sqrt(worked)
-            low += own / (1.0 + spread)
-            high += own * (1.0 + spread)
+            least, most = own / (1.0 + spread), own * (1.0 + spread)
+            if seconds > 0.0 and worked < _KNOWN * (stage.total - stage.kept):
+                # the first to come tell of workers that warm up, not of the stage: the plan counts, too
+                share = left / max(1, stage.total)
+                least, most = min(least, seconds * share / _UNSEEN), max(most, seconds * share * _UNSEEN)
+            low += least
+            high += most
         else:
             share = left / max(1, stage.total)
             low += seconds * share / _UNSEEN

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 
 from pipeline.batch.batch_file import Batch
 from pipeline.batch.estimates import estimate, refuse
@@ -15,7 +16,7 @@ from pipeline.runtime.events import Event, Listener, ignore, never
 from pipeline.runtime.executors import Executor
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.run_metrics import RunMetrics, both, serve_metrics
-from pipeline.runtime.work_folder import refuse_held
+from pipeline.runtime.work_folder import DRIVER_LOCK, held_lock, make_work, refuse_held
 
 _READ = 1
 """Inputs that are read in whole for the estimate of a run: it is to begin soon."""
@@ -52,8 +53,12 @@ def run_batch(
     refuse_held(batch.work_folder)
     planned = estimate(batch, _READ, buildings_before(batch.work_folder))
     refuse(planned)
-    status = StatusWriter(batch.work_folder, str(batch.path), batch.out, planned.stage_s, points=planned.points)
     with contextlib.ExitStack() as shown:
+        # who comes second says nothing in the status of who came first
+        work = Path(batch.work_folder).resolve()
+        make_work(work)
+        shown.enter_context(held_lock(work, DRIVER_LOCK))
+        status = StatusWriter(batch.work_folder, str(batch.path), batch.out, planned.stage_s, points=planned.points)
         if batch.cluster.metrics_port:
             shown.callback(serve_metrics(batch.cluster.metrics_port))
             on_event = both(RunMetrics(), on_event)
@@ -74,8 +79,12 @@ def _told(
         told = event.kind == "progress" and not event.message
         on_event(dataclasses.replace(event, message=status.told()) if told else event)
 
+    def asked() -> bool:
+        status.tick()
+        return cancelled()
+
     try:
-        summary = run(batch.request(), listen, executor, cancelled)
+        summary = run(batch.request(), listen, executor, asked)
     except (KeyboardInterrupt, RunCancelledError):
         status.end("interrupted", "run the batch again, and it goes on from here")
         raise

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime as dt
 import json
 import os
 import socket
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -17,7 +19,7 @@ from pipeline.batch.eta import StageProgress, duration, remaining_s
 from pipeline.errors import RunError
 from pipeline.io import LocalStorage
 from pipeline.runtime.events import Event
-from pipeline.runtime.work_folder import is_held
+from pipeline.runtime.work_folder import DRIVER_LOCK, is_held
 
 NAME = "status.json"
 _EVERY_S = 1.0
@@ -104,6 +106,8 @@ class StatusWriter:
         self._began_s: dict[str, float] = {}
         self._recent: deque[tuple[float, int]] = deque()
         self._written_s = -1e9
+        self._is_unsaid = False
+        self._lock = threading.RLock()
         self._failed = 0
         started = self._now().isoformat(timespec="seconds")
         self.status = Status(
@@ -117,7 +121,22 @@ class StatusWriter:
         )
 
     def on_event(self, event: Event) -> None:
-        """Take an event in; the file is written once a second at most."""
+        """Take an event in; the file is written once a second at most, the rest by `tick`."""
+        with self._lock:
+            self._take(event)
+            self._is_unsaid = True
+            if self._clock() - self._written_s >= _EVERY_S:
+                self._write()
+
+    def tick(self) -> None:
+        """Write what the last events changed, where nothing has happened since; may be called from another thread."""
+        with self._lock:
+            if self._is_unsaid and self._clock() - self._written_s >= _EVERY_S:
+                # a disk that is full is told by the next event, in the thread of the run
+                with contextlib.suppress(OSError, RunError):
+                    self._write()
+
+    def _take(self, event: Event) -> None:
         if event.kind in {"stage", "progress"}:
             self._advance(event)
         elif event.kind == "warning":
@@ -127,8 +146,6 @@ class StatusWriter:
             self.status = dataclasses.replace(self.status, waiting=event.message)
         elif event.kind == "run" and self.status.waiting:
             self.status = dataclasses.replace(self.status, waiting="")
-        if self._clock() - self._written_s >= _EVERY_S:
-            self._write()
 
     def _advance(self, event: Event) -> None:
         now = self._clock()
@@ -158,6 +175,7 @@ class StatusWriter:
     def _write(self) -> None:
         self._written_s = self._clock()
         self._storage.put(NAME, (json.dumps(dataclasses.asdict(self._whole()), indent=1) + "\n").encode())
+        self._is_unsaid = False
 
     def _whole(self) -> Status:
         buildings, tiles = self._seen.get(_BUILDINGS), self._seen.get(_TILES)
@@ -185,7 +203,8 @@ class StatusWriter:
 
     def told(self) -> str:
         """Rate, failures and what is still to come, in a few words."""
-        whole = self._whole()
+        with self._lock:
+            whole = self._whole()
         words = [] if whole.rate_per_s is None else [f"{whole.rate_per_s:.3g} a second"]
         if whole.stage == _BUILDINGS:
             words.append(f"{whole.buildings['failed']} failed, {whole.buildings['queued']} queued")
@@ -195,9 +214,10 @@ class StatusWriter:
 
     def end(self, state: str, message: str = "") -> Status:
         """Write how the run ended."""
-        self.status = dataclasses.replace(self.status, state=state, message=message)
-        self._write()
-        return self._whole()
+        with self._lock:
+            self.status = dataclasses.replace(self.status, state=state, message=message)
+            self._write()
+            return self._whole()
 
 
 def read_status(work_folder: str) -> Status:
@@ -217,7 +237,7 @@ def read_status(work_folder: str) -> Status:
         raise RunError(f"{path} does not exist: this batch was never run") from None
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise RunError(f"{path} cannot be read: {error}. Run the batch again: it writes a new one") from error
-    if status.state == "running" and not is_held(work_folder):
+    if status.state == "running" and not (is_held(work_folder, DRIVER_LOCK) or is_held(work_folder)):
         message = f"cut off after {status.updated_at}: run the batch again, and it goes on from there"
         return dataclasses.replace(status, state="dead", remaining_s=None, message=message)
     return status

@@ -23,6 +23,8 @@ from pipeline.runtime.kept import FOLDER
 from pipeline.runtime.scratch import Scratch
 
 _LOCK = "lock"
+DRIVER_LOCK = "driver.lock"
+"""Held by who drives a batch, from before its first word about it; tasks are kept under `_LOCK`, later."""
 _SCRATCH = "scratch"
 _MARK = "work.json"
 _BESIDE = {_LOCK, "status.json"}
@@ -149,8 +151,25 @@ def refuse_held(folder: str) -> None:
     RunError
         One does.
     """
-    if is_held(folder):
-        raise RunError(f"{folder} is at work already ({_holder(Path(folder, _LOCK))}): wait for it, or end it first")
+    for name in (DRIVER_LOCK, _LOCK):
+        if is_held(folder, name):
+            raise RunError(f"{folder} is at work already ({_holder(Path(folder, name))}): wait for it, or end it first")
+
+
+def refuse_foreign(folder: str) -> None:
+    """Say early that a work folder cannot be one; nothing is made.
+
+    Raises
+    ------
+    RunError
+        It is a file, holds other people's files, or was made by another version.
+    """
+    root = Path(folder)
+    try:
+        if root.exists():
+            _is_marked(root)
+    except OSError as error:
+        raise RunError(f"{root} cannot be read: {error.strerror or error}. Give another work folder") from error
 
 
 def _holder(lock: Path) -> str:
@@ -180,6 +199,12 @@ def is_held(folder: str, lock: str = _LOCK) -> bool:
 
 def _check_mark(root: Path) -> None:
     """Refuse a folder with other people's files, or of another format; mark it as ours."""
+    if not _is_marked(root):
+        (root / _MARK).write_text(json.dumps({"format": _FORMAT}) + "\n")
+
+
+def _is_marked(root: Path) -> bool:
+    """Whether a folder is ours already; one with other people's files, or of another format, is refused."""
     mark = root / _MARK
     if mark.is_file():
         try:
@@ -188,8 +213,8 @@ def _check_mark(root: Path) -> None:
             found = None
         if found != _FORMAT:
             raise RunError(f"{root} was made by another version (format {found!r}): remove it, or give another folder")
-        return
+        return True
     left = sorted(entry.name for entry in root.iterdir() if entry.name not in _BESIDE)
     if left:
         raise RunError(f"{root} holds {left[0]} and is no work folder: give a new or empty one")
-    mark.write_text(json.dumps({"format": _FORMAT}) + "\n")
+    return False
