@@ -238,6 +238,9 @@ def read_batch(path: str | Path) -> Batch:
     output = built["output"]
     if output is not None and not output.path:
         faults.append('[output] path is missing: give the run directory, such as path = "models"')
+    work = built["work"]
+    if work is not None and "://" in work.path:
+        faults.append(f"[work] path is {work.path!r}: use a folder of a file system that all workers share, no URL")
     faults.extend(_times_faults(built["schedule"]))
     settings = RunSettings()
     try:

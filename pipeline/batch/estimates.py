@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.batch.batch_file import Batch
@@ -18,11 +18,13 @@ from pipeline.errors import InputError, RunError
 from pipeline.inspection import RATES, inspect
 from pipeline.runtime.events import ignore
 from pipeline.runtime.executors import memory_of_workers
+from pipeline.runtime.performance import PerformanceReport
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.progress import Progress
-from pipeline.runtime.run import plan_inputs
+from pipeline.runtime.run import check_out, plan_inputs
 from pipeline.runtime.scratch import POINT
 from pipeline.runtime.stages import given_footprints
+from pipeline.runtime.work_folder import refuse_foreign
 from pipeline.tiling import MM, Tile, Window
 
 
@@ -145,7 +147,11 @@ def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Es
     )
     out_bytes = buildings * _RESULT_BYTES
     work_free, out_free = _free(batch.work_folder), _free(batch.out)
-    refusals = [*_memory_refused(plan, limit), *_disk_refused(batch, work_bytes, work_free, out_bytes, out_free)]
+    refusals = [
+        *_places_refused(batch),
+        *_memory_refused(plan, limit),
+        *_disk_refused(batch, work_bytes, work_free, out_bytes, out_free),
+    ]
     warnings = list(progress.warnings)
     if request.scheduler is not None and workers == 0:
         warnings.append(f"the scheduler {request.scheduler} has no worker now: the run would wait for one")
@@ -196,13 +202,43 @@ def _free(folder: str) -> int | None:
     """Bytes that are free where a folder is or would be; None for an object store."""
     if "://" in folder:
         return None
+    try:
+        return shutil.disk_usage(_existing(folder)).free
+    except OSError:
+        return None
+
+
+def _existing(folder: str) -> Path:
+    """The folder, or the nearest one above it that is there."""
     there = Path(folder)
     while not there.exists():
         there = there.parent
-    try:
-        return shutil.disk_usage(there).free
-    except OSError:
-        return None
+    return there
+
+
+def _disk(folder: str) -> int:
+    """The file system on which a folder is or would be."""
+    return _existing(folder).stat().st_dev
+
+
+def _places_refused(batch: Batch) -> list[str]:
+    """What cannot be written where the batch says."""
+    work, out = Path(batch.work_folder).resolve(), batch.out
+    if "://" not in out and (work.is_relative_to(Path(out).resolve()) or Path(out).resolve().is_relative_to(work)):
+        return [f"the work folder {work} and the results {out} lie in one another: give another [work] path"]
+    checks: list[Callable[[], object]] = [
+        lambda: check_out(out, overwrite=batch.output.overwrite, work=str(work)),
+        lambda: refuse_foreign(str(work)),
+    ]
+    if page := batch.cluster.performance_report:
+        checks.append(lambda: PerformanceReport(batch.whole(page)))
+    refusals = []
+    for check in checks:
+        try:
+            check()
+        except RunError as error:
+            refusals.append(str(error))
+    return refusals
 
 
 def _memory_refused(plan: Plan, limit: int | None) -> list[str]:
@@ -219,6 +255,17 @@ def _disk_refused(
     """What does not fit on a disk, what a run kept there already counted as free."""
     kept = sum(path.stat().st_size for path in Path(batch.work_folder).rglob("*") if path.is_file())
     refusals = []
+    is_one_disk = work_free is not None and out_free is not None and _disk(batch.work_folder) == _disk(batch.out)
+    if (
+        is_one_disk
+        and work_free is not None
+        and max(work_bytes - kept, out_bytes) <= work_free < (work_bytes - kept + out_bytes)
+    ):
+        refusals.append(
+            f"the work folder {batch.work_folder} and the results in {batch.out} need about "
+            f"{(work_bytes - kept + out_bytes) / 1e9:.1f} GB of one disk, {work_free / 1e9:.1f} GB are free: "
+            "give [work] path on another disk, or free space"
+        )
     if work_free is not None and work_bytes - kept > work_free:
         refusals.append(
             f"the work folder {batch.work_folder} needs about {work_bytes / 1e9:.1f} GB, {work_free / 1e9:.1f} GB "

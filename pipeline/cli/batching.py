@@ -133,10 +133,15 @@ def _rows(found: Estimate) -> list[tuple[str, str]]:
         ("tiles", f"{found.tiles} of {found.tile_size_m:g} m"),
         ("buildings", f"about {found.buildings:,} ({found.buildings_from})"),
         ("memory of a worker", f"{found.worker_bytes / 2**30:.1f}{limit} GiB"),
-        ("time", f"{duration(found.seconds[0])} to {duration(found.seconds[1])} with {found.workers} workers"),
+        ("time", f"{duration(found.seconds[0])} to {duration(found.seconds[1])} with {_hands(found.workers)}"),
         ("work folder", f"{found.work_bytes / 1e9:.2f} GB{_of(found.work_free_bytes)}"),
         ("results", f"{found.out_bytes / 1e9:.2f} GB{_of(found.out_free_bytes)}"),
     ]
+
+
+def _hands(workers: int) -> str:
+    """Who does it; where no worker is there the time is that of one."""
+    return f"{workers} workers" if workers > 1 else "1 worker" if workers else "1 worker, of which none is there now"
 
 
 def _of(free: int | None) -> str:

@@ -612,18 +612,33 @@ def _checked(out: str, *, overwrite: bool, work: str | None = None) -> str:
     RunError
         It holds something and `overwrite` is not asked for, or it cannot be written.
     """
+    check_out(out, overwrite=overwrite, work=work)
+    storage = storage_at(out)
+    try:
+        storage.make()
+    except OSError as error:
+        raise RunError(f"{storage.place} cannot be written: {error.strerror or error}. Give another --out") from error
+    return storage.place
+
+
+def check_out(out: str, *, overwrite: bool, work: str | None = None) -> None:
+    """Say whether a run directory may be written, by what is there; nothing is made.
+
+    Raises
+    ------
+    RunError
+        It holds something and `overwrite` is not asked for, or it cannot be read.
+    """
     storage = storage_at(out)
     run_dir = storage.place
     try:
-        storage.make()
         left = storage.names()
         if left and not overwrite and not (work is not None and _is_of_work(run_dir, work)):
             raise RunError(f"{run_dir} is not empty ({left[0]} …): give another --out, or --overwrite")
         if left and NAME not in left:
             raise RunError(f"{run_dir} holds {left[0]} and no run.json, so it is no run: give another --out")
     except OSError as error:
-        raise RunError(f"{run_dir} cannot be written: {error.strerror or error}. Give another --out") from error
-    return run_dir
+        raise RunError(f"{run_dir} cannot be read: {error.strerror or error}. Give another --out") from error
 
 
 def _crs_facts(reference: SpatialReference) -> dict[str, object]:

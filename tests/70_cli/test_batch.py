@@ -16,7 +16,7 @@ from pipeline.cli import app
 from pipeline.errors import RunError
 from pipeline.io import storage_at
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.work_folder import held_work
+from pipeline.runtime.work_folder import DRIVER_LOCK, held_lock, held_work, make_work
 from pipeline.synthetic.dataset import simulate
 
 
@@ -136,6 +136,48 @@ def test_a_batch_that_somebody_runs_is_refused(folder: Path, tmp_path: Path) -> 
         code, _, error = call("run", file)
     assert code == 4
     assert "is at work already" in error
+
+
+def test_who_comes_second_says_nothing_in_the_status_of_who_came_first(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "city.toml"
+    file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
+    work = tmp_path / "city.work"
+    make_work(work)
+    (work / "status.json").write_text("of the first")
+    # both looked before either held the folder
+    monkeypatch.setattr("pipeline.batch.running.refuse_held", lambda _: None)
+    with held_lock(work, DRIVER_LOCK):
+        code, _, error = call("run", file)
+    assert code == 4
+    assert "is at work already" in error
+    assert (work / "status.json").read_text() == "of the first"
+
+
+@pytest.mark.parametrize("command", ["plan", "run"])
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ('[output]\npath = "theirs"\n', "is not empty (theirs.txt"),
+        ('[output]\npath = "theirs"\noverwrite = true\n', "holds theirs.txt and no run.json"),
+        ('[output]\npath = "models"\n[work]\npath = "theirs"\n', "holds theirs.txt and is no work folder"),
+        ('[output]\npath = "models"\n[work]\npath = "models"\n', "lie in one another"),
+        ('[output]\npath = "models"\n[work]\npath = "models/work"\n', "lie in one another"),
+        ('[output]\npath = "models"\n[cluster]\nworkers = 0\nperformance_report = "no/time.html"\n', "make the folder"),
+    ],
+)
+def test_places_that_cannot_be_written_are_refused_before_anything_runs(
+    folder: Path, tmp_path: Path, command: str, lines: str, words: str
+) -> None:
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "theirs.txt").write_text("theirs")
+    file = tmp_path / "city.toml"
+    file.write_text(f'[inputs]\npaths = ["{folder}/tiles/*.laz"]\n{lines}')
+    code, _, error = call(command, file)
+    assert code == 4
+    assert words in " ".join(error.split())
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["city.toml", "theirs", "theirs.txt"]
 
 
 @pytest.mark.parametrize(
