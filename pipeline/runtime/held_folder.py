@@ -1,4 +1,4 @@
-"""Folders of scratch that several commands may make side by side, each held by its process.
+"""Folders that are held by the process that works in them: scratch that several make side by side, and results.
 
 A process that is killed cannot clean up. It holds its folder by a lock of the system, which ends with the process
 whatever ended it, so whoever comes next can tell a folder that nobody holds from one that is in use.
@@ -14,6 +14,9 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from uuid import uuid4
+
+from pipeline.errors import RunError
+from pipeline.io.urls import is_url
 
 _NAME = re.compile(r"\.?[0-9a-f]{32}")
 
@@ -63,6 +66,38 @@ def _made(parent: Path) -> tuple[Path, int]:
             fcntl.flock(handle, fcntl.LOCK_EX)
         if folder.is_dir():
             return folder, handle
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def held_results(run_dir: str) -> Iterator[None]:
+    """Hold a run directory while it is written, so that no other run on this file system writes it, too.
+
+    Nothing lies in it for that. In an object store, and where the file system cannot lock folders, nothing is held.
+
+    Parameters
+    ----------
+    run_dir : str
+        The folder, which is there, or a URL.
+
+    Raises
+    ------
+    RunError
+        Another run holds it.
+    """
+    if is_url(run_dir):
+        yield
+        return
+    handle = os.open(run_dir, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunError(f"{run_dir} is being written by another run: wait for it, or give another --out") from None
+        except OSError:
+            pass  # NFS locks files alone
+        yield
+    finally:
         os.close(handle)
 
 

@@ -39,6 +39,7 @@ from pipeline.runtime.earlier import (
 from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.executors import Executor, executor_for
 from pipeline.runtime.gather import gather
+from pipeline.runtime.held_folder import held_results
 from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import CandidateSite, Joined, RejectedSite
@@ -138,7 +139,8 @@ def rerun(
     Raises
     ------
     RunError
-        The directory holds no finished run of this version, its inputs changed, or an id is none of its buildings.
+        The directory holds no finished run of this version, its inputs changed, an id is none of its buildings, or
+        another run writes it.
     SettingsError
         The overrides hold faults.
     InputError
@@ -146,10 +148,21 @@ def rerun(
     RunCancelledError
         `cancelled` called it off; the run directory is as it was.
     """
+    with held_results(str(earlier_run(request.run_dir).run_dir)):
+        # as it is now that nobody else writes it
+        return _rerun(request, earlier_run(request.run_dir), on_event, executor, cancelled)
+
+
+def _rerun(
+    request: RerunRequest,
+    earlier: Earlier,
+    on_event: Listener,
+    executor: Executor | None,
+    cancelled: Callable[[], bool],
+) -> RerunSummary:
     began = time.perf_counter()
     progress = Progress(on_event)
     progress.tell("run", "plan", f"rerun in {request.run_dir}")
-    earlier = earlier_run(request.run_dir)
     wanted = dataclasses.replace(request_of(earlier.manifest), overrides=_overrides_file(request, earlier))
     known = earlier.records(request.only)
     unknown = [name for name in request.only if name not in known or known[name].status == REJECTED]

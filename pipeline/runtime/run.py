@@ -34,6 +34,7 @@ from pipeline.runtime.digest import run_digest
 from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.executors import Executor, executor_for, peak_of_process
 from pipeline.runtime.flight import TICK_S
+from pipeline.runtime.held_folder import held_results
 from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import Joined
@@ -298,6 +299,10 @@ def run_variants(
     ]
     shared.timings["plan"] = time.perf_counter() - began
     with contextlib.ExitStack() as held:
+        for run_dir in run_dirs:
+            held.enter_context(held_results(run_dir))
+            # whoever held it a moment ago may have left something
+            check_out(run_dir, overwrite=request.overwrite, work=request.work)
         scratch = held.enter_context(
             _scratch(work_dir, request.scratch) if request.work is None else held_work(request.work)
         )

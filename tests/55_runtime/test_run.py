@@ -17,6 +17,8 @@ import pipeline.runtime.publish
 from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, RunError
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.events import Event
+from pipeline.runtime.held_folder import held_results
+from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.run import RunRequest, run
 from pipeline.settings import RunSettings
 
@@ -106,6 +108,21 @@ def test_an_earlier_run_is_kept_unless_told_otherwise(suburb: Path, reconstruct:
     with pytest.raises(RunError, match="is not empty"):
         reconstruct(suburb, out=out)
     assert reconstruct(suburb, out=out, overwrite=True).digest == first.digest
+
+
+def test_two_runs_never_write_one_directory_at_once(suburb: Path, reconstruct: Any, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    with held_results(str(out)), pytest.raises(RunError, match=r"is being written by another run: wait for it, or"):
+        reconstruct(suburb, out=str(out))
+    assert list(out.iterdir()) == []
+    first = reconstruct(suburb, out=str(out))
+    with held_results(first.run_dir):
+        with pytest.raises(RunError, match="is being written by another run"):
+            reconstruct(suburb, out=str(out), overwrite=True)
+        with pytest.raises(RunError, match="is being written by another run"):
+            rerun(RerunRequest(run_dir=first.run_dir, workers=0))
+    assert run_digest(first.run_dir) == first.digest
 
 
 def test_a_folder_that_is_no_run_is_never_replaced(suburb: Path, reconstruct: Any, tmp_path: Path) -> None:
