@@ -74,7 +74,7 @@ class ClusterTable(Parameters):
     workers: int = parameter(
         2, "Processes of the embedded cluster; 0 runs serially in the driver.", minimum=0, maximum=1024
     )
-    scheduler: str = parameter("", "A Dask scheduler to use in place of the embedded cluster.")
+    scheduler: str = parameter("", "A Dask scheduler to use in place of the embedded cluster; without workers.")
     tls_ca: str = parameter("", "Certificate of the CA of all the cluster's processes, PEM; with tls_cert.")
     tls_cert: str = parameter("", "The driver's certificate, PEM.")
     tls_key: str = parameter("", "The driver's private key, PEM; empty where it lies with the certificate.")
@@ -241,6 +241,11 @@ def read_batch(path: str | Path) -> Batch:
     work = built["work"]
     if work is not None and "://" in work.path:
         faults.append(f"[work] path is {work.path!r}: use a folder of a file system that all workers share, no URL")
+    if tables["cluster"].get("scheduler") and "workers" in tables["cluster"]:
+        faults.append(
+            "[cluster] has both scheduler and workers: leave out workers, which the scheduler has of its own, or "
+            "scheduler for an embedded cluster"
+        )
     faults.extend(_times_faults(built["schedule"]))
     settings = RunSettings()
     try:

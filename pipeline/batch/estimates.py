@@ -14,8 +14,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.batch.batch_file import Batch
-from pipeline.errors import InputError, RunError
+from pipeline.batch.wording import as_keys, said_in_keys
+from pipeline.errors import EmptyInputError, InputError, RunError
 from pipeline.inspection import RATES, inspect
+from pipeline.io import shown
 from pipeline.runtime.events import ignore
 from pipeline.runtime.executors import memory_of_workers
 from pipeline.runtime.performance import PerformanceReport
@@ -65,7 +67,7 @@ class Estimate:
     files: int
     """Inputs."""
     points: int
-    """That their headers promise."""
+    """That their headers promise, of a window by its share of their bounds."""
     tiles: int
     """Of the lattice, that the inputs' bounds meet."""
     tile_size_m: float
@@ -117,21 +119,31 @@ def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Es
     ClusterError
         The scheduler does not answer.
     """
+    with said_in_keys():
+        return _estimated(batch, read, known)
+
+
+def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     request = batch.request()
     progress = Progress(ignore)
     plan, paths = plan_inputs(request, batch.settings, progress)
-    tiles = _tiles(plan)
+    tiles, points_in = _wanted(plan)
+    points = sum(points_in.values())
+    if not tiles:
+        raise EmptyInputError(
+            shown(paths[0]), f"all {len(paths)} inputs lie off --bbox and --aoi", "Check them, and their CRS"
+        )
     if request.footprints is not None:
         buildings, told = len(given_footprints(request.footprints, plan).polygons), "the given footprints"
-    elif known[0] and known[1] == plan.points:
+    elif known[0] and known[1] == points:
         buildings, told = known[0], "as many as in the run before"
     else:
-        buildings, told = _objects(plan, paths, read)
+        buildings, told = _objects(plan, points, [path for path in paths if shown(path) in points_in], read)
     workers, limit = memory_of_workers(workers=request.workers, scheduler=request.scheduler, tls=request.tls)
     hands = max(1, min(workers, os.cpu_count() or 1) if request.scheduler is None else workers)
     side = plan.grid.size_mm / MM
     seen = ((side + 2.0 * plan.grid.halo_mm / MM) / side) ** 2
-    millions = plan.points / 1e6
+    millions = points / 1e6
     stages = {
         "ingest": millions * CPU.ingest_per_million / min(hands, len(paths)),
         "split": millions * seen * CPU.split_per_million / min(hands, max(1, len(tiles))),
@@ -141,29 +153,35 @@ def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Es
     }
     total = RATES.seconds_start + sum(stages.values())
     work_bytes = int(
-        plan.points * POINT.itemsize * (1.0 + _SPLIT_SHARE)
+        points * POINT.itemsize * (1.0 + _SPLIT_SHARE)
         + len(tiles) * side * side * _TERRAIN_BYTES
         + buildings * _KEPT_BYTES
     )
     out_bytes = buildings * _RESULT_BYTES
     work_free, out_free = _free(batch.work_folder), _free(batch.out)
     refusals = [
-        *_places_refused(batch),
+        *places_refused(batch),
         *_memory_refused(plan, limit),
         *_disk_refused(batch, work_bytes, work_free, out_bytes, out_free),
     ]
     warnings = list(progress.warnings)
     if request.scheduler is not None and workers == 0:
         warnings.append(f"the scheduler {request.scheduler} has no worker now: the run would wait for one")
+    worker_bytes = int(RATES.gib_base * 2**30) + plan.window_bytes
+    if limit is not None and plan.window_bytes <= limit < worker_bytes:
+        warnings.append(
+            f"a worker may need up to {worker_bytes / 2**30:.1f} GiB, its limit is {limit / 2**30:.1f}: if workers are "
+            "ended for it, set a smaller tile_size_m, or give them more memory"
+        )
     return Estimate(
         files=len(paths),
-        points=plan.points,
+        points=points,
         tiles=len(tiles),
         tile_size_m=side,
         buildings=buildings,
         buildings_from=told,
         workers=workers,
-        worker_bytes=int(RATES.gib_base * 2**30) + plan.window_bytes,
+        worker_bytes=worker_bytes,
         worker_limit_bytes=limit,
         stage_s=stages,
         seconds=(total / _RANGE, total * _RANGE),
@@ -171,21 +189,33 @@ def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Es
         work_free_bytes=work_free,
         out_bytes=out_bytes,
         out_free_bytes=out_free,
-        warnings=tuple(warnings),
+        warnings=tuple(as_keys(text) for text in warnings),
         refusals=tuple(refusals),
     )
 
 
-def _tiles(plan: Plan) -> set[Tile]:
-    """Tiles that the inputs' bounds meet."""
+def _wanted(plan: Plan) -> tuple[set[Tile], dict[str, int]]:
+    """Tiles that the inputs' bounds meet within the window that is wanted, and points there by input, spread evenly."""
     found: set[Tile] = set()
+    points: dict[str, int] = {}
     for info in plan.sources:
-        x0, y0, _, x1, y1, _ = (round(value * MM) for value in info.bounds_m)
+        x_min, y_min, _, x_max, y_max, _ = info.bounds_m
+        left, bottom, right, top = x_min, y_min, x_max, y_max
+        if plan.options.window is not None:
+            unit = info.reference.horizontal_unit_m
+            window = plan.options.window
+            left, bottom = max(left, window.x_min * unit), max(bottom, window.y_min * unit)
+            right, top = min(right, window.x_max * unit), min(top, window.y_max * unit)
+        if left > right or bottom > top:
+            continue
+        whole = (x_max - x_min) * (y_max - y_min)
+        points[info.path] = round(info.point_count * ((right - left) * (top - bottom) / whole if whole > 0.0 else 1.0))
+        x0, y0, x1, y1 = (round(value * MM) for value in (left, bottom, right, top))
         found.update(plan.grid.tiles_over(Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1)))
-    return found
+    return found, points
 
 
-def _objects(plan: Plan, paths: Sequence[str], read: int) -> tuple[int, str]:
+def _objects(plan: Plan, wanted: int, paths: Sequence[str], read: int) -> tuple[int, str]:
     """Raised objects to be expected, from some inputs spread over all, and how that was found."""
     step = max(1, len(paths) // max(1, read))
     chosen = paths[step // 2 :: step][:read]
@@ -195,7 +225,7 @@ def _objects(plan: Plan, paths: Sequence[str], read: int) -> tuple[int, str]:
         objects += found.raised_objects
         points += found.used_points
     told = f"raised objects in {len(chosen)} of {len(paths)} inputs, trees among them"
-    return round(objects * plan.points / points) if points else 0, told
+    return round(objects * wanted / points) if points else 0, told
 
 
 def _free(folder: str) -> int | None:
@@ -221,8 +251,8 @@ def _disk(folder: str) -> int:
     return _existing(folder).stat().st_dev
 
 
-def _places_refused(batch: Batch) -> list[str]:
-    """What cannot be written where the batch says."""
+def places_refused(batch: Batch) -> list[str]:
+    """What cannot be written where the batch says; nothing is made."""
     work, out = Path(batch.work_folder).resolve(), batch.out
     if "://" not in out and (work.is_relative_to(Path(out).resolve()) or Path(out).resolve().is_relative_to(work)):
         return [f"the work folder {work} and the results {out} lie in one another: give another [work] path"]
@@ -237,7 +267,7 @@ def _places_refused(batch: Batch) -> list[str]:
         try:
             check()
         except RunError as error:
-            refusals.append(str(error))
+            refusals.append(as_keys(str(error)))
     return refusals
 
 
@@ -283,7 +313,7 @@ class BatchRefusedError(RunError):
     """A batch run cannot work as it is planned."""
 
 
-def refuse(found: Estimate) -> None:
+def refuse(refusals: Sequence[str]) -> None:
     """End what cannot work.
 
     Raises
@@ -291,5 +321,5 @@ def refuse(found: Estimate) -> None:
     BatchRefusedError
         Naming all that cannot work.
     """
-    if found.refusals:
-        raise BatchRefusedError("; ".join(found.refusals))
+    if refusals:
+        raise BatchRefusedError("; ".join(refusals))

@@ -8,8 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.batch.batch_file import Batch
-from pipeline.batch.estimates import estimate, refuse
+from pipeline.batch.estimates import estimate, places_refused, refuse
 from pipeline.batch.status import StatusWriter, buildings_before
+from pipeline.batch.wording import as_keys, said_in_keys
 from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.report.run_page import write_run_page
 from pipeline.runtime.events import Event, Listener, ignore, never
@@ -51,18 +52,18 @@ def run_batch(
         As `pipeline.runtime.run.run`.
     """
     refuse_held(batch.work_folder)
-    planned = estimate(batch, _READ, buildings_before(batch.work_folder))
-    refuse(planned)
-    with contextlib.ExitStack() as shown:
+    refuse(places_refused(batch))
+    with contextlib.ExitStack() as shown, said_in_keys():
         # who comes second says nothing in the status of who came first
         work = Path(batch.work_folder).resolve()
         make_work(work)
         shown.enter_context(held_lock(work, DRIVER_LOCK))
-        status = StatusWriter(batch.work_folder, str(batch.path), batch.out, planned.stage_s, points=planned.points)
+        known = buildings_before(batch.work_folder)
+        status = StatusWriter(batch.work_folder, str(batch.path), batch.out)
         if batch.cluster.metrics_port:
             shown.callback(serve_metrics(batch.cluster.metrics_port))
             on_event = both(RunMetrics(), on_event)
-        return _told(batch, status, on_event, executor, cancelled)
+        return _told(batch, status, on_event, executor, cancelled, known)
 
 
 def _told(
@@ -71,10 +72,12 @@ def _told(
     on_event: Listener,
     executor: Executor | None,
     cancelled: Callable[[], bool],
+    known: tuple[int, int],
 ) -> RunSummary:
-    """Run a batch and keep its status."""
+    """Plan and run a batch, and keep its status."""
 
     def listen(event: Event) -> None:
+        event = dataclasses.replace(event, message=as_keys(event.message))
         status.on_event(event)
         told = event.kind == "progress" and not event.message
         on_event(dataclasses.replace(event, message=status.told()) if told else event)
@@ -84,12 +87,17 @@ def _told(
         return cancelled()
 
     try:
+        # of thousands of inputs elsewhere the headers alone take minutes
+        status.begin()
+        planned = estimate(batch, _READ, known)
+        refuse(planned.refusals)
+        status.plan(planned.stage_s, planned.points)
         summary = run(batch.request(), listen, executor, asked)
     except (KeyboardInterrupt, RunCancelledError):
         status.end("interrupted", "run the batch again, and it goes on from here")
         raise
     except BaseException as error:
-        status.end("failed", f"{type(error).__name__}: {error}".removesuffix(": "))
+        status.end("failed", as_keys(f"{type(error).__name__}: {error}".removesuffix(": ")))
         raise
     status.end("incomplete" if summary.failed_tiles else "finished", f"digest {summary.digest}")
     if batch.output.report:

@@ -78,14 +78,10 @@ class StatusWriter:
         Where the file is.
     batch, out : str
         What is run, and whereto.
-    planned : mapping
-        Planned seconds by stage.
     clock : callable
         Seconds, monotonic; replaced in tests.
     now : callable
         The time of day with a time zone; replaced in tests.
-    points : int
-        Of all inputs, by their headers.
     """
 
     def __init__(
@@ -93,14 +89,11 @@ class StatusWriter:
         work_folder: str,
         batch: str,
         out: str,
-        planned: Mapping[str, float],
         clock: Callable[[], float] = time.monotonic,
         now: Callable[[], dt.datetime] = lambda: dt.datetime.now(tz=dt.UTC),
-        *,
-        points: int = 0,
     ) -> None:
         self._storage = LocalStorage(root=Path(work_folder))
-        self._planned = dict(planned)
+        self._planned: dict[str, float] = {}
         self._clock, self._now = clock, now
         self._seen: dict[str, StageProgress] = {}
         self._began_s: dict[str, float] = {}
@@ -114,11 +107,23 @@ class StatusWriter:
             state="running",
             batch=batch,
             out=out,
-            points=points,
             process=f"{os.getpid()} on {socket.gethostname()}",
             started_at=started,
             updated_at=started,
         )
+
+    def begin(self) -> None:
+        """Say that the run is planned."""
+        with self._lock:
+            self.status = dataclasses.replace(self.status, stage="plan")
+            self._write()
+
+    def plan(self, planned: Mapping[str, float], points: int) -> None:
+        """Take in what the run will take: seconds by stage, and points by the inputs' headers."""
+        with self._lock:
+            self._planned = dict(planned)
+            self.status = dataclasses.replace(self.status, points=points)
+            self._write()
 
     def on_event(self, event: Event) -> None:
         """Take an event in; the file is written once a second at most, the rest by `tick`."""
@@ -239,7 +244,7 @@ def read_status(work_folder: str) -> Status:
         raise RunError(f"{path} cannot be read: {error}. Run the batch again: it writes a new one") from error
     if status.state == "running" and not (is_held(work_folder, DRIVER_LOCK) or is_held(work_folder)):
         message = f"cut off after {status.updated_at}: run the batch again, and it goes on from there"
-        return dataclasses.replace(status, state="dead", remaining_s=None, message=message)
+        return dataclasses.replace(status, state="dead", remaining_s=None, waiting="", message=message)
     return status
 
 

@@ -42,7 +42,7 @@ def plan(
         for warning in found.warnings:
             console.warn(warning)
         console.document(dataclasses.asdict(found))
-        refuse(found)
+        refuse(found.refusals)
 
 
 def run(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
@@ -132,7 +132,7 @@ def _rows(found: Estimate) -> list[tuple[str, str]]:
         ("inputs", f"files: {found.files}, {found.points / 1e6:,.1f} million points"),
         ("tiles", f"{found.tiles} of {found.tile_size_m:g} m"),
         ("buildings", f"about {found.buildings:,} ({found.buildings_from})"),
-        ("memory of a worker", f"{found.worker_bytes / 2**30:.1f}{limit} GiB"),
+        ("memory of a worker", f"at most {found.worker_bytes / 2**30:.1f}{limit} GiB"),
         ("time", f"{duration(found.seconds[0])} to {duration(found.seconds[1])} with {_hands(found.workers)}"),
         ("work folder", f"{found.work_bytes / 1e9:.2f} GB{_of(found.work_free_bytes)}"),
         ("results", f"{found.out_bytes / 1e9:.2f} GB{_of(found.out_free_bytes)}"),
@@ -151,6 +151,8 @@ def _of(free: int | None) -> str:
 def _told(found: Status) -> list[tuple[str, str]]:
     rows = [("state", found.state), ("process", found.process), ("started", found.started_at)]
     rows.append(("told", found.updated_at))
+    if found.stage and not found.stages:
+        rows.append((found.stage, "under way" if found.state == "running" else "was under way"))
     for name, stage in found.stages.items():
         kept = f", {stage['kept']} of them before" if stage["kept"] else ""
         rows.append((name, f"{stage['done']} of {stage['total']}{kept}, {duration(stage['seconds'])}"))

@@ -79,7 +79,14 @@ def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings)
     """
     sources = _looked_at(sorted(paths), options)
     first = sources[0].reference
-    warnings = [f"{info.path}: {text}" for info in sources for text in info.warnings]
+    odd: dict[str, list[str]] = {}
+    for info in sources:
+        for text in info.warnings:
+            odd.setdefault(text, []).append(info.path)
+    # once for all: a city has thousands of inputs, and what is odd in one is so in the others
+    warnings = [
+        f"{of[0]}{f' and {len(of) - 1} more inputs' if len(of) > 1 else ''}: {text}" for text, of in odd.items()
+    ]
     for info in sources[1:]:
         other = info.reference
         same_units = (

@@ -39,7 +39,9 @@ def clock() -> Clock:
 
 @pytest.fixture
 def writer(tmp_path: Path, clock: Clock) -> StatusWriter:
-    return StatusWriter(str(tmp_path), "city.toml", "models", PLANNED, clock, clock.now)
+    found = StatusWriter(str(tmp_path), "city.toml", "models", clock, clock.now)
+    found.plan(PLANNED, 1000)
+    return found
 
 
 def test_it_tells_buildings_rate_and_what_is_left(writer: StatusWriter, clock: Clock, tmp_path: Path) -> None:
@@ -139,13 +141,20 @@ def test_a_damaged_status_is_named_and_stops_no_run(tmp_path: Path, text: str) -
     assert buildings_before(str(tmp_path)) == (0, 0)
 
 
+def test_a_run_that_is_planned_says_so(tmp_path: Path, clock: Clock) -> None:
+    StatusWriter(str(tmp_path), "city.toml", "models", clock, clock.now).begin()
+    with held_work(str(tmp_path)):
+        found = read_status(str(tmp_path))
+    assert (found.state, found.stage, found.stages) == ("running", "plan", {})
+
+
 def test_what_happened_within_the_second_is_written_though_nothing_follows(
     writer: StatusWriter, clock: Clock, tmp_path: Path
 ) -> None:
     writer.on_event(Event(kind="stage", stage="ingest", total=2))
     writer.on_event(Event(kind="progress", stage="ingest", done=2, total=2))
     writer.tick()
-    assert json.loads((tmp_path / NAME).read_text())["stages"]["ingest"]["done"] == 0
+    assert json.loads((tmp_path / NAME).read_text())["stages"] == {}
     clock.s += 1.0
     writer.tick()
     assert json.loads((tmp_path / NAME).read_text())["stages"]["ingest"]["done"] == 2

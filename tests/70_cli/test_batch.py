@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+import laspy
 import pytest
 from typer.testing import CliRunner
 
@@ -206,6 +208,71 @@ def test_a_tile_that_no_worker_can_hold_is_refused(
     code, _, error = call("plan", folder / "city.toml")
     assert code == 4
     assert "Set a smaller tile_size_m, or give the workers more memory" in error
+
+
+def test_a_limit_that_the_largest_tile_may_exceed_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    need = json.loads(call("plan", folder / "city.toml", "--json")[1])["worker_bytes"]
+
+    def tight(**_: object) -> tuple[int, int | None]:
+        return 2, need - 1
+
+    monkeypatch.setattr("pipeline.batch.estimates.memory_of_workers", tight)
+    code, _, error = call("plan", folder / "city.toml")
+    assert code == 0
+    assert "a worker may need up to" in " ".join(error.split())
+
+
+def test_the_disk_that_work_and_results_share_must_hold_both(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "city.toml"
+    file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
+    told = json.loads(call("plan", file, "--json")[1])
+    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: told["work_bytes"] + told["out_bytes"])
+    assert call("plan", file)[0] == 0
+    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: told["work_bytes"] + told["out_bytes"] - 1)
+    code, _, error = call("plan", file)
+    assert code == 4
+    assert "of one disk" in " ".join(error.split())
+
+
+def test_a_window_is_planned_by_its_share(folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "city.toml"
+    paths = f'[inputs]\npaths = ["{folder}/tiles/*.laz"]\n'
+    rest = '[settings]\ntile_size_m = 40.0\n[output]\npath = "models"\n'
+    file.write_text(paths + rest)
+    whole = json.loads(call("plan", file, "--json")[1])
+    (laz,) = (folder / "tiles").glob("*.laz")
+    with laspy.open(laz) as tile:
+        (x0, y0, _), (x1, y1, _) = tile.header.mins, tile.header.maxs
+    file.write_text(f"{paths}bbox = [{x0}, {y0}, {(x0 + x1) / 2}, {(y0 + y1) / 2}]\n{rest}")
+    part = json.loads(call("plan", file, "--json")[1])
+    assert part["points"] == pytest.approx(whole["points"] / 4, rel=0.01)
+    assert 0 < part["tiles"] < whole["tiles"]
+    assert part["buildings"] < whole["buildings"]
+
+
+def test_what_is_odd_in_every_input_is_told_once(folder: Path, tmp_path: Path) -> None:
+    (laz,) = (folder / "tiles").glob("*.laz")
+    for name in ("a.laz", "b.laz", "c.laz"):
+        shutil.copy(laz, tmp_path / name)
+    file = tmp_path / "city.toml"
+    file.write_text('[inputs]\npaths = ["*.laz"]\ncrs = "EPSG:28992"\n[output]\npath = "models"\n')
+    told = json.loads(call("plan", file, "--json")[1])["warnings"]
+    assert told
+    assert all(text.startswith(f"{tmp_path}/a.laz and 2 more inputs: ") for text in told)
+
+
+def test_faults_name_keys_of_the_batch_file(folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "city.toml"
+    file.write_text(f'[inputs]\npaths = ["{folder}/tiles/*.laz"]\nbbox = [0, 0, 1, 1]\n[output]\npath = "models"\n')
+    for command in ("plan", "run"):
+        code, _, error = call(command, file)
+        assert code == 3
+        assert "lie off [inputs] bbox and [inputs] aoi" in " ".join(error.split())
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "theirs").touch()
+    assert "give another [output] path" in " ".join(call("run", file)[2].split())
 
 
 @pytest.mark.parametrize("words", [["plan"], ["run"], ["status"]])
