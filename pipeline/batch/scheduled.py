@@ -23,7 +23,7 @@ from pipeline.batch.schedule_state import NAME, Entry, Outcome, ScheduleState, i
 from pipeline.errors import RunError, SettingsError
 from pipeline.io import LocalStorage
 from pipeline.runtime.events import Event, EventKind, Listener, ignore
-from pipeline.runtime.work_folder import held_lock, is_held, make_work
+from pipeline.runtime.work_folder import held_lock, is_at_work, is_held, make_work
 from pipeline.schedule import Cron
 
 LOCK, RUN_LOCK = "schedule.lock", "run.lock"
@@ -192,7 +192,7 @@ class _Keeper:
         now, state = self._now(), self._ended(self._state)
         before, written_at = self._batch.schedule, self._reread()
         table = self._batch.schedule
-        is_busy = self._run is not None or is_held(str(self._folder)) or is_held(str(self._folder), RUN_LOCK)
+        is_busy = self._run is not None or is_at_work(str(self._folder)) or is_held(str(self._folder), RUN_LOCK)
         # what was cut off together with the process that kept the schedule goes first
         cut = None if is_busy or table.paused or self._refused else state.running
         is_taken, slot = is_busy or state.running is not None, None

@@ -19,7 +19,7 @@ from pipeline.batch.eta import StageProgress, duration, remaining_s
 from pipeline.errors import RunError
 from pipeline.io import LocalStorage
 from pipeline.runtime.events import Event
-from pipeline.runtime.work_folder import DRIVER_LOCK, is_held
+from pipeline.runtime.work_folder import is_at_work
 
 NAME = "status.json"
 _EVERY_S = 1.0
@@ -242,7 +242,7 @@ def read_status(work_folder: str) -> Status:
         raise RunError(f"{path} does not exist: this batch was never run") from None
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise RunError(f"{path} cannot be read: {error}. Run the batch again: it writes a new one") from error
-    if status.state == "running" and not (is_held(work_folder, DRIVER_LOCK) or is_held(work_folder)):
+    if status.state == "running" and not is_at_work(work_folder):
         message = f"cut off after {status.updated_at}: run the batch again, and it goes on from there"
         return dataclasses.replace(status, state="dead", remaining_s=None, waiting="", message=message)
     return status

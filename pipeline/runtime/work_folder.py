@@ -25,6 +25,7 @@ from pipeline.runtime.scratch import Scratch
 _LOCK = "lock"
 DRIVER_LOCK = "driver.lock"
 """Held by who drives a batch, from before its first word about it; tasks are kept under `_LOCK`, later."""
+_OF_WHO_WORKS = (DRIVER_LOCK, _LOCK)
 _SCRATCH = "scratch"
 _MARK = "work.json"
 _BESIDE = {_LOCK, "status.json"}
@@ -151,9 +152,14 @@ def refuse_held(folder: str) -> None:
     RunError
         One does.
     """
-    for name in (DRIVER_LOCK, _LOCK):
+    for name in _OF_WHO_WORKS:
         if is_held(folder, name):
             raise RunError(f"{folder} is at work already ({_holder(Path(folder, name))}): wait for it, or end it first")
+
+
+def is_at_work(folder: str) -> bool:
+    """Whether some process works in a folder."""
+    return any(is_held(folder, name) for name in _OF_WHO_WORKS)
 
 
 def refuse_foreign(folder: str) -> None:
@@ -180,7 +186,7 @@ def _holder(lock: Path) -> str:
         return "by another process"
 
 
-def is_held(folder: str, lock: str = _LOCK) -> bool:
+def is_held(folder: str, lock: str) -> bool:
     """Whether some process of this machine, or of one that shares the folder's locks, works there just now."""
     try:
         handle = os.open(Path(folder, lock), os.O_RDWR | os.O_CLOEXEC)
