@@ -18,7 +18,7 @@ from pipeline.errors import RunError
 from pipeline.runtime.events import Event
 from pipeline.runtime.executors import Measured, SerialExecutor
 from pipeline.runtime.run import RunRequest, RunSummary, run
-from pipeline.runtime.work_folder import held_work, is_held
+from pipeline.runtime.work_folder import held_work, is_at_work
 from pipeline.settings import RunSettings
 from pipeline.synthetic.dataset import simulate
 
@@ -270,10 +270,10 @@ def test_another_machine_goes_on_with_all_that_was_kept(place: Place, monkeypatc
 
 def test_two_runs_do_not_work_in_one_folder(place: Place) -> None:
     with held_work(str(place.folder / "work")):
-        assert is_held(str(place.folder / "work"))
+        assert is_at_work(str(place.folder / "work"))
         with pytest.raises(RunError, match=r"at work already \(process \d+ on "):
             place.run()
-    assert not is_held(str(place.folder / "work"))
+    assert not is_at_work(str(place.folder / "work"))
     place.run()
 
 
