@@ -6,7 +6,9 @@ and yields results as they come, in any order. Nothing else of the engine shows.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import logging
 import threading
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -45,6 +47,17 @@ _NEVER = "365 days"
 """So long after a worker's death Dask looks whether one of its name is there, and ends its keeper if not: also where
 the worker came back long ago, died again just now, and is being started. That death would be blamed on its task.
 Keepers that gave up are told by their status (`Cluster.mend`)."""
+
+
+class _ToldOnce(logging.Filter):
+    """Leaves out what Dask's client says as its search for a lost scheduler is ended: `ClusterError` tells it."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a line is printed."""
+        return record.exc_info is None or not isinstance(record.exc_info[1], asyncio.CancelledError)
+
+
+_TOLD_ONCE = _ToldOnce()
 
 
 class Cluster:
@@ -253,6 +266,7 @@ class DaskExecutor:
         import dask
         from distributed import Client
 
+        logging.getLogger("distributed.client").addFilter(_TOLD_ONCE)
         # what was entered before a fault is left again
         with contextlib.ExitStack() as stack:
             if self._owned:

@@ -260,6 +260,7 @@ def strike(run: BatchRun, fault: Fault, stage: str, undisturbed: str) -> Row:
     fault.strike(run, driver, pid)
     code = driver.ended()
     assert code in ENDINGS, driver.tail()
+    assert "Traceback" not in driver.text, driver.tail()
     first = run.status()
     told = [f"{ENDINGS[code]}, {first['state']}"]
     run.gates.open()
