@@ -6,11 +6,12 @@
 | elsewhere (a file, a pipe, CI) | tables | one log line an event, throttled |
 | `--json` | one JSON document | one JSON object an event, a line each |
 | `--quiet` | as above | warnings and errors only |
-| `GABLEWORK_LOG_JSON=1` | as above | one JSON object an event, with time, level, run and stage |
+| `GABLEWORK_LOG_JSON=1` | as above | one JSON object a line: events, errors, what libraries say |
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -25,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import typer
 
-from pipeline.errors import GableworkError, InputError, RunError, SettingsError
+from pipeline.errors import InputError, RunError, SettingsError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -96,12 +97,19 @@ class Console:
         One JSON document on standard output, events as JSON lines on standard error.
     quiet : bool
         No progress.
+    log_json : bool
+        Whatever goes to standard error is one JSON object a line, as `GABLEWORK_LOG_JSON=1` asks for.
     clock : callable
         Seconds, monotonic; replaced in tests.
     """
 
     def __init__(
-        self, *, as_json: bool = False, quiet: bool = False, clock: Callable[[], float] = time.monotonic
+        self,
+        *,
+        as_json: bool = False,
+        quiet: bool = False,
+        log_json: bool = False,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.as_json = as_json
         self.quiet = quiet
@@ -109,7 +117,8 @@ class Console:
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
         self._last_line_s: dict[str, float] = {}
-        self._log_json = False
+        self._log_json = log_json
+        self._logs = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
         """Start to speak.
@@ -119,16 +128,16 @@ class Console:
         typer.Exit
             `GABLEWORK_LOG_JSON` is neither 1 nor 0.
         """
-        if os.environ.get("GABLEWORK_LOG_JSON"):
+        if self._log_json or os.environ.get("GABLEWORK_LOG_JSON"):
             from pipeline.runtime import logs
 
             try:
-                self._log_json = logs.wants_json()
+                self._log_json = logs.wants_json() or self._log_json
             except SettingsError as error:
                 self._tell_error(error, ExitCode.USAGE)
                 raise typer.Exit(ExitCode.USAGE) from error
             if self._log_json:
-                logs.configure(as_json=True)
+                self._logs.callback(logs.let_all_speak_json())
         return self
 
     def __exit__(
@@ -142,13 +151,12 @@ class Console:
             With the code of `EXIT_CODES`, in place of any error but those that typer itself handles.
         """
         self._close_bars()
-        if error is None or isinstance(error, SystemExit | typer.Exit | typer.Abort | typer.BadParameter):
-            return
-        if not isinstance(error, GableworkError | KeyboardInterrupt):
-            traceback.print_exception(error, file=sys.stderr)
-        code = exit_code_of(error)
-        self._tell_error(error, code)
-        raise typer.Exit(code) from error
+        with self._logs:
+            if error is None or isinstance(error, SystemExit | typer.Exit | typer.Abort | typer.BadParameter):
+                return
+            code = exit_code_of(error)
+            self._tell_error(error, code)
+            raise typer.Exit(code) from error
 
     # --- progress ----------------------------------------------------------------------------------------------------
 
@@ -235,6 +243,15 @@ class Console:
             self._close_bars()
             print(message, flush=True)
 
+    def tell(self, message: str) -> None:
+        """Say how a command fares that runs until it is told to end: a line for people, or one of its log."""
+        if self._log_json:
+            from pipeline.runtime.logs import LOG
+
+            LOG.info(message)
+        else:
+            self.say(message)
+
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
         """Show a table for people; nothing without rows. Columns of figures only are set to the right."""
         if not rows or self.as_json:
@@ -265,6 +282,12 @@ class Console:
 
     def _tell_error(self, error: BaseException, code: ExitCode) -> None:
         message = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+        if self._log_json:
+            from pipeline.runtime.logs import LOG
+
+            LOG.error(message, exc_info=error if code is ExitCode.INTERNAL else None)
+        elif code is ExitCode.INTERNAL:
+            traceback.print_exception(error, file=sys.stderr)
         if self.as_json:
             detail: dict[str, Any] = {"type": type(error).__name__, "exit_code": int(code), "message": message}
             if isinstance(error, InputError):
@@ -272,6 +295,7 @@ class Console:
             if isinstance(error, SettingsError):
                 detail["faults"] = list(error.faults)
             print(json.dumps({"error": detail}, indent=2), flush=True)
+        if self.as_json or self._log_json:
             return
         lines = list(error.faults) if isinstance(error, SettingsError) and len(error.faults) > 1 else [message]
         for line in lines:

@@ -85,7 +85,9 @@ def _settings(**options: Any) -> ServiceSettings:
 def _log_to_stderr() -> None:
     import logging
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    # nothing is set up here where lines are JSON: the console did
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    logging.getLogger().setLevel(logging.INFO)
     # each names an odd request of a client; whoever sends them is not to fill the log
     for chatty in ("alembic", "python_multipart"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
@@ -146,7 +148,7 @@ def serve(
             given_tls(settings.tls_ca, settings.tls_cert, settings.tls_key)
 
         def on_ready(url: str) -> None:
-            console.say(f"gablework listens on {url}")
+            console.tell(f"gablework listens on {url}")
             console.document({"url": url, "state": str(settings.state)})
 
         serve_until_told(settings, on_ready, with_driver=driver)

@@ -39,7 +39,7 @@ def worker(
     log_json: LogJson = False,
 ) -> None:
     """Work for a Dask scheduler; on SIGTERM finish what runs, then leave."""
-    with Console() as console:
+    with Console(log_json=log_json) as console:
         from pipeline.runtime.logs import wants_json
         from pipeline.runtime.tls import given_tls
         from pipeline.runtime.worker import WorkerOptions, serve_worker
@@ -58,4 +58,4 @@ def worker(
             metrics_port=metrics_port,
             metrics_host=metrics_host,
         )
-        serve_worker(options, console.say)
+        serve_worker(options, console.tell)

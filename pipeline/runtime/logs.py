@@ -14,9 +14,10 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Iterator, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
-from types import MappingProxyType
+from types import MappingProxyType, TracebackType
 from typing import Any
 
 from pipeline.errors import SettingsError
@@ -31,6 +32,9 @@ VARIABLE = "GABLEWORK_LOG_JSON"
 """Environment variable that makes workers and commands log JSON; the service's setting has the same name."""
 
 _NAME = "gablework"
+_CHATTY = ("alembic", "distributed")
+"""Libraries of whose lines a process of ours shows warnings and errors only; Dask sets its own levels as it loads, so
+that a level set before would not last."""
 _UNDER_WAY: ContextVar[Mapping[str, object]] = ContextVar("gablework facts", default=MappingProxyType({}))
 
 LOG = logging.getLogger(f"{_NAME}.run")
@@ -120,6 +124,67 @@ def configure(*, as_json: bool, name: str = _NAME, also: tuple[str, ...] = ()) -
         logger.handlers = [handler]
         logger.propagate = False
     logging.getLogger(name).setLevel(logging.INFO)
+
+
+class _NoChatter(logging.Filter):
+    """Lets pass what is ours, and what libraries say that is of interest."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the line is shown."""
+        return record.levelno >= logging.WARNING or record.name.partition(".")[0] not in _CHATTY
+
+
+def let_all_speak_json() -> Callable[[], None]:
+    """Make all lines of this process JSON on standard error, whoever writes them.
+
+    Those of libraries, also of such as are loaded later; Python's warnings; and faults that nobody catches, of any
+    thread. For processes that are ours, never for one that imports this program as a library.
+
+    Returns
+    -------
+    callable
+        Undoes it.
+    """
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonLines())
+    handler.addFilter(_NoChatter())
+    root = logging.getLogger()
+    loggers = (root, *map(logging.getLogger, (_NAME, "distributed", "py.warnings")))
+    before = [(logger, logger.handlers, logger.propagate, logger.level) for logger in loggers]
+    hooks = sys.excepthook, threading.excepthook
+    for logger in loggers:
+        logger.handlers, logger.propagate = [], True
+    # Dask adds a handler of its own as it loads, unless the root logger has one
+    root.handlers = [handler]
+    logging.captureWarnings(True)
+    sys.excepthook, threading.excepthook = _log_fault, _log_fault_of_thread
+    configure(as_json=True)
+
+    def undo() -> None:
+        logging.captureWarnings(False)
+        sys.excepthook, threading.excepthook = hooks
+        for logger, handlers, propagates, level in before:
+            logger.handlers, logger.propagate = handlers, propagates
+            logger.setLevel(level)
+
+    return undo
+
+
+def _log_fault(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    LOG.critical("a fault that nobody caught: %s", error or kind.__name__, exc_info=(kind, error, trace))
+
+
+def _log_fault_of_thread(fault: threading.ExceptHookArgs) -> None:
+    if fault.exc_type is SystemExit:
+        return
+    name = "a thread" if fault.thread is None else f"the thread {fault.thread.name}"
+    error = fault.exc_type() if fault.exc_value is None else fault.exc_value
+    LOG.critical(
+        "%s ended by a fault: %s",
+        name,
+        error or fault.exc_type.__name__,
+        exc_info=(fault.exc_type, error, fault.exc_traceback),
+    )
 
 
 def wants_json() -> bool:

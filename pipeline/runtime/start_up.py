@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import gc
+import os
+
+from pipeline.errors import SettingsError
 
 _OBJECTS_A_COLLECTION = 300_000
 """New objects, of those that can be in cycles, between two collections of the youngest; Python's own is 700. Modules
@@ -13,7 +17,7 @@ more of processor time, and with 50 thousand a fiftieth more."""
 
 
 def start_own_process() -> None:
-    """Collect garbage more rarely, and none at the end.
+    """Collect garbage more rarely, and none at the end; log JSON to the end where the environment asks for it.
 
     An interpreter that ends looks through all objects for cycles, several times: after a run over a town .3 to .4 s, a
     tenth of its processor time, for memory that the operating system takes back anyway. Frozen objects are not looked
@@ -24,3 +28,10 @@ def start_own_process() -> None:
     gc.set_threshold(_OBJECTS_A_COLLECTION, *gc.get_threshold()[1:])
     atexit.unregister(gc.freeze)
     atexit.register(gc.freeze)
+    if os.environ.get("GABLEWORK_LOG_JSON"):
+        from pipeline.runtime import logs
+
+        # a value that is neither yes nor no is told by the command itself
+        with contextlib.suppress(SettingsError):
+            if logs.wants_json():
+                logs.let_all_speak_json()

@@ -44,6 +44,8 @@ def dask_setup(worker: object) -> None:
         importlib.import_module(name)
     if os.environ.get(LOG):
         as_json = os.environ[LOG] == "json"
+        if as_json:
+            logs.let_all_speak_json()
         logs.configure(as_json=as_json, also=("distributed",) if as_json else ())
     else:
         logs.configure_once()

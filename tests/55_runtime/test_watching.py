@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +15,7 @@ from types import SimpleNamespace
 
 import httpx
 import pytest
+import typer
 from processes import free_port
 from prometheus_client import CollectorRegistry, generate_latest
 
@@ -192,6 +195,60 @@ def test_a_command_logs_its_events_as_json_lines_where_the_environment_asks(
     monkeypatch.setenv(logs.VARIABLE, "perhaps")
     with pytest.raises(SettingsError, match="GABLEWORK_LOG_JSON is 'perhaps': use 1 or 0"):
         logs.wants_json()
+
+
+SPEAKS = """
+import logging, threading, warnings
+from pipeline.runtime.start_up import start_own_process
+
+start_own_process()
+warnings.warn("odd")
+import distributed
+
+logging.getLogger("distributed.client").error("the connection broke")
+logging.getLogger("distributed.scheduler").info("State start")
+logging.getLogger("gablework.run").info("ours")
+thread = threading.Thread(target=lambda: 1 / 0, name="adder")
+thread.start()
+thread.join()
+raise KeyError("lost")
+"""
+
+
+def test_all_that_a_process_of_ours_says_is_json_also_what_libraries_say_and_what_nobody_caught() -> None:
+    environment = {**os.environ, logs.VARIABLE: "1"}
+    ended = subprocess.run([sys.executable, "-c", SPEAKS], env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    odd, broke, ours, thread, lost = (json.loads(line) for line in ended.stderr.splitlines())
+    assert (odd["logger"], broke["logger"], ours["logger"]) == ("py.warnings", "distributed.client", "gablework.run")
+    assert broke["message"] == "the connection broke"
+    assert "adder ended by a fault: division by zero" in thread["message"]
+    assert "ZeroDivisionError" in thread["exception"]
+    assert "KeyError: 'lost'" in lost["exception"]
+
+
+def test_a_command_that_fails_tells_it_in_json_and_leaves_the_loggers_as_they_were(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv(logs.VARIABLE, "1")
+    root, hook = logging.getLogger(), sys.excepthook
+    before = list(root.handlers)
+
+    def serve() -> None:
+        with Console() as console:
+            logging.getLogger("uvicorn.error").warning("a line of a library")
+            console.tell("listening")
+            raise ZeroDivisionError("by nought")
+
+    with pytest.raises(typer.Exit):
+        serve()
+    assert (root.handlers, sys.excepthook) == (before, hook)
+    said = capsys.readouterr()
+    library, told, fault = (json.loads(line) for line in said.err.splitlines())
+    assert (said.out, told["message"]) == ("", "listening")
+    assert library["logger"] == "uvicorn.error"
+    assert (fault["level"], fault["message"]) == ("error", "by nought")
+    assert "ZeroDivisionError: by nought" in fault["exception"]
 
 
 # --- the page about the workers' time --------------------------------------------------------------------------------

@@ -282,6 +282,26 @@ def test_limits_that_no_run_takes_are_refused_at_the_start_and_not_by_every_job(
 
 
 @pytest.mark.slow
+def test_all_lines_of_a_service_and_its_driver_are_json_where_the_environment_asks(tmp_path: Path) -> None:
+    said = tmp_path / "said"
+    with said.open("w") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "service.cli", "serve", "--port", "0", "--state", str(tmp_path / "state")],
+            env={**os.environ, "GABLEWORK_LOG_JSON": "1", "GABLEWORK_WORKERS": "1"},
+            stdout=sink,
+            stderr=sink,
+        )
+        try:
+            until(lambda: "distributed.worker" in said.read_text(), "a worker of the driver")
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(DEADLINE_S)
+    lines = [json.loads(line) for line in said.read_text().splitlines()]
+    assert {"uvicorn.error", "gablework.driver", "distributed.worker"} <= {line["logger"] for line in lines}
+    assert any(line["message"].startswith("gablework listens on http://") for line in lines)
+
+
+@pytest.mark.slow
 def test_serve_answers_and_ends_with_its_driver_on_sigterm(served) -> None:
     running = served()
     driver = running.driver()
