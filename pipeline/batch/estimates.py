@@ -14,10 +14,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.batch.batch_file import Batch
+from pipeline.batch.eta import duration
 from pipeline.batch.wording import as_keys, said_in_keys
 from pipeline.errors import EmptyInputError, InputError, RunError
 from pipeline.inspection import RATES, inspect
 from pipeline.io import shown
+from pipeline.runtime.compiled_kernels import kernels_are_compiled
 from pipeline.runtime.events import ignore
 from pipeline.runtime.executors import memory_of_workers
 from pipeline.runtime.performance import PerformanceReport
@@ -44,6 +46,8 @@ class CpuRates:
     """A building."""
     publish_each: float = 0.003
     """A building."""
+    compiling: float = 120.0
+    """Wall seconds of the first run on two cores whose processes all compile the kernels, over those of the next."""
 
 
 CPU = CpuRates()
@@ -167,6 +171,13 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     warnings = list(progress.warnings)
     if request.scheduler is not None and workers == 0:
         warnings.append(f"the scheduler {request.scheduler} has no worker now: the run would wait for one")
+    cold_s = 0.0
+    if request.scheduler is None and not kernels_are_compiled():
+        cold_s = CPU.compiling
+        warnings.append(
+            "numba kernels are not compiled on this machine yet: this run compiles them, which may take "
+            f"{duration(cold_s)} on top; gablework warm-up does it ahead"
+        )
     worker_bytes = int(RATES.gib_base * 2**30) + plan.window_bytes
     if limit is not None and plan.window_bytes <= limit < worker_bytes:
         warnings.append(
@@ -184,7 +195,7 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
         worker_bytes=worker_bytes,
         worker_limit_bytes=limit,
         stage_s=stages,
-        seconds=(total / _RANGE, total * _RANGE),
+        seconds=(total / _RANGE, total * _RANGE + cold_s),
         work_bytes=work_bytes,
         work_free_bytes=work_free,
         out_bytes=out_bytes,

@@ -236,6 +236,18 @@ def test_the_disk_that_work_and_results_share_must_hold_both(
     assert "of one disk" in " ".join(error.split())
 
 
+def test_kernels_that_are_yet_to_be_compiled_are_told_with_their_time(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = []
+    for compiled in (True, False):
+        monkeypatch.setattr("pipeline.batch.estimates.kernels_are_compiled", lambda compiled=compiled: compiled)
+        told = json.loads(call("plan", folder / "city.toml", "--json")[1])
+        assert any("gablework warm-up" in text for text in told["warnings"]) is not compiled
+        ends.append(told["seconds"][1])
+    assert ends[1] > ends[0] + 60.0
+
+
 def test_a_window_is_planned_by_its_share(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "city.toml"
     paths = f'[inputs]\npaths = ["{folder}/tiles/*.laz"]\n'
