@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime as dt
-import fcntl
 import os
 import select
 import signal
@@ -23,7 +22,7 @@ from pipeline.batch.schedule_state import NAME, Entry, Outcome, ScheduleState, i
 from pipeline.errors import RunError, SettingsError
 from pipeline.io import LocalStorage
 from pipeline.runtime.events import Event, EventKind, Listener, ignore
-from pipeline.runtime.work_folder import held_lock, is_at_work, is_held, make_work
+from pipeline.runtime.work_folder import held_lock, is_at_work, is_held, make_work, take_lock
 from pipeline.schedule import Cron
 
 LOCK, RUN_LOCK = "schedule.lock", "run.lock"
@@ -74,7 +73,7 @@ def start_run(batch: Batch, words: Sequence[str] = ()) -> Run:
     command = [sys.executable, "-m", "pipeline.cli", "batch", "run", str(batch.path), *words]
     lock = os.open(Path(batch.work_folder, RUN_LOCK), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        take_lock(lock)
         return subprocess.Popen(command, process_group=0, pass_fds=(lock,), stdout=subprocess.DEVNULL)  # noqa: S603
     finally:
         os.close(lock)

@@ -13,6 +13,7 @@ import json
 import os
 import shutil
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from uuid import uuid4
@@ -30,6 +31,8 @@ _SCRATCH = "scratch"
 _MARK = "work.json"
 _BESIDE = {_LOCK, "status.json"}
 """What a batch may have written before the folder was made."""
+_PATIENCE_S, _PAUSE_S = 0.5, 0.01
+"""Whoever asks whether a lock is held holds it for microseconds: it is tried again for so long, so often."""
 _FORMAT = 1
 _BOOT = "boot"
 _DISTRUSTED_S = 300.0
@@ -126,7 +129,7 @@ def held_lock(root: Path, name: str) -> Iterator[None]:
         raise RunError(f"{root} cannot be written: {error.strerror or error}. Give another work folder") from error
     try:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            take_lock(handle)
         except BlockingIOError:
             raise RunError(
                 f"{root} is at work already ({_holder(root / name)}): wait for it, or end it first"
@@ -142,6 +145,26 @@ def held_lock(root: Path, name: str) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def take_lock(handle: int) -> None:
+    """Lock an open file until all who have it open closed it, or ended.
+
+    Raises
+    ------
+    BlockingIOError
+        Another process holds it.
+    OSError
+        It is on a file system without locks.
+    """
+    end = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > end:
+                raise
+        time.sleep(_PAUSE_S)
 
 
 def refuse_held(folder: str) -> None:

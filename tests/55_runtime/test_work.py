@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -266,6 +267,17 @@ def test_another_machine_goes_on_with_all_that_was_kept(place: Place, monkeypatc
     monkeypatch.setattr("socket.gethostname", lambda: "elsewhere")
     assert place.run().digest == whole.digest
     assert not place.tasks
+
+
+def test_who_only_asks_whether_a_folder_is_held_refuses_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with held_work(str(tmp_path / "work")):
+        pass
+    asking = os.open(tmp_path / "work" / "lock", os.O_RDWR)
+    fcntl.flock(asking, fcntl.LOCK_SH)
+    monkeypatch.setattr("time.sleep", lambda _: fcntl.flock(asking, fcntl.LOCK_UN))
+    with held_work(str(tmp_path / "work")):
+        assert is_held(str(tmp_path / "work"))
+    os.close(asking)
 
 
 def test_two_runs_do_not_work_in_one_folder(place: Place) -> None:
