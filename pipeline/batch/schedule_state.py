@@ -140,7 +140,7 @@ def look(
     """
     if table.paused:
         if state.waiting is not None:
-            state = state.with_entry(_missed(state.waiting, now, "the schedule was paused while it waited"))
+            state = state.with_entry(missed(state.waiting, now, "the schedule was paused while it waited"))
         return dataclasses.replace(state, decided_until=max(now, state.decided_until), waiting=None), None
     passed = passed_slots(Cron(table.cron, table.time_zone), state.decided_until, now)
     decision = decide(
@@ -155,9 +155,9 @@ def look(
     if passed is not None and passed.before_latest is not None:
         state = state.with_entry(_missed_before(passed, now))
     if decision.late is not None:
-        state = state.with_entry(_missed(decision.late, now, "it was seen too late"))
+        state = state.with_entry(missed(decision.late, now, "it was seen too late"))
     if decision.replaced is not None:
-        state = state.with_entry(_missed(decision.replaced, now, "a later time took its place while it waited"))
+        state = state.with_entry(missed(decision.replaced, now, "a later time took its place while it waited"))
     if decision.skipped is not None:
         message = "a run was still under way"
         entry = Entry(outcome=Outcome.SKIPPED, slot=iso(decision.skipped), at=str(iso(now)), message=message)
@@ -166,7 +166,8 @@ def look(
     return dataclasses.replace(state, decided_until=max(now, state.decided_until), waiting=decision.waits), decision.run
 
 
-def _missed(slot: dt.datetime, now: dt.datetime, message: str) -> Entry:
+def missed(slot: dt.datetime, now: dt.datetime, message: str) -> Entry:
+    """A time that was not run, and why."""
     return Entry(outcome=Outcome.MISSED, slot=iso(slot), at=str(iso(now)), message=message)
 
 

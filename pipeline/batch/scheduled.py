@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Protocol
 
 from pipeline.batch.batch_file import Batch, read_batch
-from pipeline.batch.schedule_state import NAME, Entry, Outcome, ScheduleState, iso, look, read_schedule
+from pipeline.batch.schedule_state import NAME, Entry, Outcome, ScheduleState, iso, look, missed, read_schedule
 from pipeline.errors import RunError, SettingsError
 from pipeline.io import LocalStorage
 from pipeline.runtime.events import Event, EventKind, Listener, ignore
@@ -31,6 +31,8 @@ LONGEST_SLEEP_S = 30.0
 """The clock may be put forward, the batch file may change, a run by hand may end: it is looked after that long."""
 _RUN_LOOK_S = 2.0
 """While a run is under way it is looked so often whether it is over."""
+_END_LOOK_S = 0.2
+"""The same of a run that was interrupted."""
 _BEHIND_S = 0.05
 """A time is looked for a little after it, so that it has passed."""
 
@@ -83,23 +85,30 @@ class Ending:
     """Tells that a schedule is to end; may be set by a signal's handler, also while somebody sleeps by it."""
 
     def __init__(self) -> None:
-        self._is_set = False
+        self._times = 0
         self._reads, self._writes = os.pipe()
-        os.set_blocking(self._writes, False)
+        for end in (self._reads, self._writes):
+            os.set_blocking(end, False)
 
     def set(self) -> None:
-        """End it."""
-        self._is_set = True
+        """End it; once more where that takes too long."""
+        self._times += 1
         with contextlib.suppress(BlockingIOError):
             os.write(self._writes, b".")
 
     def is_set(self) -> bool:
         """Whether it is to end."""
-        return self._is_set
+        return self._times > 0
+
+    def is_urgent(self) -> bool:
+        """Whether that was said more than once."""
+        return self._times > 1
 
     def wait(self, seconds: float) -> None:
-        """Sleep, unless it is to end."""
+        """Sleep until it is said that it is to end, or to end at once."""
         select.select([self._reads], [], [], seconds)
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._reads, 1024)
 
 
 def keep_schedule(
@@ -109,7 +118,9 @@ def keep_schedule(
     start: Callable[[Batch], Run] = start_run,
     now: Callable[[], dt.datetime] = lambda: dt.datetime.now(tz=dt.UTC),
 ) -> None:
-    """Run a batch at its times until it is to end; the run that is under way then is interrupted and waited for.
+    """Run a batch at its times until it is to end.
+
+    The run that is under way then is interrupted and waited for; where the end is asked for once more, it is killed.
 
     The batch file is read again before every look at the clock. Changed times count from the change on; while the
     file has faults nothing is run, and each time that passes is told as failed.
@@ -141,7 +152,7 @@ def keep_schedule(
                 keeper.step()
                 ending.wait(keeper.sleep_s())
         finally:
-            keeper.interrupt()
+            keeper.interrupt(ending)
 
 
 def _scheduled(path: str | Path, folder: Path | None = None) -> Batch:
@@ -168,19 +179,28 @@ class _Keeper:
         self._began = ""
         self._state = ScheduleState(decided_until=now())
         self._on_disk: ScheduleState | None = None
+        self._lock = contextlib.ExitStack()
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
         """Hold the schedule, so that no other process runs it, too."""
-        make_work(self._folder)
-        with held_lock(self._folder, LOCK):
-            self._state = read_schedule(str(self._folder)) or self._state
-            if self._state.times not in {"", self._times}:  # changed while nobody looked: they count from now on
-                self._state = dataclasses.replace(self._state, decided_until=self._now(), waiting=None)
-            self._put(dataclasses.replace(self._state, times=self._times))
+        with self._lock:
+            self._hold()
+            state = self._state = read_schedule(str(self._folder)) or self._state
+            if state.times not in {"", self._times}:  # changed while nobody looked: they count from now on
+                if state.waiting is not None:
+                    state = state.with_entry(missed(state.waiting, self._now(), "the times changed while it waited"))
+                state = dataclasses.replace(state, decided_until=self._now(), waiting=None)
+            self._put(dataclasses.replace(state, times=self._times))
             if self._batch.schedule.paused:
                 self._tell("the schedule is paused")
             yield
+
+    def _hold(self) -> None:
+        """Hold the work folder's lock of schedules; the folder is made where it is not there."""
+        self._lock.close()
+        make_work(self._folder)
+        self._lock.enter_context(held_lock(self._folder, LOCK))
 
     @property
     def _times(self) -> str:
@@ -194,7 +214,7 @@ class _Keeper:
         is_busy = self._run is not None or is_at_work(str(self._folder)) or is_held(str(self._folder), RUN_LOCK)
         # what was cut off together with the process that kept the schedule goes first
         cut = None if is_busy or table.paused or self._refused else state.running
-        is_taken, slot = is_busy or state.running is not None, None
+        is_taken, slot = is_busy or cut is not None, None
         if written_at is not None:
             # what passed before the file was written is decided by what it said then
             until = min(now, max(written_at, state.decided_until))
@@ -231,11 +251,16 @@ class _Keeper:
         left = (Cron(table.cron, table.time_zone).next_time(now) - now).total_seconds()
         return min(longest, max(left, 0.0) + _BEHIND_S)
 
-    def interrupt(self) -> None:
+    def interrupt(self, ending: Ending) -> None:
         """End the run that is under way; it goes on when the schedule is started again."""
         if self._run is not None:
-            self._tell("the run is interrupted")
             self._run.send_signal(signal.SIGINT)
+            self._tell("the run is interrupted; one signal more kills it")
+            while self._run.poll() is None and not ending.is_urgent():
+                ending.wait(_END_LOOK_S)
+            if self._run.poll() is None:
+                self._run.send_signal(signal.SIGKILL)
+                self._tell("the run is killed", "warning")
             self._run.wait()
             due, state = self._state.running, self._ended(self._state)
             # only what is known to be whole is not to be gone on with
@@ -276,6 +301,8 @@ class _Keeper:
         if last is not None and not paused and dataclasses.replace(state, decided_until=last.decided_until) == last:
             return True
         try:
+            if not is_held(str(self._folder), LOCK):  # somebody removed the work folder
+                self._hold()
             LocalStorage(root=self._folder).put(NAME, state.to_json().encode())
         except (OSError, RunError) as error:
             self._tell(f"{NAME} cannot be written, so no run is started: {error}", "warning")

@@ -7,6 +7,7 @@ import datetime as dt
 import functools
 import json
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -85,17 +86,20 @@ def schedule(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> 
         from pipeline.batch.scheduled import Ending, keep_schedule, start_run
 
         ending = Ending()
-
-        def end(number: int, frame: object) -> None:
-            del number, frame
-            ending.set()
-
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            signal.signal(number, end)
+        _end_by_signals(ending.set)
         batch = read_batch(file)
         words = [word for word, is_so in (("--json", as_json), ("--quiet", quiet)) if is_so]
         keep_schedule(file, ending, console.on_event, functools.partial(start_run, words=words))
         console.document(_scheduled(batch) or {})
+
+
+def _end_by_signals(end: Callable[[], None]) -> None:
+    """Have signals call a function; a terminal that is closed ends nothing under nohup."""
+    numbers = [signal.SIGTERM, signal.SIGINT]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
+        signal.signal(number, lambda *_: end())
 
 
 def _scheduled(batch: Batch) -> dict[str, Any] | None:

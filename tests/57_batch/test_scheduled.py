@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime as dt
 import json
 import os
+import shutil
 import signal
 from collections import Counter
 from collections.abc import Callable
@@ -375,6 +377,73 @@ def test_a_run_that_outlived_the_process_before_is_waited_for(file: Path) -> Non
     with held_lock(work, scheduled.RUN_LOCK):
         again.go(file)
     assert (again.runs, state_of(file).running) == ([], AT)
+
+
+def test_a_run_that_does_not_end_is_killed_where_the_end_is_asked_for_once_more(file: Path) -> None:
+    class Deaf(FakeRun):
+        def send_signal(self, sig: int, /) -> None:
+            self.signals.append(sig)
+            self.code = -sig if sig == signal.SIGKILL else None
+
+    class Hasty(Days):
+        def start(self, batch: Batch) -> FakeRun:
+            assert batch.schedule.cron
+            self.runs.append(Deaf())
+            return self.runs[-1]
+
+    days = Hasty([])
+    days._steps = [lambda: days.later(0.5), days.set, lambda: None]
+    days.go(file)
+    assert days.runs[0].signals == [signal.SIGINT, signal.SIGKILL]
+    assert state_of(file).running == AT
+
+
+def test_a_work_folder_that_is_removed_is_made_and_held_again(file: Path) -> None:
+    days = Days([])
+    work = file.with_suffix(".work")
+
+    def second() -> None:
+        with pytest.raises(RunError, match="is at work already"), held_lock(work, scheduled.LOCK):
+            pass
+
+    days._steps = [
+        lambda: shutil.rmtree(work),
+        lambda: days.later(0.5),
+        second,
+        lambda: setattr(days.runs[0], "code", 0),
+    ]
+    days.go(file)
+    assert state_of(file).counts == {"ran": 1}
+    with held_work(str(work)):
+        pass  # a run of the batch takes it for a work folder
+
+
+def test_a_time_that_waited_is_told_as_missed_where_other_times_came_meanwhile(file: Path) -> None:
+    file.write_text(FILE + 'overlap = "wait"\n')
+    with held_work(str(file.with_suffix(".work"))):
+        days = Days([])
+        days._steps = [lambda: days.later(0.5)]
+        days.go(file)
+    assert state_of(file).waiting == AT
+    file.write_text(FILE.replace("0 *", "45 *"))
+    again = Days([])
+    again.time = AT + HOUR / 4
+    again.go(file)
+    assert (again.runs, state_of(file).waiting, state_of(file).counts) == ([], None, {"missed": 1})
+
+
+def test_a_time_that_comes_while_a_broken_file_keeps_a_run_from_going_on_is_no_overlap(file: Path) -> None:
+    days = Days([])
+    days._steps = [lambda: days.later(0.5)]
+    days.go(file)
+    again = Days([])
+    again.time = AT + HOUR / 4
+    outlived = contextlib.ExitStack()
+    outlived.enter_context(held_lock(file.with_suffix(".work"), scheduled.RUN_LOCK))
+    again._steps = [write(again, file, FILE.replace("0 *", "77 *")), outlived.close, lambda: again.later(1.0)]
+    again.go(file)
+    assert (again.runs, state_of(file).running) == ([], AT)
+    assert state_of(file).counts == {"interrupted": 1, "failed": 1}
 
 
 def test_an_end_is_told_also_while_somebody_sleeps_by_it() -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import laspy
 import pytest
@@ -15,6 +17,7 @@ from pipeline.batch.batch_file import read_batch
 from pipeline.batch.estimates import estimate
 from pipeline.batch.status import buildings_before
 from pipeline.cli import app
+from pipeline.cli.batching import _end_by_signals
 from pipeline.errors import RunError
 from pipeline.io import storage_at
 from pipeline.runtime.digest import run_digest
@@ -129,6 +132,22 @@ def test_times_are_told_before_the_first_run(folder: Path, tmp_path: Path) -> No
     assert (code, rows(told)["state"]) == (0, "never run")
     assert rows(told)["next times"].count("02:30 CE") == 3
     assert "next times" in rows(call("plan", file)[1])
+
+
+@pytest.mark.parametrize(("hangup", "times"), [(signal.SIG_IGN, 2), (signal.SIG_DFL, 3)])
+def test_a_schedule_ends_by_signals_and_under_nohup_outlives_its_terminal(hangup: Any, times: int) -> None:
+    numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    told: list[int] = []
+    before = {number: signal.getsignal(number) for number in numbers}
+    try:
+        signal.signal(signal.SIGHUP, hangup)
+        _end_by_signals(lambda: told.append(1))
+        for number in numbers:
+            signal.raise_signal(number)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert len(told) == times
 
 
 def test_a_batch_that_somebody_runs_is_refused(folder: Path, tmp_path: Path) -> None:

@@ -52,6 +52,7 @@ def test_an_ended_schedule_interrupts_its_run_and_the_next_one_goes_on(run: Batc
     first = scheduled(run, programs)
     run.held(first, "reconstruct")
     os.kill(first.pid, signal.SIGTERM)
+    first.wait_for_text("the run is interrupted")
     run.gates.open()
     assert first.ended() == 0, first.tail()
     assert (told(run)["counts"], told(run)["running"]) == ({"interrupted": 1}, SLOT.isoformat())
