@@ -218,7 +218,7 @@ def read_batch(path: str | Path) -> Batch:
         document = tomllib.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise SettingsError([f"batch file {path} cannot be read: {error.strerror or error}"]) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise SettingsError([f"batch file {path} is no TOML: {error}"]) from error
     faults: list[str] = []
     known = (*TABLES, "settings")
@@ -246,6 +246,7 @@ def read_batch(path: str | Path) -> Batch:
             "[cluster] has both scheduler and workers: leave out workers, which the scheduler has of its own, or "
             "scheduler for an embedded cluster"
         )
+    faults.extend(f"{where} holds a NUL character: use a path of this system" for where in _with_nul(document))
     faults.extend(_times_faults(built["schedule"]))
     settings = RunSettings()
     try:
@@ -256,6 +257,15 @@ def read_batch(path: str | Path) -> Batch:
         raise SettingsError(faults)
     batch = Batch(path=file, paths=(), bbox=bbox, settings=settings, **built)
     return dataclasses.replace(batch, paths=tuple(batch.whole(name) for name in paths))
+
+
+def _with_nul(value: Any, where: str = "batch file") -> list[str]:
+    """Where a document holds a character that no path can have."""
+    if isinstance(value, Mapping):
+        return [fault for name, entry in value.items() for fault in _with_nul(entry, name)]
+    if isinstance(value, list):
+        return [fault for entry in value for fault in _with_nul(entry, where)]
+    return [where] if isinstance(value, str) and "\0" in value else []
 
 
 def _times_faults(table: ScheduleTable | None) -> list[str]:

@@ -7,6 +7,7 @@ on machine and scene, so they are told as a range.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import shutil
@@ -293,31 +294,40 @@ def _memory_refused(plan: Plan, limit: int | None) -> list[str]:
 def _disk_refused(
     batch: Batch, work_bytes: int, work_free: int | None, out_bytes: int, out_free: int | None
 ) -> list[str]:
-    """What does not fit on a disk, what a run kept there already counted as free."""
-    kept = sum(path.stat().st_size for path in Path(batch.work_folder).rglob("*") if path.is_file())
+    """What does not fit on a disk, what a run left there already counted as free."""
+    if all(free is None or work_bytes + out_bytes <= free for free in (work_free, out_free)):
+        return []
+    work_bytes = max(0, work_bytes - _taken(batch.work_folder))
+    out_bytes = 0 if out_free is None else max(0, out_bytes - _taken(batch.out))
     refusals = []
-    is_one_disk = work_free is not None and out_free is not None and _disk(batch.work_folder) == _disk(batch.out)
-    if (
-        is_one_disk
-        and work_free is not None
-        and max(work_bytes - kept, out_bytes) <= work_free < (work_bytes - kept + out_bytes)
-    ):
+    if work_free is not None and work_bytes > work_free:
         refusals.append(
-            f"the work folder {batch.work_folder} and the results in {batch.out} need about "
-            f"{(work_bytes - kept + out_bytes) / 1e9:.1f} GB of one disk, {work_free / 1e9:.1f} GB are free: "
-            "give [work] path on another disk, or free space"
-        )
-    if work_free is not None and work_bytes - kept > work_free:
-        refusals.append(
-            f"the work folder {batch.work_folder} needs about {work_bytes / 1e9:.1f} GB, {work_free / 1e9:.1f} GB "
+            f"the work folder {batch.work_folder} needs about {work_bytes / 1e9:.1f} GB more, {work_free / 1e9:.1f} GB "
             "are free: give [work] path on another disk, or free space"
         )
     if out_free is not None and out_bytes > out_free:
         refusals.append(
-            f"the results in {batch.out} need about {out_bytes / 1e9:.1f} GB, {out_free / 1e9:.1f} GB are free: "
+            f"the results in {batch.out} need about {out_bytes / 1e9:.1f} GB more, {out_free / 1e9:.1f} GB are free: "
             "give another [output] path, or free space"
         )
+    is_one_disk = work_free is not None and out_free is not None and _disk(batch.work_folder) == _disk(batch.out)
+    if not refusals and is_one_disk and work_bytes + out_bytes > min(work_free or 0, out_free or 0):
+        refusals.append(
+            f"the work folder {batch.work_folder} and the results in {batch.out} need about "
+            f"{(work_bytes + out_bytes) / 1e9:.1f} GB more of one disk, {(work_free or 0) / 1e9:.1f} GB are free: "
+            "give [work] path on another disk, or free space"
+        )
     return refusals
+
+
+def _taken(folder: str) -> int:
+    """Bytes of the files in a folder; others may write and remove some meanwhile."""
+    found = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                found += Path(place, name).lstat().st_size
+    return found
 
 
 class BatchRefusedError(RunError):

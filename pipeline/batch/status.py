@@ -252,6 +252,6 @@ def buildings_before(work_folder: str) -> tuple[int, int]:
     """How many buildings the run before had, and of how many points; zeros where nobody knows."""
     try:
         status = read_status(work_folder)
-    except RunError:
+        return int(status.buildings.get("total", 0)), int(status.points)
+    except (RunError, AttributeError, TypeError, ValueError):  # there is none, or a damaged one
         return 0, 0
-    return int((status.buildings or {}).get("total", 0)), status.points

@@ -276,7 +276,7 @@ def test_who_only_asks_whether_a_folder_is_held_refuses_nobody(tmp_path: Path, m
     fcntl.flock(asking, fcntl.LOCK_SH)
     monkeypatch.setattr("time.sleep", lambda _: fcntl.flock(asking, fcntl.LOCK_UN))
     with held_work(str(tmp_path / "work")):
-        assert is_held(str(tmp_path / "work"))
+        assert is_at_work(str(tmp_path / "work"))
     os.close(asking)
 
 

@@ -111,7 +111,16 @@ def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
         assert words in told
 
 
-@pytest.mark.parametrize(("text", "words"), [(None, "cannot be read"), ("[inputs", "is no TOML")])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "cannot be read"),
+        ("[inputs", "is no TOML"),
+        (f"deep = {'[' * 5000}{']' * 5000}", "is no TOML"),
+        (r'inputs = {paths = ["a\u0000b"]}', "paths holds a NUL character"),
+        ('[work]\npath = "s3://bucket/work"', r"path is 's3://bucket/work': use a folder of a file system"),
+    ],
+)
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, text: str | None, words: str) -> None:
     path = tmp_path / "city.toml" if text is None else written(tmp_path, text)
     with pytest.raises(SettingsError, match=words):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime as dt
 import json
 from pathlib import Path
@@ -187,3 +188,10 @@ def test_the_first_buildings_of_a_stage_do_not_tell_how_long_it_takes() -> None:
     assert low < 28.0 < high
     low, high = remaining_s(planned, {"reconstruct": StageProgress(done=690, total=6565, seconds=4.1)}) or (0.0, 0.0)
     assert high < 50.0
+
+
+@pytest.mark.parametrize("damage", [{"buildings": 7}, {"buildings": {"total": None}}, {"points": "many"}])
+def test_an_odd_status_stops_no_run(writer: StatusWriter, tmp_path: Path, damage: dict[str, object]) -> None:
+    told = dataclasses.asdict(writer.end("finished"))
+    (tmp_path / NAME).write_text(json.dumps(told | damage))
+    assert buildings_before(str(tmp_path)) == (0, 0)

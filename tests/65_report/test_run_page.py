@@ -83,8 +83,11 @@ def test_the_slowest_are_told_with_what_they_are_and_lost_ones_without(street_ru
         street_run, slowest=slowest, status=RunStatus.INCOMPLETE, tiles=("x0_y0",), failed_tiles=("x0_y0",)
     )
     assert read_manifest(street_run) == manifest
-    _, read = page_of(street_run)
+    text, read = page_of(street_run)
     told = words(read)
+    for table in text.split('<table class="sortable">')[1:]:
+        rows = table.split("</table>")[0].split("<tr>")[1:]
+        assert len({row.count("<td") + row.count("<th ") for row in rows}) == 1  # a script sorts by any column
     assert "gone 9.00 in a tile that could not be published" in told
     assert f"{name} 1.50" in told
     assert "1 of 1 tiles could not be published" in told

@@ -217,6 +217,20 @@ def test_what_does_not_fit_is_refused_before_anything_runs(
     assert not (tmp_path / "models").exists()
 
 
+def test_results_that_are_replaced_need_no_room_beside_themselves(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "city.toml"
+    file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
+    monkeypatch.setattr("pipeline.batch.estimates._free", lambda path: 10 if path.endswith("models") else 10**12)
+    assert "the results in" in call("plan", file)[2]
+    (tmp_path / "models").mkdir()
+    with (tmp_path / "models" / "large").open("wb") as stream:
+        stream.truncate(10**9)
+    (tmp_path / "models" / "gone").symlink_to("nowhere")
+    assert "the results in" not in call("plan", file)[2]
+
+
 def test_a_tile_that_no_worker_can_hold_is_refused(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
