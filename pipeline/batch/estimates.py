@@ -310,11 +310,11 @@ def _disk_refused(
             f"the results in {batch.out} need about {out_bytes / 1e9:.1f} GB more, {out_free / 1e9:.1f} GB are free: "
             "give another [output] path, or free space"
         )
-    is_one_disk = work_free is not None and out_free is not None and _disk(batch.work_folder) == _disk(batch.out)
-    if not refusals and is_one_disk and work_bytes + out_bytes > min(work_free or 0, out_free or 0):
+    is_one_disk = out_free is not None and _disk(batch.work_folder) == _disk(batch.out)
+    if not refusals and is_one_disk and work_free is not None and work_bytes + out_bytes > work_free:
         refusals.append(
             f"the work folder {batch.work_folder} and the results in {batch.out} need about "
-            f"{(work_bytes + out_bytes) / 1e9:.1f} GB more of one disk, {(work_free or 0) / 1e9:.1f} GB are free: "
+            f"{(work_bytes + out_bytes) / 1e9:.1f} GB more of one disk, {work_free / 1e9:.1f} GB are free: "
             "give [work] path on another disk, or free space"
         )
     return refusals
