@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from pipeline.model import Reason
 
 
+_TOLD = 9
+"""Inputs at fault that are named beside the first one; the others are counted."""
+
+
 class GableworkError(Exception):
     """Base of all errors that are raised on purpose."""
 
@@ -57,6 +61,29 @@ class InputError(GableworkError):
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         """Survive pickling between Dask processes."""
         return type(self), (self.path, self.problem, self.fix)
+
+
+def all_at_fault(faults: Sequence[InputError]) -> InputError:
+    """One error for several inputs, of the first one's kind: who has many wants to hear of all that he has to mend.
+
+    >>> one, other = (UnreadableInputError(path, "no such file", "Check the path") for path in ("a.laz", "b.laz"))
+    >>> all_at_fault([one]) is one
+    True
+    >>> print(all_at_fault([one, other]))
+    a.laz: no such file. Check the path. 1 more input cannot be used: b.laz: no such file
+    """
+    first, others = faults[0], faults[1:]
+    if not others:
+        return first
+    told = [f"{fault.path}: {fault.problem}" for fault in others[:_TOLD]]
+    if len(others) > _TOLD:
+        told.append(f"and {len(others) - _TOLD} more")
+    inputs = "input" if len(others) == 1 else "inputs"
+    return type(first)(
+        first.path,
+        first.problem,
+        f"{first.fix.rstrip('.')}. {len(others)} more {inputs} cannot be used: {'; '.join(told)}",
+    )
 
 
 class UnreadableInputError(InputError):

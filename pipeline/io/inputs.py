@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import RunError, UnreadableInputError
+from pipeline.errors import InputError, RunError, UnreadableInputError, all_at_fault
 from pipeline.io.formats import (
     ASCII_SUFFIXES,
     POINT_SUFFIXES,
@@ -55,11 +55,22 @@ def find_inputs(
         does not answer.
     """
     found: dict[str, None] = {}
+    faults: list[InputError] = []
     for entry in entries:
-        for location in [_file(entry)] if only_files else _files_of(entry, cut):
+        try:
+            locations = [_file(entry)] if only_files else _files_of(entry, cut)
+        except InputError as fault:
+            # a server that does not answer this time is not asked for each of a thousand files
+            if not only_files and is_url(entry):
+                raise
+            faults.append(fault)
+            continue
+        for location in locations:
             # workers elsewhere do not share this process's folder
             whole = location if is_url(location) else os.path.realpath(location)
             found[whole] = None
+    if faults:
+        raise all_at_fault(faults)
     if not found:
         raise UnreadableInputError(
             "inputs", "no input files are given", "Name files, folders or patterns such as tiles/*.laz"

@@ -434,10 +434,7 @@ def memory_of_workers(*, workers: int, scheduler: str | None, tls: TlsFiles | No
     if scheduler is None:
         if workers == 0:
             return 1, None
-        from distributed.system import MEMORY_LIMIT
-
-        # as LocalCluster shares it out among workers of one thread
-        return workers, int(MEMORY_LIMIT / workers)
+        return workers, _share_bytes(workers)
     with DaskExecutor(Cluster(scheduler=scheduler, tls=tls)) as executor:
         return executor.worker_count, executor.memory_limit_bytes
 

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import shapely
 
-from pipeline.errors import CrsError, EmptyInputError, InputError
+from pipeline.errors import CrsError, EmptyInputError, InputError, all_at_fault
 from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
 from pipeline.runtime.needs import WINDOW_BASE_BYTES
 from pipeline.scene import ClassesInUse
@@ -87,17 +87,21 @@ def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings)
     warnings = [
         f"{of[0]}{f' and {len(of) - 1} more inputs' if len(of) > 1 else ''}: {text}" for text, of in odd.items()
     ]
+    faults: list[InputError] = []
     for info in sources[1:]:
         other = info.reference
         same_units = (
             other.horizontal_unit_m == first.horizontal_unit_m and other.vertical_unit_m == first.vertical_unit_m
         )
         if not same_units or (other.crs is None) != (first.crs is None) or other.crs != first.crs:
-            raise CrsError(
+            fault = CrsError(
                 info.path,
                 f"its CRS is {other.name}, that of {sources[0].path} is {first.name}",
                 "Run inputs of different CRS apart, or give --crs if one header is wrong",
             )
+            faults.append(fault)
+    if faults:
+        raise all_at_fault(faults)
     densities = [info.density_per_m2 for info in sources if math.isfinite(info.density_per_m2)]
     density = max(densities, default=1.0)
     halo_m = settings.halo_m
@@ -127,7 +131,15 @@ def _looked_at(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, 
         return open_source(path, options).info
 
     if not any(is_url(path) for path in paths):
-        return tuple(look(path) for path in paths)
+        found, faults = [], []
+        for path in paths:
+            try:
+                found.append(look(path))
+            except InputError as fault:
+                faults.append(fault)
+        if faults:
+            raise all_at_fault(faults)
+        return tuple(found)
     with ThreadPoolExecutor(_ASKED_AT_ONCE, thread_name_prefix="gablework-plan") as threads:
         return tuple(threads.map(look, paths))
 

@@ -65,6 +65,8 @@ def test_a_missing_file_an_empty_pattern_and_no_input_are_told(tmp_path):
         find_inputs([tmp_path / "missing.laz"])
     with pytest.raises(UnreadableInputError, match="meets no files"):
         find_inputs([tmp_path / "*.laz"])
+    with pytest.raises(UnreadableInputError, match=r"a\.laz: no such file.*1 more input .*b\.laz: no such file"):
+        find_inputs([tmp_path / "a.laz", tmp_path / "b.laz"])
     with pytest.raises(UnreadableInputError, match="no input files are given"):
         find_inputs([])
 
