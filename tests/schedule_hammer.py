@@ -1,7 +1,8 @@
 """A replica that ticks through shared time as fast as it can, and ends jobs; a process of its own for tests.
 
-`python schedule_hammer.py URL NAME START STEP_MINUTES TICKS` reads its own, injected clock: every process walks over
-the same times, so that all of them see the same slots due. It prints a line for every job that it made.
+`python schedule_hammer.py URL NAME START STEP_MINUTES TICKS LAP` reads its own, injected clock: every process walks
+over the same times, so that all of them see the same slots due. It prints a line for every job that it made, and waits
+for a line on its standard input before every lap of so many ticks.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from service.schedules import Outcome
 from service.store import JobStore
 
 
-def main(url: str, start: dt.datetime, step: dt.timedelta, ticks: int) -> None:
+def main(url: str, start: dt.datetime, step: dt.timedelta, ticks: int, lap: int) -> None:
     """Tick, and bring to its end what waits."""
     with JobStore(url) as store:
         for number in range(ticks):
+            if number % lap == 0 and not sys.stdin.readline():
+                sys.exit("nobody is there any more")
             told = store.schedules.tick(now=start + number * step, max_queued=10**6, max_queued_per_key=10**6)
             for run in told:
                 if run.outcome is Outcome.SUBMITTED and run.job_id is not None:
@@ -34,4 +37,5 @@ if __name__ == "__main__":
         dt.datetime.fromisoformat(sys.argv[3]),
         dt.timedelta(minutes=int(sys.argv[4])),
         int(sys.argv[5]),
+        int(sys.argv[6]),
     )

@@ -272,6 +272,7 @@ def test_faults_without_a_place_are_told_wherever_the_area_is(tmp_path, suffix):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".gpkg", ".parquet"])
 def test_of_a_file_of_a_whole_country_only_a_little_is_held(tmp_path, suffix):
     at = np.arange(100_000)

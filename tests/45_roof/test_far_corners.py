@@ -207,6 +207,7 @@ def test_of_planes_that_are_all_far_the_nearest_costs_nothing() -> None:
     assert costs[0, 1] == 0
 
 
+@pytest.mark.slow
 def test_where_no_plane_fits_a_corner_there_is_a_level_one() -> None:
     hall = Hall(LOW, [RISING, (0.0, 0.0, 9.0)])
     arguments = (hall.xy, hall.graph, int(hall.counts[1]))

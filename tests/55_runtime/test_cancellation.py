@@ -227,6 +227,7 @@ def test_scratch_that_is_gone_is_not_made_again(tmp_path: Path) -> None:
 # --- tasks that die half way, and tasks that run twice ---------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_tasks_that_died_half_way_and_tasks_that_run_twice_at_once_change_nothing(
     start: Callable[..., RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -133,7 +133,7 @@ def test_every_record_of_the_header_is_kept_byte_for_byte(rich: Path, run_classi
     assert extended.record_data_bytes() == b"x" * 100_000
 
 
-@pytest.mark.parametrize("size_m", [33.0, 61.5])
+@pytest.mark.parametrize("size_m", [pytest.param(33.0, marks=pytest.mark.slow), 61.5])
 def test_tiles_order_and_files_do_not_change_a_class(
     size_m: float, true_suburb: Path, run_classify: Classify, shuffled: Any, tmp_path: Path
 ) -> None:

@@ -111,6 +111,7 @@ def test_tasks_under_suspicion_are_tried_alone_and_none_is_lost(cluster: Cluster
     assert sorted(results) == list(range(12))
 
 
+@pytest.mark.slow
 def test_a_keeper_stays_while_it_starts_its_worker_anew_and_one_that_gave_up_is_replaced(tmp_path: Path) -> None:
     # Dask would end it where nobody of the worker's name is there at the time
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 ms"}):

@@ -147,6 +147,7 @@ def test_one_that_only_fails_in_company_is_no_loss(orders: Callable[[str], str],
     assert outcomes(orders, ["1", first_only, "2"]) == ["1", first_only, "2"]
 
 
+@pytest.mark.slow
 def test_memory_that_others_piled_up_is_not_blamed_on_the_last(orders: Callable[[str], str]) -> None:
     piles = (
         "import sys; sys.modules['os'].__dict__.setdefault('pile', []).append(b'1' * (400 * 2**20)); time.sleep(0.2)"
@@ -160,6 +161,7 @@ def test_a_child_that_keeps_much_memory_is_replaced(orders: Callable[[str], str]
     assert child_processes() == []
 
 
+@pytest.mark.slow
 def test_the_same_fault_is_told_in_the_same_words(orders: Callable[[str], str]) -> None:
     limits = IsolationLimits(timeout_s=1.0, memory_bytes=2**29)
     faults = ["os.abort()", "while True: pass", "held = [b'1' * 2**25 for _ in range(10**6)]"]
@@ -172,6 +174,7 @@ def test_printing_does_not_disturb_the_pipe(orders: Callable[[str], str]) -> Non
     assert outcomes(orders, [loud, "1"]) == [loud, "1"]
 
 
+@pytest.mark.slow
 def test_what_a_child_writes_does_not_pile_up(orders: Callable[[str], str]) -> None:
     loud = "for _ in range(64): os.write(2, b'y' * 2**20); time.sleep(0.02)"
     _, loss = outcomes(orders, [loud, loud + "\nprint('last words', flush=True); os.abort()"])

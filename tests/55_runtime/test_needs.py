@@ -142,6 +142,7 @@ def test_a_need_that_no_worker_has_runs_where_most_is_and_it_is_told(bench: Benc
     assert "need up to 64.0 GiB of memory, the largest worker has 2.0 GiB" in told.message
 
 
+@pytest.mark.slow
 def test_a_giant_does_not_wait_for_ever_for_a_worker_that_has_left(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,6 +162,7 @@ def test_a_giant_does_not_wait_for_ever_for_a_worker_that_has_left(
     assert any("the largest worker has 1.0 GiB" in event.message for event in bench.events)
 
 
+@pytest.mark.slow
 def test_embedded_workers_announce_their_share_of_the_machine() -> None:
     with Cluster(workers=2) as cluster, Client(cluster.address) as client:
         workers = client.scheduler_info(n_workers=-1)["workers"]

@@ -78,6 +78,7 @@ def test_a_run_in_a_bucket_is_that_in_a_folder_byte_by_byte(local, tile, bucket)
     assert (there.inputs[0].sha256, there.inputs[0].size_bytes) == (here.inputs[0].sha256, here.inputs[0].size_bytes)
 
 
+@pytest.mark.slow
 def test_readers_of_a_run_take_its_url(local, tile, bucket):
     run(request(tile, bucket))
     assert run_statistics(f"{bucket}/run") == run_statistics(local.run_dir)
@@ -113,6 +114,7 @@ def test_the_digest_of_a_run_needs_no_listing(tile, bucket, s3, local):
     assert run(request(tile, bucket)).digest == local.digest
 
 
+@pytest.mark.slow
 def test_a_run_that_is_there_is_only_replaced_when_asked(local, tile, bucket):
     run(request(tile, bucket))
     storage = storage_at(f"{bucket}/run")
@@ -142,6 +144,7 @@ def test_whoever_reads_while_a_run_is_replaced_sees_that_it_is_not_finished(tile
     assert read_manifest(f"{bucket}/run").status is RunStatus.RUNNING
 
 
+@pytest.mark.slow
 def test_a_store_that_fails_at_every_third_request_costs_attempts_and_nothing_else(local, tile, bucket, s3, quick):
     words = ("busy", "cut", "lost")
     s3.script = lambda asked: words[asked.number // 3 % 3] if asked.number % 3 == 0 else "pass"
@@ -152,6 +155,7 @@ def test_a_store_that_fails_at_every_third_request_costs_attempts_and_nothing_el
     assert failed >= (len(s3.seen) - 1) // 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [0, -1])
 def test_a_tile_that_cannot_be_put_costs_only_itself(local, tile, bucket, s3, quick, which):
     local_tiles = list(read_manifest(local.run_dir).tiles)
@@ -172,6 +176,7 @@ def test_a_tile_that_cannot_be_put_costs_only_itself(local, tile, bucket, s3, qu
         assert {k: v for k, v in there.items() if other in k} == {k: v for k, v in here.items() if other in k}
 
 
+@pytest.mark.slow
 def test_a_tile_whose_state_cannot_be_put_is_not_finished(local, tile, bucket, s3, quick):
     broken = read_manifest(local.run_dir).tiles[0]
     s3.script = lambda asked: "cut" if asked.method == "PUT" and f"state/{broken}" in asked.path else "pass"
@@ -204,6 +209,7 @@ def test_nothing_of_the_credentials_or_of_signed_urls_is_kept(tile, bucket, s3):
     assert b"suburb.laz?query-" in storage.get("run.json")
 
 
+@pytest.mark.slow
 def test_bundles_of_poisonous_buildings_go_into_the_bucket(tile, bucket, monkeypatch, s3, quick):
     def fail(*_args, **_kwargs):
         raise ZeroDivisionError("poison")
@@ -220,6 +226,7 @@ def test_bundles_of_poisonous_buildings_go_into_the_bucket(tile, bucket, monkeyp
     assert any(text.startswith("there is no bundle of ") and ": s3://" in text for text in again.warnings)
 
 
+@pytest.mark.slow
 def test_scratch_is_on_this_machine_and_goes(tile, bucket, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()

@@ -161,6 +161,7 @@ def test_another_footprint_is_modelled_with_the_points_inside_it(plain: Any, ove
     assert 0.3 * before[name]["n_points"] < after[name]["n_points"] < 0.7 * before[name]["n_points"]
 
 
+@pytest.mark.slow
 def test_overlapping_footprints_of_two_buildings_have_all_their_points_each(plain: Any, overridden: Any) -> None:
     before = rows(plain.run_dir, "buildings")
     one, other = sorted(before)[:2]
@@ -248,6 +249,7 @@ def test_what_changes_nothing_is_told(plain: Any, overridden: Any) -> None:
     assert any('give action = "accept", too' in warning for warning in summary.warnings)
 
 
+@pytest.mark.slow
 def test_overrides_do_the_same_whatever_the_tiles(everything: str, overridden: Any) -> None:
     digests = {overridden(everything, settings={**TILES, "tile_size_m": size}).digest for size in (0.0, 47.0)}
     assert len(digests) == 1
@@ -466,6 +468,7 @@ def test_a_unit_without_a_digest_of_its_inputs_is_sought_in_all_tiles() -> None:
     assert not pipeline.runtime.rerun._same(stages, record, dataclasses.replace(alone, block="b"))
 
 
+@pytest.mark.slow
 def test_a_rerun_holds_the_new_files_of_one_tile_at_a_time_and_touches_the_run_when_all_are_written(
     copied: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -494,6 +497,7 @@ def test_a_rerun_holds_the_new_files_of_one_tile_at_a_time_and_touches_the_run_w
     assert files(first.run_dir) == before
 
 
+@pytest.mark.slow
 def test_a_rerun_with_given_footprints_is_a_whole_run_too(
     plain: Any, overridden: Any, suburb: Path, reconstruct: Any, tmp_path: Path
 ) -> None:
@@ -524,6 +528,7 @@ def test_a_rerun_that_is_called_off_leaves_the_run_as_it_was(plain: Any, copied:
     assert files(first.run_dir) | {"run.json": (Path(first.run_dir) / "run.json").read_bytes()} == before
 
 
+@pytest.mark.slow
 def test_a_building_that_the_split_tiles_cut_off_is_sought_in_all_of_them(
     suburb: Path, reconstruct: Any, overridden: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -542,6 +547,7 @@ def test_a_building_that_the_split_tiles_cut_off_is_sought_in_all_of_them(
     assert files(first.run_dir) == files(whole.run_dir)
 
 
+@pytest.mark.slow
 def test_the_bundle_of_a_building_that_meets_a_fault_comes_with_the_other_files_or_not_at_all(
     copied: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -148,7 +148,9 @@ def test_a_run_after_a_finished_one_does_nothing_again(place: Place) -> None:
     assert files_of(place.folder / "run") == before
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize(
+    "stage", [pytest.param(stage, marks=[pytest.mark.slow] * (stage != "reconstruct")) for stage in STAGES]
+)
 def test_a_run_that_was_cut_off_goes_on_where_it_stopped(place: Place, stage: str) -> None:
     whole = place.fresh()
     all_tasks = place.tasks
@@ -182,6 +184,7 @@ def test_a_file_that_was_only_touched_costs_its_reading(place: Place) -> None:
     assert again.digest == first.digest
 
 
+@pytest.mark.slow
 def test_models_of_input_that_did_not_change_are_taken_again(place: Place) -> None:
     place.run()
     place.change("sw.laz", raised)
@@ -192,6 +195,7 @@ def test_models_of_input_that_did_not_change_are_taken_again(place: Place) -> No
     assert place.run().counts["reused"] == again.counts["candidates"]
 
 
+@pytest.mark.slow
 def test_a_file_that_is_gone_and_one_that_is_new(place: Place) -> None:
     place.run()
     (place.inputs / "nw.laz").rename(place.folder / "nw.laz")
@@ -204,7 +208,12 @@ def test_a_file_that_is_gone_and_one_that_is_new(place: Place) -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [{"method": "kmeans"}, {"candidates": {"min_area_m2": 30.0}}, {"tile_size_m": 60.0}, {"lods": "1.2,2.2"}],
+    [
+        {"candidates": {"min_area_m2": 30.0}},
+        pytest.param({"method": "kmeans"}, marks=pytest.mark.slow),
+        pytest.param({"tile_size_m": 60.0}, marks=pytest.mark.slow),
+        pytest.param({"lods": "1.2,2.2"}, marks=pytest.mark.slow),
+    ],
 )
 def test_other_settings_are_another_result(place: Place, settings: dict[str, Any]) -> None:
     place.run()
@@ -212,6 +221,7 @@ def test_other_settings_are_another_result(place: Place, settings: dict[str, Any
     assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
 
 
+@pytest.mark.slow
 def test_another_run_directory_is_published_without_modelling_again(place: Place) -> None:
     first = place.run()
     second = place.run("second")
@@ -230,6 +240,7 @@ def test_what_somebody_removed_from_the_run_directory_is_published_again(place: 
     assert files_of(place.folder / "run") == before
 
 
+@pytest.mark.slow
 def test_what_a_task_left_half_done_is_no_result(place: Place) -> None:
     whole = place.fresh()
     with pytest.raises(KeyboardInterrupt):
@@ -241,6 +252,7 @@ def test_what_a_task_left_half_done_is_no_result(place: Place) -> None:
     assert place.run().digest == whole.digest
 
 
+@pytest.mark.slow
 def test_what_was_kept_shortly_before_a_loss_of_power_is_done_again(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -260,6 +272,7 @@ def test_what_was_kept_shortly_before_a_loss_of_power_is_done_again(
     assert not place.tasks
 
 
+@pytest.mark.slow
 def test_another_machine_goes_on_with_all_that_was_kept(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = place.run()
     place.tasks.clear()

@@ -221,6 +221,7 @@ def test_every_word_of_a_closed_list_has_a_meaning() -> None:
     assert np.isfinite(EXTENT).all()
 
 
+@pytest.mark.slow
 def test_runs_may_lie_in_an_object_store_and_the_results_too(
     pair: tuple[str, str], tmp_path: Path, bucket: str
 ) -> None:

@@ -74,6 +74,7 @@ def test_a_batch_is_planned_run_and_told(folder: Path) -> None:
     assert all(stage["kept"] == stage["done"] for name, stage in status["stages"].items() if name != "join")
 
 
+@pytest.mark.slow
 def test_a_tile_index_and_a_bucket_are_inputs_and_results_of_a_batch(folder: Path, tmp_path: Path, bucket: str) -> None:
     (tmp_path / "index").mkdir()
     tile = next((folder / "tiles").glob("*.laz"))

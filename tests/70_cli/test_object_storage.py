@@ -40,6 +40,7 @@ def document(*words: str) -> Any:
     return json.loads(said)
 
 
+@pytest.mark.slow
 def test_all_commands_that_read_tiles_or_runs_take_urls(scene: Path, bucket: str, tmp_path: Path) -> None:
     tile, run = f"{bucket}/in/gable.laz", f"{bucket}/runs/gable"
     storage_at(bucket).put("in/gable.laz", (scene / "gable.laz").read_bytes())

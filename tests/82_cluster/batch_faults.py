@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow.dataset as pads
+import pytest
 from deployment import Gates, kill_process
 from faults import asked
 from object_store import FaultyProxy
@@ -281,7 +282,25 @@ def strike(run: BatchRun, fault: Fault, stage: str, undisturbed: str) -> Row:
     return Row(fault.name, stage, told[0], "".join(told[1:]), content, twice)
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """The table."""
-    lines = [HEADER, ["---"] * len(HEADER), *(row.cells for row in rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "batch_faults.md"
+
+
+def rows_told() -> list[list[str]]:
+    """The rows of the page's table, cell by cell."""
+    lines = [line.strip("| ").split(" | ") for line in PAGE.read_text().splitlines() if line.startswith("|")]
+    assert tuple(lines[0]) == HEADER
+    return lines[2:]
+
+
+def check(run: BatchRun, fault: Fault, stage: str, undisturbed: BatchRun) -> None:
+    """A batch run outlives a fault, and the page says how."""
+    row = strike(run, fault, stage, undisturbed.digest)
+    assert row.first.endswith(fault.state), row
+    assert (row.content, row.done_twice) == ("same", "no"), row
+    assert list(row.cells) in rows_told(), f"{PAGE} has no row | {' | '.join(row.cells)} |"
+
+
+def cases(*, in_store: bool) -> list[Any]:
+    """Faults of a place and the stages at which they strike, for pytest."""
+    found = [(fault, stage) for fault in FAULTS if fault.in_store == in_store for stage in fault.stages]
+    return [pytest.param(fault, stage, id=f"{fault.name}: {stage}") for fault, stage in found]

@@ -17,8 +17,6 @@ from deployment import Deployment, Ended
 from fault_table import FAULTS, Fault, Row, markdown, row, strike, without_seconds
 from processes import Programs, program
 
-from pipeline.synthetic.dataset import simulate
-
 pytestmark = pytest.mark.slow
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "faults.md"
@@ -37,12 +35,6 @@ CASES = [(fault, stage) for fault in FAULTS for stage in fault.stages]
 
 
 @pytest.fixture(scope="module")
-def tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A town of a few dozen buildings."""
-    return simulate("town", tmp_path_factory.mktemp("scene"), 5, size_m=(150.0, 150.0), density_per_m2=3.0).laz
-
-
-@pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Deployment]:
     """The service, for all faults one after the other."""
     folder = tmp_path_factory.mktemp("service")
@@ -56,10 +48,10 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Deployment]:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(service: Deployment, tile: Path) -> Ended:
+def undisturbed(service: Deployment, town_tile: Path) -> Ended:
     """A job that nothing happens to; the second one, since the first also starts the children of the workers."""
-    service.ended(service.submit(tile, SETTINGS, "first"))
-    ended = service.ended(service.submit(tile, SETTINGS, "undisturbed"))
+    service.ended(service.submit(town_tile, SETTINGS, "first"))
+    ended = service.ended(service.submit(town_tile, SETTINGS, "undisturbed"))
     assert (ended.job.status, ended.job.attempt, ended.ends) == ("successful", 1, 1)
     assert len(ended.buildings) >= 24
     assert len(list((ended.run / "state").iterdir())) >= 6
@@ -74,10 +66,10 @@ def table() -> list[Row]:
 
 @pytest.mark.parametrize(("fault", "stage"), CASES, ids=[f"{fault.name}: {stage}" for fault, stage in CASES])
 def test_a_job_outlives(
-    fault: Fault, stage: str, service: Deployment, undisturbed: Ended, tile: Path, table: list[Row]
+    fault: Fault, stage: str, service: Deployment, undisturbed: Ended, town_tile: Path, table: list[Row]
 ) -> None:
     service.settle()
-    told = row(fault.name, stage, strike(service, fault, stage, tile, SETTINGS), undisturbed)
+    told = row(fault.name, stage, strike(service, fault, stage, town_tile, SETTINGS), undisturbed)
     table.append(told)
     while service.replaced:
         silent = service.replaced.pop()
@@ -97,7 +89,7 @@ def test_no_job_is_lost_or_doubled_by_all_of_it(service: Deployment, undisturbed
 
 
 def test_buildings_that_cost_their_process_cost_only_themselves(
-    undisturbed: Ended, tile: Path, table: list[Row], tmp_path: Path, programs: Programs
+    undisturbed: Ended, town_tile: Path, table: list[Row], tmp_path: Path, programs: Programs
 ) -> None:
     crashing, endless, eating = sorted(undisturbed.buildings)[3:24:8]
     expected = {crashing: "crashed", endless: "timed_out", eating: "out_of_memory"}
@@ -105,7 +97,7 @@ def test_buildings_that_cost_their_process_cost_only_themselves(
     faults = {"crash": [crashing], "endless": [endless], "eat_memory": [eating]}
     service = Deployment(programs, tmp_path, faults=faults, variables=variables)
     service.start_all()
-    ended = service.ended(service.submit(tile, SETTINGS, "poisonous buildings"))
+    ended = service.ended(service.submit(town_tile, SETTINGS, "poisonous buildings"))
     marked = {name: reason for name, (status, reason) in ended.buildings.items() if status == "failed"}
     assert marked == expected
     assert {name: told for name, told in ended.buildings.items() if name not in expected} == {

@@ -26,6 +26,7 @@ def test_a_city_is_as_square_as_its_tiles_allow() -> None:
     assert shapes == [(20, 20), (4, 3), (7, 1)]
 
 
+@pytest.mark.slow
 def test_the_same_city_has_the_same_bytes_whatever_the_processes(tmp_path: Path) -> None:
     city = square_of(4, 100.0, 1.0, 5)
     made = make_city(city, tmp_path / "two", 2)
