@@ -236,7 +236,7 @@ def test_a_command_that_fails_tells_it_in_json_and_leaves_the_loggers_as_they_we
 
     def serve() -> None:
         with Console() as console:
-            logging.getLogger("uvicorn.error").warning("a line of a library")
+            logging.getLogger("a.library").warning("a line of a library")
             console.tell("listening")
             raise ZeroDivisionError("by nought")
 
@@ -246,7 +246,7 @@ def test_a_command_that_fails_tells_it_in_json_and_leaves_the_loggers_as_they_we
     said = capsys.readouterr()
     library, told, fault = (json.loads(line) for line in said.err.splitlines())
     assert (said.out, told["message"]) == ("", "listening")
-    assert library["logger"] == "uvicorn.error"
+    assert library["logger"] == "a.library"
     assert (fault["level"], fault["message"]) == ("error", "by nought")
     assert "ZeroDivisionError: by nought" in fault["exception"]
 
