@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Plane
 
 _LOWER_QUARTILE_CHI2 = (math.nan, 0.10153, 0.57536, 1.21253, 1.92256, 2.67460, 3.45460)
@@ -19,7 +19,7 @@ _LOWER_QUARTILE_CHI2 = (math.nan, 0.10153, 0.57536, 1.21253, 1.92256, 2.67460, 3
 # ---------------------------------------------------------------------------------------------------------- facets
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def facet_normals(xyz: FloatArray, facets: LabelArray) -> FloatArray:
     """Unit normals of facets, pointing up.
 
@@ -65,7 +65,7 @@ def aspects_deg(normals: FloatArray) -> FloatArray:
     return np.where(flat | (aspects >= 360.0), 0.0, aspects)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def facet_areas_m2(xyz: FloatArray, facets: LabelArray) -> FloatArray:
     """Surface area of every facet, (m,) float64, square metres."""
     areas = np.empty(len(facets))
@@ -95,7 +95,7 @@ def o_distances_m(normals: FloatArray, points: FloatArray) -> FloatArray:
 # ---------------------------------------------------------------------------------------------------------- planes
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def solve_plane_moments(sxx: float, sxy: float, syy: float, sxz: float, syz: float) -> tuple[float, float]:
     """The slopes a, b that solve the centred normal equations (Eqs. 11 to 14).
 
@@ -124,7 +124,7 @@ def solve_plane_moments(sxx: float, sxy: float, syy: float, sxz: float, syz: flo
     return along * sxy, along * syy
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fit_plane_coefficients(points: FloatArray, index: LabelArray) -> tuple[float, float, float, float]:
     """Least-squares plane z = a x + b y + c of some points (Eqs. 8 to 14), for use in compiled code.
 
@@ -214,7 +214,7 @@ def vertical_residuals_m(points: FloatArray, coefficients: tuple[float, float, f
 # ----------------------------------------------------------------------------------------------------------- rings
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def ring_area_m2(ring: FloatArray) -> float:
     """Signed area of a ring in plan, square metres: positive where it runs counter-clockwise.
 
@@ -233,7 +233,7 @@ def ring_area_m2(ring: FloatArray) -> float:
 # -------------------------------------------------------------------------------------------------- neighbourhoods
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _grid_shape(points: FloatArray, cell_size_m: float) -> tuple[float, float, float, int, int]:
     """Lower left corner, cell size and shape of a grid; cells grow until there are few more of them than points."""
     x_min = points[0, 0]
@@ -254,7 +254,7 @@ def _grid_shape(points: FloatArray, cell_size_m: float) -> tuple[float, float, f
     return x_min, y_min, cell_size_m, columns, rows
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sort_into_grid(
     points: FloatArray, x_min: float, y_min: float, cell_size_m: float, columns: int, rows: int
 ) -> tuple[LabelArray, LabelArray]:
@@ -275,7 +275,7 @@ def _sort_into_grid(
     return start, members
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cell_for_few(points: FloatArray) -> float:
     """Size of cells that hold about two points each, metres."""
     n = max(len(points), 1)
@@ -287,7 +287,7 @@ def _cell_for_few(points: FloatArray) -> float:
     return max(math.sqrt(2.0 * width * depth / n), max(width, depth) / n, 1e-3)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest_neighbours(
     points: FloatArray, k: int, wanted_cell_size_m: float, named: bool
 ) -> tuple[LabelArray, FloatArray]:
@@ -474,7 +474,7 @@ def _plan(points: FloatArray) -> FloatArray:
     return np.ascontiguousarray(points[:, :2], dtype=np.float64)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _spacings(points: FloatArray) -> tuple[float, float]:
     """1 / sqrt(density) in plan, by medians over the points and over their area; nan for fewer than two points."""
     n = len(points)
@@ -490,7 +490,7 @@ def _spacings(points: FloatArray) -> tuple[float, float]:
     return math.sqrt(median * math.pi / (k - 1.0 / 3.0)), math.sqrt(middle * math.pi / (k + 2.0 / 3.0))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _local_plane_sse(points: FloatArray, neighbours: LabelArray) -> FloatArray:
     """Sum of squared vertical residuals of each point and its neighbours to their own plane, (n,) m2."""
     n, k = neighbours.shape
@@ -528,7 +528,7 @@ def noise_sigma_m(points: FloatArray) -> float:
     return math.sqrt(quartile / _LOWER_QUARTILE_CHI2[freedom])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _covered(xyz_mm: IntArray, points: FloatArray, radius_mm: int, height_mm: int) -> BoolArray:
     """Whether a point has another one more than `height_mm` above it within the radius in plan."""
     n = len(points)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 
 # 2^64 / golden ratio: Fibonacci hashing (Knuth, TAOCP 3, 6.4). Unsigned, since only that wraps safely.
@@ -15,7 +15,7 @@ _FOLD = np.uint64(32)
 _PRIMES = (np.uint64(73856093), np.uint64(19349663), np.uint64(83492791), np.uint64(2654435761))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def slot_of_key(key: int | np.int64, mask: int) -> np.int64:
     """First slot of a key in an open-addressing table of mask + 1 (a power of two) slots."""
     mixed = np.uint64(key) * _GOLDEN
@@ -24,7 +24,7 @@ def slot_of_key(key: int | np.int64, mask: int) -> np.int64:
     return np.int64(mixed >> _SHIFT) & mask
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _first_of_each(
     x_mm: IntArray,
     y_mm: IntArray,

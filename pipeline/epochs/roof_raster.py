@@ -13,8 +13,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray
 
 CELLS_A_WIDTH = 5
@@ -116,7 +116,7 @@ def compare_roofs(faces: RoofFaces, groups: RoofGroups, uniform_share: float, ve
     return figures
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _compare_all(
     xy: FloatArray,
     rings: IntArray,
@@ -154,7 +154,7 @@ def _compare_all(
         _figures_of(before, after, own, rough, cell, height_m[group], ground_m[group], share, shift, figures[group])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill(
     xy: FloatArray,
     rings: IntArray,
@@ -205,7 +205,7 @@ def _fill(
                 own[row, column] |= is_own
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _figures_of(
     before: FloatArray,
     after: FloatArray,
@@ -285,7 +285,7 @@ def _figures_of(
                 figures[ROUGH_M2] += area
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _open(mask: BoolArray) -> None:
     """What of a mask a disc of 5 x 5 cells without corners fits into, in place."""
     rows, columns = mask.shape
@@ -302,7 +302,7 @@ def _open(mask: BoolArray) -> None:
             mask[row, column] = kept[row, column]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fits(mask: BoolArray, row: int, column: int) -> bool:
     """Whether the disc about a cell, two cells or more from the border, lies in the mask."""
     for i in range(-2, 3):

@@ -14,9 +14,9 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 import shapely
-from numba import njit
 from shapely import MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 CELL_M = 0.5
@@ -110,7 +110,7 @@ def _cleaned(cells: BoolArray) -> BoolArray:
 # ---------------------------------------------------------------------------------------------------------- polygons
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill(
     cells: BoolArray, edges: FloatArray, starts: IntArray, chosen: IntArray, x_min: float, y_min: float, cell: float
 ) -> None:
@@ -179,7 +179,7 @@ class PlanRaster:
 # ------------------------------------------------------------------------------------------------------------ points
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _window_keys(x: FloatArray, y: FloatArray, cell: float, side: int) -> IntArray:
     """Window that holds each point, row and column in one number."""
     keys = np.empty(len(x), np.int64)
@@ -188,7 +188,7 @@ def _window_keys(x: FloatArray, y: FloatArray, cell: float, side: int) -> IntArr
     return keys
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _vote(
     balance: LabelArray, slot: IntArray, x: FloatArray, y: FloatArray, counted: BoolArray, cell: float, side: int
 ) -> None:
@@ -308,7 +308,7 @@ def outlines_of(runs: IntArray) -> list[Polygon]:
     return outlines
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _neighbours(runs: IntArray) -> IntArray:
     """Pairs of runs in rows that follow one another and share a column."""
     n = len(runs)

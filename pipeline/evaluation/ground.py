@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.errors import InconsistentInputError
 from pipeline.evaluation.bootstrap import Statistic, Sums, share
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
@@ -239,7 +239,7 @@ def matched_points(
     return _merged(*keys[0], *keys[1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _merged(
     plan_a: IntArray, rest_a: IntArray, order_a: IntArray, plan_b: IntArray, rest_b: IntArray, order_b: IntArray
 ) -> IntArray:

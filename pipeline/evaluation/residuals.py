@@ -16,9 +16,9 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 import shapely
-from numba import njit
 from shapely import MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.evaluation.bootstrap import Statistic, quantile, ratio, root_mean, share
 from pipeline.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.evaluation.models import RoofModel
@@ -292,7 +292,7 @@ class _Tallies:
         )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _tally(
     building: LabelArray,
     residual: FloatArray,

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray
 from pipeline.triangulation.faces import DONE, triangulate_rings
 from pipeline.triangulation.projection import area_vector
@@ -187,7 +187,7 @@ def _gltf_axes(xyz: FloatArray) -> Float32Array:
     return np.column_stack((xyz[:, 0], xyz[:, 2], 0.0 - xyz[:, 1])).astype("<f4")
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _triangulated(
     corners: IntArray, ring_starts: IntArray, face_starts: IntArray
 ) -> tuple[IntArray, IntArray, FloatArray]:

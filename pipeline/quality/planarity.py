@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray
 
 _SWEEPS = 12
@@ -13,7 +13,7 @@ MICROMETRES_PER_MILLIMETRE = 1e3
 _LARGEST = 5e8
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _principal_axes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues (3,) and unit eigenvectors, the columns of (3, 3), of a symmetric matrix: cyclic Jacobi rotations.
 
@@ -47,7 +47,7 @@ def _principal_axes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return values[order], axes[:, order].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fitted_plane(corners: IntArray) -> tuple[float, float, FloatArray]:
     """The least-squares plane of a face.
 
@@ -88,7 +88,7 @@ def fitted_plane(corners: IntArray) -> tuple[float, float, FloatArray]:
     return largest, np.sqrt(max(values[1], 0.0) / values[2]) if values[2] > 0.0 else 0.0, axes
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bends_where_it_is_straight(
     corners: IntArray, ring_offsets: IntArray, axes: FloatArray, least_cosine: float
 ) -> bool:
@@ -107,7 +107,7 @@ def bends_where_it_is_straight(
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def in_fitted_plane(corners: IntArray, axes: FloatArray) -> IntArray:
     """Corners (n, 3) projected onto their least-squares plane: micrometres across and along it, and 0.
 
@@ -128,7 +128,7 @@ def in_fitted_plane(corners: IntArray, axes: FloatArray) -> IntArray:
     return flat
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _unit_normal(corners: IntArray, a: int, b: int, c: int) -> tuple[float, float, float]:
     """Unit normal of a triangle."""
     ux = float(corners[b, 0] - corners[a, 0])
@@ -142,7 +142,7 @@ def _unit_normal(corners: IntArray, a: int, b: int, c: int) -> tuple[float, floa
     return (x / length, y / length, z / length) if length > 0.0 else (0.0, 0.0, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def least_cosine_of_normals(corners: IntArray, triangles: IntArray, enough: float) -> float:
     """Cosine of the largest angle between the normals of any two triangles of a face.
 

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from numba import njit
 from shapely import MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, RoofFace
 from pipeline.quality.unseen_roof import middles_of_cells, unseen_cells
 
@@ -35,7 +35,7 @@ class ResidualSummary:
     """All points."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_inside(x: float, y: float, edges: FloatArray, first: int, last: int) -> bool:
     """Whether an odd number of edges is crossed to the right of a place."""
     inside = False
@@ -55,7 +55,7 @@ def _is_inside(x: float, y: float, edges: FloatArray, first: int, last: int) -> 
     return inside
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_near(x: float, y: float, edges: FloatArray, first: int, last: int, limit: float) -> bool:
     """Whether an edge passes within a distance of a place."""
     for e in range(first, last):
@@ -74,7 +74,7 @@ def _is_near(x: float, y: float, edges: FloatArray, first: int, last: int, limit
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _top_surface(
     px: FloatArray,
     py: FloatArray,
@@ -125,7 +125,7 @@ def _top_surface(
     return top, number
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _laid_out(
     xy: FloatArray, ring_of: IntArray, face_of_ring: IntArray, n: int, tolerance: float
 ) -> tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray, float, float, float, int, int]:
@@ -197,7 +197,7 @@ def _laid_out(
     return edges[:m].copy(), edge_starts, boxes, starts, faces, low_x, low_y, cell, columns, rows
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _seen(
     points: FloatArray,
     residuals: FloatArray,

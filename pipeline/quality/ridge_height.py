@@ -15,8 +15,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FaceKind, FloatArray, IntArray, LabelArray, Plane, Solid
 
 SAME_TOP_M = 0.05
@@ -96,7 +96,7 @@ def _top(solids: Sequence[Solid]) -> tuple[float, float, list[int]] | None:
     return x, y, sorted(numbers)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _variances_at(
     points: FloatArray,
     residuals: FloatArray,
@@ -116,7 +116,7 @@ def _variances_at(
     return variances
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _support(
     points: FloatArray, residuals: FloatArray, plane_of_point: LabelArray, reach_m: float, n_planes: int
 ) -> FloatArray:
@@ -146,7 +146,7 @@ def _support(
     return sums
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _variance_at(
     points: FloatArray,
     residuals: FloatArray,

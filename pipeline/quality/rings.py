@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import IntArray
 from pipeline.quality.union_find import root_of, unite
 from pipeline.triangulation.projection import turn_of
@@ -20,7 +20,7 @@ ORIENTATION_RINGS_SAME = 208
 _OUTSIDE, _INSIDE, _BOTH = 0, 1, 2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _within_box(flat: IntArray, a: int, b: int, p: int) -> bool:
     """Whether p, which is on the line through a and b, is between them or at an end."""
     return bool(
@@ -29,7 +29,7 @@ def _within_box(flat: IntArray, a: int, b: int, p: int) -> bool:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def segments_meet(flat: IntArray, a: int, b: int, c: int, d: int) -> bool:
     """Whether the closed segments a, b and c, d have a point in common."""
     if (
@@ -55,7 +55,7 @@ def segments_meet(flat: IntArray, a: int, b: int, c: int, d: int) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _runs_back(flat: IntArray, before: int, corner: int, after: int) -> bool:
     """Whether the edges before and after a corner lie on each other."""
     if turn_of(flat, before, corner, after) != 0:
@@ -67,7 +67,7 @@ def _runs_back(flat: IntArray, before: int, corner: int, after: int) -> bool:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def twice_ring_area(flat: IntArray, start: int, stop: int) -> int:
     """Twice the signed area of the ring start:stop in mm2, positive counter-clockwise."""
     area = 0
@@ -76,7 +76,7 @@ def twice_ring_area(flat: IntArray, start: int, stop: int) -> int:
     return area
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def ring_is_simple(flat: IntArray, start: int, stop: int) -> bool:
     """Whether the ring start:stop encloses an area and neither crosses nor touches itself."""
     count = stop - start
@@ -93,7 +93,7 @@ def ring_is_simple(flat: IntArray, start: int, stop: int) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _same_ring(ids: IntArray, a: int, a_stop: int, b: int, b_stop: int) -> bool:
     """Whether two rings have the same vertices in the same or the opposite order."""
     count = a_stop - a
@@ -109,7 +109,7 @@ def _same_ring(ids: IntArray, a: int, a_stop: int, b: int, b_stop: int) -> bool:
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rings_cross(flat: IntArray, ids: IntArray, a: int, a_stop: int, b: int, b_stop: int) -> bool:
     """Whether edges of two rings have more in common than a vertex of both."""
     for i in range(a, a_stop):
@@ -132,7 +132,7 @@ def _rings_cross(flat: IntArray, ids: IntArray, a: int, a_stop: int, b: int, b_s
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _side_of_ring(flat: IntArray, a: int, a_stop: int, b: int, b_stop: int) -> int:
     """Where the edges of ring a lie to ring b, which they do not cross: outside, inside or both, by their middles."""
     inside = outside = 0
@@ -156,7 +156,7 @@ def _side_of_ring(flat: IntArray, a: int, a_stop: int, b: int, b_stop: int) -> i
     return _INSIDE if inside else _OUTSIDE
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _touches_enclose_a_part(ids: IntArray, ring_offsets: IntArray) -> bool:
     """Whether rings that touch at vertices cut the interior: their graph (rings and common vertices) has a cycle."""
     rings = len(ring_offsets) - 1
@@ -176,7 +176,7 @@ def _touches_enclose_a_part(ids: IntArray, ring_offsets: IntArray) -> bool:
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def polygon_code(flat: IntArray, ids: IntArray, ring_offsets: IntArray) -> int:
     """The first fault of a polygon whose plane is known, 0 where there is none.
 
@@ -223,7 +223,7 @@ def polygon_code(flat: IntArray, ids: IntArray, ring_offsets: IntArray) -> int:
     return POLYGON_INTERIOR_DISCONNECTED if _touches_enclose_a_part(ids, ring_offsets) else 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def has_repeated_neighbours(ids: IntArray, start: int, stop: int) -> bool:
     """Whether two consecutive corners of the ring start:stop are the same vertex (code 102)."""
     repeated = False

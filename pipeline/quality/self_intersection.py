@@ -11,8 +11,8 @@ signed sums that do not overflow.)
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import IntArray
 from pipeline.triangulation.edge_flips import ascending_order
 
@@ -20,7 +20,7 @@ _LOW_BITS = 20
 _LOW_MASK = (1 << _LOW_BITS) - 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def side_of_plane(vertices: IntArray, a: int, b: int, c: int, d: int) -> int:
     """Sign of the volume of the tetrahedron a, b, c, d: positive where d is on the side of the normal of a, b, c."""
     ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
@@ -35,7 +35,7 @@ def side_of_plane(vertices: IntArray, a: int, b: int, c: int, d: int) -> int:
     return 1 if high > 0 or (low & _LOW_MASK) > 0 else 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _dominant_plane(vertices: IntArray, a: int, b: int, c: int) -> tuple[int, int]:
     """The two axes in which the triangle a, b, c shows the largest area."""
     ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
@@ -46,14 +46,14 @@ def _dominant_plane(vertices: IntArray, a: int, b: int, c: int) -> tuple[int, in
     return (2, 0) if ny >= nx else (1, 2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _turn(vertices: IntArray, x: int, y: int, a: int, b: int, c: int) -> int:
     """Twice the signed area of a, b, c as seen in the axes x and y."""
     right, up = vertices[b, x] - vertices[a, x], vertices[b, y] - vertices[a, y]
     return int(right * (vertices[c, y] - vertices[a, y]) - up * (vertices[c, x] - vertices[a, x]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _coplanar_segments_meet(vertices: IntArray, x: int, y: int, p: int, q: int, a: int, b: int) -> bool:
     """Whether the closed segments p, q and a, b of one plane meet, as seen in the axes x and y."""
     for axis in (x, y):
@@ -68,7 +68,7 @@ def _coplanar_segments_meet(vertices: IntArray, x: int, y: int, p: int, q: int, 
     return not ((side_p > 0 and side_q > 0) or (side_p < 0 and side_q < 0))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _in_triangle(vertices: IntArray, x: int, y: int, a: int, b: int, c: int, p: int) -> bool:
     """Whether p of the triangle's plane is within it or on its boundary, as seen in the axes x and y."""
     first, second, third = (
@@ -79,7 +79,7 @@ def _in_triangle(vertices: IntArray, x: int, y: int, a: int, b: int, c: int, p: 
     return (first >= 0 and second >= 0 and third >= 0) or (first <= 0 and second <= 0 and third <= 0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def segment_meets_triangle(vertices: IntArray, p: int, q: int, a: int, b: int, c: int) -> bool:
     """Whether the closed segment p, q and the closed triangle a, b, c have a point in common."""
     side_p, side_q = side_of_plane(vertices, a, b, c, p), side_of_plane(vertices, a, b, c, q)
@@ -101,7 +101,7 @@ def segment_meets_triangle(vertices: IntArray, p: int, q: int, a: int, b: int, c
     return first * third >= 0 and second * third >= 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def triangles_intersect(vertices: IntArray, first: IntArray, second: IntArray) -> bool:
     """Whether two triangles (three vertex indices each) meet anywhere but in the vertices and edge that they share."""
     shared = 0
@@ -138,7 +138,7 @@ def triangles_intersect(vertices: IntArray, first: IntArray, second: IntArray) -
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _longest_plan_axis(low: IntArray) -> int:
     """0 where the lower corners of boxes (n, 3) spread farther in x than in y, else 1."""
     least_x = most_x = low[0, 0]
@@ -149,7 +149,7 @@ def _longest_plan_axis(low: IntArray) -> int:
     return 0 if most_x - least_x >= most_y - least_y else 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shell_intersects_itself(vertices: IntArray, triangles: IntArray, face_of: IntArray) -> bool:
     """Whether triangles of different faces intersect.
 

@@ -8,8 +8,8 @@ triangles form one umbrella.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
 from pipeline.quality.union_find import root_of, unite
 from pipeline.triangulation.edge_flips import ascending_order
@@ -20,7 +20,7 @@ MULTIPLE_CONNECTED_COMPONENTS = 305
 POLYGON_WRONG_ORIENTATION = 307
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _edge_keys(triangles: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]:
     """Keys of the undirected edges of all triangles, by 3 * triangle + corner, and the order that sorts them."""
     keys = np.empty(3 * len(triangles), np.int64)
@@ -31,7 +31,7 @@ def _edge_keys(triangles: IntArray, vertex_count: int) -> tuple[IntArray, IntArr
     return keys, ascending_order(keys)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def is_sound_shell(triangles: IntArray, vertex_count: int, found: BoolArray) -> bool:
     """Whether the mesh is a 2-manifold without border; sets found[code] for every fault.
 
@@ -96,7 +96,7 @@ def is_sound_shell(triangles: IntArray, vertex_count: int, found: BoolArray) -> 
     return sound
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def six_volumes(vertices: IntArray, triangles: IntArray) -> float:
     """Six times the volume that the triangles enclose in mm3, positive where they face outward."""
     total = 0.0

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from numba import njit
-
+from pipeline.compiler import kernel
 from pipeline.model import IntArray
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def root_of(parent: IntArray, node: int) -> int:
     """The representative of the set that a node is in; parent (n,) starts as 0 to n - 1."""
     while parent[node] != node:
@@ -16,7 +15,7 @@ def root_of(parent: IntArray, node: int) -> int:
     return node
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def unite(parent: IntArray, first: int, second: int) -> bool:
     """Unite the sets of two nodes; whether they were different ones."""
     a, b = root_of(parent, first), root_of(parent, second)

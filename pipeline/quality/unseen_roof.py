@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def middles_of_cells(low_x: float, low_y: float, cell: float, columns: int, rows: int) -> tuple[FloatArray, FloatArray]:
     """Middles of a raster's cells, line by line, x and y, (rows * columns,) metres."""
     x = np.empty(rows * columns)
@@ -22,7 +22,7 @@ def middles_of_cells(low_x: float, low_y: float, cell: float, columns: int, rows
     return x, y
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def unseen_cells(
     points: FloatArray,
     residuals: FloatArray,
@@ -64,7 +64,7 @@ def unseen_cells(
     return places, unseen, largest
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest_squares(
     points: FloatArray,
     residuals: FloatArray,
@@ -123,7 +123,7 @@ def _nearest_squares(
     return squares
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _offer(
     kept: FloatArray, k: int, column: int, row: int, x: float, y: float, on_x: float, on_y: float
 ) -> tuple[float, float, float, float]:

@@ -40,8 +40,8 @@ from collections.abc import Iterable
 from itertools import chain
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, Solid
 from pipeline.parameters import Parameters, parameter
 from pipeline.quality.planarity import (
@@ -133,7 +133,7 @@ def _offsets(lengths: list[int]) -> IntArray:
     return offsets
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _faults(
     vertices: IntArray,
     ring_vertices: IntArray,
@@ -153,7 +153,7 @@ def _faults(
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join(parent: IntArray, vertices: IntArray, p: int, q: int) -> None:
     """Unite the sets of two vertices; the first by x, y, z represents them."""
     a, b = root_of(parent, p), root_of(parent, q)
@@ -165,7 +165,7 @@ def _join(parent: IntArray, vertices: IntArray, p: int, q: int) -> None:
     parent[b] = a
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _snap(vertices: IntArray, ring_vertices: IntArray, snap_mm: float) -> tuple[IntArray, IntArray, bool]:
     """Snapped vertices of all corners: pairs at the tolerance joined; pairs at the tolerance apart; whether it matters.
 
@@ -204,7 +204,7 @@ def _snap(vertices: IntArray, ring_vertices: IntArray, snap_mm: float) -> tuple[
     return joined, apart, differ
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _face_code(corners: IntArray, ids: IntArray, rings: IntArray, planarity_mm: float) -> int:
     """The first fault of a face's rings, 0 where there is none: corners in mm, their vertices, ring offsets."""
     for r in range(len(rings) - 1):
@@ -225,7 +225,7 @@ def _face_code(corners: IntArray, ids: IntArray, rings: IntArray, planarity_mm: 
     return int(polygon_code(flat, ids, rings)) if has_area else RING_SELF_INTERSECTION
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_folded(corners: IntArray, rings: IntArray, cut: IntArray, least_cosine: float) -> bool:
     """Whether two triangles of a face have normals too far apart: of its triangulation, or of that in its fitted plane.
 
@@ -241,7 +241,7 @@ def _is_folded(corners: IntArray, rings: IntArray, cut: IntArray, least_cosine: 
     return status != DONE or least_cosine_of_normals(corners, in_plane, least_cosine) < least_cosine
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _find_faults(
     vertices: IntArray,
     ids: IntArray,

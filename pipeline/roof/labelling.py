@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 _MAX_CELLS = 4_000_000
@@ -13,7 +13,7 @@ SAME_ROOF_M = 0.15
 """Planes that differ by less than this at a point are equally good for it."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _bucket(x: IntArray, y: IntArray, cell: int) -> tuple[LabelArray, LabelArray, int, int, int, int]:
     """Points by square cells in row-major order: starts, order, columns, rows, low x, low y."""
     low_x = x.min()
@@ -34,7 +34,7 @@ def _bucket(x: IntArray, y: IntArray, cell: int) -> tuple[LabelArray, LabelArray
     return starts, order, columns, rows, low_x, low_y
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _filled_beside(starts: LabelArray, columns: int, rows: int) -> tuple[LabelArray, LabelArray]:
     """Of every cell the first column from it on, to the west and to the east, whose cell holds points; -1 for none."""
     west, east = np.full(columns * rows, -1, np.int32), np.full(columns * rows, -1, np.int32)
@@ -51,7 +51,7 @@ def _filled_beside(starts: LabelArray, columns: int, rows: int) -> tuple[LabelAr
     return west, east
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest(x: IntArray, y: IntArray, query_x: IntArray, query_y: IntArray, cell: int) -> tuple[LabelArray, IntArray]:
     """The nearest point of every query and its squared distance; ties by index."""
     starts, order, columns, rows, low_x, low_y = _bucket(x, y, cell)
@@ -189,7 +189,7 @@ def empty_samples(
     return samples[empty], index[empty], distance[empty]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pairs_that_cross(
     x: IntArray, y: IntArray, facets: LabelArray, labels: LabelArray, known: BoolArray, planes: FloatArray
 ) -> tuple[IntArray, LabelArray]:
@@ -246,7 +246,7 @@ def _pairs_that_cross(
     return pair_keys[:n_pairs], kinds[:n_pairs]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def continue_crossings(
     x: IntArray, y: IntArray, facets: LabelArray, labels: LabelArray, known: BoolArray, planes: FloatArray
 ) -> LabelArray:

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray
 
 Point = tuple[float, float]
@@ -60,7 +60,7 @@ def fitted_run(border: FloatArray, first: int, last: int) -> Run:
     return Run(first=first, last=last, x=x, y=y, direction=direction, length=length)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fit(border: FloatArray, first: int, last: int) -> tuple[float, float, float, float]:
     """Centroid, direction and chord of a stretch: second moments of its pieces' middles and of their own extent."""
     n = len(border)
@@ -98,7 +98,7 @@ def _fit(border: FloatArray, first: int, last: int) -> tuple[float, float, float
     return cx + x0, cy + y0, direction, math.sqrt(chord_x * chord_x + chord_y * chord_y)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _off_line(border: FloatArray, first: int, last: int, x: float, y: float, direction: float) -> float:
     """Largest distance of a stretch's vertices from a line."""
     ux, uy = math.cos(direction), math.sin(direction)

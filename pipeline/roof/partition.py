@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 import shapely
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason, Tin
 
@@ -40,7 +40,7 @@ class RoofPartition:
     """What the labels number; None for the planes of the segmentation."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def connected_regions(facets: LabelArray, labels: LabelArray) -> tuple[LabelArray, int]:
     """Components of equally labelled vertices along TIN edges, numbered by their lowest vertex."""
     n = len(labels)
@@ -75,7 +75,7 @@ def connected_regions(facets: LabelArray, labels: LabelArray) -> tuple[LabelArra
     return regions, count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _region_areas(
     x: IntArray, y: IntArray, facets: LabelArray, regions: LabelArray, count: int, counted: LabelArray
 ) -> FloatArray:
@@ -91,7 +91,7 @@ def _region_areas(
     return areas
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def absorb_small_regions(
     x: IntArray,
     y: IntArray,
@@ -196,7 +196,7 @@ def absorb_small_regions(
     return labels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cut_fraction(
     x0: int,
     y0: int,
@@ -232,7 +232,7 @@ def _cut_fraction(
     return 0.5
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _meeting_point(
     vx: FloatArray, vy: FloatArray, mx: FloatArray, my: FloatArray, lab: LabelArray, planes: FloatArray
 ) -> tuple[float, float]:
@@ -263,7 +263,7 @@ def _meeting_point(
     return (mx[0] + mx[1] + mx[2]) / 3.0, (my[0] + my[1] + my[2]) / 3.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _march(
     x: IntArray,
     y: IntArray,

@@ -9,8 +9,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, Plane
 
 
@@ -120,7 +120,7 @@ def convex_hull(xy_mm: IntArray) -> FloatArray:
     return _hull(np.ascontiguousarray(xy_mm[np.lexsort((xy_mm[:, 1], xy_mm[:, 0]))])) / 1e3
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _hull(ordered: IntArray) -> IntArray:
     """Andrew's monotone chain over positions sorted by x, then y."""
     n = ordered.shape[0]
@@ -172,7 +172,7 @@ def rectangle_on_line(hull: FloatArray, line: PlanLine, side: int) -> Rectangle 
     return Rectangle(line=line, from_m=from_m, to_m=to_m, left_from_m=low, left_to_m=high)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _beyond(ring: FloatArray, side: float) -> FloatArray:
     """The part of a convex ring with a second coordinate of this sign (or 0), cut at 0 (Sutherland and Hodgman)."""
     h = ring.shape[0]
@@ -219,21 +219,21 @@ def minimum_rectangle(hull: FloatArray) -> Rectangle | None:
     return Rectangle(line=line, from_m=from_m, to_m=to_m, left_from_m=0.0, left_to_m=width_m)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _along(hull: FloatArray, edge: int, u: float, v: float, k: int) -> float:
     """Metres of vertex k along an edge of unit direction (u, v)."""
     p = hull[k % hull.shape[0]]
     return float((p[0] - hull[edge, 0]) * u + (p[1] - hull[edge, 1]) * v)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _across(hull: FloatArray, edge: int, u: float, v: float, k: int) -> float:
     """Metres of vertex k to the left of an edge of unit direction (u, v)."""
     p = hull[k % hull.shape[0]]
     return float((p[1] - hull[edge, 1]) * u - (p[0] - hull[edge, 0]) * v)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _calipers(hull: FloatArray) -> tuple[int, float, float, float]:
     """The best edge, and the rectangle's end along it, its width and its beginning along it."""
     h = hull.shape[0]

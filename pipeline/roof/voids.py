@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 import shapely
-from numba import njit
 from shapely import MultiPolygon
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import raster_cells
 from pipeline.roof.footprint import polygons_of
@@ -23,7 +23,7 @@ _JOG = 1.2
 """Cells, or point spacings: smaller jogs of a void's border are none."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _empty_cells(
     points: FloatArray, edges: FloatArray, pitch_m: float, gap_m: float, far_m: float
 ) -> tuple[FloatArray, LabelArray]:

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.runtime.tile_content import mixed
 from pipeline.terrain.facets import FacetKind
@@ -27,7 +27,7 @@ _OTHER = np.uint64(0xD1B54A32D192ED03)
 """Where the second word begins: any number but 0, where the first does."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def facet_names(keys: IntArray) -> npt.NDArray[np.uint64]:
     """Names (j, 2) uint64 of facets, from their keys (j, 6) as of `facet_keys`."""
     names = np.empty((keys.shape[0], 2), np.uint64)
@@ -47,7 +47,7 @@ def united(count: int, one: IntArray, other: IntArray) -> IntArray:
     return _united(count, np.ascontiguousarray(one), np.ascontiguousarray(other))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _united(count: int, one: IntArray, other: IntArray) -> IntArray:
     """Kernel of `united`."""
     parent = np.arange(count)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 import shapely
-from numba import njit
 from shapely import MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 from pipeline.runtime.open_fragments import TileSurfaces, open_fragments
 from pipeline.runtime.scratch import POINT, Scratch
@@ -152,7 +152,7 @@ _OF_POINTS = (0, 1, 2, 3, 6, 7)
 """Those that are held of the points of a window; the others only tell duplicates."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _columns_inside(records: npt.NDArray[np.void], x0: int, y0: int, x1: int, y1: int) -> Columns:
     """Kernel: the columns of the records with x0 <= x < x1 and y0 <= y < y1, in their order."""
     size = records.size

@@ -16,8 +16,8 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.tiling import Tile, TileGrid, Window
 
 ZoneSums: TypeAlias = npt.NDArray[np.uint64]
@@ -32,7 +32,7 @@ _S30, _S27, _S31 = np.uint64(30), np.uint64(27), np.uint64(31)
 _S32, _S40, _S48, _S56 = np.uint64(32), np.uint64(40), np.uint64(48), np.uint64(56)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mixed(state: np.uint64, word: np.uint64) -> np.uint64:
     """A state of 64 bits after one more word; for each state another permutation of the words."""
     z = (state ^ word) + _GAMMA
@@ -41,7 +41,7 @@ def mixed(state: np.uint64, word: np.uint64) -> np.uint64:
     return z ^ (z >> _S31)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def zone_sums(
     records: npt.NDArray[np.void], gps_bits: npt.NDArray[np.uint64], x0: int, y0: int, x1: int, y1: int, halo: int
 ) -> ZoneSums:

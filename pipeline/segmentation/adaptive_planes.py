@@ -12,8 +12,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.parameters import Parameters, parameter
@@ -165,7 +165,7 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
     return DetectedPlanes(coefficients=coefficients, labels=labels, sigma_m=sigma_m)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mean_nodes(points: FloatArray, cell_m: float, gap_m: float) -> tuple[FloatArray, LabelArray]:
     """Means of the points of every lattice cell, one for each stack of points that a vertical gap parts from others.
 
@@ -227,7 +227,7 @@ def mean_nodes(points: FloatArray, cell_m: float, gap_m: float) -> tuple[FloatAr
     return nodes[:count].copy(), node_of
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _f_ratio(sums: FloatArray, i: int, j: int, sigma_m: float) -> float:
     """F of two planes against one for all their points; -1 where they differ too little to matter.
 
@@ -249,7 +249,7 @@ def _f_ratio(sums: FloatArray, i: int, j: int, sigma_m: float) -> float:
     return added / (3.0 * variance) if variance > 0.0 else np.inf
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def merge_by_f_test(sums: FloatArray, pairs: IntArray, sigma_m: float) -> LabelArray:
     """Merge planes that an F-test cannot tell apart, the least different first.
 
@@ -296,7 +296,7 @@ def merge_by_f_test(sums: FloatArray, pairs: IntArray, sigma_m: float) -> LabelA
     return root
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fitted(
     points: FloatArray, labels: LabelArray, count: int, fewest_points: int, min_cosine: float
 ) -> tuple[FloatArray, BoolArray, FloatArray]:
@@ -311,7 +311,7 @@ def _fitted(
     return planes, usable, sums
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settled(
     points: FloatArray,
     neighbours: LabelArray,
@@ -337,7 +337,7 @@ def _settled(
     return labels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _labels_of_points(
     points: FloatArray,
     node_of: LabelArray,
@@ -375,7 +375,7 @@ def _labels_of_points(
     return chosen
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _noise_about(points: FloatArray, labels: LabelArray, planes: FloatArray) -> float:
     """1.4826 times the median absolute distance of the points to their planes; nan where no point has one."""
     distances = np.empty(len(points))
@@ -390,7 +390,7 @@ def _noise_about(points: FloatArray, labels: LabelArray, planes: FloatArray) -> 
     return float(_MAD_TO_SIGMA * 0.5 * (ordered[(known - 1) // 2] + ordered[known // 2]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _numbered(points: FloatArray, labels: LabelArray, planes: FloatArray, min_cosine: float) -> FloatArray:
     """Number the planes by their first point, in place, and fit those that have points to them."""
     number = np.full(len(planes), -1, np.int32)
@@ -415,7 +415,7 @@ def _numbered(points: FloatArray, labels: LabelArray, planes: FloatArray, min_co
     return final
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _detect(
     points: FloatArray,
     nodes: FloatArray,

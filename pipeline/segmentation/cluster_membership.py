@@ -12,8 +12,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, LabelArray, Reason
 from pipeline.parameters import Parameters, parameter
@@ -167,14 +167,14 @@ def may_be_roof(centres: FloatArray, settings: ClusterMembershipSettings) -> Boo
     return np.asarray(~ground & (centres[:, 0] <= settings.wall_above_deg))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _turn(a_deg: float, b_deg: float) -> float:
     """Angle between two orientations, 0 to 180."""
     turn = abs(a_deg - b_deg)
     return min(turn, 360.0 - turn)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _weighted_mean(members: FloatArray, weights: FloatArray) -> FloatArray:
     """Weighted mean of the parameters, orientation on the circle; equal weights where all are 0."""
     total = weights.sum()
@@ -191,7 +191,7 @@ def _weighted_mean(members: FloatArray, weights: FloatArray) -> FloatArray:
     return mean
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _close_points(members: FloatArray, close: FloatArray, sample: int) -> FloatArray:
     """For each member the number of other members within the distances in all three parameters.
 
@@ -214,7 +214,7 @@ def _close_points(members: FloatArray, close: FloatArray, sample: int) -> FloatA
     return weights
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest_centre(parameters: FloatArray, centres: FloatArray, scales: FloatArray, most: float) -> LabelArray:
     """The centre with the highest membership, which falls with the distance in all three parameters; -1 beyond `most`.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def connected_parts(labels: LabelArray, neighbours: LabelArray) -> LabelArray:
     """Number the parts of equal label that hang together over edges.
 
@@ -46,7 +46,7 @@ def connected_parts(labels: LabelArray, neighbours: LabelArray) -> LabelArray:
     return parts
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def labels_of_points(
     facets: LabelArray,
     facet_labels: LabelArray,

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, LabelArray
 
 _NORMAL_NOISE = 1.5
@@ -43,7 +43,7 @@ def passes_for_noise(sigma_m: float, spacing_m: float, wanted_deg: float, most_p
     return min(max(0, math.ceil(widths - 1.0)), most_passes)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def smoothed_normals(
     normals: FloatArray, areas_m2: FloatArray, neighbours: LabelArray, usable: BoolArray, passes: int
 ) -> FloatArray:

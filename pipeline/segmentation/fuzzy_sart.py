@@ -13,8 +13,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.parameters import Parameters, parameter
@@ -105,13 +105,13 @@ def _dot(t: FloatArray, x: FloatArray) -> float:
     return float(t[0] * x[0] + t[1] * x[1] + t[2] * x[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _module_degree(t_module: float, x_module: float) -> float:
     """MDM of Eq. 4."""
     return min(t_module / x_module, x_module / t_module)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _angle_degree(cosine: float) -> float:
     """ADM of Eq. 5, with alpha of Eq. 6; the cosine may leave [-1, 1] by rounding."""
     return 1.0 - math.acos(min(1.0, max(-1.0, cosine))) / math.pi
@@ -237,7 +237,7 @@ def cluster(vectors: FloatArray, areas_m2: FloatArray, settings: FuzzySartCluste
     return Clustering(labels=labels, templates=templates, epochs=int(epochs))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _learn(
     vectors: FloatArray,
     order: npt.NDArray[np.int64],
@@ -361,7 +361,7 @@ def _learn(
     return labels, template[:count].copy(), epochs, work
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _degree(
     template: FloatArray,
     template_module: FloatArray,

@@ -16,8 +16,8 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.parameters import Parameters, parameter
@@ -187,7 +187,7 @@ def choose_clusters(
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def farthest_point_start(normals: FloatArray, weights: FloatArray, k: int) -> FloatArray:
     """The first centres: the normal farthest from the mean direction, then always the one farthest from all chosen.
 
@@ -232,7 +232,7 @@ def farthest_point_start(normals: FloatArray, weights: FloatArray, k: int) -> Fl
     return chosen
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def kmeans(
     normals: FloatArray, weights: FloatArray, start: FloatArray, most_rounds: int
 ) -> tuple[LabelArray, FloatArray, float, int]:
@@ -295,7 +295,7 @@ def kmeans(
     return labels, centres, inertia, rounds
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def silhouette(normals: FloatArray, weights: FloatArray, labels: LabelArray, k: int) -> float:
     """Weighted mean silhouette (Rousseeuw 1987) with the distance 1 - cosine.
 
@@ -350,7 +350,7 @@ def silhouette(normals: FloatArray, weights: FloatArray, labels: LabelArray, k: 
     return total / weight
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def labels_around(xyz: FloatArray, facets: LabelArray, facet_labels: LabelArray) -> LabelArray:
     """Cluster of every point: the one that most facets around the point belong to, by the sines of their angles there.
 
@@ -407,7 +407,7 @@ def labels_around(xyz: FloatArray, facets: LabelArray, facet_labels: LabelArray)
     return labels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sine_in_plan(xyz: FloatArray, facets: LabelArray, t: int, k: int) -> float:
     """Sine of the angle of a facet at one of its corners, in plan."""
     p = facets[t, k]

@@ -7,8 +7,8 @@ from the flattest neighbourhoods on, and go through the same refinement as those
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
 from pipeline.segmentation.plane_regression import (
     N_SUMS,
@@ -22,7 +22,7 @@ _LEAST_SEED_POINTS = 4
 """A plane has three free parameters: four points are the fewest that can contradict one another."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cluster_leftovers(
     points: FloatArray, neighbours: LabelArray, labels: LabelArray, distance_m: float, fewest_points: int
 ) -> LabelArray:
@@ -100,7 +100,7 @@ def cluster_leftovers(
     return grown
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sums_of_neighbourhood(points: FloatArray, neighbours: LabelArray, labels: LabelArray, i: int) -> FloatArray:
     """The sums of the regression over a point and its leftover neighbours."""
     sums = np.zeros(N_SUMS)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Reason
 from pipeline.parameters import Parameters, parameter
@@ -100,7 +100,7 @@ def _dense_groups(parameters: FloatArray, shift: float, settings: ParameterBoxSe
     return np.asarray(_grow(boxes, dense, columns)[box_of_facet])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _grow(boxes: IntArray, dense: BoolArray, columns: int) -> LabelArray:
     """Region growing over the eight neighbours in slope and orientation; -1 for boxes that are not dense."""
     group = np.full(boxes.size, -1, np.int32)

@@ -11,15 +11,15 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import best_fit_plane, cosine_of_slope, mean_square_residual
 
 _NO_MERGE = 1e30
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def touching_pairs(neighbours: LabelArray, labels: LabelArray, usable: BoolArray) -> IntArray:
     """Codes low * n + high of all pairs of usable clusters that occur together among one point and its neighbours.
 
@@ -73,7 +73,7 @@ def touching_pairs(neighbours: LabelArray, labels: LabelArray, usable: BoolArray
     return _ascending_once(codes[:count])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _ascending_once(codes: IntArray) -> IntArray:
     """Sorted codes without repetition."""
     ordered = np.sort(codes)
@@ -85,7 +85,7 @@ def _ascending_once(codes: IntArray) -> IntArray:
     return ordered[:kept].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def parallel_pairs_in_reach(
     points: FloatArray,
     labels: LabelArray,
@@ -138,14 +138,14 @@ def parallel_pairs_in_reach(
     return _ascending_once(codes[:count]), work
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cosine_between(planes: FloatArray, i: int, j: int) -> float:
     """Cosine of the angle between two planes (a, b, c)."""
     dot = planes[i, 0] * planes[j, 0] + planes[i, 1] * planes[j, 1] + 1.0
     return float(dot * cosine_of_slope(planes[i, 0], planes[i, 1]) * cosine_of_slope(planes[j, 0], planes[j, 1]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _merged_residual(
     sums: FloatArray, planes: FloatArray, i: int, j: int, min_cosine: float, min_cosine_small: float, small: float
 ) -> float:
@@ -167,7 +167,7 @@ def _merged_residual(
     return math.sqrt(max(0.0, in_i, in_j)) * cosine_of_slope(a, b)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def merge_planes(
     sums: FloatArray,
     planes: FloatArray,
@@ -289,7 +289,7 @@ def merge_planes(
     return root, work
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _before(keys: FloatArray, items: npt.NDArray[np.int32], p: int, q: int) -> bool:
     """Order of the queue: smaller residual, then smaller indices."""
     if keys[p] != keys[q]:
@@ -299,14 +299,14 @@ def _before(keys: FloatArray, items: npt.NDArray[np.int32], p: int, q: int) -> b
     return bool(items[p, 1] < items[q, 1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _swap(keys: FloatArray, items: npt.NDArray[np.int32], p: int, q: int) -> None:
     keys[p], keys[q] = keys[q], keys[p]
     for d in range(4):
         items[p, d], items[q, d] = items[q, d], items[p, d]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _push(
     keys: FloatArray, items: npt.NDArray[np.int32], held: int, key: float, i: int, j: int, age_i: int, age_j: int
 ) -> int:
@@ -323,7 +323,7 @@ def _push(
     return held + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pop(keys: FloatArray, items: npt.NDArray[np.int32], held: int) -> int:
     """Drop the first pair of the heap; returns how many it then holds."""
     held -= 1

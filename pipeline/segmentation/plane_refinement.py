@@ -11,8 +11,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, LabelArray, Plane, Reason
 from pipeline.parameters import Parameters, parameter
@@ -205,7 +205,7 @@ def describe_planes(points: FloatArray, planes: FloatArray, labels: LabelArray) 
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _support(points: FloatArray, planes: FloatArray, labels: LabelArray) -> FloatArray:
     """Number of each plane's points and root mean square of their vertical residuals, 0 of none, (k, 2)."""
     sums = cluster_sums(points, labels, len(planes))
@@ -217,7 +217,7 @@ def _support(points: FloatArray, planes: FloatArray, labels: LabelArray) -> Floa
     return support
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _refine(
     points: FloatArray,
     neighbours: LabelArray,
@@ -290,7 +290,7 @@ def _refine(
     return planes, labels, work
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fit_all(sums: FloatArray, planes: FloatArray, usable: BoolArray, fewest: int, min_cosine: float) -> None:
     """Best-fit plane of every cluster, in place; usable where it has points enough and is not too steep."""
     for k in range(sums.shape[0]):
@@ -301,7 +301,7 @@ def _fit_all(sums: FloatArray, planes: FloatArray, usable: BoolArray, fewest: in
         usable[k] = fitted and sums[k, 0] >= fewest and cosine_of_slope(a, b) >= min_cosine
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _drop_outliers(
     points: FloatArray, labels: LabelArray, planes: FloatArray, usable: BoolArray, limit_m: float
 ) -> None:
@@ -312,7 +312,7 @@ def _drop_outliers(
             labels[i] = -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _renumber(
     points: FloatArray, labels: LabelArray, planes: FloatArray, usable: BoolArray
 ) -> tuple[FloatArray, LabelArray]:

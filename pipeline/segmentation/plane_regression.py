@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.geometry import solve_plane_moments
 from pipeline.model import FloatArray, LabelArray
 
@@ -23,7 +23,7 @@ _LEAST_VARIANCE_M2 = 1e-9
 """Below this the points coincide in plan."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_point(sums: FloatArray, points: FloatArray, i: int) -> None:
     """Add point i to the ten sums of a cluster, in place."""
     x = points[i, 0]
@@ -41,7 +41,7 @@ def add_point(sums: FloatArray, points: FloatArray, i: int) -> None:
     sums[9] += z * z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cluster_sums(points: FloatArray, labels: LabelArray, n_clusters: int) -> FloatArray:
     """The sums of Eq. 14 for every cluster: (n_clusters, 10) float64; labels below 0 are skipped."""
     sums = np.zeros((n_clusters, N_SUMS))
@@ -53,7 +53,7 @@ def cluster_sums(points: FloatArray, labels: LabelArray, n_clusters: int) -> Flo
     return sums
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def best_fit_plane(sums: FloatArray) -> tuple[float, float, float, bool]:
     """The solution (b1, b2, b0) of Eq. 14 and whether there is one.
 
@@ -79,7 +79,7 @@ def best_fit_plane(sums: FloatArray) -> tuple[float, float, float, bool]:
     return a, b, z - a * x - b * y, True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mean_square_residual(sums: FloatArray, a: float, b: float, c: float) -> float:
     """SSE of Eq. 10 over n, for any plane, from the sums; vertical, square metres, never negative."""
     sse = (
@@ -93,7 +93,7 @@ def mean_square_residual(sums: FloatArray, a: float, b: float, c: float) -> floa
     return float(max(0.0, sse / sums[0]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cosine_of_slope(a: float, b: float) -> float:
     """Turns a vertical distance to the plane into a perpendicular one (Eq. 1)."""
     return 1.0 / math.sqrt(1.0 + a * a + b * b)

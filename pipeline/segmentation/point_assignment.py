@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, LabelArray
 from pipeline.segmentation.plane_regression import cosine_of_slope
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def distance_to_plane(points: FloatArray, i: int, planes: FloatArray, k: int) -> float:
     """Perpendicular distance of a point to a plane (Eq. 1)."""
     vertical = points[i, 2] - planes[k, 0] * points[i, 0] - planes[k, 1] * points[i, 1] - planes[k, 2]
     return float(abs(vertical) * cosine_of_slope(planes[k, 0], planes[k, 1]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def vote_among_neighbours(
     points: FloatArray,
     neighbours: LabelArray,
@@ -130,7 +130,7 @@ def vote_among_neighbours(
     return old
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def nearest_plane(points: FloatArray, planes: FloatArray, usable: BoolArray, distance_m: float) -> LabelArray:
     """The nearest of all planes within the distance: the paper's merging of points with planes.
 

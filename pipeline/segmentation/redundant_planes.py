@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_merge import touching_pairs
 from pipeline.segmentation.point_assignment import distance_to_plane
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def dissolve_redundant(
     points: FloatArray,
     neighbours: LabelArray,
@@ -93,7 +93,7 @@ def dissolve_redundant(
                     labels[i] = partner[p]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _partners(pairs: IntArray, n: int) -> tuple[IntArray, IntArray]:
     """Pairs as lists: where the partners of every cluster begin, (n + 1,), and the partners, ascending."""
     first = np.zeros(n + 1, np.int64)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.parameters import Parameters, parameter
@@ -122,7 +122,7 @@ def grow_regions(
     return planes, labels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _misfits(points: FloatArray, neighbours: LabelArray, clusters: LabelArray, gradients: FloatArray) -> FloatArray:
     """Mean square perpendicular distance of a point's neighbourhood to the best plane of its cluster's direction."""
     misfits = np.full(len(points), np.inf)
@@ -146,13 +146,13 @@ def _misfits(points: FloatArray, neighbours: LabelArray, clusters: LabelArray, g
     return misfits
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _near(points: FloatArray, i: int, a: float, b: float, c: float, reach: float) -> bool:
     """Whether a point lies within a vertical reach of a plane."""
     return bool(abs(points[i, 2] - a * points[i, 0] - b * points[i, 1] - c) <= reach)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _grow_regions(
     points: FloatArray,
     neighbours: LabelArray,

@@ -11,8 +11,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.segmentation.point_assignment import distance_to_plane
 
@@ -183,7 +183,7 @@ def _near(
     return _near_segment(points, planes, index, low, high, *ridge.start, *ridge.end, distance_m, reach_m)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _near_segment(
     points: FloatArray,
     planes: FloatArray,
@@ -220,7 +220,7 @@ def _near_segment(
     return near[:count].copy(), distance[:count].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _difference(points: FloatArray, i: int, planes: FloatArray, low: int, high: int) -> float:
     """Elevation of the low-numbered plane above the other at a point; its zero is the line of intersection."""
     return float(
@@ -230,7 +230,7 @@ def _difference(points: FloatArray, i: int, planes: FloatArray, low: int, high: 
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _segments(
     points: FloatArray,
     planes: FloatArray,
@@ -259,7 +259,7 @@ def _segments(
     return rows[:count].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _borders(labels: LabelArray, neighbours: LabelArray, n_planes: int) -> IntArray:
     """Codes (low plane * planes + high plane) * points + point of the points beside another plane, ascending, once."""
     n = labels.size
@@ -279,7 +279,7 @@ def _borders(labels: LabelArray, neighbours: LabelArray, n_planes: int) -> IntAr
     return np.unique(codes[:count])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _segment(
     points: FloatArray,
     planes: FloatArray,

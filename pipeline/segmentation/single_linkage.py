@@ -10,8 +10,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray, Reason
 from pipeline.parameters import Parameters, parameter
@@ -130,7 +130,7 @@ def link(
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _root(parent: LabelArray, i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -138,13 +138,13 @@ def _root(parent: LabelArray, i: int) -> int:
     return i
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join(parent: LabelArray, i: int, j: int) -> None:
     a, b = _root(parent, i), _root(parent, j)
     parent[max(a, b)] = min(a, b)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _link(slope: FloatArray, orientation: FloatArray, distance: float, work_limit: int) -> tuple[LabelArray, int]:
     """Kernel: union-find over a grid whose cells are so small that all points of one are linked."""
     n = slope.size
@@ -200,7 +200,7 @@ def _link(slope: FloatArray, orientation: FloatArray, distance: float, work_limi
     return labels, work
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _near(
     slope: FloatArray,
     orientation: FloatArray,

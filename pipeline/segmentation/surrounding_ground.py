@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def far_from(samples: FloatArray, points: FloatArray, distance_m: float) -> BoolArray:
     """Which samples have no point within a distance in plan.
 

@@ -12,8 +12,8 @@ import heapq
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import (
     N_SUMS,
@@ -41,7 +41,7 @@ _REFIT_GROWTH = 1.3
 """A region is fitted again each time that it has grown by this factor."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def local_planes(points: FloatArray, neighbours: LabelArray) -> tuple[FloatArray, FloatArray]:
     """The plane of every point and its nearest neighbours.
 
@@ -79,7 +79,7 @@ def local_planes(points: FloatArray, neighbours: LabelArray) -> tuple[FloatArray
     return planes, variances
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def noise_of_local_planes(variances: FloatArray, order: IntArray) -> float:
     """Standard deviation of the noise, metres, from what `local_planes` tells; 0 where there is no plane.
 
@@ -100,13 +100,13 @@ def noise_of_local_planes(variances: FloatArray, order: IntArray) -> float:
     return math.sqrt(variances[order[(known - 1) // 4]] * _FREEDOM / _LOWER_QUARTILE_CHI2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _height(points: FloatArray, i: int, a: float, b: float, c: float) -> float:
     """Height of a point above a plane."""
     return float(points[i, 2] - a * points[i, 0] - b * points[i, 1] - c)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _joins(
     points: FloatArray,
     neighbours: LabelArray,
@@ -136,7 +136,7 @@ def _joins(
     return near >= _COMPANY * known
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _grow(
     points: FloatArray,
     neighbours: LabelArray,
@@ -209,7 +209,7 @@ def _grow(
     return kept, a, b, c, gain
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def take_regions(
     points: FloatArray,
     neighbours: LabelArray,

@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.synthetic.first_hit import (
     BOX,
@@ -66,14 +66,14 @@ class FlightLine(NamedTuple):
     """The strip's own error, up."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _normal_of(state: np.uint64, draw: int) -> float:
     """A standard normal number from two draws (Box and Muller 1958)."""
     radius = math.sqrt(-2.0 * math.log(uniform_of(state, draw)))
     return radius * math.cos(2.0 * math.pi * uniform_of(state, draw + 1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def line_state(seed: int, strip: int, line: int) -> np.uint64:
     """The random state of one scan line."""
     state = mixed_bits(np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15))
@@ -81,19 +81,19 @@ def line_state(seed: int, strip: int, line: int) -> np.uint64:
     return mixed_bits(state ^ mixed_bits(np.uint64(line) + np.uint64(0x8CB92BA72F3D8DD7)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pulse_state(line: np.uint64, pulse: int) -> np.uint64:
     """The random state of one pulse, from that of its line."""
     return mixed_bits(line ^ mixed_bits(np.uint64(pulse) + np.uint64(0xABC98388FB8FAC03)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def row_chance(line: np.uint64, draw: int) -> float:
     """A number in (0, 1) that decides a fault of a whole scan line, from the line's state."""
     return uniform_of(line ^ np.uint64(_WRONG_ROW), draw)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _places_in_extent(
     flight: FlightLine, extent: FloatArray, half_swath: float, spacing: float, line: int, pulses_a_line: int
 ) -> tuple[int, int]:
@@ -118,7 +118,7 @@ def _places_in_extent(
     return first, max(first, stop)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def scan_lines(
     scene: SceneArrays,
     flight: FlightLine,
@@ -293,7 +293,7 @@ def scan_lines(
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sort_downwards(z: FloatArray, kind: IntArray, thing: IntArray, face: IntArray, n: int) -> None:
     """Insertion sort of the hits, highest (nearest to the aircraft) first, equal ones in the order of their lines."""
     for k in range(1, n):
@@ -305,7 +305,7 @@ def _sort_downwards(z: FloatArray, kind: IntArray, thing: IntArray, face: IntArr
         z[slot], kind[slot], thing[slot], face[slot] = this_z, this_kind, this_thing, this_face
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _most_frequent(kind: IntArray, thing: IntArray, face: IntArray, first: int, stop: int) -> tuple[int, int]:
     """The hit whose surface has most of the beam (the higher one on ties), and 1 where there are several surfaces."""
     best, most = first, 0
@@ -319,7 +319,7 @@ def _most_frequent(kind: IntArray, thing: IntArray, face: IntArray, first: int, 
     return best, 0 if most == stop - first else 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _class_of(kind: int) -> int:
     """ASPRS class of a kind of hit."""
     if kind == GROUND:
@@ -331,7 +331,7 @@ def _class_of(kind: int) -> int:
     return 6
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _intensity(kind: int, share: float) -> int:
     """Share of the beam times a reflectance in 16 bits."""
     reflectance = 0.35

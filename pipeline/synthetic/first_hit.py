@@ -13,8 +13,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.synthetic.scene_arrays import CELL_M
 
@@ -30,7 +30,7 @@ _ROUNDING_M = 1e-6
 """Bounds are taken wider by this."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mixed_bits(value: np.uint64) -> np.uint64:
     """The finaliser of splitmix64 (Steele, Lea, Flood 2014): 64 bits in, 64 well mixed bits out."""
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -38,14 +38,14 @@ def mixed_bits(value: np.uint64) -> np.uint64:
     return value ^ (value >> np.uint64(31))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def uniform_of(state: np.uint64, draw: int) -> float:
     """The draw-th uniform number in (0, 1) of a state: a pure function, so order and chunks cannot matter."""
     bits = mixed_bits(state + np.uint64(draw) * np.uint64(0x9E3779B97F4A7C15))
     return float((bits >> np.uint64(11)) + np.uint64(1)) / 9007199254740994.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def terrain_z(terrain: FloatArray, waves: FloatArray, x: float, y: float) -> float:
     """Elevation of the terrain."""
     z: float = terrain[0] + terrain[1] * x + terrain[2] * y
@@ -54,7 +54,7 @@ def terrain_z(terrain: FloatArray, waves: FloatArray, x: float, y: float) -> flo
     return z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def terrain_hit(
     terrain: FloatArray, waves: FloatArray, x: float, y: float, z: float, lean_x: float, lean_y: float
 ) -> Any:
@@ -94,7 +94,7 @@ def terrain_hit(
     return start_x + high * lean_x, start_y + high * lean_y, start_z + high
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _inside(edges: FloatArray, start: int, stop: int, x: float, y: float) -> bool:
     """Point in polygon by crossings of all rings; points on the border belong to one side or the other."""
     inside = False
@@ -107,7 +107,7 @@ def _inside(edges: FloatArray, start: int, stop: int, x: float, y: float) -> boo
     return inside
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _passes_by(circles: FloatArray, prism: int, x: float, y: float, z: float, lean: float, radius: float) -> bool:
     """Whether a line stays out of the circle around a prism by more than a radius: most do."""
     away_x, away_y = x - circles[prism, 0], y - circles[prism, 1]
@@ -115,7 +115,7 @@ def _passes_by(circles: FloatArray, prism: int, x: float, y: float, z: float, le
     return bool(away_x * away_x + away_y * away_y > reach * reach)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _near_bounds(faces: FloatArray, face: int, x1: float, y1: float, x2: float, y2: float, distance: float) -> bool:
     """Whether the rectangle around two places comes near to the bounds of a face."""
     reach = distance + _ROUNDING_M
@@ -127,7 +127,7 @@ def _near_bounds(faces: FloatArray, face: int, x1: float, y1: float, x2: float, 
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _meets_crown(
     trees: FloatArray, tree: int, x: float, y: float, z: float, lean_x: float, lean_y: float, radius: float
 ) -> bool:
@@ -140,7 +140,7 @@ def _meets_crown(
     return bool(linear * linear > square * (from_x * from_x + from_y * from_y + from_z * from_z - 1.0))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def is_clear(
     cell_start: LabelArray,
     entries: IntArray,
@@ -192,7 +192,7 @@ def is_clear(
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _prism_hit(
     face_start: LabelArray,
     edge_start: LabelArray,
@@ -249,7 +249,7 @@ def _prism_hit(
     return best, hit
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _tree_hit(
     trees: FloatArray, tree: int, x: float, y: float, z: float, lean_x: float, lean_y: float, chance: float
 ) -> float:
@@ -272,7 +272,7 @@ def _tree_hit(
     return float(z + up)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cell_of(grid: FloatArray, across: int, up: int, x: float, y: float) -> int:
     """Number of the grid's cell, -1 outside."""
     column = math.floor((x - grid[0]) / CELL_M)
@@ -283,7 +283,7 @@ def cell_of(grid: FloatArray, across: int, up: int, x: float, y: float) -> int:
     return cell
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def first_hit(
     cell_start: LabelArray,
     entries: IntArray,
@@ -327,7 +327,7 @@ def first_hit(
     return best, kind, thing, face
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def is_wet(spot_start: LabelArray, spots: FloatArray, building: int, x: float, y: float) -> bool:
     """Whether a place on a building's roof lies in one of its wet spots."""
     for spot in range(spot_start[building], spot_start[building + 1]):

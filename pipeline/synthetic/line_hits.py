@@ -6,15 +6,15 @@ import dataclasses
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, LabelArray
 from pipeline.synthetic.first_hit import ROOF, WALL, cell_of, first_hit, terrain_hit
 from pipeline.synthetic.scene import Scene
 from pipeline.synthetic.scene_arrays import SceneArrays, scene_arrays
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _first_hits(
     scene: SceneArrays,
     x: FloatArray,
@@ -50,7 +50,7 @@ def _first_hits(
         )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _landings(
     scene: SceneArrays, x: FloatArray, y: FloatArray, z: FloatArray, lean_x: FloatArray, lean_y: FloatArray
 ) -> None:

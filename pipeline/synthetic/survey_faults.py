@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
 from pipeline.synthetic.beam import line_state, row_chance
 from pipeline.synthetic.scene import FaultKind, SurveyFault
@@ -28,7 +28,7 @@ def fault_rows(faults: tuple[SurveyFault, ...], places: FloatArray) -> FloatArra
     return np.array(rows, dtype=np.float64).reshape(-1, 11)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def move_faulty(places: FloatArray, lines: LabelArray, faults: FloatArray, seed: int, strip: int) -> None:
     """Move the returns that faults concern, in place.
 

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 
@@ -47,7 +47,7 @@ _OVER_RISE_MM = 300.0
 Distances = npt.NDArray[np.float32]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _drop(
     lowest: Elevations, r: int, c: int, stride: tuple[int, int, float], within: float, drop_mm: float
 ) -> tuple[float, float]:
@@ -76,7 +76,7 @@ def _drop(
     return -1.0, 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _widths(
     lowest: Elevations, stride: tuple[int, int, float], widest: float, drop_mm: float, rise_mm: float
 ) -> tuple[Distances, Distances]:
@@ -98,7 +98,7 @@ def _widths(
     return ahead, behind
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark(out: BoolArray, lowest: Elevations, ahead: Distances, behind: Distances, along: tuple[float, float]) -> None:
     """Mark the cells whose two edges go on beside one another, to one side along them."""
     rows, columns = out.shape

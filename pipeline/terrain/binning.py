@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def points_by_cell(
     x: IntArray, y: IntArray, used: BoolArray, cell: int
 ) -> tuple[IntArray, IntArray, int, int, int, int]:

@@ -14,8 +14,8 @@ from collections.abc import Iterator, Mapping
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, Reason
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.facets import FacetKind
@@ -314,7 +314,7 @@ def may_join(kind: KindArray, sums: IntArray, faults: KindArray, settings: Candi
     return joins & (f["step_share"] >= settings.unite_share)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _largest_beside(
     joining: IntArray,
     steps: IntArray,

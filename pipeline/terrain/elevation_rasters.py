@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.terrain.lattice import NO_DATA, Elevations, height_above
 
@@ -37,7 +37,7 @@ def terrain_at(x_mm: IntArray, y_mm: IntArray, terrain: Elevations, column0: int
     return np.where(below == NO_DATA, np.nan, -below.astype(np.float64)).reshape(x.shape)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def closed(occupied: BoolArray, cells: int) -> BoolArray:
     """Closing of a mask by a square of 2 cells + 1: gaps up to so wide are filled, the outer edge stays.
 
@@ -57,7 +57,7 @@ def closed(occupied: BoolArray, cells: int) -> BoolArray:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def highest_in_cells(column: IntArray, row: IntArray, z_mm: IntArray, shape: tuple[int, int]) -> FloatArray:
     """Elevation of the highest point of each cell, float64 (rows, columns), nan where there is none."""
     out = np.full(shape, np.nan)
@@ -68,7 +68,7 @@ def highest_in_cells(column: IntArray, row: IntArray, z_mm: IntArray, shape: tup
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def filled(surface: FloatArray, wanted: BoolArray, reach: int) -> FloatArray:
     """Wanted cells without a value from the nearest square ring of cells that has one, by inverse squared distance."""
     rows, columns = surface.shape

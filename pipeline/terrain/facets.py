@@ -10,8 +10,8 @@ from __future__ import annotations
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
 
 
@@ -46,7 +46,7 @@ class VertexKind(IntEnum):
     """Stands above the ground among rough surroundings."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def classify_facets(
     x: IntArray,
     y: IntArray,
@@ -103,7 +103,7 @@ def classify_facets(
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def marks(
     x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArray, core: tuple[int, int, int, int], far_mm: int
 ) -> tuple[BoolArray, BoolArray]:
@@ -132,7 +132,7 @@ def marks(
     return near, shared
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def with_vertex(facets: LabelArray, marked: BoolArray) -> BoolArray:
     """Mask of the facets with at least one marked vertex."""
     out = np.empty(facets.shape[0], np.bool_)
@@ -141,7 +141,7 @@ def with_vertex(facets: LabelArray, marked: BoolArray) -> BoolArray:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def label_fragments(kinds: KindArray, neighbours: LabelArray, considered: BoolArray) -> tuple[LabelArray, KindArray]:
     """Fragment of every considered facet of a surface kind (-1 for others), and the kind of each fragment."""
     m = kinds.size
@@ -169,7 +169,7 @@ def label_fragments(kinds: KindArray, neighbours: LabelArray, considered: BoolAr
     return label, kind_of[:count].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def label_vertices(x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArray, label: LabelArray) -> LabelArray:
     """Fragment of every vertex: that of its largest object or building facet, else crown; -1 where there is none.
 
@@ -204,7 +204,7 @@ def label_vertices(x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArra
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def facet_keys(x: IntArray, y: IntArray, facets: LabelArray, chosen: IntArray) -> IntArray:
     """Coordinates (k, 6) of the vertices of the chosen facets, from the smallest on, counter-clockwise.
 

@@ -11,8 +11,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
 from pipeline.parameters import parameter
 from pipeline.terrain.hierarchical_filter import HierarchicalFilterSettings, hierarchical_ground
@@ -112,7 +112,7 @@ class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
         return float(self.reach_m + 4)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _terrain(
     lowest: Elevations, is_ground: BoolArray, bridge: int, max_slope: float, drawn: tuple[int, int, int, int]
 ) -> Elevations:
@@ -148,7 +148,7 @@ def _terrain(
     return terrain
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def slopes_of(terrain: Elevations) -> Elevations:
     """Steepest rise in mm over a metre: by central differences, one-sided beside the unknown."""
     rows, columns = terrain.shape
@@ -258,7 +258,7 @@ def _part_with_data(lowest: Elevations, margin: int) -> tuple[slice, slice]:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _near_terrain(
     x_mm: IntArray,
     y_mm: IntArray,

@@ -13,8 +13,8 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, PIT_CELLS, Elevations, without_pits
@@ -121,7 +121,7 @@ class HierarchicalFilterSettings(Parameters):
         return float(pits + self.seed_cell_m - 1 + sum(level.reach for level in self.levels()))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _lowest_of_cells(lowest: Elevations, size: int, column0: int, row0: int) -> BoolArray:
     """Mask of the lowest lattice cell of each cell of `size` anchored at the origin; of equal ones the first by row."""
     rows, columns = lowest.shape
@@ -141,7 +141,7 @@ def _lowest_of_cells(lowest: Elevations, size: int, column0: int, row0: int) -> 
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_cut(lowest: Elevations, r: int, c: int, size: int, corner: tuple[int, int]) -> bool:
     """Whether the data of the cell of seeds that holds (r, c) extend over less than _WHOLE_SHARE of a side."""
     rows, columns = lowest.shape
@@ -155,7 +155,7 @@ def _is_cut(lowest: Elevations, r: int, c: int, size: int, corner: tuple[int, in
     return min(high_r - low_r, high_c - low_c) + 1 < _WHOLE_SHARE * size
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _stands_on_a_wall(lowest: Elevations, r: int, c: int, reach: int, step_mm: float) -> bool:
     """Whether within reach something at the level of (r, c) ends in a step down of more than step_mm.
 
@@ -177,7 +177,7 @@ def _stands_on_a_wall(lowest: Elevations, r: int, c: int, reach: int, step_mm: f
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _without_cut_off(lowest: Elevations, seeds: BoolArray, size: int, corner: tuple[int, int], step_mm: float) -> None:
     """Clear seeds on walls whose cells the data's edge cuts: what is left of such a cell may be all roof.
 
@@ -190,7 +190,7 @@ def _without_cut_off(lowest: Elevations, seeds: BoolArray, size: int, corner: tu
                 seeds[r, c] = not _stands_on_a_wall(lowest, r, c, size - 1, step_mm)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _without_clumps(lowest: Elevations, size: int, column0: int, row0: int, depth_mm: int) -> Elevations:
     """Clear what lies deeper than depth_mm below all but three of the 24 cells of `size` around its own.
 

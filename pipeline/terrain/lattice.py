@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
 
 CELL_MM = 1000
@@ -23,7 +23,7 @@ PIT_MATES = 2
 """At most as many neighbours of a pit lie as deep."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lowest_per_cell(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, used: BoolArray, column0: int, row0: int, columns: int, rows: int
 ) -> Elevations:
@@ -38,7 +38,7 @@ def lowest_per_cell(
     return lowest
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def without_pits(lowest: Elevations, depth_mm: int, mates: int = PIT_MATES) -> Elevations:
     """Clear cells that lie deeper than depth_mm below all but at most `mates` of the 24 cells around."""
     rows, columns = lowest.shape
@@ -62,7 +62,7 @@ def without_pits(lowest: Elevations, depth_mm: int, mates: int = PIT_MATES) -> E
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def height_above(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, terrain: Elevations, column0: int, row0: int
 ) -> IntArray:

@@ -13,8 +13,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.between_walls import between_walls, between_walls_support_m
@@ -147,7 +147,7 @@ class MorphologicalFilterSettings(Parameters):
         return max(self.widest_m, 2 * self.max_window_m)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
     """The surface of the lowest points with gaps closed up to reach cells from their rims.
 
@@ -178,7 +178,7 @@ def closed_gaps(lowest: Elevations, reach: int) -> Elevations:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def without_clumps(lowest: Elevations, level: Elevations, slope_mm: Elevations, deep_mm: int) -> Elevations:
     """Clear cells far below the trend that few around them share: clumps of low outliers.
 
@@ -210,7 +210,7 @@ def without_clumps(lowest: Elevations, level: Elevations, slope_mm: Elevations, 
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _heights(
     lowest: Elevations, level: Elevations, slope_mm: Elevations, limits: tuple[int, float]
 ) -> tuple[Elevations, Elevations]:
@@ -230,7 +230,7 @@ def _heights(
     return height, base
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def regrown(
     lowest: Elevations, ground: BoolArray, barred: BoolArray, passes: int, limits: tuple[int, int, float]
 ) -> BoolArray:

@@ -8,8 +8,8 @@ that an erosion goes on from the last.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import ByteArray
 from pipeline.terrain.lattice import NO_DATA, Elevations
 
@@ -17,13 +17,13 @@ _HIGH = np.int32(2**30)
 _LOW = np.int32(-(2**30))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_square(number: int) -> bool:
     """Whether the n-th piece of an octagon is a square: 29 of 70 are, as sqrt(2) - 1 asks; the others are crosses."""
     return number * 29 // 70 > (number - 1) * 29 // 70
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _widened(values: Elevations, across: Elevations, is_square: bool, want_low: bool) -> None:
     """Replace values, but for their frame of one cell, by the extreme over a square or cross of three cells."""
     rows, columns = values.shape
@@ -52,7 +52,7 @@ def _widened(values: Elevations, across: Elevations, is_square: bool, want_low: 
                 out[c] = max(east[c], v)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def framed(surface: Elevations) -> Elevations:
     """The surface within a frame of one cell, what has no data above everything: ready to be eroded."""
     rows, columns = surface.shape
@@ -64,13 +64,13 @@ def framed(surface: Elevations) -> Elevations:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def erode_once(eroded: Elevations, scratch: Elevations, radius: int) -> None:
     """From the erosion by the octagon of radius - 1 to that of radius, in place; both arrays are framed."""
     _widened(eroded, scratch, _is_square(radius), True)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, scratch: Elevations, radius: int) -> None:
     """From an erosion to the opening, written to the framed array `opened`.
 
@@ -97,7 +97,7 @@ def dilate_back(surface: Elevations, eroded: Elevations, opened: Elevations, scr
         _widened(opened, scratch, _is_square(number), False)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cut_off(surface: Elevations, base_mm: Elevations, rise_mm: float, largest: int) -> ByteArray:
     """The first radius of a growing opening that takes more off a cell than it may.
 

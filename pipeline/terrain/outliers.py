@@ -10,8 +10,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.spatial_hash import slot_of_key
@@ -40,7 +40,7 @@ class OutlierSettings(Parameters):
         return 2.0 * self.cube_m
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _find(keys: IntArray, key: int, mask: int) -> np.int64:
     """Slot that holds a key, or the empty one where it belongs."""
     s = slot_of_key(key, mask)
@@ -49,7 +49,7 @@ def _find(keys: IntArray, key: int, mask: int) -> np.int64:
     return s
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _grown(keys: IntArray, counts: IntArray) -> tuple[IntArray, IntArray]:
     """The table in twice the slots."""
     size = 2 * keys.size
@@ -63,7 +63,7 @@ def _grown(keys: IntArray, counts: IntArray) -> tuple[IntArray, IntArray]:
     return new_keys, new_counts
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _by_table(
     x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, cube_mm: int, min_neighbours: int, low: tuple[int, int, int]
 ) -> BoolArray:
@@ -104,7 +104,7 @@ def _by_table(
     return keep
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _by_grid(
     x_mm: IntArray,
     y_mm: IntArray,
@@ -143,7 +143,7 @@ def _by_grid(
     return keep
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _dense_enough(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, cube_mm: int, min_neighbours: int) -> BoolArray:
     """Kernel: count points a cube, then sum the 27 cubes around each occupied cube once."""
     n = x_mm.size

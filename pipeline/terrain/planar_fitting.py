@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 
@@ -32,7 +32,7 @@ MAX_LEAN = 0.6
 """Farthest that the centroid of a trend's square may lie from its middle, in half sides: 0.5 at a straight edge."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def plane_sums(elevation: Elevations, used: BoolArray) -> Sums:
     """Integral images of the used cells."""
     rows, columns = elevation.shape
@@ -56,7 +56,7 @@ def plane_sums(elevation: Elevations, used: BoolArray) -> Sums:
     return sums
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def plane_around(sums: Sums, r: int, c: int, half: int) -> tuple[int, float, float, float, bool]:
     """The plane through the used cells of the square of 2 half + 1 cells around a cell.
 
@@ -100,7 +100,7 @@ def plane_around(sums: Sums, r: int, c: int, half: int) -> tuple[int, float, flo
     return n, mean, sx / n, sy / n, False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def join_planes(
     elevation: Elevations,
     ground: BoolArray,
@@ -143,7 +143,7 @@ def join_planes(
                 joined[r, c] = above <= max_step + max_slope * CELL_MM * far
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def leaning_planes(elevation: Elevations, used: BoolArray, half: int, widest: int) -> tuple[Elevations, Elevations]:
     """The trend at every cell: level and rise of the plane through the used cells of a square around it.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _facet_containing(
     px: int, py: int, start: int, x: IntArray, y: IntArray, facets: LabelArray, neighbours: LabelArray
 ) -> tuple[int, int]:
@@ -39,7 +39,7 @@ def _facet_containing(
     return -1, -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest_vertex(px: int, py: int, pz: int, x: IntArray, y: IntArray, z: IntArray, far_mm: int) -> int:
     """Nearest vertex in plan within far_mm, equal distances by elevation, then by coordinates; -1 where none.
 
@@ -61,7 +61,7 @@ def _nearest_vertex(px: int, py: int, pz: int, x: IntArray, y: IntArray, z: IntA
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def assign_points(
     px: IntArray,
     py: IntArray,

@@ -10,8 +10,8 @@ import dataclasses
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, ByteArray, IntArray, KindArray
 from pipeline.spatial_hash import slot_of_key
 from pipeline.terrain.binning import points_by_cell
@@ -78,7 +78,7 @@ def support_m(vegetation: VegetationSettings) -> float:
     return vegetation.support_m + CELL_M + (2 * AROUND_MM + PIT_REACH_MM) / 1000.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def tops_nearby(x: IntArray, y: IntArray, z: IntArray, used: BoolArray, wanted: BoolArray, reach: int) -> IntArray:
     """Elevation of the highest used point within a distance in plan of each wanted one, int64 (n,).
 
@@ -108,7 +108,7 @@ def tops_nearby(x: IntArray, y: IntArray, z: IntArray, used: BoolArray, wanted: 
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def counts_nearby(x: IntArray, y: IntArray, used: BoolArray, reach: int) -> IntArray:
     """How many used points, itself included, lie within `reach` in x and in y of each used point; 0 for others."""
     n = x.size
@@ -129,7 +129,7 @@ def counts_nearby(x: IntArray, y: IntArray, used: BoolArray, reach: int) -> IntA
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sums_around(x: IntArray, y: IntArray, used: BoolArray, values: IntArray, cell: int) -> IntArray:
     """Sums of some values over the used points in the 3 x 3 cells around each used point.
 
@@ -168,7 +168,7 @@ def sums_around(x: IntArray, y: IntArray, used: BoolArray, values: IntArray, cel
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def index_of_each(
     x: IntArray, y: IntArray, z: IntArray, number: ByteArray, of_x: IntArray, of_y: IntArray, of_z: IntArray,
     of_number: ByteArray,

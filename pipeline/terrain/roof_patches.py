@@ -11,8 +11,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray, Tin
 from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.vegetation import smallest_eigenvalue
@@ -65,7 +65,7 @@ class Borders:
     """(g, 2) pairs of patches that see each other across gaps, those with the longest sight first."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def solve_plane(s: FloatArray) -> tuple[float, float, float, bool]:
     """Slopes and level at the sums' origin, from sums of 1, x, y, z, xx, xy, yy, xz, yz; False where there is none."""
     n = s[0]
@@ -81,7 +81,7 @@ def solve_plane(s: FloatArray) -> tuple[float, float, float, bool]:
     return a, b, mz - a * mx - b * my, True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def local_planes(x: IntArray, y: IntArray, z: IntArray, radius_mm: int, min_points: int) -> FloatArray:
     """Slopes along x and y and orthogonal deviation in mm of the plane around every vertex, (n, 3).
 
@@ -140,7 +140,7 @@ def local_planes(x: IntArray, y: IntArray, z: IntArray, radius_mm: int, min_poin
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def circumradii(x: IntArray, y: IntArray, facets: LabelArray) -> FloatArray:
     """Circumradius of every facet, (m,), in the unit of the vertices."""
     out = np.empty(facets.shape[0])
@@ -153,7 +153,7 @@ def circumradii(x: IntArray, y: IntArray, facets: LabelArray) -> FloatArray:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def vertex_neighbours(n: int, facets: LabelArray, sound: LabelArray) -> tuple[IntArray, LabelArray]:
     """Compressed rows: the vertices that share a sound facet with each; some twice."""
     start = np.zeros(n + 1, np.int64)
@@ -173,7 +173,7 @@ def vertex_neighbours(n: int, facets: LabelArray, sound: LabelArray) -> tuple[In
     return start, others
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def grow_patches(
     x: IntArray,
     y: IntArray,
@@ -253,7 +253,7 @@ def grow_patches(
     return label, planes[:count].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_patches(
     x: IntArray, y: IntArray, z: IntArray, start: IntArray, others: LabelArray, label: LabelArray, planes: FloatArray
 ) -> int:
@@ -304,7 +304,7 @@ def fill_patches(
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def border_pieces(
     x: IntArray, y: IntArray, facets: LabelArray, neighbours: LabelArray, sound: LabelArray, label: LabelArray, k: int
 ) -> tuple[LabelArray, FloatArray, FloatArray, FloatArray]:

@@ -13,8 +13,8 @@ import math
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray, Tin
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.facets import (
@@ -104,7 +104,7 @@ class SurfaceSettings(Parameters):
         return round(2 * self.thinning_m * 1000)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sum_fragments(
     x: IntArray,
     y: IntArray,

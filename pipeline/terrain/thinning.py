@@ -8,15 +8,15 @@ and lets trees fall apart. Sparse clouds pass unchanged: thinning adapts by itse
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.spatial_hash import slot_of_key
 
 _BITS = 31
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _highest_per_cell(
     x_mm: IntArray,
     y_mm: IntArray,

@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, LabelArray
 from pipeline.terrain.lattice import CELL_MM, Elevations
 from pipeline.tin.delaunay import triangulate
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _joins_facet(
     x: int, y: int, above: float, cosine: float, corners: tuple[float, ...], z: float, limits: tuple[float, ...]
 ) -> bool:
@@ -43,7 +43,7 @@ def _joins_facet(
     return distance <= sine * math.sqrt(nearest)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join_facets(
     lowest: Elevations,
     asked: BoolArray,

@@ -18,8 +18,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.roof_patches import Borders, Patches, patches_of
@@ -256,7 +256,7 @@ def _across_gaps(unit: LabelArray, borders: Borders) -> LabelArray:
     return np.array([root(whole, k) for k in range(len(whole))], np.int32)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _unit_of_points(
     x: IntArray,
     y: IntArray,
@@ -302,7 +302,7 @@ def _unit_of_points(
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def smallest_points(x: IntArray, y: IntArray, z: IntArray, label: LabelArray) -> IntArray:
     """Index of the lexicographically smallest point of every label from 0 on, int64; -1 for a label without points."""
     found = np.full(label.max() + 1, -1, np.int64)

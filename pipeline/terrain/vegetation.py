@@ -10,8 +10,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.binning import points_by_cell
@@ -73,7 +73,7 @@ class VegetationSettings(Parameters):
         return 2.0 * self.radius_m * 2.0 ** (_SCALES - 1) + self.company_m
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def smallest_eigenvalue(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
     """Smallest eigenvalue of a symmetric 3 x 3 matrix (trigonometric form, Smith 1961)."""
     q = (xx + yy + zz) / 3.0
@@ -89,7 +89,7 @@ def smallest_eigenvalue(xx: float, xy: float, xz: float, yy: float, yz: float, z
     return max(0.0, q + 2.0 * p * math.cos(math.acos(half_det) / 3.0 + 2.0 * math.pi / 3.0))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _block_around(
     points: FloatArray, start: IntArray, cell: tuple[int, int], shape: tuple[int, int], reach: int, block: FloatArray
 ) -> tuple[FloatArray, int]:
@@ -110,7 +110,7 @@ def _block_around(
     return block, count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest(
     block: FloatArray, count: int, at: tuple[float, float, float], limit: float, level: float, out: FloatArray
 ) -> int:
@@ -124,7 +124,7 @@ def _nearest(
     return found
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc"})
+@kernel(fastmath={"reassoc"})
 def _moments(
     block: FloatArray,
     count: int,
@@ -158,7 +158,7 @@ def _moments(
     return n, sx, sy, sz, xx, xy, xz, yy, yz, zz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _spread_mm2(s: tuple[float, float, float, float, float, float, float, float, float, float]) -> float:
     """Variance of the counted neighbours across the plane that fits them best."""
     count = s[0]
@@ -173,7 +173,7 @@ def _spread_mm2(s: tuple[float, float, float, float, float, float, float, float,
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _planar(
     x_mm: IntArray,
     y_mm: IntArray,
@@ -269,7 +269,7 @@ def planarity(
     return verdict
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _crowns(
     x_mm: IntArray,
     y_mm: IntArray,

@@ -7,8 +7,8 @@ that cell, and of a flat roof the whole height: so a limit in metres a step tell
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, ByteArray
 from pipeline.terrain.lattice import NO_DATA, Elevations
 from pipeline.terrain.openings import dilate_back, erode_once, framed
@@ -32,7 +32,7 @@ _RIM_SHARE = 0.9
 """But for a tenth of them."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _coarse(lowest: Elevations, column0: int, row0: int) -> Elevations:
     """Lowest elevation of each coarse cell, anchored at the CRS's origin."""
     rows, columns = lowest.shape
@@ -46,7 +46,7 @@ def _coarse(lowest: Elevations, column0: int, row0: int) -> Elevations:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _extreme_of_nine(values: Elevations, want_low: bool, into_gaps: bool) -> Elevations:
     """Extreme of the nine cells around each cell with data, or only around each one without."""
     rows, columns = values.shape
@@ -67,7 +67,7 @@ def _extreme_of_nine(values: Elevations, want_low: bool, into_gaps: bool) -> Ele
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _floors(surface: Elevations, first: int, last: int, rise_mm: float) -> Elevations:
     """The opening's level where a step of its growing radius takes more than rise_mm a cell of it, else NO_DATA."""
     rows, columns = surface.shape
@@ -88,7 +88,7 @@ def _floors(surface: Elevations, first: int, last: int, rise_mm: float) -> Eleva
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _on_fine(lowest: Elevations, floors: Elevations, column0: int, row0: int, above_mm: int) -> BoolArray:
     """Mask of the cells that stand so far above the floor of a coarse cell beside them."""
     rows, columns = lowest.shape
@@ -136,7 +136,7 @@ def wide_objects(lowest: Elevations, corner: tuple[int, int], narrower: int, rad
     return _on_fine(lowest, floors, *corner, round(rise_mm * narrower / 2))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def with_corners(lowest: Elevations, wide: BoolArray, first: ByteArray) -> BoolArray:
     """Wide objects with the corners into which no octagon fits.
 

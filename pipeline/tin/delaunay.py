@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray, Tin
 from pipeline.tin.half_edges import canonical_facets, locate, restore_delaunay, split_facet, start_sphere
 from pipeline.tin.predicates import orientation
@@ -22,7 +22,7 @@ _HILBERT_BITS = 16
 _ROUND_FACTOR = 8
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _hilbert_keys(xy_mm: IntArray, x_min: int, y_min: int, shift: int) -> npt.NDArray[np.uint64]:
     """Position on the Hilbert curve in the upper, index in the lower 32 bits."""
     n = len(xy_mm)
@@ -46,7 +46,7 @@ def _hilbert_keys(xy_mm: IntArray, x_min: int, y_min: int, shift: int) -> npt.ND
     return keys
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _insert_all(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArray) -> tuple[int, int]:
     """Triangulate vertices that follow a Hilbert curve; return the number of facets and a duplicate vertex or -1."""
     n = len(x) - 1
@@ -201,7 +201,7 @@ def unique_xy_ranked(xy_mm: IntArray, z_mm: IntArray) -> tuple[IntArray, LabelAr
     return _keep_highest(position, np.ascontiguousarray(z_mm, dtype=np.int64), np.argsort(position))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _keep_highest(position: IntArray, z_mm: IntArray, order: IntArray) -> tuple[IntArray, LabelArray, LabelArray]:
     """The kernel of `unique_xy_ranked`; `order` sorts the positions, in whatever way where they are equal."""
     n = len(position)

@@ -14,8 +14,8 @@ import dataclasses
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, LabelArray, Tin
 from pipeline.parameters import Parameters, parameter
 from pipeline.tin.delaunay import hilbert_order, unique_xy_ranked
@@ -66,14 +66,14 @@ class GreedyTin:
     """(n,) bool, True for a point that was absorbed by a facet; False for one beneath another at the same position."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_left(x: FloatArray, y: FloatArray, rank: LabelArray, a: int, b: int, p: int) -> bool:
     """Whether p belongs to the left of the directed edge a, b; points on it are left of its ascending direction."""
     turn = orientation(x[a], y[a], x[b], y[b], x[p], y[p])
     return bool(turn > 0.0 or (turn == 0.0 and rank[a] < rank[b]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _facet_plane(
     x: FloatArray, y: FloatArray, z: FloatArray, rank: LabelArray, origin: LabelArray, facet: int
 ) -> tuple[int, float, float]:
@@ -90,7 +90,7 @@ def _facet_plane(
     return a, (uz * vy - vz * uy) / twice_area, (ux * vz - vx * uz) / twice_area
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _push(
     errors: FloatArray,
     points: LabelArray,
@@ -116,7 +116,7 @@ def _push(
     facets[i] = facet
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pop(errors: FloatArray, points: LabelArray, facets: LabelArray, rank: LabelArray, size: int) -> None:
     """Remove the top of a heap of `size` entries."""
     last = size - 1
@@ -144,7 +144,7 @@ def _pop(errors: FloatArray, points: LabelArray, facets: LabelArray, rank: Label
     facets[i] = facet
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _insert_greedily(
     x: FloatArray,
     y: FloatArray,

@@ -10,25 +10,25 @@ enough" away.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
 from pipeline.tin.predicates import lies_in_circumcircle, orientation
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def following(e: int) -> int:
     """The next half-edge of the same facet."""
     return e - 2 if e & 3 == 2 else e + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def preceding(e: int) -> int:
     """The previous half-edge of the same facet."""
     return e + 2 if e & 3 == 0 else e - 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def start_sphere(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArray, a: int, b: int, c: int) -> None:
     """Facet 0 of three vertices that are not collinear, and the facets 1 to 3 between its edges and infinity."""
     infinity = len(x) - 1
@@ -49,7 +49,7 @@ def start_sphere(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelAr
         twin[before + 2] = outer + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def split_facet(origin: LabelArray, twin: LabelArray, facet: int, first_new: int, p: int) -> None:
     """Put vertex p into a facet; it becomes three: `facet`, `first_new`, `first_new + 1`, each with p in slot 0."""
     e = 4 * facet
@@ -83,7 +83,7 @@ def split_facet(origin: LabelArray, twin: LabelArray, facet: int, first_new: int
     twin[e] = g + 2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def must_flip(x: FloatArray, y: FloatArray, p: int, u: int, v: int, q: int) -> bool:
     """Whether the edge u, v between the facets (p, u, v) and (v, u, q) is not Delaunay; p is the new vertex."""
     infinity = len(x) - 1
@@ -97,7 +97,7 @@ def must_flip(x: FloatArray, y: FloatArray, p: int, u: int, v: int, q: int) -> b
     return bool(lies_in_circumcircle(x[p], y[p], x[u], y[u], x[v], y[v], x[q], y[q]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def restore_delaunay(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArray, facet: int) -> int:
     """Flip around the newest vertex until all is Delaunay again (Lawson 1977); return how many flips were made.
 
@@ -140,7 +140,7 @@ def restore_delaunay(x: FloatArray, y: FloatArray, origin: LabelArray, twin: Lab
                 return flips
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def locate(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArray, facet: int, p: int) -> int:
     """The facet that holds p (on its border counts), or a facet at infinity whose hull edge p lies beyond.
 
@@ -176,7 +176,7 @@ def locate(x: FloatArray, y: FloatArray, origin: LabelArray, twin: LabelArray, f
             return int(e >> 2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def canonical_facets(
     origin: LabelArray, twin: LabelArray, n_facets: int, order: LabelArray
 ) -> tuple[LabelArray, LabelArray, LabelArray]:

@@ -17,7 +17,8 @@ the data.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from pipeline.compiler import kernel
 
 MAX_EXTENT_MM = 1 << 21
 """The predicates are exact for points whose coordinates differ by at most this."""
@@ -26,7 +27,7 @@ _CERTAIN = float(1 << 36)
 """Bound of the rounding error of the in-circle determinant: 3 products and 2 sums, below 2^86 * 2^-53 each."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> float:
     """Twice the signed area of the triangle a, b, c in mm2; positive where it turns left; exact.
 
@@ -38,7 +39,7 @@ def orientation(ax: float, ay: float, bx: float, by: float, cx: float, cy: float
     return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lies_in_circumcircle(
     ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float
 ) -> bool:

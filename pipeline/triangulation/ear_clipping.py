@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import IntArray
 from pipeline.triangulation.projection import in_cone, same_place, turn_of
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_ear(flat: IntArray, chain: IntArray, before: IntArray, after: IntArray, node: int) -> bool:
     """Whether the triangle at a node of the chain is inside, holds no other corner and its cut is a true diagonal."""
     p, q = before[node], after[node]
@@ -33,7 +33,7 @@ def _is_ear(flat: IntArray, chain: IntArray, before: IntArray, after: IntArray, 
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def clip_ears(flat: IntArray, chain: IntArray, length: int) -> tuple[IntArray, int]:
     """Triangles (length - 2, 3) of corners, and their number: fewer where no ear is left."""
     before, after = np.empty(length, np.int64), np.empty(length, np.int64)

@@ -7,8 +7,8 @@ not depend on where a ring starts.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import IntArray
 from pipeline.triangulation.projection import turn_of
 
@@ -16,7 +16,7 @@ _TIE = 1e-9
 """Relative difference of angles below which four corners count as cocircular."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _apex_angle(corners: IntArray, apex: int, a: int, b: int) -> tuple[float, float]:
     """Sine and cosine, times the product of the legs, of the angle at apex between a and b, in space."""
     ux = float(corners[a, 0] - corners[apex, 0])
@@ -29,7 +29,7 @@ def _apex_angle(corners: IntArray, apex: int, a: int, b: int) -> tuple[float, fl
     return np.sqrt(cross_x * cross_x + cross_y * cross_y + cross_z * cross_z), ux * vx + uy * vy + uz * vz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _comes_before(corners: IntArray, a: int, b: int) -> bool:
     """Whether corner a comes before b by x, then y, then z."""
     for k in range(3):
@@ -38,7 +38,7 @@ def _comes_before(corners: IntArray, a: int, b: int) -> bool:
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _prefers_diagonal(corners: IntArray, a: int, c: int, b: int, d: int) -> bool:
     """Whether the quadrangle a, b, c, d is better cut from b to d than from a to c."""
     sine_b, cosine_b = _apex_angle(corners, b, a, c)
@@ -54,7 +54,7 @@ def _prefers_diagonal(corners: IntArray, a: int, c: int, b: int, d: int) -> bool
     return bool(not _comes_before(corners, low_now, low_new) and _comes_before(corners, high_new, high_now))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def ascending_order(keys: IntArray) -> IntArray:
     """Indices (n,) that sort int64 keys (n,), ties by index: a merge sort, much faster to compile than numpy's."""
     count = len(keys)
@@ -80,7 +80,7 @@ def ascending_order(keys: IntArray) -> IntArray:
     return order
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _neighbours(triangles: IntArray, count: int, corner_count: int) -> IntArray:
     """(count, 3) the triangle across the edge from each corner to the next; -1 at a ring."""
     keys = np.empty(3 * count, np.int64)
@@ -98,7 +98,7 @@ def _neighbours(triangles: IntArray, count: int, corner_count: int) -> IntArray:
     return neighbours
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _flip(triangles: IntArray, neighbours: IntArray, t: int, k: int, other: int, m: int) -> None:
     """Turn the diagonal that edge k of triangle t shares with edge m of another."""
     a, c, b = triangles[t, k], triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]
@@ -121,7 +121,7 @@ def _flip(triangles: IntArray, neighbours: IntArray, t: int, k: int, other: int,
                 break
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def flip_to_delaunay(corners: IntArray, flat: IntArray, triangles: IntArray, count: int) -> None:
     """Flip diagonals in place until none is preferred (at most as often as there are pairs of corners)."""
     neighbours = _neighbours(triangles, count, len(flat))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray
 from pipeline.triangulation.ear_clipping import clip_ears
 from pipeline.triangulation.edge_flips import flip_to_delaunay
@@ -64,7 +64,7 @@ def triangulate_face(vertices: FloatArray, rings: Sequence[Sequence[int]]) -> In
     return ids[triangles]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def triangulate_rings(corners: IntArray, ring_offsets: IntArray) -> tuple[IntArray, int]:
     """Triangulate one face from the corners of its rings.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import IntArray
 from pipeline.triangulation.projection import in_cone, same_place, turn_of
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _blocks(flat: IntArray, a: int, b: int, p: int, q: int) -> bool:
     """Whether the edge a, b crosses the bridge p, q, or its corner a lies on the bridge between the ends."""
     if same_place(flat, a, p) or same_place(flat, a, q):
@@ -28,7 +28,7 @@ def _blocks(flat: IntArray, a: int, b: int, p: int, q: int) -> bool:
     return (side_p > 0 and side_q < 0) or (side_p < 0 and side_q > 0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _free_bridge(
     flat: IntArray, chain: IntArray, length: int, waiting: IntArray, stops: IntArray, p: int, q: int
 ) -> bool:
@@ -44,7 +44,7 @@ def _free_bridge(
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _splice(chain: IntArray, length: int, place: int, start: int, stop: int, corner: int, touching: bool) -> int:
     """Insert the hole start:stop behind chain[place], from its corner once round and back; the new length."""
     extra = stop - start if touching else stop - start + 2
@@ -63,7 +63,7 @@ def _splice(chain: IntArray, length: int, place: int, start: int, stop: int, cor
     return length + extra
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join_touching(flat: IntArray, chain: IntArray, length: int, start: int, stop: int) -> int:
     """Join the hole start:stop to the chain at a common corner; the new length, or the old where they do not touch."""
     for i in range(length):
@@ -75,7 +75,7 @@ def _join_touching(flat: IntArray, chain: IntArray, length: int, start: int, sto
     return length
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join_by_bridge(
     flat: IntArray, chain: IntArray, length: int, ring_offsets: IntArray, waiting: IntArray, hole: int, corner: int
 ) -> int:
@@ -103,7 +103,7 @@ def _join_by_bridge(
     return length
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rightmost_corner(flat: IntArray, start: int, stop: int) -> int:
     """The corner of start:stop that lies farthest right, of several the highest."""
     best = start
@@ -113,7 +113,7 @@ def _rightmost_corner(flat: IntArray, start: int, stop: int) -> int:
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def one_chain(flat: IntArray, ring_offsets: IntArray) -> tuple[IntArray, int]:
     """The outer ring with all holes joined to it as one chain of corners, and its length; 0 without bridges.
 

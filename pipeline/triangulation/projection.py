@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import IntArray
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def area_vector(corners: IntArray, start: int, stop: int) -> tuple[int, int, int]:
     """Twice the vector area of the ring corners[start:stop] (Newell's normal), in mm2: exact."""
     x = y = z = 0
@@ -29,7 +29,7 @@ def area_vector(corners: IntArray, start: int, stop: int) -> tuple[int, int, int
     return x, y, z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def project_along_dominant_axis(corners: IntArray, outer_stop: int) -> tuple[IntArray, bool]:
     """Drop the coordinate in which the outer ring's normal is longest.
 
@@ -61,20 +61,20 @@ def project_along_dominant_axis(corners: IntArray, outer_stop: int) -> tuple[Int
     return flat, turn != 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def turn_of(flat: IntArray, a: int, b: int, c: int) -> int:
     """Twice the signed area of the triangle a, b, c in mm2: positive where it turns left."""
     right, up = flat[b, 0] - flat[a, 0], flat[b, 1] - flat[a, 1]
     return int(right * (flat[c, 1] - flat[a, 1]) - up * (flat[c, 0] - flat[a, 0]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def same_place(flat: IntArray, a: int, b: int) -> bool:
     """Whether two corners coincide."""
     return bool(flat[a, 0] == flat[b, 0] and flat[a, 1] == flat[b, 1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def in_cone(flat: IntArray, before: int, node: int, after: int, target: int) -> bool:
     """Whether the way from node to target starts strictly inside the polygon on the left of before, node, after."""
     left_of_first = turn_of(flat, before, node, target)

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 
 KERNEL = """
-from numba import njit
+from pipeline.compiler import kernel
 
-@njit(cache=True)
+@kernel
 def half(x):
     return x / {divisor}
 """

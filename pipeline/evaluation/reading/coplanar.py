@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.geometry import solve_plane_moments
 from pipeline.model import FloatArray, IntArray
 
@@ -18,7 +18,7 @@ ANGLE_DEG = 0.1
 _LEAST_UP = 1e-9
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def face_vectors(xyz: FloatArray, corners: IntArray, ring_offsets: IntArray, face_rings: IntArray) -> FloatArray:
     """Area vectors of faces (Newell): the direction is the normal, the length the area less the holes'.
 
@@ -52,7 +52,7 @@ def face_vectors(xyz: FloatArray, corners: IntArray, ring_offsets: IntArray, fac
     return vectors
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _neighbours(
     corners: IntArray, ring_offsets: IntArray, face_rings: IntArray, vertices: int
 ) -> tuple[IntArray, IntArray]:
@@ -96,7 +96,7 @@ def _neighbours(
     return offsets, others
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _least_cosine(xyz: FloatArray, corners: IntArray, area: float, distance_m: float, angle_deg: float) -> float:
     """Cosine of the largest angle that a face may have to a plane that it lies in: what a small error explains."""
     extent = 0.0
@@ -110,7 +110,7 @@ def _least_cosine(xyz: FloatArray, corners: IntArray, area: float, distance_m: f
     return math.cos(max(math.radians(angle_deg), explained))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def coplanar_regions(
     xyz: FloatArray,
     corners: IntArray,

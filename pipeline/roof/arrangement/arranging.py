@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import shapely
-from numba import njit
 from shapely import MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason
 from pipeline.roof.arrangement.candidate_lines import border_places, candidate_lines
@@ -35,7 +35,7 @@ _CUTS = 3
 """How often cells are cut whose plane leaves the points."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _arranged(
     points: FloatArray,
     labels: LabelArray,

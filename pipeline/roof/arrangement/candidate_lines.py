@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import vertical_distance_m
 
@@ -33,7 +33,7 @@ _LEAST_POINTS = 4
 _MAX_DIRECTIONS = 24
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _outline_directions(edges: FloatArray) -> FloatArray:
     """Directions of the long edges of the outline and those square to them, longest first, in [0, pi)."""
     length = np.hypot(edges[:, 2] - edges[:, 0], edges[:, 3] - edges[:, 1])
@@ -48,7 +48,7 @@ def _outline_directions(edges: FloatArray) -> FloatArray:
     return found[:n].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _with_direction(found: FloatArray, n: int, angle: float) -> int:
     """Append a direction unless a like one is there; the new number of them."""
     for q in range(n):
@@ -61,7 +61,7 @@ def _with_direction(found: FloatArray, n: int, angle: float) -> int:
     return n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def border_places(
     labels: LabelArray, place: LabelArray, low_x: float, low_y: float, cell_m: float, columns: int, n_planes: int
 ) -> tuple[FloatArray, IntArray]:
@@ -96,7 +96,7 @@ def border_places(
     return places[:m][order], pairs[:m][order]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_band(
     places: FloatArray, first: int, last: int, line_of: LabelArray, directions: FloatArray, n: int, band_m: float
 ) -> tuple[int, float, float]:
@@ -122,7 +122,7 @@ def _best_band(
     return most, best_angle, best_offset
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _parting_shift(
     points: FloatArray,
     planes: FloatArray,
@@ -176,7 +176,7 @@ def _parting_shift(
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def candidate_lines(
     places: FloatArray,
     pairs: IntArray,

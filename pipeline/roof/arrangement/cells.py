@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
 from pipeline.roof.arrangement.subdivision import FACE, ORIGIN, between_vertices
@@ -28,7 +28,7 @@ _DOUBTFUL_SHARE = 0.5
 space, as a crown does, is met by about half of them."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cells_of_points(xy: IntArray, graph: LabelArray, n_edges: int, points: FloatArray) -> LabelArray:
     """The cell in which each point lies, (n,) int32; -1 outside.
 
@@ -73,7 +73,7 @@ def cells_of_points(xy: IntArray, graph: LabelArray, n_edges: int, points: Float
     return cells
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cell_areas_m2(xy: IntArray, graph: LabelArray, n_edges: int, n_cells: int) -> FloatArray:
     """Area of every cell, (c,) float64."""
     twice = np.zeros(n_cells, np.int64)
@@ -84,7 +84,7 @@ def cell_areas_m2(xy: IntArray, graph: LabelArray, n_edges: int, n_cells: int) -
     return twice.astype(np.float64) * 0.5e-6
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cell_costs(
     xy: IntArray,
     graph: LabelArray,
@@ -155,7 +155,7 @@ def cell_costs(
     return costs, misfits
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cell_borders(xy: IntArray, graph: LabelArray, n_edges: int, cost_per_m: float) -> tuple[LabelArray, IntArray]:
     """Pairs of cells that share an edge, and what a border of faces there costs."""
     pairs = np.empty((n_edges // 2, 2), np.int32)
@@ -173,7 +173,7 @@ def cell_borders(xy: IntArray, graph: LabelArray, n_edges: int, cost_per_m: floa
     return pairs[:m], weights[:m]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def connected_faces(labels: LabelArray, pairs: LabelArray) -> tuple[LabelArray, int]:
     """The face of every cell: cells of one label that hang together by edges, numbered by their lowest cell."""
     parent = np.arange(len(labels)).astype(np.int32)
@@ -202,7 +202,7 @@ def connected_faces(labels: LabelArray, pairs: LabelArray) -> tuple[LabelArray, 
     return faces, count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def points_per_cell(cells: LabelArray, n_cells: int) -> LabelArray:
     """How many points lie in each cell, (c,) int32; `cells` as from `cells_of_points`."""
     held = np.zeros(n_cells, np.int32)
@@ -212,7 +212,7 @@ def points_per_cell(cells: LabelArray, n_cells: int) -> LabelArray:
     return held
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def unite_faces(
     misfits: IntArray,
     held: LabelArray,

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.cells import cell_borders, connected_faces
 from pipeline.roof.arrangement.subdivision import (
@@ -33,13 +33,13 @@ _LARGE_COST = 100.0
 """Metres: more than heights differ by."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _face_left(graph: LabelArray, h: int, faces: LabelArray) -> int:
     cell = graph[h, FACE]
     return int(faces[cell]) if cell >= 0 else -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _borders_at(graph: LabelArray, h: int, faces: LabelArray, borders: LabelArray) -> int:
     """The borders between faces that leave the origin of h, turning left; their number."""
     m = 0
@@ -54,7 +54,7 @@ def _borders_at(graph: LabelArray, h: int, faces: LabelArray, borders: LabelArra
             return m
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _crosses(around: LabelArray, heights: FloatArray, m: int) -> bool:
     """Whether a face meets itself at a vertex, or walls of four faces meet above it."""
     for i in range(m):
@@ -70,7 +70,7 @@ def _crosses(around: LabelArray, heights: FloatArray, m: int) -> bool:
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _give_corner(
     xy: IntArray,
     graph: LabelArray,
@@ -117,13 +117,13 @@ def _give_corner(
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _height_m(plane: FloatArray, x_mm: float, y_mm: float) -> float:
     height: float = plane[0] * x_mm * 1e-3 + plane[1] * y_mm * 1e-3 + plane[2]
     return height
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _corner_cost(
     xy: IntArray, graph: LabelArray, planes: FloatArray, own: int, giver: int, beyond: int, edge: int, corner_mm: float
 ) -> float:
@@ -144,7 +144,7 @@ def _corner_cost(
     return cost
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def part_crossings(
     xy: IntArray,
     graph: LabelArray,
@@ -234,7 +234,7 @@ def part_crossings(
     return faces, n_faces
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def corners_of_borders(
     xy: IntArray, graph: LabelArray, n_vertices: int, n_edges: int, n_outline: int, faces: LabelArray
 ) -> BoolArray:
@@ -262,7 +262,7 @@ def corners_of_borders(
     return needed
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def trace_faces(
     xy: IntArray, graph: LabelArray, n_edges: int, faces: LabelArray, needed: BoolArray
 ) -> tuple[LabelArray, LabelArray, LabelArray]:
@@ -322,7 +322,7 @@ def trace_faces(
     return vertices[:n].copy(), starts[: rings + 1].copy(), owner[:rings].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rings_of_faces(
     xy: IntArray, vertices: LabelArray, starts: LabelArray, owner: LabelArray, n_faces: int
 ) -> tuple[FloatArray, IntArray, LabelArray, bool]:

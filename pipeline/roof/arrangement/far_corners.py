@@ -16,8 +16,8 @@ import math
 from typing import TypeAlias
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
 from pipeline.roof.arrangement.subdivision import (
@@ -51,7 +51,7 @@ _MOST_LEVEL = 8
 """Horizontal planes that are added at a time: more places where nothing fits are no roof that planes can tell."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def heights_raster(points: FloatArray, spacing_m: float) -> HeightsRaster:
     """Lowest and highest point of every cell of a raster, (r, c) metres, inf and -inf where there is none.
 
@@ -71,7 +71,7 @@ def heights_raster(points: FloatArray, spacing_m: float) -> HeightsRaster:
     return low, high, west, south, side
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _heights_at(raster: HeightsRaster, x_mm: float, y_mm: float) -> tuple[float, float, float]:
     """Lowest and highest point around a place, and within what distance of it they were looked for, metres.
 
@@ -92,14 +92,14 @@ def _heights_at(raster: HeightsRaster, x_mm: float, y_mm: float) -> tuple[float,
     return lowest, highest, within
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_heights(xy: IntArray, first: int, last: int, raster: HeightsRaster, around: HeightsAround) -> None:
     """The heights around vertices that are new."""
     for v in range(first, last):
         around[0][v], around[1][v], around[2][v] = _heights_at(raster, float(xy[v, 0]), float(xy[v, 1]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def heights_around(xy: IntArray, n_vertices: int, raster: HeightsRaster) -> HeightsAround:
     """Lowest and highest point around every vertex and within what distance, (v,) metres each, with room for more.
 
@@ -110,7 +110,7 @@ def heights_around(xy: IntArray, n_vertices: int, raster: HeightsRaster) -> Heig
     return around
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _outside_m(plane: FloatArray, x_mm: float, y_mm: float, heights: tuple[float, float, float], side: float) -> float:
     """How far a plane lies above (or, negative, below) what the heights around a place allow; 0 without heights."""
     lowest, highest, within = heights
@@ -122,19 +122,19 @@ def _outside_m(plane: FloatArray, x_mm: float, y_mm: float, heights: tuple[float
     return outside
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _vertex_outside_m(plane: FloatArray, xy: IntArray, v: int, around: HeightsAround) -> float:
     """The same at a vertex."""
     lowest, highest, within, side = around
     return _outside_m(plane, float(xy[v, 0]), float(xy[v, 1]), (lowest[v], highest[v], within[v]), side)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_far(plane: FloatArray, xy: IntArray, v: int, around: HeightsAround, far_m: float) -> bool:
     return abs(_vertex_outside_m(plane, xy, v, around)) > far_m
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_costs_of_far_planes(
     xy: IntArray,
     graph: LabelArray,
@@ -176,7 +176,7 @@ def add_costs_of_far_planes(
                 misfits[cell, k] += cost
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def with_level_planes(
     xy: IntArray,
     graph: LabelArray,
@@ -219,7 +219,7 @@ def with_level_planes(
     return extended[:k].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _plane_beyond(
     points: FloatArray,
     cells: LabelArray,
@@ -249,7 +249,7 @@ def _plane_beyond(
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cut_where_planes_meet(
     xy: IntArray,
     graph: LabelArray,
@@ -276,7 +276,7 @@ def _cut_where_planes_meet(
     cut_by_line(xy, graph, counts, meeting, line, snap_mm, spans, cell)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _end_of_chord(
     xy: IntArray,
     graph: LabelArray,
@@ -309,7 +309,7 @@ def _end_of_chord(
     return int(counts[0] - 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cut_by_chord(
     xy: IntArray,
     graph: LabelArray,
@@ -342,7 +342,7 @@ def _cut_by_chord(
             return
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cut_off_far_corners(
     xy: IntArray,
     graph: LabelArray,

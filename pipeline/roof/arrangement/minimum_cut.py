@@ -9,12 +9,12 @@ Costs are integers: sums and cuts are exact and do not depend on the order of an
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import IntArray, LabelArray
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def neighbour_lists(n: int, edges: LabelArray, weights: IntArray) -> tuple[LabelArray, LabelArray, IntArray]:
     """The edges of every node in compressed rows.
 
@@ -54,7 +54,7 @@ def neighbour_lists(n: int, edges: LabelArray, weights: IntArray) -> tuple[Label
     return starts, others, costs
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _distances(
     first: LabelArray, following: LabelArray, target: LabelArray, capacity: IntArray, distance: LabelArray, n: int
 ) -> bool:
@@ -79,7 +79,7 @@ def _distances(
     return bool(distance[n + 1] >= 0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cut(
     first: LabelArray, following: LabelArray, target: LabelArray, capacity: IntArray, distance: LabelArray, n: int
 ) -> None:
@@ -139,7 +139,7 @@ def _cut(
             arc = following[arc]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _number_those_that_may_change(
     costs: IntArray,
     nodes: LabelArray,
@@ -199,7 +199,7 @@ def _number_those_that_may_change(
                 tail += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def expand_labels(
     costs: IntArray,
     allowed: LabelArray,
@@ -311,7 +311,7 @@ def expand_labels(
             number[p] = -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def every_label(n: int, k: int) -> tuple[LabelArray, LabelArray]:
     """The lists of `expand_labels` where every node can take every label."""
     allowed = np.empty(n * k, np.int32)

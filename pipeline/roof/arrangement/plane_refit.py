@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import vertical_distance_m
 
@@ -17,7 +17,7 @@ _LEAST_WIDTH_M = 0.2
 """Standard deviation across the longest direction of the points, below which they tell no slope across it."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def labels_of_points(
     points: FloatArray, labels: LabelArray, place: LabelArray, low_x: float, low_y: float, cell_m: float, columns: int
 ) -> LabelArray:
@@ -33,7 +33,7 @@ def labels_of_points(
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fit(points: FloatArray, chosen: LabelArray, plane: FloatArray, cap_m: float, fitted: FloatArray) -> bool:
     """Least squares over the chosen points nearer than the cap to a plane; whether they tell one."""
     n = 0
@@ -65,7 +65,7 @@ def _fit(points: FloatArray, chosen: LabelArray, plane: FloatArray, cap_m: float
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def refitted_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, cap_m: float) -> FloatArray:
     """Every plane by least squares over the points of its places that it explains, while that lowers their cost.
 
@@ -109,7 +109,7 @@ def refitted_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, 
     return better
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def support_of_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, cap_m: float) -> FloatArray:
     """Points that each plane explains of those with its label, and their squared vertical residuals, (k, 2) float64."""
     support = np.zeros((len(planes), 2))

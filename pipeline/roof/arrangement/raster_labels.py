@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.minimum_cut import expand_labels, neighbour_lists
 
@@ -24,14 +24,14 @@ _ROUNDS = 3
 _SETTLING_ROUNDS = 8
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def vertical_distance_m(point: FloatArray, plane: FloatArray) -> float:
     """How far a point lies above or below the plane z = a x + b y + c."""
     distance: float = abs(point[2] - plane[0] * point[0] - plane[1] * point[1] - plane[2])
     return distance
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def raster_cells(
     edges: FloatArray, low_x: float, low_y: float, cell_m: float, columns: int, rows: int
 ) -> tuple[LabelArray, LabelArray]:
@@ -75,7 +75,7 @@ def raster_cells(
     return number, place[:n].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cell_costs(
     points: FloatArray,
     planes: FloatArray,
@@ -112,7 +112,7 @@ def _cell_costs(
     return costs, count, near
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _first_labels(
     costs: IntArray, count: LabelArray, number: LabelArray, place: LabelArray, columns: int, rows: int
 ) -> LabelArray:
@@ -146,7 +146,7 @@ def _first_labels(
     return labels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _raster_edges(
     number: LabelArray, place: LabelArray, columns: int, rows: int, side: int, diagonal: int
 ) -> tuple[LabelArray, IntArray]:
@@ -169,7 +169,7 @@ def _raster_edges(
     return edges[:m], weights[:m]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _near_own_points(
     near: LabelArray, labels: LabelArray, number: LabelArray, place: LabelArray, columns: int, rows: int
 ) -> tuple[LabelArray, LabelArray]:
@@ -199,7 +199,7 @@ def _near_own_points(
     return nodes, starts
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settle(
     costs: IntArray,
     place: LabelArray,
@@ -269,7 +269,7 @@ def _settle(
             break
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def raster_labels(
     points: FloatArray, planes: FloatArray, edges: FloatArray, cell_m: float, cap_m: float, cost_per_m: float
 ) -> tuple[LabelArray, LabelArray, float, float, int]:

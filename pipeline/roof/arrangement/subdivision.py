@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
 
 ORIGIN, NEXT, PREVIOUS, FACE, LINE = 0, 1, 2, 3, 4
@@ -31,21 +31,21 @@ _APART_MM = 10.0
 _LEAST_SUPPORT_MM = 10.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def turn_of(xy: IntArray, a: int, b: int, c: int) -> int:
     """Positive where a, b, c turn left; exact."""
     turn: int = (xy[b, 0] - xy[a, 0]) * (xy[c, 1] - xy[a, 1]) - (xy[b, 1] - xy[a, 1]) * (xy[c, 0] - xy[a, 0])
     return turn
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _in_box(xy: IntArray, a: int, b: int, p: int) -> bool:
     between_x: bool = min(xy[a, 0], xy[b, 0]) <= xy[p, 0] <= max(xy[a, 0], xy[b, 0])
     between_y: bool = min(xy[a, 1], xy[b, 1]) <= xy[p, 1] <= max(xy[a, 1], xy[b, 1])
     return between_x and between_y
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _segments_meet(xy: IntArray, a: int, b: int, c: int, d: int) -> bool:
     """Whether two closed segments without a common end vertex have a common point; exact."""
     low_x, high_x = min(xy[a, 0], xy[b, 0]), max(xy[a, 0], xy[b, 0])
@@ -66,7 +66,7 @@ def _segments_meet(xy: IntArray, a: int, b: int, c: int, d: int) -> bool:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _same_ray(xy: IntArray, a: int, b: int, c: int) -> bool:
     """Whether b and c lie in the same direction from a; exact."""
     if turn_of(xy, a, b, c) != 0:
@@ -75,7 +75,7 @@ def _same_ray(xy: IntArray, a: int, b: int, c: int) -> bool:
     return dot > 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_clear(xy: IntArray, graph: LabelArray, n_edges: int, a: int, b: int, skipped: int) -> bool:
     """Whether a segment touches no edge but at its own end vertices; the edge `skipped` and its twin do not count."""
     low_x, high_x = min(xy[a, 0], xy[b, 0]), max(xy[a, 0], xy[b, 0])
@@ -99,7 +99,7 @@ def _is_clear(xy: IntArray, graph: LabelArray, n_edges: int, a: int, b: int, ski
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _has_clearance(xy: IntArray, graph: LabelArray, n_edges: int, a: int, b: int, face: int) -> bool:
     """Whether no vertex of a cell comes too near to a chord."""
     dx, dy = float(xy[b, 0] - xy[a, 0]), float(xy[b, 1] - xy[a, 1])
@@ -117,7 +117,7 @@ def _has_clearance(xy: IntArray, graph: LabelArray, n_edges: int, a: int, b: int
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_apart(xy: IntArray, graph: LabelArray, n_edges: int, w: int, skipped: int) -> bool:
     """Whether a new vertex keeps away from all edges but the one that it lies on, also where two meet narrowly."""
     for h in range(0, n_edges, 2):
@@ -133,7 +133,7 @@ def _is_apart(xy: IntArray, graph: LabelArray, n_edges: int, w: int, skipped: in
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def insert_vertex(xy: IntArray, n_vertices: int, graph: LabelArray, n_edges: int, h: int, x: int, y: int) -> bool:
     """Cut half-edge h and its twin at a new vertex, unless that would touch other edges.
 
@@ -165,7 +165,7 @@ def insert_vertex(xy: IntArray, n_vertices: int, graph: LabelArray, n_edges: int
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _corner(xy: IntArray, graph: LabelArray, n_edges: int, v: int, towards: int, face: int) -> int:
     """The half-edge that leaves v in the corner of a cell into which `towards` lies; -1 for none."""
     for h in range(n_edges):
@@ -183,7 +183,7 @@ def _corner(xy: IntArray, graph: LabelArray, n_edges: int, v: int, towards: int,
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def twice_loop_area(xy: IntArray, graph: LabelArray, start: int) -> int:
     """Twice the signed area of the loop of a half-edge in mm2; exact."""
     area = 0
@@ -197,7 +197,7 @@ def twice_loop_area(xy: IntArray, graph: LabelArray, start: int) -> int:
             return int(area)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_in_loop(xy: IntArray, graph: LabelArray, start: int, v: int) -> int:
     """1 where vertex v lies inside a loop, -1 outside, 0 on it; exact."""
     inside = False
@@ -214,7 +214,7 @@ def _is_in_loop(xy: IntArray, graph: LabelArray, start: int, v: int) -> int:
             return 1 if inside else -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _set_face(graph: LabelArray, start: int, face: int) -> None:
     h = start
     while True:
@@ -224,7 +224,7 @@ def _set_face(graph: LabelArray, start: int, face: int) -> None:
             return
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def insert_chord(
     xy: IntArray, graph: LabelArray, n_edges: int, n_faces: int, u: int, v: int, face: int, line: int
 ) -> int:
@@ -275,13 +275,13 @@ def insert_chord(
     return 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def between_vertices(y: float) -> float:
     """The nearest ordinate half-way between those that vertices can have: a ray there passes none."""
     return math.floor(y) + 0.5
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cell_at(xy: IntArray, graph: LabelArray, n_edges: int, x: float, y: float) -> int:
     """The cell in which a place lies, to half a millimetre; -1 outside."""
     y = between_vertices(y)
@@ -298,7 +298,7 @@ def cell_at(xy: IntArray, graph: LabelArray, n_edges: int, x: float, y: float) -
     return face
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def outline_graph(
     ring_xy: IntArray, ring_starts: LabelArray, polygon_of_ring: LabelArray, room: int
 ) -> tuple[IntArray, LabelArray]:
@@ -339,7 +339,7 @@ def outline_graph(
     return xy, graph
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cut_by_line(
     xy: IntArray,
     graph: LabelArray,
@@ -416,7 +416,7 @@ def cut_by_line(
             counts[2] += made
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _supported_spans(
     line: FloatArray, number: int, line_of: LabelArray, places: FloatArray, half_m: float
 ) -> FloatArray:
@@ -442,7 +442,7 @@ def _supported_spans(
     return spans[:m]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def subdivide(
     xy: IntArray,
     graph: LabelArray,

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import shapely
-from numba import njit
 from shapely import MultiPolygon, Polygon
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.roof.footprint import polygons_of
@@ -148,7 +148,7 @@ def _least_distance_mm(vertices: FloatArray) -> float:
     return float(apart.min())
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _label_at(u: float, v: float, regions: FloatArray, counts: LabelArray, planes: FloatArray) -> int:
     """Part and plane over a place."""
     for p in range(len(regions)):

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from numba import njit
 from shapely import MultiPolygon
 
+from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, LabelArray, Plane, Reason
 from pipeline.roof.partition import RoofPartition
@@ -157,7 +157,7 @@ def fit_templates(points: FloatArray, outline_mm: MultiPolygon) -> Templates:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fit_in_frame(
     points: FloatArray, edges: FloatArray, origin: FloatArray, sigma_m: float, fewest: int
 ) -> tuple[float, tuple[float, int, FloatArray, LabelArray, FloatArray, FloatArray, LabelArray]]:
@@ -166,7 +166,7 @@ def _fit_in_frame(
     return direction, fit_parts(framed, turned, sigma_m, fewest)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _in_frame(points: FloatArray, edges: FloatArray, origin: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """The main direction of an outline, and points and edges along it and across."""
     # written out: the last bits of a matrix product depend on the machine

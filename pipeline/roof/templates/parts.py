@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray, LabelArray
 from pipeline.roof.templates.shapes import CAP_SIGMAS, MOST_PLANES, best_shape, copy_planes, height
 
@@ -33,7 +33,7 @@ _FINALISTS = 3
 """Cuts whose sides are fitted thoroughly."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def main_direction(edges: FloatArray) -> float:
     """The direction along which, or across which, most of an outline runs; radians, -pi/4 to pi/4.
 
@@ -69,7 +69,7 @@ def main_direction(edges: FloatArray) -> float:
     return best - quarter * round(best / quarter)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _box_of(edges: FloatArray, region: FloatArray) -> FloatArray:
     """Extent of the outline within a rectangle: of its edges there, and of the rectangle's corners inside it."""
     box = np.array([math.inf, -math.inf, math.inf, -math.inf])
@@ -102,7 +102,7 @@ def _box_of(edges: FloatArray, region: FloatArray) -> FloatArray:
     return box
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sort(values: FloatArray) -> None:
     """Ascending, in place; few values, and a call into numpy's would compile for a second."""
     for i in range(1, len(values)):
@@ -114,7 +114,7 @@ def _sort(values: FloatArray) -> None:
         values[j] = value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cuts(points: FloatArray, edges: FloatArray, box: FloatArray) -> tuple[FloatArray, int]:
     """Cuts worth a trial: their axis, place and price in parameters; their number."""
     m, e = len(points), len(edges)
@@ -143,7 +143,7 @@ def _cuts(points: FloatArray, edges: FloatArray, box: FloatArray) -> tuple[Float
     return cuts, count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _side(points: FloatArray, region: FloatArray, axis: int, place: float, side: int) -> tuple[FloatArray, FloatArray]:
     """The points and the region on one side of a cut: 0 below, 1 from it on."""
     own = np.empty_like(points)
@@ -159,7 +159,7 @@ def _side(points: FloatArray, region: FloatArray, axis: int, place: float, side:
     return own[:m], half
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settled_place(
     points: FloatArray,
     box: FloatArray,
@@ -207,7 +207,7 @@ def _settled_place(
     return settled
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_cut(
     points: FloatArray,
     edges: FloatArray,
@@ -269,7 +269,7 @@ def _best_cut(
     return best, axis, place, price
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fit_parts(
     points: FloatArray, edges: FloatArray, sigma_m: float, fewest: int
 ) -> tuple[float, int, FloatArray, LabelArray, FloatArray, FloatArray, LabelArray]:

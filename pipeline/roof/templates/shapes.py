@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pipeline.compiler import kernel
 from pipeline.model import FloatArray
 
 MOST_PLANES = 4
@@ -35,7 +35,7 @@ _BEYOND_M = 0.3
 _REFITS = 4
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def robust_line(t: FloatArray, z: FloatArray, reach_m: float, level: bool) -> tuple[float, float]:
     """The line z = c + s t that most points lie near, by graduated non-convexity.
 
@@ -77,7 +77,7 @@ def robust_line(t: FloatArray, z: FloatArray, reach_m: float, level: bool) -> tu
     return c, s
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def height(planes: FloatArray, count: int, u: float, v: float) -> tuple[float, int]:
     """Height of a lower envelope over a place, and the plane that gives it."""
     lowest, which = math.inf, -1
@@ -88,7 +88,7 @@ def height(planes: FloatArray, count: int, u: float, v: float) -> tuple[float, i
     return lowest, which
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def misfit(planes: FloatArray, count: int, points: FloatArray, sigma_m: float) -> float:
     """Sum of the squared residuals over sigma, each at most the square of `CAP_SIGMAS`."""
     total = 0.0
@@ -99,7 +99,7 @@ def misfit(planes: FloatArray, count: int, points: FloatArray, sigma_m: float) -
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _stays_near(planes: FloatArray, count: int, points: FloatArray, box: FloatArray) -> bool:
     """Whether slopes are those of a roof, and the envelope stays near the heights of the points within the box."""
     steepest = 0.0
@@ -139,7 +139,7 @@ def _stays_near(planes: FloatArray, count: int, points: FloatArray, box: FloatAr
     return top <= high + beyond_m and bottom >= low - beyond_m
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _refit(planes: FloatArray, count: int, points: FloatArray, reach_m: float) -> bool:
     """Let every plane of an envelope go free: points to their plane, planes to their points (Magnani and Boyd 2009).
 
@@ -180,7 +180,7 @@ def _refit(planes: FloatArray, count: int, points: FloatArray, reach_m: float) -
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _drop(u: float, v: float, axis: int, ridge: float, box: FloatArray, ends: int) -> float:
     """How far, in plan, a place lies below the ridge of a roof of equal pitch.
 
@@ -200,7 +200,7 @@ def _drop(u: float, v: float, axis: int, ridge: float, box: FloatArray, ends: in
     return drop
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _ridged(planes: FloatArray, axis: int, ridge: float, box: FloatArray, ends: int, c: float, slope: float) -> int:
     """The planes of that roof, from its ridge's elevation and its slope; their number."""
     along = 1 - axis
@@ -218,7 +218,7 @@ def _ridged(planes: FloatArray, axis: int, ridge: float, box: FloatArray, ends: 
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def copy_planes(planes: FloatArray, to: FloatArray) -> None:
     """Copy planes; written out, since assigning whole arrays compiles for seconds."""
     for k in range(len(planes)):
@@ -226,7 +226,7 @@ def copy_planes(planes: FloatArray, to: FloatArray) -> None:
             to[k, q] = planes[k, q]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def best_shape(
     points: FloatArray, box: FloatArray, sigma_m: float, cost_of_parameter: float, thorough: bool
 ) -> tuple[float, int, int, FloatArray]:
