@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import functools
+import hashlib
+import os
+import sys
 from collections.abc import Callable, Mapping
+from importlib.metadata import version
 from typing import Any, TypeVar, overload
+
+from pipeline.compiler import store
+from pipeline.compiler.fingerprint import Kerneled, fingerprint
 
 
 class Kernel:
@@ -26,15 +33,32 @@ class Kernel:
         self.options = dict(options)
 
     @functools.cached_property
+    def fingerprint(self) -> bytes:
+        """A hash of all that the machine code depends on but for signature and processor, 32 bytes."""
+        return hashlib.sha256(_versions() + fingerprint(self.py_func, self.options, _source_of)).digest()
+
+    @property
+    def prefix(self) -> str:
+        """With which the names of its files begin."""
+        place = f"{sys.implementation.cache_tag}-{os.uname().machine}-{_processor()}"
+        return f"{self.py_func.__module__}.{self.py_func.__qualname__}.{place}-"
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether there is a file of it, of whatever signature; numba is not asked."""
+        return bool(os.environ.get("NUMBA_DISABLE_JIT")) or store.is_kept(self.prefix, self.fingerprint)
+
+    @functools.cached_property
     def dispatcher(self) -> Any:
         """Numba's own object; the function itself where numba is switched off."""
-        import numba
+        os.environ["NUMBA_CPU_NAME"] = _processor()
+        from pipeline.compiler.backend import dispatcher_of
 
-        return numba.njit(cache=True, nogil=True, **self.options)(self.py_func)
+        return dispatcher_of(self.py_func, self.options, self.prefix, lambda: self.fingerprint)
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
         """The function's value."""
-        return self.dispatcher(*arguments)
+        return self.dispatcher(*arguments, **named)
 
     @property
     def _numba_type_(self) -> Any:
@@ -44,6 +68,24 @@ class Kernel:
     def __reduce__(self) -> str:
         """Kernels travel by name."""
         return self.py_func.__qualname__
+
+
+def _processor() -> str:
+    """The processor to compile for: by default any of this machine's kind.
+
+    Such code is as fast as that for the very processor, and its files can be carried from machine to machine.
+    """
+    return os.environ.get("NUMBA_CPU_NAME") or "generic"
+
+
+@functools.cache
+def _versions() -> bytes:
+    """The versions that machine code hangs on."""
+    return repr([version(name) for name in ("numba", "llvmlite")]).encode()
+
+
+def _source_of(value: Any) -> Kerneled | None:
+    return (value.py_func, value.options) if isinstance(value, Kernel) else None
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])

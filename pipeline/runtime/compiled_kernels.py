@@ -1,4 +1,4 @@
-"""Whether the kernels of a run are compiled already: numba keeps them on disk, by source file, version and processor.
+"""Whether the kernels of a run are compiled already.
 
 A run that meets none compiles them in each of its processes at once, which takes longer than many a run.
 """
@@ -25,31 +25,19 @@ MODELLING = (take_regions, raster_labels, subdivide, triangulate_rings, shell_in
 
 
 def kernels_are_compiled(kernels: Iterable[Any] = (*GROUND, *MODELLING)) -> bool:
-    """Whether a run in this place need not compile kernels; compiles nothing, and reads one small file a kernel.
+    """Whether a run in this place need not compile kernels; compiles nothing, and reads the head of a file per kernel.
 
-    It holds for this user on this machine (or whoever shares `NUMBA_CACHE_DIR`); of workers elsewhere it tells nothing.
-    A kernel counts where its index is of this source file, this version of numba and this processor, as numba itself
-    asks before it compiles. A run that was cut off while it compiled leaves some of them without.
+    It holds for this user on this machine, or for all who share `NUMBA_CACHE_DIR`; it says nothing of workers
+    elsewhere.
 
     Parameters
     ----------
     kernels : iterable
-        Those that bear witness for all; `MODELLING` is enough for inputs with classes.
+        Those that stand for all; `MODELLING` is enough for inputs with classes.
 
     Returns
     -------
     bool
         Also True where numba is switched off (`NUMBA_DISABLE_JIT`): nothing is compiled then.
     """
-    return all(_is_compiled(kernel) for kernel in kernels)
-
-
-def _is_compiled(kernel: Any) -> bool:
-    """Whether numba would find a kernel on disk, for arguments of whatever types."""
-    if not hasattr(kernel, "targetctx"):
-        # a plain function: numba is switched off
-        return True
-    processor = kernel.targetctx.codegen().magic_tuple()
-    # numba has no public question for this; the test holds this against kernels that were and were not compiled
-    index = kernel._cache._cache_file._load_index()  # noqa: SLF001
-    return any(key[1] == processor for key in index)
+    return all(kernel.is_compiled for kernel in kernels)

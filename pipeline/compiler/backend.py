@@ -1,0 +1,294 @@
+"""How numba compiles our kernels: the one module that knows numba's inside.
+
+A kernel that only other kernels call needs no machine code of its own: its callers link its code and optimise it
+together with theirs. numba makes machine code and wrappers for each all the same, and optimises each by itself; so it
+does for its own helpers (`np.argsort` and the like). Here code is optimised and generated only for what is called from
+Python. What is compiled is kept in files of ours (`pipeline.compiler.store`) under fingerprints that cover callees.
+
+It is written against the versions in `KNOWN`. With any other numba, or with `GABLEWORK_PLAIN_NUMBA` set, kernels are
+`numba.njit(cache=True)` and nothing more: slower to compile, equal in what they compute.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import llvmlite.binding as llvm
+import numba
+from numba.core import codegen, compiler, config, event, registry, serialize, sigutils
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.runtime import _nrt_python
+from numba.core.targetconfig import ConfigStack
+
+from pipeline.compiler import store
+from pipeline.compiler.store import Stored
+
+KNOWN = ("0.68.",)
+"""Versions of numba whose inside is known."""
+COMMON_OPTIONS = {"nopython": True, "nogil": True}
+"""Of all kernels."""
+_ENVIRONMENTS = "_ZN08NumbaEnv"
+
+
+def is_known() -> bool:
+    """Whether kernels are compiled in our way."""
+    return numba.__version__.startswith(KNOWN) and not os.environ.get("GABLEWORK_PLAIN_NUMBA")
+
+
+def dispatcher_of(
+    function: Callable[..., Any], options: Mapping[str, Any], prefix: str, fingerprint: Callable[[], bytes]
+) -> Any:
+    """Numba's object for a kernel; the function itself where numba is switched off (`NUMBA_DISABLE_JIT`).
+
+    Parameters
+    ----------
+    function : callable
+        The kernel's plain function.
+    options : mapping
+        Options beyond the common ones.
+    prefix : str
+        With which the names of the kernel's files begin.
+    fingerprint : callable
+        Tells the kernel's fingerprint; asked when a file is looked for.
+    """
+    if config.DISABLE_JIT:
+        return function
+    if not is_known():
+        return numba.njit(cache=True, nogil=True, **options)(function)
+    _prepare()
+    return KernelDispatcher(function, {**COMMON_OPTIONS, **options}, prefix, fingerprint)
+
+
+# --------------------------------------------------------------------------------------------------- the processor
+
+
+def _prepare() -> None:
+    """Set numba up before its first kernel: code for every processor of this kind, and our libraries."""
+    context = registry.cpu_target.target_context
+    if getattr(context, "gablework", False):
+        return
+    context.gablework = True
+    context.codegen()._library_class = _Library
+    make_executable = context.get_executable
+
+    def get_executable(library: Any, fndesc: Any, environment: Any) -> Any:
+        """A C function; for what has no wrapper nothing that could be called."""
+        flags = ConfigStack.top_or_none()
+        if flags is not None and flags.no_cpython_wrapper:
+            return _no_code()
+        made = make_executable(library, fndesc, environment)
+        for referenced in _environments(library):
+            library.codegen.set_env(referenced.env_name, referenced)
+        return made
+
+    context.get_executable = get_executable
+    for name, address in _nrt_python.c_helpers.items():
+        llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
+
+
+def _no_code() -> Any:
+    """What stands where numba wants a C function, and each time another: numba knows compiled functions by them.
+
+    It takes no arguments and there is nothing to pop, so a call would raise in any case.
+    """
+    return {}.popitem
+
+
+def _environments(library: Any) -> list[Any]:
+    """The environments that a library's code refers to: its own and those of what is linked into it."""
+    names = (variable.name for variable in library._final_module.global_variables)
+    found = (compiler.lookup_environment(name) for name in names if name.startswith(_ENVIRONMENTS))
+    return [environment for environment in found if environment is not None and environment.can_cache()]
+
+
+class _Library(codegen.JITCodeLibrary):
+    """Code that is only linked until its address is asked for."""
+
+    _has_code = False
+    _shared_module: Any
+    _bitcode: bytes | None = None
+
+    def finalize(self) -> None:
+        """Link what it calls, and no more."""
+        self._raise_if_finalized()
+        seen = set()
+        for library in self._linking_libraries:
+            if library not in seen:
+                seen.add(library)
+                self._reload_init.update(library._reload_init)
+                self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """The address of a function; its code is generated now if it was not."""
+        self._ensure_finalized()
+        if not self._has_code:
+            self._has_code = True
+            self._optimize_final_module()
+            self._final_module.verify()
+            self._finalized = False
+            self._finalize_final_module()
+        address: int = super().get_pointer_to_function(name)
+        return address
+
+    def load(self, stored: Stored, defined: tuple[str, ...]) -> None:
+        """Take the code of a file."""
+        self._bitcode = stored.bitcode
+        if stored.machine_code:
+            self._has_code = True
+            self.enable_object_caching()
+            self._set_compiled_object(stored.machine_code)
+            self._finalize_final_module()
+            self.codegen._engine._defined_symbols.update(defined)
+        else:
+            self._finalized = True
+
+    def _get_module_for_linking(self) -> Any:
+        if self._shared_module is None and self._bitcode is not None:
+            self._shared_module = llvm.parse_bitcode(self._bitcode)
+            self._bitcode = None
+        return super()._get_module_for_linking()
+
+
+# ------------------------------------------------------------------------------------------------- the dispatcher
+
+
+class _Depth(threading.local):
+    """How many kernels this thread is compiling inside one another."""
+
+    value = 0
+
+
+_DEPTH = _Depth()
+
+
+def _without_wrappers(flags: Any) -> Any:
+    """Numba's flags for a kernel: only what Python calls gets a wrapper, and nothing one for C."""
+    flags.no_cfunc_wrapper = True
+    flags.no_cpython_wrapper = _DEPTH.value > 1
+    return flags
+
+
+class KernelDispatcher(registry.CPUDispatcher):
+    """numba's dispatcher with files of ours."""
+
+    def __init__(
+        self, function: Callable[..., Any], options: Mapping[str, Any], prefix: str, fingerprint: Callable[[], bytes]
+    ) -> None:
+        super().__init__(function, targetoptions=dict(options))
+        self._prefix = prefix
+        self._compiler._customize_flags = _without_wrappers
+        self._fingerprint = fingerprint
+        self._callable: set[tuple[Any, ...]] = set()
+
+    def _compilation_chain_init_hook(self) -> None:
+        """Look for no extensions of numba; there are none that we know."""
+
+    def compile(self, sig: Any) -> Any:
+        """Load or compile the kernel for a signature; its C function where Python asks."""
+        arguments, _ = sigutils.normalize_signature(sig)
+        with global_compiler_lock, self._compiling_counter:
+            for_python = _DEPTH.value == 0
+            if arguments in self.overloads and (arguments in self._callable or not for_python):
+                return self.overloads[arguments].entry_point
+            name = self._prefix + self._suffix(arguments)
+            if not self._load(name, arguments, for_python=for_python):
+                with store.claimed(name):
+                    # another process may have compiled it meanwhile
+                    if not self._load(name, arguments, for_python=for_python):
+                        self._compile(name, arguments, for_python=for_python)
+            return self.overloads[arguments].entry_point
+
+    @staticmethod
+    def _suffix(arguments: tuple[Any, ...]) -> str:
+        """Tells files of one kernel apart: by signature and processor."""
+        processor = registry.cpu_target.target_context.codegen().magic_tuple()
+        return hashlib.sha256(repr((str(arguments), processor)).encode()).hexdigest()[:16]
+
+    def _load(self, name: str, arguments: tuple[Any, ...], *, for_python: bool) -> bool:
+        """Load the kernel if there is a file of it that serves."""
+        stored = store.load(name, self._fingerprint())
+        if stored is None or (for_python and not stored.machine_code):
+            return False
+        fndesc, environment, signature, reload_init, environments, defined = pickle.loads(stored.facts)  # noqa: S301
+        for again in reload_init:
+            again()
+        if not for_python:
+            self.targetctx.refresh()
+        library = self.targetctx.codegen().create_library(fndesc.qualname)
+        library.load(stored, defined)
+        runnable = bool(stored.machine_code)
+        entry = self.targetctx.get_executable(library, fndesc, environment) if runnable else _no_code()
+        for referenced in environments if runnable else ():
+            library.codegen.set_env(referenced.env_name, referenced)
+        self._take(
+            arguments,
+            compiler.compile_result(
+                typing_context=self.typingctx,
+                target_context=self.targetctx,
+                entry_point=entry,
+                library=library,
+                fndesc=fndesc,
+                environment=environment,
+                signature=signature,
+                objectmode=False,
+                lifted=(),
+                reload_init=reload_init,
+            ),
+            runnable=runnable,
+        )
+        self.targetctx.insert_user_function(entry, fndesc, [library])
+        return True
+
+    def _compile(self, name: str, arguments: tuple[Any, ...], *, for_python: bool) -> None:
+        """Compile the kernel, and keep it."""
+        known = self.overloads.get(arguments)
+        if known is not None:
+            result = self._with_wrapper(known)
+        else:
+            details = {"dispatcher": self, "args": arguments, "return_type": None}
+            _DEPTH.value += 1
+            try:
+                with event.trigger_event("numba:compile", data=details):
+                    result = self._compiler.compile(arguments, None)
+            finally:
+                _DEPTH.value -= 1
+        self._take(arguments, result, runnable=for_python)
+        library, fndesc = result.library, result.fndesc
+        library._ensure_finalized()
+        if library.has_dynamic_globals:
+            return
+        bitcode = library._get_module_for_linking().as_bitcode()
+        fndesc.typemap = fndesc.calltypes = None
+        facts = (
+            fndesc,
+            result.environment,
+            result.signature,
+            result.reload_init,
+            tuple(_environments(library)),
+            (fndesc.llvm_func_name, fndesc.llvm_cpython_wrapper_name),
+        )
+        code = library._get_compiled_object() if for_python else b""
+        store.save(name, self._fingerprint(), Stored(facts=serialize.dumps(facts), machine_code=code, bitcode=bitcode))
+
+    def _with_wrapper(self, known: Any) -> Any:
+        """A kernel that kernels called so far, made callable from Python."""
+        context = self.targetctx.subtarget(environment=known.environment, fndesc=known.fndesc, enable_nrt=True)
+        library = context.codegen().create_library(known.fndesc.qualname)
+        library.enable_object_caching()
+        context.create_cpython_wrapper(library, known.fndesc, known.environment, None, release_gil=True)
+        library.add_linking_library(known.library)
+        entry = context.get_executable(library, known.fndesc, known.environment)
+        return known._replace(library=library, entry_point=entry)
+
+    def _take(self, arguments: tuple[Any, ...], result: Any, *, runnable: bool) -> None:
+        self.overloads[arguments] = result
+        if runnable:
+            self._callable.add(arguments)
+            self._insert([argument._code for argument in arguments], result.entry_point, False)

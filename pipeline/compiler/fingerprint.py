@@ -1,0 +1,131 @@
+"""The fingerprint of a kernel: a hash of all that its machine code depends on.
+
+It covers the kernel's own bytecode and constants, the values of the globals that it names, and the same of every
+kernel that it calls, directly or not. Comments, docstrings, blank lines and edits elsewhere in a file leave it as it
+was; an edit of a callee in another file changes it. numba itself looks at the kernel's own file alone.
+"""
+
+from __future__ import annotations
+
+import enum
+import hashlib
+import inspect
+import types
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_PLAIN = (int, float, complex, str, bytes, bool, type(None), np.generic, np.dtype)
+
+
+def fingerprint(function: Callable[..., Any], options: Mapping[str, Any], source_of: SourceOf) -> bytes:
+    """The fingerprint of a kernel, 32 bytes.
+
+    Parameters
+    ----------
+    function : callable
+        The plain function of the kernel.
+    options : mapping
+        With which it is compiled.
+    source_of : callable
+        Function and options of a value that is a kernel; None of any other value.
+
+    Returns
+    -------
+    bytes
+        Equal for equal code on every machine; it depends on the minor version of Python, whose bytecode it hashes.
+    """
+    found: dict[str, bytes] = {}
+    waiting: list[Kerneled] = [(function, options)]
+    while waiting:
+        one, with_options = waiting.pop()
+        name = f"{one.__module__}.{one.__qualname__}"
+        if name not in found:
+            own = _Own(source_of)
+            own.add(repr(sorted(with_options.items())), *_of_function(one, own))
+            found[name] = own.digest()
+            waiting.extend(own.calls)
+    whole = hashlib.sha256()
+    for name in sorted(found):
+        whole.update(name.encode() + b"\0" + found[name])
+    return whole.digest()
+
+
+Kerneled = tuple[Callable[..., Any], Mapping[str, Any]]
+SourceOf = Callable[[Any], Kerneled | None]
+
+
+class _Own:
+    """The hash of one kernel's own code, and the kernels that it names."""
+
+    def __init__(self, source_of: SourceOf) -> None:
+        self._hash = hashlib.sha256()
+        self._source_of = source_of
+        self.calls: list[Kerneled] = []
+
+    def add(self, *texts: str) -> None:
+        for text in texts:
+            self._hash.update(text.encode() + b"\0")
+
+    def digest(self) -> bytes:
+        return self._hash.digest()
+
+    def value(self, value: Any) -> str:
+        """A text that changes whenever the value may compile to other code."""
+        kernel = self._source_of(value)
+        if kernel is not None:
+            self.calls.append(kernel)
+            return f"kernel {kernel[0].__module__}.{kernel[0].__qualname__}"
+        if isinstance(value, enum.Enum):
+            return f"{type(value).__qualname__}.{value.name}={value.value!r}"
+        if isinstance(value, _PLAIN):
+            return f"{type(value).__name__} {value!r}"
+        if isinstance(value, tuple | frozenset):
+            items = sorted(map(repr, value)) if isinstance(value, frozenset) else map(self.value, value)
+            return f"{type(value).__qualname__}({', '.join(items)})"
+        if isinstance(value, np.ndarray):
+            return f"array {value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
+        if isinstance(value, types.ModuleType):
+            return f"module {value.__name__}"
+        if isinstance(value, type):
+            fields = getattr(value, "_fields", ())
+            return f"class {value.__module__}.{value.__qualname__}{fields!r}"
+        if inspect.isfunction(value):
+            return "\0".join(_of_function(value, self))
+        if callable(value):
+            return f"callable {getattr(value, '__module__', '')}.{getattr(value, '__qualname__', value)!s}"
+        return f"{type(value).__qualname__} of {_file_hash(value)}"
+
+
+def _of_function(function: Callable[..., Any], own: _Own) -> Iterator[str]:
+    """What is to be hashed of a function: code, defaults, closure and the globals that it names."""
+    code = function.__code__
+    names: set[str] = set()
+    yield from _of_code(code, own, names, documented=function.__doc__)
+    for value in (*(function.__defaults__ or ()), *(cell.cell_contents for cell in function.__closure__ or ())):
+        yield own.value(value)
+    known = function.__globals__
+    for name in sorted(names & known.keys()):
+        yield f"{name}={own.value(known[name])}"
+        if isinstance(known[name], types.ModuleType) and known[name].__name__.startswith("pipeline"):
+            for attribute in sorted(names & vars(known[name]).keys()):
+                yield f"{name}.{attribute}={own.value(getattr(known[name], attribute))}"
+
+
+def _of_code(code: types.CodeType, own: _Own, names: set[str], documented: str | None = None) -> Iterator[str]:
+    """What is to be hashed of compiled Python, without its place in the file and without its docstring."""
+    names.update(code.co_names)
+    yield f"{code.co_code.hex()} {code.co_flags} {code.co_argcount}"
+    yield repr((code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars))
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _of_code(constant, own, names)
+        elif documented is None or constant != documented:
+            yield own.value(constant)
+
+
+def _file_hash(value: Any) -> str:
+    """The hash of the file that defines a value's class, for values that nobody foresaw."""
+    return hashlib.sha256(Path(inspect.getfile(type(value))).read_bytes()).hexdigest()
