@@ -87,8 +87,13 @@ def _prepare() -> None:
         return made
 
     context.get_executable = get_executable
+    context.create_cfunc_wrapper = _no_wrapper
     for name, address in _nrt_python.c_helpers.items():
         llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
+
+
+def _no_wrapper(*of_function: Any) -> None:
+    """Make no wrapper for callers in C; there are none."""
 
 
 def _no_code() -> Any:
@@ -112,6 +117,10 @@ class _Library(codegen.JITCodeLibrary):
     _has_code = False
     _shared_module: Any
     _bitcode: bytes | None = None
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Leave functions as they are: they are optimised with the code that they are linked into."""
+        ll_module.data_layout = self._codegen._data_layout
 
     def finalize(self) -> None:
         """Link what it calls, and no more."""
@@ -170,7 +179,6 @@ _DEPTH = _Depth()
 
 def _without_wrappers(flags: Any) -> Any:
     """Numba's flags for a kernel: only what Python calls gets a wrapper, and nothing one for C."""
-    flags.no_cfunc_wrapper = True
     flags.no_cpython_wrapper = _DEPTH.value > 1
     return flags
 

@@ -52,6 +52,11 @@ class Stored:
         lengths = (len(self.facts), len(self.machine_code), len(self.bitcode))
         return _HEADER.pack(_MAGIC, fingerprint, *lengths) + self.facts + self.machine_code + self.bitcode
 
+    @staticmethod
+    def fingerprint_of(content: bytes) -> bytes:
+        """The fingerprint in a file's head."""
+        return content[len(_MAGIC) : len(_MAGIC) + 32]
+
     @classmethod
     def unpacked(cls, content: bytes, fingerprint: bytes) -> Stored | None:
         """What a file holds; None where it is cut off, or of another fingerprint."""

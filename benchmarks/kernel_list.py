@@ -1,0 +1,89 @@
+"""Writes pipeline/compiler/kernels.json: the kernels that Python calls, with which signatures, by what needs them.
+
+    make kernels
+
+runs commands that reach all parts of the product in an empty folder of kernels, and lists what they compiled. Run it
+after a kernel was added or removed, or is called with other types. It takes some minutes. What the list lacks is
+compiled when it is first called, so an old list costs time and nothing else.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from glob import glob
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from pipeline.compiler.signatures import written
+from pipeline.compiler.store import ENDING, Stored
+from pipeline.compiler.warm_up import LIST, Listed, write_list
+
+
+def commands(folder: Path) -> dict[str, list[str]]:
+    """What to run, by group; later groups list only what earlier ones did not compile."""
+    scene = folder / "scene"
+    tile, truth = scene / "suburb.laz", scene / "truth"
+    gables = folder / "gables"
+    every = "fuzzy-sart,parameter-space-2d,parameter-space-3d,kmeans"
+    faithful = ",".join(f"{name}:faithful" for name in every.split(","))
+    return {
+        "simulate": [f"simulate suburb --out {scene} --with-classes", f"simulate hofmann310 --out {gables}"],
+        "reconstruct": [
+            f"reconstruct {tile} --out {folder}/plain --classes ignore --workers 0",
+            f"reconstruct {tile} --out {folder}/apart --classes ignore --workers 2",
+            f"reconstruct {tile} --out {folder}/trusted --workers 2 --lods 1.2,1.3,2.2",
+            f"reconstruct {tile} --out {folder}/given --workers 0 --footprints {truth}/buildings/*/*.parquet",
+            f"reconstruct {gables}/hofmann310.laz --out {folder}/others --workers 0 --meshes glb",
+        ],
+        "evaluate": [
+            f"evaluate {folder}/plain --truth {truth} --out {folder}/report",
+            f"evaluate {folder}/plain --points {tile} --out {folder}/measured",
+        ],
+        "classify": [f"classify {tile} --out {folder}/classified --rasters --classes ignore"],
+        "compare": [f"compare {tile} --methods {every},{faithful} --out {folder}/compared"],
+        "diff": [f"batch diff {folder}/plain {folder}/trusted --out {folder}/changes"],
+    }
+
+
+def compiled(folder: Path) -> dict[str, Listed]:
+    """The kernels of a folder that Python calls, by file name."""
+    found = {}
+    for path in folder.glob(f"*{ENDING}"):
+        content = path.read_bytes()
+        stored = Stored.unpacked(content, Stored.fingerprint_of(content))
+        if stored is None or not stored.machine_code:
+            continue
+        function, _, signature, *_ = pickle.loads(stored.facts)
+        found[path.name] = Listed(
+            kernel=f"{function.modname}:{function.qualname}",
+            arguments=[written(kind) for kind in signature.args],
+            weight=-(-len(content) // 1000),
+        )
+    return found
+
+
+def main() -> None:
+    """Run the commands and write the list."""
+    groups: dict[str, list[Listed]] = {}
+    with TemporaryDirectory(prefix="gablework-") as name:
+        folder = Path(name)
+        kernels = folder / "kernels"
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(kernels)}
+        known: set[str] = set()
+        for group, lines in commands(folder).items():
+            for command in lines:
+                print(command, flush=True)
+                words = [w for word in command.split() for w in (map(str, glob(word)) if "*" in word else (word,))]
+                subprocess.run([sys.executable, "-m", "service.cli", *words, "--quiet"], env=environment, check=True)
+            found = compiled(kernels)
+            groups[group] = [one for file, one in found.items() if file not in known]
+            known.update(found)
+            print(f"{group}: {len(groups[group])} kernels", flush=True)
+    write_list(groups, LIST)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""Kernels compiled ahead of their first call, in as many processes as there are cores.
+
+`kernels.json` lists what Python calls, with the signatures that it calls it with, by what needs it; what these call
+is compiled with them. Processes leave a kernel that another one is at work on to it and wait for its code
+(`store.claimed`), so none is compiled twice. What the list lacks is compiled when it is first called.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+LIST = Path(__file__).with_name("kernels.json")
+"""Written by `make kernels`."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Listed:
+    """A kernel that Python calls, with one signature."""
+
+    kernel: str
+    """Its name, `module:function`."""
+    arguments: list[Any]
+    """Types of its arguments, as `pipeline.compiler.signatures` writes them."""
+    weight: int
+    """Kilobytes of its code: about how long it takes to compile."""
+
+
+def listed(groups: Iterable[str] | None = None) -> list[Listed]:
+    """The kernels of some groups, the heaviest first, each once.
+
+    Parameters
+    ----------
+    groups : iterable of str, optional
+        Keys of the list; all of them by default.
+
+    Raises
+    ------
+    KeyError
+        There is no such group.
+    """
+    found = json.loads(LIST.read_text(encoding="utf-8"))
+    kernels = [Listed(kernel=k, arguments=a, weight=w) for name in groups or found for k, a, w in found[name]]
+    return sorted(kernels, key=lambda one: -one.weight)
+
+
+def compile_kernels(
+    kernels: Iterable[Listed],
+    processes: int | None = None,
+    on_progress: Callable[[int, int, float], None] | None = None,
+) -> int:
+    """Compile kernels that are not compiled yet.
+
+    Parameters
+    ----------
+    kernels : iterable of Listed
+        Those of `listed`.
+    processes : int, optional
+        How many compile at once; by default one per core that this process may use.
+    on_progress : callable, optional
+        Gets how many are done, of how many, and the seconds that the rest may take.
+
+    Returns
+    -------
+    int
+        How many were compiled or loaded.
+    """
+    waiting = list(kernels)
+    whole = sum(one.weight for one in waiting) or 1
+    began = time.perf_counter()
+    done = weight = 0
+    count = processes or len(os.sched_getaffinity(0))
+    with ProcessPoolExecutor(min(count, len(waiting)) or 1, mp_context=get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(_compile, one) for one in waiting]):
+            weight += future.result()
+            done += 1
+            if on_progress is not None:
+                took = time.perf_counter() - began
+                on_progress(done, len(waiting), took * (whole - weight) / max(weight, 1))
+    return done
+
+
+def _compile(one: Listed) -> int:
+    """Compile or load a kernel in this process; its weight."""
+    from pipeline.compiler.signatures import kernel_named, read
+
+    kernel = kernel_named(one.kernel)
+    if not os.environ.get("NUMBA_DISABLE_JIT"):
+        kernel.dispatcher.compile(tuple(read(kind) for kind in one.arguments))
+    return one.weight
+
+
+def write_list(groups: dict[str, list[Listed]], path: Path = LIST) -> None:
+    """Write the list, one kernel a line so that changes are easy to see."""
+    told = []
+    for name, kernels in groups.items():
+        rows = sorted((one.kernel, one.arguments, one.weight) for one in kernels)
+        told.append(f"{json.dumps(name)}: [\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]")
+    path.write_text("{\n" + ",\n".join(told) + "\n}\n", encoding="utf-8")
