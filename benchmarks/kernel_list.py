@@ -13,7 +13,6 @@ import os
 import pickle
 import subprocess
 import sys
-from glob import glob
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,14 +22,14 @@ from pipeline.compiler.warm_up import LIST, Listed, write_list
 
 
 def commands(folder: Path) -> dict[str, list[str]]:
-    """What to run, by group; later groups list only what earlier ones did not compile."""
+    """What to run, by group: a group lists what those before it did not compile. Scenes come first, under no name."""
     scene = folder / "scene"
     tile, truth = scene / "suburb.laz", scene / "truth"
     gables = folder / "gables"
     every = "fuzzy-sart,parameter-space-2d,parameter-space-3d,kmeans"
     faithful = ",".join(f"{name}:faithful" for name in every.split(","))
     return {
-        "simulate": [f"simulate suburb --out {scene} --with-classes", f"simulate hofmann310 --out {gables}"],
+        "": [f"simulate suburb --out {scene} --with-classes", f"simulate hofmann310 --out {gables}"],
         "reconstruct": [
             f"reconstruct {tile} --out {folder}/plain --classes ignore --workers 0",
             f"reconstruct {tile} --out {folder}/apart --classes ignore --workers 2",
@@ -38,6 +37,7 @@ def commands(folder: Path) -> dict[str, list[str]]:
             f"reconstruct {tile} --out {folder}/given --workers 0 --footprints {truth}/buildings/*/*.parquet",
             f"reconstruct {gables}/hofmann310.laz --out {folder}/others --workers 0 --meshes glb",
         ],
+        "simulate": [f"simulate suburb --out {folder}/again", f"simulate city --size 60 60 --out {folder}/city"],
         "evaluate": [
             f"evaluate {folder}/plain --truth {truth} --out {folder}/report",
             f"evaluate {folder}/plain --points {tile} --out {folder}/measured",
@@ -65,19 +65,27 @@ def compiled(folder: Path) -> dict[str, Listed]:
     return found
 
 
+def expanded(pattern: str) -> list[str]:
+    """The files that an absolute pattern matches."""
+    return sorted(str(path) for path in Path("/").glob(pattern.lstrip("/")))
+
+
 def main() -> None:
     """Run the commands and write the list."""
     groups: dict[str, list[Listed]] = {}
     with TemporaryDirectory(prefix="gablework-") as name:
         folder = Path(name)
-        kernels = folder / "kernels"
-        environment = {**os.environ, "NUMBA_CACHE_DIR": str(kernels)}
         known: set[str] = set()
         for group, lines in commands(folder).items():
+            # scenes are made apart: their kernels are listed with `simulate`
+            kernels = folder / ("kernels" if group else "kernels of scenes")
+            environment = {**os.environ, "NUMBA_CACHE_DIR": str(kernels)}
             for command in lines:
                 print(command, flush=True)
-                words = [w for word in command.split() for w in (map(str, glob(word)) if "*" in word else (word,))]
+                words = [w for word in command.split() for w in (expanded(word) if "*" in word else (word,))]
                 subprocess.run([sys.executable, "-m", "service.cli", *words, "--quiet"], env=environment, check=True)
+            if not group:
+                continue
             found = compiled(kernels)
             groups[group] = [one for file, one in found.items() if file not in known]
             known.update(found)

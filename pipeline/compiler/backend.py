@@ -141,7 +141,8 @@ class _Library(codegen.JITCodeLibrary):
             self._has_code = True
             self._optimize_final_module()
             self._final_module.verify()
-            self._finalized = False
+            # asked again: what nothing uses is gone now
+            self._dynamic_globals.clear()
             self._finalize_final_module()
         address: int = super().get_pointer_to_function(name)
         return address

@@ -14,9 +14,11 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from numba.core import types
+import numba
 
 from pipeline.compiler.kernel import Kernel
+
+types: Any = numba.types
 
 
 def written(kind: Any) -> Any:
