@@ -11,6 +11,7 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, RoofFace
 from pipeline.quality.unseen_roof import middles_of_cells, unseen_cells
 
@@ -84,7 +85,7 @@ def _top_surface(
     edge_starts: IntArray,
     boxes: FloatArray,
     coefficients: FloatArray,
-    cell_starts: IntArray,
+    cell_starts: LabelArray,
     cell_faces: IntArray,
     low_x: float,
     low_y: float,
@@ -128,7 +129,7 @@ def _top_surface(
 @kernel
 def _laid_out(
     xy: FloatArray, ring_of: IntArray, face_of_ring: IntArray, n: int, tolerance: float
-) -> tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray, float, float, float, int, int]:
+) -> tuple[FloatArray, IntArray, FloatArray, LabelArray, IntArray, float, float, float, int, int]:
     """Edges of all faces, where each face's start, their boxes; faces by cells, where each cell's start; the cells.
 
     Parameters
@@ -156,11 +157,11 @@ def _laid_out(
         box[0], box[1], box[2], box[3] = min(box[0], x), min(box[1], y), max(box[2], x), max(box[3], y)
         if v > 0 and ring_of[v - 1] == ring_of[v]:
             edges[m, 0], edges[m, 1], edges[m, 2], edges[m, 3] = xy[v - 1, 0], xy[v - 1, 1], x, y
-            edge_starts[face + 1] += 1
+            edge_starts[face + 1] = m + 1
             m += 1
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for f in range(n):
-        edge_starts[f + 1] += edge_starts[f]
+        edge_starts[f + 1] = max(edge_starts[f + 1], edge_starts[f])
         if boxes[f, 0] <= boxes[f, 2]:
             boxes[f, :2] -= tolerance
             boxes[f, 2:] += tolerance
@@ -171,15 +172,10 @@ def _laid_out(
     while (width / cell + 1) * (depth / cell + 1) > max(_MAX_CELLS, 8 * n):
         cell *= 2.0
     columns, rows = math.floor(width / cell) + 1, math.floor(depth / cell) + 1
-    starts = np.zeros(columns * rows + 1, np.int64)
-    faces = np.empty(0, np.int64)
-    filled = np.empty(0, np.int64)
+    # every face in every cell that its box meets; the second turn writes what the first one counted
+    cells, face_of = np.empty(0, np.int32), np.empty(0, np.int32)
     for turn in range(2):
-        if turn == 1:
-            for k in range(columns * rows):
-                starts[k + 1] += starts[k]
-            faces = np.empty(starts[-1], np.int64)
-            filled = starts[:-1].copy()
+        m = 0
         for f in range(n):
             if not boxes[f, 0] <= boxes[f, 2]:
                 continue
@@ -189,12 +185,16 @@ def _laid_out(
             r1 = min(rows - 1, math.floor((boxes[f, 3] - low_y) / cell))
             for r in range(r0, r1 + 1):
                 for c in range(c0, c1 + 1):
-                    if turn == 0:
-                        starts[r * columns + c + 1] += 1
-                    else:
-                        faces[filled[r * columns + c]] = f
-                        filled[r * columns + c] += 1
-    return edges[:m].copy(), edge_starts, boxes, starts, faces, low_x, low_y, cell, columns, rows
+                    if turn == 1:
+                        cells[m], face_of[m] = r * columns + c, f
+                    m += 1
+        if turn == 0:
+            cells, face_of = np.empty(m, np.int32), np.empty(m, np.int32)
+    starts, members = counting_sort(cells, columns * rows)
+    faces = np.empty(len(members), np.int64)
+    for s in range(len(members)):
+        faces[s] = face_of[members[s]]
+    return edges[: edge_starts[n]].copy(), edge_starts, boxes, starts, faces, low_x, low_y, cell, columns, rows
 
 
 @kernel
@@ -214,7 +214,7 @@ def _seen(
     edge_starts: IntArray,
     boxes: FloatArray,
     coefficients: FloatArray,
-    cell_starts: IntArray,
+    cell_starts: LabelArray,
     cell_faces: IntArray,
     low_x: float,
     low_y: float,
