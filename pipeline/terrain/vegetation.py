@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.model import BoolArray, FloatArray, IntArray, KindArray
+from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, LabelArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.binning import points_by_cell
 
