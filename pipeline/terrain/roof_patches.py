@@ -142,17 +142,15 @@ def local_planes(x: IntArray, y: IntArray, z: IntArray, radius_mm: int, min_poin
     return out
 
 
-@kernel
 def circumradii(x: IntArray, y: IntArray, facets: LabelArray) -> FloatArray:
     """Circumradius of every facet, (m,), in the unit of the vertices."""
-    out = np.empty(facets.shape[0])
-    for f in range(facets.shape[0]):
-        a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
-        ux, uy, vx, vy = float(x[b] - x[a]), float(y[b] - y[a]), float(x[c] - x[a]), float(y[c] - y[a])
-        wx, wy = vx - ux, vy - uy
-        product = math.sqrt(ux * ux + uy * uy) * math.sqrt(vx * vx + vy * vy) * math.sqrt(wx * wx + wy * wy)
-        out[f] = product / (2.0 * (ux * vy - uy * vx))
-    return out
+    a, b, c = facets.T
+    ux, uy = (x[b] - x[a]).astype(np.float64), (y[b] - y[a]).astype(np.float64)
+    vx, vy = (x[c] - x[a]).astype(np.float64), (y[c] - y[a]).astype(np.float64)
+    wx, wy = vx - ux, vy - uy
+    product = np.sqrt(ux * ux + uy * uy) * np.sqrt(vx * vx + vy * vy) * np.sqrt(wx * wx + wy * wy)
+    radii: FloatArray = product / (2.0 * (ux * vy - uy * vx))
+    return radii
 
 
 @kernel

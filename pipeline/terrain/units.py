@@ -126,7 +126,7 @@ def units_of_patches(patches: Patches, borders: Borders, settings: UnitSettings)
         What separates units.
     """
     count = len(patches.areas_m2)
-    parent = np.arange(count)
+    unit = np.arange(count)
     large = (patches.areas_m2 >= _PART_M2) & ~np.isnan(patches.levels_mm)
     rows = [
         row
@@ -160,15 +160,15 @@ def units_of_patches(patches: Patches, borders: Borders, settings: UnitSettings)
             joining.append(row)
     # the longest first, so that what runs along several houses does not unite them across their gutters
     for row in sorted(joining, key=lambda row: (-borders.length_m[row], row)):
-        p, q = sorted((root_of(parent, int(borders.first[row])), root_of(parent, int(borders.second[row]))))
+        p, q = sorted((int(unit[borders.first[row]]), int(unit[borders.second[row]])))
         if p == q or q in apart[p]:
             continue
-        parent[q] = p
+        unit[unit == q] = p
         apart[p] |= apart[q]
         for other in apart.pop(q):
             apart[other].discard(q)
             apart[other].add(p)
-    return _absorbed(np.array([root_of(parent, k) for k in range(count)], np.int64), patches, borders, settings)
+    return _absorbed(unit, patches, borders, settings)
 
 
 def _absorbed(unit: IntArray, patches: Patches, borders: Borders, settings: UnitSettings) -> LabelArray:
@@ -231,11 +231,20 @@ def _absorbed(unit: IntArray, patches: Patches, borders: Borders, settings: Unit
 
 def _across_gaps(unit: LabelArray, borders: Borders) -> LabelArray:
     """Join what hangs together across gaps in the data only: a gap tells nothing of buildings."""
-    part, whole = united(len(unit), borders.first, borders.second), unit.astype(np.int64)
-    for p, q in borders.gap_pairs.tolist():
-        if unite(part, p, q):
-            unite(whole, p, q)
-    return np.array([root_of(whole, k) for k in range(len(whole))], np.int32)
+    part = united(len(unit), borders.first, borders.second)
+    return _united_across(part, unit.astype(np.int64), borders.gap_pairs.astype(np.int64))
+
+
+@kernel
+def _united_across(part: IntArray, whole: IntArray, gap_pairs: IntArray) -> LabelArray:
+    """The sets `whole`, each as one of its members, after uniting the pairs (g, 2) that unite sets in `part`, too."""
+    for g in range(len(gap_pairs)):
+        if unite(part, gap_pairs[g, 0], gap_pairs[g, 1]):
+            unite(whole, gap_pairs[g, 0], gap_pairs[g, 1])
+    roots = np.empty(len(whole), np.int32)
+    for k in range(len(whole)):
+        roots[k] = root_of(whole, k)
+    return roots
 
 
 @kernel
