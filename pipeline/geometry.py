@@ -11,6 +11,9 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.merge_sort import in_order
+from pipeline.kernels.normal_equations import moments_of, solve_plane_moments
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Plane
 
 _LOWER_QUARTILE_CHI2 = (math.nan, 0.10153, 0.57536, 1.21253, 1.92256, 2.67460, 3.45460)
@@ -96,35 +99,6 @@ def o_distances_m(normals: FloatArray, points: FloatArray) -> FloatArray:
 
 
 @kernel
-def solve_plane_moments(sxx: float, sxy: float, syy: float, sxz: float, syz: float) -> tuple[float, float]:
-    """The slopes a, b that solve the centred normal equations (Eqs. 11 to 14).
-
-    Parameters
-    ----------
-    sxx, sxy, syy, sxz, syz : float
-        Sums of products of coordinates relative to their means.
-
-    Returns
-    -------
-    a, b : float
-        Where the points are collinear in plan, to 1e-6 of their spread, the plane is undetermined across the line: it
-        is taken level across, and sloping along the line. Where all are at one position it is horizontal.
-    """
-    determinant = sxx * syy - sxy * sxy
-    trace = sxx + syy
-    if trace <= 0.0:
-        return 0.0, 0.0
-    if determinant > 1e-12 * trace * trace:
-        return (sxz * syy - syz * sxy) / determinant, (syz * sxx - sxz * sxy) / determinant
-    # of rank one: the gradient lies along the line, whose direction is the larger row of the moments
-    if sxx >= syy:
-        along = sxz / (sxx * sxx + sxy * sxy)
-        return along * sxx, along * sxy
-    along = syz / (syy * syy + sxy * sxy)
-    return along * sxy, along * syy
-
-
-@kernel
 def fit_plane_coefficients(points: FloatArray, index: LabelArray) -> tuple[float, float, float, float]:
     """Least-squares plane z = a x + b y + c of some points (Eqs. 8 to 14), for use in compiled code.
 
@@ -140,40 +114,13 @@ def fit_plane_coefficients(points: FloatArray, index: LabelArray) -> tuple[float
     a, b, c, sse : float
         Coefficients, and the sum of squared vertical residuals in m2 (Eq. 10). Collinear points: `solve_plane_moments`.
     """
-    k = len(index)
-    mean_x = 0.0
-    mean_y = 0.0
-    mean_z = 0.0
-    for q in range(k):
-        i = index[q]
-        mean_x += points[i, 0]
-        mean_y += points[i, 1]
-        mean_z += points[i, 2]
-    mean_x /= k
-    mean_y /= k
-    mean_z /= k
-    sxx = 0.0
-    sxy = 0.0
-    syy = 0.0
-    sxz = 0.0
-    syz = 0.0
-    for q in range(k):
-        i = index[q]
-        x = points[i, 0] - mean_x
-        y = points[i, 1] - mean_y
-        z = points[i, 2] - mean_z
-        sxx += x * x
-        sxy += x * y
-        syy += y * y
-        sxz += x * z
-        syz += y * z
-    a, b = solve_plane_moments(sxx, sxy, syy, sxz, syz)
+    found = moments_of(points, index)
+    a, b = solve_plane_moments(found.xx, found.xy, found.yy, found.xz, found.yz)
     sse = 0.0
-    for q in range(k):
-        i = index[q]
-        residual = points[i, 2] - mean_z - a * (points[i, 0] - mean_x) - b * (points[i, 1] - mean_y)
+    for i in index:
+        residual = points[i, 2] - found.z - a * (points[i, 0] - found.x) - b * (points[i, 1] - found.y)
         sse += residual * residual
-    return a, b, mean_z - a * mean_x - b * mean_y, sse
+    return a, b, found.z - a * found.x - b * found.y, sse
 
 
 def fit_plane(points: FloatArray) -> Plane:
@@ -259,20 +206,10 @@ def _sort_into_grid(
     points: FloatArray, x_min: float, y_min: float, cell_size_m: float, columns: int, rows: int
 ) -> tuple[LabelArray, LabelArray]:
     """Points by cell, ascending within one: where each cell starts (columns * rows + 1), and the indices."""
-    n = len(points)
-    start = np.zeros(columns * rows + 1, np.int32)
-    cell = np.empty(n, np.int32)
-    for i in range(n):
+    cell = np.empty(len(points), np.int32)
+    for i in range(len(points)):
         cell[i] = int((points[i, 1] - y_min) / cell_size_m) * columns + int((points[i, 0] - x_min) / cell_size_m)
-        start[cell[i] + 1] += 1
-    for c in range(columns * rows):
-        start[c + 1] += start[c]
-    end = start[:-1].copy()
-    members = np.empty(n, np.int32)
-    for i in range(n):
-        members[end[cell[i]]] = i
-        end[cell[i]] += 1
-    return start, members
+    return counting_sort(cell, columns * rows)
 
 
 @kernel
@@ -481,7 +418,8 @@ def _spacings(points: FloatArray) -> tuple[float, float]:
     k = min(_SPACING_NEIGHBOURS, n - 1)
     if k < 1:
         return np.nan, np.nan
-    squares = np.sort(_nearest_neighbours(points, k, 0.0, False)[1][:, k - 1])
+    _, all_squares = _nearest_neighbours(points, k, 0.0, False)
+    squares = in_order(all_squares[:, k - 1].copy())
     median = 0.5 * (squares[(n - 1) // 2] + squares[n // 2])
     covered = np.cumsum(squares)
     middle = squares[min(np.searchsorted(covered, 0.5 * covered[-1]), n - 1)]

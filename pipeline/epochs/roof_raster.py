@@ -9,8 +9,8 @@ part (J. Serra: Image analysis and mathematical morphology, 1982).
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,8 +31,7 @@ N_FIGURES = 16
 _NOTHING = -1.0e30
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RoofFaces:
+class RoofFaces(NamedTuple):
     """Roof faces of many buildings, in metres."""
 
     xy: FloatArray
@@ -47,8 +46,7 @@ class RoofFaces:
     """(f,) bool, True where the points scatter about the face: it may stand on a tree."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RoofGroups:
+class RoofGroups(NamedTuple):
     """Which faces each group looks at, and how."""
 
     starts: IntArray
@@ -95,49 +93,17 @@ def compare_roofs(faces: RoofFaces, groups: RoofGroups, uniform_share: float, ve
         common roof.
     """
     figures = np.zeros((len(groups.starts) - 1, N_FIGURES))
-    _compare_all(
-        faces.xy,
-        faces.rings,
-        faces.faces,
-        faces.planes,
-        faces.is_rough,
-        groups.starts,
-        groups.face,
-        groups.is_new,
-        groups.is_own,
-        groups.boxes,
-        groups.width_m,
-        groups.height_m,
-        groups.ground_m,
-        uniform_share,
-        vertical_shift_m,
-        figures,
-    )
+    _compare_all(faces, groups, uniform_share, vertical_shift_m, figures)
     return figures
 
 
 @kernel
-def _compare_all(
-    xy: FloatArray,
-    rings: IntArray,
-    faces: IntArray,
-    planes: FloatArray,
-    is_rough: BoolArray,
-    starts: IntArray,
-    face: IntArray,
-    is_new: BoolArray,
-    is_own: BoolArray,
-    boxes: FloatArray,
-    width_m: FloatArray,
-    height_m: FloatArray,
-    ground_m: FloatArray,
-    share: float,
-    shift: float,
-    figures: FloatArray,
-) -> None:
+def _compare_all(faces: RoofFaces, groups: RoofGroups, share: float, shift: float, figures: FloatArray) -> None:
+    """Kernel of `compare_roofs`."""
+    starts, boxes = groups.starts, groups.boxes
     for group in range(len(starts) - 1):
         west, south = boxes[group, 0], boxes[group, 1]
-        cell = width_m[group] / CELLS_A_WIDTH
+        cell = groups.width_m[group] / CELLS_A_WIDTH
         columns = math.ceil((boxes[group, 2] - west) / cell) + 1
         rows = math.ceil((boxes[group, 3] - south) / cell) + 1
         while columns * rows > MOST_CELLS:
@@ -147,21 +113,27 @@ def _compare_all(
         own = np.zeros((rows, columns), np.bool_)
         rough_before, rough_after = np.zeros((rows, columns), np.bool_), np.zeros((rows, columns), np.bool_)
         for entry in range(starts[group], starts[group + 1]):
-            heights, rough = (after, rough_after) if is_new[entry] else (before, rough_before)
-            one = face[entry]
-            _fill(xy, rings, faces, planes, one, is_rough[one], heights, rough, own, is_own[entry], west, south, cell)
+            heights, rough = (after, rough_after) if groups.is_new[entry] else (before, rough_before)
+            _fill(faces, groups.face[entry], heights, rough, own, groups.is_own[entry], west, south, cell)
         rough = rough_before | rough_after
-        _figures_of(before, after, own, rough, cell, height_m[group], ground_m[group], share, shift, figures[group])
+        _figures_of(
+            before,
+            after,
+            own,
+            rough,
+            cell,
+            groups.height_m[group],
+            groups.ground_m[group],
+            share,
+            shift,
+            figures[group],
+        )
 
 
 @kernel
 def _fill(
-    xy: FloatArray,
-    rings: IntArray,
-    faces: IntArray,
-    planes: FloatArray,
+    roofs: RoofFaces,
     face: int,
-    is_rough: bool,
     heights: FloatArray,
     rough: BoolArray,
     own: BoolArray,
@@ -171,6 +143,7 @@ def _fill(
     cell: float,
 ) -> None:
     """The face into a raster of heights, cell middles by the even-odd rule; the highest stays."""
+    xy, rings, faces, planes, is_rough = roofs.xy, roofs.rings, roofs.faces, roofs.planes, roofs.is_rough[face]
     rows, columns = heights.shape
     first, last = rings[faces[face]], rings[faces[face + 1]]
     if last - first < 3:

@@ -15,6 +15,7 @@ import shapely
 
 from pipeline.evaluation.models import RoofModel, RoofSurface
 from pipeline.evaluation.reference import Conditions, Reference, ReferencePoints
+from pipeline.kernels.union_find import united
 from pipeline.model import LabelArray, RoofType
 
 BLOCK_SHAPE = "block"
@@ -80,24 +81,14 @@ def _shifted(surface: RoofSurface, shift: int) -> RoofSurface:
 
 def _with_common_groups(surfaces: Sequence[RoofSurface]) -> list[RoofSurface]:
     """The surfaces, those of one plane that touch in one group, together with the groups that they had."""
-    parent = list(range(len(surfaces)))
-
-    def root(k: int) -> int:
-        while parent[k] != k:
-            k = parent[k]
-        return k
-
     first_of: dict[int, int] = {}
-    for k, surface in enumerate(surfaces):
-        if surface.group >= 0:
-            parent[k] = root(first_of.setdefault(surface.group, k))
+    pairs = [(first_of.setdefault(surface.group, k), k) for k, surface in enumerate(surfaces) if surface.group >= 0]
     polygons = np.array([surface.polygon for surface in surfaces], dtype=object)
     tree = shapely.STRtree(polygons)
     for one, other in tree.query(polygons, predicate="dwithin", distance=_TOUCH_M).T.tolist():
         if one < other and _one_plane(surfaces[one], surfaces[other]) and _touch(polygons[one], polygons[other]):
-            low, high = sorted((root(one), root(other)))
-            parent[high] = low
-    roots = [root(k) for k in range(len(surfaces))]
+            pairs.append((one, other))
+    roots = united(len(surfaces), *np.array(pairs, np.int64).reshape(-1, 2).T).tolist()
     shared = {k for k, count in Counter(roots).items() if count > 1}
     return [
         dataclasses.replace(surface, group=surfaces[k].plane_id) if k in shared else surface

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import FloatArray, IntArray
 
 _SWEEPS = 12
@@ -19,7 +20,8 @@ def _principal_axes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     The smallest comes first.
     """
-    axes = np.eye(3)
+    axes = np.zeros((3, 3))
+    axes[0, 0] = axes[1, 1] = axes[2, 2] = 1.0
     for _ in range(_SWEEPS):
         rest = abs(matrix[0, 1]) + abs(matrix[0, 2]) + abs(matrix[1, 2])
         if rest <= 1e-18 * (matrix[0, 0] + matrix[1, 1] + matrix[2, 2]):
@@ -42,9 +44,16 @@ def _principal_axes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
                 for k in range(3):
                     kp, kq = axes[k, p], axes[k, q]
                     axes[k, p], axes[k, q] = cosine * kp - sine * kq, sine * kp + cosine * kq
-    values = np.array([matrix[0, 0], matrix[1, 1], matrix[2, 2]])
-    order = np.argsort(values)
-    return values[order], axes[:, order].copy()
+    diagonal = np.empty(3)
+    for k in range(3):
+        diagonal[k] = matrix[k, k]
+    order = ascending_order(diagonal)
+    values, sorted_axes = np.empty(3), np.empty((3, 3))
+    for m in range(3):
+        values[m] = diagonal[order[m]]
+        for k in range(3):
+            sorted_axes[k, m] = axes[k, order[m]]
+    return values, sorted_axes
 
 
 @kernel

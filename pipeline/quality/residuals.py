@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, RoofFace
 from pipeline.quality.unseen_roof import middles_of_cells, unseen_cells
 
@@ -33,6 +35,33 @@ class ResidualSummary:
     """Share of points that have a roof above or below them; 0 without points."""
     n_points: int
     """All points."""
+
+
+class _Faces(NamedTuple):
+    """Many planar faces in a local frame, and which of them lie in each cell of a grid."""
+
+    origin_x: float
+    origin_y: float
+    """Of the frame, metres."""
+    planes: FloatArray
+    """(n, 3) float64."""
+    edges: FloatArray
+    """(e, 4) float64, x and y of both ends, face by face."""
+    edge_starts: IntArray
+    """(n + 1,) int64."""
+    boxes: FloatArray
+    """(n, 4) float64, west, south, east, north."""
+    cell_starts: LabelArray
+    """(rows * columns + 1,) int32."""
+    cell_faces: IntArray
+    """(m,) int64, faces by cells."""
+    low_x: float
+    low_y: float
+    cell: float
+    columns: int
+    rows: int
+    tolerance: float
+    """A place that no face covers takes a face whose border is this near, metres."""
 
 
 @kernel
@@ -75,39 +104,24 @@ def _is_near(x: float, y: float, edges: FloatArray, first: int, last: int, limit
 
 
 @kernel
-def _top_surface(
-    px: FloatArray,
-    py: FloatArray,
-    origin_x: float,
-    origin_y: float,
-    edges: FloatArray,
-    edge_starts: IntArray,
-    boxes: FloatArray,
-    coefficients: FloatArray,
-    cell_starts: IntArray,
-    cell_faces: IntArray,
-    low_x: float,
-    low_y: float,
-    cell: float,
-    columns: int,
-    rows: int,
-    tolerance: float,
-) -> tuple[FloatArray, LabelArray]:
+def _top_surface(px: FloatArray, py: FloatArray, faces: _Faces) -> tuple[FloatArray, LabelArray]:
     """Highest face over every point and its number, nan and -1 where there is none."""
+    edges, edge_starts, boxes, planes = faces.edges, faces.edge_starts, faces.boxes, faces.planes
+    cell_starts, tolerance = faces.cell_starts, faces.tolerance
     n = len(px)
     top = np.full(n, np.nan)
     number = np.full(n, -1, np.int32)
     for i in range(n):
-        x = px[i] - origin_x
-        y = py[i] - origin_y
-        column = math.floor((x - low_x) / cell)
-        row = math.floor((y - low_y) / cell)
-        if column < 0 or row < 0 or column >= columns or row >= rows:
+        x = px[i] - faces.origin_x
+        y = py[i] - faces.origin_y
+        column = math.floor((x - faces.low_x) / faces.cell)
+        row = math.floor((y - faces.low_y) / faces.cell)
+        if column < 0 or row < 0 or column >= faces.columns or row >= faces.rows:
             continue
-        k = row * columns + column
+        k = row * faces.columns + column
         for turn in range(2):
             for s in range(cell_starts[k], cell_starts[k + 1]):
-                face = cell_faces[s]
+                face = faces.cell_faces[s]
                 if x < boxes[face, 0] or y < boxes[face, 1] or x > boxes[face, 2] or y > boxes[face, 3]:
                     continue
                 first, last = edge_starts[face], edge_starts[face + 1]
@@ -116,7 +130,7 @@ def _top_surface(
                 else:
                     hit = _is_near(x, y, edges, first, last, tolerance)
                 if hit:
-                    z = coefficients[face, 0] * x + coefficients[face, 1] * y + coefficients[face, 2]
+                    z = planes[face, 0] * x + planes[face, 1] * y + planes[face, 2]
                     if not top[i] >= z:
                         top[i] = z
                         number[i] = face
@@ -128,7 +142,7 @@ def _top_surface(
 @kernel
 def _laid_out(
     xy: FloatArray, ring_of: IntArray, face_of_ring: IntArray, n: int, tolerance: float
-) -> tuple[FloatArray, IntArray, FloatArray, IntArray, IntArray, float, float, float, int, int]:
+) -> tuple[FloatArray, IntArray, FloatArray, LabelArray, IntArray, float, float, float, int, int]:
     """Edges of all faces, where each face's start, their boxes; faces by cells, where each cell's start; the cells.
 
     Parameters
@@ -156,11 +170,11 @@ def _laid_out(
         box[0], box[1], box[2], box[3] = min(box[0], x), min(box[1], y), max(box[2], x), max(box[3], y)
         if v > 0 and ring_of[v - 1] == ring_of[v]:
             edges[m, 0], edges[m, 1], edges[m, 2], edges[m, 3] = xy[v - 1, 0], xy[v - 1, 1], x, y
-            edge_starts[face + 1] += 1
+            edge_starts[face + 1] = m + 1
             m += 1
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for f in range(n):
-        edge_starts[f + 1] += edge_starts[f]
+        edge_starts[f + 1] = max(edge_starts[f + 1], edge_starts[f])
         if boxes[f, 0] <= boxes[f, 2]:
             boxes[f, :2] -= tolerance
             boxes[f, 2:] += tolerance
@@ -171,15 +185,10 @@ def _laid_out(
     while (width / cell + 1) * (depth / cell + 1) > max(_MAX_CELLS, 8 * n):
         cell *= 2.0
     columns, rows = math.floor(width / cell) + 1, math.floor(depth / cell) + 1
-    starts = np.zeros(columns * rows + 1, np.int64)
-    faces = np.empty(0, np.int64)
-    filled = np.empty(0, np.int64)
+    # every face in every cell that its box meets; the second turn writes what the first one counted
+    cells, face_of = np.empty(0, np.int32), np.empty(0, np.int32)
     for turn in range(2):
-        if turn == 1:
-            for k in range(columns * rows):
-                starts[k + 1] += starts[k]
-            faces = np.empty(starts[-1], np.int64)
-            filled = starts[:-1].copy()
+        m = 0
         for f in range(n):
             if not boxes[f, 0] <= boxes[f, 2]:
                 continue
@@ -189,50 +198,32 @@ def _laid_out(
             r1 = min(rows - 1, math.floor((boxes[f, 3] - low_y) / cell))
             for r in range(r0, r1 + 1):
                 for c in range(c0, c1 + 1):
-                    if turn == 0:
-                        starts[r * columns + c + 1] += 1
-                    else:
-                        faces[filled[r * columns + c]] = f
-                        filled[r * columns + c] += 1
-    return edges[:m].copy(), edge_starts, boxes, starts, faces, low_x, low_y, cell, columns, rows
+                    if turn == 1:
+                        cells[m], face_of[m] = r * columns + c, f
+                    m += 1
+        if turn == 0:
+            cells, face_of = np.empty(m, np.int32), np.empty(m, np.int32)
+    starts, members = counting_sort(cells, columns * rows)
+    faces = np.empty(len(members), np.int64)
+    for s in range(len(members)):
+        faces[s] = face_of[members[s]]
+    return edges[: edge_starts[n]].copy(), edge_starts, boxes, starts, faces, low_x, low_y, cell, columns, rows
 
 
 @kernel
 def _seen(
     points: FloatArray,
     residuals: FloatArray,
-    raster_x: float,
-    raster_y: float,
-    raster_cell: float,
-    raster_columns: int,
-    raster_rows: int,
+    raster: tuple[float, float, float, int, int],
     tolerance_m: float,
     gap_m: float,
-    origin_x: float,
-    origin_y: float,
-    edges: FloatArray,
-    edge_starts: IntArray,
-    boxes: FloatArray,
-    coefficients: FloatArray,
-    cell_starts: IntArray,
-    cell_faces: IntArray,
-    low_x: float,
-    low_y: float,
-    cell: float,
-    columns: int,
-    rows: int,
-    tolerance: float,
+    faces: _Faces,
 ) -> tuple[int, int, float]:
     """The kernel of `TopSurface.seen`."""
-    x, y = middles_of_cells(raster_x, raster_y, raster_cell, raster_columns, raster_rows)
-    _, number = _top_surface(
-        x, y, origin_x, origin_y, edges, edge_starts, boxes, coefficients, cell_starts, cell_faces,
-        low_x, low_y, cell, columns, rows, tolerance,
-    )  # fmt: skip
-    return unseen_cells(
-        points, residuals, number >= 0, raster_x, raster_y, raster_cell, raster_columns, raster_rows,
-        tolerance_m, gap_m,
-    )  # fmt: skip
+    low_x, low_y, cell, columns, rows = raster
+    x, y = middles_of_cells(low_x, low_y, cell, columns, rows)
+    _, number = _top_surface(x, y, faces)
+    return unseen_cells(points, residuals, number >= 0, low_x, low_y, cell, columns, rows, tolerance_m, gap_m)
 
 
 class TopSurface:
@@ -267,7 +258,6 @@ class TopSurface:
     ) -> None:
         n = len(polygons)
         self._empty = all(polygon.is_empty for polygon in polygons)
-        self._tolerance = tolerance_m
         if self._empty:
             return
         parts, owner = shapely.get_parts(np.asarray(polygons, dtype=object), return_index=True)
@@ -275,9 +265,6 @@ class TopSurface:
         xy, ring = shapely.get_coordinates(rings, return_index=True)
         self._corner = (float(np.floor(xy[:, 0].min())), float(np.floor(xy[:, 1].min()))) if corner is None else corner
         xy = xy - np.array(self._corner)
-        laid_out = _laid_out(xy, ring, owner[part], n, tolerance_m)
-        self._edges, self._edge_starts, self._boxes, self._cell_starts, self._cell_faces = laid_out[:5]
-        self._grid = laid_out[5:]
         planes = np.array(coefficients, dtype=np.float64).reshape(n, 3)
         if origins is not None:
             shift = np.asarray(origins, dtype=np.float64)
@@ -288,7 +275,13 @@ class TopSurface:
             )
         elif self._corner != (0.0, 0.0):
             planes[:, 2] += planes[:, 0] * self._corner[0] + planes[:, 1] * self._corner[1]
-        self._planes = planes
+        edges, starts, boxes, cell_starts, cell_faces, west, south, cell, columns, rows = _laid_out(
+            xy, ring, owner[part], n, tolerance_m
+        )
+        self._faces = _Faces(
+            *self._corner, planes, edges, starts, boxes, cell_starts, cell_faces, west, south, cell, columns, rows,
+            tolerance_m,
+        )  # fmt: skip
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -296,7 +289,7 @@ class TopSurface:
         if self._empty:
             return math.nan, math.nan, math.nan, math.nan
         east, north = self._corner
-        low, high = self._boxes[:, :2].min(axis=0).tolist(), self._boxes[:, 2:].max(axis=0).tolist()
+        low, high = self._faces.boxes[:, :2].min(axis=0).tolist(), self._faces.boxes[:, 2:].max(axis=0).tolist()
         return low[0] + east, low[1] + north, high[0] + east, high[1] + north
 
     def at(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, LabelArray]:
@@ -316,29 +309,8 @@ class TopSurface:
         """
         if self._empty or len(x) == 0:
             return np.full(len(x), np.nan), np.full(len(x), -1, np.int32)
-        top, number = _top_surface(
-            np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64), *self._arguments()
-        )
-        return top, number
-
-    def _arguments(
-        self,
-    ) -> tuple[
-        float, float, FloatArray, IntArray, FloatArray, FloatArray, IntArray, IntArray,
-        float, float, float, int, int, float,
-    ]:  # fmt: skip
-        """What the kernels take."""
-        return (
-            *self._corner,
-            self._edges,
-            self._edge_starts,
-            self._boxes,
-            self._planes,
-            self._cell_starts,
-            self._cell_faces,
-            *self._grid,
-            self._tolerance,
-        )
+        x, y = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
+        return _top_surface(x, y, self._faces)
 
     def seen(
         self,
@@ -374,12 +346,8 @@ class TopSurface:
         """
         if self._empty:
             return 0, 0, 0.0
-        low_x, low_y, cell, columns, rows = raster
-        places, far, square = _seen(
-            np.ascontiguousarray(points, dtype=np.float64), residuals, low_x, low_y, cell, columns, rows,
-            tolerance_m, gap_m, *self._arguments(),
-        )  # fmt: skip
-        return places, far, square
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        return _seen(points, residuals, raster, tolerance_m, gap_m, self._faces)
 
     def elevation(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Elevation of the highest face at places, (n,) float64; nan where there is none."""

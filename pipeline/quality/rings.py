@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.orientation import same_ray, segments_meet, turn_of
+from pipeline.kernels.union_find import root_of, unite
 from pipeline.model import IntArray
-from pipeline.quality.union_find import root_of, unite
-from pipeline.triangulation.projection import turn_of
 
 RING_SELF_INTERSECTION = 104
 INTERSECTION_RINGS = 201
@@ -18,53 +18,6 @@ INNER_RINGS_NESTED = 207
 ORIENTATION_RINGS_SAME = 208
 
 _OUTSIDE, _INSIDE, _BOTH = 0, 1, 2
-
-
-@kernel
-def _within_box(flat: IntArray, a: int, b: int, p: int) -> bool:
-    """Whether p, which is on the line through a and b, is between them or at an end."""
-    return bool(
-        min(flat[a, 0], flat[b, 0]) <= flat[p, 0] <= max(flat[a, 0], flat[b, 0])
-        and min(flat[a, 1], flat[b, 1]) <= flat[p, 1] <= max(flat[a, 1], flat[b, 1])
-    )
-
-
-@kernel
-def segments_meet(flat: IntArray, a: int, b: int, c: int, d: int) -> bool:
-    """Whether the closed segments a, b and c, d have a point in common."""
-    if (
-        max(flat[a, 0], flat[b, 0]) < min(flat[c, 0], flat[d, 0])
-        or max(flat[c, 0], flat[d, 0]) < min(flat[a, 0], flat[b, 0])
-        or max(flat[a, 1], flat[b, 1]) < min(flat[c, 1], flat[d, 1])
-        or max(flat[c, 1], flat[d, 1]) < min(flat[a, 1], flat[b, 1])
-    ):
-        return False
-    side_c, side_d = turn_of(flat, a, b, c), turn_of(flat, a, b, d)
-    if (side_c > 0 and side_d > 0) or (side_c < 0 and side_d < 0):
-        return False
-    side_a, side_b = turn_of(flat, c, d, a), turn_of(flat, c, d, b)
-    if (side_a > 0 and side_b > 0) or (side_a < 0 and side_b < 0):
-        return False
-    if side_c == 0 and side_d == 0:
-        return (
-            _within_box(flat, a, b, c)
-            or _within_box(flat, a, b, d)
-            or _within_box(flat, c, d, a)
-            or _within_box(flat, c, d, b)
-        )
-    return True
-
-
-@kernel
-def _runs_back(flat: IntArray, before: int, corner: int, after: int) -> bool:
-    """Whether the edges before and after a corner lie on each other."""
-    if turn_of(flat, before, corner, after) != 0:
-        return False
-    return bool(
-        (flat[before, 0] - flat[corner, 0]) * (flat[after, 0] - flat[corner, 0])
-        + (flat[before, 1] - flat[corner, 1]) * (flat[after, 1] - flat[corner, 1])
-        > 0
-    )
 
 
 @kernel
@@ -84,7 +37,7 @@ def ring_is_simple(flat: IntArray, start: int, stop: int) -> bool:
         return False
     for i in range(count):
         a, b = start + i, start + (i + 1) % count
-        if _runs_back(flat, a, b, start + (i + 2) % count):
+        if same_ray(flat, b, a, start + (i + 2) % count):
             return False
         last = count - 1 if i == 0 else count
         for j in range(i + 2, last):
@@ -126,7 +79,7 @@ def _rings_cross(flat: IntArray, ids: IntArray, a: int, a_stop: int, b: int, b_s
                     common, far, other_far = p, q, r
                 elif ids[q] == ids[r]:
                     common, far, other_far = q, p, s
-                if not _runs_back(flat, far, common, other_far):
+                if not same_ray(flat, common, far, other_far):
                     continue
             return True
     return False
@@ -164,7 +117,8 @@ def _touches_enclose_a_part(ids: IntArray, ring_offsets: IntArray) -> bool:
     parent = np.arange(rings + corners)
     ring_of = np.empty(corners, np.int64)
     for r in range(rings):
-        ring_of[ring_offsets[r] : ring_offsets[r + 1]] = r
+        for i in range(ring_offsets[r], ring_offsets[r + 1]):
+            ring_of[i] = r
     for i in range(corners):
         for j in range(i):
             if ids[j] == ids[i]:
@@ -221,12 +175,3 @@ def polygon_code(flat: IntArray, ids: IntArray, ring_offsets: IntArray) -> int:
                 if side != _OUTSIDE:
                     return INTERSECTION_RINGS if side == _BOTH else INNER_RINGS_NESTED
     return POLYGON_INTERIOR_DISCONNECTED if _touches_enclose_a_part(ids, ring_offsets) else 0
-
-
-@kernel
-def has_repeated_neighbours(ids: IntArray, start: int, stop: int) -> bool:
-    """Whether two consecutive corners of the ring start:stop are the same vertex (code 102)."""
-    repeated = False
-    for i in range(start, stop):
-        repeated = repeated or ids[i] == ids[i + 1 if i + 1 < stop else start]
-    return repeated

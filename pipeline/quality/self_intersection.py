@@ -13,8 +13,9 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.orientation import segments_meet, turn_of
 from pipeline.model import IntArray
-from pipeline.triangulation.edge_flips import ascending_order
 
 _LOW_BITS = 20
 _LOW_MASK = (1 << _LOW_BITS) - 1
@@ -36,47 +37,20 @@ def side_of_plane(vertices: IntArray, a: int, b: int, c: int, d: int) -> int:
 
 
 @kernel
-def _dominant_plane(vertices: IntArray, a: int, b: int, c: int) -> tuple[int, int]:
-    """The two axes in which the triangle a, b, c shows the largest area."""
+def _in_plane(vertices: IntArray, a: int, b: int, c: int, p: int, q: int) -> IntArray:
+    """Five vertices (5, 2) as seen along the axis along which the triangle a, b, c shows the largest area."""
     ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
     vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
     nx, ny, nz = abs(uy * vz - uz * vy), abs(uz * vx - ux * vz), abs(ux * vy - uy * vx)
+    x, y = 1, 2
     if nz >= nx and nz >= ny:
-        return 0, 1
-    return (2, 0) if ny >= nx else (1, 2)
-
-
-@kernel
-def _turn(vertices: IntArray, x: int, y: int, a: int, b: int, c: int) -> int:
-    """Twice the signed area of a, b, c as seen in the axes x and y."""
-    right, up = vertices[b, x] - vertices[a, x], vertices[b, y] - vertices[a, y]
-    return int(right * (vertices[c, y] - vertices[a, y]) - up * (vertices[c, x] - vertices[a, x]))
-
-
-@kernel
-def _coplanar_segments_meet(vertices: IntArray, x: int, y: int, p: int, q: int, a: int, b: int) -> bool:
-    """Whether the closed segments p, q and a, b of one plane meet, as seen in the axes x and y."""
-    for axis in (x, y):
-        if max(vertices[p, axis], vertices[q, axis]) < min(vertices[a, axis], vertices[b, axis]) or max(
-            vertices[a, axis], vertices[b, axis]
-        ) < min(vertices[p, axis], vertices[q, axis]):
-            return False
-    side_a, side_b = _turn(vertices, x, y, p, q, a), _turn(vertices, x, y, p, q, b)
-    if (side_a > 0 and side_b > 0) or (side_a < 0 and side_b < 0):
-        return False
-    side_p, side_q = _turn(vertices, x, y, a, b, p), _turn(vertices, x, y, a, b, q)
-    return not ((side_p > 0 and side_q > 0) or (side_p < 0 and side_q < 0))
-
-
-@kernel
-def _in_triangle(vertices: IntArray, x: int, y: int, a: int, b: int, c: int, p: int) -> bool:
-    """Whether p of the triangle's plane is within it or on its boundary, as seen in the axes x and y."""
-    first, second, third = (
-        _turn(vertices, x, y, a, b, p),
-        _turn(vertices, x, y, b, c, p),
-        _turn(vertices, x, y, c, a, p),
-    )
-    return (first >= 0 and second >= 0 and third >= 0) or (first <= 0 and second <= 0 and third <= 0)
+        x, y = 0, 1
+    elif ny >= nx:
+        x, y = 2, 0
+    flat = np.empty((5, 2), np.int64)
+    for i, vertex in enumerate((a, b, c, p, q)):
+        flat[i, 0], flat[i, 1] = vertices[vertex, x], vertices[vertex, y]
+    return flat
 
 
 @kernel
@@ -86,13 +60,14 @@ def segment_meets_triangle(vertices: IntArray, p: int, q: int, a: int, b: int, c
     if side_p * side_q > 0:
         return False
     if side_p == 0 and side_q == 0:
-        x, y = _dominant_plane(vertices, a, b, c)
-        return (
-            _in_triangle(vertices, x, y, a, b, c, p)
-            or _coplanar_segments_meet(vertices, x, y, p, q, a, b)
-            or _coplanar_segments_meet(vertices, x, y, p, q, b, c)
-            or _coplanar_segments_meet(vertices, x, y, p, q, c, a)
-        )
+        flat = _in_plane(vertices, a, b, c, p, q)
+        positive, negative = True, True
+        for i in range(3):
+            side = turn_of(flat, i, (i + 1) % 3, 3)
+            positive, negative = positive and side >= 0, negative and side <= 0
+            if segments_meet(flat, 3, 4, i, (i + 1) % 3):
+                return True
+        return positive or negative
     first = side_of_plane(vertices, p, q, a, b)
     second = side_of_plane(vertices, p, q, b, c)
     if first * second < 0:
@@ -122,8 +97,8 @@ def triangles_intersect(vertices: IntArray, first: IntArray, second: IntArray) -
         a, b, c, d = first[(i_alone + 1) % 3], first[(i_alone + 2) % 3], first[i_alone], second[j_alone]
         if side_of_plane(vertices, a, b, c, d) != 0:
             return False
-        x, y = _dominant_plane(vertices, a, b, c)
-        return (_turn(vertices, x, y, a, b, c) > 0) == (_turn(vertices, x, y, a, b, d) > 0)
+        flat = _in_plane(vertices, a, b, c, d, d)
+        return (turn_of(flat, 0, 1, 2) > 0) == (turn_of(flat, 0, 1, 3) > 0)
     if shared == 1:
         p, q = first[(i_shared + 1) % 3], first[(i_shared + 2) % 3]
         r, s = second[(j_shared + 1) % 3], second[(j_shared + 2) % 3]
@@ -136,17 +111,6 @@ def triangles_intersect(vertices: IntArray, first: IntArray, second: IntArray) -
         if segment_meets_triangle(vertices, second[k], second[(k + 1) % 3], first[0], first[1], first[2]):
             return True
     return False
-
-
-@kernel
-def _longest_plan_axis(low: IntArray) -> int:
-    """0 where the lower corners of boxes (n, 3) spread farther in x than in y, else 1."""
-    least_x = most_x = low[0, 0]
-    least_y = most_y = low[0, 1]
-    for i in range(1, len(low)):
-        least_x, most_x = min(least_x, low[i, 0]), max(most_x, low[i, 0])
-        least_y, most_y = min(least_y, low[i, 1]), max(most_y, low[i, 1])
-    return 0 if most_x - least_x >= most_y - least_y else 1
 
 
 @kernel
@@ -173,7 +137,12 @@ def shell_intersects_itself(vertices: IntArray, triangles: IntArray, face_of: In
         for k in range(3):
             a, b, c = vertices[triangles[t, 0], k], vertices[triangles[t, 1], k], vertices[triangles[t, 2], k]
             low[t, k], high[t, k] = min(a, b, c), max(a, b, c)
-    along = _longest_plan_axis(low)
+    least, most = low[0].copy(), low[0].copy()
+    for t in range(count):
+        for k in range(2):
+            least[k], most[k] = min(least[k], low[t, k]), max(most[k], low[t, k])
+    # the plan axis along which the boxes spread farther
+    along = 0 if most[0] - least[0] >= most[1] - least[1] else 1
     across = 1 - along
     order = ascending_order(low[:, along].copy())
     for i in range(count):

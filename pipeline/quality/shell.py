@@ -10,25 +10,14 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.union_find import root_of, unite
 from pipeline.model import BoolArray, IntArray
-from pipeline.quality.union_find import root_of, unite
-from pipeline.triangulation.edge_flips import ascending_order
+from pipeline.triangulation.edge_flips import edges_in_order
 
 SHELL_NOT_CLOSED = 302
 NON_MANIFOLD_CASE = 303
 MULTIPLE_CONNECTED_COMPONENTS = 305
 POLYGON_WRONG_ORIENTATION = 307
-
-
-@kernel
-def _edge_keys(triangles: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]:
-    """Keys of the undirected edges of all triangles, by 3 * triangle + corner, and the order that sorts them."""
-    keys = np.empty(3 * len(triangles), np.int64)
-    for t in range(len(triangles)):
-        for k in range(3):
-            a, b = triangles[t, k], triangles[t, (k + 1) % 3]
-            keys[3 * t + k] = a * vertex_count + b if a < b else b * vertex_count + a
-    return keys, ascending_order(keys)
 
 
 @kernel
@@ -49,7 +38,7 @@ def is_sound_shell(triangles: IntArray, vertex_count: int, found: BoolArray) -> 
     bool
         True where none holds.
     """
-    keys, order = _edge_keys(triangles, vertex_count)
+    keys, order = edges_in_order(triangles, len(triangles), vertex_count)
     component = np.arange(len(triangles))
     umbrella = np.arange(3 * len(triangles))
     manifold = True

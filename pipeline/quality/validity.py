@@ -42,6 +42,9 @@ from itertools import chain
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.orientation import comes_before
+from pipeline.kernels.union_find import root_of
 from pipeline.model import BoolArray, IntArray, Solid
 from pipeline.parameters import Parameters, parameter
 from pipeline.quality.planarity import (
@@ -50,11 +53,9 @@ from pipeline.quality.planarity import (
     in_fitted_plane,
     least_cosine_of_normals,
 )
-from pipeline.quality.rings import RING_SELF_INTERSECTION, has_repeated_neighbours, polygon_code
+from pipeline.quality.rings import RING_SELF_INTERSECTION, polygon_code
 from pipeline.quality.self_intersection import shell_intersects_itself
 from pipeline.quality.shell import is_sound_shell, six_volumes
-from pipeline.quality.union_find import root_of
-from pipeline.triangulation.edge_flips import ascending_order
 from pipeline.triangulation.faces import DONE, MILLIMETRES_PER_METRE, triangulate_rings
 from pipeline.triangulation.projection import area_vector, project_along_dominant_axis
 
@@ -145,24 +146,11 @@ def _faults(
 ) -> BoolArray:
     """(406,) bool, True at the codes of the faults of a solid, by either verdict on pairs at the snapping tolerance."""
     joined, apart, differ = _snap(vertices, ring_vertices, snap_mm)
-    found = _find_faults(vertices, joined, ring_offsets, face_offsets, planarity_mm, least_cosine)
-    if differ:
-        others = _find_faults(vertices, apart, ring_offsets, face_offsets, planarity_mm, least_cosine)
-        for code in range(len(found)):
-            found[code] |= others[code]
+    found = np.zeros(_CODE_LIMIT, np.bool_)
+    for verdict in range(2 if differ else 1):
+        ids = joined if verdict == 0 else apart
+        _find_faults(vertices, ids, ring_offsets, face_offsets, planarity_mm, least_cosine, found)
     return found
-
-
-@kernel
-def _join(parent: IntArray, vertices: IntArray, p: int, q: int) -> None:
-    """Unite the sets of two vertices; the first by x, y, z represents them."""
-    a, b = root_of(parent, p), root_of(parent, q)
-    for k in range(3):
-        if vertices[a, k] != vertices[b, k]:
-            if vertices[b, k] < vertices[a, k]:
-                a, b = b, a
-            break
-    parent[b] = a
 
 
 @kernel
@@ -176,7 +164,9 @@ def _snap(vertices: IntArray, ring_vertices: IntArray, snap_mm: float) -> tuple[
     for vertex in ring_vertices:
         is_used[vertex] = True
     order = ascending_order(vertices[:, 0].copy())
-    inclusive, exclusive = np.arange(count), np.arange(count)
+    parents = np.empty((2, count), np.int64)
+    for vertex in range(count):
+        parents[0, vertex] = parents[1, vertex] = vertex
     limit = snap_mm * snap_mm
     differ = False
     for i in range(count):
@@ -192,15 +182,19 @@ def _snap(vertices: IntArray, ring_vertices: IntArray, snap_mm: float) -> tuple[
             distance = float(dx * dx + dy * dy + dz * dz)
             if distance > limit or not is_used[q]:
                 continue
-            _join(inclusive, vertices, p, q)
-            if distance < limit or distance == 0.0:
-                _join(exclusive, vertices, p, q)
-            else:
-                differ = True
+            is_within = distance < limit or distance == 0.0
+            differ = differ or not is_within
+            for verdict in range(2 if is_within else 1):
+                # the first by x, y, z represents all
+                parent = parents[verdict]
+                a, b = root_of(parent, p), root_of(parent, q)
+                if comes_before(vertices, b, a):
+                    a, b = b, a
+                parent[b] = a
     joined, apart = np.empty_like(ring_vertices), np.empty_like(ring_vertices)
     for corner in range(len(ring_vertices)):
-        joined[corner] = root_of(inclusive, ring_vertices[corner])
-        apart[corner] = root_of(exclusive, ring_vertices[corner])
+        joined[corner] = root_of(parents[0], ring_vertices[corner])
+        apart[corner] = root_of(parents[1], ring_vertices[corner])
     return joined, apart, differ
 
 
@@ -211,8 +205,9 @@ def _face_code(corners: IntArray, ids: IntArray, rings: IntArray, planarity_mm: 
         if rings[r + 1] - rings[r] < 3:
             return TOO_FEW_POINTS
     for r in range(len(rings) - 1):
-        if has_repeated_neighbours(ids, rings[r], rings[r + 1]):
-            return CONSECUTIVE_POINTS_SAME
+        for i in range(rings[r], rings[r + 1]):
+            if ids[i] == ids[i + 1 if i + 1 < rings[r + 1] else rings[r]]:
+                return CONSECUTIVE_POINTS_SAME
     if len(corners) == 3:
         x, y, z = area_vector(corners, 0, 3)
         return RING_SELF_INTERSECTION if x == 0 and y == 0 and z == 0 else 0
@@ -249,9 +244,9 @@ def _find_faults(
     face_offsets: IntArray,
     planarity_mm: float,
     least_cosine: float,
-) -> BoolArray:
-    """(406,) bool, True at the codes of the faults of a solid whose corners `ids` are snapped vertices."""
-    found = np.zeros(_CODE_LIMIT, np.bool_)
+    found: BoolArray,
+) -> None:
+    """Set found[code] for the faults of a solid whose corners `ids` are snapped vertices."""
     corners = np.empty((len(ids), 3), np.int64)
     for i in range(len(ids)):
         for k in range(3):
@@ -270,7 +265,7 @@ def _find_faults(
             found[code] = True
             sound = False
     if not sound:
-        return found
+        return
     triangles = np.empty((len(ids) + 2 * len(ring_offsets), 3), np.int64)
     face_of = np.empty(len(triangles), np.int64)
     count = 0
@@ -291,15 +286,14 @@ def _find_faults(
             face_of[count] = f
             count += 1
     if not sound:
-        return found
+        return
     if faces < 4:
         found[TOO_FEW_POLYGONS] = True
-        return found
+        return
     triangles = triangles[:count]
     if not is_sound_shell(triangles, len(vertices), found):
-        return found
+        return
     if shell_intersects_itself(vertices, triangles, face_of):
         found[SHELL_SELF_INTERSECTION] = True
     elif six_volumes(vertices, triangles) <= 0.0:
         found[WRONG_ORIENTATION_SHELL] = True
-    return found

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 _MAX_CELLS = 4_000_000
@@ -20,17 +22,10 @@ def _bucket(x: IntArray, y: IntArray, cell: int) -> tuple[LabelArray, LabelArray
     low_y = y.min()
     columns = (x.max() - low_x) // cell + 1
     rows = (y.max() - low_y) // cell + 1
-    starts = np.zeros(columns * rows + 1, np.int32)
+    keys = np.empty(len(x), np.int32)
     for i in range(len(x)):
-        starts[(y[i] - low_y) // cell * columns + (x[i] - low_x) // cell + 1] += 1
-    for k in range(columns * rows):
-        starts[k + 1] += starts[k]
-    filled = starts[:-1].copy()
-    order = np.empty(len(x), np.int32)
-    for i in range(len(x)):
-        k = (y[i] - low_y) // cell * columns + (x[i] - low_x) // cell
-        order[filled[k]] = i
-        filled[k] += 1
+        keys[i] = (y[i] - low_y) // cell * columns + (x[i] - low_x) // cell
+    starts, order = counting_sort(keys, columns * rows)
     return starts, order, columns, rows, low_x, low_y
 
 
@@ -220,7 +215,7 @@ def _pairs_that_cross(
             elif at_q < 0.0 < at_p:
                 votes[count] = 1
             count += 1
-    order = np.argsort(keys[:count], kind="mergesort")
+    order = ascending_order(keys[:count])
     pair_keys = np.empty(count, np.int64)
     kinds = np.empty(count, np.int32)
     n_pairs = 0

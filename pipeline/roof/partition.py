@@ -17,6 +17,9 @@ import shapely
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.union_find import numbered_sets, unite
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason, Tin
 
 OUTSIDE = -1
@@ -44,35 +47,14 @@ class RoofPartition:
 def connected_regions(facets: LabelArray, labels: LabelArray) -> tuple[LabelArray, int]:
     """Components of equally labelled vertices along TIN edges, numbered by their lowest vertex."""
     n = len(labels)
-    parent = np.arange(n).astype(np.int32)
+    parent = np.arange(n)
     for t in range(len(facets)):
         for k in range(3):
             a = facets[t, k]
             b = facets[t, (k + 1) % 3]
-            if labels[a] != labels[b]:
-                continue
-            while parent[a] != a:
-                parent[a] = parent[parent[a]]
-                a = parent[a]
-            while parent[b] != b:
-                parent[b] = parent[parent[b]]
-                b = parent[b]
-            if a < b:
-                parent[b] = a
-            else:
-                parent[a] = b
-    regions = np.empty(n, np.int32)
-    count = 0
-    for i in range(n):
-        root = i
-        while parent[root] != root:
-            root = parent[root]
-        if root == i:
-            regions[i] = count
-            count += 1
-        else:
-            regions[i] = regions[root]
-    return regions, count
+            if labels[a] == labels[b]:
+                unite(parent, a, b)
+    return numbered_sets(parent)
 
 
 @kernel
@@ -113,37 +95,22 @@ def absorb_small_regions(
     n_planes = len(planes)
     n = len(labels)
     # adjacency of vertices in compressed rows, both directions of every edge (inner edges twice, which does not matter)
-    starts = np.zeros(n + 1, np.int32)
+    corners = np.empty(6 * len(facets), np.int32)
     for t in range(len(facets)):
-        for k in range(3):
-            starts[facets[t, k] + 1] += 2
-    for i in range(n):
-        starts[i + 1] += starts[i]
-    filled = starts[:-1].copy()
-    adjacent = np.empty(starts[n], np.int32)
-    for t in range(len(facets)):
-        for k in range(3):
-            v = facets[t, k]
-            adjacent[filled[v]] = facets[t, (k + 1) % 3]
-            adjacent[filled[v] + 1] = facets[t, (k + 2) % 3]
-            filled[v] += 2
+        for k in range(6):
+            corners[6 * t + k] = facets[t, k // 2]
+    starts, adjacent = counting_sort(corners, n)
+    for s in range(len(adjacent)):
+        t, k = adjacent[s] // 6, adjacent[s] % 6
+        adjacent[s] = facets[t, (k // 2 + 1 + k % 2) % 3]
     border = np.zeros(n_planes + 1, np.int64)
     for _ in range(50):
         regions, count = connected_regions(facets, labels)
         areas = _region_areas(x, y, facets, regions, count, counted)
-        first = np.zeros(count + 1, np.int32)
-        for i in range(n):
-            first[regions[i] + 1] += 1
-        for r in range(count):
-            first[r + 1] += first[r]
-        filled_regions = first[:-1].copy()
-        members = np.empty(n, np.int32)
-        for i in range(n):
-            members[filled_regions[regions[i]]] = i
-            filled_regions[regions[i]] += 1
+        first, members = counting_sort(regions, count)
         touched = np.zeros(count, np.uint8)
         changed = False
-        for r in np.argsort(areas, kind="mergesort"):
+        for r in ascending_order(areas):
             label = labels[members[first[r]]]
             if areas[r] >= max(minimum_area_m2, minimum_void_m2):
                 break

@@ -17,6 +17,7 @@ import numpy as np
 import shapely
 
 from pipeline.errors import BuildingError
+from pipeline.kernels.union_find import united
 from pipeline.model import FaceKind, FloatArray, Plane, Reason, RoofFace, Solid, SolidFace
 from pipeline.roof.partition import RoofPartition
 
@@ -154,22 +155,11 @@ def _insert_crossings(mesh: _Mesh, planes: Sequence[Plane]) -> dict[tuple[int, i
 
 def _connected(mesh: _Mesh, edges: dict[tuple[int, int], int]) -> list[list[int]]:
     """Faces of every part that hangs together by edges."""
-    root = list(range(len(mesh.faces)))
-
-    def find(face: int) -> int:
-        while root[face] != face:
-            root[face] = root[root[face]]
-            face = root[face]
-        return face
-
-    for (a, b), left in edges.items():
-        right = edges.get((b, a))
-        if right is not None:
-            low, high = sorted((find(left), find(right)))
-            root[high] = low
+    left = np.fromiter(edges.values(), np.int64)
+    right = np.fromiter((edges.get((b, a), face) for (a, b), face in edges.items()), np.int64)
     parts: dict[int, list[int]] = {}
-    for face in range(len(mesh.faces)):
-        parts.setdefault(find(face), []).append(face)
+    for face, first in enumerate(united(len(mesh.faces), left, right).tolist()):
+        parts.setdefault(first, []).append(face)
     return list(parts.values())
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
+from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray, KindArray
 from pipeline.runtime.tile_content import mixed
 from pipeline.terrain.facets import FacetKind
@@ -41,31 +42,6 @@ def facet_names(keys: IntArray) -> npt.NDArray[np.uint64]:
     return names
 
 
-def united(count: int, one: IntArray, other: IntArray) -> IntArray:
-    """Smallest member (count,) int64 of the set of each of `count` elements, after uniting `one[i]` and `other[i]`."""
-    # one layout, so that the kernel is compiled once
-    return _united(count, np.ascontiguousarray(one), np.ascontiguousarray(other))
-
-
-@kernel
-def _united(count: int, one: IntArray, other: IntArray) -> IntArray:
-    """Kernel of `united`."""
-    parent = np.arange(count)
-    for i in range(one.size):
-        a, b = one[i], other[i]
-        while parent[a] != a:
-            parent[a] = parent[parent[a]]
-            a = parent[a]
-        while parent[b] != b:
-            parent[b] = parent[parent[b]]
-            b = parent[b]
-        parent[max(a, b)] = min(a, b)
-    for k in range(count):
-        # parents are smaller than their children, so the parent's root is known
-        parent[k] = parent[parent[k]]
-    return parent
-
-
 def united_by_name(count: int, names: npt.NDArray[np.uint64], holders: IntArray) -> IntArray:
     """Smallest member (count,) int64 of the set of each of `count` elements, where those with one name are one set.
 
@@ -80,7 +56,7 @@ def united_by_name(count: int, names: npt.NDArray[np.uint64], holders: IntArray)
     """
     order = np.lexsort((names[:, 1], names[:, 0]))
     same = np.flatnonzero((names[order[1:]] == names[order[:-1]]).all(axis=1))
-    return united(count, holders[order[same]].astype(np.int64), holders[order[same + 1]].astype(np.int64))
+    return united(count, holders[order[same]], holders[order[same + 1]])
 
 
 def telling_facets(

@@ -17,8 +17,9 @@ import dataclasses
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
-from pipeline.runtime.border_facets import facet_names, telling_facets, united
+from pipeline.runtime.border_facets import facet_names, telling_facets
 from pipeline.runtime.finished_surfaces import Finished, finished
 from pipeline.terrain.candidates import SOLID, CandidateSettings, Fault, Surfaces, judge_surfaces, may_join
 from pipeline.terrain.facets import FacetKind

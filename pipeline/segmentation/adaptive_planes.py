@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.geometry import nearest_neighbours
+from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.segmentation.plane_merge import touching_pairs
@@ -186,21 +187,22 @@ def mean_nodes(points: FloatArray, cell_m: float, gap_m: float) -> tuple[FloatAr
         Node of every point.
     """
     n = len(points)
-    column = np.empty(n, np.int64)
     row = np.empty(n, np.int64)
+    first_row, last_row = math.floor(points[0, 1] / cell_m), math.floor(points[0, 1] / cell_m)
     for i in range(n):
-        column[i] = math.floor(points[i, 0] / cell_m)
         row[i] = math.floor(points[i, 1] / cell_m)
-    first_row = row.min()
-    rows = row.max() + 1 - first_row
-    order = np.argsort(column * rows + (row - first_row), kind="mergesort")
+        first_row, last_row = min(first_row, row[i]), max(last_row, row[i])
+    cell = np.empty(n, np.int64)
+    for i in range(n):
+        cell[i] = math.floor(points[i, 0] / cell_m) * (last_row + 1 - first_row) + (row[i] - first_row)
+    order = ascending_order(cell)
     nodes = np.zeros((n, 3))
     node_of = np.empty(n, np.int32)
     count = 0
     begin = 0
     while begin < n:
         end = begin + 1
-        while end < n and row[order[end]] == row[order[begin]] and column[order[end]] == column[order[begin]]:
+        while end < n and cell[order[end]] == cell[order[begin]]:
             i = order[end]
             q = end
             while q > begin and points[order[q - 1], 2] > points[i, 2]:
@@ -386,7 +388,7 @@ def _noise_about(points: FloatArray, labels: LabelArray, planes: FloatArray) -> 
             known += 1
     if known == 0:
         return np.nan
-    ordered = np.sort(distances[:known])
+    ordered = in_order(distances[:known])
     return float(_MAD_TO_SIGMA * 0.5 * (ordered[(known - 1) // 2] + ordered[known // 2]))
 
 
@@ -431,7 +433,7 @@ def _detect(
 ) -> tuple[FloatArray, LabelArray, float]:
     """Kernel of `detect_planes`: planes, labels of the points, noise."""
     local, variances = local_planes(nodes, neighbours)
-    order = np.argsort(variances, kind="mergesort")
+    order = ascending_order(variances)
     sigma_m = noise_of_local_planes(variances, order)
     distance_m = min(max(noises * sigma_m, distance_min_m), distance_max_m)
     # of a plane through m points spread evenly over a disc the slope has the error 2 sigma sqrt(pi) / (spacing m)

@@ -19,6 +19,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
+from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.parameters import Parameters, parameter
 
@@ -371,19 +372,11 @@ def labels_around(xyz: FloatArray, facets: LabelArray, facet_labels: LabelArray)
         Equal sums: the cluster of the facet that comes first; -1 where no labelled facet touches the point.
     """
     n = xyz.shape[0]
-    start = np.zeros(n + 1, np.int64)
-    for t in range(facets.shape[0]):
+    vertices = np.empty(3 * len(facets), np.int32)
+    for t in range(len(facets)):
         for k in range(3):
-            start[facets[t, k] + 1] += 1
-    for i in range(n):
-        start[i + 1] += start[i]
-    corner = np.empty(start[n], np.int64)
-    end = start[:-1].copy()
-    for t in range(facets.shape[0]):
-        for k in range(3):
-            i = facets[t, k]
-            corner[end[i]] = 3 * t + k
-            end[i] += 1
+            vertices[3 * t + k] = facets[t, k]
+    start, corner = counting_sort(vertices, n)
     most = -1
     for label in facet_labels:
         most = max(most, label)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import FloatArray, LabelArray
 from pipeline.segmentation.plane_regression import (
     N_SUMS,
@@ -60,7 +61,7 @@ def cluster_leftovers(
                 flatness[i] = mean_square_residual(sums, a, b, c) * cosine_of_slope(a, b) ** 2
     queue = np.empty(n, np.int32)
     asked = np.full(n, -1, np.int32)
-    for seed in np.argsort(flatness, kind="mergesort"):
+    for seed in ascending_order(flatness):
         if flatness[seed] > distance_m * distance_m:
             break
         if grown[seed] >= 0:

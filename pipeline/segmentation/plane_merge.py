@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.compiler import kernel
+from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
+from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import best_fit_plane, cosine_of_slope, mean_square_residual
 
@@ -76,7 +77,7 @@ def touching_pairs(neighbours: LabelArray, labels: LabelArray, usable: BoolArray
 @kernel
 def _ascending_once(codes: IntArray) -> IntArray:
     """Sorted codes without repetition."""
-    ordered = np.sort(codes)
+    ordered = in_order(codes)
     kept = 0
     for i in range(ordered.size):
         if i == 0 or ordered[i] != ordered[i - 1]:
@@ -113,8 +114,19 @@ def parallel_pairs_in_reach(
             box[k, 1] = min(box[k, 1], points[i, 1])
             box[k, 2] = max(box[k, 2], points[i, 0])
             box[k, 3] = max(box[k, 3], points[i, 1])
-    nodes = np.flatnonzero(usable)
-    nodes = nodes[np.argsort(box[nodes, 0], kind="mergesort")]
+    west = np.full(n, np.inf)
+    count_of_usable = 0
+    for k in range(n):
+        if usable[k]:
+            west[k] = box[k, 0]
+            count_of_usable += 1
+    # those that are not usable come last, among those without points
+    nodes = np.empty(count_of_usable, np.int64)
+    held = 0
+    for k in ascending_order(west):
+        if usable[k]:
+            nodes[held] = k
+            held += 1
     codes = np.empty(64, np.int64)
     count = 0
     work = 0
@@ -212,8 +224,8 @@ def merge_planes(
     last = np.full(n, -1, np.int64)
     following = np.full(2 * pairs.size, -1, np.int64)
     partner = np.empty(2 * pairs.size, np.int64)
-    keys = np.empty(pairs.size + 16)
-    items = np.empty((pairs.size + 16, 4), np.int32)
+    # pairs of clusters, low * n + high, with the sum of their versions
+    queue = heap_with_room(pairs.size + 16)
     held = 0
     work = 0
     for p in range(pairs.size):
@@ -229,14 +241,15 @@ def merge_planes(
         work += 1
         residual = _merged_residual(sums, planes, i, j, min_cosine, min_cosine_small, small)
         if residual < max_residual_m:
-            held = _push(keys, items, held, residual, i, j, 0, 0)
+            queue = heap_push(queue, held, residual, pairs[p], 0)
+            held += 1
     mark = np.full(n, -1, np.int64)
     merges = 0
     while held > 0:
-        i = items[0, 0]
-        j = items[0, 1]
-        stale = version[i] != items[0, 2] or version[j] != items[0, 3]
-        held = _pop(keys, items, held)
+        i, j = queue.ranks[0] // n, queue.ranks[0] % n
+        stale = root[i] != i or root[j] != j or version[i] + version[j] != queue.items[0]
+        heap_pop(queue, held)
+        held -= 1
         if stale:
             continue
         merges += 1
@@ -273,10 +286,8 @@ def merge_planes(
             high = max(i, other)
             residual = _merged_residual(sums, planes, low, high, min_cosine, min_cosine_small, small)
             if residual < max_residual_m:
-                if held == keys.size:
-                    keys = np.concatenate((keys, np.empty(held)))
-                    items = np.concatenate((items, np.empty((held, 4), np.int32)))
-                held = _push(keys, items, held, residual, low, high, version[low], version[high])
+                queue = heap_push(queue, held, residual, low * n + high, version[low] + version[high])
+                held += 1
             before = entry
             entry = following[entry]
         if work > work_limit:
@@ -287,55 +298,3 @@ def merge_planes(
             r = root[r]
         root[k] = r
     return root, work
-
-
-@kernel
-def _before(keys: FloatArray, items: npt.NDArray[np.int32], p: int, q: int) -> bool:
-    """Order of the queue: smaller residual, then smaller indices."""
-    if keys[p] != keys[q]:
-        return bool(keys[p] < keys[q])
-    if items[p, 0] != items[q, 0]:
-        return bool(items[p, 0] < items[q, 0])
-    return bool(items[p, 1] < items[q, 1])
-
-
-@kernel
-def _swap(keys: FloatArray, items: npt.NDArray[np.int32], p: int, q: int) -> None:
-    keys[p], keys[q] = keys[q], keys[p]
-    for d in range(4):
-        items[p, d], items[q, d] = items[q, d], items[p, d]
-
-
-@kernel
-def _push(
-    keys: FloatArray, items: npt.NDArray[np.int32], held: int, key: float, i: int, j: int, age_i: int, age_j: int
-) -> int:
-    """Put a pair into the binary heap; returns how many it then holds."""
-    keys[held] = key
-    items[held, 0] = i
-    items[held, 1] = j
-    items[held, 2] = age_i
-    items[held, 3] = age_j
-    at = held
-    while at > 0 and _before(keys, items, at, (at - 1) // 2):
-        _swap(keys, items, at, (at - 1) // 2)
-        at = (at - 1) // 2
-    return held + 1
-
-
-@kernel
-def _pop(keys: FloatArray, items: npt.NDArray[np.int32], held: int) -> int:
-    """Drop the first pair of the heap; returns how many it then holds."""
-    held -= 1
-    _swap(keys, items, 0, held)
-    at = 0
-    while True:
-        child = 2 * at + 1
-        if child >= held:
-            return held
-        if child + 1 < held and _before(keys, items, child + 1, child):
-            child += 1
-        if not _before(keys, items, child, at):
-            return held
-        _swap(keys, items, at, child)
-        at = child

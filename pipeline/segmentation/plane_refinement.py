@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -161,20 +162,22 @@ def refine_planes(
         np.ascontiguousarray(neighbours, dtype=np.int32),
         labels.astype(np.int32),
         n_clusters,
-        distance_m,
-        fewest_points,
-        settings.rounds,
-        settings.voting_passes,
-        settings.vote_weight,
-        settings.assignment == "all_planes",
-        math.cos(math.radians(settings.max_slope_deg)),
-        settings.outlier_factor,
-        settings.merge_residual_m,
-        settings.merge_angle_deg,
-        settings.small_cluster_points,
-        settings.merge_reach_m,
-        settings.plane_cost,
-        settings.refinement_work_limit,
+        _Rules(
+            distance_m=distance_m,
+            fewest_points=fewest_points,
+            rounds=settings.rounds,
+            voting_passes=settings.voting_passes,
+            vote_weight=settings.vote_weight,
+            all_planes=settings.assignment == "all_planes",
+            min_cosine=math.cos(math.radians(settings.max_slope_deg)),
+            outlier_factor=settings.outlier_factor,
+            merge_residual_m=settings.merge_residual_m,
+            merge_angle_deg=settings.merge_angle_deg,
+            small_cluster_points=settings.small_cluster_points,
+            merge_reach_m=settings.merge_reach_m,
+            plane_cost=settings.plane_cost,
+            work_limit=settings.refinement_work_limit,
+        ),
     )
     if work > settings.refinement_work_limit:
         raise BuildingError(
@@ -217,49 +220,57 @@ def _support(points: FloatArray, planes: FloatArray, labels: LabelArray) -> Floa
     return support
 
 
+class _Rules(NamedTuple):
+    """`PlaneRefinementSettings` at a density of points."""
+
+    distance_m: float
+    fewest_points: int
+    rounds: int
+    voting_passes: int
+    vote_weight: float
+    all_planes: bool
+    min_cosine: float
+    outlier_factor: float
+    merge_residual_m: float
+    merge_angle_deg: float
+    small_cluster_points: int
+    merge_reach_m: float
+    plane_cost: float
+    work_limit: int
+
+
 @kernel
 def _refine(
-    points: FloatArray,
-    neighbours: LabelArray,
-    labels: LabelArray,
-    n_clusters: int,
-    distance_m: float,
-    fewest_points: int,
-    rounds: int,
-    voting_passes: int,
-    vote_weight: float,
-    all_planes: bool,
-    min_cosine: float,
-    outlier_factor: float,
-    merge_residual_m: float,
-    merge_angle_deg: float,
-    small_cluster_points: int,
-    merge_reach_m: float,
-    plane_cost: float,
-    work_limit: int,
+    points: FloatArray, neighbours: LabelArray, labels: LabelArray, n_clusters: int, rules: _Rules
 ) -> tuple[FloatArray, LabelArray, int]:
     """Planes, labels and work; incomplete once the work passes the limit."""
     planes = np.zeros((n_clusters, 3))
     usable = np.zeros(n_clusters, np.bool_)
-    parallel_cosine = math.cos(math.radians(merge_angle_deg))
+    parallel_cosine = math.cos(math.radians(rules.merge_angle_deg))
     work = 0
-    for round_ in range(rounds):
-        fewest = fewest_points if round_ > 0 else min(fewest_points, _LEAST_SEED_POINTS)
+    for round_ in range(rules.rounds):
+        fewest = rules.fewest_points if round_ > 0 else min(rules.fewest_points, _LEAST_SEED_POINTS)
         sums = cluster_sums(points, labels, n_clusters)
-        _fit_all(sums, planes, usable, fewest, min_cosine)
-        _drop_outliers(points, labels, planes, usable, outlier_factor * distance_m)
+        _fit_all(sums, planes, usable, fewest, rules.min_cosine)
+        _drop_outliers(points, labels, planes, usable, rules.outlier_factor * rules.distance_m)
         sums = cluster_sums(points, labels, n_clusters)
-        _fit_all(sums, planes, usable, min(fewest, _LEAST_SEED_POINTS), min_cosine)
+        _fit_all(sums, planes, usable, min(fewest, _LEAST_SEED_POINTS), rules.min_cosine)
         pairs = touching_pairs(neighbours, labels, usable)
-        if merge_reach_m > 0.0:
-            settled = usable & (sums[:, 0] >= fewest_points)
+        if rules.merge_reach_m > 0.0:
+            settled = usable & (sums[:, 0] >= rules.fewest_points)
             distant, looks = parallel_pairs_in_reach(
-                points, labels, planes, settled, merge_reach_m, parallel_cosine, work_limit
+                points, labels, planes, settled, rules.merge_reach_m, parallel_cosine, rules.work_limit
             )
             work += looks
             pairs = np.unique(np.concatenate((pairs, distant)))
         root, comparisons = merge_planes(
-            sums, planes, pairs, merge_residual_m, merge_angle_deg, small_cluster_points, work_limit
+            sums,
+            planes,
+            pairs,
+            rules.merge_residual_m,
+            rules.merge_angle_deg,
+            rules.small_cluster_points,
+            rules.work_limit,
         )
         work += comparisons
         for i in range(labels.size):
@@ -267,24 +278,24 @@ def _refine(
                 labels[i] = root[labels[i]]
         for k in range(n_clusters):
             usable[k] = usable[k] and root[k] == k
-        if all_planes:
+        if rules.all_planes:
             work += labels.size * int(usable.sum())
-        if work > work_limit:
+        if work > rules.work_limit:
             return planes, labels, work
-        if all_planes:
-            labels = nearest_plane(points, planes, usable, distance_m)
+        if rules.all_planes:
+            labels = nearest_plane(points, planes, usable, rules.distance_m)
         else:
             if round_ > 0:
-                dissolve_redundant(points, neighbours, labels, planes, usable, distance_m, plane_cost)
+                dissolve_redundant(points, neighbours, labels, planes, usable, rules.distance_m, rules.plane_cost)
             labels = vote_among_neighbours(
-                points, neighbours, labels, planes, usable, distance_m, vote_weight, voting_passes
+                points, neighbours, labels, planes, usable, rules.distance_m, rules.vote_weight, rules.voting_passes
             )
     sums = cluster_sums(points, labels, n_clusters)
-    _fit_all(sums, planes, usable, fewest_points, min_cosine)
-    if not all_planes:
-        dissolve_redundant(points, neighbours, labels, planes, usable, distance_m, plane_cost)
+    _fit_all(sums, planes, usable, rules.fewest_points, rules.min_cosine)
+    if not rules.all_planes:
+        dissolve_redundant(points, neighbours, labels, planes, usable, rules.distance_m, rules.plane_cost)
         labels = vote_among_neighbours(
-            points, neighbours, labels, planes, usable, distance_m, vote_weight, voting_passes
+            points, neighbours, labels, planes, usable, rules.distance_m, rules.vote_weight, rules.voting_passes
         )
     planes, labels = _renumber(points, labels, planes, usable)
     return planes, labels, work

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.geometry import solve_plane_moments
+from pipeline.kernels.normal_equations import solve_plane_moments
 from pipeline.model import FloatArray, LabelArray
 
 N_SUMS = 10

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.merge_sort import ascending_order
+from pipeline.model import BoolArray, FloatArray, LabelArray
 from pipeline.segmentation.plane_merge import touching_pairs
 from pipeline.segmentation.point_assignment import distance_to_plane
 
@@ -47,23 +49,19 @@ def dissolve_redundant(
     pairs = touching_pairs(neighbours, labels, usable)
     if plane_cost <= 0.0 or pairs.size == 0:
         return
-    first, partner = _partners(pairs, n)
-    size = np.zeros(n, np.int64)
-    for k in labels:
-        if k >= 0:
-            size[k] += 1
-    # Points by label, in their order.
-    begin = np.zeros(n + 1, np.int64)
+    # the partners of every cluster, ascending: as the higher of a pair, then as the lower
+    m = pairs.size
+    owners = np.empty(2 * m, np.int32)
+    for p in range(m):
+        owners[p], owners[m + p] = pairs[p] % n, pairs[p] // n
+    first, partner = counting_sort(owners, n)
+    for p in range(2 * m):
+        partner[p] = owners[(partner[p] + m) % (2 * m)]
+    begin, member = counting_sort(labels, n)
+    size = np.empty(n, np.int64)
     for k in range(n):
-        begin[k + 1] = begin[k] + size[k]
-    fill = begin[:-1].copy()
-    member = np.empty(begin[n], np.int64)
-    for i in range(labels.size):
-        k = labels[i]
-        if k >= 0:
-            member[fill[k]] = i
-            fill[k] += 1
-    for k in np.argsort(size, kind="mergesort"):
+        size[k] = begin[k + 1] - begin[k]
+    for k in ascending_order(size):
         if not usable[k] or first[k] == first[k + 1]:
             continue
         worth = 0.0
@@ -91,24 +89,3 @@ def dissolve_redundant(
                 if distance < least:
                     least = distance
                     labels[i] = partner[p]
-
-
-@kernel
-def _partners(pairs: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Pairs as lists: where the partners of every cluster begin, (n + 1,), and the partners, ascending."""
-    first = np.zeros(n + 1, np.int64)
-    for code in pairs:
-        first[code // n + 1] += 1
-        first[code % n + 1] += 1
-    for k in range(n):
-        first[k + 1] += first[k]
-    fill = first[:-1].copy()
-    partner = np.empty(2 * pairs.size, np.int64)
-    for side in range(2):
-        for code in pairs:
-            low = code // n
-            high = code % n
-            owner = high if side == 0 else low
-            partner[fill[owner]] = low if side == 0 else high
-            fill[owner] += 1
-    return first, partner

@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
+from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.parameters import Parameters, parameter
 from pipeline.segmentation.plane_regression import N_SUMS, add_point, best_fit_plane, cosine_of_slope
@@ -173,7 +174,7 @@ def _grow_regions(
     planes = np.empty((n // fewest_points + 1, 3))
     count = 0
     misfits = _misfits(points, neighbours, clusters, gradients)
-    for seed in np.argsort(misfits, kind="mergesort"):
+    for seed in ascending_order(misfits):
         if misfits[seed] > distance_m * distance_m:
             break
         if labels[seed] >= 0:

@@ -13,7 +13,9 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
-from pipeline.model import FloatArray, IntArray, LabelArray, Reason
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.union_find import numbered_sets, root_of, unite
+from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.parameters import Parameters, parameter
 
 
@@ -131,41 +133,22 @@ def link(
 
 
 @kernel
-def _root(parent: LabelArray, i: int) -> int:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
-@kernel
-def _join(parent: LabelArray, i: int, j: int) -> None:
-    a, b = _root(parent, i), _root(parent, j)
-    parent[max(a, b)] = min(a, b)
-
-
-@kernel
 def _link(slope: FloatArray, orientation: FloatArray, distance: float, work_limit: int) -> tuple[LabelArray, int]:
     """Kernel: union-find over a grid whose cells are so small that all points of one are linked."""
     n = slope.size
-    parent = np.arange(n).astype(np.int32)
+    parent = np.arange(n)
     # the orientation's cells divide the circle; a hair smaller than the diagonal allows
     columns = math.ceil(360.0 / (distance / math.sqrt(2.0) * (1.0 - 1e-9)))
     width = 360.0 / columns
     rows = int(90.0 / width) + 1
-    cell = np.empty(n, np.int64)
+    cell = np.empty(n, np.int32)
     for i in range(n):
         column = min(int(orientation[i] / width), columns - 1)
         cell[i] = min(int(slope[i] / width), rows - 1) * columns + column
-    order = np.argsort(cell, kind="mergesort")
-    start = np.zeros(rows * columns + 1, np.int64)
-    for i in range(n):
-        start[cell[i] + 1] += 1
-    for c in range(rows * columns):
-        start[c + 1] += start[c]
+    start, order = counting_sort(cell, rows * columns)
     for c in range(rows * columns):
         for q in range(start[c] + 1, start[c + 1]):
-            _join(parent, order[start[c]], order[q])
+            unite(parent, order[start[c]], order[q])
     reach = math.ceil(distance / width)
     work = 0
     for c in range(rows * columns):
@@ -180,32 +163,23 @@ def _link(slope: FloatArray, orientation: FloatArray, distance: float, work_limi
                 other = (row + dr) * columns + (column + dc) % columns
                 if start[other] == start[other + 1] or other == c:
                     continue
-                if _root(parent, order[start[c]]) == _root(parent, order[start[other]]):
+                if root_of(parent, order[start[c]]) == root_of(parent, order[start[other]]):
                     continue
                 joined, comparisons = _near(slope, orientation, order, start, c, other, distance, work_limit - work)
                 work += comparisons
                 if joined:
-                    _join(parent, order[start[c]], order[start[other]])
+                    unite(parent, order[start[c]], order[start[other]])
                 if work > work_limit:
-                    return parent, work
-    labels = np.empty(n, np.int32)
-    count = 0
-    for i in range(n):
-        root = _root(parent, i)
-        if root == i:
-            labels[i] = count
-            count += 1
-        else:
-            labels[i] = labels[root]
-    return labels, work
+                    return numbered_sets(parent)[0], work
+    return numbered_sets(parent)[0], work
 
 
 @kernel
 def _near(
     slope: FloatArray,
     orientation: FloatArray,
-    order: IntArray,
-    start: IntArray,
+    order: LabelArray,
+    start: LabelArray,
     a: int,
     b: int,
     distance: float,

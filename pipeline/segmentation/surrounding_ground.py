@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import BoolArray, FloatArray
 
 
@@ -25,14 +26,15 @@ def far_from(samples: FloatArray, points: FloatArray, distance_m: float) -> Bool
     -------
     (m,) bool
     """
-    x_min = points[:, 0].min()
-    y_min = points[:, 1].min()
-    columns = int((points[:, 0].max() - x_min) / distance_m) + 1
-    rows = int((points[:, 1].max() - y_min) / distance_m) + 1
-    cell = ((points[:, 1] - y_min) / distance_m).astype(np.int64) * columns
-    cell += ((points[:, 0] - x_min) / distance_m).astype(np.int64)
-    order = np.argsort(cell, kind="mergesort")
-    cell = cell[order]
+    x_min, y_min, x_max, y_max = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(len(points)):
+        x_min, y_min = min(x_min, points[i, 0]), min(y_min, points[i, 1])
+        x_max, y_max = max(x_max, points[i, 0]), max(y_max, points[i, 1])
+    columns, rows = int((x_max - x_min) / distance_m) + 1, int((y_max - y_min) / distance_m) + 1
+    cell = np.empty(len(points), np.int32)
+    for i in range(len(points)):
+        cell[i] = int((points[i, 1] - y_min) / distance_m) * columns + int((points[i, 0] - x_min) / distance_m)
+    start, order = counting_sort(cell, columns * rows)
     far = np.ones(samples.shape[0], np.bool_)
     for s in range(samples.shape[0]):
         x = samples[s, 0]
@@ -44,10 +46,7 @@ def far_from(samples: FloatArray, points: FloatArray, distance_m: float) -> Bool
         if left > right:
             continue
         for r in range(max(row - 1, 0), min(row + 1, rows - 1) + 1):
-            begin = np.searchsorted(cell, r * columns + left)
-            for q in range(begin, cell.size):
-                if cell[q] > r * columns + right:
-                    break
+            for q in range(start[r * columns + left], start[r * columns + right + 1]):
                 dx = points[order[q], 0] - x
                 dy = points[order[q], 1] - y
                 if dx * dx + dy * dy <= distance_m * distance_m:

@@ -8,12 +8,12 @@ region's points of 1 - (distance / limit)^2, the complement of MSAC's cost (Torr
 
 from __future__ import annotations
 
-import heapq
 import math
 
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import (
     N_SUMS,
@@ -265,7 +265,8 @@ def take_regions(
     queue = np.empty(n, np.int32)
     reached = np.zeros(n, np.int32)
     anew = np.zeros(n, np.int32)
-    trials = [(0.0, -1)]
+    # the loss of every trial region and its seed, behind them that of none
+    trials, held_trials = heap_push(heap_with_room(64), 0, 0.0, -1, 0), 1
     mark = 0
     for seed in order:
         if variances[seed] > 4.0 * distance_m * distance_m:
@@ -287,11 +288,14 @@ def take_regions(
                         asked[j] = mark
                         reached[j] += 1
             if cosine_of_slope(a, b) >= min_cosine:
-                heapq.heappush(trials, (-gain, int(seed)))
+                trials = heap_push(trials, held_trials, -gain, seed, 0)
+                held_trials += 1
         mark += 1
     label = first_label
-    while trials[0][0] < 0.0:
-        lost, seed = heapq.heappop(trials)
+    while trials.keys[0] < 0.0:
+        lost, seed = trials.keys[0], trials.ranks[0]
+        heap_pop(trials, held_trials)
+        held_trials -= 1
         if labels[seed] >= 0:
             continue
         held, a, b, _, gain = _grow(
@@ -301,8 +305,9 @@ def take_regions(
         mark += 1
         if held < fewest_points or cosine_of_slope(a, b) < min_cosine:
             continue
-        if gain < -lost and -gain > trials[0][0]:
-            heapq.heappush(trials, (-gain, seed))
+        if gain < -lost and -gain > trials.keys[0]:
+            trials = heap_push(trials, held_trials, -gain, seed, 0)
+            held_trials += 1
             continue
         for q in range(held):
             labels[queue[q]] = label

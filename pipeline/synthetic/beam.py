@@ -163,9 +163,7 @@ def scan_lines(
     wrong_rows, wrong_lift = survey[9], survey[10]
     right_x, right_y = flight.along_y, -flight.along_x
     terrain, waves, base_z = scene.terrain, scene.waves, scene.terrain[0]
-    cell_start, entries, n_buildings = scene.cell_start, scene.entries, scene.n_buildings
-    face_start, edge_start, circles, faces = scene.face_start, scene.edge_start, scene.circles, scene.faces
-    edges, trees, spot_start, spots = scene.edges, scene.trees, scene.spot_start, scene.spots
+    spot_start, spots = scene.spot_start, scene.spots
     grid, cells_across, cells_up = scene.grid, scene.cells_across, scene.cells_up
     hit_z = np.empty(LINES_A_BEAM)
     hit_kind = np.empty(LINES_A_BEAM, np.int64)
@@ -201,14 +199,7 @@ def scan_lines(
             cell = cell_of(grid, cells_across, cells_up, x, y)
             lines = 1
             if cell >= 0 and not is_clear(
-                cell_start,
-                entries,
-                face_start,
-                edge_start,
-                circles,
-                faces,
-                edges,
-                trees,
+                scene,
                 cell,
                 x,
                 y,
@@ -234,15 +225,7 @@ def scan_lines(
                         lean_y,
                     )
                 top, kind, thing, face = first_hit(
-                    cell_start,
-                    entries,
-                    n_buildings,
-                    face_start,
-                    edge_start,
-                    circles,
-                    faces,
-                    edges,
-                    trees,
+                    scene,
                     cell,
                     line_x,
                     line_y,

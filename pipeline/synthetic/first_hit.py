@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.synthetic.scene_arrays import CELL_M
+from pipeline.model import FloatArray, LabelArray
+from pipeline.synthetic.scene_arrays import CELL_M, SceneArrays
 
 GROUND, ROOF, WALL, TREE, BOX = 0, 1, 2, 3, 4
 """Kinds of hits."""
@@ -142,30 +142,18 @@ def _meets_crown(
 
 @kernel
 def is_clear(
-    cell_start: LabelArray,
-    entries: IntArray,
-    face_start: LabelArray,
-    edge_start: LabelArray,
-    circles: FloatArray,
-    faces: FloatArray,
-    edges: FloatArray,
-    trees: FloatArray,
-    cell: int,
-    x: float,
-    y: float,
-    z: float,
-    lean_x: float,
-    lean_y: float,
-    radius: float,
+    scene: SceneArrays, cell: int, x: float, y: float, z: float, lean_x: float, lean_y: float, radius: float
 ) -> bool:
     """Whether a beam of a radius around a line meets no edge of a roof face and no crown.
 
     Each face is looked at in its own plane, whether it is hit or hidden, so a beam past an eave is not clear. Edges of
     walls alone (the vertical corners of a house) are not looked at.
     """
+    face_start, edge_start, circles = scene.face_start, scene.edge_start, scene.circles
+    faces, edges, trees = scene.faces, scene.edges, scene.trees
     lean = math.sqrt(lean_x * lean_x + lean_y * lean_y)
-    for entry in range(cell_start[cell], cell_start[cell + 1]):
-        number = entries[entry, 0]
+    for entry in range(scene.cell_start[cell], scene.cell_start[cell + 1]):
+        number = scene.entries[entry, 0]
         if number < 0:
             if _meets_crown(trees, ~number, x, y, z, lean_x, lean_y, radius):
                 return False
@@ -285,15 +273,7 @@ def cell_of(grid: FloatArray, across: int, up: int, x: float, y: float) -> int:
 
 @kernel
 def first_hit(
-    cell_start: LabelArray,
-    entries: IntArray,
-    n_buildings: int,
-    face_start: LabelArray,
-    edge_start: LabelArray,
-    circles: FloatArray,
-    faces: FloatArray,
-    edges: FloatArray,
-    trees: FloatArray,
+    scene: SceneArrays,
     cell: int,
     x: float,
     y: float,
@@ -310,7 +290,10 @@ def first_hit(
     best, kind, thing, face = z, GROUND, -1, -1
     if cell < 0:
         return best, kind, thing, face
-    for entry in range(cell_start[cell], cell_start[cell + 1]):
+    entries, n_buildings = scene.entries, scene.n_buildings
+    face_start, edge_start, circles = scene.face_start, scene.edge_start, scene.circles
+    faces, edges, trees = scene.faces, scene.edges, scene.trees
+    for entry in range(scene.cell_start[cell], scene.cell_start[cell + 1]):
         number = entries[entry, 0]
         if number >= 0:
             top, hit = _prism_hit(face_start, edge_start, circles, faces, edges, number, x, y, z, lean_x, lean_y)

@@ -30,15 +30,7 @@ def _first_hits(
     """The first hits of lines through terrain points; z is replaced by the elevation of the hit."""
     for k in range(len(x)):
         z[k], kind[k], thing[k], face[k] = first_hit(
-            scene.cell_start,
-            scene.entries,
-            scene.n_buildings,
-            scene.face_start,
-            scene.edge_start,
-            scene.circles,
-            scene.faces,
-            scene.edges,
-            scene.trees,
+            scene,
             cell_of(scene.grid, scene.cells_across, scene.cells_up, x[k], y[k]),
             x[k],
             y[k],

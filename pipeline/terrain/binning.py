@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.model import BoolArray, IntArray
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.model import BoolArray, IntArray, LabelArray
 
 
 @kernel
 def points_by_cell(
     x: IntArray, y: IntArray, used: BoolArray, cell: int
-) -> tuple[IntArray, IntArray, int, int, int, int]:
+) -> tuple[LabelArray, LabelArray, int, int, int, int]:
     """Used points sorted by square cells.
 
     Parameters
@@ -25,9 +26,9 @@ def points_by_cell(
 
     Returns
     -------
-    start : (rows * columns + 1,) int64
+    start : (rows * columns + 1,) int32
         Where the points of each cell begin, row by row.
-    members : (m,) int64
+    members : (m,) int32
         Indices of the used points; within a cell in their own order.
     column0, row0, columns, rows : int
         First column and row, and how many there are.
@@ -35,17 +36,9 @@ def points_by_cell(
     n = x.size
     column0, row0 = x.min() // cell, y.min() // cell
     columns, rows = x.max() // cell - column0 + 1, y.max() // cell - row0 + 1
-    start = np.zeros(columns * rows + 1, np.int64)
+    keys = np.full(n, -1, np.int32)
     for i in range(n):
         if used[i]:
-            start[(y[i] // cell - row0) * columns + x[i] // cell - column0 + 1] += 1
-    for k in range(columns * rows):
-        start[k + 1] += start[k]
-    position = start[:-1].copy()
-    members = np.empty(start[-1], np.int64)
-    for i in range(n):
-        if used[i]:
-            k = (y[i] // cell - row0) * columns + x[i] // cell - column0
-            members[position[k]] = i
-            position[k] += 1
+            keys[i] = (y[i] // cell - row0) * columns + x[i] // cell - column0
+    start, members = counting_sort(keys, columns * rows)
     return start, members, column0, row0, columns, rows

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.compiler import kernel
+from pipeline.kernels.normal_equations import solve_plane_moments
 from pipeline.model import BoolArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
 
@@ -94,8 +95,7 @@ def plane_around(sums: Sums, r: int, c: int, half: int) -> tuple[int, float, flo
             # about the centroid; z about its mean to keep the float products small
             vxz = (m[7] - c * m[3]) - sx * mean
             vyz = (m[8] - r * m[3]) - sy * mean
-            a = (vxz * vyy - vyz * vxy) / det
-            b = (vyz * vxx - vxz * vxy) / det
+            a, b = solve_plane_moments(vxx, vxy, vyy, vxz, vyz)
             return n, mean - (a * sx + b * sy) / n, a, b, True
     return n, mean, sx / n, sy / n, False
 

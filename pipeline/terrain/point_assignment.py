@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.compiler import kernel
@@ -61,35 +63,60 @@ def _nearest_vertex(px: int, py: int, pz: int, x: IntArray, y: IntArray, z: IntA
     return best
 
 
+class CorePoints(NamedTuple):
+    """Points of a tile's core."""
+
+    x: IntArray
+    y: IntArray
+    z: IntArray
+    above_ground: IntArray
+    """(n,) int64, millimetres all."""
+    last: BoolArray
+    """(n,) bool, last returns."""
+    allowed: KindArray
+    """(n,) int8, 0 for points that the trusted classes exclude, 2 for building, else 1."""
+
+
+class LabelledTin(NamedTuple):
+    """A TIN whose facets and vertices belong to fragments of surfaces."""
+
+    x: IntArray
+    y: IntArray
+    z: IntArray
+    """(v,) int64, vertices, millimetres."""
+    facets: LabelArray
+    neighbours: LabelArray
+    """(m, 3) int32."""
+    kinds: KindArray
+    """(m,) int8."""
+    label: LabelArray
+    vertex_label: LabelArray
+    """(m,) and (v,) int32, fragments; -1 for none."""
+    fragment_kind: KindArray
+    """(f,) int8."""
+
+
+class AssignmentLimits(NamedTuple):
+    """Millimetres: how far points belong to a surface, from where on they are canopy, lie above ground, are far off."""
+
+    reach: int
+    canopy: int
+    ground: int
+    far: int
+
+
 @kernel
 def assign_points(
-    px: IntArray,
-    py: IntArray,
-    pz: IntArray,
-    above_ground: IntArray,
-    last: BoolArray,
-    allowed: KindArray,
-    x: IntArray,
-    y: IntArray,
-    z: IntArray,
-    facets: LabelArray,
-    neighbours: LabelArray,
-    kinds: KindArray,
-    label: LabelArray,
-    vertex_label: LabelArray,
-    fragment_kind: KindArray,
-    reach_mm: int,
-    canopy_mm: int,
-    ground_mm: int,
-    far_mm: int,
-    sums: IntArray,
-    lowest_point: IntArray,
+    points: CorePoints, surfaces: LabelledTin, limits: AssignmentLimits, sums: IntArray, lowest_point: IntArray
 ) -> LabelArray:
     """Fragment of every point of the core, int32 (n,), -1 where none; fills the columns POINTS and CANOPY of sums.
 
     A point belongs to the surface of the facet around it, or at walls and borders to that of the vertex
-    nearest in elevation. `allowed` is 0 for points that the trusted classes exclude, 2 for building, else 1.
+    nearest in elevation. `lowest_point` (f, 3) int64 gets the smallest point of each fragment.
     """
+    px, py, pz, above_ground, last, allowed = points
+    x, y, z, facets, neighbours, kinds, label, vertex_label, fragment_kind = surfaces
+    reach_mm, canopy_mm, ground_mm, far_mm = limits
     n = px.size
     out = np.full(n, -1, np.int32)
     m = facets.shape[0]

@@ -13,6 +13,8 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.normal_equations import solve_plane_moments
 from pipeline.model import FloatArray, IntArray, LabelArray, Tin
 from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.vegetation import smallest_eigenvalue
@@ -77,7 +79,7 @@ def solve_plane(s: FloatArray) -> tuple[float, float, float, bool]:
     det = xx * yy - xy * xy
     if det <= 1e-3 * (xx + yy) * (xx + yy) or det <= 0.0:
         return 0.0, 0.0, 0.0, False
-    a, b = (xz * yy - yz * xy) / det, (yz * xx - xz * xy) / det
+    a, b = solve_plane_moments(xx, xy, yy, xz, yz)
     return a, b, mz - a * mx - b * my, True
 
 
@@ -140,36 +142,29 @@ def local_planes(x: IntArray, y: IntArray, z: IntArray, radius_mm: int, min_poin
     return out
 
 
-@kernel
 def circumradii(x: IntArray, y: IntArray, facets: LabelArray) -> FloatArray:
     """Circumradius of every facet, (m,), in the unit of the vertices."""
-    out = np.empty(facets.shape[0])
-    for f in range(facets.shape[0]):
-        a, b, c = facets[f, 0], facets[f, 1], facets[f, 2]
-        ux, uy, vx, vy = float(x[b] - x[a]), float(y[b] - y[a]), float(x[c] - x[a]), float(y[c] - y[a])
-        wx, wy = vx - ux, vy - uy
-        product = math.sqrt(ux * ux + uy * uy) * math.sqrt(vx * vx + vy * vy) * math.sqrt(wx * wx + wy * wy)
-        out[f] = product / (2.0 * (ux * vy - uy * vx))
-    return out
+    a, b, c = facets.T
+    ux, uy = (x[b] - x[a]).astype(np.float64), (y[b] - y[a]).astype(np.float64)
+    vx, vy = (x[c] - x[a]).astype(np.float64), (y[c] - y[a]).astype(np.float64)
+    wx, wy = vx - ux, vy - uy
+    product = np.sqrt(ux * ux + uy * uy) * np.sqrt(vx * vx + vy * vy) * np.sqrt(wx * wx + wy * wy)
+    radii: FloatArray = product / (2.0 * (ux * vy - uy * vx))
+    return radii
 
 
 @kernel
-def vertex_neighbours(n: int, facets: LabelArray, sound: LabelArray) -> tuple[IntArray, LabelArray]:
+def vertex_neighbours(n: int, facets: LabelArray, sound: LabelArray) -> tuple[LabelArray, LabelArray]:
     """Compressed rows: the vertices that share a sound facet with each; some twice."""
-    start = np.zeros(n + 1, np.int64)
+    corners = np.empty(6 * sound.size, np.int32)
     for k in range(sound.size):
-        for q in range(3):
-            start[facets[sound[k], q] + 1] += 2
-    for v in range(n):
-        start[v + 1] += start[v]
-    position = start[:-1].copy()
-    others = np.empty(start[n], np.int32)
-    for k in range(sound.size):
-        for q in range(3):
-            v = facets[sound[k], q]
-            others[position[v]] = facets[sound[k], (q + 1) % 3]
-            others[position[v] + 1] = facets[sound[k], (q + 2) % 3]
-            position[v] += 2
+        for q in range(6):
+            corners[6 * k + q] = facets[sound[k], q // 2]
+    start, members = counting_sort(corners, n)
+    others = np.empty(len(members), np.int32)
+    for s in range(len(members)):
+        k, q = members[s] // 6, members[s] % 6
+        others[s] = facets[sound[k], (q // 2 + 1 + q % 2) % 3]
     return start, others
 
 
@@ -178,7 +173,7 @@ def grow_patches(
     x: IntArray,
     y: IntArray,
     z: IntArray,
-    start: IntArray,
+    start: LabelArray,
     others: LabelArray,
     local: FloatArray,
     order: IntArray,
@@ -255,7 +250,7 @@ def grow_patches(
 
 @kernel
 def fill_patches(
-    x: IntArray, y: IntArray, z: IntArray, start: IntArray, others: LabelArray, label: LabelArray, planes: FloatArray
+    x: IntArray, y: IntArray, z: IntArray, start: LabelArray, others: LabelArray, label: LabelArray, planes: FloatArray
 ) -> int:
     """Give the vertices that no patch took to the patch beside them whose plane is nearest; the number of patches.
 
@@ -369,7 +364,7 @@ def patches_of(
     distance_m: float,
     max_angle_deg: float,
     least_step_m: float,
-) -> tuple[Patches, Borders, IntArray, LabelArray]:
+) -> tuple[Patches, Borders, LabelArray, LabelArray]:
     """Planar patches of a roof, the borders between them, and which vertices are neighbours (compressed rows).
 
     Parameters

@@ -25,7 +25,7 @@ from pipeline.terrain.facets import (
     marks,
     with_vertex,
 )
-from pipeline.terrain.point_assignment import assign_points
+from pipeline.terrain.point_assignment import AssignmentLimits, CorePoints, LabelledTin, assign_points
 
 
 class Sum(IntEnum):
@@ -300,11 +300,12 @@ def fragments_of(
     )  # fmt: skip
     lowest = np.full((len(fragment_kind), 3), 2**62, np.int64)
     point_fragment = assign_points(
-        points.x_mm, points.y_mm, points.z_mm, points.height_mm, points.last, points.allowed,
-        x, y, z, tin.facets, tin.neighbours, kinds, label, vertex_label, fragment_kind,
-        round(settings.reach_m * 1000), round(canopy_m * 1000), round(ground_m * 1000),
-        far_mm, sums, lowest,
-    )  # fmt: skip
+        CorePoints(points.x_mm, points.y_mm, points.z_mm, points.height_mm, points.last, points.allowed),
+        LabelledTin(x, y, z, tin.facets, tin.neighbours, kinds, label, vertex_label, fragment_kind),
+        AssignmentLimits(round(settings.reach_m * 1000), round(canopy_m * 1000), round(ground_m * 1000), far_mm),
+        sums,
+        lowest,
+    )
     crossing = np.flatnonzero((label >= 0) & with_vertex(tin.facets, shared))
     return (
         Fragments(

@@ -20,6 +20,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.union_find import root_of, unite, united
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.roof_patches import Borders, Patches, patches_of
@@ -125,14 +126,7 @@ def units_of_patches(patches: Patches, borders: Borders, settings: UnitSettings)
         What separates units.
     """
     count = len(patches.areas_m2)
-    parent = list(range(count))
-
-    def root(k: int) -> int:
-        while parent[k] != k:
-            parent[k] = parent[parent[k]]
-            k = parent[k]
-        return k
-
+    unit = np.arange(count)
     large = (patches.areas_m2 >= _PART_M2) & ~np.isnan(patches.levels_mm)
     rows = [
         row
@@ -166,15 +160,15 @@ def units_of_patches(patches: Patches, borders: Borders, settings: UnitSettings)
             joining.append(row)
     # the longest first, so that what runs along several houses does not unite them across their gutters
     for row in sorted(joining, key=lambda row: (-borders.length_m[row], row)):
-        p, q = sorted((root(int(borders.first[row])), root(int(borders.second[row]))))
+        p, q = sorted((int(unit[borders.first[row]]), int(unit[borders.second[row]])))
         if p == q or q in apart[p]:
             continue
-        parent[q] = p
+        unit[unit == q] = p
         apart[p] |= apart[q]
         for other in apart.pop(q):
             apart[other].discard(q)
             apart[other].add(p)
-    return _absorbed(np.array([root(k) for k in range(count)], np.int64), patches, borders, settings)
+    return _absorbed(unit, patches, borders, settings)
 
 
 def _absorbed(unit: IntArray, patches: Patches, borders: Borders, settings: UnitSettings) -> LabelArray:
@@ -237,23 +231,20 @@ def _absorbed(unit: IntArray, patches: Patches, borders: Borders, settings: Unit
 
 def _across_gaps(unit: LabelArray, borders: Borders) -> LabelArray:
     """Join what hangs together across gaps in the data only: a gap tells nothing of buildings."""
-    part, whole = list(range(len(unit))), unit.tolist()
+    part = united(len(unit), borders.first, borders.second)
+    return _united_across(part, unit.astype(np.int64), borders.gap_pairs.astype(np.int64))
 
-    def root(parent: list[int], k: int) -> int:
-        while parent[k] != k:
-            k = parent[k]
-        return k
 
-    for p, q in zip(borders.first.tolist(), borders.second.tolist(), strict=True):
-        a, b = root(part, p), root(part, q)
-        part[max(a, b)] = min(a, b)
-    for p, q in borders.gap_pairs.tolist():
-        a, b = root(part, p), root(part, q)
-        if a != b:
-            part[max(a, b)] = min(a, b)
-            a, b = root(whole, p), root(whole, q)
-            whole[max(a, b)] = min(a, b)
-    return np.array([root(whole, k) for k in range(len(whole))], np.int32)
+@kernel
+def _united_across(part: IntArray, whole: IntArray, gap_pairs: IntArray) -> LabelArray:
+    """The sets `whole`, each as one of its members, after uniting the pairs (g, 2) that unite sets in `part`, too."""
+    for g in range(len(gap_pairs)):
+        if unite(part, gap_pairs[g, 0], gap_pairs[g, 1]):
+            unite(whole, gap_pairs[g, 0], gap_pairs[g, 1])
+    roots = np.empty(len(whole), np.int32)
+    for k in range(len(whole)):
+        roots[k] = root_of(whole, k)
+    return roots
 
 
 @kernel
@@ -268,7 +259,7 @@ def _unit_of_points(
     unit: LabelArray,
     patch: LabelArray,
     planes: FloatArray,
-    start: IntArray,
+    start: LabelArray,
     others: LabelArray,
 ) -> LabelArray:
     """Unit of every point: that of its cell's vertex, or beside a border that of the nearest plane around it."""

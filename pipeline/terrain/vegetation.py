@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.model import BoolArray, FloatArray, IntArray, KindArray
+from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, LabelArray
 from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.binning import points_by_cell
 
@@ -91,7 +91,7 @@ def smallest_eigenvalue(xx: float, xy: float, xz: float, yy: float, yz: float, z
 
 @kernel
 def _block_around(
-    points: FloatArray, start: IntArray, cell: tuple[int, int], shape: tuple[int, int], reach: int, block: FloatArray
+    points: FloatArray, start: LabelArray, cell: tuple[int, int], shape: tuple[int, int], reach: int, block: FloatArray
 ) -> tuple[FloatArray, int]:
     """The points (3, n) of the cells around one, in `block` or a larger array; and how many they are."""
     (r, c), (rows, columns) = cell, shape

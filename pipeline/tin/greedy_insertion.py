@@ -16,6 +16,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
 from pipeline.model import BoolArray, FloatArray, LabelArray, Tin
 from pipeline.parameters import Parameters, parameter
 from pipeline.tin.delaunay import hilbert_order, unique_xy_ranked
@@ -91,60 +92,6 @@ def _facet_plane(
 
 
 @kernel
-def _push(
-    errors: FloatArray,
-    points: LabelArray,
-    facets: LabelArray,
-    rank: LabelArray,
-    size: int,
-    error: float,
-    point: int,
-    facet: int,
-) -> None:
-    """Add an entry to a heap of `size` entries; at its top is the largest error, of equal ones the smallest point."""
-    i = size
-    while i > 0:
-        parent = (i - 1) >> 1
-        if errors[parent] > error or (errors[parent] == error and rank[points[parent]] <= rank[point]):
-            break
-        errors[i] = errors[parent]
-        points[i] = points[parent]
-        facets[i] = facets[parent]
-        i = parent
-    errors[i] = error
-    points[i] = point
-    facets[i] = facet
-
-
-@kernel
-def _pop(errors: FloatArray, points: LabelArray, facets: LabelArray, rank: LabelArray, size: int) -> None:
-    """Remove the top of a heap of `size` entries."""
-    last = size - 1
-    error = errors[last]
-    point = points[last]
-    facet = facets[last]
-    i = 0
-    while True:
-        child = 2 * i + 1
-        if child >= last:
-            break
-        if child + 1 < last and (
-            errors[child + 1] > errors[child]
-            or (errors[child + 1] == errors[child] and rank[points[child + 1]] < rank[points[child]])
-        ):
-            child += 1
-        if errors[child] < error or (errors[child] == error and rank[points[child]] >= rank[point]):
-            break
-        errors[i] = errors[child]
-        points[i] = points[child]
-        facets[i] = facets[child]
-        i = child
-    errors[i] = error
-    points[i] = point
-    facets[i] = facet
-
-
-@kernel
 def _insert_greedily(
     x: FloatArray,
     y: FloatArray,
@@ -174,10 +121,9 @@ def _insert_greedily(
     next_in_bucket = np.empty(n, np.int32)
     worst = np.full(2 * (n + 4), -1, np.int32)  # the candidate of every facet
     worst_error = np.empty(2 * (n + 4))
-    heap_errors = np.empty(1024)
-    heap_points = np.empty(1024, np.int32)
-    heap_facets = np.empty(1024, np.int32)
-    heap_size = 0
+    # the candidates of all facets: the largest error first, of equal ones the smallest point
+    candidates = heap_with_room(1024)
+    held = 0
     star = np.empty(64, np.int32)
     unplaced = np.arange(n).astype(np.int32)
     n_unplaced = n
@@ -248,20 +194,17 @@ def _insert_greedily(
                 continue
             worst[t] = chosen
             worst_error[t] = largest
-            if heap_size == len(heap_errors):
-                heap_errors = np.concatenate((heap_errors, heap_errors))
-                heap_points = np.concatenate((heap_points, heap_points))
-                heap_facets = np.concatenate((heap_facets, heap_facets))
-            _push(heap_errors, heap_points, heap_facets, rank, heap_size, largest, chosen, t)
-            heap_size += 1
+            candidates = heap_push(candidates, held, -largest, rank[chosen], t)
+            held += 1
         newest = -1
-        while heap_size > 0 and newest < 0:
+        while held > 0 and newest < 0:
             # an entry is stale where its facet has changed since
-            if worst[heap_facets[0]] == heap_points[0] and worst_error[heap_facets[0]] == heap_errors[0]:
-                newest = heap_points[0]
-                facet = heap_facets[0]
-            _pop(heap_errors, heap_points, heap_facets, rank, heap_size)
-            heap_size -= 1
+            t = candidates.items[0]
+            if worst[t] >= 0 and rank[worst[t]] == candidates.ranks[0] and worst_error[t] == -candidates.keys[0]:
+                newest = worst[t]
+                facet = t
+            heap_pop(candidates, held)
+            held -= 1
         if newest < 0:
             break
         if is_absorbed_inserted:

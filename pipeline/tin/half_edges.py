@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import FloatArray, LabelArray
 from pipeline.tin.predicates import lies_in_circumcircle, orientation
 
@@ -200,8 +201,7 @@ def canonical_facets(
     """
     n = len(order)
     first_edge = np.full(n_facets, -1, np.int32)
-    start = np.zeros(n + 1, np.int32)
-    n_real = 0
+    smallest = np.full(n_facets, -1, np.int32)
     for t in range(n_facets):
         e = 4 * t
         a, b, c = origin[e], origin[e + 1], origin[e + 2]
@@ -216,28 +216,23 @@ def canonical_facets(
             k = 2
             a = c
         first_edge[t] = e + k
-        start[a + 1] += 1
-        n_real += 1
-    for v in range(n):
-        start[v + 1] += start[v]
-    end = start.copy()
-    edges = np.empty(n_real, np.int32)
+        smallest[t] = a
+    start, edges = counting_sort(smallest, n)
+    n_real = len(edges)
     seconds = np.empty(n_real, np.int32)
-    for t in range(n_facets):
-        e = first_edge[t]
-        if e < 0:
-            continue
-        a = order[origin[e]]
-        b = order[origin[4 * t + ((e & 3) + 1) % 3]]
-        # insertion into the few facets whose smallest vertex is a, by their second vertex
-        i = end[a]
-        end[a] += 1
-        while i > start[a] and seconds[i - 1] > b:
-            edges[i] = edges[i - 1]
-            seconds[i] = seconds[i - 1]
-            i -= 1
-        edges[i] = e
-        seconds[i] = b
+    for v in range(n):
+        for s in range(start[v], start[v + 1]):
+            t = edges[s]
+            e = first_edge[t]
+            b = order[origin[4 * t + ((e & 3) + 1) % 3]]
+            # insertion into the few facets whose smallest vertex this is, by their second vertex
+            i = s
+            while i > start[v] and seconds[i - 1] > b:
+                edges[i] = edges[i - 1]
+                seconds[i] = seconds[i - 1]
+                i -= 1
+            edges[i] = e
+            seconds[i] = b
     number = np.full(n_facets, -1, np.int32)
     for i in range(n_real):
         number[edges[i] >> 2] = i

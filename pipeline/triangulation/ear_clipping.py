@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.orientation import in_cone, same_place, turn_of
 from pipeline.model import IntArray
-from pipeline.triangulation.projection import in_cone, same_place, turn_of
 
 
 @kernel

@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.orientation import comes_before, turn_of
 from pipeline.model import IntArray
-from pipeline.triangulation.projection import turn_of
 
 _TIE = 1e-9
 """Relative difference of angles below which four corners count as cocircular."""
@@ -30,15 +31,6 @@ def _apex_angle(corners: IntArray, apex: int, a: int, b: int) -> tuple[float, fl
 
 
 @kernel
-def _comes_before(corners: IntArray, a: int, b: int) -> bool:
-    """Whether corner a comes before b by x, then y, then z."""
-    for k in range(3):
-        if corners[a, k] != corners[b, k]:
-            return bool(corners[a, k] < corners[b, k])
-    return False
-
-
-@kernel
 def _prefers_diagonal(corners: IntArray, a: int, c: int, b: int, d: int) -> bool:
     """Whether the quadrangle a, b, c, d is better cut from b to d than from a to c."""
     sine_b, cosine_b = _apex_angle(corners, b, a, c)
@@ -47,55 +39,22 @@ def _prefers_diagonal(corners: IntArray, a: int, c: int, b: int, d: int) -> bool
     scale = np.sqrt((sine_b * sine_b + cosine_b * cosine_b) * (sine_d * sine_d + cosine_d * cosine_d))
     if abs(sine_of_sum) > _TIE * scale:
         return bool(sine_of_sum < 0.0)
-    low_now, high_now = (a, c) if _comes_before(corners, a, c) else (c, a)
-    low_new, high_new = (b, d) if _comes_before(corners, b, d) else (d, b)
-    if _comes_before(corners, low_new, low_now):
+    low_now, high_now = (a, c) if comes_before(corners, a, c) else (c, a)
+    low_new, high_new = (b, d) if comes_before(corners, b, d) else (d, b)
+    if comes_before(corners, low_new, low_now):
         return True
-    return bool(not _comes_before(corners, low_now, low_new) and _comes_before(corners, high_new, high_now))
+    return bool(not comes_before(corners, low_now, low_new) and comes_before(corners, high_new, high_now))
 
 
 @kernel
-def ascending_order(keys: IntArray) -> IntArray:
-    """Indices (n,) that sort int64 keys (n,), ties by index: a merge sort, much faster to compile than numpy's."""
-    count = len(keys)
-    order, spare = np.empty(count, np.int64), np.empty(count, np.int64)
-    for i in range(count):
-        order[i] = i
-    width = 1
-    while width < count:
-        for start in range(0, count, 2 * width):
-            middle, stop = start + width, start + 2 * width
-            middle = min(middle, count)
-            stop = min(stop, count)
-            left, right = start, middle
-            for place in range(start, stop):
-                if left < middle and (right >= stop or keys[order[left]] <= keys[order[right]]):
-                    spare[place] = order[left]
-                    left += 1
-                else:
-                    spare[place] = order[right]
-                    right += 1
-        order, spare = spare, order
-        width *= 2
-    return order
-
-
-@kernel
-def _neighbours(triangles: IntArray, count: int, corner_count: int) -> IntArray:
-    """(count, 3) the triangle across the edge from each corner to the next; -1 at a ring."""
+def edges_in_order(triangles: IntArray, count: int, corner_count: int) -> tuple[IntArray, IntArray]:
+    """Keys (3 count,) of the undirected edges of triangles, by 3 * triangle + corner, and the order that sorts them."""
     keys = np.empty(3 * count, np.int64)
     for t in range(count):
         for k in range(3):
             a, b = triangles[t, k], triangles[t, (k + 1) % 3]
             keys[3 * t + k] = a * corner_count + b if a < b else b * corner_count + a
-    order = ascending_order(keys)
-    neighbours = np.full((count, 3), -1, np.int64)
-    for i in range(1, len(keys)):
-        first, second = order[i - 1], order[i]
-        if keys[first] == keys[second]:
-            neighbours[first // 3, first % 3] = second // 3
-            neighbours[second // 3, second % 3] = first // 3
-    return neighbours
+    return keys, ascending_order(keys)
 
 
 @kernel
@@ -124,7 +83,14 @@ def _flip(triangles: IntArray, neighbours: IntArray, t: int, k: int, other: int,
 @kernel
 def flip_to_delaunay(corners: IntArray, flat: IntArray, triangles: IntArray, count: int) -> None:
     """Flip diagonals in place until none is preferred (at most as often as there are pairs of corners)."""
-    neighbours = _neighbours(triangles, count, len(flat))
+    keys, order = edges_in_order(triangles, count, len(flat))
+    # the triangle across the edge from each corner to the next; -1 at a ring
+    neighbours = np.full((count, 3), -1, np.int64)
+    for i in range(1, len(keys)):
+        first, second = order[i - 1], order[i]
+        if keys[first] == keys[second]:
+            neighbours[first // 3, first % 3] = second // 3
+            neighbours[second // 3, second % 3] = first // 3
     budget = len(flat) * len(flat)
     changed = True
     while changed and budget > 0:

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.orientation import same_place
 from pipeline.model import FloatArray, IntArray
 from pipeline.triangulation.ear_clipping import clip_ears
 from pipeline.triangulation.edge_flips import flip_to_delaunay
 from pipeline.triangulation.hole_bridges import one_chain
-from pipeline.triangulation.projection import project_along_dominant_axis, same_place
+from pipeline.triangulation.projection import project_along_dominant_axis
 
 MILLIMETRES_PER_METRE = 1000.0
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.orientation import in_cone, same_place, turn_of
 from pipeline.model import IntArray
-from pipeline.triangulation.projection import in_cone, same_place, turn_of
 
 
 @kernel
@@ -146,5 +146,10 @@ def one_chain(flat: IntArray, ring_offsets: IntArray) -> tuple[IntArray, int]:
             if joined == length:
                 return chain, 0
         length = joined
-        waiting = waiting[waiting != hole]
+        left = 0
+        for ring in waiting:
+            if ring != hole:
+                waiting[left] = ring
+                left += 1
+        waiting = waiting[:left]
     return chain, length

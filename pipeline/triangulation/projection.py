@@ -59,26 +59,3 @@ def project_along_dominant_axis(corners: IntArray, outer_stop: int) -> tuple[Int
         flat[i, 0] = corners[i, first] - corners[0, first]
         flat[i, 1] = corners[i, second] - corners[0, second]
     return flat, turn != 0
-
-
-@kernel
-def turn_of(flat: IntArray, a: int, b: int, c: int) -> int:
-    """Twice the signed area of the triangle a, b, c in mm2: positive where it turns left."""
-    right, up = flat[b, 0] - flat[a, 0], flat[b, 1] - flat[a, 1]
-    return int(right * (flat[c, 1] - flat[a, 1]) - up * (flat[c, 0] - flat[a, 0]))
-
-
-@kernel
-def same_place(flat: IntArray, a: int, b: int) -> bool:
-    """Whether two corners coincide."""
-    return bool(flat[a, 0] == flat[b, 0] and flat[a, 1] == flat[b, 1])
-
-
-@kernel
-def in_cone(flat: IntArray, before: int, node: int, after: int, target: int) -> bool:
-    """Whether the way from node to target starts strictly inside the polygon on the left of before, node, after."""
-    left_of_first = turn_of(flat, before, node, target)
-    left_of_second = turn_of(flat, node, after, target)
-    if turn_of(flat, before, node, after) > 0:
-        return left_of_first > 0 and left_of_second > 0
-    return left_of_first > 0 or left_of_second > 0

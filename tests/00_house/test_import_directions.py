@@ -40,6 +40,7 @@ def test_the_sources_keep_all_contracts(copied_house: Path) -> None:
     [
         ("pipeline/model.py", "import service", "The service stands on the pipeline"),
         ("pipeline/geometry.py", "import pipeline.tin", "Layers of the pipeline"),
+        ("pipeline/kernels/union_find.py", "import pipeline.geometry", "Layers of the pipeline"),
         ("pipeline/terrain/ground.py", "import pipeline.roof", "Layers of the pipeline"),
         ("pipeline/tin/delaunay.py", "import pipeline.io", "The science knows no files"),
         ("pipeline/segmentation/fuzzy_sart.py", "import dask", "The science knows no files"),

@@ -24,17 +24,18 @@ from pipeline.roof.arrangement.subdivision import (
     NEXT,
     ORIGIN,
     PREVIOUS,
+    Subdivision,
     cell_at,
     insert_chord,
     insert_vertex,
-    outline_graph,
     subdivide,
+    subdivision_of,
 )
 
 
 def random_graph(seed: int, n: int, k: int) -> tuple[IntArray, LabelArray, IntArray]:
     rng = np.random.default_rng(seed)
-    pairs = np.array([pair for pair in itertools.combinations(range(n), 2) if rng.random() < 0.45], np.int32)
+    pairs = np.array([pair for pair in itertools.combinations(range(n), 2) if rng.random() < 0.45], np.int64)
     pairs = pairs.reshape(-1, 2)
     return rng.integers(0, 60, (n, k)), pairs, rng.integers(1, 40, len(pairs))
 
@@ -69,7 +70,7 @@ def test_with_more_labels_no_expansion_is_left_that_costs_less(seed: int) -> Non
 
 def test_a_label_that_costs_the_same_is_not_taken() -> None:
     costs = np.array([[5, 5], [5, 5]])
-    labels = expanded(costs, np.array([[0, 1]], np.int32), np.array([3]), np.array([1, 1], np.int32))
+    labels = expanded(costs, np.array([[0, 1]]), np.array([3]), np.array([1, 1], np.int32))
     assert labels.tolist() == [1, 1]
 
 
@@ -153,29 +154,29 @@ def test_a_face_that_explains_too_little_joins_its_neighbour_and_another_stays()
 def test_a_face_costs_the_more_the_more_of_its_own_points_misfit_it(own_misfit: int, faces: int) -> None:
     # beside a large face forty points, that save thirty; half of them or more would make the face cost sixty
     costs = np.array([[0, 200_000], [30_000 + own_misfit, own_misfit]])
-    pairs, weights = np.array([[0, 1]], np.int32), np.array([100])
+    pairs, weights = np.array([[0, 1]]), np.array([100])
     labels = np.array([0, 1], np.int32)
     unite_faces(costs, np.array([200, 40], np.int32), pairs, weights, labels, 16_000, 60_000)
     assert connected_faces(labels, pairs)[1] == faces
 
 
 def test_points_are_counted_by_cell_and_those_outside_not_at_all() -> None:
-    assert points_per_cell(np.array([2, 0, -1, 2], np.int32), 4).tolist() == [1, 0, 2, 0]
+    assert points_per_cell(np.array([2, 0, -1, 2]), 4).tolist() == [1, 0, 2, 0]
 
 
-def square(holes: int = 0) -> tuple[IntArray, LabelArray, LabelArray]:
-    """A square of 10 m with small square holes along its diagonal, as a graph with its counts."""
+def square(holes: int = 0) -> Subdivision:
+    """A square of 10 m with small square holes along its diagonal."""
     rings = [np.array([(0, 0), (10_000, 0), (10_000, 10_000), (0, 10_000)])]
     for hole in range(holes):
         x = 2000 + 3000 * hole
         rings.append(np.array([(x, x), (x, x + 1000), (x + 1000, x + 1000), (x + 1000, x)]))
-    starts = np.arange(0, 4 * len(rings) + 1, 4).astype(np.int32)
-    xy, graph = outline_graph(np.concatenate(rings), starts, np.zeros(len(rings), np.int32), 400)
-    return xy, graph, np.array([starts[-1], 2 * starts[-1], 1], np.int32)
+    starts = np.arange(0, 4 * len(rings) + 1, 4)
+    return subdivision_of(np.concatenate(rings), starts, np.zeros(len(rings), np.int64), 400)
 
 
-def loops(graph: LabelArray, n_edges: int) -> list[list[int]]:
+def loops(plan: Subdivision) -> list[list[int]]:
     """All loops of half-edges; every half-edge must lie in exactly one."""
+    graph, n_edges = plan.graph, plan.counts[1]
     left = set(range(n_edges))
     found = []
     while left:
@@ -195,64 +196,68 @@ def loops(graph: LabelArray, n_edges: int) -> list[list[int]]:
 
 
 def test_a_chord_between_corners_makes_two_cells() -> None:
-    xy, graph, _ = square()
-    assert insert_chord(xy, graph, 8, 1, 0, 2, 0, 7) == 1
-    assert cell_areas_m2(xy, graph, 10, 2).tolist() == [50.0, 50.0]
-    assert len(loops(graph, 10)) == 3
-    assert {cell_at(xy, graph, 10, 9000.0, 1000.0), cell_at(xy, graph, 10, 1000.0, 9000.0)} == {0, 1}
-    assert cell_at(xy, graph, 10, -5.0, 5000.0) == -1
+    plan = square()
+    assert insert_chord(plan, 0, 2, 0, 7) == 1
+    assert plan.counts.tolist() == [4, 10, 2]
+    assert cell_areas_m2(plan).tolist() == [50.0, 50.0]
+    assert len(loops(plan)) == 3
+    assert {cell_at(plan, 9000.0, 1000.0), cell_at(plan, 1000.0, 9000.0)} == {0, 1}
+    assert cell_at(plan, -5.0, 5000.0) == -1
 
 
 def test_a_chord_to_a_hole_makes_one_loop_of_two_and_the_next_parts_the_cell() -> None:
-    xy, graph, _ = square(holes=1)
-    assert insert_chord(xy, graph, 16, 1, 0, 4, 0, 0) == 0
-    assert insert_chord(xy, graph, 18, 1, 6, 2, 0, 0) == 1
-    assert sorted(cell_areas_m2(xy, graph, 20, 2).tolist()) == [49.5, 49.5]
-    loops(graph, 20)
+    plan = square(holes=1)
+    assert insert_chord(plan, 0, 4, 0, 0) == 0
+    assert insert_chord(plan, 6, 2, 0, 0) == 1
+    assert sorted(cell_areas_m2(plan).tolist()) == [49.5, 49.5]
+    loops(plan)
 
 
 def test_a_hole_stays_in_the_cell_that_it_lies_in() -> None:
-    xy, graph, _ = square(holes=1)
-    assert insert_vertex(xy, 8, graph, 16, 0, 6000, 0)
-    assert insert_vertex(xy, 9, graph, 18, 4, 6000, 10_000)
-    assert insert_chord(xy, graph, 20, 1, 8, 9, 0, 0) == 1
-    assert sorted(cell_areas_m2(xy, graph, 22, 2).tolist()) == [40.0, 59.0]
-    loops(graph, 22)
+    plan = square(holes=1)
+    assert insert_vertex(plan, 0, 6000, 0)
+    assert insert_vertex(plan, 4, 6000, 10_000)
+    assert insert_chord(plan, 8, 9, 0, 0) == 1
+    assert sorted(cell_areas_m2(plan).tolist()) == [40.0, 59.0]
+    loops(plan)
 
 
 def test_a_chord_through_a_hole_is_not_drawn() -> None:
-    xy, graph, _ = square(holes=2)
-    assert insert_chord(xy, graph, 24, 1, 0, 2, 0, 0) == -1
+    plan = square(holes=2)
+    assert insert_chord(plan, 0, 2, 0, 0) == -1
+    assert plan.counts.tolist() == [12, 24, 1]
 
 
 def test_a_vertex_close_to_another_edge_is_not_inserted() -> None:
-    xy, graph, _ = square()
-    assert not insert_vertex(xy, 4, graph, 8, 0, 4, 0)
-    assert insert_vertex(xy, 4, graph, 8, 0, 40, 0)
+    plan = square()
+    assert not insert_vertex(plan, 0, 4, 0)
+    assert insert_vertex(plan, 0, 40, 0)
+    assert plan.counts.tolist() == [5, 10, 1]
 
 
 @pytest.mark.parametrize("seed", range(30))
 def test_any_lines_leave_a_planar_graph_that_fills_the_outline(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    xy, graph, counts = square(holes=seed % 3)
-    area = cell_areas_m2(xy, graph, int(counts[1]), 1)[0]
+    plan = square(holes=seed % 3)
+    area = cell_areas_m2(plan)[0]
     n = 12
     angles = np.round(rng.uniform(0.0, np.pi, n) * (4 if seed % 2 else 1000)) / (4 if seed % 2 else 1000)
     through = rng.uniform(1.0, 9.0, (n, 2))
     lines = np.column_stack((-np.sin(angles), np.cos(angles), np.zeros(n)))
     lines[:, 2] = -(lines[:, :2] * through).sum(axis=1)
     scores, numbers = rng.uniform(0.0, 1.0, n), np.arange(n).astype(np.int32)
-    subdivide(xy, graph, counts, lines, scores, np.zeros(n, np.int32), numbers, through, 1.0)
-    n_vertices, n_edges, n_cells = counts.tolist()
+    subdivide(plan, lines, scores, np.zeros(n, np.int32), numbers, through, 1.0, 1.0)
+    xy, graph = plan.xy, plan.graph
+    n_vertices, n_edges, n_cells = plan.counts.tolist()
     assert n_cells > 4
-    rings = loops(graph, n_edges)
+    rings = loops(plan)
     component = list(range(n_vertices))
     for h in range(0, n_edges, 2):
         a, b = component[graph[h, ORIGIN]], component[graph[h ^ 1, ORIGIN]]
         component = [a if one == b else one for one in component]
     # Euler, with a loop for every border of a cell: vertices - edges + loops = 2 components
     assert n_vertices - n_edges // 2 + len(rings) == 2 * len(set(component))
-    areas = cell_areas_m2(xy, graph, n_edges, n_cells)
+    areas = cell_areas_m2(plan)
     assert (areas > 0.0).all()
     assert areas.sum() == pytest.approx(area, abs=0.02)
     edges = shapely.linestrings([(xy[graph[h, ORIGIN]], xy[graph[h ^ 1, ORIGIN]]) for h in range(0, n_edges, 2)])
@@ -264,5 +269,5 @@ def test_any_lines_leave_a_planar_graph_that_fills_the_outline(seed: int) -> Non
             assert len(common) == 1
             assert shapely.get_coordinates(meeting).tolist() == [xy[common.pop()].tolist()]
     places = np.column_stack((rng.uniform(0.2, 9.8, (200, 2)), np.zeros(200)))
-    cells = cells_of_points(xy, graph, n_edges, places)
-    assert cells.tolist() == [cell_at(xy, graph, n_edges, x * 1e3, y * 1e3) for x, y, _ in places.tolist()]
+    cells = cells_of_points(plan, places)
+    assert cells.tolist() == [cell_at(plan, x * 1e3, y * 1e3) for x, y, _ in places.tolist()]

@@ -18,7 +18,7 @@ from pipeline.roof.arrangement.far_corners import (
     with_level_planes,
 )
 from pipeline.roof.arrangement.settings import ArrangementSettings
-from pipeline.roof.arrangement.subdivision import FACE, insert_chord, insert_vertex, outline_graph
+from pipeline.roof.arrangement.subdivision import FACE, insert_chord, insert_vertex, subdivision_of
 
 RISING = (0.5, 0.0, 3.0)
 """A plane that explains the west of a hall, up to x = 8 m."""
@@ -41,23 +41,21 @@ class Hall:
     def __init__(self, east: tuple[float, float, float], planes: list[tuple[float, float, float]]) -> None:
         self.points = np.concatenate([grid(0.0, 8.0, RISING), grid(8.0, 12.0, east)])
         ring = np.array([[0, 0], [12_000, 0], [12_000, 6_000], [0, 6_000]], np.int64)
-        starts, owner = np.array([0, 4], np.int32), np.zeros(1, np.int32)
-        self.xy, self.graph = outline_graph(ring, starts, owner, 40)
-        self.counts = np.array([4, 8, 1], np.int32)
+        self.plan = subdivision_of(ring, np.array([0, 4]), np.zeros(1, np.int64), 40)
         self.planes = np.array(planes)
         self.labels = np.zeros(1, np.int32)
         self.raster = heights_raster(self.points, SPACING_M)
-        self.around = heights_around(self.xy, 4, self.raster)
+        self.around = heights_around(self.plan, self.raster)
 
     def cut(self) -> int:
-        cells = cells_of_points(self.xy, self.graph, self.counts[1], self.points)
+        cells = cells_of_points(self.plan, self.points)
         return cut_off_far_corners(
-            self.xy, self.graph, self.counts, self.points, cells, self.planes, self.labels, self.around, self.raster,
+            self.plan, self.points, cells, self.planes, self.labels, self.around, self.raster,
             FAR_M, 0.3, 0, 1.0,
         )  # fmt: skip
 
     def areas(self) -> list[float]:
-        return sorted(cell_areas_m2(self.xy, self.graph, self.counts[1], self.counts[2]).tolist())
+        return sorted(cell_areas_m2(self.plan).tolist())
 
 
 def test_heights_are_those_of_the_points_around_a_place() -> None:
@@ -73,7 +71,7 @@ def test_heights_are_those_of_the_points_around_a_place() -> None:
 def test_far_from_all_points_there_are_no_heights() -> None:
     hall = Hall(LOW, [RISING, LOW])
     raster = heights_raster(hall.points[hall.points[:, 0] < 8.0], SPACING_M)
-    lowest, highest, _, _ = heights_around(hall.xy, 4, raster)
+    lowest, highest, _, _ = heights_around(hall.plan, raster)
     assert (lowest[:4] > highest[:4]).tolist() == [False, True, True, False]
 
 
@@ -97,7 +95,7 @@ def test_a_plane_below_the_points_is_cut_off_too() -> None:
     hall = Hall((0.0, 0.0, 9.0), [sinking, (0.0, 0.0, 9.0)])
     hall.points[hall.points[:, 0] < 8.0, 2] = 9.0 - 0.5 * hall.points[hall.points[:, 0] < 8.0, 0]
     hall.raster = heights_raster(hall.points, SPACING_M)
-    hall.around = heights_around(hall.xy, 4, hall.raster)
+    hall.around = heights_around(hall.plan, hall.raster)
     assert hall.cut() == 1
     east, west = hall.areas()
     assert 6.0 * 1.5 < east < 6.0 * 4.0
@@ -114,21 +112,20 @@ def test_of_two_planes_that_fit_beyond_the_better_one_decides_where_to_cut() -> 
 def test_both_cells_beside_an_edge_are_cut(*, swapped: bool) -> None:
     hall = Hall(FALLING, [RISING, FALLING])
     for x in (0, 12_000):
-        for h in range(int(hall.counts[1])):
-            if hall.xy[hall.graph[h, 0], 0] == x == hall.xy[hall.graph[h ^ 1, 0], 0] and hall.graph[h, FACE] == 0:
-                assert insert_vertex(hall.xy, hall.counts[0], hall.graph, hall.counts[1], h, x, 3_000)
-                hall.counts += np.array([1, 2, 0], np.int32)
+        xy, graph, counts = hall.plan
+        for h in range(int(counts[1])):
+            if xy[graph[h, 0], 0] == x == xy[graph[h ^ 1, 0], 0] and graph[h, FACE] == 0:
+                assert insert_vertex(hall.plan, h, x, 3_000)
                 break
     ends = (5, 4) if swapped else (4, 5)
-    assert insert_chord(hall.xy, hall.graph, hall.counts[1], 1, *ends, 0, 0) == 1
-    hall.counts += np.array([0, 2, 1], np.int32)
+    assert insert_chord(hall.plan, *ends, 0, 0) == 1
     # one half of the hall rises throughout
     rising = hall.points[:, 1] > 3.0
     hall.points[rising, 2] = 3.0 + 0.5 * hall.points[rising, 0]
     hall.labels = np.zeros(2, np.int32)
     hall.planes = np.array([RISING, FALLING])
     hall.raster = heights_raster(hall.points, SPACING_M)
-    hall.around = heights_around(hall.xy, int(hall.counts[0]), hall.raster)
+    hall.around = heights_around(hall.plan, hall.raster)
     assert hall.cut() == 1
     assert hall.areas() == pytest.approx([12.0, 24.0, 36.0], abs=0.01)
 
@@ -156,13 +153,13 @@ def test_without_points_the_outline_is_one_face() -> None:
 def test_a_cell_near_its_points_is_left_alone() -> None:
     hall = Hall(tuple(RISING), [RISING, LOW])
     assert hall.cut() == 0
-    assert hall.counts.tolist() == [4, 8, 1]
+    assert hall.plan.counts.tolist() == [4, 8, 1]
 
 
 def test_a_cell_that_is_far_at_all_corners_is_found_and_left_whole() -> None:
     hall = Hall(LOW, [(0.0, 0.0, 20.0), LOW])
     assert hall.cut() == 1
-    assert hall.counts[2] == 1
+    assert hall.plan.counts[2] == 1
 
 
 @pytest.mark.parametrize(
@@ -172,9 +169,9 @@ def test_a_cell_that_is_far_at_all_corners_is_found_and_left_whole() -> None:
 def test_a_plane_costs_where_it_goes_on_by_more_than_its_slope(plane: tuple[float, float, float], *, far: bool) -> None:
     hall = Hall(LOW, [plane, LOW])
     hall.points[:, 2] = 3.0
-    around = heights_around(hall.xy, 4, heights_raster(hall.points, SPACING_M))
+    around = heights_around(hall.plan.xy, 4, heights_raster(hall.points, SPACING_M))
     costs, misfits = np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64)
-    add_costs_of_far_planes(hall.xy, hall.graph, hall.counts[1], hall.planes, around, FAR_M, costs, misfits)
+    add_costs_of_far_planes(hall.plan, hall.planes, around, FAR_M, costs, misfits)
     assert (costs[0, 0] > 0, costs[0, 1]) == (far, 0)
     assert (costs == misfits).all()
 
@@ -183,9 +180,9 @@ def test_a_plane_costs_where_it_goes_on_by_more_than_its_slope(plane: tuple[floa
 def test_a_plane_costs_by_the_metre_up_to_a_limit(height_m: float, cost: int) -> None:
     hall = Hall(LOW, [(0.0, 0.0, height_m), LOW])
     hall.points[:, 2] = 3.0
-    around = heights_around(hall.xy, 4, heights_raster(hall.points, SPACING_M))
+    around = heights_around(hall.plan.xy, 4, heights_raster(hall.points, SPACING_M))
     costs, misfits = np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64)
-    add_costs_of_far_planes(hall.xy, hall.graph, hall.counts[1], hall.planes, around, FAR_M, costs, misfits)
+    add_costs_of_far_planes(hall.plan, hall.planes, around, FAR_M, costs, misfits)
     assert costs.tolist() == misfits.tolist() == [[cost, 0]]
 
 
@@ -194,15 +191,15 @@ def test_steep_planes_go_on_no_farther_than_one_of_45_degrees(slope: float, *, i
     hall = Hall(LOW, [(0.0, slope, 3.0)])
     hall.points[:, 2] = 3.0 + slope * hall.points[:, 1]
     # the eave is a metre from the first points, so that those of the next cells tell
-    around = heights_around(hall.xy, 4, heights_raster(hall.points[hall.points[:, 1] > 0.9], SPACING_M))
-    extended = with_level_planes(hall.xy, hall.graph, hall.counts[1], hall.planes, hall.labels, around, FAR_M)
+    around = heights_around(hall.plan.xy, 4, heights_raster(hall.points[hall.points[:, 1] > 0.9], SPACING_M))
+    extended = with_level_planes(hall.plan, hall.planes, hall.labels, around, FAR_M)
     assert (len(extended) > 1) == is_far
 
 
 def test_of_planes_that_are_all_far_the_nearest_costs_nothing() -> None:
     hall = Hall(LOW, [(0.0, 0.0, 14.0), (0.0, 0.0, 11.0)])
     costs, misfits = np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64)
-    add_costs_of_far_planes(hall.xy, hall.graph, hall.counts[1], hall.planes, hall.around, FAR_M, costs, misfits)
+    add_costs_of_far_planes(hall.plan, hall.planes, hall.around, FAR_M, costs, misfits)
     assert costs[0, 0] > 0
     assert costs[0, 1] == 0
 
@@ -210,7 +207,7 @@ def test_of_planes_that_are_all_far_the_nearest_costs_nothing() -> None:
 @pytest.mark.slow
 def test_where_no_plane_fits_a_corner_there_is_a_level_one() -> None:
     hall = Hall(LOW, [RISING, (0.0, 0.0, 9.0)])
-    arguments = (hall.xy, hall.graph, int(hall.counts[1]))
+    arguments = (hall.plan,)
     extended = with_level_planes(*arguments, hall.planes, hall.labels, hall.around, FAR_M)
     assert extended[:2].tolist() == hall.planes.tolist()
     assert extended[2:].tolist() == [[0.0, 0.0, 3.0]]

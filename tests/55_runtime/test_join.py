@@ -17,8 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from slow_join import WholeSplit, whole_join, whole_surfaces
 
+from pipeline.kernels.union_find import united
 from pipeline.model import IntArray, Tin
-from pipeline.runtime.border_facets import facet_names, telling_facets, united, united_by_name
+from pipeline.runtime.border_facets import facet_names, telling_facets, united_by_name
 from pipeline.runtime.join import Joined, join
 from pipeline.runtime.open_fragments import open_fragments
 from pipeline.runtime.split import Split

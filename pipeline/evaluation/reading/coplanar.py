@@ -7,8 +7,10 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
-from pipeline.geometry import solve_plane_moments
-from pipeline.model import FloatArray, IntArray
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.normal_equations import solve_plane_moments
+from pipeline.model import FloatArray, IntArray, LabelArray
 
 DISTANCE_M = 0.01
 """Vertices up to this far from a plane lie in it."""
@@ -55,7 +57,7 @@ def face_vectors(xyz: FloatArray, corners: IntArray, ring_offsets: IntArray, fac
 @kernel
 def _neighbours(
     corners: IntArray, ring_offsets: IntArray, face_rings: IntArray, vertices: int
-) -> tuple[IntArray, IntArray]:
+) -> tuple[LabelArray, IntArray]:
     """Faces that share an edge with each face: offsets (f + 1,) and faces, a face once for every common edge."""
     keys = np.empty(len(corners), np.int64)
     owner = np.empty(len(corners), np.int64)
@@ -67,11 +69,11 @@ def _neighbours(
                 a, b = min(corners[k], corners[following]), max(corners[k], corners[following])
                 keys[k] = a * vertices + b
                 owner[k] = f
-    order = np.argsort(keys, kind="mergesort")
-    offsets = np.zeros(faces + 1, np.int64)
-    others = np.empty(0, np.int64)
-    fill = np.empty(0, np.int64)
+    order = ascending_order(keys)
+    # every pair of faces at an edge, both ways; the second turn writes what the first one counted
+    beside, others = np.empty(0, np.int32), np.empty(0, np.int64)
     for writes in (False, True):
+        count = 0
         start = 0
         while start < len(order):
             stop = start + 1
@@ -79,21 +81,18 @@ def _neighbours(
                 stop += 1
             for i in range(start, stop):
                 for j in range(start, stop):
-                    f, g = owner[order[i]], owner[order[j]]
-                    if f == g:
-                        continue
-                    if writes:
-                        others[fill[f]] = g
-                        fill[f] += 1
-                    else:
-                        offsets[f + 1] += 1
+                    if owner[order[i]] != owner[order[j]]:
+                        if writes:
+                            beside[count], others[count] = owner[order[i]], owner[order[j]]
+                        count += 1
             start = stop
         if not writes:
-            for f in range(faces):
-                offsets[f + 1] += offsets[f]
-            others = np.empty(offsets[faces], np.int64)
-            fill = offsets[:-1].copy()
-    return offsets, others
+            beside, others = np.empty(count, np.int32), np.empty(count, np.int64)
+    offsets, members = counting_sort(beside, faces)
+    ordered = np.empty(len(members), np.int64)
+    for m in range(len(members)):
+        ordered[m] = others[members[m]]
+    return offsets, ordered
 
 
 @kernel
@@ -152,7 +151,7 @@ def coplanar_regions(
     labels = np.full(faces, -1, np.int64)
     queue = np.empty(faces, np.int64)
     count = 0
-    for seed in np.argsort(-areas, kind="mergesort"):
+    for seed in ascending_order(-areas):
         if labels[seed] >= 0:
             continue
         labels[seed] = count

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.kernels.union_find import united
 from pipeline.model import FaceKind, FloatArray
 
 MILLIMETRES_PER_METRE = 1000.0
@@ -140,20 +141,10 @@ def grouped(count: int, pairs: Iterable[Sequence[int]]) -> list[list[int]]:
     >>> grouped(4, [(0, 2), (3, 3)])
     [[0, 2], [1], [3]]
     """
-    parent = list(range(count))
-
-    def root(number: int) -> int:
-        while parent[number] != number:
-            parent[number] = parent[parent[number]]
-            number = parent[number]
-        return number
-
-    for one, other in pairs:
-        a, b = root(one), root(other)
-        parent[max(a, b)] = min(a, b)
+    one, other = np.fromiter(chain.from_iterable(pairs), np.int64).reshape(-1, 2).T
     groups: dict[int, list[int]] = {}
-    for number in range(count):
-        groups.setdefault(root(number), []).append(number)
+    for number, first in enumerate(united(count, one, other).tolist()):
+        groups.setdefault(first, []).append(number)
     return list(groups.values())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -25,7 +26,7 @@ from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, ne
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, raster_labels
 from pipeline.roof.arrangement.settings import ArrangementSettings
-from pipeline.roof.arrangement.subdivision import outline_graph, subdivide
+from pipeline.roof.arrangement.subdivision import CELLS, EDGES, VERTICES, Subdivision, subdivide, subdivision_of
 from pipeline.roof.partition import RoofPartition
 
 _EDGES_PER_LINE = 24
@@ -35,42 +36,55 @@ _CUTS = 3
 """How often cells are cut whose plane leaves the points."""
 
 
+class _Outline(NamedTuple):
+    """Rings of an outline: vertices (n, 2) mm, first vertex of each and number of vertices, polygon of each; int64."""
+
+    xy: IntArray
+    starts: IntArray
+    polygons: IntArray
+
+
+class _Weights(NamedTuple):
+    """Costs and lengths: `ArrangementSettings` at a density of points."""
+
+    cell_m: float
+    points_per_m2: float
+    cap_m: float
+    cost_per_m: float
+    face_cost: int
+    doubtful_cost: int
+    line_length_m: float
+    line_reach_m: float
+    overshoot_m: float
+    clearance: float
+
+
+class _Arranged(NamedTuple):
+    """The subdivision; rings from `rings_of_faces`; plane of each face, face of each cell; planes and their support."""
+
+    plan: Subdivision
+    rings: tuple[FloatArray, IntArray, LabelArray, bool]
+    plane_of_face: LabelArray
+    faces: LabelArray
+    planes: FloatArray
+    support: FloatArray
+
+
 @kernel
 def _arranged(
-    points: FloatArray,
-    labels: LabelArray,
-    planes: FloatArray,
-    ring_xy: IntArray,
-    ring_starts: LabelArray,
-    polygon_of_ring: LabelArray,
-    cell_m: float,
-    points_per_m2: float,
-    cap_m: float,
-    cost_per_m: float,
-    face_cost: int,
-    doubtful_cost: int,
-    line_length_m: float,
-    line_reach_m: float,
-    overshoot_m: float,
-    clearance: float,
-) -> tuple[
-    IntArray,
-    tuple[FloatArray, IntArray, LabelArray, bool],
-    LabelArray,
-    LabelArray,
-    LabelArray,
-    FloatArray,
-    FloatArray,
-]:
-    """Vertices; rings from `rings_of_faces`; the faces' planes; graph, cells' faces; planes and their support."""
-    n_outline = len(ring_xy)
+    points: FloatArray, labels: LabelArray, planes: FloatArray, outline: _Outline, weights: _Weights
+) -> _Arranged:
+    """Kernel of `arrange`."""
+    cap_m, overshoot_m, clearance = weights.cap_m, weights.overshoot_m, weights.clearance
+    n_outline = len(outline.xy)
     edges = np.empty((n_outline, 4))
-    for r in range(len(ring_starts) - 1):
-        for v in range(ring_starts[r], ring_starts[r + 1]):
-            after = v + 1 if v + 1 < ring_starts[r + 1] else ring_starts[r]
+    for r in range(len(outline.starts) - 1):
+        first, last = outline.starts[r], outline.starts[r + 1]
+        for v in range(first, last):
+            after = v + 1 if v + 1 < last else first
             for axis in range(2):
-                edges[v, axis] = ring_xy[v, axis] * 1e-3
-                edges[v, 2 + axis] = ring_xy[after, axis] * 1e-3
+                edges[v, axis] = outline.xy[v, axis] * 1e-3
+                edges[v, 2 + axis] = outline.xy[after, axis] * 1e-3
     k = len(planes)
 
     lines, scores = np.empty((0, 3)), np.empty(0)
@@ -80,71 +94,70 @@ def _arranged(
     if k == 1:
         planes = refitted_planes(points, label_of_point, planes, cap_m)
     else:
-        raster, place, low_x, low_y, columns = raster_labels(points, planes, edges, cell_m, cap_m, cost_per_m)
-        half = 0.5 * cell_m
+        raster, place, low_x, low_y, columns = raster_labels(
+            points, planes, edges, weights.cell_m, cap_m, weights.cost_per_m
+        )
+        half = 0.5 * weights.cell_m
         label_of_point = labels_of_points(points, raster, place, low_x, low_y, half, columns)
         planes = refitted_planes(points, label_of_point, planes, cap_m)
         places, pairs = border_places(raster, place, low_x, low_y, half, columns, k)
         lines, scores, crossing, line_of = candidate_lines(
-            places, pairs, points, planes, edges, half, cap_m, line_length_m
+            places, pairs, points, planes, edges, half, cap_m, weights.line_length_m
         )
 
-    xy, graph = outline_graph(ring_xy, ring_starts, polygon_of_ring, _SPARE_EDGES + _EDGES_PER_LINE * len(lines))
-    counts = np.array([n_outline, 2 * n_outline, polygon_of_ring.max() + 1], np.int32)
-    subdivide(xy, graph, counts, lines, scores, crossing, line_of, places, line_reach_m, clearance)
+    plan = subdivision_of(outline.xy, outline.starts, outline.polygons, _SPARE_EDGES + _EDGES_PER_LINE * len(lines))
+    counts = plan.counts
+    subdivide(plan, lines, scores, crossing, line_of, places, weights.line_reach_m, clearance)
 
-    spacing_m = 1.0 / math.sqrt(points_per_m2)
+    spacing_m = 1.0 / math.sqrt(weights.points_per_m2)
     raster_of_heights = heights_raster(points, spacing_m)
-    chosen = np.empty(0, np.int32)
+    cell_labels = np.zeros(counts[CELLS] + len(plan.xy), np.int32)
+    known = 0
     for attempt in range(_CUTS + 1):
-        n_cells, before = counts[2], chosen
-        cell_labels = np.zeros(n_cells + len(xy), np.int32)
+        n_cells = counts[CELLS]
+        before, cell_labels = cell_labels, np.zeros(n_cells + len(plan.xy), np.int32)
         if k == 1:
             break
         chosen = cell_labels[:n_cells]
-        chosen[: len(before)] = before
-        cells = cells_of_points(xy, graph, counts[1], points)
-        costs, misfits = cell_costs(
-            xy, graph, counts[1], n_cells, points, labels, planes, cells, cap_m, points_per_m2, overshoot_m
-        )
-        around = heights_around(xy, counts[0], raster_of_heights)
+        cells = cells_of_points(plan, points)
+        costs, misfits = cell_costs(plan, points, labels, planes, cells, cap_m, weights.points_per_m2, overshoot_m)
+        around = heights_around(plan, raster_of_heights)
         if attempt > 0:
-            add_costs_of_far_planes(xy, graph, counts[1], planes, around, overshoot_m, costs, misfits)
-        borders, weights = cell_borders(xy, graph, counts[1], cost_per_m)
-        for i in range(len(before), n_cells):
-            chosen[i] = np.argmin(costs[i])
-        starts, others, border_costs = neighbour_lists(n_cells, borders, weights)
+            add_costs_of_far_planes(plan, planes, around, overshoot_m, costs, misfits)
+        borders, border_weights = cell_borders(plan, weights.cost_per_m)
+        for i in range(n_cells):
+            chosen[i] = before[i] if i < known else np.argmin(costs[i])
+        known = n_cells
+        starts, others, border_costs = neighbour_lists(n_cells, borders, border_weights)
         allowed, allowed_starts = every_label(n_cells, k)
         expand_labels(costs, allowed, allowed_starts, starts, others, border_costs, chosen, _ROUNDS)
         held = points_per_cell(cells, n_cells)
-        unite_faces(misfits, held, borders, weights, chosen, face_cost, doubtful_cost)
+        unite_faces(misfits, held, borders, border_weights, chosen, weights.face_cost, weights.doubtful_cost)
         for i in range(len(points)):
             label_of_point[i] = chosen[cells[i]] if cells[i] >= 0 else -1
         if attempt == _CUTS:
             break
-        planes = with_level_planes(xy, graph, counts[1], planes, chosen, around, overshoot_m)
+        planes = with_level_planes(plan, planes, chosen, around, overshoot_m)
         is_more, k = len(planes) > k, len(planes)
-        line = len(lines) + attempt * len(graph)
+        line = len(lines) + attempt * len(plan.graph)
         found = cut_off_far_corners(
-            xy, graph, counts, points, cells, planes, chosen, around, raster_of_heights, overshoot_m, cap_m, line,
-            clearance,
-        )  # fmt: skip
-        if found == 0 or (attempt > 0 and counts[2] == n_cells and not is_more):
+            plan, points, cells, planes, chosen, around, raster_of_heights, overshoot_m, cap_m, line, clearance
+        )
+        if found == 0 or (attempt > 0 and counts[CELLS] == n_cells and not is_more):
             break
     support = support_of_planes(points, label_of_point, planes, cap_m)
 
-    faces, n_faces = part_crossings(xy, graph, counts, cell_labels, planes, clearance)
+    faces, n_faces = part_crossings(plan, cell_labels, planes, clearance)
     plane_of_face = np.empty(n_faces, np.int32)
-    for i in range(counts[2]):
+    for i in range(counts[CELLS]):
         plane_of_face[faces[i]] = cell_labels[i]
-    needed = corners_of_borders(xy, graph, counts[0], counts[1], n_outline, faces)
-    vertices, starts, owner = trace_faces(xy, graph, counts[1], faces, needed)
-    used = graph[: counts[1]].copy()
-    rings = rings_of_faces(xy, vertices, starts, owner, n_faces)
-    return xy[: counts[0]].copy(), rings, plane_of_face, used, faces, planes, support
+    vertices, ring_starts, owner = trace_faces(plan, faces, corners_of_borders(plan, n_outline, faces))
+    rings = rings_of_faces(plan.xy, vertices, ring_starts, owner, n_faces)
+    used = Subdivision(plan.xy[: counts[VERTICES]].copy(), plan.graph[: counts[EDGES]].copy(), counts)
+    return _Arranged(used, rings, plane_of_face, faces, planes, support)
 
 
-def _rings_of(outline_mm: MultiPolygon) -> tuple[IntArray, LabelArray, LabelArray]:
+def _rings_of(outline_mm: MultiPolygon) -> tuple[IntArray, IntArray, IntArray]:
     """Rings of the outline, outer ones to the left, holes to the right, with their starts and polygons."""
     rings: list[IntArray] = []
     polygons: list[int] = []
@@ -152,8 +165,8 @@ def _rings_of(outline_mm: MultiPolygon) -> tuple[IntArray, LabelArray, LabelArra
         for ring in (polygon.exterior, *polygon.interiors):
             rings.append(np.rint(shapely.get_coordinates(ring)[:-1]).astype(np.int64))
             polygons.append(number)
-    starts = np.cumsum([0, *(len(ring) for ring in rings)]).astype(np.int32)
-    return np.concatenate(rings), starts, np.array(polygons, np.int32)
+    starts = np.cumsum([0, *(len(ring) for ring in rings)], dtype=np.int64)
+    return np.concatenate(rings), starts, np.array(polygons, np.int64)
 
 
 def _polygons(nodes: FloatArray, ring_of: IntArray, owner: LabelArray) -> tuple[Polygon, ...] | None:
@@ -222,36 +235,34 @@ def arrange(
     moved[:, 2] += moved[:, 0] * shift[0] + moved[:, 1] * shift[1]
     points_per_m2 = 1.0 / spacing_m**2
     face_cost, doubtful_cost = settings.costs_of_face(points_per_m2)
-    xy, rings, plane_of_face, graph, faces, fitted, support = _arranged(
-        points - shift,
-        labels,
-        moved,
-        ring_xy - low,
-        ring_starts,
-        polygon_of_ring,
-        settings.raster_cell_of(spacing_m),
-        points_per_m2,
-        settings.residual_cap_m,
-        settings.border_cost / spacing_m,
-        round(face_cost * COST_SCALE),
-        round(doubtful_cost * COST_SCALE),
-        settings.line_length_m,
-        max(settings.line_reach_m, spacing_m),
-        max(settings.overshoot_m, spacing_m),
-        clearance,
+    weights = _Weights(
+        cell_m=settings.raster_cell_of(spacing_m),
+        points_per_m2=points_per_m2,
+        cap_m=settings.residual_cap_m,
+        cost_per_m=settings.border_cost / spacing_m,
+        face_cost=round(face_cost * COST_SCALE),
+        doubtful_cost=round(doubtful_cost * COST_SCALE),
+        line_length_m=settings.line_length_m,
+        line_reach_m=max(settings.line_reach_m, spacing_m),
+        overshoot_m=max(settings.overshoot_m, spacing_m),
+        clearance=clearance,
     )
-    nodes, ring_of, owner, is_sound = rings
+    found = _arranged(points - shift, labels, moved, _Outline(ring_xy - low, ring_starts, polygon_of_ring), weights)
+    nodes, ring_of, owner, is_sound = found.rings
     polygons = _polygons(nodes + low, ring_of, owner) if is_sound else None
     if polygons is None:
         # with every vertex that was put on a line the faces are as exact as the subdivision itself
-        vertices, starts, owner = trace_faces(xy, graph, len(graph), faces, np.ones(len(xy), np.bool_))
-        nodes, ring_of, owner, is_sound = rings_of_faces(xy, vertices, starts, owner, len(plane_of_face))
+        vertices, starts, owner = trace_faces(found.plan, found.faces, np.ones(len(found.plan.xy), np.bool_))
+        nodes, ring_of, owner, is_sound = rings_of_faces(
+            found.plan.xy, vertices, starts, owner, len(found.plane_of_face)
+        )
         polygons = _polygons(nodes + low, ring_of, owner) if is_sound else None
     if polygons is None:
         raise BuildingError(Reason.NO_PARTITION, "the cells of the outline make no coverage")
+    fitted = found.planes
     fitted[:, 2] -= fitted[:, 0] * shift[0] + fitted[:, 1] * shift[1]
     described = tuple(
         Plane(a=a, b=b, c=c, n_points=int(n), rmse_m=math.sqrt(squares / n) if n else 0.0)
-        for (a, b, c), (n, squares) in zip(fitted.tolist(), support.tolist(), strict=True)
+        for (a, b, c), (n, squares) in zip(fitted.tolist(), found.support.tolist(), strict=True)
     )
-    return RoofPartition(polygons=polygons, labels=plane_of_face, planes=described)
+    return RoofPartition(polygons=polygons, labels=found.plane_of_face, planes=described)

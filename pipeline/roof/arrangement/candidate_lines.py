@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import vertical_distance_m
 
@@ -36,11 +37,13 @@ _MAX_DIRECTIONS = 24
 @kernel
 def _outline_directions(edges: FloatArray) -> FloatArray:
     """Directions of the long edges of the outline and those square to them, longest first, in [0, pi)."""
-    length = np.hypot(edges[:, 2] - edges[:, 0], edges[:, 3] - edges[:, 1])
+    shortness = np.empty(len(edges))
+    for e in range(len(edges)):
+        shortness[e] = -np.hypot(edges[e, 2] - edges[e, 0], edges[e, 3] - edges[e, 1])
     found = np.empty(_MAX_DIRECTIONS)
     n = 0
-    for e in np.argsort(-length, kind="mergesort"):
-        if length[e] < _LEAST_EDGE_M or n + 2 > _MAX_DIRECTIONS:
+    for e in ascending_order(shortness):
+        if -shortness[e] < _LEAST_EDGE_M or n + 2 > _MAX_DIRECTIONS:
             break
         for quarter in range(2):
             angle = math.atan2(edges[e, 3] - edges[e, 1], edges[e, 2] - edges[e, 0]) + quarter * math.pi / 2
@@ -92,8 +95,12 @@ def border_places(
             places[m, 1] = low_y + (r + 0.5 + 0.5 * (step == 1)) * cell_m
             pairs[m] = np.int64(min(labels[i], labels[j])) * n_planes + max(labels[i], labels[j])
             m += 1
-    order = np.argsort(pairs[:m], kind="mergesort")
-    return places[:m][order], pairs[:m][order]
+    order = ascending_order(pairs[:m])
+    ordered, ordered_pairs = np.empty((m, 2)), np.empty(m, np.int64)
+    for s in range(m):
+        ordered[s, 0], ordered[s, 1] = places[order[s], 0], places[order[s], 1]
+        ordered_pairs[s] = pairs[order[s]]
+    return ordered, ordered_pairs
 
 
 @kernel
@@ -110,7 +117,7 @@ def _best_band(
             if line_of[q] < 0:
                 offsets[m] = across_x * places[q, 0] + across_y * places[q, 1]
                 m += 1
-        ordered = np.sort(offsets[:m])
+        ordered = in_order(offsets[:m])
         end = 0
         for begin in range(m):
             while end < m and ordered[end] <= ordered[begin] + band_m:
@@ -156,7 +163,7 @@ def _parting_shift(
         m += 1
     if m < _LEAST_POINTS:
         return math.nan
-    order = np.argsort(offsets[:m], kind="mergesort")
+    order = ascending_order(offsets[:m])
     total = 0.0
     for q in range(m):
         total += gains[order[q]]

@@ -14,9 +14,12 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.merge_sort import ascending_order
+from pipeline.kernels.union_find import numbered_sets, unite
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
-from pipeline.roof.arrangement.subdivision import FACE, ORIGIN, between_vertices
+from pipeline.roof.arrangement.subdivision import CELLS, EDGES, FACE, ORIGIN, Subdivision, between_vertices
 
 _LEAST_BEYOND = 3.0
 """Points that a cell counts for at least where a plane leaves the heights of its own: splinters hold none."""
@@ -29,33 +32,33 @@ space, as a crown does, is met by about half of them."""
 
 
 @kernel
-def cells_of_points(xy: IntArray, graph: LabelArray, n_edges: int, points: FloatArray) -> LabelArray:
-    """The cell in which each point lies, (n,) int32; -1 outside.
+def cells_of_points(plan: Subdivision, points: FloatArray) -> IntArray:
+    """The cell in which each point lies, (n,) int64; -1 outside.
 
     Points on a border belong to the cell east of it; `points` are in metres.
     """
+    xy, graph, n_edges = plan.xy, plan.graph, plan.counts[EDGES]
     low, high = math.inf, -math.inf
     for h in range(n_edges):
         low = min(low, float(xy[graph[h, ORIGIN], 1]))
         high = max(high, float(xy[graph[h, ORIGIN], 1]))
     rows = int((high - low) / _ROW_MM) + 1
-    starts = np.zeros(rows + 1, np.int32)
+    # every edge that runs down, once for each row of places that it passes
+    room = 0
+    for h in range(n_edges):
+        top, bottom = xy[graph[h, ORIGIN], 1], xy[graph[h ^ 1, ORIGIN], 1]
+        if top > bottom:
+            room += int((top - low) / _ROW_MM) - int((bottom - low) / _ROW_MM) + 1
+    held, row_of = np.empty(room, np.int64), np.empty(room, np.int32)
+    m = 0
     for h in range(n_edges):
         top, bottom = xy[graph[h, ORIGIN], 1], xy[graph[h ^ 1, ORIGIN], 1]
         if top > bottom:
             for r in range(int((bottom - low) / _ROW_MM), int((top - low) / _ROW_MM) + 1):
-                starts[r + 1] += 1
-    for r in range(rows):
-        starts[r + 1] += starts[r]
-    filled = starts[:-1].copy()
-    in_row = np.empty(starts[rows], np.int32)
-    for h in range(n_edges):
-        top, bottom = xy[graph[h, ORIGIN], 1], xy[graph[h ^ 1, ORIGIN], 1]
-        if top > bottom:
-            for r in range(int((bottom - low) / _ROW_MM), int((top - low) / _ROW_MM) + 1):
-                in_row[filled[r]] = h
-                filled[r] += 1
-    cells = np.full(len(points), -1, np.int32)
+                held[m], row_of[m] = h, r
+                m += 1
+    starts, in_row = counting_sort(row_of, rows)
+    cells = np.full(len(points), -1, np.int64)
     for i in range(len(points)):
         x, y = points[i, 0] * 1e3, between_vertices(points[i, 1] * 1e3)
         if y < low or y >= high:
@@ -63,7 +66,7 @@ def cells_of_points(xy: IntArray, graph: LabelArray, n_edges: int, points: Float
         r = int((y - low) / _ROW_MM)
         nearest = -math.inf
         for s in range(starts[r], starts[r + 1]):
-            h = in_row[s]
+            h = held[in_row[s]]
             p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
             if xy[p, 1] > y >= xy[q, 1]:
                 at = xy[p, 0] + (y - xy[p, 1]) * (xy[q, 0] - xy[p, 0]) / (xy[q, 1] - xy[p, 1])
@@ -74,26 +77,27 @@ def cells_of_points(xy: IntArray, graph: LabelArray, n_edges: int, points: Float
 
 
 @kernel
-def cell_areas_m2(xy: IntArray, graph: LabelArray, n_edges: int, n_cells: int) -> FloatArray:
+def cell_areas_m2(plan: Subdivision) -> FloatArray:
     """Area of every cell, (c,) float64."""
-    twice = np.zeros(n_cells, np.int64)
-    for h in range(n_edges):
+    xy, graph = plan.xy, plan.graph
+    twice = np.zeros(plan.counts[CELLS], np.int64)
+    for h in range(plan.counts[EDGES]):
         if graph[h, FACE] >= 0:
             p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
             twice[graph[h, FACE]] += xy[p, 0] * xy[q, 1] - xy[p, 1] * xy[q, 0]
-    return twice.astype(np.float64) * 0.5e-6
+    areas = np.empty(len(twice))
+    for cell in range(len(twice)):
+        areas[cell] = twice[cell] * 0.5e-6
+    return areas
 
 
 @kernel
 def cell_costs(
-    xy: IntArray,
-    graph: LabelArray,
-    n_edges: int,
-    n_cells: int,
+    plan: Subdivision,
     points: FloatArray,
     labels: LabelArray,
     planes: FloatArray,
-    cells: LabelArray,
+    cells: IntArray,
     cap_m: float,
     points_per_m2: float,
     overshoot_m: float,
@@ -111,10 +115,13 @@ def cell_costs(
     misfits : (c, k) int64
         The same without what lies within half the cap.
     """
+    xy, graph, n_cells = plan.xy, plan.graph, plan.counts[CELLS]
     k = len(planes)
     costs, misfits = np.zeros((n_cells, k), np.int64), np.zeros((n_cells, k), np.int64)
-    expected = cell_areas_m2(xy, graph, n_edges, n_cells) * points_per_m2
-    lacking = expected.copy()
+    expected, lacking = cell_areas_m2(plan), np.empty(n_cells)
+    for cell in range(n_cells):
+        expected[cell] *= points_per_m2
+        lacking[cell] = expected[cell]
     lowest, highest = np.full(k, math.inf), np.full(k, -math.inf)
     for i in range(len(points)):
         if labels[i] >= 0:
@@ -134,7 +141,7 @@ def cell_costs(
             lowest[label] = highest[label] = planes[label, 2]
     beyond = np.zeros((n_cells, k), np.int64)
     corners = np.zeros(n_cells, np.int64)
-    for h in range(n_edges):
+    for h in range(plan.counts[EDGES]):
         cell = graph[h, FACE]
         if cell < 0:
             continue
@@ -156,9 +163,10 @@ def cell_costs(
 
 
 @kernel
-def cell_borders(xy: IntArray, graph: LabelArray, n_edges: int, cost_per_m: float) -> tuple[LabelArray, IntArray]:
+def cell_borders(plan: Subdivision, cost_per_m: float) -> tuple[IntArray, IntArray]:
     """Pairs of cells that share an edge, and what a border of faces there costs."""
-    pairs = np.empty((n_edges // 2, 2), np.int32)
+    xy, graph, n_edges = plan.xy, plan.graph, plan.counts[EDGES]
+    pairs = np.empty((n_edges // 2, 2), np.int64)
     weights = np.empty(n_edges // 2, np.int64)
     m = 0
     for h in range(0, n_edges, 2):
@@ -174,36 +182,17 @@ def cell_borders(xy: IntArray, graph: LabelArray, n_edges: int, cost_per_m: floa
 
 
 @kernel
-def connected_faces(labels: LabelArray, pairs: LabelArray) -> tuple[LabelArray, int]:
+def connected_faces(labels: LabelArray, pairs: IntArray) -> tuple[LabelArray, int]:
     """The face of every cell: cells of one label that hang together by edges, numbered by their lowest cell."""
-    parent = np.arange(len(labels)).astype(np.int32)
+    parent = np.arange(len(labels))
     for e in range(len(pairs)):
-        a, b = pairs[e, 0], pairs[e, 1]
-        if labels[a] != labels[b]:
-            continue
-        while parent[a] != a:
-            parent[a] = parent[parent[a]]
-            a = parent[a]
-        while parent[b] != b:
-            parent[b] = parent[parent[b]]
-            b = parent[b]
-        parent[max(a, b)] = min(a, b)
-    faces = np.empty(len(labels), np.int32)
-    count = 0
-    for i in range(len(labels)):
-        if parent[i] == i:
-            faces[i] = count
-            count += 1
-        else:
-            root = i
-            while parent[root] != root:
-                root = parent[root]
-            faces[i] = faces[root]
-    return faces, count
+        if labels[pairs[e, 0]] == labels[pairs[e, 1]]:
+            unite(parent, pairs[e, 0], pairs[e, 1])
+    return numbered_sets(parent)
 
 
 @kernel
-def points_per_cell(cells: LabelArray, n_cells: int) -> LabelArray:
+def points_per_cell(cells: IntArray, n_cells: int) -> LabelArray:
     """How many points lie in each cell, (c,) int32; `cells` as from `cells_of_points`."""
     held = np.zeros(n_cells, np.int32)
     for cell in cells:
@@ -216,7 +205,7 @@ def points_per_cell(cells: LabelArray, n_cells: int) -> LabelArray:
 def unite_faces(
     misfits: IntArray,
     held: LabelArray,
-    pairs: LabelArray,
+    pairs: IntArray,
     weights: IntArray,
     labels: LabelArray,
     face_cost: int,
@@ -250,7 +239,8 @@ def unite_faces(
         label_of = np.empty(count, np.int32)
         for i in range(len(labels)):
             label_of[faces[i]] = labels[i]
-            data[faces[i]] += misfits[i]
+            for label in range(k):
+                data[faces[i], label] += misfits[i, label]
             inside[faces[i]] += held[i]
         keys = np.empty(2 * len(pairs), np.int64)
         between = np.empty(2 * len(pairs), np.int64)
@@ -261,7 +251,7 @@ def unite_faces(
                 keys[m], keys[m + 1] = np.int64(f) * count + g, np.int64(g) * count + f
                 between[m] = between[m + 1] = weights[e]
                 m += 2
-        order = np.argsort(keys[:m], kind="mergesort")
+        order = ascending_order(keys[:m])
         best = np.int64(0)
         best_face, best_label = -1, -1
         saved = np.zeros(k, np.int64)

@@ -11,14 +11,20 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
+from pipeline.kernels.orientation import turn_of
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.cells import cell_borders, connected_faces
 from pipeline.roof.arrangement.subdivision import (
+    CELLS,
+    EDGES,
     FACE,
     LINE,
     NEXT,
     ORIGIN,
     PREVIOUS,
+    VERTICES,
+    Subdivision,
     insert_chord,
     insert_vertex,
 )
@@ -34,13 +40,13 @@ _LARGE_COST = 100.0
 
 
 @kernel
-def _face_left(graph: LabelArray, h: int, faces: LabelArray) -> int:
+def _face_left(graph: IntArray, h: int, faces: LabelArray) -> int:
     cell = graph[h, FACE]
     return int(faces[cell]) if cell >= 0 else -1
 
 
 @kernel
-def _borders_at(graph: LabelArray, h: int, faces: LabelArray, borders: LabelArray) -> int:
+def _borders_at(graph: IntArray, h: int, faces: LabelArray, borders: IntArray) -> int:
     """The borders between faces that leave the origin of h, turning left; their number."""
     m = 0
     g = h
@@ -55,7 +61,7 @@ def _borders_at(graph: LabelArray, h: int, faces: LabelArray, borders: LabelArra
 
 
 @kernel
-def _crosses(around: LabelArray, heights: FloatArray, m: int) -> bool:
+def _crosses(around: IntArray, heights: FloatArray, m: int) -> bool:
     """Whether a face meets itself at a vertex, or walls of four faces meet above it."""
     for i in range(m):
         for j in range(i):
@@ -71,48 +77,35 @@ def _crosses(around: LabelArray, heights: FloatArray, m: int) -> bool:
 
 
 @kernel
-def _give_corner(
-    xy: IntArray,
-    graph: LabelArray,
-    counts: LabelArray,
-    labels: LabelArray,
-    first: int,
-    last: int,
-    label: int,
-    corner_mm: float,
-) -> bool:
+def _give_corner(plan: Subdivision, labels: LabelArray, first: int, last: int, label: int, corner_mm: float) -> bool:
     """Give the corner from half-edge `first` to the left up to `last` another label; whether there was room for it."""
+    xy, graph, counts = plan.xy, plan.graph, plan.counts
     g = first
     while True:
         v, w = graph[g, ORIGIN], graph[g ^ 1, ORIGIN]
         dx, dy = float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1])
         length = math.hypot(dx, dy)
         size = min(corner_mm, 0.4 * length)
-        if size < _LEAST_CORNER_MM or counts[0] >= len(xy) or counts[1] + 4 > len(graph):
+        if size < _LEAST_CORNER_MM or counts[VERTICES] >= len(xy) or counts[EDGES] + 4 > len(graph):
             return False
         x, y = int(np.rint(xy[v, 0] + size / length * dx)), int(np.rint(xy[v, 1] + size / length * dy))
-        if not insert_vertex(xy, counts[0], graph, counts[1], g, x, y):
+        if not insert_vertex(plan, g, x, y):
             return False
-        counts[0] += 1
-        counts[1] += 2
         if g == last:
             break
         g = graph[g, PREVIOUS] ^ 1
-    given_from = counts[2]
+    given_from = counts[CELLS]
     g = first
     while g != last:
         left = graph[g, PREVIOUS] ^ 1
         u, v = graph[g ^ 1, ORIGIN], graph[left ^ 1, ORIGIN]
         cell = graph[g, FACE]
-        made = insert_chord(xy, graph, counts[1], counts[2], u, v, cell, -1)
-        if made >= 0:
-            counts[1] += 2
-        if made != 1:
-            labels[given_from : counts[2]] = labels[cell]
+        if insert_chord(plan, u, v, cell, -1) != 1:
+            for given in range(given_from, counts[CELLS]):
+                labels[given] = labels[cell]
             return False
         # the triangle lies left of the chord, and so is the new cell
-        labels[counts[2]] = label
-        counts[2] += 1
+        labels[counts[CELLS] - 1] = label
         g = left
     return True
 
@@ -125,19 +118,21 @@ def _height_m(plane: FloatArray, x_mm: float, y_mm: float) -> float:
 
 @kernel
 def _corner_cost(
-    xy: IntArray, graph: LabelArray, planes: FloatArray, own: int, giver: int, beyond: int, edge: int, corner_mm: float
+    plan: Subdivision, planes: FloatArray, own: int, giver: int, beyond: int, edge: int, corner_mm: float
 ) -> float:
     """How much heights change where a corner takes its neighbour's plane, metres; much where planes would then cross.
 
     Along `edge` the neighbour's plane meets that beyond the corner: where they cross close to the vertex, the solid
     would get vertices too close to one another.
     """
+    xy, graph = plan.xy, plan.graph
     v, w = graph[edge, ORIGIN], graph[edge ^ 1, ORIGIN]
     fraction = min(corner_mm / math.hypot(float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1])), 0.4)
     x, y = xy[v, 0] + fraction * (xy[w, 0] - xy[v, 0]), xy[v, 1] + fraction * (xy[w, 1] - xy[v, 1])
     cost = abs(_height_m(planes[giver], x, y) - _height_m(planes[own], x, y))
     if beyond >= 0 and beyond != giver:
-        at_vertex = _height_m(planes[giver], xy[v, 0], xy[v, 1]) - _height_m(planes[beyond], xy[v, 0], xy[v, 1])
+        at_x, at_y = float(xy[v, 0]), float(xy[v, 1])
+        at_vertex = _height_m(planes[giver], at_x, at_y) - _height_m(planes[beyond], at_x, at_y)
         at_end = _height_m(planes[giver], x, y) - _height_m(planes[beyond], x, y)
         if at_vertex * at_end < 0.0:
             cost += 0.1 * _LARGE_COST
@@ -146,19 +141,14 @@ def _corner_cost(
 
 @kernel
 def part_crossings(
-    xy: IntArray,
-    graph: LabelArray,
-    counts: LabelArray,
-    labels: LabelArray,
-    planes: FloatArray,
-    clearance: float = 1.0,
+    plan: Subdivision, labels: LabelArray, planes: FloatArray, clearance: float
 ) -> tuple[LabelArray, int]:
     """Part borders that cross such that no solid could stand on them.
 
     Parameters
     ----------
-    xy, graph, counts : arrays
-        The subdivision; changed in place.
+    plan : Subdivision
+        Changed in place.
     labels : (c + room,) int32
         Plane of every cell, with room for the new ones; changed in place.
     planes : (k, 3) float64
@@ -173,18 +163,19 @@ def part_crossings(
     n_faces : int
         Their number.
     """
+    xy, graph, counts = plan.xy, plan.graph, plan.counts
     corner_mm = clearance * _CORNER_MM
-    borders = np.empty(_MOST_BORDERS, np.int32)
-    around = np.empty(_MOST_BORDERS, np.int32)
-    plane_of = np.empty(_MOST_BORDERS, np.int32)
+    borders = np.empty(_MOST_BORDERS, np.int64)
+    around = np.empty(_MOST_BORDERS, np.int64)
+    plane_of = np.empty(_MOST_BORDERS, np.int64)
     refused = np.empty(2 * _MOST_BORDERS, np.bool_)
     heights = np.empty(_MOST_BORDERS)
-    pairs, _ = cell_borders(xy, graph, counts[1], 0.0)
-    faces, n_faces = connected_faces(labels[: counts[2]], pairs)
-    leaving = np.full(len(xy), -1, np.int32)
-    for h in range(counts[1]):
+    pairs, _ = cell_borders(plan, 0.0)
+    faces, n_faces = connected_faces(labels[: counts[CELLS]], pairs)
+    leaving = np.full(len(xy), -1, np.int64)
+    for h in range(counts[EDGES]):
         leaving[graph[h, ORIGIN]] = h
-    for v in range(counts[0]):
+    for v in range(counts[VERTICES]):
         # every corner that goes takes a border away from the vertex
         while leaving[v] >= 0:
             m = _borders_at(graph, leaving[v], faces, borders)
@@ -196,7 +187,7 @@ def part_crossings(
                 plane_of[i] = -1
                 if around[i] >= 0:
                     plane_of[i] = labels[graph[borders[i], FACE]]
-                    heights[i] = _height_m(planes[plane_of[i]], xy[v, 0], xy[v, 1])
+                    heights[i] = _height_m(planes[plane_of[i]], float(xy[v, 0]), float(xy[v, 1]))
             if not _crosses(around, heights, m):
                 break
             refused[:] = False
@@ -210,9 +201,7 @@ def part_crossings(
                         if around[i] < 0 or around[j] < 0 or refused[2 * i + side]:
                             continue
                         edge = borders[i] if side == 0 else borders[(i + 1) % m]
-                        cost = _corner_cost(
-                            xy, graph, planes, plane_of[i], plane_of[j], plane_of[beyond], edge, corner_mm
-                        )
+                        cost = _corner_cost(plan, planes, plane_of[i], plane_of[j], plane_of[beyond], edge, corner_mm)
                         if around[j] == around[beyond]:
                             cost -= _LARGE_COST
                         elif plane_of[j] == plane_of[beyond]:
@@ -225,32 +214,33 @@ def part_crossings(
                     break
                 label = labels[graph[borders[giver], FACE]]
                 first, last = borders[corner], borders[(corner + 1) % m]
-                given = _give_corner(xy, graph, counts, labels, first, last, label, corner_mm)
+                given = _give_corner(plan, labels, first, last, label, corner_mm)
                 refused[choice] = not given
-            pairs, _ = cell_borders(xy, graph, counts[1], 0.0)
-            faces, n_faces = connected_faces(labels[: counts[2]], pairs)
+            pairs, _ = cell_borders(plan, 0.0)
+            faces, n_faces = connected_faces(labels[: counts[CELLS]], pairs)
             if not given:
                 break
     return faces, n_faces
 
 
 @kernel
-def corners_of_borders(
-    xy: IntArray, graph: LabelArray, n_vertices: int, n_edges: int, n_outline: int, faces: LabelArray
-) -> BoolArray:
+def corners_of_borders(plan: Subdivision, n_outline: int, faces: LabelArray) -> BoolArray:
     """Which vertices the faces need, (v,) bool.
 
     The outline's own are needed; one that was put on a line is not where two faces only meet along that line.
     """
-    degree = np.zeros(n_vertices, np.int32)
-    ends = np.full((n_vertices, 2), -1, np.int32)
-    for h in range(n_edges):
+    xy, graph, n_vertices = plan.xy, plan.graph, plan.counts[VERTICES]
+    degree = np.zeros(n_vertices, np.int64)
+    ends = np.full((n_vertices, 2), -1, np.int64)
+    for h in range(plan.counts[EDGES]):
         if _face_left(graph, h, faces) != _face_left(graph, h ^ 1, faces):
             v = graph[h, ORIGIN]
             if degree[v] < 2:
                 ends[v, degree[v]] = h
             degree[v] += 1
-    needed = degree > 0
+    needed = np.zeros(n_vertices, np.bool_)
+    for v in range(n_vertices):
+        needed[v] = degree[v] > 0
     for v in range(n_outline, n_vertices):
         if degree[v] != 2 or graph[ends[v, 0], LINE] != graph[ends[v, 1], LINE]:
             continue
@@ -263,26 +253,25 @@ def corners_of_borders(
 
 
 @kernel
-def trace_faces(
-    xy: IntArray, graph: LabelArray, n_edges: int, faces: LabelArray, needed: BoolArray
-) -> tuple[LabelArray, LabelArray, LabelArray]:
+def trace_faces(plan: Subdivision, faces: LabelArray, needed: BoolArray) -> tuple[IntArray, IntArray, LabelArray]:
     """The rings around all faces, outer rings to the left, holes to the right; rings that touch themselves are parted.
 
     Returns
     -------
-    vertices : (n,) int32
+    vertices : (n,) int64
         Vertices of the rings, one ring after the other, not closed.
-    starts : (r + 1,) int32
+    starts : (r + 1,) int64
         First vertex of every ring.
     owner : (r,) int32
         Face of every ring.
     """
-    vertices = np.empty(n_edges, np.int32)
-    starts = np.zeros(n_edges + 1, np.int32)
+    graph, n_edges = plan.graph, plan.counts[EDGES]
+    vertices = np.empty(n_edges, np.int64)
+    starts = np.zeros(n_edges + 1, np.int64)
     owner = np.empty(n_edges, np.int32)
     done = np.zeros(n_edges, np.bool_)
-    place = np.full(len(xy), -1, np.int32)
-    stack = np.empty(n_edges, np.int32)
+    place = np.full(len(plan.xy), -1, np.int64)
+    stack = np.empty(n_edges, np.int64)
     n = 0
     rings = 0
     for start in range(n_edges):
@@ -324,7 +313,7 @@ def trace_faces(
 
 @kernel
 def rings_of_faces(
-    xy: IntArray, vertices: LabelArray, starts: LabelArray, owner: LabelArray, n_faces: int
+    xy: IntArray, vertices: IntArray, starts: IntArray, owner: LabelArray, n_faces: int
 ) -> tuple[FloatArray, IntArray, LabelArray, bool]:
     """The rings from `trace_faces` by faces, the outer one of each first.
 
@@ -348,18 +337,19 @@ def rings_of_faces(
         is_sound = is_sound and last - first >= 3
         area = np.int64(0)
         for s in range(first + 1, last - 1):
-            o, p, q = vertices[first], vertices[s], vertices[s + 1]
-            area += (xy[p, 0] - xy[o, 0]) * (xy[q, 1] - xy[o, 1]) - (xy[p, 1] - xy[o, 1]) * (xy[q, 0] - xy[o, 0])
+            area += turn_of(xy, vertices[first], vertices[s], vertices[s + 1])
         is_outer[r] = area > 0
         outer += is_outer[r]
     nodes = np.empty((len(vertices), 2))
     ring_of = np.empty(len(vertices), np.int64)
     owners = np.empty(n_rings, np.int32)
     n = 0
-    key = 2 * owner.astype(np.int64)
+    key = np.empty(n_rings, np.int32)
     for r in range(n_rings):
-        key[r] += not is_outer[r]
-    for m, r in enumerate(np.argsort(key, kind="mergesort")):
+        key[r] = 2 * owner[r] + (not is_outer[r])
+    _, order = counting_sort(key, 2 * n_faces)
+    for m in range(n_rings):
+        r = order[m]
         is_sound = is_sound and (is_outer[r] or (m > 0 and owners[m - 1] == owner[r]))
         for s in range(starts[r], starts[r + 1]):
             nodes[n, 0], nodes[n, 1] = xy[vertices[s], 0], xy[vertices[s], 1]

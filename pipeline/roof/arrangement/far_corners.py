@@ -13,7 +13,7 @@ distance within which points are looked for; down an eave also over the distance
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,20 +21,46 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
 from pipeline.roof.arrangement.subdivision import (
+    CELLS,
+    EDGES,
     FACE,
     NEXT,
     ORIGIN,
     PREVIOUS,
     SNAP_CROSSING_MM,
+    VERTICES,
+    Subdivision,
     cut_by_line,
     insert_chord,
     insert_vertex,
 )
 
-HeightsRaster: TypeAlias = tuple[FloatArray, FloatArray, float, float, float]
-"""From `heights_raster`."""
-HeightsAround: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, float]
-"""From `heights_around`."""
+
+class HeightsRaster(NamedTuple):
+    """Lowest and highest points by the cells of a raster, metres."""
+
+    lowest: FloatArray
+    """(r, c), inf where there is none."""
+    highest: FloatArray
+    """(r, c), -inf where there is none."""
+    west: float
+    south: float
+    side: float
+    """Of a cell, 0.75 m or a spacing."""
+
+
+class HeightsAround(NamedTuple):
+    """Lowest and highest points around every vertex, metres, with room for more."""
+
+    lowest: FloatArray
+    """(v,), inf where there is none."""
+    highest: FloatArray
+    """(v,), -inf where there is none."""
+    within: FloatArray
+    """(v,), how far from the vertex they were looked for."""
+    side: float
+    """Of the raster's cells."""
+
 
 _AROUND_M = 0.75
 """Points at least so near to a corner tell how high a roof may be there."""
@@ -53,22 +79,21 @@ _MOST_LEVEL = 8
 
 @kernel
 def heights_raster(points: FloatArray, spacing_m: float) -> HeightsRaster:
-    """Lowest and highest point of every cell of a raster, (r, c) metres, inf and -inf where there is none.
-
-    Behind them the west and south end and the side of the cells, 0.75 m or a spacing.
-    """
+    """Lowest and highest point of every cell of a raster."""
     side = max(_AROUND_M, spacing_m)
     if len(points) == 0:
-        return np.full((1, 1), math.inf), np.full((1, 1), -math.inf), 0.0, 0.0, side
-    west, south = points[:, 0].min(), points[:, 1].min()
-    columns = int((points[:, 0].max() - west) / side) + 1
-    rows = int((points[:, 1].max() - south) / side) + 1
+        return HeightsRaster(np.full((1, 1), math.inf), np.full((1, 1), -math.inf), 0.0, 0.0, side)
+    west, south, east, north = math.inf, math.inf, -math.inf, -math.inf
+    for i in range(len(points)):
+        west, south = min(west, points[i, 0]), min(south, points[i, 1])
+        east, north = max(east, points[i, 0]), max(north, points[i, 1])
+    columns, rows = int((east - west) / side) + 1, int((north - south) / side) + 1
     low, high = np.full((rows, columns), math.inf), np.full((rows, columns), -math.inf)
     for i in range(len(points)):
         r, c = int((points[i, 1] - south) / side), int((points[i, 0] - west) / side)
         low[r, c] = min(low[r, c], points[i, 2])
         high[r, c] = max(high[r, c], points[i, 2])
-    return low, high, west, south, side
+    return HeightsRaster(low, high, west, south, side)
 
 
 @kernel
@@ -78,8 +103,8 @@ def _heights_at(raster: HeightsRaster, x_mm: float, y_mm: float) -> tuple[float,
     All within the side of a cell count, none at three times that distance, but where there are none those up to as far
     again; the lowest is above the highest where there are none either.
     """
-    low, high, west, south, side = raster
-    r, c = math.floor((y_mm * 1e-3 - south) / side), math.floor((x_mm * 1e-3 - west) / side)
+    low, high, side = raster.lowest, raster.highest, raster.side
+    r, c = math.floor((y_mm * 1e-3 - raster.south) / side), math.floor((x_mm * 1e-3 - raster.west) / side)
     lowest, highest, within = math.inf, -math.inf, side
     for reach in (1, 2):
         within = side if reach == 1 else _FAR_SIDES * side
@@ -93,27 +118,29 @@ def _heights_at(raster: HeightsRaster, x_mm: float, y_mm: float) -> tuple[float,
 
 
 @kernel
-def _add_heights(xy: IntArray, first: int, last: int, raster: HeightsRaster, around: HeightsAround) -> None:
-    """The heights around vertices that are new."""
-    for v in range(first, last):
-        around[0][v], around[1][v], around[2][v] = _heights_at(raster, float(xy[v, 0]), float(xy[v, 1]))
+def _add_heights(plan: Subdivision, first: int, raster: HeightsRaster, around: HeightsAround) -> None:
+    """The heights around vertices from `first` on."""
+    for v in range(first, plan.counts[VERTICES]):
+        lowest, highest, within = _heights_at(raster, float(plan.xy[v, 0]), float(plan.xy[v, 1]))
+        around.lowest[v], around.highest[v], around.within[v] = lowest, highest, within
 
 
 @kernel
-def heights_around(xy: IntArray, n_vertices: int, raster: HeightsRaster) -> HeightsAround:
-    """Lowest and highest point around every vertex and within what distance, (v,) metres each, with room for more.
-
-    Behind them the side of the raster.
-    """
-    around = np.full(len(xy), math.inf), np.full(len(xy), -math.inf), np.full(len(xy), raster[4]), raster[4]
-    _add_heights(xy, 0, n_vertices, raster, around)
+def heights_around(plan: Subdivision, raster: HeightsRaster) -> HeightsAround:
+    """Lowest and highest point around every vertex."""
+    room = len(plan.xy)
+    lowest, highest, within = np.empty(room), np.empty(room), np.empty(room)
+    lowest[:], highest[:], within[:] = math.inf, -math.inf, raster.side
+    around = HeightsAround(lowest, highest, within, raster.side)
+    _add_heights(plan, 0, raster, around)
     return around
 
 
 @kernel
-def _outside_m(plane: FloatArray, x_mm: float, y_mm: float, heights: tuple[float, float, float], side: float) -> float:
+def _outside_m(
+    plane: FloatArray, x_mm: float, y_mm: float, lowest: float, highest: float, within: float, side: float
+) -> float:
     """How far a plane lies above (or, negative, below) what the heights around a place allow; 0 without heights."""
-    lowest, highest, within = heights
     if lowest > highest:
         return 0.0
     z = plane[0] * x_mm * 1e-3 + plane[1] * y_mm * 1e-3 + plane[2]
@@ -123,22 +150,15 @@ def _outside_m(plane: FloatArray, x_mm: float, y_mm: float, heights: tuple[float
 
 
 @kernel
-def _vertex_outside_m(plane: FloatArray, xy: IntArray, v: int, around: HeightsAround) -> float:
+def _vertex_outside_m(plane: FloatArray, plan: Subdivision, v: int, around: HeightsAround) -> float:
     """The same at a vertex."""
-    lowest, highest, within, side = around
-    return _outside_m(plane, float(xy[v, 0]), float(xy[v, 1]), (lowest[v], highest[v], within[v]), side)
-
-
-@kernel
-def _is_far(plane: FloatArray, xy: IntArray, v: int, around: HeightsAround, far_m: float) -> bool:
-    return abs(_vertex_outside_m(plane, xy, v, around)) > far_m
+    x, y = float(plan.xy[v, 0]), float(plan.xy[v, 1])
+    return _outside_m(plane, x, y, around.lowest[v], around.highest[v], around.within[v], around.side)
 
 
 @kernel
 def add_costs_of_far_planes(
-    xy: IntArray,
-    graph: LabelArray,
-    n_edges: int,
+    plan: Subdivision,
     planes: FloatArray,
     around: HeightsAround,
     far_m: float,
@@ -149,8 +169,8 @@ def add_costs_of_far_planes(
 
     Parameters
     ----------
-    xy, graph, n_edges : arrays and int
-        The subdivision.
+    plan : Subdivision
+        The cells.
     planes : (k, 3) float64
         Coefficients a, b, c.
     around : HeightsAround
@@ -161,14 +181,17 @@ def add_costs_of_far_planes(
         From `cell_costs`; changed in place.
     """
     farthest = np.zeros(costs.shape)
-    for h in range(n_edges):
-        cell = graph[h, FACE]
+    for h in range(plan.counts[EDGES]):
+        cell = plan.graph[h, FACE]
         if cell >= 0:
             for k in range(len(planes)):
-                outside = abs(_vertex_outside_m(planes[k], xy, graph[h, ORIGIN], around))
+                outside = abs(_vertex_outside_m(planes[k], plan, plan.graph[h, ORIGIN], around))
                 farthest[cell, k] = max(farthest[cell, k], outside)
     for cell in range(len(costs)):
-        least = max(farthest[cell].min(), far_m)
+        least = math.inf
+        for k in range(len(planes)):
+            least = min(least, farthest[cell, k])
+        least = max(least, far_m)
         for k in range(len(planes)):
             if farthest[cell, k] > least:
                 cost = int(COST_SCALE * min(_COST_PER_M * (farthest[cell, k] - least), _MOST_COST))
@@ -178,19 +201,13 @@ def add_costs_of_far_planes(
 
 @kernel
 def with_level_planes(
-    xy: IntArray,
-    graph: LabelArray,
-    n_edges: int,
-    planes: FloatArray,
-    labels: LabelArray,
-    around: HeightsAround,
-    far_m: float,
+    plan: Subdivision, planes: FloatArray, labels: LabelArray, around: HeightsAround, far_m: float
 ) -> FloatArray:
     """The planes, and horizontal ones where none of them fits a corner that the plane of its cell is far from.
 
     Parameters
     ----------
-    xy, graph, n_edges, planes, around, far_m : arrays, int and float
+    plan, planes, around, far_m
         As in `add_costs_of_far_planes`.
     labels : (c,) int32
         Plane of every cell.
@@ -200,21 +217,22 @@ def with_level_planes(
     (k + l, 3) float64
         The given ones first.
     """
-    lowest, highest, _, _ = around
     extended = np.empty((len(planes) + _MOST_LEVEL, 3))
-    extended[: len(planes)] = planes
     k = len(planes)
-    for h in range(n_edges):
-        cell, v = graph[h, FACE], graph[h, ORIGIN]
+    for q in range(k):
+        for axis in range(3):
+            extended[q, axis] = planes[q, axis]
+    for h in range(plan.counts[EDGES]):
+        cell, v = plan.graph[h, FACE], plan.graph[h, ORIGIN]
         if k == len(extended):
             break
-        if cell < 0 or not _is_far(planes[labels[cell]], xy, v, around, far_m):
+        if cell < 0 or abs(_vertex_outside_m(planes[labels[cell]], plan, v, around)) <= far_m:
             continue
         fits = False
         for q in range(k):
-            fits = fits or not _is_far(extended[q], xy, v, around, far_m)
+            fits = fits or abs(_vertex_outside_m(extended[q], plan, v, around)) <= far_m
         if not fits:
-            extended[k, 0], extended[k, 1], extended[k, 2] = 0.0, 0.0, 0.5 * (lowest[v] + highest[v])
+            extended[k, 0], extended[k, 1], extended[k, 2] = 0.0, 0.0, 0.5 * (around.lowest[v] + around.highest[v])
             k += 1
     return extended[:k].copy()
 
@@ -222,7 +240,7 @@ def with_level_planes(
 @kernel
 def _plane_beyond(
     points: FloatArray,
-    cells: LabelArray,
+    cells: IntArray,
     planes: FloatArray,
     cell: int,
     own: int,
@@ -238,10 +256,10 @@ def _plane_beyond(
     for k in range(len(planes)):
         if not fits[k]:
             continue
-        apart = planes[own] - planes[k]
+        a, b, c = planes[own, 0] - planes[k, 0], planes[own, 1] - planes[k, 1], planes[own, 2] - planes[k, 2]
         gain = 0.0
         for i in range(len(points)):
-            if cells[i] == cell and up * (apart[0] * points[i, 0] + apart[1] * points[i, 1] + apart[2]) > 0.0:
+            if cells[i] == cell and up * (a * points[i, 0] + b * points[i, 1] + c) > 0.0:
                 gain += min(vertical_distance_m(points[i], planes[own]), cap_m)
                 gain -= min(vertical_distance_m(points[i], planes[k]), cap_m)
         if gain > saved:
@@ -251,44 +269,33 @@ def _plane_beyond(
 
 @kernel
 def _cut_where_planes_meet(
-    xy: IntArray,
-    graph: LabelArray,
-    counts: LabelArray,
-    cell: int,
-    one: FloatArray,
-    other: FloatArray,
-    line: int,
-    snap_mm: float,
+    plan: Subdivision, cell: int, one: FloatArray, other: FloatArray, line: int, snap_mm: float
 ) -> None:
     """Cut a cell along the line in which two planes meet, where it crosses the cell."""
-    meeting = one - other
-    slope = math.hypot(meeting[0], meeting[1])
+    slope = math.hypot(one[0] - other[0], one[1] - other[1])
     if slope < 1e-6:
         return
-    meeting /= slope
+    meeting = np.empty(3)
+    for axis in range(3):
+        meeting[axis] = (one[axis] - other[axis]) / slope
     meeting[2] *= 1e3
-    spans = np.array([[math.inf, -math.inf]])
-    for h in range(counts[1]):
-        if graph[h, FACE] == cell:
-            v = graph[h, ORIGIN]
-            along = -meeting[1] * xy[v, 0] + meeting[0] * xy[v, 1]
+    spans = np.empty((1, 2))
+    spans[0, 0], spans[0, 1] = math.inf, -math.inf
+    for h in range(plan.counts[EDGES]):
+        if plan.graph[h, FACE] == cell:
+            v = plan.graph[h, ORIGIN]
+            along = -meeting[1] * plan.xy[v, 0] + meeting[0] * plan.xy[v, 1]
             spans[0, 0], spans[0, 1] = min(spans[0, 0], along), max(spans[0, 1], along)
-    cut_by_line(xy, graph, counts, meeting, line, snap_mm, spans, cell)
+    cut_by_line(plan, meeting, line, snap_mm, spans, cell)
 
 
 @kernel
 def _end_of_chord(
-    xy: IntArray,
-    graph: LabelArray,
-    counts: LabelArray,
-    edge: int,
-    is_far_first: bool,
-    plane: FloatArray,
-    raster: HeightsRaster,
-    far_m: float,
+    plan: Subdivision, edge: int, is_far_first: bool, plane: FloatArray, raster: HeightsRaster, far_m: float
 ) -> int:
     """The vertex where an edge from what is far to what is not gets near enough: a new one, else its near end."""
-    u, w = graph[edge, ORIGIN], graph[edge ^ 1, ORIGIN]
+    xy, counts = plan.xy, plan.counts
+    u, w = plan.graph[edge, ORIGIN], plan.graph[edge ^ 1, ORIGIN]
     if not is_far_first:
         u, w = w, u
     dx, dy = float(xy[w, 0] - xy[u, 0]), float(xy[w, 1] - xy[u, 1])
@@ -296,24 +303,21 @@ def _end_of_chord(
     at = _STEP_MM
     while at < length:
         x, y = xy[u, 0] + at / length * dx, xy[u, 1] + at / length * dy
-        if abs(_outside_m(plane, x, y, _heights_at(raster, x, y), raster[4])) <= far_m:
+        lowest, highest, within = _heights_at(raster, x, y)
+        if abs(_outside_m(plane, x, y, lowest, highest, within, raster.side)) <= far_m:
             break
         at += _STEP_MM
-    if at > length - _STEP_MM or counts[0] >= len(xy) or counts[1] + 2 > len(graph):
+    if at > length - _STEP_MM or counts[VERTICES] >= len(xy) or counts[EDGES] + 2 > len(plan.graph):
         return int(w)
     x, y = xy[u, 0] + at / length * dx, xy[u, 1] + at / length * dy
-    if not insert_vertex(xy, counts[0], graph, counts[1], edge, int(np.rint(x)), int(np.rint(y))):
+    if not insert_vertex(plan, edge, int(np.rint(x)), int(np.rint(y))):
         return int(w)
-    counts[0] += 1
-    counts[1] += 2
-    return int(counts[0] - 1)
+    return int(counts[VERTICES] - 1)
 
 
 @kernel
 def _cut_by_chord(
-    xy: IntArray,
-    graph: LabelArray,
-    counts: LabelArray,
+    plan: Subdivision,
     cell: int,
     plane: FloatArray,
     around: HeightsAround,
@@ -323,20 +327,18 @@ def _cut_by_chord(
     line: int,
 ) -> None:
     """Cut corners that are too far off, where the edges beside them get near enough; from the corner `first` on."""
+    graph = plan.graph
     h = first
     while True:
         last, g = h, graph[h, NEXT]
-        while g != first and _is_far(plane, xy, graph[g, ORIGIN], around, far_m):
+        while g != first and abs(_vertex_outside_m(plane, plan, graph[g, ORIGIN], around)) > far_m:
             last, g = g, graph[g, NEXT]
         if last != h:
-            start = _end_of_chord(xy, graph, counts, h, False, plane, raster, far_m)
-            end = _end_of_chord(xy, graph, counts, last, True, plane, raster, far_m)
-            if start != end and counts[1] + 2 <= len(graph):
-                made = insert_chord(xy, graph, counts[1], counts[2], start, end, cell, line)
-                if made >= 0:
-                    counts[1] += 2
-                    counts[2] += made
-                    return
+            start = _end_of_chord(plan, h, False, plane, raster, far_m)
+            end = _end_of_chord(plan, last, True, plane, raster, far_m)
+            has_room = start != end and plan.counts[EDGES] + 2 <= len(graph)
+            if has_room and insert_chord(plan, start, end, cell, line) >= 0:
+                return
         h = g
         if h == first:
             return
@@ -344,11 +346,9 @@ def _cut_by_chord(
 
 @kernel
 def cut_off_far_corners(
-    xy: IntArray,
-    graph: LabelArray,
-    counts: LabelArray,
+    plan: Subdivision,
     points: FloatArray,
-    cells: LabelArray,
+    cells: IntArray,
     planes: FloatArray,
     labels: LabelArray,
     around: HeightsAround,
@@ -362,9 +362,9 @@ def cut_off_far_corners(
 
     Parameters
     ----------
-    xy, graph, counts : arrays
-        From `subdivide`; changed in place.
-    points, cells : (n, 3) float64 and (n,) int32
+    plan : Subdivision
+        Changed in place.
+    points, cells : (n, 3) float64 and (n,) int64
         Metres; the cell of each.
     planes : (k, 3) float64
         Coefficients a, b, c.
@@ -386,40 +386,44 @@ def cut_off_far_corners(
     int
         Cells that have such corners, cut or not.
     """
-    n_cells, known = counts[2], counts[0]
+    graph, counts = plan.graph, plan.counts
+    n_cells, known = counts[CELLS], counts[VERTICES]
     found = 0
     fits = np.empty(len(planes), np.bool_)
     for cell in range(n_cells):
         # cuts of other cells put vertices on the borders of this one
-        _add_heights(xy, known, counts[0], raster, around)
-        known = counts[0]
+        _add_heights(plan, known, raster, around)
+        known = counts[VERTICES]
         plane = planes[labels[cell]]
         farthest, far_corner = 0.0, -1
         fits[:] = True
-        for h in range(counts[1]):
+        for h in range(counts[EDGES]):
             if graph[h, FACE] != cell:
                 continue
             v = graph[h, ORIGIN]
-            outside = _vertex_outside_m(plane, xy, v, around)
+            outside = _vertex_outside_m(plane, plan, v, around)
             if abs(outside) <= far_m:
                 continue
             if abs(outside) > abs(farthest):
                 farthest, far_corner = outside, h
             for k in range(len(planes)):
-                fits[k] = fits[k] and not _is_far(planes[k], xy, v, around, far_m)
+                fits[k] = fits[k] and abs(_vertex_outside_m(planes[k], plan, v, around)) <= far_m
         if far_corner < 0:
             continue
         found += 1
         near_corner = graph[far_corner, PREVIOUS]
-        while near_corner != far_corner and _is_far(plane, xy, graph[near_corner, ORIGIN], around, far_m):
+        while (
+            near_corner != far_corner
+            and abs(_vertex_outside_m(plane, plan, graph[near_corner, ORIGIN], around)) > far_m
+        ):
             near_corner = graph[near_corner, PREVIOUS]
         if near_corner == far_corner:
             continue
-        n_before = counts[2]
+        n_before = counts[CELLS]
         other = _plane_beyond(points, cells, planes, cell, labels[cell], fits, math.copysign(1.0, farthest), cap_m)
         if other >= 0:
             snap_mm = clearance * SNAP_CROSSING_MM
-            _cut_where_planes_meet(xy, graph, counts, cell, plane, planes[other], line + found, snap_mm)
-        if counts[2] == n_before:
-            _cut_by_chord(xy, graph, counts, cell, plane, around, raster, far_m, near_corner, line + found)
+            _cut_where_planes_meet(plan, cell, plane, planes[other], line + found, snap_mm)
+        if counts[CELLS] == n_before:
+            _cut_by_chord(plan, cell, plane, around, raster, far_m, near_corner, line + found)
     return found

@@ -11,18 +11,19 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import IntArray, LabelArray
 
 
 @kernel
-def neighbour_lists(n: int, edges: LabelArray, weights: IntArray) -> tuple[LabelArray, LabelArray, IntArray]:
+def neighbour_lists(n: int, edges: IntArray, weights: IntArray) -> tuple[LabelArray, LabelArray, IntArray]:
     """The edges of every node in compressed rows.
 
     Parameters
     ----------
     n : int
         Number of nodes.
-    edges : (m, 2) int32
+    edges : (m, 2) int64
         Pairs of nodes.
     weights : (m,) int64
         Cost of every pair.
@@ -36,21 +37,15 @@ def neighbour_lists(n: int, edges: LabelArray, weights: IntArray) -> tuple[Label
     costs : (2 m,) int64
         Its pair's cost.
     """
-    starts = np.zeros(n + 1, np.int32)
+    nodes = np.empty(2 * len(edges), np.int32)
     for e in range(len(edges)):
-        starts[edges[e, 0] + 1] += 1
-        starts[edges[e, 1] + 1] += 1
-    for i in range(n):
-        starts[i + 1] += starts[i]
-    filled = starts[:-1].copy()
+        nodes[2 * e], nodes[2 * e + 1] = edges[e, 0], edges[e, 1]
+    starts, ends = counting_sort(nodes, n)
     others = np.empty(2 * len(edges), np.int32)
     costs = np.empty(2 * len(edges), np.int64)
-    for e in range(len(edges)):
-        for k in range(2):
-            node = edges[e, k]
-            others[filled[node]] = edges[e, 1 - k]
-            costs[filled[node]] = weights[e]
-            filled[node] += 1
+    for s in range(len(ends)):
+        others[s] = nodes[ends[s] ^ 1]
+        costs[s] = weights[ends[s] // 2]
     return starts, others, costs
 
 

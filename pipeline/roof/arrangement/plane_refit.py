@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.normal_equations import moments_of, solve_plane_moments
 from pipeline.model import FloatArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import vertical_distance_m
 
@@ -36,32 +37,20 @@ def labels_of_points(
 @kernel
 def _fit(points: FloatArray, chosen: LabelArray, plane: FloatArray, cap_m: float, fitted: FloatArray) -> bool:
     """Least squares over the chosen points nearer than the cap to a plane; whether they tell one."""
+    near = np.empty(len(chosen), np.int32)
     n = 0
-    mean = np.zeros(3)
     for i in chosen:
         if vertical_distance_m(points[i], plane) < cap_m:
+            near[n] = i
             n += 1
-            for axis in range(3):
-                mean[axis] += points[i, axis]
     if n < _FEWEST_POINTS:
         return False
-    mean /= n
-    xx, xy, yy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in chosen:
-        if vertical_distance_m(points[i], plane) < cap_m:
-            x, y, z = points[i, 0] - mean[0], points[i, 1] - mean[1], points[i, 2] - mean[2]
-            xx += x * x
-            xy += x * y
-            yy += y * y
-            xz += x * z
-            yz += y * z
-    determinant = xx * yy - xy * xy
+    found = moments_of(points, near[:n])
     # the smaller eigenvalue of the scatter is at least determinant / trace
-    if determinant < n * _LEAST_WIDTH_M**2 * (xx + yy):
+    if found.xx * found.yy - found.xy * found.xy < n * _LEAST_WIDTH_M**2 * (found.xx + found.yy):
         return False
-    fitted[0] = (xz * yy - yz * xy) / determinant
-    fitted[1] = (yz * xx - xz * xy) / determinant
-    fitted[2] = mean[2] - fitted[0] * mean[0] - fitted[1] * mean[1]
+    a, b = solve_plane_moments(found.xx, found.xy, found.yy, found.xz, found.yz)
+    fitted[0], fitted[1], fitted[2] = a, b, found.z - a * found.x - b * found.y
     return True
 
 

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.merge_sort import in_order
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.minimum_cut import expand_labels, neighbour_lists
 
@@ -63,7 +64,7 @@ def raster_cells(
                 fraction = (y - edges[e, 1]) / (edges[e, 3] - edges[e, 1])
                 crossings[found] = edges[e, 0] + fraction * (edges[e, 2] - edges[e, 0])
                 found += 1
-        ordered = np.sort(crossings[:found])
+        ordered = in_order(crossings[:found])
         for k in range(0, found - 1, 2):
             first = max(math.ceil((ordered[k] - low_x) / cell_m - 0.5), 0)
             last = min(math.floor((ordered[k + 1] - low_x) / cell_m - 0.5), columns - 1)
@@ -149,9 +150,9 @@ def _first_labels(
 @kernel
 def _raster_edges(
     number: LabelArray, place: LabelArray, columns: int, rows: int, side: int, diagonal: int
-) -> tuple[LabelArray, IntArray]:
+) -> tuple[IntArray, IntArray]:
     """Pairs of neighbouring cells, over sides and corners, and what a border between them costs."""
-    edges = np.empty((4 * len(place), 2), np.int32)
+    edges = np.empty((4 * len(place), 2), np.int64)
     weights = np.empty(4 * len(place), np.int64)
     m = 0
     for i in range(len(place)):
@@ -301,8 +302,11 @@ def raster_labels(
     columns : int
         Its columns; the cell is half of `cell_m`.
     """
-    low_x, low_y = min(edges[:, 0].min(), edges[:, 2].min()), min(edges[:, 1].min(), edges[:, 3].min())
-    high_x, high_y = max(edges[:, 0].max(), edges[:, 2].max()), max(edges[:, 1].max(), edges[:, 3].max())
+    low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
+    for e in range(len(edges)):
+        for end in range(0, 4, 2):
+            low_x, low_y = min(low_x, edges[e, end]), min(low_y, edges[e, end + 1])
+            high_x, high_y = max(high_x, edges[e, end]), max(high_y, edges[e, end + 1])
     columns, rows = int((high_x - low_x) / cell_m) + 1, int((high_y - low_y) / cell_m) + 1
     number, place = raster_cells(edges, low_x, low_y, cell_m, columns, rows)
     costs, count, near = _cell_costs(points, planes, cap_m, number, len(place), low_x, low_y, cell_m, columns, rows)

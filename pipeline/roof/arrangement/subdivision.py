@@ -6,20 +6,37 @@ has support, each along a chord from border to border. A chord ends at a vertex,
 is nothing to snap afterwards. Every chord, and every edge that a rounded vertex bends, is tested with exact integers
 against what is there; one that would touch it is not drawn.
 
-Half-edges h and h ^ 1 are twins. `face` is the cell left of a half-edge, -1 outside. Columns of `graph`:
+Half-edges h and h ^ 1 are twins. `face` is the cell left of a half-edge, -1 outside.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.merge_sort import ascending_order, in_order
+from pipeline.kernels.orientation import lies_between, same_ray, segments_meet, turn_of
 from pipeline.model import FloatArray, IntArray, LabelArray
+
+
+class Subdivision(NamedTuple):
+    """An outline and the cells in it, with room for more; kernels change it in place."""
+
+    xy: IntArray
+    """(v, 2) int64, vertices, millimetres."""
+    graph: IntArray
+    """(h, 5) int64, half-edges; the columns are `ORIGIN` to `LINE`."""
+    counts: IntArray
+    """(3,) int64, vertices, half-edges and cells in use."""
+
 
 ORIGIN, NEXT, PREVIOUS, FACE, LINE = 0, 1, 2, 3, 4
 """Start vertex; half-edges after and before; cell to the left; the line it lies on (outline edges from -2 down)."""
+VERTICES, EDGES, CELLS = 0, 1, 2
+"""Places of `counts`."""
 _SNAP_MM = 60.0
 """A line passes through vertices nearer to it than this."""
 SNAP_CROSSING_MM = 35.0
@@ -32,55 +49,12 @@ _LEAST_SUPPORT_MM = 10.0
 
 
 @kernel
-def turn_of(xy: IntArray, a: int, b: int, c: int) -> int:
-    """Positive where a, b, c turn left; exact."""
-    turn: int = (xy[b, 0] - xy[a, 0]) * (xy[c, 1] - xy[a, 1]) - (xy[b, 1] - xy[a, 1]) * (xy[c, 0] - xy[a, 0])
-    return turn
-
-
-@kernel
-def _in_box(xy: IntArray, a: int, b: int, p: int) -> bool:
-    between_x: bool = min(xy[a, 0], xy[b, 0]) <= xy[p, 0] <= max(xy[a, 0], xy[b, 0])
-    between_y: bool = min(xy[a, 1], xy[b, 1]) <= xy[p, 1] <= max(xy[a, 1], xy[b, 1])
-    return between_x and between_y
-
-
-@kernel
-def _segments_meet(xy: IntArray, a: int, b: int, c: int, d: int) -> bool:
-    """Whether two closed segments without a common end vertex have a common point; exact."""
-    low_x, high_x = min(xy[a, 0], xy[b, 0]), max(xy[a, 0], xy[b, 0])
-    low_y, high_y = min(xy[a, 1], xy[b, 1]), max(xy[a, 1], xy[b, 1])
-    if max(xy[c, 0], xy[d, 0]) < low_x or min(xy[c, 0], xy[d, 0]) > high_x:
-        return False
-    if max(xy[c, 1], xy[d, 1]) < low_y or min(xy[c, 1], xy[d, 1]) > high_y:
-        return False
-    abc, abd = turn_of(xy, a, b, c), turn_of(xy, a, b, d)
-    cda, cdb = turn_of(xy, c, d, a), turn_of(xy, c, d, b)
-    if ((abc > 0) != (abd > 0)) and ((cda > 0) != (cdb > 0)) and abc != 0 and abd != 0 and cda != 0 and cdb != 0:
-        return True
-    return (
-        (abc == 0 and _in_box(xy, a, b, c))
-        or (abd == 0 and _in_box(xy, a, b, d))
-        or (cda == 0 and _in_box(xy, c, d, a))
-        or (cdb == 0 and _in_box(xy, c, d, b))
-    )
-
-
-@kernel
-def _same_ray(xy: IntArray, a: int, b: int, c: int) -> bool:
-    """Whether b and c lie in the same direction from a; exact."""
-    if turn_of(xy, a, b, c) != 0:
-        return False
-    dot: int = (xy[b, 0] - xy[a, 0]) * (xy[c, 0] - xy[a, 0]) + (xy[b, 1] - xy[a, 1]) * (xy[c, 1] - xy[a, 1])
-    return dot > 0
-
-
-@kernel
-def _is_clear(xy: IntArray, graph: LabelArray, n_edges: int, a: int, b: int, skipped: int) -> bool:
+def _is_clear(plan: Subdivision, a: int, b: int, skipped: int) -> bool:
     """Whether a segment touches no edge but at its own end vertices; the edge `skipped` and its twin do not count."""
+    xy, graph = plan.xy, plan.graph
     low_x, high_x = min(xy[a, 0], xy[b, 0]), max(xy[a, 0], xy[b, 0])
     low_y, high_y = min(xy[a, 1], xy[b, 1]), max(xy[a, 1], xy[b, 1])
-    for h in range(0, n_edges, 2):
+    for h in range(0, plan.counts[EDGES], 2):
         if h == skipped or h == skipped ^ 1:
             continue
         c, d = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
@@ -92,19 +66,20 @@ def _is_clear(xy: IntArray, graph: LabelArray, n_edges: int, a: int, b: int, ski
         if from_c or from_d:
             shared, other = (c, d) if from_c else (d, c)
             far = b if shared == a else a
-            if other == far or _same_ray(xy, shared, other, far):
+            if other == far or same_ray(xy, shared, other, far):
                 return False
-        elif _segments_meet(xy, a, b, c, d):
+        elif segments_meet(xy, a, b, c, d):
             return False
     return True
 
 
 @kernel
-def _has_clearance(xy: IntArray, graph: LabelArray, n_edges: int, a: int, b: int, face: int) -> bool:
+def _has_clearance(plan: Subdivision, a: int, b: int, face: int) -> bool:
     """Whether no vertex of a cell comes too near to a chord."""
+    xy, graph = plan.xy, plan.graph
     dx, dy = float(xy[b, 0] - xy[a, 0]), float(xy[b, 1] - xy[a, 1])
     length = math.hypot(dx, dy)
-    for h in range(n_edges):
+    for h in range(plan.counts[EDGES]):
         if graph[h, FACE] != face:
             continue
         v = graph[h, ORIGIN]
@@ -118,9 +93,10 @@ def _has_clearance(xy: IntArray, graph: LabelArray, n_edges: int, a: int, b: int
 
 
 @kernel
-def _is_apart(xy: IntArray, graph: LabelArray, n_edges: int, w: int, skipped: int) -> bool:
+def _is_apart(plan: Subdivision, w: int, skipped: int) -> bool:
     """Whether a new vertex keeps away from all edges but the one that it lies on, also where two meet narrowly."""
-    for h in range(0, n_edges, 2):
+    xy, graph = plan.xy, plan.graph
+    for h in range(0, plan.counts[EDGES], 2):
         if h == skipped or h == skipped ^ 1:
             continue
         p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
@@ -134,22 +110,22 @@ def _is_apart(xy: IntArray, graph: LabelArray, n_edges: int, w: int, skipped: in
 
 
 @kernel
-def insert_vertex(xy: IntArray, n_vertices: int, graph: LabelArray, n_edges: int, h: int, x: int, y: int) -> bool:
+def insert_vertex(plan: Subdivision, h: int, x: int, y: int) -> bool:
     """Cut half-edge h and its twin at a new vertex, unless that would touch other edges.
 
-    The new vertex is `n_vertices`, the new half-edges are `n_edges` (from it on) and its twin.
+    The new vertex and half-edges are the last ones: of the latter the even one goes on from the new vertex.
     """
-    w = n_vertices
+    xy, graph, counts = plan.xy, plan.graph, plan.counts
+    w = counts[VERTICES]
     xy[w, 0] = x
     xy[w, 1] = y
     a, b = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
-    if not (_is_clear(xy, graph, n_edges, a, w, h) and _is_clear(xy, graph, n_edges, w, b, h)):
+    if not (_is_clear(plan, a, w, h) and _is_clear(plan, w, b, h) and _is_apart(plan, w, h)):
         return False
-    if not _is_apart(xy, graph, n_edges, w, h):
-        return False
-    twin, new, back = h ^ 1, n_edges, n_edges ^ 1
-    graph[new] = graph[h]
-    graph[back] = graph[twin]
+    twin, new, back = h ^ 1, counts[EDGES], counts[EDGES] ^ 1
+    for column in range(LINE + 1):
+        graph[new, column] = graph[h, column]
+        graph[back, column] = graph[twin, column]
     graph[new, ORIGIN] = w
     graph[back, ORIGIN] = b
     graph[twin, ORIGIN] = w
@@ -162,50 +138,53 @@ def insert_vertex(xy: IntArray, n_vertices: int, graph: LabelArray, n_edges: int
     graph[back, NEXT] = twin
     graph[before, NEXT] = back
     graph[twin, PREVIOUS] = back
+    counts[VERTICES] += 1
+    counts[EDGES] += 2
     return True
 
 
 @kernel
-def _corner(xy: IntArray, graph: LabelArray, n_edges: int, v: int, towards: int, face: int) -> int:
+def _corner(plan: Subdivision, v: int, towards: int, face: int) -> int:
     """The half-edge that leaves v in the corner of a cell into which `towards` lies; -1 for none."""
-    for h in range(n_edges):
+    xy, graph = plan.xy, plan.graph
+    for h in range(plan.counts[EDGES]):
         if graph[h, ORIGIN] != v or graph[h, FACE] != face:
             continue
         a, b = graph[h ^ 1, ORIGIN], graph[graph[h, PREVIOUS], ORIGIN]
         left_of_a, right_of_b = turn_of(xy, v, a, towards) > 0, turn_of(xy, v, b, towards) < 0
         turn = turn_of(xy, v, a, b)
-        if turn > 0 or (turn == 0 and not _same_ray(xy, v, a, b)):
+        if turn > 0 or (turn == 0 and not same_ray(xy, v, a, b)):
             inside = left_of_a and (right_of_b if turn > 0 else True)
         else:
-            inside = left_of_a or right_of_b or (turn_of(xy, v, a, towards) == 0 and not _same_ray(xy, v, a, towards))
+            inside = left_of_a or right_of_b or (turn_of(xy, v, a, towards) == 0 and not same_ray(xy, v, a, towards))
         if inside:
             return h
     return -1
 
 
 @kernel
-def twice_loop_area(xy: IntArray, graph: LabelArray, start: int) -> int:
+def _twice_loop_area(plan: Subdivision, start: int) -> int:
     """Twice the signed area of the loop of a half-edge in mm2; exact."""
+    xy, graph = plan.xy, plan.graph
     area = 0
-    h = start
-    x, y = xy[graph[start, ORIGIN], 0], xy[graph[start, ORIGIN], 1]
+    origin, h = graph[start, ORIGIN], start
     while True:
-        p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
-        area += (xy[p, 0] - x) * (xy[q, 1] - y) - (xy[p, 1] - y) * (xy[q, 0] - x)
+        area += turn_of(xy, origin, graph[h, ORIGIN], graph[h ^ 1, ORIGIN])
         h = graph[h, NEXT]
         if h == start:
-            return int(area)
+            return area
 
 
 @kernel
-def _is_in_loop(xy: IntArray, graph: LabelArray, start: int, v: int) -> int:
+def _is_in_loop(plan: Subdivision, start: int, v: int) -> int:
     """1 where vertex v lies inside a loop, -1 outside, 0 on it; exact."""
+    xy, graph = plan.xy, plan.graph
     inside = False
     h = start
     while True:
         p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
         turn = turn_of(xy, p, q, v)
-        if turn == 0 and _in_box(xy, p, q, v):
+        if turn == 0 and lies_between(xy, p, q, v):
             return 0
         if (xy[p, 1] > xy[v, 1]) != (xy[q, 1] > xy[v, 1]) and (turn > 0) == (xy[q, 1] > xy[p, 1]):
             inside = not inside
@@ -215,7 +194,7 @@ def _is_in_loop(xy: IntArray, graph: LabelArray, start: int, v: int) -> int:
 
 
 @kernel
-def _set_face(graph: LabelArray, start: int, face: int) -> None:
+def _set_face(graph: IntArray, start: int, face: int) -> None:
     h = start
     while True:
         graph[h, FACE] = face
@@ -225,22 +204,20 @@ def _set_face(graph: LabelArray, start: int, face: int) -> None:
 
 
 @kernel
-def insert_chord(
-    xy: IntArray, graph: LabelArray, n_edges: int, n_faces: int, u: int, v: int, face: int, line: int
-) -> int:
-    """Join two vertices of a cell by the edge `n_edges`, unless it would touch anything between.
+def insert_chord(plan: Subdivision, u: int, v: int, face: int, line: int) -> int:
+    """Join two vertices of a cell by an edge, the last one then, unless it would touch anything between.
 
     Returns
     -------
     int
         Cells made: 1, or 0 where two loops of the cell became one; -1 where there is no room for the chord.
     """
-    at_u, at_v = _corner(xy, graph, n_edges, u, v, face), _corner(xy, graph, n_edges, v, u, face)
-    if at_u < 0 or at_v < 0 or not _has_clearance(xy, graph, n_edges, u, v, face):
+    graph, counts = plan.graph, plan.counts
+    at_u, at_v = _corner(plan, u, v, face), _corner(plan, v, u, face)
+    if at_u < 0 or at_v < 0 or not _has_clearance(plan, u, v, face) or not _is_clear(plan, u, v, -1):
         return -1
-    if not _is_clear(xy, graph, n_edges, u, v, -1):
-        return -1
-    out, back = n_edges, n_edges ^ 1
+    out, back = counts[EDGES], counts[EDGES] ^ 1
+    counts[EDGES] += 2
     before_u, before_v = graph[at_u, PREVIOUS], graph[at_v, PREVIOUS]
     graph[out, ORIGIN], graph[out, NEXT], graph[out, PREVIOUS] = u, at_v, before_u
     graph[back, ORIGIN], graph[back, NEXT], graph[back, PREVIOUS] = v, at_u, before_v
@@ -253,23 +230,25 @@ def insert_chord(
         if h == back:
             return 0
         h = graph[h, NEXT]
-    start = out if twice_loop_area(xy, graph, out) > 0 else back
-    _set_face(graph, start, n_faces)
+    made = int(counts[CELLS])
+    counts[CELLS] += 1
+    start = out if _twice_loop_area(plan, out) > 0 else back
+    _set_face(graph, start, made)
     # the other loops of the old cell are holes: each lies in one of the two; those that stay are marked meanwhile
     stays = -3
     _set_face(graph, back if start == out else out, stays)
-    for h in range(n_edges):
+    for h in range(out):
         if graph[h, FACE] != face:
             continue
         where = 0
         g = h
         while where == 0:
-            where = _is_in_loop(xy, graph, start, graph[g, ORIGIN])
+            where = _is_in_loop(plan, start, graph[g, ORIGIN])
             g = graph[g, NEXT]
             if g == h:
                 break
-        _set_face(graph, h, n_faces if where > 0 else stays)
-    for h in range(n_edges + 2):
+        _set_face(graph, h, made if where > 0 else stays)
+    for h in range(counts[EDGES]):
         if graph[h, FACE] == stays:
             graph[h, FACE] = face
     return 1
@@ -282,53 +261,48 @@ def between_vertices(y: float) -> float:
 
 
 @kernel
-def cell_at(xy: IntArray, graph: LabelArray, n_edges: int, x: float, y: float) -> int:
+def cell_at(plan: Subdivision, x: float, y: float) -> int:
     """The cell in which a place lies, to half a millimetre; -1 outside."""
+    xy, graph = plan.xy, plan.graph
     y = between_vertices(y)
     nearest = -math.inf
     face = -1
-    for h in range(n_edges):
+    for h in range(plan.counts[EDGES]):
         p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
         # of each edge the half that runs down has the places to the right of it on its left side
         if xy[p, 1] > y >= xy[q, 1]:
             at = xy[p, 0] + (y - xy[p, 1]) * (xy[q, 0] - xy[p, 0]) / (xy[q, 1] - xy[p, 1])
             if nearest < at <= x:
                 nearest = at
-                face = graph[h, FACE]
+                face = int(graph[h, FACE])
     return face
 
 
 @kernel
-def outline_graph(
-    ring_xy: IntArray, ring_starts: LabelArray, polygon_of_ring: LabelArray, room: int
-) -> tuple[IntArray, LabelArray]:
-    """The graph of an outline, one cell a polygon, with room for more.
+def subdivision_of(ring_xy: IntArray, ring_starts: IntArray, polygon_of_ring: IntArray, room: int) -> Subdivision:
+    """An outline, one cell a polygon.
 
     Parameters
     ----------
     ring_xy : (n, 2) int64
-        Vertices of the rings, not closed, millimetres; outer rings turn left, holes right.
-    ring_starts : (r + 1,) int32
+        Vertices of the rings, not closed, millimetres; outer rings turn left, holes right. They come first, and so do
+        their 2 n half-edges, the even ones inside.
+    ring_starts : (r + 1,) int64
         First vertex of every ring.
-    polygon_of_ring : (r,) int32
+    polygon_of_ring : (r,) int64
         The polygon of every ring.
     room : int
         Vertices and edges to leave room for.
-
-    Returns
-    -------
-    xy : (n + room, 2) int64
-        Vertices; the first n are the outline's.
-    graph : (2 (n + room), 5) int32
-        Half-edges; the first 2 n are the outline's, the even ones inside.
     """
     n = len(ring_xy)
     xy = np.zeros((n + room, 2), np.int64)
-    xy[:n] = ring_xy
-    graph = np.full((2 * (n + room), 5), -1, np.int32)
+    graph = np.full((2 * (n + room), 5), -1, np.int64)
+    counts = np.array([n, 2 * n, 0])
     for r in range(len(ring_starts) - 1):
         first, last = ring_starts[r], ring_starts[r + 1]
+        counts[CELLS] = max(counts[CELLS], polygon_of_ring[r] + 1)
         for v in range(first, last):
+            xy[v, 0], xy[v, 1] = ring_xy[v, 0], ring_xy[v, 1]
             after = v + 1 if v + 1 < last else first
             before = v - 1 if v > first else last - 1
             graph[2 * v, ORIGIN], graph[2 * v + 1, ORIGIN] = v, after
@@ -336,26 +310,17 @@ def outline_graph(
             graph[2 * v + 1, NEXT], graph[2 * v + 1, PREVIOUS] = 2 * before + 1, 2 * after + 1
             graph[2 * v, FACE] = polygon_of_ring[r]
             graph[2 * v, LINE] = graph[2 * v + 1, LINE] = -2 - v
-    return xy, graph
+    return Subdivision(xy, graph, counts)
 
 
 @kernel
-def cut_by_line(
-    xy: IntArray,
-    graph: LabelArray,
-    counts: LabelArray,
-    line: FloatArray,
-    number: int,
-    snap_mm: float,
-    spans: FloatArray,
-    only: int = -1,
-) -> None:
-    """Cut the cells in which a line has support, or only one of them.
+def cut_by_line(plan: Subdivision, line: FloatArray, number: int, snap_mm: float, spans: FloatArray, only: int) -> None:
+    """Cut the cells in which a line has support, or `only` one of them; -1 for all.
 
-    `counts` holds the numbers of vertices, half-edges and cells; `spans` are the stretches of the line with support,
-    in mm along it. `line` is in mm.
+    `spans` are the stretches of the line with support, in mm along it. `line` is in mm.
     """
-    n_vertices, n_edges = counts[0], counts[1]
+    xy, graph, counts = plan.xy, plan.graph, plan.counts
+    n_vertices, n_edges = counts[VERTICES], counts[EDGES]
     nx, ny = line[0], line[1]
     off = np.empty(n_vertices)
     for v in range(n_vertices):
@@ -364,8 +329,8 @@ def cut_by_line(
             off[v] = 0.0
     # where the line passes vertices and crosses edges, in order along it
     along = np.empty(n_vertices + n_edges // 2)
-    vertex = np.empty(n_vertices + n_edges // 2, np.int32)
-    crossed = np.empty(n_vertices + n_edges // 2, np.int32)
+    vertex = np.empty(n_vertices + n_edges // 2, np.int64)
+    crossed = np.empty(n_vertices + n_edges // 2, np.int64)
     m = 0
     for v in range(n_vertices):
         if off[v] == 0.0:
@@ -373,7 +338,7 @@ def cut_by_line(
             vertex[m] = v
             crossed[m] = -1
             m += 1
-    for h in range(0, n_edges, 2):
+    for h in range(0, plan.counts[EDGES], 2):
         p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
         if (off[p] > 0.0 > off[q]) or (off[p] < 0.0 < off[q]):
             fraction = off[p] / (off[p] - off[q])
@@ -383,7 +348,7 @@ def cut_by_line(
             vertex[m] = -1
             crossed[m] = h
             m += 1
-    order = np.argsort(along[:m], kind="mergesort")
+    order = ascending_order(along[:m])
     for k in range(m - 1):
         i, j = order[k], order[k + 1]
         low, high = along[i], along[j]
@@ -392,10 +357,10 @@ def cut_by_line(
         supported = False
         for s in range(len(spans)):
             supported = supported or min(high, spans[s, 1]) - max(low, spans[s, 0]) > _LEAST_SUPPORT_MM
-        if not supported or counts[0] + 2 > len(xy) or counts[1] + 6 > len(graph):
+        if not supported or counts[VERTICES] + 2 > len(xy) or counts[EDGES] + 6 > len(graph):
             continue
         middle = 0.5 * (low + high)
-        face = cell_at(xy, graph, counts[1], -nx * line[2] - ny * middle, -ny * line[2] + nx * middle)
+        face = cell_at(plan, -nx * line[2] - ny * middle, -ny * line[2] + nx * middle)
         if face < 0 or (only >= 0 and face != only):
             continue
         room = True
@@ -403,17 +368,11 @@ def cut_by_line(
             if vertex[e] < 0 and room:
                 x = int(np.rint(-nx * line[2] - ny * along[e]))
                 y = int(np.rint(-ny * line[2] + nx * along[e]))
-                room = insert_vertex(xy, counts[0], graph, counts[1], crossed[e], x, y)
+                room = insert_vertex(plan, crossed[e], x, y)
                 if room:
-                    vertex[e] = counts[0]
-                    counts[0] += 1
-                    counts[1] += 2
-        if not room:
-            continue
-        made = insert_chord(xy, graph, counts[1], counts[2], vertex[i], vertex[j], face, number)
-        if made >= 0:
-            counts[1] += 2
-            counts[2] += made
+                    vertex[e] = counts[VERTICES] - 1
+        if room:
+            insert_chord(plan, vertex[i], vertex[j], face, number)
 
 
 @kernel
@@ -430,7 +389,7 @@ def _supported_spans(
         if line_of[q] == number:
             along[n] = -line[1] * places[q, 0] + line[0] * places[q, 1]
             n += 1
-    along.sort()
+    along = in_order(along)
     spans = np.empty((n, 2))
     m = 0
     for t in along:
@@ -444,25 +403,21 @@ def _supported_spans(
 
 @kernel
 def subdivide(
-    xy: IntArray,
-    graph: LabelArray,
-    counts: LabelArray,
+    plan: Subdivision,
     lines: FloatArray,
     scores: FloatArray,
     crossing: LabelArray,
     line_of: LabelArray,
     places: FloatArray,
     reach_m: float,
-    clearance: float = 1.0,
+    clearance: float,
 ) -> None:
     """Cut an outline by candidate lines, those with the highest scores first.
 
     Parameters
     ----------
-    xy, graph : arrays
-        From `outline_graph`; changed in place.
-    counts : (3,) int32
-        Numbers of vertices, half-edges and cells; changed in place.
+    plan : Subdivision
+        From `subdivision_of`; changed in place.
     lines, scores, crossing, line_of, places : arrays
         From `candidate_lines` and `border_places`, metres.
     reach_m : float
@@ -471,9 +426,8 @@ def subdivide(
         Times the usual distance within which a line passes through a vertex.
     """
     in_mm = np.empty(3)
-    for number in np.argsort(-scores, kind="mergesort"):
+    for number in ascending_order(-scores):
         spans = _supported_spans(lines[number], number, line_of, places, reach_m)
-        in_mm[:] = lines[number]
-        in_mm[2] *= 1e3
+        in_mm[0], in_mm[1], in_mm[2] = lines[number, 0], lines[number, 1], lines[number, 2] * 1e3
         snap_mm = SNAP_CROSSING_MM if crossing[number] != 0 else _SNAP_MM
-        cut_by_line(xy, graph, counts, in_mm, number, clearance * snap_mm, spans)
+        cut_by_line(plan, in_mm, number, clearance * snap_mm, spans, -1)

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from pipeline.compiler import kernel
+from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.model import FloatArray, LabelArray
 from pipeline.roof.templates.shapes import CAP_SIGMAS, MOST_PLANES, best_shape, copy_planes, height
 
@@ -45,8 +46,15 @@ def main_direction(edges: FloatArray) -> float:
         x, y of both ends, metres.
     """
     if len(edges) > _LONGEST_EDGES:
-        lengths = np.hypot(edges[:, 2] - edges[:, 0], edges[:, 3] - edges[:, 1])
-        edges = edges[np.argsort(-lengths, kind="mergesort")[:_LONGEST_EDGES]]
+        shortness = np.empty(len(edges))
+        for e in range(len(edges)):
+            shortness[e] = -np.hypot(edges[e, 2] - edges[e, 0], edges[e, 3] - edges[e, 1])
+        order = ascending_order(shortness)
+        longest = np.empty((_LONGEST_EDGES, 4))
+        for e in range(_LONGEST_EDGES):
+            for q in range(4):
+                longest[e, q] = edges[order[e], q]
+        edges = longest
     quarter = 0.5 * math.pi
     best, most = 0.0, -1.0
     for e in range(len(edges)):
@@ -103,31 +111,18 @@ def _box_of(edges: FloatArray, region: FloatArray) -> FloatArray:
 
 
 @kernel
-def _sort(values: FloatArray) -> None:
-    """Ascending, in place; few values, and a call into numpy's would compile for a second."""
-    for i in range(1, len(values)):
-        value = values[i]
-        j = i
-        while j > 0 and values[j - 1] > value:
-            values[j] = values[j - 1]
-            j -= 1
-        values[j] = value
-
-
-@kernel
 def _cuts(points: FloatArray, edges: FloatArray, box: FloatArray) -> tuple[FloatArray, int]:
     """Cuts worth a trial: their axis, place and price in parameters; their number."""
     m, e = len(points), len(edges)
     cuts = np.empty((2 * (m + e), 3))
     count = 0
-    own, corners = np.empty(m), np.empty(e)
+    along, corners_along = np.empty(m), np.empty(e)
     for axis in range(2):
         for i in range(m):
-            own[i] = points[i, axis]
+            along[i] = points[i, axis]
         for i in range(e):
-            corners[i] = edges[i, axis]
-        _sort(own)
-        _sort(corners)
+            corners_along[i] = edges[i, axis]
+        own, corners = in_order(along), in_order(corners_along)
         low, high = box[2 * axis] + _LEAST_SIDE_M, box[2 * axis + 1] - _LEAST_SIDE_M
         last = -math.inf
         for i in range(e):

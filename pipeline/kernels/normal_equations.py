@@ -1,0 +1,77 @@
+"""Planes z = a x + b y + c by least squares: moments about the mean, and the centred normal equations.
+
+Sums run in the order of the points, one after the other, and not through BLAS: the result has the same bits on every
+machine. Equations are those of Shorter & Kasparis.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from pipeline.compiler import kernel
+from pipeline.model import FloatArray, LabelArray
+
+
+class Moments(NamedTuple):
+    """Mean of some points, metres, and sums of products of coordinates relative to it, square metres."""
+
+    x: float
+    y: float
+    z: float
+    xx: float
+    xy: float
+    yy: float
+    xz: float
+    yz: float
+
+
+@kernel
+def moments_of(points: FloatArray, index: LabelArray) -> Moments:
+    """Moments of the points (n, 3) float64 with the numbers `index` (k,) int32, at least one."""
+    k = len(index)
+    mean_x, mean_y, mean_z = 0.0, 0.0, 0.0
+    for i in index:
+        mean_x += points[i, 0]
+        mean_y += points[i, 1]
+        mean_z += points[i, 2]
+    mean_x /= k
+    mean_y /= k
+    mean_z /= k
+    xx, xy, yy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in index:
+        x, y, z = points[i, 0] - mean_x, points[i, 1] - mean_y, points[i, 2] - mean_z
+        xx += x * x
+        xy += x * y
+        yy += y * y
+        xz += x * z
+        yz += y * z
+    return Moments(mean_x, mean_y, mean_z, xx, xy, yy, xz, yz)
+
+
+@kernel
+def solve_plane_moments(sxx: float, sxy: float, syy: float, sxz: float, syz: float) -> tuple[float, float]:
+    """The slopes a, b that solve the centred normal equations (Eqs. 11 to 14).
+
+    Parameters
+    ----------
+    sxx, sxy, syy, sxz, syz : float
+        Sums of products of coordinates relative to their means.
+
+    Returns
+    -------
+    a, b : float
+        Where the points are collinear in plan, to 1e-6 of their spread, the plane is undetermined across the line: it
+        is taken level across, and sloping along the line. Where all are at one position it is horizontal.
+    """
+    determinant = sxx * syy - sxy * sxy
+    trace = sxx + syy
+    if trace <= 0.0:
+        return 0.0, 0.0
+    if determinant > 1e-12 * trace * trace:
+        return (sxz * syy - syz * sxy) / determinant, (syz * sxx - sxz * sxy) / determinant
+    # of rank one: the gradient lies along the line, whose direction is the larger row of the moments
+    if sxx >= syy:
+        along = sxz / (sxx * sxx + sxy * sxy)
+        return along * sxx, along * sxy
+    along = syz / (syy * syy + sxy * sxy)
+    return along * sxy, along * syy
