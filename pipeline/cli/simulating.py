@@ -109,24 +109,49 @@ def demo(
         console.document(dataclasses.asdict(made.summary) | told)
 
 
-def warm_up(as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """Compile the numba kernels, by a small simulated run in this process."""
+def warm_up(
+    what: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="WHAT",
+            help="What to compile for: reconstruct, simulate, evaluate, classify, compare, diff or all; default "
+            "reconstruct by the default method.",
+        ),
+    ] = None,
+    into: Annotated[
+        str | None,
+        typer.Option(metavar="DIR", help="Write the kernels there, with their hashes, to ship them with a package."),
+    ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compile numba kernels ahead of their first use, on all cores."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from tempfile import TemporaryDirectory
+        import os
+        from pathlib import Path
 
-        from pipeline.runtime.classify import ClassifyRequest, classify
-        from pipeline.runtime.modelling import load
-        from pipeline.runtime.run import RunRequest, run
-        from pipeline.synthetic.dataset import simulate as simulate_scene
+        from pipeline.compiler import store, warm_up
+        from pipeline.errors import SettingsError
+        from pipeline.runtime.events import Event
 
-        with TemporaryDirectory(prefix="gablework-") as folder:
-            started = time.perf_counter()
-            scene = simulate_scene("gable", f"{folder}/scene")
-            request = RunRequest(inputs=(str(scene.laz),), out=f"{folder}/run", meshes="glb", workers=0)
-            summary = run(request, console.on_event)
-            load()  # the other methods, too
-            classified = ClassifyRequest(inputs=(str(scene.laz),), out=f"{folder}/classified", rasters=True, workers=0)
-            classify(classified, console.on_event)
-            seconds = time.perf_counter() - started
-        console.say(f"kernels compiled and one building modelled in {seconds:.1f} s")
-        console.document({"seconds": seconds, "statuses": summary.statuses})
+        groups = warm_up.groups()
+        wanted = what or ["reconstruct"]
+        unknown = [name for name in wanted if name not in {*groups, "all"}]
+        if unknown:
+            raise SettingsError([f"{name!r} is not known: use {', '.join(groups)} or all" for name in unknown])
+        if into is not None:
+            os.environ["NUMBA_CACHE_DIR"] = into
+        started = time.perf_counter()
+
+        def on_progress(done: int, total: int, left_s: float) -> None:
+            left = f"about {left_s:.0f} s left" if done < total else ""
+            console.on_event(Event(kind="progress", stage="compile", done=done, total=total, message=left))
+
+        kernels = warm_up.listed(None if "all" in wanted else wanted)
+        console.on_event(Event(kind="stage", stage="compile", total=len(kernels)))
+        warm_up.compile_kernels(kernels, on_progress=on_progress)
+        if into is not None:
+            store.write_list(Path(into))
+        seconds = time.perf_counter() - started
+        console.say(f"{len(kernels)} kernels are compiled; it took {seconds:.1f} s")
+        console.document({"seconds": seconds, "kernels": len(kernels)})

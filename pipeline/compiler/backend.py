@@ -261,6 +261,7 @@ class KernelDispatcher(registry.CPUDispatcher):
         if known is not None:
             result = self._with_wrapper(known)
         else:
+            store.say_what_does_not_fit(self._prefix)
             details = {"dispatcher": self, "args": arguments, "return_type": None}
             _DEPTH.value += 1
             try:

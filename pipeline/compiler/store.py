@@ -27,12 +27,11 @@ import platformdirs
 
 ENDING = ".kernel"
 _PACKAGE = Path(__file__).resolve().parents[1]
-SHIPPED = _PACKAGE / "compiled"
-"""Kernels that came with an installed package."""
 LIST = "kernels.json"
-"""Beside them: the sha256 of each, by file name."""
+"""Beside kernels that came with a package or an image: the sha256 of each, by file name."""
 _HEADER = struct.Struct("<8s32sQQQ")
 _MAGIC = b"gwkern01"
+_LOCKS = "locks"
 _LOCK_RANGE = 2**30
 
 
@@ -85,18 +84,27 @@ def load(name: str, fingerprint: bytes) -> Stored | None:
     """
     file_name = name + ENDING
     listed = _shipped_hashes().get(file_name)
-    for folder in (SHIPPED, folder_of_kernels()) if listed else (folder_of_kernels(),):
+    for folder in (shipped_folder(), folder_of_kernels()) if listed else (folder_of_kernels(),):
         try:
             content = (folder / file_name).read_bytes()
         except OSError:
             continue
-        if folder is SHIPPED and hashlib.sha256(content).hexdigest() != listed:
-            _warn(f"{folder / file_name} is not the file that came with the package: it is compiled anew")
+        if folder == shipped_folder() and hashlib.sha256(content).hexdigest() != listed:
+            _warn(f"{folder / file_name} is not the file that {LIST} names: this kernel is compiled anew")
             continue
         stored = Stored.unpacked(content, fingerprint)
         if stored is not None:
             return stored
     return None
+
+
+def say_what_does_not_fit(name: str) -> None:
+    """Warn once where kernels came with the package and the one that is about to be compiled is not among them."""
+    if _shipped_hashes():
+        _warn(
+            f"{name} is compiled now: the kernels in {shipped_folder()} were made for another Python, numba or "
+            "processor, or are called in a new way"
+        )
 
 
 def save(name: str, fingerprint: bytes, stored: Stored) -> None:
@@ -124,7 +132,7 @@ def is_kept(prefix: str, fingerprint: bytes) -> bool:
     fingerprint : bytes
         Of the kernel.
     """
-    for folder in (SHIPPED, folder_of_kernels()):
+    for folder in (shipped_folder(), folder_of_kernels()):
         for path in folder.glob(f"{glob.escape(prefix)}*{ENDING}"):
             with contextlib.suppress(OSError), path.open("rb") as file:
                 head = file.read(_HEADER.size)
@@ -156,6 +164,21 @@ def claimed(name: str) -> Iterator[None]:
         fcntl.lockf(file, fcntl.LOCK_UN, 1, at)
 
 
+def write_list(folder: Path) -> int:
+    """Write the list of a folder's kernels and their hashes, so that they can be shipped; how many there are."""
+    hashes = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob(f"*{ENDING}"))}
+    (folder / LIST).write_text(json.dumps(hashes, indent=0) + "\n", encoding="ascii")
+    (folder / _LOCKS).unlink(missing_ok=True)
+    return len(hashes)
+
+
+@functools.cache
+def shipped_folder() -> Path:
+    """The folder of kernels that came with the package, or that the environment names; never written."""
+    named = os.environ.get("GABLEWORK_KERNELS")
+    return Path(named) if named else _PACKAGE / "compiled"
+
+
 @functools.cache
 def folder_of_kernels() -> Path:
     """The folder that new files go to: of the environment, beside the sources, or the user's own."""
@@ -171,7 +194,7 @@ def folder_of_kernels() -> Path:
 def _shipped_hashes() -> dict[str, str]:
     """The hashes of the files that came with the package, by name."""
     try:
-        hashes: dict[str, str] = json.loads((SHIPPED / LIST).read_text(encoding="ascii"))
+        hashes: dict[str, str] = json.loads((shipped_folder() / LIST).read_text(encoding="ascii"))
     except FileNotFoundError:
         return {}
     return hashes
@@ -182,7 +205,7 @@ def _lock_file() -> int | None:
     """The file whose bytes are locked, opened once: closing any descriptor of it would drop all locks."""
     try:
         folder_of_kernels().mkdir(parents=True, exist_ok=True)
-        return os.open(folder_of_kernels() / "locks", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        return os.open(folder_of_kernels() / _LOCKS, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
     except OSError:
         return None
 

@@ -33,6 +33,11 @@ class Listed:
     """Kilobytes of its code: about how long it takes to compile."""
 
 
+def groups() -> list[str]:
+    """What kernels are listed for."""
+    return list(json.loads(LIST.read_text(encoding="utf-8")))
+
+
 def listed(groups: Iterable[str] | None = None) -> list[Listed]:
     """The kernels of some groups, the heaviest first, each once.
 

@@ -184,10 +184,3 @@ def test_a_failed_tile_is_exit_code_1(
     code, _, log = invoke("reconstruct", str(scene / "gable.laz"), *words)
     assert code == 1
     assert "tile x1_y2 failed" in log
-
-
-@pytest.mark.slow
-def test_warm_up_compiles_and_models_one_building() -> None:
-    code, said, _ = invoke("warm-up", "--json")
-    assert code == 0
-    assert json.loads(said)["statuses"] == {"ok": 1}

@@ -198,8 +198,10 @@ def test_a_worker_and_its_building_fit_into_the_container(composed_files: Compos
 
 def test_build_and_run_agree_on_where_and_for_what_kernels_are_compiled(image: Image) -> None:
     build, run = image.stage("environment").environment, image.last.environment
-    assert build["NUMBA_CPU_NAME"] == run["NUMBA_CPU_NAME"] == "generic"
-    assert build["NUMBA_CACHE_DIR"] == run["GABLEWORK_KERNELS"] != run["NUMBA_CACHE_DIR"]
+    (line,) = [one.text for one in image.stage("environment").all("RUN") if "warm-up" in one.text]
+    assert f"warm-up all --into {run['GABLEWORK_KERNELS']}" in line
+    assert run["NUMBA_CACHE_DIR"] != run["GABLEWORK_KERNELS"]
+    assert "NUMBA_CPU_NAME" not in {*build, *run}
     assert build["OPENBLAS_NUM_THREADS"] == run["OPENBLAS_NUM_THREADS"] == "1"
 
 
@@ -270,23 +272,6 @@ def test_storage_is_found_by_the_variables_of_the_compose_file(root: Path, tmp_p
         assert done.stdout.strip() == "b'x'", done.stderr
     finally:
         server.stop()
-
-
-def test_kernels_are_laid_out_once_and_can_be_written(entrypoint: ModuleType, tmp_path: Path) -> None:
-    source = tmp_path / "image" / "geometry_1"
-    source.mkdir(parents=True)
-    (source / "kernel.nbc").write_bytes(b"compiled")
-    (source / "kernel.nbc").chmod(0o444)
-    source.chmod(0o555)
-    given = {"GABLEWORK_KERNELS": str(tmp_path / "image"), "NUMBA_CACHE_DIR": str(tmp_path / "run")}
-    entrypoint.lay_out_kernels(given)
-    laid = tmp_path / "run" / "geometry_1" / "kernel.nbc"
-    assert laid.read_bytes() == b"compiled"
-    assert laid.parent.stat().st_mode & 0o777 == laid.parent.parent.stat().st_mode & 0o777 == 0o755
-    laid.write_bytes(b"newer")
-    entrypoint.lay_out_kernels(given)
-    assert laid.read_bytes() == b"newer"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["image", "run"]
 
 
 def test_the_wheel_of_the_image_holds_all_modules_and_the_page(image: Image, root: Path, tmp_path: Path) -> None:

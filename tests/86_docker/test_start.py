@@ -129,7 +129,7 @@ def kernels(host: Host, image: Image) -> Path:
     folder = host.own_folder("kernels")
     made = host.run(command, host.environment(env, home=host.own_folder("build")))
     assert made.returncode == 0, made.stderr
-    assert len(list(folder.rglob("*.nbc"))) > 100
+    assert len(list(folder.rglob("*.kernel"))) > 100
     for path in (folder, *folder.rglob("*")):
         path.chmod(0o555 if path.is_dir() else 0o444)
     return folder
@@ -245,11 +245,10 @@ def test_the_documented_way_leads_from_nothing_to_models(composed: Composed, roo
     assert len(statuses) >= 3
     assert set(statuses) <= {"ok", "fallback"}
 
-    # compiled at build, used by all, written by none
-    compiled = {path.name for path in (composed.host.folder / "kernels").rglob("*.nbc")}
+    # compiled at build, used by all
     for name in ("driver", "worker-1", "worker-2"):
-        here = {path.name for path in (composed.host.folder / name / "kernels").rglob("*.nbc")}
-        assert here == compiled, f"{name} compiled {sorted(here - compiled)}"
+        here = {path.name for path in (composed.host.folder / name / "kernels").rglob("*.kernel")}
+        assert here == set(), f"{name} compiled {sorted(here)}"
 
     for name, health in (("api", "api"), ("driver", "driver"), ("scheduler", "scheduler"), ("worker", "worker-1")):
         assert composed.healthy(name, health), name

@@ -1,0 +1,235 @@
+"""Kernels: what is compiled, what is kept, and what makes a kept kernel stale, each in fresh processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.compiler.store import ENDING, LIST, Stored
+
+CALLEE = """
+from pipeline.compiler import kernel
+
+FACTOR = {factor}
+
+@kernel
+def scaled(x):
+    return x * FACTOR
+
+@kernel
+def unrelated(x):
+    return x - {minus}
+"""
+CALLER = """
+import numpy as np
+from callee import scaled, unrelated
+from pipeline.compiler import kernel
+
+@kernel
+def total(values):
+    result = 0.0
+    for value in values:
+        result += scaled(value)
+    return result
+
+@kernel
+def halves(values):
+    return values.copy(), len(values) // 2
+"""
+COUNTED = """
+import json, warnings
+import numpy as np
+from numba.core import event
+
+class Counting(event.Listener):
+    def __init__(self):
+        self.seen = []
+    def on_start(self, told):
+        self.seen.append(told.data["dispatcher"].py_func.__name__)
+    def on_end(self, told):
+        pass
+
+counting = Counting()
+event.register("numba:compile", counting)
+import caller, callee
+"""
+VALUES = "np.array([1.0, 2.0, 4.0])"
+
+
+class Sources:
+    """Two files with kernels, and a folder of what was compiled of them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.kept = folder / "kept"
+        self.write()
+
+    def write(self, *, factor: str = "3.0", minus: str = "1.0", end: str = "") -> None:
+        (self.folder / "callee.py").write_text(CALLEE.format(factor=factor, minus=minus) + end)
+        (self.folder / "caller.py").write_text(CALLER)
+
+    def start(self, words: str, **environment: str) -> subprocess.Popen[str]:
+        path = os.pathsep.join([str(self.folder), *filter(None, sys.path)])
+        env = {**os.environ, "NUMBA_CACHE_DIR": str(self.kept), "PYTHONPATH": path, **environment}
+        code = f"{COUNTED}\n{words}\nprint(json.dumps([told, counting.seen]))"
+        return subprocess.Popen(
+            [sys.executable, "-c", code], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    def run(self, words: str, **environment: str) -> tuple[object, list[str], str]:
+        """What the words leave in `told`, the functions of ours that were compiled, and what was warned of."""
+        said, warned = (process := self.start(words, **environment)).communicate()
+        assert process.returncode == 0, warned
+        told, compiled = json.loads(said)
+        return told, [name for name in compiled if name in {"total", "scaled", "unrelated", "halves"}], warned
+
+    def held(self) -> dict[str, Stored]:
+        """What is kept, by kernel."""
+        found = {}
+        for path in self.kept.glob(f"*{ENDING}"):
+            content = path.read_bytes()
+            stored = Stored.unpacked(content, Stored.fingerprint_of(content))
+            assert stored is not None
+            found[path.name.split(".cpython")[0]] = stored
+        return found
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> Sources:
+    return Sources(tmp_path)
+
+
+def test_a_kernel_is_compiled_once_and_loaded_by_the_next_process(sources: Sources) -> None:
+    assert sources.run(f"told = caller.total({VALUES})")[:2] == (21.0, ["total", "scaled"])
+    assert sources.run(f"told = caller.total({VALUES})")[:2] == (21.0, [])
+
+
+def test_an_edit_of_a_callee_in_another_file_recompiles_its_caller_and_nothing_else(sources: Sources) -> None:
+    both = f"told = [caller.total({VALUES}), caller.halves({VALUES})[1]]"
+    assert sources.run(both)[:2] == ([21.0, 1], ["total", "scaled", "halves"])
+    sources.write(factor="5.0")
+    assert sources.run(both)[:2] == ([35.0, 1], ["total", "scaled"])
+
+
+def test_touching_a_file_commenting_it_or_editing_another_kernel_in_it_recompiles_nothing(sources: Sources) -> None:
+    sources.run(f"told = caller.total({VALUES})")
+    sources.write(minus="2.0", end="\n# a remark\n")
+    (sources.folder / "caller.py").write_text("\n# moved down\n\n" + CALLER)
+    for path in sources.folder.glob("call*.py"):
+        os.utime(path, (1e9, 1e9))
+    assert sources.run(f"told = caller.total({VALUES})")[:2] == (21.0, [])
+
+
+def test_what_only_kernels_call_has_no_machine_code_until_python_calls_it(sources: Sources) -> None:
+    sources.run(f"told = caller.total({VALUES})")
+    assert {name: bool(stored.machine_code) for name, stored in sources.held().items()} == {
+        "caller.total": True,
+        "callee.scaled": False,
+    }
+    # its code is there, so it is not compiled once more for Python
+    assert sources.run(f"caller.total({VALUES}); told = callee.scaled(2.0)")[0] == 6.0
+    assert sources.held()["callee.scaled"].machine_code
+
+
+def test_one_process_calls_a_kernel_from_kernels_and_from_python(sources: Sources) -> None:
+    assert sources.run(f"told = [caller.total({VALUES}), callee.scaled(2.0)]")[:2] == ([21.0, 6.0], ["total", "scaled"])
+    both = f"told = [callee.scaled(2.0), caller.total({VALUES})]"
+    assert Sources.run(sources, both, NUMBA_CACHE_DIR=str(sources.folder / "other"))[0] == [6.0, 21.0]
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "other"])
+def test_a_damaged_file_is_compiled_anew(sources: Sources, damage: str) -> None:
+    sources.run(f"told = caller.total({VALUES})")
+    (path,) = sources.kept.glob("caller.total*")
+    whole = path.read_bytes()
+    path.write_bytes({"cut": whole[:-1], "empty": b"", "other": b"x" + whole[1:]}[damage])
+    assert sources.run(f"told = caller.total({VALUES})")[:2] == (21.0, ["total"])
+    assert path.read_bytes() != b""
+
+
+def test_plain_numba_computes_the_same_and_keeps_its_own_files(sources: Sources) -> None:
+    words = f"told = [caller.total({VALUES}), caller.halves({VALUES})[1], callee.scaled(2.0)]"
+    ours = sources.run(words)[0]
+    assert sources.run(words, GABLEWORK_PLAIN_NUMBA="1")[0] == ours
+    assert list(sources.kept.rglob("*.nbc"))
+
+
+def test_a_numba_that_is_not_known_is_used_plainly(sources: Sources) -> None:
+    words = f"import pipeline.compiler.backend as backend; backend.KNOWN = ('0.1.',); told = caller.total({VALUES})"
+    assert sources.run(words)[0] == 21.0
+    assert sources.held() == {}
+
+
+def test_the_numba_of_the_locks_is_known() -> None:
+    from pipeline.compiler.backend import is_known
+
+    assert is_known()
+
+
+def test_without_numba_kernels_are_plain_functions(sources: Sources) -> None:
+    told, compiled, _ = sources.run(f"told = float(caller.total({VALUES}))", NUMBA_DISABLE_JIT="1")
+    assert (told, compiled) == (21.0, [])
+
+
+def test_two_processes_that_meet_no_kernels_compile_each_once(sources: Sources) -> None:
+    started = [sources.start(f"told = caller.total({VALUES})") for _ in range(2)]
+    compiled: list[str] = []
+    for process in started:
+        said, warned = process.communicate()
+        assert process.returncode == 0, warned
+        told, seen = json.loads(said)
+        assert told == 21.0
+        compiled += [name for name in seen if name in {"total", "scaled"}]
+    assert sorted(compiled) == ["scaled", "total"]
+
+
+# ------------------------------------------------------------------------------------------------ shipped kernels
+
+
+def ship(sources: Sources) -> Path:
+    """Compile, and leave the kernels as a package has them."""
+    from pipeline.compiler.store import write_list
+
+    sources.run(f"told = caller.total({VALUES})")
+    folder = sources.kept.rename(sources.folder / "shipped")
+    assert write_list(folder) == 2
+    return folder
+
+
+def test_shipped_kernels_are_loaded_and_nothing_is_written(sources: Sources) -> None:
+    folder = ship(sources)
+    told, compiled, warned = sources.run(f"told = caller.total({VALUES})", GABLEWORK_KERNELS=str(folder))
+    assert (told, compiled, warned) == (21.0, [], "")
+    assert sources.held() == {}
+
+
+def test_a_shipped_file_whose_hash_is_not_listed_is_not_loaded(sources: Sources) -> None:
+    folder = ship(sources)
+    (path,) = folder.glob("caller.total*")
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    told, compiled, warned = sources.run(f"told = caller.total({VALUES})", GABLEWORK_KERNELS=str(folder))
+    assert (told, compiled) == (21.0, ["total"])
+    assert f"is not the file that {LIST} names" in warned
+
+
+def test_kernels_that_do_not_fit_the_processor_are_compiled_and_that_is_said(sources: Sources) -> None:
+    folder = ship(sources)
+    environment = {"GABLEWORK_KERNELS": str(folder), "NUMBA_CPU_NAME": "x86-64-v3"}
+    told, compiled, warned = sources.run(f"told = caller.total({VALUES})", **environment)
+    assert (told, compiled) == (21.0, ["total", "scaled"])
+    assert "were made for another Python, numba or processor" in warned
+
+
+def test_where_nothing_can_be_written_kernels_are_compiled_and_that_is_said(sources: Sources) -> None:
+    (sources.folder / "file").write_text("")
+    nowhere = str(sources.folder / "file" / "kernels")
+    told, compiled, warned = sources.run(f"told = caller.total({VALUES})", NUMBA_CACHE_DIR=nowhere)
+    assert (told, compiled) == (21.0, ["total", "scaled"])
+    assert f"cannot be kept in {nowhere}" in warned
