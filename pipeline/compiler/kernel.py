@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import operator
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -56,9 +57,8 @@ class Kernel:
 
         return dispatcher_of(self.py_func, self.options, self.prefix, lambda: self.fingerprint)
 
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """The function's value."""
-        return self.dispatcher(*arguments, **named)
+    # numba's object is called without a frame of Python between: buildings call kernels by the hundred
+    __call__ = property(operator.attrgetter("dispatcher"))
 
     @property
     def _numba_type_(self) -> Any:

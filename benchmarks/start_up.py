@@ -1,0 +1,254 @@
+"""What starting up and small jobs cost, beside an earlier version on the same machine within the same hour.
+
+    python -m benchmarks.start_up --baseline CHECKOUT --out DIR [--data ../shared/data] [--rows NAME ...] [--repeat 3]
+
+CHECKOUT is another checkout of this repository with its environment (`make .venv/.run-stamp`), `d53c62d` for the table
+in docs/results/start_up.md. Both versions run in turns, the medians of their runs are divided. Processor seconds are
+those of a command and of everything that it starts, also of what outlives it for a moment: such processes are waited
+for. Compiled kernels are there, but for the rows `demo` and `kernels`, which clone both checkouts and begin with
+nothing. A machine that others use at the same time tells the ratios of processor seconds all the same; those of wall
+seconds want a quiet one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import dataclasses
+import os
+import resource
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+_PR_SET_CHILD_SUBREAPER = 36
+
+IMPORT = "import pipeline.runtime.run"
+BUILDINGS = """
+import time
+from benchmarks.candidates import found_scene
+from pipeline.reconstruct import reconstruct_building
+from pipeline.settings import RunSettings
+
+settings = RunSettings()
+found = found_scene({tiles!r}, "EPSG:7415", settings, {footprints!r}).candidates
+building = settings.building
+best = [9e9] * len(found)
+for turn in range(4):
+    for k, candidate in enumerate(found):
+        began = time.process_time()
+        reconstruct_building(candidate, settings.general.method, building)
+        best[k] = min(best[k], time.process_time() - began)
+print(sum(best) / len(best))
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """What a command cost."""
+
+    processor_s: float
+    wall_s: float
+    said: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Row:
+    """A line of the table: two commands, and the marks of their ratio."""
+
+    label: str
+    ours: list[str]
+    theirs: list[str]
+    marks: dict[str, tuple[float, float]]
+    """Required and stretch by what is compared: `CPU` or `wall`."""
+
+
+def become_reaper() -> None:
+    """Have processes that lose their parent become children of this one, so that their time is counted here."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def cost(command: list[str], folder: Path, environment: dict[str, str] | None = None) -> Cost:
+    """Run a command and wait for all that it started.
+
+    Raises
+    ------
+    RuntimeError
+        It failed.
+    """
+    variables = {**os.environ, **(environment or {})}
+    variables.pop("PYTHONDONTWRITEBYTECODE", None)
+    before, began = _processor_s(), time.perf_counter()
+    done = subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, check=False)
+    wall_s = time.perf_counter() - began
+    while True:
+        try:
+            os.wait()
+        except ChildProcessError:
+            break
+    if done.returncode:
+        raise RuntimeError(f"{command} in {folder} ended with {done.returncode}: {done.stderr[-2000:]}")
+    return Cost(_processor_s() - before, wall_s, done.stdout)
+
+
+def _processor_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def program(checkout: Path, *words: str) -> list[str]:
+    """A gablework command of a checkout."""
+    return [str(checkout / ".venv" / "bin" / "gablework"), *words]
+
+
+def rows(baseline: Path, data: Path, out: Path, city: Path | None) -> dict[str, Row]:
+    """All rows but those that begin with nothing."""
+    east, west = data / "ahn3" / "delft_east.laz", data / "ahn3" / "delft_west.laz"
+    crs = ("--crs", "EPSG:7415")
+
+    def run(checkout: Path, command: str, *words: str) -> list[str]:
+        made = out / f"{checkout.name}-run"
+        return program(checkout, command, *words, "--out", str(made), "--overwrite", "--quiet")
+
+    def against_serial(command: str, *words: str) -> tuple[list[str], list[str]]:
+        return run(ROOT, command, *words), run(baseline, command, *words, "--workers", "0")
+
+    both = (str(east), str(west), *crs, "--meshes", "none")
+    footprints = data / "ahn3" / "footprints.gpkg"
+    found = {}
+    ours, theirs = against_serial("reconstruct", *both, "--footprints", str(footprints))
+    marks = {"CPU": (0.84, 0.60), "wall": (0.90, 0.55)}
+    found["given"] = Row(
+        label="Both Delft tiles with footprints, default options", ours=ours, theirs=theirs, marks=marks
+    )
+    ours, theirs = against_serial("reconstruct", *both)
+    marks = {"wall": (0.65, 0.55)}
+    found["both"] = Row(
+        label="Both Delft tiles without footprints, default options", ours=ours, theirs=theirs, marks=marks
+    )
+    ours, theirs = against_serial("reconstruct", str(east), *crs)
+    marks = {"CPU": (0.9, 0.6), "wall": (0.9, 0.6)}
+    found["east"] = Row(label="`delft_east`, default options", ours=ours, theirs=theirs, marks=marks)
+    ours, theirs = against_serial("classify", str(data / "isprs" / "samp11-utm.laz"))
+    marks = {"CPU": (0.7, 0.4)}
+    found["classify"] = Row(label="`classify` of `samp11`, default options", ours=ours, theirs=theirs, marks=marks)
+    ours, theirs = ([str(one / ".venv/bin/python"), "-c", IMPORT] for one in (ROOT, baseline))
+    marks = {"CPU": (0.6, 0.4)}
+    found["import"] = Row(label="Import of what `reconstruct` needs", ours=ours, theirs=theirs, marks=marks)
+    code = BUILDINGS.format(tiles=[str(east), str(west)], footprints=str(footprints))
+    ours, theirs = ([str(one / ".venv/bin/python"), "-c", code] for one in (ROOT, baseline))
+    marks = {"said": (1.05, 0.95)}
+    found["buildings"] = Row(label="Milliseconds per building, warm", ours=ours, theirs=theirs, marks=marks)
+    if city is not None:
+        ours, theirs = (run(one, "reconstruct", str(city)) for one in (ROOT, baseline))
+        marks = {"wall": (1.0, 0.9)}
+        found["city"] = Row(label="City of 36 files", ours=ours, theirs=theirs, marks=marks)
+    return found
+
+
+def measured(row: Row, baseline: Path, repeat: int) -> list[list[str]]:
+    """The lines of a row: ratio of medians of runs in turns, after one run each that does not count."""
+    for command, folder in ((row.ours, ROOT), (row.theirs, baseline)):
+        cost(command, folder)
+    ours, theirs = [], []
+    for _ in range(repeat):
+        ours.append(cost(row.ours, ROOT))
+        theirs.append(cost(row.theirs, baseline))
+    ways: dict[str, Callable[[Cost], float]] = {
+        "CPU": lambda one: one.processor_s,
+        "wall": lambda one: one.wall_s,
+        "said": lambda one: float(one.said),
+    }
+    lines = []
+    for what in {"CPU", "wall"} | row.marks.keys() if "said" not in row.marks else row.marks:
+        way = ways[what]
+        mine, other = (statistics.median(map(way, costs)) for costs in (ours, theirs))
+        required, stretch = row.marks.get(what, (None, None))
+        scale, unit = (1000.0, "ms") if what == "said" else (1.0, "s")
+        lines.append(
+            line(
+                f"{row.label}: {'CPU' if what == 'said' else what}",
+                mine * scale,
+                other * scale,
+                unit,
+                required,
+                stretch,
+            )
+        )
+    return sorted(lines)
+
+
+def line(label: str, mine: float, other: float, unit: str, required: float | None, stretch: float | None) -> list[str]:
+    """A line of the table."""
+    marks = ["" if mark is None else f"{mark:.2f}" for mark in (required, stretch)]
+    return [label, f"{other:.2f} {unit}", f"{mine:.2f} {unit}", f"{mine / other:.2f}", *marks]
+
+
+def demo(checkout: Path, folder: Path) -> tuple[Cost, int, int]:
+    """`make demo` in a fresh clone with empty caches: its cost, kernels, compilations."""
+    shutil.rmtree(folder, ignore_errors=True)
+    subprocess.run(["git", "clone", "--quiet", str(checkout), str(folder)], check=True)
+    kernels = folder / "kernels-of-demo"
+    spent = cost(["make", "demo"], folder, {"NUMBA_CACHE_DIR": str(kernels)})
+    files = [*kernels.rglob("*.kernel"), *kernels.rglob("*.nbc")]
+    names = {path.name.split(".cpython")[0].split(".py3")[0] for path in files}
+    return spent, len(names), len(files)
+
+
+def demos(baseline: Path, out: Path, repeat: int) -> list[list[str]]:
+    """The lines of the demo."""
+    found: dict[Path, list[tuple[Cost, int, int]]] = {ROOT: [], baseline: []}
+    for _ in range(repeat):
+        for checkout, made in found.items():
+            made.append(demo(checkout, out / "clone"))
+    ours, theirs = found[ROOT], found[baseline]
+    lines = []
+    for label, marks, way in (
+        ("`make demo` in a fresh clone: CPU", (0.55, 0.30), lambda one: one[0].processor_s),
+        ("`make demo` in a fresh clone: wall", (0.35, 0.22), lambda one: one[0].wall_s),
+    ):
+        mine, other = (statistics.median(map(way, costs)) for costs in (ours, theirs))
+        lines.append(line(label, mine, other, "s", *marks))
+    for label, marks, place in (("kernels", ("300", "200"), 1), ("compilations", ("450", "300"), 2)):
+        lines.append([f"The same: {label}", str(theirs[0][place]), str(ours[0][place]), "", *marks])
+    return lines
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--baseline", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
+    parser.add_argument("--city", type=Path, help="the tiles that benchmarks/city_tiles.py made; without, no such row")
+    parser.add_argument("--rows", nargs="*", help="demo, given, both, east, classify, import, buildings, city; all")
+    parser.add_argument("--repeat", type=int, default=3)
+    arguments = parser.parse_args()
+    become_reaper()
+    out, baseline = arguments.out.resolve(), arguments.baseline.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    every = rows(baseline, arguments.data.resolve(), out, arguments.city)
+    wanted = arguments.rows or ["demo", *every]
+    unknown = [name for name in wanted if name not in {"demo", *every}]
+    if unknown:
+        sys.exit(f"unknown rows {unknown}: use {', '.join(['demo', *every])}")
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before, medians of {arguments.repeat}\n")
+    print("| | before | now | ratio | required | stretch |\n| --- | --- | --- | --- | --- | --- |", flush=True)
+    for name in wanted:
+        lines = (
+            demos(baseline, out, arguments.repeat)
+            if name == "demo"
+            else measured(every[name], baseline, arguments.repeat)
+        )
+        for cells in lines:
+            print("| " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
