@@ -12,7 +12,6 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
-from pipeline.kernels.merge_sort import in_order
 from pipeline.kernels.normal_equations import moments_of, solve_plane_moments
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Plane
 
@@ -411,18 +410,16 @@ def _plan(points: FloatArray) -> FloatArray:
     return np.ascontiguousarray(points[:, :2], dtype=np.float64)
 
 
-@kernel
 def _spacings(points: FloatArray) -> tuple[float, float]:
     """1 / sqrt(density) in plan, by medians over the points and over their area; nan for fewer than two points."""
     n = len(points)
     k = min(_SPACING_NEIGHBOURS, n - 1)
     if k < 1:
-        return np.nan, np.nan
-    _, all_squares = _nearest_neighbours(points, k, 0.0, False)
-    squares = in_order(all_squares[:, k - 1].copy())
-    median = 0.5 * (squares[(n - 1) // 2] + squares[n // 2])
+        return math.nan, math.nan
+    squares = np.sort(_nearest_neighbours(points, k, 0.0, False)[1][:, k - 1])
+    median = 0.5 * float(squares[(n - 1) // 2] + squares[n // 2])
     covered = np.cumsum(squares)
-    middle = squares[min(np.searchsorted(covered, 0.5 * covered[-1]), n - 1)]
+    middle = float(squares[min(int(np.searchsorted(covered, 0.5 * covered[-1])), n - 1)])
     # pi density r_k^2 is Gamma(k) distributed; its median is k - 1/3 within 2 % for k >= 1; weighted with itself a
     # Gamma(k) variate is Gamma(k + 1) distributed
     return math.sqrt(median * math.pi / (k - 1.0 / 3.0)), math.sqrt(middle * math.pi / (k + 2.0 / 3.0))

@@ -201,23 +201,14 @@ def label_vertices(x: IntArray, y: IntArray, facets: LabelArray, kinds: KindArra
     return out
 
 
-@kernel
 def facet_keys(x: IntArray, y: IntArray, facets: LabelArray, chosen: IntArray) -> IntArray:
     """Coordinates (k, 6) of the vertices of the chosen facets, from the smallest on, counter-clockwise.
 
     The same facet gives the same coordinates in every tile that sees it: that is how fragments of one
     surface find each other.
     """
-    keys = np.empty((chosen.size, 6), np.int64)
-    for i in range(chosen.size):
-        f = chosen[i]
-        k = 0
-        for q in range(1, 3):
-            v, w = facets[f, q], facets[f, k]
-            if x[v] < x[w] or (x[v] == x[w] and y[v] < y[w]):
-                k = q
-        for q in range(3):
-            v = facets[f, (k + q) % 3]
-            keys[i, 2 * q] = x[v]
-            keys[i, 2 * q + 1] = y[v]
+    corners = facets[chosen]
+    first = np.lexsort((y[corners], x[corners]), axis=1)[:, :1]
+    corners = np.take_along_axis(corners, (first + np.arange(3)) % 3, axis=1)
+    keys: IntArray = np.stack((x[corners], y[corners]), axis=2).reshape(-1, 6)
     return keys
