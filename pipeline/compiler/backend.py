@@ -28,6 +28,7 @@ from numba.core.targetconfig import ConfigStack
 from pipeline.compiler import store
 from pipeline.compiler.store import Stored
 
+types: Any = numba.types
 KNOWN = ("0.68.",)
 """Versions of numba whose inside is known."""
 COMMON_OPTIONS = {"nopython": True, "nogil": True}
@@ -184,6 +185,12 @@ def _without_wrappers(flags: Any) -> Any:
     return flags
 
 
+def _common(kind: Any) -> Any:
+    """The type that stands for all of its kind: int64 for signed integers, no literals."""
+    kind = types.unliteral(kind)
+    return types.int64 if isinstance(kind, types.Integer) and kind.signed else kind
+
+
 class KernelDispatcher(registry.CPUDispatcher):
     """numba's dispatcher with files of ours."""
 
@@ -198,6 +205,10 @@ class KernelDispatcher(registry.CPUDispatcher):
 
     def _compilation_chain_init_hook(self) -> None:
         """Look for no extensions of numba; there are none that we know."""
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """How another kernel calls this one: numbers as one type each, so that it is compiled once."""
+        return super().get_call_template(tuple(map(_common, args)), {name: _common(kind) for name, kind in kws.items()})
 
     def compile(self, sig: Any) -> Any:
         """Load or compile the kernel for a signature; its C function where Python asks."""
@@ -295,6 +306,8 @@ class KernelDispatcher(registry.CPUDispatcher):
         context.create_cpython_wrapper(library, known.fndesc, known.environment, None, release_gil=True)
         library.add_linking_library(known.library)
         entry = context.get_executable(library, known.fndesc, known.environment)
+        # numba finds a compiled function by its C function, which is another one now
+        self.targetctx.insert_user_function(entry, known.fndesc, [library])
         return known._replace(library=library, entry_point=entry)
 
     def _take(self, arguments: tuple[Any, ...], result: Any, *, runnable: bool) -> None:

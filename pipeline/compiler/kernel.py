@@ -8,7 +8,6 @@ import operator
 import os
 import sys
 from collections.abc import Callable, Mapping
-from importlib.metadata import version
 from typing import Any, TypeVar, overload
 
 from pipeline.compiler import store
@@ -81,6 +80,8 @@ def _processor() -> str:
 @functools.cache
 def _versions() -> bytes:
     """The versions that machine code hangs on."""
+    from importlib.metadata import version
+
     return repr([version(name) for name in ("numba", "llvmlite")]).encode()
 
 

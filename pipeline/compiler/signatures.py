@@ -4,6 +4,7 @@
 | --- | --- |
 | number, boolean, none | its name: `"float64"` |
 | array | `["float64", 2, "C"]`: items, dimensions, layout; and `"readonly"` where it is |
+| record, the item of an array | `{"record": [["x", "<i8"], ...]}`: numpy's description of it |
 | tuple | `{"tuple": [...]}` |
 | named tuple | `{"class": "module:Name", "fields": [...]}` |
 | argument left out | `{"default": value}` |
@@ -15,6 +16,8 @@ import importlib
 from typing import Any
 
 import numba
+import numpy as np
+from numba.np.numpy_support import as_dtype
 
 from pipeline.compiler.kernel import Kernel
 
@@ -30,12 +33,14 @@ def written(kind: Any) -> Any:
         No kernel takes such an argument yet: add it here.
     """
     if isinstance(kind, types.Array):
-        return [str(kind.dtype), kind.ndim, kind.layout, *(() if kind.mutable else ("readonly",))]
+        return [written(kind.dtype), kind.ndim, kind.layout, *(() if kind.mutable else ("readonly",))]
     if isinstance(kind, types.BaseNamedTuple):
         named = kind.instance_class
         return {"class": f"{named.__module__}:{named.__qualname__}", "fields": [written(one) for one in kind]}
     if isinstance(kind, types.BaseTuple):
         return {"tuple": [written(one) for one in kind]}
+    if isinstance(kind, types.Record):
+        return {"record": np.lib.format.dtype_to_descr(as_dtype(kind))}
     if isinstance(kind, types.Omitted):
         return {"default": kind.value}
     if isinstance(kind, types.Number | types.Boolean | types.NoneType):
@@ -56,6 +61,8 @@ def read(told: Any) -> Any:
     if isinstance(told, list):
         items, dimensions, layout, *readonly = told
         return types.Array(read(items), dimensions, layout, readonly=bool(readonly))
+    if "record" in told:
+        return numba.from_dtype(np.lib.format.descr_to_dtype([tuple(field) for field in told["record"]]))
     if "default" in told:
         return types.Omitted(told["default"])
     if "tuple" in told:

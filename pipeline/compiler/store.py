@@ -23,8 +23,6 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import platformdirs
-
 ENDING = ".kernel"
 _PACKAGE = Path(__file__).resolve().parents[1]
 LIST = "kernels.json"
@@ -187,6 +185,8 @@ def folder_of_kernels() -> Path:
         return Path(named)
     if os.access(_PACKAGE, os.W_OK):
         return _PACKAGE / "__pycache__" / "kernels"
+    import platformdirs
+
     return Path(platformdirs.user_cache_dir("gablework")) / "kernels"
 
 

@@ -32,6 +32,7 @@ class Pair(NamedTuple):
         np.zeros((3, 2)).T,
         np.zeros((4, 4), np.int32)[::2, ::2],
         np.zeros(3, bool),
+        np.zeros(3, [("x", "<i8"), ("kind", "u1")]),
         (1, 2.0),
         (1.0, 2.0),
         (np.zeros(3), (1, 2)),
