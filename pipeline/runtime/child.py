@@ -1,6 +1,6 @@
 """The child process that does the building work: `python -m pipeline.runtime.child PARENT [MODULE:FUNCTION ...]`.
 
-Started by `pipeline.runtime.supervised`, never by hand, or forked from a `pipeline.runtime.process_server`. It calls the
+Started by `pipeline.runtime.executed`, never by hand, or forked by a `pipeline.runtime.process_server`. It calls the
 functions that it is told to load what it will need, says that it is ready, and then works off batches until its parent
 is gone. It knows nothing of buildings.
 """

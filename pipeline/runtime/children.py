@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from pipeline.errors import RunError
 from pipeline.runtime.executed import Executed
-from pipeline.runtime.forking import ProcessServer, can_fork
+from pipeline.runtime.forking import ProcessServer, can_fork, executed_server, forked_server
 from pipeline.runtime.logs import LOG
 from pipeline.runtime.measured import charge
 from pipeline.runtime.supervised import SupervisedChild
@@ -94,6 +95,12 @@ class _Children:
                 server.end()
             self._retired.clear()
 
+    def take(self, server: ProcessServer) -> None:
+        """Have children forked from a server."""
+        with self._lock:
+            self._retire()
+            self._server = server
+
     def _ready_child(self, cancelled: Callable[[], bool], *, fresh: bool, loads: Sequence[str]) -> SupervisedChild:
         """An idle child or a new one."""
         fault = ""
@@ -147,7 +154,7 @@ class _Children:
             self._retire()
         self._retired = [server for server in self._retired if server.alive]
         if self._server is None and self._can_fork:
-            self._server = ProcessServer(loads)
+            self._server = ProcessServer(functools.partial(executed_server, loads))
         return self._server
 
     def _retire(self) -> None:
@@ -200,6 +207,11 @@ def preload(loads: Sequence[str]) -> None:
         server; a server that is there already loads nothing more: what is missing each child loads by itself.
     """
     _children.preload(loads)
+
+
+def fork_server() -> None:
+    """Have this process forked to be the server of its children, with all that it has loaded; it has one thread."""
+    _children.take(ProcessServer(forked_server))
 
 
 def kill_children() -> None:

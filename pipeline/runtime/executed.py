@@ -86,7 +86,7 @@ class Executed:
 
 
 def environment_with_this_package() -> dict[str, str]:
-    """This process's environment, with the package that runs here before all others that may have its name."""
+    """The environment of this process, with the package that runs here before all others that may have its name."""
     root = str(Path(__file__).resolve().parents[2])
     paths = [root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}

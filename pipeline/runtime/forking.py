@@ -12,19 +12,22 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import IO
 
 from pipeline.runtime.executed import environment_with_this_package, in_starter_thread
 from pipeline.runtime.messages import NUMBER, Order, frame
-from pipeline.runtime.process_server import THREADED, kill_with_group
+from pipeline.runtime.process_server import THREADED, kill_with_group, serve_forked
 
 _READ_AT_START = (
-    *("PYTHON", "LD_", "MALLOC_", "GLIBC_", "LC_", "LANG", "TZ"),
-    *("NUMBA_", "GABLEWORK_", "OPENBLAS_", "OMP_", "MKL_", "RAYON_", "ARROW_", "GDAL_", "PROJ_"),
+    *("PYTHON", "LD_", "LC_", "LANG", "TZ"),
+    *("NUMBA_", "GABLEWORK_", "ARROW_", "GDAL_", "PROJ_"),
 )
 """Beginnings of variables that the interpreter or a library reads once: with others a server is no use any more."""
-
-_WITHOUT_THREADS = {"OPENBLAS_NUM_THREADS": "1", "JE_ARROW_MALLOC_CONF": "background_thread:false"}
+_READ_LATER = ("GABLEWORK_WORKER_", "PYTHONSAFEPATH", "PYTHONHASHSEED")
+"""Beginnings of variables that look like those, but matter to no child; Dask sets the last one."""
+WITHOUT_THREADS = {"OPENBLAS_NUM_THREADS": "1", "JE_ARROW_MALLOC_CONF": "background_thread:false"}
 """What keeps libraries from starting threads when they are loaded: those of matrices, and one that tidies memory."""
 
 
@@ -117,31 +120,73 @@ class Forked:
                 self._code = numbers[1]
 
 
+class Own:
+    """A process that this one forked, asked as `subprocess.Popen` is."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._code: int | None = None
+
+    def poll(self) -> int | None:
+        """Its return code; None as long as it lives."""
+        return self._waited(os.WNOHANG)
+
+    def wait(self) -> int | None:
+        """Wait for its end; its return code."""
+        return self._waited(0)
+
+    def kill(self) -> None:
+        """Kill it."""
+        if self.poll() is None:
+            os.kill(self._pid, signal.SIGKILL)
+
+    def _waited(self, options: int) -> int | None:
+        if self._code is None:
+            pid, status = os.waitpid(self._pid, options)
+            if pid:
+                self._code = os.waitstatus_to_exitcode(status)
+        return self._code
+
+
+def executed_server(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes]) -> subprocess.Popen[bytes]:
+    """Start a server that loads things, as `pipeline.runtime.child` takes them."""
+    command = [sys.executable, "-P", "-m", "pipeline.runtime.process_server", str(os.getpid())]
+    return in_starter_thread(
+        subprocess.Popen,
+        [*command, str(orders.fileno()), *loads],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=stderr,
+        pass_fds=[orders.fileno()],
+        start_new_session=True,
+        env=environment_with_this_package() | WITHOUT_THREADS,
+    )
+
+
+def forked_server(orders: socket.socket, stderr: IO[bytes]) -> Own:
+    """Fork a server with all that this process has loaded; for one that has a single thread."""
+    owner = os.getpid()
+    pid = os.fork()
+    if not pid:
+        serve_forked(owner, orders, stderr.fileno())
+    return Own(pid)
+
+
 class ProcessServer:
     """A server, started and asked for processes.
 
     Parameters
     ----------
-    loads : sequence of str
-        What it loads, as `pipeline.runtime.child` takes it.
+    start : callable
+        Starts it, with a socket for its orders and a file for what it has to say: `executed_server`, `forked_server`.
     """
 
-    def __init__(self, loads: Sequence[str]) -> None:
-        self._environment = _read_at_start(os.environ)
+    def __init__(self, start: Callable[[socket.socket, IO[bytes]], subprocess.Popen[bytes] | Own]) -> None:
+        self._environment = read_at_start(os.environ)
         self._stderr = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - lives as long as this object
         self._socket, there = socket.socketpair()
         with there:
-            command = [sys.executable, "-P", "-m", "pipeline.runtime.process_server", str(os.getpid())]
-            self._process = in_starter_thread(
-                subprocess.Popen,
-                [*command, str(there.fileno()), *loads],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=self._stderr,
-                pass_fds=[there.fileno()],
-                start_new_session=True,
-                env=environment_with_this_package() | _WITHOUT_THREADS,
-            )
+            self._process = start(there, self._stderr)
 
     @property
     def alive(self) -> bool:
@@ -168,7 +213,7 @@ class ProcessServer:
     @property
     def serves(self) -> bool:
         """Whether it is there, and its children would be as those that are started now."""
-        return self.alive and self._environment == _read_at_start(os.environ)
+        return self.alive and self._environment == read_at_start(os.environ)
 
     def forked(self, loads: Sequence[str], stderr: int) -> Forked:
         """A process that runs `pipeline.runtime.child`; forked when the server has loaded.
@@ -213,10 +258,15 @@ class ProcessServer:
 def _folder() -> str:
     """The working directory; empty where it is gone."""
     try:
-        return os.getcwd()
+        return str(Path.cwd())
     except FileNotFoundError:
         return ""
 
 
-def _read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
-    return {name: value for name, value in environment.items() if name.startswith(_READ_AT_START)}
+def read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
+    """The variables that count once only, when a process starts."""
+    return {
+        name: value
+        for name, value in environment.items()
+        if name.startswith(_READ_AT_START) and not name.startswith(_READ_LATER)
+    }

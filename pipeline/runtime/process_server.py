@@ -30,6 +30,7 @@ import socket
 import sys
 import traceback
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NoReturn
 
 from pipeline.runtime import child
@@ -61,8 +62,39 @@ def main(arguments: Sequence[str]) -> None:
     serve(socket.socket(fileno=int(arguments[1])))
 
 
+def serve_forked(owner: int, orders: socket.socket, stderr: int) -> NoReturn:
+    """Be the server of the process that this one was just forked from, and of which it keeps nothing but the memory.
+
+    Parameters
+    ----------
+    owner : int
+        Process id of the other.
+    orders : socket
+        To it.
+    stderr : int
+        Descriptor that gets what this process has to say.
+    """
+    try:
+        os.setsid()
+        child.end_with_parent(owner)
+        nothing = os.open(os.devnull, os.O_RDWR)
+        for number, descriptor in enumerate((nothing, nothing, stderr, orders.detach())):
+            os.dup2(descriptor, number)
+        os.closerange(4, os.sysconf("SC_OPEN_MAX"))
+        signal.set_wakeup_fd(-1)
+        for name in (signal.SIGCHLD, signal.SIGINT):
+            signal.signal(name, signal.SIG_DFL)
+        serve(socket.socket(fileno=3))
+    except BaseException:  # noqa: BLE001 - as an interpreter ends
+        traceback.print_exc()
+    finally:
+        os._exit(1)
+
+
 def serve(owner: socket.socket) -> NoReturn:
     """Fork children for an owner; for a process with one thread, which ends here."""
+    # the stop of a service goes to all its processes: this one ends with its owner, not before
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.collect()
     gc.freeze()  # a collection would write to all objects, and so copy the memory that is shared
     _Server(owner).serve()
@@ -119,7 +151,7 @@ class _Server:
             os.close(descriptor)
 
     def _fork(self, order: Order, control: socket.socket, standard: Sequence[int]) -> None:
-        if len(os.listdir("/proc/self/task")) > 1:
+        if sum(1 for _ in Path("/proc/self/task").iterdir()) > 1:
             os._exit(THREADED)
         server = os.getpid()
         pid = os.fork()
@@ -136,6 +168,7 @@ class _Server:
         code = 1
         try:
             os.setsid()
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
             for number, descriptor in enumerate(standard):
                 os.dup2(descriptor, number)
                 os.close(descriptor)
