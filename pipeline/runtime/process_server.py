@@ -95,8 +95,7 @@ def serve(owner: socket.socket) -> NoReturn:
     """Fork children for an owner; for a process with one thread, which ends here."""
     # the stop of a service goes to all its processes: this one ends with its owner, not before
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    gc.collect()
-    gc.freeze()  # a collection would write to all objects, and so copy the memory that is shared
+    gc.freeze()  # a collection in a child would write to all objects, and so copy the memory that is shared
     _Server(owner).serve()
     os._exit(0)
 

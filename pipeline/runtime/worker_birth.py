@@ -6,6 +6,7 @@ itself (`pipeline.runtime.process_server`), so that they begin with the same.
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import signal
@@ -27,6 +28,7 @@ def _prepare() -> None:
         importlib.import_module(name)
     if kernels_are_compiled():  # or else each compiles what it needs, when the run tells that it does
         child.load(f"pipeline.runtime.modelling:load_once:{_METHOD}")
+    gc.freeze()  # a collection would write to all objects, and so copy the memory that is shared
     server = os.getpid()
 
     def born() -> None:
