@@ -37,6 +37,8 @@ from pipeline.runtime import child
 from pipeline.runtime.messages import NUMBER, Frames, Order
 from pipeline.runtime.start_up import start_own_process
 
+NAME = "gablework-fork"
+"""Name of the process, as `ps` and `top` show it."""
 THREADED = 75
 """Exit code of a server that has more than one thread: a forked child would wait for locks that nobody lets go."""
 _PIECE = 2**16
@@ -93,6 +95,7 @@ def serve_forked(owner: int, orders: socket.socket, stderr: int) -> NoReturn:
 
 def serve(owner: socket.socket) -> NoReturn:
     """Fork children for an owner; for a process with one thread, which ends here."""
+    child.be_named(NAME)
     # the stop of a service goes to all its processes: this one ends with its owner, not before
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.freeze()  # a collection in a child would write to all objects, and so copy the memory that is shared

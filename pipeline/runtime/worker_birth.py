@@ -11,9 +11,9 @@ import importlib
 import os
 import signal
 
-from pipeline.runtime import child, children
+from pipeline.runtime import child, children, process_server
 from pipeline.runtime.compiled_kernels import kernels_are_compiled
-from pipeline.runtime.worker_setup import STAGES
+from pipeline.runtime.worker_setup import NAME, STAGES
 
 _METHOD = "arrangement"
 """The default method; others are loaded by those who model by them."""
@@ -22,6 +22,7 @@ _METHOD = "arrangement"
 def _prepare() -> None:
     """Load, and be born again in every worker."""
     child.end_with_parent(os.getppid())
+    child.be_named(process_server.NAME)
     # the stop of a service goes to all its processes: workers, which finish their tasks, must not lose this one
     signal.signal(signal.SIGTERM, _left_to_the_nanny)
     for name in STAGES:
@@ -33,6 +34,7 @@ def _prepare() -> None:
 
     def born() -> None:
         if os.getppid() == server:
+            child.be_named(NAME)
             children.fork_server()
 
     os.register_at_fork(after_in_child=born)

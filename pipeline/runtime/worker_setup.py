@@ -14,6 +14,8 @@ from pipeline.runtime.start_up import start_own_process
 
 STAGES = tuple(f"pipeline.runtime.{name}" for name in ("ingest", "split", "modelling", "publish"))
 """The modules of all tasks."""
+NAME = "gablework-work"
+"""Name of a worker's process that was forked, as `ps` and `top` show it."""
 LOG = "GABLEWORK_WORKER_LOG"
 """How `gablework worker` tells its worker to log: plain or json. Embedded workers log nothing unless asked for JSON."""
 METRICS_PORT, METRICS_HOST = "GABLEWORK_WORKER_METRICS_PORT", "GABLEWORK_WORKER_METRICS_HOST"
