@@ -21,7 +21,6 @@ _METHOD = "arrangement"
 
 def _prepare() -> None:
     """Load, and be born again in every worker."""
-    child.end_with_parent(os.getppid())
     child.be_named(process_server.NAME)
     # the stop of a service goes to all its processes: workers, which finish their tasks, must not lose this one
     signal.signal(signal.SIGTERM, _left_to_the_nanny)

@@ -6,6 +6,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator, Mapping
 from multiprocessing import forkserver
@@ -26,6 +27,8 @@ _environment: Mapping[str, str] | None = None
 @contextlib.contextmanager
 def forked_workers() -> Iterator[Mapping[str, Any]]:
     """Dask's settings under which workers are forked from a server, which starts and loads at once; a context manager.
+
+    For processes that have imported Dask.
 
     There is one server a process. It outlives its users, so that the next cluster's workers start fast, too, but not a
     change of the environment between them. Where this system cannot fork there are no settings, and workers start the
@@ -53,6 +56,8 @@ def _start() -> None:
         _stop()
         _environment = now
     multiprocessing.set_forkserver_preload(list(_PRELOADED))
+    # Dask would import all that it can use, here and there, and have that loaded in place of ours
+    vars(sys.modules["distributed.utils"])["_forkserver_preload_set"] = True
     before = dict(os.environ)
     special = {"PYTHONPATH": environment_with_this_package()["PYTHONPATH"], **WITHOUT_THREADS, **_SAFE_PATH}
     # the server takes the environment of this process: there is no other way to give it one
