@@ -25,8 +25,12 @@ _READ_AT_START = (
     *("NUMBA_", "GABLEWORK_", "ARROW_", "GDAL_", "PROJ_"),
 )
 """Beginnings of variables that the interpreter or a library reads once: with others a server is no use any more."""
-_READ_LATER = ("GABLEWORK_WORKER_", "PYTHONSAFEPATH", "PYTHONHASHSEED")
-"""Beginnings of variables that look like those, but matter to no child; Dask sets the last one."""
+_READ_LATER = (
+    *("GABLEWORK_WORKER_", "PYTHONSAFEPATH", "PYTHONHASHSEED"),
+    *("GDAL_CURL_CA_BUNDLE", "PROJ_CURL_CA_BUNDLE"),
+)
+"""Beginnings of variables that look like those, but matter to no child: Dask sets one, and pyogrio the last two as it
+is loaded."""
 WITHOUT_THREADS = {"OPENBLAS_NUM_THREADS": "1", "JE_ARROW_MALLOC_CONF": "background_thread:false"}
 """What keeps libraries from starting threads when they are loaded: those of matrices, and one that tidies memory."""
 
