@@ -12,7 +12,7 @@ import signal
 from pipeline.runtime import logs
 from pipeline.runtime.start_up import start_own_process
 
-STAGES = tuple(f"pipeline.runtime.{name}" for name in ("ingest", "split", "modelling", "publish"))
+STAGES = (*(f"pipeline.runtime.{name}" for name in ("ingest", "split", "modelling", "publish")), "pipeline.reconstruct")
 """The modules of all tasks."""
 NAME = "gablework-work"
 """Name of a worker's process that was forked, as `ps` and `top` show it."""
