@@ -229,5 +229,6 @@ os.register_at_fork(after_in_child=_forget_children)
 
 
 @atexit.register
-def _close() -> None:
+def close_children() -> None:
+    """End the children of this process and start no others; a process that ends without `atexit` calls it itself."""
     _children.close()

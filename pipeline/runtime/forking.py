@@ -36,6 +36,7 @@ WITHOUT_THREADS = {"OPENBLAS_NUM_THREADS": "1", "JE_ARROW_MALLOC_CONF": "backgro
 
 
 _SAID_BYTES = 2000
+_END_S = 1.0
 
 
 def can_fork() -> bool:
@@ -135,8 +136,21 @@ class Own:
         """Its return code; None as long as it lives."""
         return self._waited(os.WNOHANG)
 
-    def wait(self) -> int | None:
-        """Wait for its end; its return code."""
+    def wait(self, timeout: float | None = None) -> int | None:
+        """Wait for its end; its return code.
+
+        Raises
+        ------
+        TimeoutError
+            It lives still.
+        """
+        if timeout is not None and self._code is None:
+            lives = os.pidfd_open(self._pid)
+            try:
+                if not select.select([lives], [], [], timeout)[0]:
+                    raise TimeoutError
+            finally:
+                os.close(lives)
         return self._waited(0)
 
     def kill(self) -> None:
@@ -191,6 +205,7 @@ class ProcessServer:
         self._socket, there = socket.socketpair()
         with there:
             self._process = start(there, self._stderr)
+        self._asked = False
 
     @property
     def alive(self) -> bool:
@@ -227,6 +242,7 @@ class ProcessServer:
         OSError
             The server is gone.
         """
+        self._asked = True
         order = Order(environment=environment_with_this_package(), folder=_folder(), loads=tuple(loads))
         theirs: list[int] = []
         control, there = socket.socketpair()
@@ -253,8 +269,11 @@ class ProcessServer:
         self._socket.close()
 
     def end(self) -> None:
-        """Kill it, and so all of its children."""
+        """End it: by itself where its children are gone, whose processor time it then hands up, else with them."""
         self.retire()
+        if self._asked:
+            with contextlib.suppress(TimeoutError, subprocess.TimeoutExpired):
+                self._process.wait(_END_S)
         self._process.kill()
         self._process.wait()
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import multiprocessing
 import os
+import select
 import signal
 import sys
 import threading
@@ -19,6 +21,7 @@ _PRELOADED = ("distributed.nanny", "pipeline.runtime.worker_birth")
 _SETTINGS = {"distributed.worker.multiprocessing-method": "forkserver"}
 _SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """Nothing is imported from the working directory."""
+_END_S = 2.0
 _changing = threading.Lock()
 _users = 0
 _environment: Mapping[str, str] | None = None
@@ -73,9 +76,26 @@ def _start() -> None:
 
 
 def _stop() -> None:
-    """End the server, if there is one: Python has no public way."""
+    """End the server, if there is one: by itself where all workers are gone, whose processor time it hands up.
+
+    Python has no public way.
+    """
     server: Any = forkserver._forkserver  # noqa: SLF001
     pid = server._forkserver_pid  # noqa: SLF001
-    if pid is not None:
-        os.kill(pid, signal.SIGKILL)
-        server._stop()  # noqa: SLF001
+    if pid is None:
+        return
+    os.close(server._forkserver_alive_fd)  # noqa: SLF001
+    server._forkserver_alive_fd = server._forkserver_address = server._forkserver_pid = None  # noqa: SLF001
+    lives = os.pidfd_open(pid)
+    try:
+        if not select.select([lives], [], [], _END_S)[0]:
+            os.kill(pid, signal.SIGKILL)
+    finally:
+        os.close(lives)
+    os.waitpid(pid, 0)
+
+
+@atexit.register
+def _close() -> None:
+    with _changing:
+        _stop()
