@@ -18,9 +18,13 @@ from typing import Self
 
 import psutil
 
+from pipeline.runtime import child, process_server, worker_setup
+
 LOOK_S = 0.25
 DRIVER, SCHEDULER, NANNY, WORKER, CHILD, OTHER = "driver", "scheduler", "nanny", "worker", "child", "other"
-ROLES = (DRIVER, SCHEDULER, NANNY, WORKER, CHILD, OTHER)
+FORKING = "process server"
+ROLES = (DRIVER, SCHEDULER, NANNY, FORKING, WORKER, CHILD, OTHER)
+_NAMES = {child.NAME: CHILD, process_server.NAME: FORKING, worker_setup.NAME: WORKER}
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -35,18 +39,17 @@ class Seen:
     """Largest resident size, VmHWM."""
 
 
-def role_of(command: Sequence[str], roots: dict[int, str], pid: int) -> str:
-    """What a process is, by its command line.
+def role_of(name: str, command: Sequence[str], roots: dict[int, str], pid: int) -> str:
+    """What a process is, by its name, its command line and its id.
 
-    >>> role_of(["python", "-P", "-m", "pipeline.runtime.child", "7"], {}, 8)
+    >>> role_of("gablework-child", ["python", "-P", "-m", "pipeline.runtime.process_server", "7"], {}, 8)
     'child'
     """
     if pid in roots:
         return roots[pid]
-    told = " ".join(command)
-    if "pipeline.runtime.child" in told:
-        return CHILD
-    return WORKER if "spawn_main" in told else OTHER
+    if name in _NAMES:
+        return _NAMES[name]
+    return WORKER if "spawn_main" in " ".join(command) else OTHER
 
 
 class Watcher:
@@ -104,9 +107,11 @@ class Watcher:
     def _look_at(self, process: psutil.Process) -> None:
         with contextlib.suppress(psutil.Error, OSError, ValueError):
             seen = self.seen.get(process.pid)
+            # a process gets its name when it has loaded
+            role = role_of(process.name(), process.cmdline(), self._roots, process.pid)
             if seen is None:
-                seen = Seen(pid=process.pid, role=role_of(process.cmdline(), self._roots, process.pid))
-                self.seen[process.pid] = seen
+                seen = self.seen[process.pid] = Seen(pid=process.pid, role=role)
+            seen.role = role
             times = process.cpu_times()
             seen.cpu_s = max(seen.cpu_s, times.user + times.system)
             for line in Path(f"/proc/{process.pid}/status").read_text(encoding="ascii").splitlines():

@@ -22,16 +22,18 @@ import dataclasses
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
-from pipeline.export.tile import MESHES
+from pipeline.export.mesh_kinds import MESHES
 from pipeline.parameters import Parameters, build, parameter
 from pipeline.runtime.isolation import IsolationLimits
-from pipeline.runtime.run import RunRequest
 from pipeline.runtime.tls import given_tls
 from pipeline.schedule import Cron, Missed, Overlap
 from pipeline.settings import RunSettings
+
+if TYPE_CHECKING:
+    from pipeline.runtime.run import RunRequest
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -176,6 +178,7 @@ class Batch:
 
     def request(self) -> RunRequest:
         """What the engine is asked to do."""
+        from pipeline.runtime.run import RunRequest  # with all that a run needs, and a status does not
 
         def given(name: str) -> str | None:
             return self.whole(name) if name else None

@@ -13,13 +13,11 @@ from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.glb import glb_bytes
+from pipeline.export.mesh_kinds import MESHES
 from pipeline.export.obj import obj_text
 from pipeline.export.records import RecordContext, RejectedObject, building_row, plane_rows, rejected_row
 from pipeline.export.solid_geometry import lod_suffix, model_at
 from pipeline.model import BuildingResult
-
-MESHES = ("building", "tile", "glb", "none")
-"""What meshes a run writes: one OBJ a building, one OBJ a tile, one GLB a tile, none."""
 
 Put = Callable[[str, bytes], None]
 """Stores bytes under a path relative to the run directory, atomically: readers see the old file or the new one."""
@@ -88,7 +86,7 @@ def mesh_files(
     context : RecordContext
         Units, and the coarser levels of detail.
     meshes : str
-        One of `MESHES`.
+        One of `pipeline.export.mesh_kinds.MESHES`.
     """
     units_m = context.reference.horizontal_unit_m, context.reference.vertical_unit_m
     for lod in (None, *context.coarser_lods):
@@ -132,7 +130,7 @@ def write_tile(
     context : RecordContext
         Facts of the run.
     meshes : str
-        One of `MESHES`.
+        One of `pipeline.export.mesh_kinds.MESHES`.
     put : callable, optional
         Stores a file elsewhere, such as in an object store; `put_local(run_dir)` by default.
 

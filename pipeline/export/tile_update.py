@@ -72,7 +72,7 @@ def updated_tile(
     context : RecordContext
         Facts of the run, and those of `results`.
     meshes : str
-        As the run was written: one of `pipeline.export.tile.MESHES`.
+        As the run was written: one of `pipeline.export.mesh_kinds.MESHES`.
 
     Raises
     ------

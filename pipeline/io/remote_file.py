@@ -15,7 +15,6 @@ import shutil
 import tempfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from email.utils import parsedate_to_datetime
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -281,6 +280,8 @@ def _time_ns(info: dict[str, Any]) -> int:
     """When a file was written, by what S3 or HTTP tell."""
     told = info.get("LastModified") or info.get("Last-Modified")
     if isinstance(told, str):
+        from email.utils import parsedate_to_datetime  # most runs read no file of a server
+
         try:
             told = parsedate_to_datetime(told)
         except ValueError:

@@ -1,7 +1,8 @@
 """The child process that does the building work: `python -m pipeline.runtime.child PARENT [MODULE:FUNCTION ...]`.
 
-Started by `pipeline.runtime.isolation`, never by hand. It calls the functions named on its command line to load what it
-will need, says that it is ready, and then works off batches until its parent is gone. It knows nothing of buildings.
+Started by `pipeline.runtime.executed`, never by hand, or forked by a `pipeline.runtime.process_server`. It calls the
+functions that it is told to load what it will need, says that it is ready, and then works off batches until its parent
+is gone. It knows nothing of buildings.
 """
 
 from __future__ import annotations
@@ -25,8 +26,10 @@ from pipeline.errors import RunError
 from pipeline.runtime.messages import Batch, Begun, Finished, Frames, OutOfMemory, Raised, Ready, frame
 from pipeline.runtime.start_up import start_own_process
 
+NAME = "gablework-child"
+"""Name of the process, as `ps` and `top` show it on Linux, which allows no longer one."""
 _PIECE = 2**20
-_PR_SET_PDEATHSIG = 1
+_PR_SET_PDEATHSIG, _PR_SET_NAME = 1, 15
 _FIRST_VICTIM = "1000"
 
 
@@ -36,23 +39,44 @@ def main(arguments: Sequence[str]) -> None:
     Parameters
     ----------
     arguments : sequence of str
-        The parent's process id, then functions to be called once, as `module:function`, or `module:function:argument`
-        where it takes a text.
+        The parent's process id, then what is called before this process is ready: `module:function`,
+        `module:function:argument` where it takes a text, or `module` alone to be imported.
     """
     start_own_process()
+    serve_parent(int(arguments[0]), arguments[1:])
+
+
+def serve_parent(parent: int, loads: Sequence[str]) -> None:
+    """Work off what comes over standard input until the parent is gone.
+
+    Parameters
+    ----------
+    parent : int
+        Process id of the parent.
+    loads : sequence of str
+        What is called before this process is ready.
+    """
     incoming, outgoing = _private_pipes()
-    _end_with_parent(int(arguments[0]))
+    end_with_parent(parent)
+    be_named(NAME)
     _be_the_first_victim()
     faulthandler.enable(all_threads=False)
     faulthandler.register(signal.SIGUSR1, all_threads=True)
     batches: queue.SimpleQueue[Batch] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(incoming, batches), daemon=True).start()
-    for name in arguments[1:]:
-        module, function, *argument = name.split(":", 2)
-        getattr(importlib.import_module(module), function)(*argument)
+    for name in loads:
+        load(name)
     _send(outgoing, Ready())
     while True:
         _work(batches.get(), outgoing)
+
+
+def load(name: str) -> None:
+    """Call a function, told as `module:function`, or as `module:function:argument`; or import a `module`."""
+    module, *function = name.split(":", 2)
+    loaded = importlib.import_module(module)
+    if function:
+        getattr(loaded, function[0])(*function[1:])
 
 
 def _private_pipes() -> tuple[int, int]:
@@ -68,7 +92,7 @@ def _private_pipes() -> tuple[int, int]:
     return incoming, outgoing
 
 
-def _end_with_parent(parent: int) -> None:
+def end_with_parent(parent: int) -> None:
     """Have the system kill this process when its parent dies.
 
     Closed pipes would end it too, but not while a building holds the interpreter's lock.
@@ -77,6 +101,12 @@ def _end_with_parent(parent: int) -> None:
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # it died before the line above
         os._exit(0)
+
+
+def be_named(name: str) -> None:
+    """Tell those who look at processes what this one is: a forked one has the command line of its server."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
 
 
 def _be_the_first_victim() -> None:

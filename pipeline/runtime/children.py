@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from pipeline.errors import RunError
+from pipeline.runtime.executed import Executed
+from pipeline.runtime.forking import ProcessServer, can_fork, executed_server, forked_server
+from pipeline.runtime.logs import LOG
 from pipeline.runtime.measured import charge
 from pipeline.runtime.supervised import SupervisedChild
 
@@ -33,6 +37,9 @@ class _Children:
         self._lock = threading.Lock()
         self._idle: list[SupervisedChild] = []
         self._all: set[SupervisedChild] = set()
+        self._server: ProcessServer | None = None
+        self._retired: list[ProcessServer] = []
+        self._can_fork = can_fork()
         self._closed = False
 
     @contextlib.contextmanager
@@ -68,6 +75,12 @@ class _Children:
         self._closed = True
         self.kill()
 
+    def preload(self, loads: Sequence[str]) -> None:
+        """Start the server that children are forked from, where none is there."""
+        with self._lock:
+            if not self._closed:
+                self._serving(loads)
+
     def kill(self) -> None:
         """Kill all children; the next work starts others."""
         with self._lock:
@@ -77,12 +90,23 @@ class _Children:
                 child.end()
             for child in lent:
                 child.kill()
+            self._retire()
+            for server in self._retired:
+                server.end()
+            self._retired.clear()
+
+    def take(self, server: ProcessServer) -> None:
+        """Have children forked from a server."""
+        with self._lock:
+            self._retire()
+            self._server = server
 
     def _ready_child(self, cancelled: Callable[[], bool], *, fresh: bool, loads: Sequence[str]) -> SupervisedChild:
         """An idle child or a new one."""
         fault = ""
-        for _ in range(FRUITLESS_STARTS):
-            child = self._idle_or_new(fresh=fresh, loads=loads)
+        for start in range(FRUITLESS_STARTS):
+            # where a forked one does not last, it may be for the server's sake
+            child = self._idle_or_new(fresh=fresh, loads=loads, forked=start == 0)
             try:
                 problem = child.wait_until_ready(_START_TIMEOUT_S, cancelled)
             except BaseException:
@@ -94,7 +118,7 @@ class _Children:
             self._end(child)
         raise RunError(fault)
 
-    def _idle_or_new(self, *, fresh: bool, loads: Sequence[str]) -> SupervisedChild:
+    def _idle_or_new(self, *, fresh: bool, loads: Sequence[str], forked: bool) -> SupervisedChild:
         with self._lock:
             if self._closed:
                 raise RunError("this process is about to end: it models no buildings any more")
@@ -106,9 +130,38 @@ class _Children:
                 elif not (fresh and child.begun):
                     self._idle.remove(child)
                     return child
-            child = SupervisedChild(loads)
+            child = self._new(loads, forked=forked)
             self._all.add(child)
         return child
+
+    def _new(self, loads: Sequence[str], *, forked: bool) -> SupervisedChild:
+        server = self._serving(loads) if forked else None
+        if server is not None:
+            try:
+                return SupervisedChild(lambda stderr: server.forked(loads, stderr))
+            except OSError as error:
+                LOG.warning("no process can be forked: %s", error)
+                self._retire()
+        return SupervisedChild(lambda stderr: Executed(loads, stderr))
+
+    def _serving(self, loads: Sequence[str]) -> ProcessServer | None:
+        """The server, started where none is there that can serve; None where children have to be executed."""
+        if self._server is not None and not self._server.serves:
+            if fault := self._server.fault:
+                LOG.warning("the server that processes are forked from ended: %s", fault)
+                # one that ended by itself will do so again; one that was killed will not
+                self._can_fork = self._server.was_killed
+            self._retire()
+        self._retired = [server for server in self._retired if server.alive]
+        if self._server is None and self._can_fork:
+            self._server = ProcessServer(functools.partial(executed_server, loads))
+        return self._server
+
+    def _retire(self) -> None:
+        if self._server is not None:
+            self._server.retire()
+            self._retired.append(self._server)
+            self._server = None
 
     def _end(self, child: SupervisedChild) -> None:
         child.end()
@@ -144,8 +197,25 @@ def lent_child(
     return _children.lent(cancelled, fresh=fresh, loads=loads)
 
 
+def preload(loads: Sequence[str]) -> None:
+    """Have the server that children are forked from load what they will need, while this process does something else.
+
+    Parameters
+    ----------
+    loads : sequence of str
+        What it loads, as `pipeline.runtime.child` takes it. Without this call the first child's loads are those of the
+        server; a server that is there already loads nothing more: what is missing each child loads by itself.
+    """
+    _children.preload(loads)
+
+
+def fork_server() -> None:
+    """Have this process forked to be the server of its children, with all that it has loaded; it has one thread."""
+    _children.take(ProcessServer(forked_server))
+
+
 def kill_children() -> None:
-    """Kill the children of this process; the next work starts others."""
+    """Kill the children of this process and the server that they were forked from; the next work starts others."""
     _children.kill()
 
 
@@ -159,5 +229,6 @@ os.register_at_fork(after_in_child=_forget_children)
 
 
 @atexit.register
-def _close() -> None:
+def close_children() -> None:
+    """End the children of this process and start no others; a process that ends without `atexit` calls it itself."""
     _children.close()

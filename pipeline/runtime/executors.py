@@ -26,6 +26,7 @@ from pipeline.runtime.priorities import Traffic, priority_of
 from pipeline.runtime.serial import Executor, SerialExecutor
 from pipeline.runtime.tls import TlsFiles, check_address, given_tls, why_not
 from pipeline.runtime.versions import ENGINE, TALKING, WORKING, differences
+from pipeline.runtime.worker_forking import forked_workers
 
 __all__ = [
     "Cluster",
@@ -198,9 +199,12 @@ class Cluster:
             "distributed.scheduler.allowed-failures": 1,
             **worker_setup.LEAN_LOOP,
         }
+        starting = contextlib.ExitStack()
         try:
             # the configuration is the process's own, not the thread's, and workers copy it as they start
-            with self._starting, dask.config.set(settings):
+            with self._starting, dask.config.set(settings), starting:
+                # also those that are started again later
+                starting.enter_context(dask.config.set(starting.enter_context(forked_workers())))
                 self._embedded = LocalCluster(
                     n_workers=self._workers,
                     threads_per_worker=1,
@@ -212,6 +216,7 @@ class Cluster:
                     security=self.security,
                     resources={RESOURCE: each_bytes},
                 )
+                self._while_running = starting.pop_all()
         except (OSError, RuntimeError, TimeoutError) as error:
             raise ClusterError(f"the {self._workers} workers of this machine do not start: {error}") from error
         self._while_running.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": _NEVER}))

@@ -13,15 +13,17 @@ import json
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pyarrow.fs as pafs
 import shapely
 
 from pipeline.errors import RunError
 from pipeline.export.tile import Put, put_local
 from pipeline.io import arrow_at
 from pipeline.tiling import MM, Tile, TileGrid
+
+if TYPE_CHECKING:
+    import pyarrow.fs as pafs
 
 NAME = "run.json"
 """File name of the manifest in the run directory."""

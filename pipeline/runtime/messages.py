@@ -16,11 +16,25 @@ from __future__ import annotations
 import dataclasses
 import pickle
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+NUMBER = struct.Struct("<q")
+"""How a process server tells a process id and a return code."""
 _LENGTH = struct.Struct("<Q")
 _LONGEST = 2**40
+
+
+@dataclasses.dataclass(frozen=True)
+class Order:
+    """What a process server is to fork."""
+
+    environment: Mapping[str, str]
+    """Environment of the child."""
+    folder: str
+    """Its working directory."""
+    loads: tuple[str, ...]
+    """What it calls before it is ready, as `pipeline.runtime.child` takes it."""
 
 
 @dataclasses.dataclass(frozen=True)

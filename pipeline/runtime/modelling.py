@@ -18,7 +18,6 @@ from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, Reason, RoofType, Status
-from pipeline.reconstruct import failed_building, reconstruct_building
 from pipeline.runtime.bundle import Bundle, Incident, write_bundle
 from pipeline.runtime.gather import gather
 from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
@@ -266,6 +265,8 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     OSError, GableworkError
         Scratch cannot be read, the settings are none: that is the run's fault, not the candidate's.
     """
+    from pipeline.reconstruct import reconstruct_building  # with all methods, which who hands out tasks does without
+
     task = task.way_of(site)
     if task.compared:
         # a child that has modelled by another method has not loaded this one: its first building would be charged
@@ -336,6 +337,8 @@ def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
     MemoryError, OSError
         Its points cannot be put together.
     """
+    from pipeline.reconstruct import failed_building  # as above
+
     task = task.way_of(site)
     candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, beside=task.settings.roof.at_walls)
     result = failed_building(candidate, task.method, loss.reason, loss.detail)
@@ -406,6 +409,8 @@ def model_bundle(bundle: Bundle) -> BuildingResult:
     MemoryError
         As it came.
     """
+    from pipeline.reconstruct import reconstruct_building  # as above
+
     return reconstruct_building(bundle.candidate, bundle.method, bundle.settings)
 
 
@@ -423,6 +428,8 @@ def load(*methods: str) -> None:
     *methods : str
         Their names; without any, all methods.
     """
+    from pipeline.reconstruct import reconstruct_building  # as above
+
     lattice = np.arange(-4.5, 15.0)
     east, north = (axis.ravel() for axis in np.meshgrid(lattice, lattice, indexing="ij"))
     outline = shapely.box(0.0, 0.0, 16.0, 10.0)  # partly without points, which is looked at in given outlines

@@ -8,17 +8,15 @@ import fcntl
 import os
 import select
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import RunCancelledError
+from pipeline.runtime.executed import Started
 from pipeline.runtime.messages import Batch, Begun, Finished, Frames, OutOfMemory, Raised, Ready, frame
 
 _PIECE = 2**20
@@ -63,25 +61,18 @@ class SupervisedChild:
 
     Parameters
     ----------
-    loads : sequence of str
-        Functions that it calls before it is ready, as `module:function`.
+    start : callable
+        Starts it, with its standard error at a descriptor: `Executed`, or `ProcessServer.forked`.
     """
 
-    def __init__(self, loads: Sequence[str]) -> None:
-        import psutil  # type: ignore[import-untyped]  # slow to load, and a serial run has no child
-
+    def __init__(self, start: Callable[[int], Started]) -> None:
         self._stderr = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - closed in `end`
         # both processes write behind the end, also after it was cut
         fcntl.fcntl(self._stderr, fcntl.F_SETFL, fcntl.fcntl(self._stderr, fcntl.F_GETFL) | os.O_APPEND)
-        command = [sys.executable, "-P", "-m", "pipeline.runtime.child", str(os.getpid()), *loads]
-        self._process = _STARTER.submit(_spawn, command, self._stderr.fileno()).result()
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._stdin, self._stdout = self._process.stdin, self._process.stdout
-        self._watched = psutil.Process(self._process.pid)
-        self._is_gone = psutil.Error
+        self._process = start(self._stderr.fileno())
+        self._watched: Any = None
         self._poll = select.poll()
-        self._poll.register(self._stdout, select.POLLIN)
+        self._poll.register(self._process.stdout, select.POLLIN)
         self._frames = Frames()
         self._ready = False
         self._nonsense = ""
@@ -97,12 +88,9 @@ class SupervisedChild:
 
     @property
     def memory_bytes(self) -> int:
-        """Its private memory: resident, without what it shares with files; 0 once it is gone."""
-        try:
-            info = self._watched.memory_info()
-        except self._is_gone:
-            return 0
-        return int(info.rss) - int(getattr(info, "shared", 0))
+        """Its private memory: resident, without what it shares with files; 0 where it is not there."""
+        info = self._seen("memory_info")
+        return 0 if info is None else int(info.rss) - int(getattr(info, "shared", 0))
 
     def spent_cpu_s(self) -> float:
         """CPU seconds that it spent since this was last asked, its start included; of one that is gone as last seen."""
@@ -111,9 +99,21 @@ class SupervisedChild:
         return spent
 
     def _look_at_cpu(self) -> None:
-        with contextlib.suppress(self._is_gone):
-            times = self._watched.cpu_times()
+        times = self._seen("cpu_times")
+        if times is not None:
             self._seen_cpu_s = max(self._seen_cpu_s, times.user + times.system)
+
+    def _seen(self, what: str) -> Any:
+        """What psutil tells of the process; None where it is not there."""
+        import psutil  # type: ignore[import-untyped]  # slow to load, and a serial run has no child
+
+        if self._watched is None and self._process.pid is None:
+            return None
+        try:
+            self._watched = self._watched or psutil.Process(self._process.pid)
+            return getattr(self._watched, what)()
+        except psutil.Error:
+            return None
 
     def wait_until_ready(self, timeout_s: float, cancelled: Callable[[], bool]) -> str | None:
         """Wait for the child to have loaded what it needs.
@@ -213,22 +213,22 @@ class SupervisedChild:
     def kill(self) -> None:
         """Kill the process and all that it started; harmless where it is gone."""
         self._look_at_cpu()
-        if self._process.poll() is None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.kill()
 
     def end(self) -> None:
         """Kill the process, wait for its end and let go of all that belongs to it."""
+        if self._stderr.closed:
+            return
         self.kill()
         self._process.wait()
-        for pipe in (self._stdin, self._stdout, self._stderr):
-            pipe.close()
+        self._process.close()
+        self._stderr.close()
 
     def _write(self, content: bytes) -> None:
         """Write a message whole."""
         rest = memoryview(content)
         while rest:
-            rest = rest[os.write(self._stdin.fileno(), rest) :]
+            rest = rest[os.write(self._process.stdin, rest) :]
 
     def _messages(self, cancelled: Callable[[], bool]) -> Iterator[Any]:
         """What the child says as it comes, and None every tick; ends when the child is gone."""
@@ -236,7 +236,7 @@ class SupervisedChild:
         tick_at = time.monotonic() + _TICK_S
         while True:
             if self._poll.poll(max(0.0, tick_at - time.monotonic()) * 1e3):
-                received = os.read(self._stdout.fileno(), _PIECE)
+                received = os.read(self._process.stdout, _PIECE)
                 if not received:
                     return
                 try:
@@ -261,9 +261,8 @@ class SupervisedChild:
         self._look_at_cpu()  # until it is waited for, the system remembers
         if self._nonsense:
             return self._nonsense
-        try:
-            code = self._process.wait(timeout=_TRACE_WAIT_S)
-        except subprocess.TimeoutExpired:
+        code = self._process.wait(_TRACE_WAIT_S)
+        if code is None:
             return "its process closed its pipe"
         if code >= 0:
             return f"its process ended with exit code {code}"
@@ -277,6 +276,7 @@ class SupervisedChild:
         """Have the child write where it is; faulthandler does that also while a building holds the interpreter."""
         before = os.fstat(self._stderr.fileno()).st_size
         deadline = time.monotonic() + _TRACE_WAIT_S
+        assert self._process.pid is not None
         os.kill(self._process.pid, signal.SIGUSR1)
         while time.monotonic() < deadline:
             if os.fstat(self._stderr.fileno()).st_size > before and not self._poll.poll(_TICK_S * 1e3):
@@ -307,38 +307,3 @@ def _system_kills() -> int:
     except OSError:
         return 0
     return int(counts.get("oom_kill", 0))
-
-
-def _spawn(command: Sequence[str], stderr: int) -> subprocess.Popen[bytes]:
-    """Start the process, with the package that runs here before all others that may have its name."""
-    root = str(Path(__file__).resolve().parents[2])
-    paths = [root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    return subprocess.Popen(  # noqa: S603 - our own module
-        command,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=stderr,
-        bufsize=0,
-        start_new_session=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-    )
-
-
-def _new_starter() -> ThreadPoolExecutor:
-    """One thread that lives as long as this process.
-
-    Linux ends a child with the *thread* that started it, and threads of a worker's pool may end any time.
-    """
-    return ThreadPoolExecutor(max_workers=1, thread_name_prefix="child-starter")
-
-
-_STARTER = _new_starter()
-
-
-def _after_fork() -> None:
-    """A forked copy of this process has no starter thread."""
-    global _STARTER  # noqa: PLW0603 - threads do not survive a fork
-    _STARTER = _new_starter()
-
-
-os.register_at_fork(after_in_child=_after_fork)

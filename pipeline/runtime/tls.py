@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import socket
-import ssl
 from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -90,6 +89,8 @@ def _unreadable(path: str) -> str:
 
 def _unusable(files: TlsFiles) -> list[str]:
     """What is wrong with files that can be read."""
+    import ssl  # most runs speak no TLS
+
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     key = files.key or files.cert
     faults = []
@@ -183,6 +184,8 @@ def why_not(address: str, tls: TlsFiles | None) -> str:
     tls : TlsFiles or None
         The files with which it was tried.
     """
+    import ssl  # as above
+
     parts = urlsplit(address if "://" in address else f"tcp://{address}")
     try:
         host, port = parts.hostname, parts.port

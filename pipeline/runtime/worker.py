@@ -23,6 +23,7 @@ from pipeline.errors import ClusterError, SettingsError
 from pipeline.runtime import logs, worker_setup
 from pipeline.runtime.needs import RESOURCE
 from pipeline.runtime.tls import TlsFiles, check_address, why_not
+from pipeline.runtime.worker_forking import forked_workers
 
 _POLL_S = 0.1
 _HAND_OVER_S = 30.0
@@ -125,7 +126,7 @@ def serve_worker(options: WorkerOptions, say: Callable[[str], None]) -> None:
         "distributed.worker.daemon": True,
         **worker_setup.LEAN_LOOP,
     }
-    with dask.config.set(quiet):
+    with dask.config.set(quiet), forked_workers() as forked, dask.config.set(forked):
         if options.log_json:
             logs.configure(as_json=True, also=("distributed",))
         asyncio.run(_serve(options, say))

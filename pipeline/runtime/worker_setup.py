@@ -6,14 +6,18 @@ The stages are imported here, and so while the client still plans, not when the 
 from __future__ import annotations
 
 import importlib
+import multiprocessing.util
 import os
 import signal
 
 from pipeline.runtime import logs
+from pipeline.runtime.children import close_children
 from pipeline.runtime.start_up import start_own_process
 
-STAGES = tuple(f"pipeline.runtime.{name}" for name in ("ingest", "split", "modelling", "publish"))
+STAGES = (*(f"pipeline.runtime.{name}" for name in ("ingest", "split", "modelling", "publish")), "pipeline.reconstruct")
 """The modules of all tasks."""
+NAME = "gablework-work"
+"""Name of a worker's process that was forked, as `ps` and `top` show it."""
 LOG = "GABLEWORK_WORKER_LOG"
 """How `gablework worker` tells its worker to log: plain or json. Embedded workers log nothing unless asked for JSON."""
 METRICS_PORT, METRICS_HOST = "GABLEWORK_WORKER_METRICS_PORT", "GABLEWORK_WORKER_METRICS_HOST"
@@ -40,6 +44,8 @@ def dask_setup(worker: object) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         # a function, not SIG_IGN, which programs that a task starts would inherit
         signal.signal(number, _left_to_the_nanny)
+    # a forked worker ends without `atexit`
+    multiprocessing.util.Finalize(None, close_children, exitpriority=0)
     for name in STAGES:
         importlib.import_module(name)
     if os.environ.get(LOG):

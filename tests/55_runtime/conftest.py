@@ -14,7 +14,6 @@ import pytest
 from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate
 from pipeline.reconstruct import reconstruct_building
-from pipeline.runtime import modelling
 from pipeline.runtime.executors import Measured, SerialExecutor, measure
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.settings import RunSettings
@@ -103,5 +102,5 @@ def candidates(monkeypatch: pytest.MonkeyPatch) -> list[Candidate]:
         seen.append(candidate)
         return reconstruct_building(candidate, method, settings)
 
-    monkeypatch.setattr(modelling, "reconstruct_building", watched)
+    monkeypatch.setattr("pipeline.reconstruct.reconstruct_building", watched)
     return seen

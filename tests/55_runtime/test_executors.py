@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import dask
+import psutil
 import pytest
 from distributed import Client, Status
 
@@ -19,6 +21,7 @@ from pipeline.runtime import worker_setup
 from pipeline.runtime.events import Event, Watch
 from pipeline.runtime.executors import Cluster, Measured, SerialExecutor, executor_for
 from pipeline.runtime.flight import Lookout
+from pipeline.runtime.forking import can_fork
 from pipeline.runtime.measured import measure_packed, packed
 from pipeline.runtime.versions import ENGINE, differences, fingerprint, versions_here, versions_of
 
@@ -64,6 +67,18 @@ def test_workers_do_not_spend_their_time_on_looking_at_themselves(cluster: Clust
         for name, wanted in worker_setup.LEAN_LOOP.items():
             assert set(client.run(dask.config.get, name).values()) == {wanted}
     assert dask.config.get("distributed.worker.profile.enabled")  # this process's own settings are left alone
+
+
+@pytest.mark.skipif(not can_fork(), reason="this system starts workers the long way")
+def test_workers_are_forked_from_one_server_and_their_children_from_what_they_were_born_with(cluster: Cluster) -> None:
+    with Client(cluster.address, set_as_default=False) as client:
+        found = client.run(chores.family, None)
+    assert len(found) == 2
+    (server,) = {parent for parent, _, _ in found.values()}
+    assert server != os.getpid()
+    for _, worker, own_server in found.values():
+        assert psutil.Process(own_server).ppid() == worker
+        assert psutil.Process(own_server).cmdline() == psutil.Process(server).cmdline(), "it was forked"
 
 
 def test_several_runs_share_one_cluster_at_once(cluster: Cluster) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -23,7 +24,7 @@ from faults.asked import environment
 import pipeline.reconstruct
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.model import Candidate, Reason
-from pipeline.runtime import children
+from pipeline.runtime import child, children
 from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
 from pipeline.runtime.messages import Frames, frame
 
@@ -47,8 +48,21 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def child_processes(of: int | None = None) -> list[psutil.Process]:
-    """The children of a process, of this one by default, that run our module."""
-    return [p for p in psutil.Process(of).children() if "pipeline.runtime.child" in " ".join(p.cmdline())]
+    """The living children that work for a process, for this one by default; not the server that they come from."""
+    found = []
+    for process in psutil.Process(of).children(recursive=True):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if process.name() == child.NAME and not ended(process):
+                found.append(process)
+    return found
+
+
+def ended(process: psutil.Process) -> bool:
+    """Whether a process does nothing any more."""
+    try:
+        return bool(process.status() == psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return True
 
 
 def wait_for(condition: Callable[[], Any], what: str) -> Any:
@@ -207,8 +221,8 @@ def test_a_child_killed_from_outside_costs_nothing(orders: Callable[[str], str],
     thread = threading.Thread(target=lambda: found.extend(outcomes(orders, ["1", waits, "2"])))
     thread.start()
     wait_for((tmp_path / "reached").exists, "the item")
-    (child,) = child_processes()
-    child.kill()
+    (victim,) = child_processes()
+    victim.kill()
     wait_for(lambda: len((tmp_path / "reached").read_text()) == 2, "the second trial")
     (tmp_path / "go").touch()
     thread.join(DEADLINE_S)
@@ -217,9 +231,9 @@ def test_a_child_killed_from_outside_costs_nothing(orders: Callable[[str], str],
 
 def test_an_idle_child_that_was_killed_is_replaced(orders: Callable[[str], str]) -> None:
     outcomes(orders, ["1"])
-    (child,) = child_processes()
-    child.kill()
-    child.wait()
+    (victim,) = child_processes()
+    victim.kill()
+    wait_for(lambda: ended(victim), "the end of the child")
     assert outcomes(orders, ["2"]) == ["2"]
 
 
@@ -287,7 +301,7 @@ WORKER = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started us with SIGINT ignored
 sys.path.insert(0, sys.argv[1])
-from pipeline.runtime import children
+from pipeline.runtime import child, children
 from pipeline.runtime.isolation import IsolationLimits, supervise
 children._LOADS = ()
 import orders_of_a_test
@@ -309,18 +323,21 @@ def test_a_child_is_gone_when_its_worker_is_killed(
     told = f"open('{tmp_path}/reached', 'w').close()\n{order}"
     with subprocess.Popen([sys.executable, "-c", WORKER, str(tmp_path), told], stderr=subprocess.DEVNULL) as worker:
         wait_for(lambda: (tmp_path / "reached").exists() or worker.poll() is not None, "the item")
-        (child,) = child_processes(worker.pid)
+        family = psutil.Process(worker.pid).children(recursive=True)
+        (busy,) = child_processes(worker.pid)
+        assert busy in family
         worker.send_signal(sign)
-    wait_for(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE, "the end of the child")
+    for process in family:
+        wait_for(lambda process=process: ended(process), "the end of the child, and of the server that it came from")
 
 
 def test_a_child_outlives_the_thread_that_asked_for_it(orders: Callable[[str], str]) -> None:
     thread = threading.Thread(target=lambda: outcomes(orders, ["1"]))
     thread.start()
     thread.join(DEADLINE_S)
-    (child,) = child_processes()
+    (first,) = child_processes()
     assert outcomes(orders, ["2"]) == ["2"]
-    assert child_processes() == [child]
+    assert child_processes() == [first]
 
 
 # --- with buildings ---------------------------------------------------------------------------------------------------

@@ -18,7 +18,6 @@ from pipeline.io.remote_file import on_this_machine
 from pipeline.io.retries import persistently
 from pipeline.io.urls import filesystem_of
 from pipeline.report.table import run_statistics
-from pipeline.runtime import modelling
 from pipeline.runtime import publish as publishing
 from pipeline.runtime.bundle import read_bundle
 from pipeline.runtime.classify import ClassifyRequest, classify
@@ -214,7 +213,7 @@ def test_bundles_of_poisonous_buildings_go_into_the_bucket(tile, bucket, monkeyp
     def fail(*_args, **_kwargs):
         raise ZeroDivisionError("poison")
 
-    monkeypatch.setattr(modelling, "reconstruct_building", fail)
+    monkeypatch.setattr("pipeline.reconstruct.reconstruct_building", fail)
     summary = run(request(tile, bucket))
     kept = [key for key in storage_at(f"{bucket}/run").keys("quarantine") if key.endswith(".bundle")]
     assert len(kept) == summary.statuses["failed"] > 0

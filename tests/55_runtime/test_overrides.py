@@ -16,7 +16,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import pipeline.runtime.modelling
+import pipeline.reconstruct
 import pipeline.runtime.rerun
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.io import SpatialReference
@@ -428,14 +428,14 @@ def test_a_rerun_models_no_other_building_and_splits_only_the_tiles_around(
     plain: Any, copied: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     modelled = []
-    real = pipeline.runtime.modelling.reconstruct_building
+    real = pipeline.reconstruct.reconstruct_building
 
     def watched(candidate: Any, *rest: Any) -> Any:
         modelled.append(candidate.building_id)
         return real(candidate, *rest)
 
     first = copied()
-    monkeypatch.setattr(pipeline.runtime.modelling, "reconstruct_building", watched)
+    monkeypatch.setattr(pipeline.reconstruct, "reconstruct_building", watched)
     name = max(rows(first.run_dir, "buildings"))
     (tmp_path / "o.toml").write_text(f'[[building]]\nbuilding_id = "{name}"\nmethod = "kmeans"')
     done = again(first.run_dir, overrides=str(tmp_path / "o.toml"))
@@ -562,7 +562,7 @@ def test_the_bundle_of_a_building_that_meets_a_fault_comes_with_the_other_files_
         raise RunCancelledError("called off")
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline.runtime.modelling, "reconstruct_building", faulty)
+        patch.setattr(pipeline.reconstruct, "reconstruct_building", faulty)
         with monkeypatch.context() as late:
             late.setattr("pipeline.runtime.rerun._prepared", called_off)
             with pytest.raises(RunCancelledError):

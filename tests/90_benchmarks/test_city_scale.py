@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks.city_scale import report, stage_rows, stage_table
 from benchmarks.city_tiles import make_city, make_row, square_of
-from benchmarks.process_watch import CHILD, DRIVER, OTHER, WORKER, Seen, Watcher, role_of
+from benchmarks.process_watch import CHILD, DRIVER, FORKING, OTHER, WORKER, Seen, Watcher, role_of
 from benchmarks.traced_run import TracingExecutor
 from pipeline.runtime.events import Watch
 from pipeline.runtime.serial import SerialExecutor
@@ -66,10 +66,12 @@ def test_tiles_that_are_there_are_kept(tmp_path: Path) -> None:
 
 
 def test_processes_are_told_apart_by_what_they_run() -> None:
-    assert role_of(["python", "-m", "pipeline.runtime.child", "12"], {}, 3) == CHILD
-    assert role_of(["python", "-c", "from multiprocessing.spawn import spawn_main"], {}, 3) == WORKER
-    assert role_of(["python", "run.py"], {3: DRIVER}, 3) == DRIVER
-    assert role_of(["resource_tracker"], {}, 3) == OTHER
+    assert role_of("gablework-child", ["python", "-m", "pipeline.runtime.process_server", "12"], {}, 3) == CHILD
+    assert role_of("gablework-work", ["python", "-c", "from multiprocessing.forkserver import main"], {}, 3) == WORKER
+    assert role_of("gablework-fork", ["python", "-c", "from multiprocessing.forkserver import main"], {}, 3) == FORKING
+    assert role_of("python", ["python", "-c", "from multiprocessing.spawn import spawn_main"], {}, 3) == WORKER
+    assert role_of("python", ["python", "run.py"], {3: DRIVER}, 3) == DRIVER
+    assert role_of("python", ["resource_tracker"], {}, 3) == OTHER
 
 
 def test_what_a_process_spends_is_seen_from_outside() -> None:

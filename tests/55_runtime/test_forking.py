@@ -1,0 +1,190 @@
+"""Processes forked from a preloaded server: they have what it loaded, and nothing of it is lost but time."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from pipeline.errors import RunCancelledError, RunError
+from pipeline.runtime import children, process_server
+from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
+
+LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
+DEADLINE_S = 120.0
+
+PROGRAM = """
+import os, threading, time
+LOADED_BY = os.getpid()
+def load():
+    pass
+def load_with_thread():
+    threading.Thread(target=time.sleep, args=(1000,), daemon=True).start()
+def read(path):
+    open(path).read()
+def fail():
+    raise OSError("not loaded")
+def ask(expression):
+    return eval(expression)
+"""
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+
+
+@pytest.fixture(autouse=True)
+def no_children_left() -> Iterator[None]:
+    """Neither children nor servers of other tests, and none afterwards."""
+    children.kill_children()
+    yield
+    children.kill_children()
+    assert [
+        process for process in psutil.Process().children(recursive=True) if process.name().startswith("gable")
+    ] == []
+
+
+@pytest.fixture
+def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """What an expression is in a fresh child, which has loaded a module of the test."""
+    (tmp_path / "loaded_by_a_test.py").write_text(PROGRAM)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    import loaded_by_a_test  # type: ignore[import-not-found]
+
+    def asked(expression: str, loads: str = "loaded_by_a_test:load") -> Any:
+        for child in tuple(children._children._idle):
+            child.begun = 1
+        with children.lent_child(lambda: False, fresh=True, loads=(loads,)) as child:
+            child.begun = 1
+        ((_, found),) = supervise(loaded_by_a_test.ask, [expression], LIMITS, loads=(loads,))
+        return found
+
+    return asked
+
+
+def servers() -> list[psutil.Process]:
+    """The servers of this process that live."""
+    found = [process for process in psutil.Process().children() if process.name() == process_server.NAME]
+    return [process for process in found if process.status() != psutil.STATUS_ZOMBIE]
+
+
+def wait_for(condition: Callable[[], Any], what: str) -> Any:
+    """What the condition gives once it is true."""
+    end = time.monotonic() + DEADLINE_S
+    while not (value := condition()):
+        assert time.monotonic() < end, f"waited in vain for {what}"
+        time.sleep(0.02)
+    return value
+
+
+def test_children_have_what_their_server_loaded(ask: Callable[..., Any]) -> None:
+    loaded_by, first = ask("__import__('loaded_by_a_test').LOADED_BY, os.getpid()")
+    assert [server.pid for server in servers()] == [loaded_by]
+    assert ask("__import__('loaded_by_a_test').LOADED_BY") == loaded_by
+    assert first != loaded_by
+
+
+def test_a_server_is_there_before_anybody_asks_for_a_child(ask: Callable[..., Any]) -> None:
+    children.preload(["loaded_by_a_test"])
+    (server,) = wait_for(servers, "the server")
+    assert ask("__import__('loaded_by_a_test').LOADED_BY") == server.pid
+
+
+def test_what_a_server_cannot_load_is_told_by_the_child(ask: Callable[..., Any]) -> None:
+    children.preload(["loaded_by_a_test:fail"])
+    assert ask("1 + 1") == 2
+    with pytest.raises(RunError, match=r"(?s)3 times in a row.*OSError: not loaded"):
+        ask("1", "loaded_by_a_test:fail")
+
+
+def test_children_have_the_environment_and_the_folder_of_now(
+    ask: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = ask("os.getppid()")
+    monkeypatch.setenv("SOME_WORD", "new")
+    monkeypatch.chdir(tmp_path)
+    children._children._idle[0].end()
+    assert ask("os.environ['SOME_WORD'], os.getcwd(), os.getppid()") == ("new", str(tmp_path), server)
+
+
+def test_a_variable_that_is_read_once_gets_another_server(
+    ask: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = ask("os.getppid()")
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    children._children._idle[0].end()
+    after = ask("os.getppid()")
+    assert after != before
+    wait_for(lambda: [server.pid for server in servers()] == [after], "the end of the server that forks no more")
+
+
+def test_children_begin_with_one_thread_and_their_own_session(ask: Callable[..., Any]) -> None:
+    assert ask("len(os.listdir('/proc/self/task')), os.getsid(0) == os.getpid() == os.getpgid(0)") == (2, True)
+
+
+def test_children_of_a_server_that_is_killed_die_and_the_work_is_done_by_others(
+    ask: Callable[..., Any], tmp_path: Path
+) -> None:
+    mark, go = tmp_path / "mark", tmp_path / "go"
+    order = f"open('{mark}', 'a').write('1') and [time.sleep(0.02) for _ in iter(lambda: os.path.exists('{go}'), True)]"
+    found: list[Any] = []
+    thread = threading.Thread(target=lambda: found.append(ask(order)))
+    thread.start()
+    wait_for(mark.exists, "the item")
+    (server,) = servers()
+    server.kill()
+    wait_for(lambda: len(mark.read_text()) == 2, "the second trial")
+    go.touch()
+    thread.join(DEADLINE_S)
+    assert len(found) == 1
+    assert not isinstance(found[0], Loss)
+    assert [other.pid for other in servers()] != [server.pid]
+
+
+def test_a_service_that_is_told_to_end_keeps_its_server(ask: Callable[..., Any]) -> None:
+    server = ask("os.getppid()")
+    os.kill(server, signal.SIGTERM)
+    children._children._idle[0].end()
+    assert ask("os.getppid()") == server
+
+
+def test_nothing_is_forked_from_a_process_with_threads(
+    ask: Callable[..., Any], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(children._children, "_can_fork", True)  # it is not afterwards
+    with caplog.at_level(logging.WARNING):
+        assert ask("os.getppid()", "loaded_by_a_test:load_with_thread") == os.getpid()
+        children._children._idle[0].end()
+        assert ask("os.getppid()", "loaded_by_a_test:load") == os.getpid()
+    assert "started threads" in caplog.text
+
+
+def test_where_nothing_can_be_forked_children_are_executed(
+    ask: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(children._children, "_can_fork", False)
+    assert ask("os.getppid()") == os.getpid()
+    loss = ask("os.kill(os.getpid(), 11)")
+    assert "signal 11 (SIGSEGV), also alone" in loss.detail
+    assert servers() == []
+
+
+def test_a_child_that_is_called_off_before_its_server_has_loaded_never_begins(
+    ask: Callable[..., Any], tmp_path: Path
+) -> None:
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)  # who opens it waits for somebody who writes
+    with (
+        pytest.raises(RunCancelledError),
+        children.lent_child(lambda: True, fresh=False, loads=(f"loaded_by_a_test:read:{fifo}",)),
+    ):
+        pytest.fail("it is not ready")
+    assert children._children._all == set()
