@@ -88,7 +88,7 @@ service/viewer/dist/index.html: $(VIEWER_SOURCES) hatch_build.py requirements-vi
 # --- the two commands ------------------------------------------------------------------------------------------------
 
 demo: $(VENV)/.warm-demo-stamp
-	@$(BIN)/gablework demo --out $(OUT) --workers 2 --overwrite
+	@$(BIN)/gablework demo --out $(OUT) --overwrite
 
 test: check unit
 

@@ -35,8 +35,9 @@ from benchmarks.city_scale import free_port, wait_for_listener
 from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions
 from pipeline.model import IntArray
+from pipeline.runtime.engine import executor_for
 from pipeline.runtime.events import Watch, ignore
-from pipeline.runtime.executors import Cluster, DaskExecutor, executor_for
+from pipeline.runtime.executors import Cluster, DaskExecutor
 from pipeline.runtime.join import NOWHERE, join
 from pipeline.runtime.kept import result_of
 from pipeline.runtime.open_fragments import BorderFacets

@@ -20,8 +20,9 @@ from pathlib import Path
 
 import psutil
 
-from pipeline.runtime.executors import Cluster, Executor, SerialExecutor
+from pipeline.runtime.executors import Cluster
 from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.serial import Executor, SerialExecutor
 
 STAGES = ("split", "reconstruct", "total")
 COMPARED = ("reconstruct", "total", "cpu")

@@ -33,12 +33,12 @@ import numpy as np
 
 from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions
+from pipeline.runtime.engine import executor_for
 from pipeline.runtime.events import ignore
-from pipeline.runtime.executors import Executor, executor_for
 from pipeline.runtime.plan import Plan, make_plan
 from pipeline.runtime.progress import Progress
 from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.serial import SerialExecutor
+from pipeline.runtime.serial import Executor, SerialExecutor
 from pipeline.runtime.stages import Stages
 from pipeline.settings import RunSettings
 from pipeline.synthetic.dataset import simulate

@@ -38,7 +38,7 @@ def demonstrate(
     out: str | Path,
     on_event: Listener,
     *,
-    workers: int,
+    workers: int | None,
     overwrite: bool,
     size_m: tuple[float, float] | None,
     seed: int | None,
@@ -51,8 +51,8 @@ def demonstrate(
         Folder of everything: `scene/`, `run/`, `report/` and `demo.png`.
     on_event : callable
         Gets the events of all steps.
-    workers : int
-        Processes of the embedded cluster; 0 runs serially.
+    workers : int or None
+        Processes of the embedded cluster; 0 runs serially, None leaves it to the estimate.
     overwrite : bool
         Replace an earlier demo.
     size_m : tuple of float or None

@@ -11,7 +11,8 @@ import numpy as np
 
 from pipeline.io.source import ReadOptions, Source, SourceInfo, open_source
 from pipeline.model import FloatArray
-from pipeline.runtime.plan import make_plan
+from pipeline.runtime.expected import RATES, expected
+from pipeline.runtime.plan import Plan, make_plan
 from pipeline.settings import RunSettings
 
 RAISED_M = 2.5
@@ -22,24 +23,8 @@ LEAST_AREA_M2 = 10.0
 """Smaller groups of raised cells are not counted."""
 MOST_CELLS = 4_000_000
 """Bounds the raster's memory: a larger tile gets coarser cells."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Rates:
-    """What a run with two workers costs on two cores; docs/how_to/plan_a_run.md tells how it was measured."""
-
-    seconds_start: float = 5.0
-    """Start of a run with two workers, kernels compiled."""
-    seconds_per_million_points: float = 4.0
-    """Ingest, split and join."""
-    seconds_per_object: float = 0.06
-    """Reconstruction and publishing of a candidate."""
-    gib_base: float = 0.3
-    """A worker with its libraries and kernels; the largest task of the plan comes on top."""
-
-
-RATES = Rates()
-"""The measured rates."""
+_CORES = 2
+"""For which the time is estimated."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -135,7 +120,7 @@ def inspect(path: str | Path, options: ReadOptions | None, on_progress: Callable
         highest = max(highest, float(cloud.xyz[:, 2].max()))
         on_progress(used, source.info.point_count)
     plan = make_plan([str(path)], options or ReadOptions(), RunSettings())
-    return _told(source, raster, classes, returns, used, (lowest, highest), plan.window_bytes)
+    return _told(source, raster, classes, returns, used, (lowest, highest), plan)
 
 
 def _told(
@@ -145,11 +130,11 @@ def _told(
     returns: np.ndarray[tuple[int], np.dtype[np.int64]],
     used: int,
     elevation_m: tuple[float, float],
-    window_bytes: int,
+    plan: Plan,
 ) -> Inspection:
     objects = raster.raised_objects()
     area = raster.occupied_area_m2()
-    millions = used / 1e6
+    work = expected(plan, objects)
     return Inspection(
         info=source.info,
         warnings=source.warnings,
@@ -162,10 +147,8 @@ def _told(
         density_per_m2=used / area if area > 0.0 else math.nan,
         raised_objects=objects,
         cell_m=raster.cell_m,
-        estimated_seconds=RATES.seconds_start
-        + RATES.seconds_per_million_points * millions
-        + RATES.seconds_per_object * objects,
-        estimated_gib=RATES.gib_base + window_bytes / 2**30,
+        estimated_seconds=RATES.start_s + sum(work.wall_s(_CORES).values()),
+        estimated_gib=RATES.process_gib + plan.window_bytes / 2**30,
     )
 
 

@@ -36,7 +36,8 @@ def parameter(
     unit : str
         Unit of a number, empty where it has none.
     minimum, maximum : float, optional
-        Inclusive bounds of a number, or of each number of a tuple.
+        Inclusive bounds of a number, or of each number of a tuple; of a whole number that may stand in the place of a
+        text.
     choices : tuple of str, optional
         The valid words of a string.
     changes_geometry : bool
@@ -78,6 +79,11 @@ def _fault(name: str, value: Any, field: dataclasses.Field[Any]) -> str | None:
             low_text = "any" if low is None else f"{low:g}"
             high_text = "any" if high is None else f"{high:g}"
             return f"{name} is {value:g}: use {low_text} to {high_text} {unit}".rstrip()
+    if isinstance(default, str) and meta["minimum"] is not None:
+        low, high = meta["minimum"], meta["maximum"]
+        if value == default or (type(value) is int and low <= value <= high):
+            return None
+        return f"{name} is {value!r}: use {default!r} or a whole number from {low:g} to {high:g}"
     if isinstance(default, str) and not isinstance(value, str):
         return f"{name} is {value!r}: use a text in quotes"
     return None

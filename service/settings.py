@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 from pathlib import Path
+from typing import Annotated, Literal
 
 import platformdirs
 from pydantic import Field
@@ -75,7 +76,9 @@ class ServiceSettings(BaseSettings):
     )
     tls_cert: str | None = Field(default=None, description="The driver's own certificate for the cluster, PEM.")
     tls_key: str | None = Field(default=None, description="Its key, PEM, where it is not in the same file.")
-    workers: int = Field(default=2, ge=1, description="Processes of the embedded cluster.")
+    workers: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
+        default="auto", description="Processes of the embedded cluster; auto takes one a core."
+    )
     driver_jobs: int = Field(default=2, ge=1, description="Jobs that one driver runs at once.")
     lease_s: float = Field(
         default=30.0,

@@ -9,8 +9,6 @@ footprints = "footprints.gpkg"
 method = "arrangement"
 [output]
 path = "models"
-[cluster]
-workers = 2
 ```
 
 Paths are relative to the file's folder. All faults are told at once.
@@ -73,8 +71,11 @@ class WorkTable(Parameters):
 class ClusterTable(Parameters):
     """`[cluster]`: who does it."""
 
-    workers: int = parameter(
-        2, "Processes of the embedded cluster; 0 runs serially in the driver.", minimum=0, maximum=1024
+    workers: int | str = parameter(
+        "auto",
+        "Processes of the embedded cluster; 0 runs serially in the driver, auto starts a cluster for large runs only.",
+        minimum=0,
+        maximum=1024,
     )
     scheduler: str = parameter("", "A Dask scheduler to use in place of the embedded cluster; without workers.")
     tls_ca: str = parameter("", "Certificate of the CA of all the cluster's processes, PEM; with tls_cert.")
@@ -176,6 +177,11 @@ class Batch:
         """The run directory."""
         return self.whole(self.output.path)
 
+    @property
+    def workers(self) -> int | None:
+        """Processes of the embedded cluster; None leaves it to the estimate."""
+        return self.cluster.workers if isinstance(self.cluster.workers, int) else None
+
     def request(self) -> RunRequest:
         """What the engine is asked to do."""
         from pipeline.runtime.run import RunRequest  # with all that a run needs, and a status does not
@@ -193,7 +199,7 @@ class Batch:
             vertical_unit=self.inputs.vertical_unit or None,
             bbox=self.bbox,
             aoi=given(self.inputs.aoi),
-            workers=self.cluster.workers,
+            workers=self.workers,
             scheduler=self.cluster.scheduler or None,
             meshes=self.output.meshes,
             licence=self.inputs.licence or None,
@@ -202,7 +208,7 @@ class Batch:
             performance_report=given(self.cluster.performance_report),
             overwrite=self.output.overwrite,
             work=self.work_folder,
-            isolate=self.cluster.isolate and bool(self.cluster.workers or self.cluster.scheduler),
+            isolate=self.cluster.isolate and (self.workers != 0 or bool(self.cluster.scheduler)),
             building_timeout_s=self.cluster.building_timeout_s,
             building_memory_bytes=round(self.cluster.building_memory_gib * 2**30),
         )

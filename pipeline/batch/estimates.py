@@ -1,8 +1,8 @@
 """What a batch run will take: tiles, points, memory, time, disk, told before anything runs; and what cannot work.
 
 Points and areas come from the headers of all inputs. How many buildings to expect is told by a few inputs that are
-read in whole. Times are the measured rates below, for the points that a tile sees with its halo; the true ones depend
-on machine and scene, so they are told as a range.
+read in whole. Times are those of `pipeline.runtime.expected`; the true ones depend on machine and scene, so they are
+told as a range.
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ from pipeline.batch.batch_file import Batch
 from pipeline.batch.eta import duration
 from pipeline.batch.wording import as_keys, said_in_keys
 from pipeline.errors import EmptyInputError, InputError, RunError
-from pipeline.inspection import RATES, inspect
+from pipeline.inspection import inspect
 from pipeline.io import shown
 from pipeline.runtime.compiled_kernels import kernels_are_compiled
+from pipeline.runtime.engine import engine_of
 from pipeline.runtime.events import ignore
 from pipeline.runtime.executors import memory_of_workers
+from pipeline.runtime.expected import RATES, expected
+from pipeline.runtime.machine import cores, memory_bytes
 from pipeline.runtime.performance import PerformanceReport
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.progress import Progress
@@ -30,29 +33,8 @@ from pipeline.runtime.run import check_out, plan_inputs
 from pipeline.runtime.scratch import POINT
 from pipeline.runtime.stages import given_footprints
 from pipeline.runtime.work_folder import refuse_foreign
-from pipeline.tiling import MM, Tile, Window
+from pipeline.tiling import MM
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CpuRates:
-    """CPU seconds, measured serially on a simulated suburb of 324 thousand points and on Delft, kernels compiled."""
-
-    ingest_per_million: float = 1.2
-    """A million points."""
-    split_per_million: float = 1.5
-    """A million points of windows, halos and all."""
-    join_per_million: float = 0.3
-    """A million points; the driver's own, not shared among workers."""
-    reconstruct_each: float = 0.015
-    """A building."""
-    publish_each: float = 0.003
-    """A building."""
-    compiling: float = 120.0
-    """Wall seconds of the first run on two cores whose processes all compile the kernels, over those of the next."""
-
-
-CPU = CpuRates()
-"""The measured rates."""
 _RANGE = 2.0
 """Machines and scenes differ by about so much either way."""
 _RESULT_BYTES = 12_000
@@ -82,7 +64,7 @@ class Estimate:
     buildings_from: str
     """How that was found."""
     workers: int
-    """Of the embedded cluster, or those that the scheduler has now."""
+    """Processes that work at once on this machine, or those that the scheduler has now."""
     worker_bytes: int
     """Peak of a worker."""
     worker_limit_bytes: int | None
@@ -132,9 +114,9 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     request = batch.request()
     progress = Progress(ignore)
     plan, paths = plan_inputs(request, batch.settings, progress)
-    tiles, points_in = _wanted(plan)
-    points = sum(points_in.values())
-    if not tiles:
+    work = expected(plan)
+    points = work.points
+    if not work.tiles:
         raise EmptyInputError(
             shown(paths[0]), f"all {len(paths)} inputs lie off --bbox and --aoi", "Check them, and their CRS"
         )
@@ -143,23 +125,27 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     elif known[0] and known[1] == points:
         buildings, told = known[0], "as many as in the run before"
     else:
-        buildings, told = _objects(plan, points, [path for path in paths if shown(path) in points_in], read)
-    workers, limit = memory_of_workers(workers=request.workers, scheduler=request.scheduler, tls=request.tls)
-    hands = max(1, min(workers, os.cpu_count() or 1) if request.scheduler is None else workers)
+        buildings, told = _objects(plan, points, [path for path in paths if shown(path) in work.points_by_file], read)
+    work = dataclasses.replace(work, buildings=buildings)
+    engine, processes = engine_of(
+        workers=request.workers,
+        scheduler=request.scheduler,
+        expected_cpu_s=sum(work.cpu_s().values()),
+        at=cores(),
+        performance_report=request.performance_report is not None,
+    )
+    limit: int | None = memory_bytes()
+    workers = processes
+    if engine != "local":
+        embedded = processes if engine == "cluster" else 0
+        workers, limit = memory_of_workers(workers=embedded, scheduler=request.scheduler, tls=request.tls)
+    hands = workers if request.scheduler is not None else min(workers, cores())
     side = plan.grid.size_mm / MM
-    seen = ((side + 2.0 * plan.grid.halo_mm / MM) / side) ** 2
-    millions = points / 1e6
-    stages = {
-        "ingest": millions * CPU.ingest_per_million / min(hands, len(paths)),
-        "split": millions * seen * CPU.split_per_million / min(hands, max(1, len(tiles))),
-        "join": millions * CPU.join_per_million,
-        "reconstruct": buildings * CPU.reconstruct_each / hands,
-        "publish": buildings * CPU.publish_each / min(hands, max(1, len(tiles))),
-    }
-    total = RATES.seconds_start + sum(stages.values())
+    stages = work.wall_s(hands)
+    total = RATES.start_s + sum(stages.values()) + (RATES.cluster_start_s if engine == "cluster" else 0.0)
     work_bytes = int(
         points * POINT.itemsize * (1.0 + _SPLIT_SHARE)
-        + len(tiles) * side * side * _TERRAIN_BYTES
+        + work.tiles * side * side * _TERRAIN_BYTES
         + buildings * _KEPT_BYTES
     )
     out_bytes = buildings * _RESULT_BYTES
@@ -174,12 +160,12 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
         warnings.append(f"the scheduler {request.scheduler} has no worker now: the run would wait for one")
     cold_s = 0.0
     if request.scheduler is None and not kernels_are_compiled():
-        cold_s = CPU.compiling
+        cold_s = RATES.compiling_s
         warnings.append(
             "numba kernels are not compiled on this machine yet: this run compiles them, which may take "
             f"{duration(cold_s)} on top; gablework warm-up does it ahead"
         )
-    worker_bytes = int(RATES.gib_base * 2**30) + plan.window_bytes
+    worker_bytes = int(RATES.process_gib * 2**30) + plan.window_bytes
     if limit is not None and plan.window_bytes <= limit < worker_bytes:
         warnings.append(
             f"a worker may need up to {worker_bytes / 2**30:.1f} GiB, its limit is {limit / 2**30:.1f}: if workers are "
@@ -188,7 +174,7 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     return Estimate(
         files=len(paths),
         points=points,
-        tiles=len(tiles),
+        tiles=work.tiles,
         tile_size_m=side,
         buildings=buildings,
         buildings_from=told,
@@ -204,27 +190,6 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
         warnings=tuple(as_keys(text) for text in warnings),
         refusals=tuple(refusals),
     )
-
-
-def _wanted(plan: Plan) -> tuple[set[Tile], dict[str, int]]:
-    """Tiles that the inputs' bounds meet within the window that is wanted, and points there by input, spread evenly."""
-    found: set[Tile] = set()
-    points: dict[str, int] = {}
-    for info in plan.sources:
-        x_min, y_min, _, x_max, y_max, _ = info.bounds_m
-        left, bottom, right, top = x_min, y_min, x_max, y_max
-        if plan.options.window is not None:
-            unit = info.reference.horizontal_unit_m
-            window = plan.options.window
-            left, bottom = max(left, window.x_min * unit), max(bottom, window.y_min * unit)
-            right, top = min(right, window.x_max * unit), min(top, window.y_max * unit)
-        if left > right or bottom > top:
-            continue
-        whole = (x_max - x_min) * (y_max - y_min)
-        points[info.path] = round(info.point_count * ((right - left) * (top - bottom) / whole if whole > 0.0 else 1.0))
-        x0, y0, x1, y1 = (round(value * MM) for value in (left, bottom, right, top))
-        found.update(plan.grid.tiles_over(Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1)))
-    return found, points
 
 
 def _objects(plan: Plan, wanted: int, paths: Sequence[str], read: int) -> tuple[int, str]:

@@ -14,9 +14,9 @@ from pipeline.batch.wording import as_keys, said_in_keys
 from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.report.run_page import write_run_page
 from pipeline.runtime.events import Event, Listener, ignore, never
-from pipeline.runtime.executors import Executor
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.run_metrics import RunMetrics, both, serve_metrics
+from pipeline.runtime.serial import Executor
 from pipeline.runtime.work_folder import DRIVER_LOCK, held_lock, make_work, refuse_held
 
 _READ = 1

@@ -22,6 +22,7 @@ from pipeline.cli.options import (
     Workers,
 )
 from pipeline.console import Console
+from pipeline.runtime.early import start_early
 
 if TYPE_CHECKING:
     from pipeline.runtime.classify import ClassifySummary
@@ -44,7 +45,7 @@ def classify(
     vertical_unit: VerticalUnit = None,
     classes: Classes = None,
     settings: SettingsFile = None,
-    workers: Workers = 2,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     tls_ca: TlsCa = None,
     tls_cert: TlsCert = None,
@@ -59,6 +60,8 @@ def classify(
         from pipeline.runtime.classify import classify as classify_files
         from pipeline.runtime.tls import given_tls
         from pipeline.settings import RunSettings
+
+        start_early("classify", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None)
 
         request = ClassifyRequest(
             inputs=tuple(tiles),

@@ -39,6 +39,7 @@ from pipeline.cli.options import (
     Workers,
 )
 from pipeline.console import Console, ExitCode
+from pipeline.runtime.early import start_early
 
 if TYPE_CHECKING:
     from pipeline.runtime.run import RunSummary
@@ -70,7 +71,7 @@ def reconstruct(
     aoi: Aoi = None,
     classes: Classes = None,
     settings: SettingsFile = None,
-    workers: Workers = 2,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     tls_ca: TlsCa = None,
     tls_cert: TlsCert = None,
@@ -90,6 +91,10 @@ def reconstruct(
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.run import RunRequest, run
         from pipeline.runtime.tls import given_tls
+
+        start_early(
+            "reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=method
+        )
 
         request = RunRequest(
             inputs=tuple(tiles),
@@ -130,7 +135,7 @@ def rerun(
         list[str] | None,
         typer.Option(metavar="ID", help="A building to model again in any case; several by several --only."),
     ] = None,
-    workers: Workers = 2,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     tls_ca: TlsCa = None,
     tls_cert: TlsCert = None,
@@ -147,6 +152,8 @@ def rerun(
         from pipeline.runtime.rerun import RerunRequest
         from pipeline.runtime.rerun import rerun as rerun_buildings
         from pipeline.runtime.tls import given_tls
+
+        start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=False, method=None)
 
         serial = workers == 0 and scheduler is None
         limits = IsolationLimits(timeout_s=building_timeout, memory_bytes=round(building_memory * 2**30))
@@ -186,7 +193,7 @@ def compare(
     truth: Truth = None,
     points: Points = None,
     as_surveyed: AsSurveyed = False,
-    workers: Workers = 2,
+    workers: Workers = None,
     scheduler: Scheduler = None,
     tls_ca: TlsCa = None,
     tls_cert: TlsCert = None,
@@ -210,6 +217,8 @@ def compare(
         from pipeline.runtime.run import RunRequest
         from pipeline.runtime.tls import given_tls
         from pipeline.settings import RunSettings, read_table
+
+        start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None)
 
         table = read_table(settings)
         tables = own_tables(table)

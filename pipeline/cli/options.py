@@ -14,8 +14,33 @@ Crs = Annotated[
 VerticalUnit = Annotated[
     str | None, typer.Option(metavar="UNIT", help="Unit of elevations: m, ft or us-ft; default as the header says.")
 ]
+_MOST_WORKERS = 1024
+
+
+def worker_count(text: str) -> int | None:
+    """How many workers an option asks for; None for `auto`.
+
+    Raises
+    ------
+    BadParameter
+        It is neither `auto` nor a number of processes.
+    """
+    if text == "auto":
+        return None
+    if text.isdecimal() and int(text) <= _MOST_WORKERS:
+        return int(text)
+    raise typer.BadParameter(f"{text!r}: use auto, or a whole number from 0 to {_MOST_WORKERS}")
+
+
 Workers = Annotated[
-    int, typer.Option(min=0, help="Processes of the embedded cluster; 0 runs serially in this process.")
+    int | None,
+    typer.Option(
+        metavar="N",
+        parser=worker_count,
+        show_default="auto",
+        help="Processes of the embedded cluster; 0 runs serially in this process, auto starts a cluster for large "
+        "jobs only.",
+    ),
 ]
 Method = Annotated[
     str | None,

@@ -77,7 +77,7 @@ def demo(
         tuple[float, float] | None, typer.Option(metavar="EAST NORTH", help="Extent of the suburb in metres.")
     ] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Of the suburb; default its own.")] = None,
-    workers: Workers = 2,
+    workers: Workers = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
     quiet: Quiet = False,

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.dataset as pads
 import pyarrow.fs as pafs
 import pyarrow.parquet as pq
 import shapely
@@ -21,6 +20,9 @@ import shapely
 from pipeline.errors import RunError
 from pipeline.export.records import KEYS, SCHEMAS
 from pipeline.export.solid_geometry import SOLIDS
+
+if TYPE_CHECKING:
+    import pyarrow.dataset as pads
 
 VERSION = "1.1.0"
 """Version of GeoParquet."""
@@ -137,6 +139,40 @@ def parquet_bytes(table: pa.Table) -> bytes:
     return data
 
 
+def table_files(
+    run_dir: str, table_name: str, filesystem: pafs.FileSystem, tiles: Sequence[str] | None = None
+) -> list[str]:
+    """The files of one table of a run, sorted; the arguments are those of `table_dataset`.
+
+    Raises
+    ------
+    RunError
+        Where the folder does not exist.
+    """
+    folder = f"{str(run_dir).rstrip('/')}/{table_name}"
+    if tiles is not None:
+        return [f"{folder}/tile={tile}/part-0.parquet" for tile in tiles]
+    if filesystem.get_file_info(folder).type != pafs.FileType.Directory:
+        raise RunError(f"{folder} is no folder: give the directory that a run wrote")
+    found = [
+        info.path
+        for info in filesystem.get_file_info(pafs.FileSelector(folder, recursive=True))
+        if info.type == pafs.FileType.File
+    ]
+    # as Arrow's own search: what is being written has a name that begins with a dot
+    return sorted(path for path in found if not any(part[0] in "._" for part in path[len(folder) + 1 :].split("/")))
+
+
+def files_dataset(files: Sequence[str], schema: pa.Schema, filesystem: pafs.FileSystem) -> pads.Dataset:
+    """Parquet files as one dataset of a schema, `tile` as a text column from the folders' names."""
+    import pyarrow.dataset as pads
+
+    if not files:
+        return pads.dataset(schema.empty_table())
+    partitioning = pads.partitioning(pa.schema([("tile", pa.string())]), flavor="hive")
+    return pads.dataset(files, schema=schema, filesystem=filesystem, format="parquet", partitioning=partitioning)
+
+
 def table_dataset(
     run_dir: str,
     table_name: str,
@@ -162,15 +198,8 @@ def table_dataset(
         Where the folder does not exist.
     """
     filesystem = filesystem or pafs.LocalFileSystem()
-    folder = f"{str(run_dir).rstrip('/')}/{table_name}"
-    if tiles is None and filesystem.get_file_info(folder).type != pafs.FileType.Directory:
-        raise RunError(f"{folder} is no folder: give the directory that a run wrote")
-    partitioning = pads.partitioning(pa.schema([("tile", pa.string())]), flavor="hive")
     schema = stored_schema(table_name).append(pa.field("tile", pa.string()))
-    if tiles is not None and not tiles:
-        return pads.dataset(schema.empty_table())
-    files = folder if tiles is None else [f"{folder}/tile={tile}/part-0.parquet" for tile in tiles]
-    return pads.dataset(files, schema=schema, filesystem=filesystem, format="parquet", partitioning=partitioning)
+    return files_dataset(table_files(run_dir, table_name, filesystem, tiles), schema, filesystem)
 
 
 def read_table(run_dir: str, table_name: str, filesystem: pafs.FileSystem | None = None) -> pa.Table:

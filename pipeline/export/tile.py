@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
-import secrets
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.glb import glb_bytes
 from pipeline.export.mesh_kinds import MESHES
 from pipeline.export.obj import obj_text
-from pipeline.export.records import RecordContext, RejectedObject, building_row, plane_rows, rejected_row
+from pipeline.export.putting import Put, put_local
+from pipeline.export.records import building_row, plane_rows, rejected_row
 from pipeline.export.solid_geometry import lod_suffix, model_at
 from pipeline.model import BuildingResult
-
-Put = Callable[[str, bytes], None]
-"""Stores bytes under a path relative to the run directory, atomically: readers see the old file or the new one."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,24 +32,6 @@ class TileFiles:
     """Rows of the planes table."""
     n_rejected: int
     """Rows of the rejected table."""
-
-
-def put_local(run_dir: str | Path) -> Put:
-    """An atomic put into a local run directory: a temporary name that readers skip, then a rename."""
-    root = Path(run_dir)
-
-    def put(path: str, data: bytes) -> None:
-        target = root / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}.part")
-        try:
-            temporary.write_bytes(data)
-            temporary.replace(target)
-        except OSError as error:
-            temporary.unlink(missing_ok=True)
-            raise RunError(f"{target} cannot be written: {error}. Free space, or give another --out") from error
-
-    return put
 
 
 def mesh_path(tile_key: str, building_id: str, meshes: str, lod: str | None = None) -> str | None:

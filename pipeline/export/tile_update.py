@@ -18,17 +18,10 @@ import pyarrow.parquet as pq
 
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.geoparquet import geo_table, parquet_bytes
 from pipeline.export.obj import obj_text
-from pipeline.export.records import (
-    KEYS,
-    SCHEMAS,
-    RecordContext,
-    RejectedObject,
-    building_row,
-    plane_rows,
-    rejected_row,
-)
+from pipeline.export.records import KEYS, SCHEMAS, building_row, plane_rows, rejected_row
 from pipeline.export.tile import mesh_files, mesh_path
 from pipeline.model import BuildingResult
 

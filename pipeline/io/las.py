@@ -254,15 +254,13 @@ class LasFile:
         with self._path.open("rb") as stream:
             if self._chunks is None:
                 last = max(self._block.point_count - SAMPLE_SIZE, 0)
-                for start in np.unique(np.linspace(0, last, SAMPLE_PLACES).astype(np.int64)).tolist():
+                for start in _places(last):
                     stream.seek(self._block.offset_to_points + start * self._block.point_size)
                     count = min(SAMPLE_SIZE, self._block.point_count - start)
                     pieces.append(self._decode(stream, count, start))
             else:
                 filled = np.flatnonzero(self._chunks.counts)
-                for chunk in filled[
-                    np.unique(np.linspace(0, len(filled) - 1, SAMPLE_PLACES).astype(np.int64))
-                ].tolist():
+                for chunk in filled[_places(len(filled) - 1)].tolist():
                     count = min(SAMPLE_SIZE, int(self._chunks.counts[chunk]))
                     offset, size = int(self._chunks.offsets[chunk]), int(self._chunks.sizes[chunk])
                     pieces.append(self._decode_chunk(stream, offset, size, count))
@@ -317,6 +315,11 @@ class LasFile:
                 lows, highs = np.minimum(lows, piece.xyz.min(axis=0)), np.maximum(highs, piece.xyz.max(axis=0))
         x_min, y_min, z_min, x_max, y_max, z_max = (float(value) for value in (*lows, *highs))
         return x_min, y_min, z_min, x_max, y_max, z_max
+
+
+def _places(last: int) -> list[int]:
+    """Some numbers spread from 0 to the last one, each once; `np.unique` would load masked arrays first."""
+    return sorted(set(np.linspace(0, last, SAMPLE_PLACES).astype(np.int64).tolist()))
 
 
 def read_exactly(stream: io.BufferedReader, into: npt.NDArray[np.uint8]) -> None:

@@ -18,7 +18,7 @@ from pipeline.io import LocalStorage, ReadOptions, find_inputs
 from pipeline.report.comparison import ComparedRun, PointFiles, write_comparison
 from pipeline.runtime.compare import SUMMARY, CompareRequest, CompareSummary, compare, settings_of
 from pipeline.runtime.events import Event, Listener, ignore, never
-from pipeline.runtime.executors import Executor
+from pipeline.runtime.serial import Executor
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from pipeline.errors import RunError
 from pipeline.runtime.executed import Executed
-from pipeline.runtime.forking import ProcessServer, can_fork, executed_server, forked_server
+from pipeline.runtime.forking import ProcessServer, can_fork, executed_server, forked_server, has_one_thread
 from pipeline.runtime.logs import LOG
 from pipeline.runtime.measured import charge
 from pipeline.runtime.supervised import SupervisedChild
@@ -154,7 +154,8 @@ class _Children:
             self._retire()
         self._retired = [server for server in self._retired if server.alive]
         if self._server is None and self._can_fork:
-            self._server = ProcessServer(functools.partial(executed_server, loads))
+            start = forked_server if has_one_thread() else executed_server
+            self._server = ProcessServer(functools.partial(start, loads))
         return self._server
 
     def _retire(self) -> None:
@@ -211,7 +212,7 @@ def preload(loads: Sequence[str]) -> None:
 
 def fork_server() -> None:
     """Have this process forked to be the server of its children, with all that it has loaded; it has one thread."""
-    _children.take(ProcessServer(forked_server))
+    _children.take(ProcessServer(functools.partial(forked_server, ())))
 
 
 def kill_children() -> None:

@@ -19,12 +19,14 @@ from pipeline.runtime.classified_files import (
     output_name,
     write_classified,
 )
+from pipeline.runtime.engine import executor_for
 from pipeline.runtime.events import Listener, Watch, ignore, never
-from pipeline.runtime.executors import Executor, executor_for, peak_of_process
+from pipeline.runtime.expected import expected
 from pipeline.runtime.held_folder import held_folder, remove_abandoned
 from pipeline.runtime.ingest import Ingested, part_of
 from pipeline.runtime.join import Joined, PointRange
 from pipeline.runtime.labelling import LabelTask, label, neighbourhood
+from pipeline.runtime.measured import peak_of_process
 from pipeline.runtime.plan import check_memory
 from pipeline.runtime.progress import Progress
 from pipeline.runtime.rasters import (
@@ -38,6 +40,7 @@ from pipeline.runtime.rasters import (
 )
 from pipeline.runtime.run import RunRequest, calling_off, plan_inputs
 from pipeline.runtime.scratch import Scratch
+from pipeline.runtime.serial import Executor
 from pipeline.runtime.stages import Stages, classes_in_use, given_footprints
 from pipeline.runtime.tls import TlsFiles
 from pipeline.settings import RunSettings
@@ -66,8 +69,8 @@ class ClassifyRequest:
     """Write terrain, surface and height too."""
     raster_cell: float | None = None
     """Side of their cells in units of the CRS; None for half a metre."""
-    workers: int = 2
-    """Processes of the embedded cluster; 0 runs serially in this process."""
+    workers: int | None = None
+    """Processes of the embedded cluster; 0 runs serially in this process, None leaves it to the estimate."""
     scheduler: str | None = None
     """Address of a Dask scheduler that takes the place of the embedded cluster."""
     tls: TlsFiles | None = None
@@ -173,6 +176,7 @@ def classify(
             workers=request.workers,
             scheduler=request.scheduler,
             local_directory=str(scratch_dir / "dask"),
+            work=expected(plan, 0),
             tls=request.tls,
         )
         with calling_off(scratch, cancelled) as called_off, engine:

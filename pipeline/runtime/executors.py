@@ -1,4 +1,4 @@
-"""Where tasks run: serially in this process, or on Dask.
+"""Tasks on Dask: an embedded cluster, or one elsewhere.
 
 A plan is data and tasks are plain functions of one argument; an executor maps a function over tasks
 and yields results as they come, in any order. Nothing else of the engine shows.
@@ -15,29 +15,17 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
-from pipeline.errors import ClusterError, SettingsError, VersionMismatchError
+from pipeline.errors import ClusterError, VersionMismatchError
 from pipeline.runtime import worker_setup
 from pipeline.runtime.events import Watch
 from pipeline.runtime.flight import SETTLE_INTERRUPTED_S, SETTLE_S, TICK_S, Flight, Lookout
-from pipeline.runtime.measured import Measured, Result, Task, measure, mismatch_told, peak_of_process
+from pipeline.runtime.measured import Measured, Result, Task, mismatch_told
 from pipeline.runtime.needs import RESOURCE
 from pipeline.runtime.performance import PerformanceReport
 from pipeline.runtime.priorities import Traffic, priority_of
-from pipeline.runtime.serial import Executor, SerialExecutor
 from pipeline.runtime.tls import TlsFiles, check_address, given_tls, why_not
 from pipeline.runtime.versions import ENGINE, TALKING, WORKING, differences
 from pipeline.runtime.worker_forking import forked_workers
-
-__all__ = [
-    "Cluster",
-    "DaskExecutor",
-    "Executor",
-    "Measured",
-    "SerialExecutor",
-    "executor_for",
-    "measure",
-    "peak_of_process",
-]
 
 CONNECT_S = 20.0
 """A scheduler that does not answer within so long is not there."""
@@ -384,6 +372,10 @@ class DaskExecutor:
             self._report.add(stage, measured)
             yield measured
 
+    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
+        """The step's result, worked out here: what a driver holds of a city should not travel."""
+        return function(task)
+
     def _started(self) -> Lookout:
         if self._lookout is None:
             raise ClusterError("the executor is not connected: use it as a context manager")
@@ -457,37 +449,3 @@ def _share_bytes(workers: int) -> int:
     from distributed.system import MEMORY_LIMIT
 
     return int(MEMORY_LIMIT / max(1, workers))
-
-
-def executor_for(
-    *,
-    workers: int,
-    scheduler: str | None,
-    local_directory: str,
-    priority: int = 0,
-    traffic: Traffic = "interactive",
-    tls: TlsFiles | None = None,
-    performance_report: str | None = None,
-) -> Executor:
-    """The executor that a request asks for: serial without workers and scheduler, else Dask.
-
-    Parameters
-    ----------
-    workers, scheduler, local_directory, tls
-        As `Cluster` has them.
-    priority, traffic, performance_report
-        As `Cluster.executor` has them.
-
-    Raises
-    ------
-    SettingsError
-        A performance report is asked for where there are no workers, or certificates cannot be used.
-    """
-    if workers == 0 and scheduler is None:
-        if performance_report is not None:
-            raise SettingsError(["a performance report tells the time of workers, and there are none: use --workers 1"])
-        return SerialExecutor()
-    cluster = Cluster(workers=workers, scheduler=scheduler, local_directory=local_directory, tls=tls)
-    return DaskExecutor(
-        cluster, priority=priority_of(traffic, priority), owned=True, performance_report=performance_report
-    )

@@ -51,6 +51,15 @@ _NOT_SHARED = (
 )
 
 
+def blame(stage: str, task: object) -> str:
+    """The message where processes died of one task, whatever else ran."""
+    smaller = ", or set a smaller tile_size_m" if stage == "split" else ""
+    return (
+        f"stage {stage}: workers died again and again on one task, also when it ran alone: {repr(task)[:300]}. "
+        f"Give them more memory{smaller}"
+    )
+
+
 class Lookout:
     """Looks after the cluster while nothing comes: whether workers are there, whether the scheduler answers.
 
@@ -358,7 +367,7 @@ class Flight(Generic[Task, Result]):
             if not isinstance(error, KilledWorker):
                 raise error
             if self._alone is not None:
-                raise RunError(self._blame(number)) from error
+                raise RunError(blame(self.stage, self.tasks[number])) from error
             self._drop(future, "suspect")
             LOG.warning("workers died of the task: it is tried alone", extra=self._facts(number))
             self._suspects.append(number)
@@ -382,14 +391,6 @@ class Flight(Generic[Task, Result]):
         self._reserved.pop(future, None)
         TALLIES.land(self.stage, outcome)
         future.release()
-
-    def _blame(self, number: int) -> str:
-        told = repr(self.tasks[number])[:300]
-        smaller = ", or set a smaller tile_size_m" if self.stage == "split" else ""
-        return (
-            f"stage {self.stage}: workers died again and again on one task, also when it ran alone: {told}. "
-            f"Give them more memory{smaller}"
-        )
 
     def _settle(self) -> None:
         """Tell the tasks in flight to end, wait for those that run, take all back."""

@@ -181,13 +181,19 @@ def executed_server(loads: Sequence[str], orders: socket.socket, stderr: IO[byte
     )
 
 
-def forked_server(orders: socket.socket, stderr: IO[bytes]) -> Own:
-    """Fork a server with all that this process has loaded; for one that has a single thread."""
+def forked_server(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes]) -> Own:
+    """Fork a server with all that this process has loaded, to load more; for one that has a single thread."""
     owner = os.getpid()
     pid = os.fork()
     if not pid:
-        serve_forked(owner, orders, stderr.fileno())
+        os.environ.update(WITHOUT_THREADS)
+        serve_forked(owner, orders, stderr.fileno(), loads)
     return Own(pid)
+
+
+def has_one_thread() -> bool:
+    """Whether nothing in this process could hold a lock while it is forked; also no thread of a library."""
+    return sum(1 for _ in Path("/proc/self/task").iterdir()) == 1
 
 
 class ProcessServer:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from pipeline.export.records import CandidateFacts
+from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.model import BoolArray, Candidate, IntArray
 from pipeline.runtime.join import CandidateSite

@@ -141,6 +141,11 @@ class Keeping(Generic[Task, Result, Told]):
         """What the task declares to need."""
         return int(getattr(self.task, "memory_bytes", 0))
 
+    @property
+    def supervises(self) -> bool:
+        """Whether the task runs its items in child processes of its own."""
+        return bool(getattr(self.task, "supervises", False))
+
     def __repr__(self) -> str:
         """The task alone, which is what people want to see."""
         return repr(self.task)

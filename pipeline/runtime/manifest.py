@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.export.tile import Put, put_local
+from pipeline.export.putting import Put, put_local
 from pipeline.io import arrow_at
 from pipeline.tiling import MM, Tile, TileGrid
 

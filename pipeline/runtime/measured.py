@@ -9,6 +9,7 @@ import resource
 import socket
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
@@ -84,6 +85,24 @@ def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> 
     return Measured(
         result=result, seconds=seconds, cpu_s=cpu_s, began_s=began_s, process=process, peak_bytes=peak_bytes
     )
+
+
+def measure_in_child(work: tuple[Callable[[Task], Result], Task, str]) -> Measured[Result]:
+    """Run one task in a child process of whoever waits for it; a fault of ours tells where it happened.
+
+    Parameters
+    ----------
+    work : tuple
+        Function, task and stage.
+    """
+    try:
+        return measure(*work)
+    except GableworkError:
+        raise
+    except Exception as error:
+        # a traceback does not survive the pipe, a note does
+        error.add_note(traceback.format_exc())
+        raise
 
 
 def packed(function: Callable[[Task], Result], task: Task) -> bytes:

@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 
 from pipeline.errors import GableworkError, RunCancelledError, RunError
-from pipeline.export.records import CandidateFacts
+from pipeline.export.facts import CandidateFacts
 from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.methods import METHODS, ReconstructSettings
@@ -70,6 +70,11 @@ class BatchTask:
         """What the process that models them may come to take: they come one after the other."""
         limit_bytes = None if self.isolation is None else self.isolation.memory_bytes
         return building_bytes(max((site.points for site in self.sites), default=0), limit_bytes)
+
+    @property
+    def supervises(self) -> bool:
+        """Whether buildings are modelled in children of the process that has the task."""
+        return self.isolation is not None
 
     def way_of(self, site: CandidateSite) -> BatchTask:
         """The task with the method and the settings of one site."""

@@ -56,15 +56,20 @@ def main(arguments: Sequence[str]) -> None:
     """
     start_own_process()
     child.end_with_parent(int(arguments[0]))
-    for name in arguments[2:]:
+    _load(arguments[2:])
+    serve(socket.socket(fileno=int(arguments[1])))
+
+
+def _load(loads: Sequence[str]) -> None:
+    """Load what children will need; what cannot be loaded is left to them, who tell why."""
+    for name in loads:
         try:
             child.load(name)
         except Exception:  # noqa: BLE001 - told by the child that needs it
             traceback.print_exc()
-    serve(socket.socket(fileno=int(arguments[1])))
 
 
-def serve_forked(owner: int, orders: socket.socket, stderr: int) -> NoReturn:
+def serve_forked(owner: int, orders: socket.socket, stderr: int, loads: Sequence[str] = ()) -> NoReturn:
     """Be the server of the process that this one was just forked from, and of which it keeps nothing but the memory.
 
     Parameters
@@ -75,6 +80,8 @@ def serve_forked(owner: int, orders: socket.socket, stderr: int) -> NoReturn:
         To it.
     stderr : int
         Descriptor that gets what this process has to say.
+    loads : sequence of str
+        What is loaded besides, as `pipeline.runtime.child` takes it.
     """
     try:
         os.setsid()
@@ -86,6 +93,7 @@ def serve_forked(owner: int, orders: socket.socket, stderr: int) -> NoReturn:
         signal.set_wakeup_fd(-1)
         for name in (signal.SIGCHLD, signal.SIGINT):
             signal.signal(name, signal.SIG_DFL)
+        _load(loads)
         serve(socket.socket(fileno=3))
     except BaseException:  # noqa: BLE001 - as an interpreter ends
         traceback.print_exc()

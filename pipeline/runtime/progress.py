@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 from pipeline.runtime.events import Event, EventKind, Listener, Watch
-from pipeline.runtime.executors import Executor
 from pipeline.runtime.kept import Keeping, Place, keep, told_of
 from pipeline.runtime.scratch import Scratch
+from pipeline.runtime.serial import Executor
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

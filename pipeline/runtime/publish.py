@@ -10,8 +10,8 @@ from pathlib import Path
 import shapely
 
 from pipeline.errors import RunCancelledError, RunError
-from pipeline.export.records import RecordContext, RejectedObject
-from pipeline.export.tile import Put, write_tile
+from pipeline.export.facts import RecordContext, RejectedObject
+from pipeline.export.putting import Put
 from pipeline.io import Storage, storage_at
 from pipeline.io.storage import Puts
 from pipeline.model import Status
@@ -146,6 +146,8 @@ def retire(storage: Storage, tile: Tile) -> None:
 
 def _write(task: PublishTask, put: Put) -> dict[str, str]:
     """Write the files of a tile that owns something; the sha256 of each by its path."""
+    from pipeline.export.tile import write_tile  # with Arrow, which who hands out the tasks does not need
+
     stored: list[StoredResult] = []
     for place in task.batches:
         stored.extend(stored_results(task.scratch, place))

@@ -11,8 +11,9 @@ from typing import Any
 from pipeline import __version__
 from pipeline.errors import RunError
 from pipeline.export.cityjson import cityjson_lines
+from pipeline.export.facts import RecordContext
 from pipeline.export.obj import obj_text
-from pipeline.export.records import RecordContext, building_row
+from pipeline.export.records import building_row
 from pipeline.export.solid_geometry import SOLID_COLUMNS
 from pipeline.model import BuildingResult, Reason
 from pipeline.reconstruct import failed_building

@@ -36,8 +36,9 @@ from pipeline.runtime.earlier import (
     earlier_run,
     request_of,
 )
+from pipeline.runtime.engine import executor_for
 from pipeline.runtime.events import Listener, Watch, ignore, never
-from pipeline.runtime.executors import Executor, executor_for
+from pipeline.runtime.expected import expected
 from pipeline.runtime.gather import gather
 from pipeline.runtime.held_folder import held_results
 from pipeline.runtime.ingest import Ingested
@@ -61,6 +62,7 @@ from pipeline.runtime.run import (
 )
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.scratch_folder import SCRATCH, remove_folder
+from pipeline.runtime.serial import Executor
 from pipeline.runtime.stages import GivenFootprints, Models, Splits, Stages, given_footprints, points_by_tile
 from pipeline.runtime.tls import TlsFiles
 from pipeline.tiling import MM, Tile
@@ -82,8 +84,8 @@ class RerunRequest:
     """The overrides file that takes the place of the run's own; None keeps that."""
     only: tuple[str, ...] = ()
     """Buildings, by building_id, that are modelled again whatever the overrides say."""
-    workers: int = 2
-    """Processes of the embedded cluster; 0 runs serially in this process."""
+    workers: int | None = None
+    """Processes of the embedded cluster; 0 runs serially in this process, None leaves it to the estimate."""
     scheduler: str | None = None
     """Address of a Dask scheduler that takes the place of the embedded cluster."""
     tls: TlsFiles | None = None
@@ -177,7 +179,12 @@ def _rerun(
     remove_folder(scratch_dir)
     scratch = Scratch(str(scratch_dir / uuid4().hex))
     engine = executor or executor_for(
-        workers=request.workers, scheduler=request.scheduler, local_directory=str(scratch_dir / "dask"), tls=request.tls
+        workers=request.workers,
+        scheduler=request.scheduler,
+        local_directory=str(scratch_dir / "dask"),
+        # a few tiles are split for it; they are not known yet, and all inputs are read
+        work=dataclasses.replace(expected(plan, 0), seen_points=0.0),
+        tls=request.tls,
     )
     scratch.create()
     try:

@@ -30,9 +30,9 @@ from pipeline.io import (
 from pipeline.io.footprints import read_area
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.tile_index import TileIndex
-from pipeline.runtime.digest import run_digest
+from pipeline.runtime.engine import executor_for
 from pipeline.runtime.events import Listener, Watch, ignore, never
-from pipeline.runtime.executors import Executor, executor_for, peak_of_process
+from pipeline.runtime.expected import expected
 from pipeline.runtime.flight import TICK_S
 from pipeline.runtime.held_folder import held_results
 from pipeline.runtime.ingest import Ingested
@@ -48,6 +48,7 @@ from pipeline.runtime.manifest import (
     read_manifest,
     write_manifest,
 )
+from pipeline.runtime.measured import peak_of_process
 from pipeline.runtime.overrides import read_overrides
 from pipeline.runtime.plan import Plan, check_memory, make_plan, without_far_files
 from pipeline.runtime.priorities import Traffic
@@ -56,6 +57,7 @@ from pipeline.runtime.publish import QUARANTINE, Published
 from pipeline.runtime.run_counts import Counted, told_counts
 from pipeline.runtime.scratch import Scratch
 from pipeline.runtime.scratch_folder import check_scratch, remove_folder, scratch_folder
+from pipeline.runtime.serial import Executor
 from pipeline.runtime.stages import MODELS, Models, Stages, given_footprints
 from pipeline.runtime.stale import tidy
 from pipeline.runtime.tls import TlsFiles
@@ -93,8 +95,8 @@ class RunRequest:
     """x_min, y_min, x_max, y_max in the CRS's units."""
     aoi: str | None = None
     """A vector file of areas of interest."""
-    workers: int = 2
-    """Processes of the embedded cluster; 0 runs serially in this process."""
+    workers: int | None = None
+    """Processes of the embedded cluster; 0 runs serially in this process, None leaves it to the estimate."""
     scheduler: str | None = None
     """Address of a Dask scheduler that takes the place of the embedded cluster."""
     tls: TlsFiles | None = None
@@ -310,6 +312,7 @@ def run_variants(
             workers=request.workers,
             scheduler=request.scheduler,
             local_directory=str(Path(scratch.root, "dask")),
+            work=expected(plan, None if footprints is None else len(footprints.polygons)),
             traffic=request.traffic,
             tls=request.tls,
             performance_report=request.performance_report,
@@ -380,7 +383,8 @@ def run_variants(
     outcomes = []
     for k, (run_dir, own) in enumerate(zip(run_dirs, progresses, strict=True)):
         finishing = time.perf_counter()
-        digest = run_digest(run_dir, tiles=_with_tables(run_dir, joined, modelled[k], published[k]))
+        content = (run_dir, _with_tables(run_dir, joined, modelled[k], published[k]))
+        digest = engine.apart("digest", _digest_of, content, shared.watch)
         own.timings["digest"] = time.perf_counter() - finishing
         # of several variants each is told with what it took alone: the shared stages and its own
         alone = len(variants) == 1
@@ -460,6 +464,14 @@ def _inputs_told(
     ]
     inputs.extend(told_file(name) for name in (request.footprints, request.aoi, request.overrides) if name is not None)
     return tuple(inputs)
+
+
+def _digest_of(content: tuple[str, list[str] | None]) -> str:
+    """The digest of a run directory, and of which tiles."""
+    from pipeline.runtime.digest import run_digest  # with Arrow, which a driver does without
+
+    run_dir, tiles = content
+    return run_digest(run_dir, tiles=tiles)
 
 
 def _plan_bounds_m(found: Ingested) -> tuple[float, float, float, float] | None:

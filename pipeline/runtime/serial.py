@@ -1,4 +1,8 @@
-"""What a run needs of an engine, and the simplest one: one task after the other, in this process."""
+"""What a run needs of an engine, and the simplest one: one task after the other, in this process.
+
+A plan is data and tasks are plain functions of one argument; an executor maps a function over tasks
+and yields results as they come, in any order. Nothing else of the engine shows.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +24,9 @@ class Executor(Protocol):
         self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
     ) -> Generator[Measured[Result], None, None]:
         """Results of all tasks, in the order in which they finish."""
+
+    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
+        """The result of one step of the driver: worked out here, or where the libraries are that it needs."""
 
     @property
     def memory_limit_bytes(self) -> int | None:
@@ -53,6 +60,10 @@ class SerialExecutor:
         for task in tasks:
             watch.check_cancelled()
             yield measure(function, task, stage)
+
+    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
+        """The step's result, worked out here."""
+        return function(task)
 
     @property
     def memory_limit_bytes(self) -> int | None:

@@ -17,12 +17,11 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline import __version__
 from pipeline.errors import EmptyInputError, InconsistentInputError
-from pipeline.export.records import RecordContext
+from pipeline.export.facts import RecordContext
 from pipeline.io import SpatialReference, shown, storage_at
 from pipeline.io.footprints import read_footprints
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import Status
-from pipeline.runtime.executors import Executor
 from pipeline.runtime.ingest import Ingested, IngestTask, ingest, part_of, spread_m
 from pipeline.runtime.isolation import IsolationLimits
 from pipeline.runtime.join import CandidateSite, Joined, PointRange, RejectedSite, join, join_footprints
@@ -43,12 +42,14 @@ from pipeline.runtime.plan import Plan, check_windows, split_grid, window_bytes
 from pipeline.runtime.progress import Progress
 from pipeline.runtime.publish import QUARANTINE, Published, PublishTask, publish, retire
 from pipeline.runtime.scratch import Scratch
+from pipeline.runtime.serial import Executor
 from pipeline.runtime.split import Split, SplitTask, SplitTold, split, told_of_split
 from pipeline.runtime.stale import clear_points, clear_tiles, drop_stale, publishing
 from pipeline.runtime.tile_content import ZoneSums, content_of_window, zone_sums_of
 from pipeline.runtime.units import divide, unit_tasks
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse
 from pipeline.settings import RunSettings
+from pipeline.terrain.candidates import CandidateSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 Task = TypeVar("Task")
@@ -173,6 +174,24 @@ class Splits:
     """Digest of what lies in and around each tile: equal where nothing that comes after sees a difference."""
     numbers: Mapping[Tile, Sequence[int]]
     """Of each tile the numbers of the given footprints that meet it; empty where none were given."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class JoinTask:
+    """All tiles, to be joined."""
+
+    scratch: Scratch
+    places: tuple[Place, ...]
+    """Where their descriptors are kept."""
+    grid: TileGrid
+    settings: CandidateSettings
+    crs_name: str
+
+
+def joined_of(task: JoinTask) -> Joined:
+    """What `join` makes of the tiles, read one after the other."""
+    described = (result_of(task.scratch, place) for place in task.places)
+    return join(described, task.grid, task.settings, task.crs_name)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -381,13 +400,19 @@ class Stages:
         started = time.perf_counter()
         self.progress.tell("stage", "join", total=1)
         crs_name = f"EPSG:{reference.epsg}" if reference.epsg is not None else reference.name
-        described = self._descriptors(splits)
         if footprints is None:
-            joined = join(described, self.plan.grid, self.settings.scene.candidates, crs_name)
+            task = JoinTask(
+                scratch=self.scratch,
+                places=tuple(place for _, place in sorted(splits.places.items(), key=itemgetter(0))),
+                grid=self.plan.grid,
+                settings=self.settings.scene.candidates,
+                crs_name=crs_name,
+            )
+            joined = self.executor.apart("join", joined_of, task, self.progress.watch)
             joined = self._divided(dataclasses.replace(joined, keys=splits.keys), crs_name)
         else:
             joined = join_footprints(
-                described,
+                self._descriptors(splits),
                 self.plan.grid,
                 splits.numbers,
                 footprints.polygons,

@@ -6,6 +6,8 @@ import atexit
 import contextlib
 import gc
 import os
+import sys
+from importlib.abc import MetaPathFinder
 
 from pipeline.errors import SettingsError
 
@@ -16,8 +18,30 @@ buildings then leaves less than a hundred in cycles. With Python's own number a 
 more of processor time, and with 50 thousand a fiftieth more."""
 
 
+NOT_OURS = frozenset({"cffi", "pandas", "requests"})
+"""What libraries load where they find it, though nothing here uses it and no lock of the product has it: numba, pyarrow
+and laspy. Beside a test's or somebody's own packages a run would take a third of a second more for it."""
+
+
+class _WithoutThem(MetaPathFinder):
+    """Finds nothing, and says so of what is not ours."""
+
+    def find_spec(self, name: str, *_: object) -> None:
+        """Leave a module to the other finders.
+
+        Raises
+        ------
+        ModuleNotFoundError
+            It is not ours.
+        """
+        if name in NOT_OURS:
+            raise ModuleNotFoundError(f"No module named {name!r} in a process of gablework", name=name)
+
+
 def start_own_process() -> None:
     """Collect garbage more rarely, and none at the end; log JSON to the end where the environment asks for it.
+
+    Load none of the packages that only other programs of this environment need.
 
     An interpreter that ends looks through all objects for cycles, several times: after a run over a town .3 to .4 s, a
     tenth of its processor time, for memory that the operating system takes back anyway. Frozen objects are not looked
@@ -25,6 +49,10 @@ def start_own_process() -> None:
 
     For processes that are ours from start to end, never for one that imports this program as a library.
     """
+    if not any(isinstance(finder, _WithoutThem) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _WithoutThem())
+    # matrices are small here: threads for them cost time to start, and a process with threads cannot be forked
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.set_threshold(_OBJECTS_A_COLLECTION, *gc.get_threshold()[1:])
     atexit.unregister(gc.freeze)
     atexit.register(gc.freeze)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import importlib.metadata
+import os
 import sys
 from collections.abc import Mapping
 
@@ -16,7 +16,33 @@ WORKING = ("numpy", "scipy", "numba", "shapely", "pyproj", "pyarrow", "pyogrio",
 """Packages whose versions can change what a task finds; a scheduler runs no task and needs none of them."""
 
 
+_METADATA = ".dist-info"
+
+
+@functools.cache
+def _installed() -> Mapping[str, str]:
+    """Versions of what is installed, by the names of the folders of their metadata; the first of each on the path.
+
+    The standard library would read and parse a file a package, which takes as long as the import of this program.
+    """
+    found: dict[str, str] = {}
+    for folder in sys.path:
+        try:
+            names = os.listdir(folder or ".")  # noqa: PTH208 - a Path takes longer
+        except OSError:
+            continue
+        for name in names:
+            if name.endswith(_METADATA):
+                package, _, version = name.removesuffix(_METADATA).partition("-")
+                found.setdefault(package.lower().replace("_", "-"), version)
+    return found
+
+
 def _version(package: str) -> str:
+    if package in _installed():
+        return _installed()[package]
+    import importlib.metadata  # a zipped package, or another kind of metadata
+
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

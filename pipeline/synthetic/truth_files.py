@@ -17,7 +17,7 @@ import shapely
 
 import pipeline
 from pipeline.errors import InputError
-from pipeline.export.records import RecordContext
+from pipeline.export.facts import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.model import BoolArray, ByteArray, LabelArray
 from pipeline.synthetic.conditions import condition_row

@@ -13,8 +13,8 @@ from pipeline import __version__
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.events import Event, Listener
-from pipeline.runtime.executors import Executor
 from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.runtime.serial import Executor
 from pipeline.settings import RunSettings
 from service.driver.clusters import SharedCluster
 from service.driver.held import HeldJob
@@ -241,7 +241,6 @@ def run_request(
         crs=request.crs,
         vertical_unit=request.vertical_unit,
         bbox=request.bbox,
-        workers=settings.workers,
         scheduler=settings.scheduler,
         meshes=request.meshes,
         licence=request.licence,

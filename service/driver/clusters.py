@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 from pipeline.errors import ClusterError, RunCancelledError
 from pipeline.runtime.events import Event
 from pipeline.runtime.executors import Cluster
+from pipeline.runtime.machine import cores
 from pipeline.runtime.tls import given_tls
 from service.driver.held import LOG, Engine, HeldJob
 from service.settings import ServiceSettings
@@ -42,7 +43,8 @@ class SharedCluster:
     def __init__(self, settings: ServiceSettings, make: Callable[[], Engine] | None = None) -> None:
         self._scheduler = settings.scheduler
         tls = given_tls(settings.tls_ca, settings.tls_cert, settings.tls_key)
-        self._make = make or (lambda: Cluster(workers=settings.workers, scheduler=settings.scheduler, tls=tls))
+        workers = cores() if settings.workers == "auto" else settings.workers
+        self._make = make or (lambda: Cluster(workers=workers, scheduler=settings.scheduler, tls=tls))
         self._lock = threading.Lock()
         self._engine: Engine | None = None
         self._closed = False

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from pipeline.runtime.events import Event
-from pipeline.runtime.executors import Executor
+from pipeline.runtime.serial import Executor
 from service.driver.progress import WORDS, percent
 from service.driver.wording import Scrubber
 from service.errors import LeaseLostError, StoreError

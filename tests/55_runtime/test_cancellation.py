@@ -13,11 +13,12 @@ import pytest
 
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.events import Event
-from pipeline.runtime.executors import Measured, SerialExecutor, measure
 from pipeline.runtime.kept import keep
 from pipeline.runtime.manifest import RunStatus, read_manifest
+from pipeline.runtime.measured import Measured, measure
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.runtime.scratch import Scratch
+from pipeline.runtime.serial import SerialExecutor
 from pipeline.settings import RunSettings
 
 STAGES = ("ingest", "split", "reconstruct", "publish")

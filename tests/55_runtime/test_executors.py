@@ -18,11 +18,13 @@ from distributed import Client, Status
 
 from pipeline.errors import ClusterError, RunCancelledError, RunError, VersionMismatchError
 from pipeline.runtime import worker_setup
+from pipeline.runtime.engine import executor_for
 from pipeline.runtime.events import Event, Watch
-from pipeline.runtime.executors import Cluster, Measured, SerialExecutor, executor_for
+from pipeline.runtime.executors import Cluster
 from pipeline.runtime.flight import Lookout
 from pipeline.runtime.forking import can_fork
-from pipeline.runtime.measured import measure_packed, packed
+from pipeline.runtime.measured import Measured, measure_packed, packed
+from pipeline.runtime.serial import SerialExecutor
 from pipeline.runtime.versions import ENGINE, differences, fingerprint, versions_here, versions_of
 
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))

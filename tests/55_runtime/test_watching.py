@@ -22,8 +22,9 @@ from prometheus_client import CollectorRegistry, generate_latest
 from pipeline.console import Console
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.runtime import logs
+from pipeline.runtime.engine import executor_for
 from pipeline.runtime.events import Event, Watch
-from pipeline.runtime.executors import Cluster, executor_for
+from pipeline.runtime.executors import Cluster
 from pipeline.runtime.measured import Measured, measure
 from pipeline.runtime.performance import BINS, ROWS, PerformanceReport
 from pipeline.runtime.run_metrics import RunMetrics, TallyMetrics, both, serve_metrics

@@ -17,8 +17,9 @@ import pytest
 
 from pipeline.errors import RunError
 from pipeline.runtime.events import Event
-from pipeline.runtime.executors import Measured, SerialExecutor
+from pipeline.runtime.measured import Measured
 from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.runtime.serial import SerialExecutor
 from pipeline.runtime.work_folder import held_work, is_at_work
 from pipeline.settings import RunSettings
 from pipeline.synthetic.dataset import simulate

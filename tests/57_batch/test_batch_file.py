@@ -39,7 +39,7 @@ def test_what_is_not_said_is_as_in_reconstruct(tmp_path: Path) -> None:
     batch = read_batch(written(tmp_path, LEAST))
     assert batch.work_folder == str(tmp_path / "city.work")
     request = batch.request()
-    assert (request.workers, request.scheduler, request.isolate, request.meshes) == (2, None, True, "building")
+    assert (request.workers, request.scheduler, request.isolate, request.meshes) == (None, None, True, "building")
     assert request.settings.general.method == "arrangement"
     assert (request.crs, request.footprints, request.bbox) == (None, None, None)
 
@@ -103,7 +103,7 @@ def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
         "[inputs] bbox is [1, 2]",
         "[inputs] path is no setting",
         "meshes is 'stl': use one of building",
-        "workers is -1: use 0 to 1024",
+        "workers is -1: use 'auto' or a whole number from 0 to 1024",
         "scheduler is 8786: use a text in quotes",
         "magic",
         "[sttings] is no table of a batch file",

@@ -15,7 +15,8 @@ from pipeline.cli.options import Meshes
 from pipeline.errors import RunError
 from pipeline.export.geoparquet import read_table
 from pipeline.export.mesh_kinds import MESHES
-from pipeline.export.tile import put_local, write_tile
+from pipeline.export.putting import put_local
+from pipeline.export.tile import write_tile
 from service.processes.descriptions import MESHES as OFFERED_BY_THE_SERVICE
 
 BUILT = (small.gable, small.two_parts, small.failed)

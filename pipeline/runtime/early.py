@@ -1,0 +1,46 @@
+"""What a command starts before it does anything else: the server that the children of a small job are forked from.
+
+The server loads what they need while the command itself reads its options, imports and plans. Cheap to import.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Job = Literal["reconstruct", "classify"]
+
+_METHOD = "arrangement"
+"""The default method; a child loads another one by itself."""
+_STAGES = ("numpy.ma", "pipeline.runtime.ingest", "pipeline.runtime.split")
+_LOADS = {
+    "reconstruct": ("pipeline.runtime.publish", "pipeline.export.tile"),
+    "classify": ("pipeline.runtime.labelling", "pipeline.runtime.classified_files"),
+}
+_SCENE = "pipeline.runtime.rehearsal:rehearse_scene"
+
+
+def start_early(job: Job, *, workers: int | None, scheduler: str | None, footprints: bool, method: str | None) -> None:
+    """Start the server of a job that may be small; nothing where it was told to run elsewhere, or was started before.
+
+    Parameters
+    ----------
+    job : {'reconstruct', 'classify'}
+        Whose stages it is to load.
+    workers, scheduler
+        As asked for.
+    footprints : bool
+        Whether outlines are given: then no surfaces are looked for.
+    method : str or None
+        Name of the method; None for the default one.
+    """
+    if workers is not None or scheduler is not None:
+        return
+    import pipeline.io.las  # noqa: F401 - nearly every job reads LAS, and this process forks the server
+    from pipeline.runtime.children import preload
+
+    loads = [*_STAGES, *_LOADS[job]]
+    if not footprints:
+        loads.append(_SCENE)
+    if job == "reconstruct":
+        loads.append(f"pipeline.runtime.modelling:load_once:{method or _METHOD}")
+    preload(loads)

@@ -1,0 +1,103 @@
+"""Which engine runs a job: this process alone, its children, or a Dask cluster."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pipeline.errors import SettingsError
+from pipeline.runtime.expected import RATES, Expected
+from pipeline.runtime.machine import cores
+from pipeline.runtime.priorities import Traffic, priority_of
+from pipeline.runtime.serial import Executor, SerialExecutor
+from pipeline.runtime.tls import TlsFiles
+
+Engine = Literal["serial", "local", "cluster"]
+
+SMALL_S = 10.0 * RATES.cluster_start_s
+"""Jobs that take less wall time on all cores need no cluster: its start would cost them more than a tenth."""
+
+
+def engine_of(
+    *, workers: int | None, scheduler: str | None, expected_cpu_s: float, at: int, performance_report: bool = False
+) -> tuple[Engine, int]:
+    """The engine of a job, and how many processes it has; those of a scheduler elsewhere are its own.
+
+    Parameters
+    ----------
+    workers : int or None
+        As asked for; None leaves it to the estimate.
+    scheduler : str or None
+        As asked for.
+    expected_cpu_s : float
+        CPU seconds of the job.
+    at : int
+        Cores of this machine.
+    performance_report : bool
+        Whether a page about the time of workers is asked for, which only a cluster has.
+
+    Examples
+    --------
+    >>> engine_of(workers=None, scheduler=None, expected_cpu_s=5.0, at=2)
+    ('local', 2)
+    >>> engine_of(workers=None, scheduler=None, expected_cpu_s=500.0, at=2)
+    ('cluster', 2)
+    """
+    if scheduler is not None:
+        return "cluster", 0
+    if workers is not None:
+        return ("cluster", workers) if workers else ("serial", 1)
+    if performance_report or expected_cpu_s / at > SMALL_S:
+        return "cluster", at
+    return "local", at
+
+
+def executor_for(
+    *,
+    workers: int | None,
+    scheduler: str | None,
+    local_directory: str,
+    work: Expected | None = None,
+    priority: int = 0,
+    traffic: Traffic = "interactive",
+    tls: TlsFiles | None = None,
+    performance_report: str | None = None,
+) -> Executor:
+    """The executor that a request asks for.
+
+    Parameters
+    ----------
+    workers, scheduler
+        As `engine_of` has them.
+    local_directory, tls
+        As `Cluster` has them.
+    work : Expected, optional
+        What there is to do; without, a job counts as small.
+    priority, traffic, performance_report
+        As `Cluster.executor` has them.
+
+    Raises
+    ------
+    SettingsError
+        A performance report is asked for where there are no workers, or certificates cannot be used.
+    """
+    engine, processes = engine_of(
+        workers=workers,
+        scheduler=scheduler,
+        expected_cpu_s=0.0 if work is None else sum(work.cpu_s().values()),
+        at=cores(),
+        performance_report=performance_report is not None,
+    )
+    if engine == "serial":
+        if performance_report is not None:
+            raise SettingsError(["a performance report tells the time of workers, and there are none: use --workers 1"])
+        return SerialExecutor()
+    if engine == "local":
+        from pipeline.runtime.local import LocalExecutor
+
+        return LocalExecutor(processes)
+    from pipeline.runtime.executors import Cluster, DaskExecutor
+
+    cluster = Cluster(workers=processes, scheduler=scheduler, local_directory=local_directory, tls=tls)
+    return DaskExecutor(
+        cluster, priority=priority_of(traffic, priority), owned=True, performance_report=performance_report
+    )

@@ -1,0 +1,99 @@
+"""Which engine runs a job, by what is asked for and by what it will cost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import SettingsError
+from pipeline.io import ReadOptions
+from pipeline.runtime import machine
+from pipeline.runtime.engine import SMALL_S, engine_of, executor_for
+from pipeline.runtime.expected import RATES, Expected, expected
+from pipeline.runtime.local import LocalExecutor
+from pipeline.runtime.plan import make_plan
+from pipeline.runtime.serial import SerialExecutor
+from pipeline.settings import RunSettings
+
+
+@pytest.mark.parametrize(
+    ("workers", "scheduler", "cpu_s", "at", "report", "engine"),
+    [
+        (None, None, 0.0, 2, False, ("local", 2)),
+        (None, None, 2 * SMALL_S, 2, False, ("local", 2)),
+        (None, None, 2 * SMALL_S + 1.0, 2, False, ("cluster", 2)),
+        (None, None, 2 * SMALL_S + 1.0, 16, False, ("local", 16)),
+        (None, None, 5.0, 1, False, ("local", 1)),
+        (None, None, 5.0, 4, True, ("cluster", 4)),
+        (None, "tcp://far:8786", 5.0, 4, False, ("cluster", 0)),
+        (0, "tcp://far:8786", 5.0, 4, False, ("cluster", 0)),
+        (0, None, 1e6, 4, False, ("serial", 1)),
+        (0, None, 1e6, 4, True, ("serial", 1)),
+        (3, None, 0.0, 8, False, ("cluster", 3)),
+    ],
+)
+def test_what_is_asked_for_counts_before_what_a_job_costs(
+    workers: int | None, scheduler: str | None, cpu_s: float, at: int, report: bool, engine: tuple[str, int]
+) -> None:
+    found = engine_of(workers=workers, scheduler=scheduler, expected_cpu_s=cpu_s, at=at, performance_report=report)
+    assert found == engine
+
+
+def test_a_cluster_starts_only_where_its_start_is_less_than_a_tenth_of_the_job() -> None:
+    assert 10.0 * RATES.cluster_start_s <= SMALL_S
+
+
+def test_executors_are_what_the_engine_says() -> None:
+    assert isinstance(executor_for(workers=0, scheduler=None, local_directory=""), SerialExecutor)
+    assert isinstance(executor_for(workers=None, scheduler=None, local_directory=""), LocalExecutor)
+    with pytest.raises(SettingsError, match="--workers 1"):
+        executor_for(workers=0, scheduler=None, local_directory="", performance_report="time.html")
+
+
+def test_more_points_buildings_and_halos_cost_more() -> None:
+    def cost(*, points: int = 10**6, seen: float = 2e6, buildings: int = 100) -> float:
+        work = Expected(points_by_file={"a": points}, tiles=4, seen_points=seen, buildings=buildings)
+        return sum(work.cpu_s().values())
+
+    assert cost() < cost(points=2 * 10**6)
+    assert cost() < cost(seen=4e6)
+    assert cost() < cost(buildings=200)
+
+
+def test_a_plan_tells_points_tiles_and_buildings(suburb: Path) -> None:
+    plan = make_plan([str(suburb)], ReadOptions(), RunSettings())
+    found = expected(plan)
+    assert found.points == plan.points
+    assert found.tiles >= 1
+    assert found.points <= found.seen_points <= found.points * max(1, found.tiles)
+    assert found.buildings == round(plan.points / 1e6 * RATES.buildings_per_million)
+    assert expected(plan, 7).buildings == 7
+    off = make_plan([str(suburb)], ReadOptions(bbox=(-9e6, -9e6, -8e6, -8e6)), RunSettings())
+    assert (expected(off).points, expected(off).tiles) == (0, 0)
+
+
+def test_one_file_is_not_read_by_several_hands() -> None:
+    work = Expected(points_by_file={"a": 10**6}, tiles=4, seen_points=1e6, buildings=100)
+    alone, four = work.wall_s(1), work.wall_s(4)
+    assert four["ingest"] == alone["ingest"]
+    assert four["join"] == alone["join"]
+    assert four["split"] == alone["split"] / 4
+
+
+@pytest.mark.parametrize(
+    ("told", "most"), [("150000 100000", 1), ("50000 100000", 1), ("max 100000", None), (None, None)]
+)
+def test_a_quota_of_the_control_group_bounds_the_cores(tmp_path: Path, told: str | None, most: int | None) -> None:
+    if told is not None:
+        (tmp_path / "cpu.max").write_text(told)
+    free = machine.cores(tmp_path / "nowhere")
+    assert machine.cores(tmp_path) == (free if most is None else min(free, most))
+
+
+def test_a_limit_of_the_control_group_bounds_the_memory(tmp_path: Path) -> None:
+    assert machine.memory_bytes(tmp_path) > 2**20
+    (tmp_path / "memory.max").write_text("max\n")
+    assert machine.memory_bytes(tmp_path) > 2**20
+    (tmp_path / "memory.max").write_text(f"{2**20}\n")
+    assert machine.memory_bytes(tmp_path) == 2**20

@@ -1,0 +1,135 @@
+"""Small jobs run in children of the command: equal results, and no child's death costs more than its task."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from faults.asked import environment
+
+from pipeline.errors import RunCancelledError, RunError
+from pipeline.runtime import children
+from pipeline.runtime.events import Watch
+from pipeline.runtime.local import LocalExecutor
+from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.measured import peak_of_process
+
+sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
+
+import chores
+
+LONG_S = 120.0
+
+
+@pytest.fixture(autouse=True)
+def children_that_know_chores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Children of a server of its own, which finds the tasks of this file."""
+    children.kill_children()
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent / "on_workers"), prepend=os.pathsep)
+    yield
+    children.kill_children()
+
+
+def results(executor: LocalExecutor, function: Any, tasks: list[Any], watch: Watch | None = None) -> list[Any]:
+    """Results of a map, as they came."""
+    return [measured.result for measured in executor.map("test", function, tasks, watch or Watch())]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_every_task_gives_its_result_however_many_children_there_are(count: int) -> None:
+    executor = LocalExecutor(count)
+    assert sorted(results(executor, chores.double, list(range(7)))) == [0, 2, 4, 6, 8, 10, 12]
+    assert results(executor, chores.double, []) == []
+    assert executor.apart("test", chores.double, 21, Watch()) == 42
+
+
+def test_as_many_tasks_run_at_once_as_there_are_children(tmp_path: Path) -> None:
+    found: list[str] = []
+    tasks = [(str(tmp_path), name) for name in ("a", "b", "c")]
+    running = threading.Thread(target=lambda: found.extend(results(LocalExecutor(2), chores.wait_for_mark, tasks)))
+    running.start()
+    end = time.monotonic() + LONG_S
+    while len(list(tmp_path.glob("started-*"))) < 2 and time.monotonic() < end:
+        time.sleep(0.02)
+    assert len(list(tmp_path.glob("started-*"))) == 2
+    (tmp_path / "go").touch()
+    running.join()
+    assert sorted(found) == ["a", "b", "c"]
+
+
+def test_tasks_that_need_more_memory_than_there_is_run_one_after_the_other(tmp_path: Path) -> None:
+    (tmp_path / "go").touch()
+    tasks = [chores.Weighty(str(tmp_path), name, 3 * 2**30) for name in ("a", "b")]
+    measured = list(LocalExecutor(2, 4 * 2**30).map("test", chores.weigh, tasks, Watch()))
+    first, second = sorted(measured, key=lambda one: one.began_s)
+    assert first.began_s + first.seconds <= second.began_s
+    assert {one.result for one in measured} == {"a", "b"}
+
+
+def test_tasks_run_in_processes_of_their_own_which_are_told() -> None:
+    (measured,) = LocalExecutor(1).map("test", chores.double, [4], Watch())
+    assert measured.process.partition(":")[0] == peak_of_process()[0].partition(":")[0]
+    assert measured.process != peak_of_process()[0]
+    assert measured.peak_bytes > 0
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_task_that_costs_its_child_is_tried_alone_and_then_counts(tmp_path: Path, count: int) -> None:
+    tasks = [(str(tmp_path), number, 1 if number == 2 else 0) for number in range(5)]
+    assert sorted(results(LocalExecutor(count), chores.die_at_first, tasks)) == [0, 1, 2, 3, 4]
+    assert len(list(tmp_path.glob("2.*"))) == 2
+
+
+def test_a_task_that_kills_its_child_alone_too_ends_the_run_and_is_named() -> None:
+    with pytest.raises(RunError, match=r"stage test: workers died again and again on one task.*: 5\. Give them more"):
+        results(LocalExecutor(2), chores.die_if_five, list(range(8)))
+
+
+def test_an_error_of_a_task_is_raised_here_and_says_where_it_happened() -> None:
+    with pytest.raises(ZeroDivisionError, match="on purpose") as raised:
+        results(LocalExecutor(2), chores.fail, ["on purpose"])
+    assert "in fail" in raised.value.__notes__[0]
+
+
+def test_calling_off_ends_the_tasks_that_run_and_tells_them(tmp_path: Path) -> None:
+    told = threading.Event()
+
+    def begun() -> bool:
+        return bool(list(tmp_path.glob("started-*")))
+
+    watch = Watch(cancelled=begun, stop=told.set)
+    with pytest.raises(RunCancelledError):
+        results(LocalExecutor(2), chores.wait_for_mark, [(str(tmp_path), name) for name in "abcd"], watch)
+    assert told.is_set()
+    assert len(list(tmp_path.glob("started-*"))) <= 2, "no other task began"
+
+
+def test_the_content_is_that_of_a_serial_run(suburb: Path, reconstruct: Any) -> None:
+    serial = reconstruct(suburb, settings={"tile_size_m": 40.0})
+    local = reconstruct(suburb, settings={"tile_size_m": 40.0}, workers=None)
+    one = reconstruct(suburb, settings={"tile_size_m": 40.0}, executor=LocalExecutor(1), workers=None)
+    assert local.digest == one.digest == serial.digest
+    assert serial.statuses["ok"] >= 1
+    told = read_manifest(local.run_dir)
+    assert set(told.timings_s) == set(read_manifest(serial.run_dir).timings_s)
+    assert len(told.peak_memory_bytes) >= 2, "this process, and children"
+    assert all(peak > 0 for peak in told.peak_memory_bytes.values())
+
+
+def test_a_building_that_crashes_costs_itself_alone(
+    suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = reconstruct(suburb)
+    victim = min(path.stem for path in Path(good.run_dir, "meshes").rglob("*.obj"))
+    for name, value in environment(crash=[victim]).items():
+        monkeypatch.setenv(name, value)
+    hurt = reconstruct(suburb, workers=None)
+    assert hurt.reasons == {**good.reasons, "crashed": 1}
+    assert sum(hurt.statuses.values()) == sum(good.statuses.values())
+    assert [path.stem for path in Path(hurt.run_dir, "quarantine").iterdir()] == [victim]
