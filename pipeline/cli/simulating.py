@@ -120,17 +120,18 @@ def warm_up(
     ] = None,
     into: Annotated[
         str | None,
-        typer.Option(metavar="DIR", help="Write the kernels there, with their hashes, to ship them with a package."),
+        typer.Option(
+            metavar="DIR", help="Copy all compiled kernels there, with a list of their hashes, for a package."
+        ),
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Compile numba kernels ahead of their first use, on all cores."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        import os
         from pathlib import Path
 
-        from pipeline.compiler import store, warm_up
+        from pipeline.compiler import warm_up
         from pipeline.errors import SettingsError
         from pipeline.runtime.events import Event
 
@@ -139,8 +140,6 @@ def warm_up(
         unknown = [name for name in wanted if name not in {*groups, "all"}]
         if unknown:
             raise SettingsError([f"{name!r} is not known: use {', '.join(groups)} or all" for name in unknown])
-        if into is not None:
-            os.environ["NUMBA_CACHE_DIR"] = into
         started = time.perf_counter()
 
         def on_progress(done: int, total: int, left_s: float) -> None:
@@ -151,7 +150,7 @@ def warm_up(
         console.on_event(Event(kind="stage", stage="compile", total=len(kernels)))
         warm_up.compile_kernels(kernels, on_progress=on_progress)
         if into is not None:
-            store.write_list(Path(into))
+            warm_up.ship(Path(into))
         seconds = time.perf_counter() - started
         console.say(f"{len(kernels)} kernels are compiled; it took {seconds:.1f} s")
         console.document({"seconds": seconds, "kernels": len(kernels)})

@@ -18,9 +18,10 @@ import hashlib
 import json
 import os
 import struct
+import sys
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 ENDING = ".kernel"
@@ -162,11 +163,24 @@ def claimed(name: str) -> Iterator[None]:
         fcntl.lockf(file, fcntl.LOCK_UN, 1, at)
 
 
-def write_list(folder: Path) -> int:
-    """Write the list of a folder's kernels and their hashes, so that they can be shipped; how many there are."""
-    hashes = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.glob(f"*{ENDING}"))}
+def ship(folder: Path, is_current: Callable[[str, bytes], bool]) -> int:
+    """Copy what is compiled to a folder with a list of hashes, so that a package can take it along; how many files.
+
+    Parameters
+    ----------
+    folder : Path
+        New or empty.
+    is_current : callable
+        Whether a kernel, `module.function`, has a fingerprint: what is left of earlier versions stays here.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    hashes = {}
+    for path in sorted(folder_of_kernels().glob(f"*{ENDING}")):
+        content = path.read_bytes()
+        if is_current(path.name.partition(f".{sys.implementation.cache_tag}-")[0], Stored.fingerprint_of(content)):
+            (folder / path.name).write_bytes(content)
+            hashes[path.name] = hashlib.sha256(content).hexdigest()
     (folder / LIST).write_text(json.dumps(hashes, indent=0) + "\n", encoding="ascii")
-    (folder / _LOCKS).unlink(missing_ok=True)
     return len(hashes)
 
 

@@ -17,6 +17,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from pipeline.compiler import store
+from pipeline.compiler.kernel import Kernel
+
 LIST = Path(__file__).with_name("kernels.json")
 """Written by `make kernels`."""
 
@@ -100,6 +103,20 @@ def _compile(one: Listed) -> int:
     if not os.environ.get("NUMBA_DISABLE_JIT"):
         kernel.dispatcher.compile(tuple(read(kind) for kind in one.arguments))
     return one.weight
+
+
+def ship(folder: Path) -> int:
+    """Copy all compiled kernels of this version to a folder that a package takes along; how many files."""
+    from pipeline.compiler.signatures import kernel_named
+
+    def is_current(name: str, fingerprint: bytes) -> bool:
+        try:
+            kernel = kernel_named(":".join(name.rsplit(".", 1)))
+        except (ImportError, AttributeError):
+            return False
+        return isinstance(kernel, Kernel) and kernel.fingerprint == fingerprint
+
+    return store.ship(folder, is_current)
 
 
 def write_list(groups: dict[str, list[Listed]], path: Path = LIST) -> None:

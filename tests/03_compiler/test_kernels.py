@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -196,11 +197,12 @@ def test_two_processes_that_meet_no_kernels_compile_each_once(sources: Sources) 
 
 def ship(sources: Sources) -> Path:
     """Compile, and leave the kernels as a package has them."""
-    from pipeline.compiler.store import write_list
-
-    sources.run(f"told = caller.total({VALUES})")
-    folder = sources.kept.rename(sources.folder / "shipped")
-    assert write_list(folder) == 2
+    folder = sources.folder / "shipped"
+    words = f"caller.total({VALUES})\nfrom pathlib import Path\nfrom pipeline.compiler.warm_up import ship\n"
+    (sources.kept).mkdir(exist_ok=True)
+    (sources.kept / f"caller.gone.{sys.implementation.cache_tag}-x{ENDING}").write_bytes(b"of an earlier version")
+    assert sources.run(f"{words}told = ship(Path({str(folder)!r}))")[0] == 2
+    shutil.rmtree(sources.kept)
     return folder
 
 
