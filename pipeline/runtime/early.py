@@ -38,9 +38,7 @@ def start_early(job: Job, *, workers: int | None, scheduler: str | None, footpri
     import pipeline.io.las  # noqa: F401 - nearly every job reads LAS, and this process forks the server
     from pipeline.runtime.children import preload
 
-    loads = [*_STAGES, *_LOADS[job]]
-    if not footprints:
-        loads.append(_SCENE)
+    loads = [*_STAGES, *_LOADS[job], f"{_SCENE}:given" if footprints else _SCENE]
     if job == "reconstruct":
         loads.append(f"pipeline.runtime.modelling:load_once:{method or _METHOD}")
     preload(loads)

@@ -22,11 +22,13 @@ no more, and ends after its last child.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import gc
 import os
 import select
 import signal
 import socket
+import stat
 import sys
 import traceback
 from collections.abc import Sequence
@@ -60,6 +62,20 @@ def main(arguments: Sequence[str]) -> None:
     serve(socket.socket(fileno=int(arguments[1])))
 
 
+def _close_all_from(first: int) -> None:
+    """Close all descriptors from a number on but files that are read.
+
+    A library that was loaded before the fork, such as PROJ with its data base, goes on to read them by their numbers.
+    """
+    for number in sorted(int(name) for name in os.listdir("/proc/self/fd")):  # noqa: PTH208 - numbers, no paths
+        if number < first:
+            continue
+        with contextlib.suppress(OSError):  # the listing's own is closed by now
+            read_only = fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
+            if not (read_only and stat.S_ISREG(os.fstat(number).st_mode)):
+                os.close(number)
+
+
 def _load(loads: Sequence[str]) -> None:
     """Load what children will need; what cannot be loaded is left to them, who tell why."""
     for name in loads:
@@ -89,7 +105,7 @@ def serve_forked(owner: int, orders: socket.socket, stderr: int, loads: Sequence
         nothing = os.open(os.devnull, os.O_RDWR)
         for number, descriptor in enumerate((nothing, nothing, stderr, orders.detach())):
             os.dup2(descriptor, number)
-        os.closerange(4, os.sysconf("SC_OPEN_MAX"))
+        _close_all_from(4)
         signal.set_wakeup_fd(-1)
         for name in (signal.SIGCHLD, signal.SIGINT):
             signal.signal(name, signal.SIG_DFL)

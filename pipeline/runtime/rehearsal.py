@@ -8,6 +8,7 @@ from __future__ import annotations
 import tempfile
 
 import numpy as np
+import shapely
 
 from pipeline.runtime.join import join
 from pipeline.runtime.scratch import POINT, Scratch
@@ -22,8 +23,15 @@ _HOUSES = ((4, 10), (14, 20))
 """From where to where they stand, in both directions, metres."""
 
 
-def rehearse_scene() -> None:
-    """Split, join and divide a tile with houses, its classes known."""
+def rehearse_scene(outlines: str = "") -> None:
+    """Split, join and divide a tile with houses, its classes known.
+
+    Parameters
+    ----------
+    outlines : str
+        `given` where footprints tell where the houses are: then the tile is split alone.
+    """
+    footprints = tuple(shapely.box(low, low, high, high) for low, high in _HOUSES) if outlines else None
     steps = np.arange(500, _SIDE_M * MM, 1000)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
     points = np.zeros(len(x), POINT)
@@ -46,8 +54,11 @@ def rehearse_scene() -> None:
             settings=settings,
             classes=ClassesInUse(ground=True, building=True),
             scratch=scratch,
-            footprints=None,
+            footprints=footprints,
         )
-        joined = join([split(task)], grid, settings.candidates, "")
+        found = split(task)
+        if footprints is not None:
+            return
+        joined = join([found], grid, settings.candidates, "")
         for units in unit_tasks(joined.candidates, settings.units, grid, scratch, ""):
             divide(units)

@@ -12,8 +12,8 @@ import pyarrow.dataset as ds
 import pytest
 import shapely
 
+import pipeline.export.tile
 import pipeline.reconstruct
-import pipeline.runtime.publish
 from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, RunError
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.events import Event
@@ -236,14 +236,14 @@ def test_a_tile_that_cannot_be_written_costs_only_itself(
 ) -> None:
     whole = reconstruct(suburb, settings={"tile_size_m": 40.0})
     tiles = sorted({row["tile"] for row in rows(whole.run_dir, "buildings")})
-    real = pipeline.runtime.publish.write_tile
+    real = pipeline.export.tile.write_tile
 
     def sabotaged(run_dir: str, tile_key: str, *rest: Any, **options: Any) -> Any:
         if tile_key == tiles[0]:
             raise RunError("the disk is full, on purpose")
         return real(run_dir, tile_key, *rest, **options)
 
-    monkeypatch.setattr(pipeline.runtime.publish, "write_tile", sabotaged)
+    monkeypatch.setattr(pipeline.export.tile, "write_tile", sabotaged)
     hurt = reconstruct(suburb, settings={"tile_size_m": 40.0})
     assert hurt.failed_tiles == (tiles[0],)
     state = json.loads((Path(hurt.run_dir) / "state" / f"{tiles[0]}.json").read_text())
