@@ -3,6 +3,7 @@
 #   make demo      simulate a small suburb, reconstruct it, show what was found
 #   make test      style, types, import directions, tests: everything but the slow tests
 #   make slow      the slow tests: minutes, real processes, real data
+#   make everything  both at once, as CI does
 #   make wheel     a wheel for this platform, with the web page and compiled kernels
 #   make kernels   list anew which kernels are compiled ahead (after a kernel was added or is called in a new way)
 #   make viewer    build the web page (types, unit tests, bundle); brings its own Node
@@ -26,7 +27,7 @@ COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generat
 KERNEL_SOURCES := $(shell grep -rl --include='*.py' kernel pipeline | LC_ALL=C sort)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check unit slow viewer wheel kernels serve ruler lock docs format clean
+.PHONY: help demo test check unit slow everything all-tests viewer wheel kernels serve ruler lock docs format clean
 .DELETE_ON_ERROR:
 
 help:
@@ -90,7 +91,9 @@ service/viewer/dist/index.html: $(VIEWER_SOURCES) hatch_build.py requirements-vi
 demo: $(VENV)/.warm-demo-stamp
 	@$(BIN)/gablework demo --out $(OUT) --overwrite
 
-test: check unit
+# Both at once: mypy has one thread, and a test that waits leaves the other processor idle. Their environment is made first.
+test: $(VENV)/.test-stamp $(VENV)/.warm-stamp
+	@$(MAKE) --no-print-directory --jobs 2 check unit
 
 check: $(VENV)/.test-stamp
 	$(BIN)/ruff check .
@@ -98,11 +101,22 @@ check: $(VENV)/.test-stamp
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
+# More processes than processors, as tests wait for processes, sockets and files; the slow ones wait most of their time.
+# A file stays in one process, the longest come first (tests/conftest.py).
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder --durations=15
+
 unit: $(VENV)/.test-stamp $(VENV)/.warm-stamp
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile --durations=15
+	$(PYTEST) --numprocesses 3 -m "not slow"
 
 slow: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m slow --numprocesses 2 --dist loadfile --durations=15
+	$(PYTEST) --numprocesses 4 -m slow
+
+# What CI runs: style, types and imports beside all tests at once, so that quick tests run where slow ones wait.
+everything: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
+	@$(MAKE) --no-print-directory --jobs 2 check all-tests
+
+all-tests: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
+	$(PYTEST) --numprocesses 4 -m "slow or not slow"
 
 viewer: service/viewer/dist/index.html
 

@@ -28,6 +28,41 @@ REQUIRED = "GABLEWORK_REQUIRE_SHARED_DATA"
 REQUIRED_PROGRAMS = "GABLEWORK_REQUIRE_PROGRAMS"
 """Environment variable of .ci/run: 1 makes a test that needs PostgreSQL or Chromium fail where it would skip."""
 
+LONGEST_FIRST = (
+    "82_cluster/test_batch_faults.py",
+    "82_cluster/test_faults.py",
+    "84_web/test_page.py",
+    "82_cluster/test_batch_store_faults.py",
+    "82_cluster/test_workers.py",
+    "81_driver/test_driver_processes.py",
+    "83_openapi/test_schemathesis.py",
+    "82_cluster/test_tls_cluster.py",
+    "55_runtime/test_work.py",
+    "55_runtime/test_overrides.py",
+    "55_runtime/test_tile_independence.py",
+    "55_runtime/test_object_store_runs.py",
+    "90_benchmarks/test_city_scale.py",
+    "90_benchmarks/test_entries.py",
+    "55_runtime/test_isolation.py",
+    "55_runtime/test_classify.py",
+    "15_synthetic/test_solids.py",
+    "81_postgres/test_schedules.py",
+    "81_postgres/test_store.py",
+    "65_report/test_evaluation_page.py",
+    "45_roof/test_arrangement_parts.py",
+    "80_service/test_buildings_api.py",
+    "60_export/test_tile_update.py",
+    "55_runtime/test_replay.py",
+    "55_runtime/test_run.py",
+)
+"""Files of tests that take longest. They begin first, so that no process works on one of them alone at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Bring the longest files to the front; pytest-xdist hands out whole files in this order."""
+    places = {Path(__file__).parent / name: place for place, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: places.get(item.path, len(places)))
+
 
 @pytest.fixture(scope="session")
 def needs_program() -> Callable[..., str]:

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from typing import Any, Self, TypeVar
 
 import pytest
+from migrated import with_tables
 
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.compare import CompareRequest, CompareSummary
@@ -156,8 +157,7 @@ class Bench:
         self.settings = ServiceSettings(
             state=folder, poll_s=0.02, lease_s=30.0, driver_jobs=1, drain_s=30.0, max_attempts=3
         )
-        self.store = JobStore(self.settings.database)
-        self.store.migrate()
+        self.store = JobStore(with_tables(self.settings.database))
         self.folder = StateFolder(folder.resolve())
         self._running: list[tuple[Driver, threading.Thread]] = []
         self.codes: list[int] = []

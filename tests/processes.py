@@ -7,6 +7,7 @@ A folder of tests takes what it needs into its conftest: put this folder on `sys
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import secrets
 import shutil
@@ -337,19 +338,30 @@ class PostgresServer:
         """The SQLAlchemy URL of a database."""
         return f"postgresql+pg8000://{self.user}:{quote(self.password)}@127.0.0.1:{self.port}/{database}"
 
-    def create_database(self) -> str:
-        """The SQLAlchemy URL of a fresh, empty database."""
+    def create_database(self, *, with_tables: bool = False) -> str:
+        """The SQLAlchemy URL of a fresh database: empty, or with the service's tables and nothing in them."""
         import pg8000.native
 
         name = f"test_{secrets.token_hex(6)}"
+        template = self._with_tables if with_tables else "template1"
         connection = pg8000.native.Connection(
             self.user, host="127.0.0.1", port=self.port, database="postgres", password=self.password
         )
         try:
-            connection.run(f'CREATE DATABASE "{name}"')
+            connection.run(f'CREATE DATABASE "{name}" TEMPLATE "{template}"')
         finally:
             connection.close()
         return self.url(name)
+
+    @functools.cached_property
+    def _with_tables(self) -> str:
+        """The name of a database that was migrated once, for others to be copied from."""
+        from service.store import JobStore
+
+        url = self.create_database()
+        with JobStore(url) as store:
+            store.migrate()
+        return url.rpartition("/")[2]
 
     def stop(self) -> None:
         """Stop it, connections are cut; the data stay."""

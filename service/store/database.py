@@ -97,8 +97,10 @@ class Database:
                 Path(self._url.database).parent.mkdir(parents=True, exist_ok=True)
         with self.write() as connection:
             self.lock(connection, _LOCK_MIGRATIONS)
-            self._check_not_newer(migrations.current(connection))
-            migrations.upgrade(connection)
+            found = migrations.current(connection)
+            self._check_not_newer(found)
+            if found != migrations.head():
+                migrations.upgrade(connection)
 
     def check(self) -> None:
         """Whether the database answers and has this version's tables.

@@ -116,3 +116,9 @@ def test_the_supported_pythons_are_told_alike() -> None:
     low, high = re.fullmatch(r">=3\.(\d+),<3\.(\d+)", project["requires-python"]).groups()  # type: ignore[union-attr]
     assert versions == [f"3.{minor}" for minor in range(int(low), int(high))]
     assert f"Python 3.{low} to 3.{int(high) - 1}" in (ROOT / "README.md").read_text()
+
+
+def test_the_files_of_tests_that_begin_first_are_there(pytestconfig: pytest.Config) -> None:
+    conftest = pytestconfig.pluginmanager.get_plugin(str(ROOT / "tests" / "conftest.py"))
+    assert conftest is not None
+    assert [name for name in conftest.LONGEST_FIRST if not (ROOT / "tests" / name).is_file()] == []

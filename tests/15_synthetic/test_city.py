@@ -211,7 +211,7 @@ def test_a_city_is_written_in_bounded_memory(tmp_path: Path) -> None:
         "print(made.points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
     )
     figures = []
-    for size in (700, 1400):
+    for size in (500, 1000):
         done = subprocess.run(
             [sys.executable, "-c", program, str(tmp_path / str(size)), str(size)],
             capture_output=True,
@@ -221,7 +221,7 @@ def test_a_city_is_written_in_bounded_memory(tmp_path: Path) -> None:
         figures.append([int(word) for word in done.stdout.split()])
     (few, small_kb), (many, large_kb) = figures
     assert many > 3.6 * few
-    assert large_kb - small_kb < 150_000
+    assert large_kb - small_kb < 100_000
     assert large_kb < 1_500_000
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import json
 import os
@@ -105,6 +106,34 @@ def place(quarters: Path, tmp_path: Path) -> Place:
     return Place(tmp_path, quarters)
 
 
+@dataclasses.dataclass(frozen=True)
+class Finished:
+    """A place after a whole run, and a copy of it as it was then."""
+
+    place: Place
+    aside: Path
+    summary: RunSummary
+    tasks: Counter[str]
+
+
+@pytest.fixture(scope="module")
+def finished(quarters: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """One run for all tests that begin after one."""
+    place = Place(tmp_path_factory.mktemp("finished") / "place", quarters)
+    summary = place.run()
+    aside = shutil.copytree(place.folder, place.folder.with_name("aside"))
+    return Finished(place, aside, summary, place.tasks)
+
+
+@pytest.fixture
+def used(finished: Finished) -> Place:
+    """The place where the run was, as the run left it: the same paths and times."""
+    shutil.rmtree(finished.place.folder)
+    shutil.copytree(finished.aside, finished.place.folder)
+    finished.place.tasks = Counter()
+    return finished.place
+
+
 def raised(las: laspy.LasData) -> None:
     """One corner of a file lies 30 cm higher: about one building."""
     corner = (las.x > las.x.max() - 25.0) & (las.y > las.y.max() - 25.0)
@@ -137,74 +166,68 @@ def test_a_run_in_a_work_folder_is_any_run(place: Place) -> None:
     assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
 
 
-def test_a_run_after_a_finished_one_does_nothing_again(place: Place) -> None:
-    first = place.run()
-    assert min(place.tasks[stage] for stage in STAGES) > 0
-    before = files_of(place.folder / "run")
-    again = place.run()
-    assert not place.tasks
+def test_a_run_after_a_finished_one_does_nothing_again(used: Place, finished: Finished) -> None:
+    first = finished.summary
+    assert min(finished.tasks[stage] for stage in STAGES) > 0
+    before = files_of(used.folder / "run")
+    again = used.run()
+    assert not used.tasks
     assert again.digest == first.digest
     assert again.counts["reused"] == again.counts["candidates"]
     assert {**again.counts, "reused": 0} == first.counts
-    assert files_of(place.folder / "run") == before
+    assert files_of(used.folder / "run") == before
 
 
 @pytest.mark.parametrize(
     "stage", [pytest.param(stage, marks=[pytest.mark.slow] * (stage != "reconstruct")) for stage in STAGES]
 )
-def test_a_run_that_was_cut_off_goes_on_where_it_stopped(place: Place, stage: str) -> None:
-    whole = place.fresh()
-    all_tasks = place.tasks
+def test_a_run_that_was_cut_off_goes_on_where_it_stopped(place: Place, finished: Finished, stage: str) -> None:
     with pytest.raises(KeyboardInterrupt):
         place.run(on_event=stop_at(stage, 2))
     before = place.tasks
     assert json.loads((place.folder / "run" / "run.json").read_text())["status"] == "cancelled"
-    assert place.run().digest == whole.digest
+    assert place.run().digest == finished.summary.digest
     assert before[stage] > 0
-    assert before + place.tasks == all_tasks
-    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+    assert before + place.tasks == finished.tasks
+    assert files_of(place.folder / "run") == files_of(finished.aside / "run")
 
 
-def test_what_changed_is_done_again_and_nothing_else(place: Place) -> None:
-    first = place.run()
-    whole = place.tasks
-    place.change("sw.laz", raised)
-    again = place.run()
-    tasks = place.tasks
-    assert again.digest == place.fresh().digest != first.digest
-    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+def test_what_changed_is_done_again_and_nothing_else(used: Place, finished: Finished) -> None:
+    first, whole = finished.summary, finished.tasks
+    used.change("sw.laz", raised)
+    again = used.run()
+    tasks = used.tasks
+    assert again.digest == used.fresh().digest != first.digest
+    assert files_of(used.folder / "run") == files_of(used.folder / "fresh")
     assert tasks["ingest"] == 1
     assert 0 < tasks["split"] <= whole["split"]
 
 
-def test_a_file_that_was_only_touched_costs_its_reading(place: Place) -> None:
-    first = place.run()
-    place.change("ne.laz", len)
-    again = place.run()
-    assert place.tasks == {"ingest": 1}
-    assert again.digest == first.digest
+def test_a_file_that_was_only_touched_costs_its_reading(used: Place, finished: Finished) -> None:
+    used.change("ne.laz", len)
+    again = used.run()
+    assert used.tasks == {"ingest": 1}
+    assert again.digest == finished.summary.digest
 
 
 @pytest.mark.slow
-def test_models_of_input_that_did_not_change_are_taken_again(place: Place) -> None:
-    place.run()
-    place.change("sw.laz", raised)
-    again = place.run()
-    assert place.tasks["reconstruct"] > 0
+def test_models_of_input_that_did_not_change_are_taken_again(used: Place) -> None:
+    used.change("sw.laz", raised)
+    again = used.run()
+    assert used.tasks["reconstruct"] > 0
     remade = again.counts["candidates"] - again.counts["reused"]
     assert 0 < remade < again.counts["candidates"] / 2
-    assert place.run().counts["reused"] == again.counts["candidates"]
+    assert used.run().counts["reused"] == again.counts["candidates"]
 
 
 @pytest.mark.slow
-def test_a_file_that_is_gone_and_one_that_is_new(place: Place) -> None:
-    place.run()
-    (place.inputs / "nw.laz").rename(place.folder / "nw.laz")
-    assert place.run().digest == place.fresh().digest
-    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
-    (place.folder / "nw.laz").rename(place.inputs / "nw.laz")
-    assert place.run().digest == place.fresh().digest
-    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+def test_a_file_that_is_gone_and_one_that_is_new(used: Place, finished: Finished) -> None:
+    (used.inputs / "nw.laz").rename(used.folder / "nw.laz")
+    assert used.run().digest == used.fresh().digest
+    assert files_of(used.folder / "run") == files_of(used.folder / "fresh")
+    (used.folder / "nw.laz").rename(used.inputs / "nw.laz")
+    assert used.run().digest == finished.summary.digest
+    assert files_of(used.folder / "run") == files_of(finished.aside / "run")
 
 
 @pytest.mark.parametrize(
@@ -216,71 +239,67 @@ def test_a_file_that_is_gone_and_one_that_is_new(place: Place) -> None:
         pytest.param({"lods": "1.2,2.2"}, marks=pytest.mark.slow),
     ],
 )
-def test_other_settings_are_another_result(place: Place, settings: dict[str, Any]) -> None:
-    place.run()
-    assert place.run(settings=settings).digest == place.fresh(settings).digest
-    assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
+def test_other_settings_are_another_result(used: Place, settings: dict[str, Any]) -> None:
+    assert used.run(settings=settings).digest == used.fresh(settings).digest
+    assert files_of(used.folder / "run") == files_of(used.folder / "fresh")
 
 
 @pytest.mark.slow
-def test_another_run_directory_is_published_without_modelling_again(place: Place) -> None:
-    first = place.run()
-    second = place.run("second")
-    assert set(place.tasks) == {"publish"}
-    assert second.digest == first.digest
-    assert files_of(place.folder / "second") == files_of(place.folder / "run")
+def test_another_run_directory_is_published_without_modelling_again(used: Place, finished: Finished) -> None:
+    second = used.run("second")
+    assert set(used.tasks) == {"publish"}
+    assert second.digest == finished.summary.digest
+    assert files_of(used.folder / "second") == files_of(used.folder / "run")
 
 
-def test_what_somebody_removed_from_the_run_directory_is_published_again(place: Place) -> None:
-    first = place.run()
-    before = files_of(place.folder / "run")
-    shutil.rmtree(place.folder / "run" / "state")
-    shutil.rmtree(place.folder / "run" / "buildings")
-    assert place.run().digest == first.digest
-    assert set(place.tasks) == {"publish"}
-    assert files_of(place.folder / "run") == before
+def test_what_somebody_removed_from_the_run_directory_is_published_again(used: Place, finished: Finished) -> None:
+    before = files_of(used.folder / "run")
+    shutil.rmtree(used.folder / "run" / "state")
+    shutil.rmtree(used.folder / "run" / "buildings")
+    assert used.run().digest == finished.summary.digest
+    assert set(used.tasks) == {"publish"}
+    assert files_of(used.folder / "run") == before
 
 
 @pytest.mark.slow
-def test_what_a_task_left_half_done_is_no_result(place: Place) -> None:
-    whole = place.fresh()
+def test_what_a_task_left_half_done_is_no_result(place: Place, finished: Finished) -> None:
     with pytest.raises(KeyboardInterrupt):
         place.run(on_event=stop_at("ingest", 2))
     scratch = place.folder / "work" / "scratch"
     bucket = next((scratch / "points").glob("*/*.bin"))
     (bucket.parent / f"{'0' * 16}.bin").write_bytes(bucket.read_bytes())
     (bucket.parent / f"{'1' * 16}.{'2' * 32}.part").write_bytes(bucket.read_bytes())
-    assert place.run().digest == whole.digest
+    assert place.run().digest == finished.summary.digest
 
 
 @pytest.mark.slow
 def test_what_was_kept_shortly_before_a_loss_of_power_is_done_again(
-    place: Place, monkeypatch: pytest.MonkeyPatch
+    used: Place, finished: Finished, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = place.run()
-    kept = sorted((place.folder / "work" / "scratch" / "kept").glob("*/*/*"))
+    whole = finished.summary
+    kept = sorted((used.folder / "work" / "scratch" / "kept").glob("*/*/*"))
     old = [path for path in kept if path.parent.parent.name.startswith(("ingest", "tiles"))]
     for path in old:
         os.utime(path, ns=(0, path.stat().st_mtime_ns - 400 * 10**9))
     late = next(path for path in kept if path.parent.parent.name.startswith("models-"))
     late.write_bytes(late.read_bytes()[:20])
-    place.tasks.clear()
+    used.tasks.clear()
     monkeypatch.setattr("pipeline.runtime.work_folder.boot_id", lambda: "another-boot")
-    assert place.run().digest == whole.digest
-    assert set(place.tasks) == {"join", "outline", "reconstruct", "publish"}
-    place.tasks.clear()
-    assert place.run().digest == whole.digest
-    assert not place.tasks
+    assert used.run().digest == whole.digest
+    assert set(used.tasks) == {"join", "outline", "reconstruct", "publish"}
+    used.tasks.clear()
+    assert used.run().digest == whole.digest
+    assert not used.tasks
 
 
 @pytest.mark.slow
-def test_another_machine_goes_on_with_all_that_was_kept(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = place.run()
-    place.tasks.clear()
+def test_another_machine_goes_on_with_all_that_was_kept(
+    used: Place, finished: Finished, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("pipeline.runtime.work_folder.boot_id", lambda: "another-boot")
     monkeypatch.setattr("socket.gethostname", lambda: "elsewhere")
-    assert place.run().digest == whole.digest
-    assert not place.tasks
+    assert used.run().digest == finished.summary.digest
+    assert not used.tasks
 
 
 def test_who_only_asks_whether_a_folder_is_held_refuses_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

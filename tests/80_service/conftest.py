@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from driver_bench import bench  # noqa: F401 - a fixture
+from migrated import with_tables
 from starlette.testclient import TestClient
 
 from service.app import create_app
@@ -67,7 +68,7 @@ def starting(tmp_path: Path) -> Iterator[Starting]:
 
         def start(**options: Any) -> LocalService:
             settings = ServiceSettings(**{"state": tmp_path / "state", **options})
-            store = stack.enter_context(JobStore(settings.database))
+            store = stack.enter_context(JobStore(with_tables(settings.database)))
             app = create_app(settings, store)
             client = TestClient(app, OWN_URL, raise_server_exceptions=False, root_path=settings.root_path)
             return LocalService(stack.enter_context(client), store, settings)

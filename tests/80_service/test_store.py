@@ -14,6 +14,7 @@ from service.store import JobStore
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 pytest.register_assert_rewrite("store_contract")
 
+from migrated import with_tables  # noqa: E402
 from store_contract import StoreContract, claim, submit  # noqa: E402
 
 
@@ -21,8 +22,9 @@ class TestOnSqlite(StoreContract):
     """All of the contract, on a file."""
 
     @pytest.fixture
-    def url(self, tmp_path: Path) -> str:
-        return f"sqlite:///{tmp_path / 'some % folder' / 'service.db'}"
+    def url(self, tmp_path: Path, request: pytest.FixtureRequest) -> str:
+        url = f"sqlite:///{tmp_path / 'some % folder' / 'service.db'}"
+        return with_tables(url) if "store" in request.fixturenames else url
 
 
 def test_a_killed_writer_leaves_no_lock_and_no_half_a_job(tmp_path: Path) -> None:

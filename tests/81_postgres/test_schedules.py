@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from processes import PostgresServer
 from schedule_contract import HOUR, LIMITS, NOON, ScheduleContract, jobs_of, make
 
 from service.store import JobStore
@@ -14,8 +15,8 @@ class TestSchedulesOnPostgres(ScheduleContract):
     """All of the contract, on PostgreSQL."""
 
     @pytest.fixture
-    def url(self, postgres_url: str) -> str:
-        return postgres_url
+    def url(self, postgres_server: PostgresServer, request: pytest.FixtureRequest) -> str:
+        return postgres_server.create_database(with_tables="store" in request.fixturenames)
 
 
 def test_a_schedule_that_another_decides_is_passed_over_and_not_waited_for(postgres_url: str) -> None:

@@ -16,8 +16,8 @@ class TestOnPostgres(StoreContract):
     """All of the contract, on PostgreSQL."""
 
     @pytest.fixture
-    def url(self, postgres_url: str) -> str:
-        return postgres_url
+    def url(self, postgres_server: PostgresServer, request: pytest.FixtureRequest) -> str:
+        return postgres_server.create_database(with_tables="store" in request.fixturenames)
 
 
 def test_a_server_that_is_away_is_told_without_the_password_and_is_found_again(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,9 +10,12 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).parent))
 
-from batch_faults import BatchRun
-from processes import Programs, programs
+from batch_faults import SETTINGS, Undisturbed, buildings_of
+from processes import programs
 
+from pipeline.runtime.digest import run_digest
+from pipeline.runtime.run import RunRequest, run
+from pipeline.settings import RunSettings
 from pipeline.synthetic.dataset import simulate
 
 __all__ = ["programs"]
@@ -26,16 +28,10 @@ def town_tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def undisturbed_batch(town_tile: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[BatchRun]:
-    """A batch run that nothing happens to."""
-    folder = tmp_path_factory.mktemp("undisturbed")
-    some = Programs(folder)
-    try:
-        run = BatchRun(some, folder / "run", town_tile)
-        driver = run.start()
-        assert driver.ended() == 0, driver.tail()
-        assert run.status()["state"] == "finished"
-        assert len(run.buildings()) >= 24
-        yield run
-    finally:
-        some.end()
+def undisturbed_batch(town_tile: Path, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+    """What a batch of the town delivers when nothing happens to it: a run in this process, which costs least."""
+    out = str(tmp_path_factory.mktemp("undisturbed") / "run")
+    run(RunRequest(inputs=(str(town_tile),), out=out, settings=RunSettings.from_mapping(SETTINGS), workers=0))
+    found = Undisturbed(digest=run_digest(out), buildings=buildings_of(out))
+    assert len(found.buildings) >= 24
+    return found

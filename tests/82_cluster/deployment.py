@@ -79,10 +79,10 @@ class Gates:
             mark.unlink()
         (folder / "go").unlink()
 
-    def open(self) -> None:
-        """Let all through."""
-        for folder in self._folders.values():
-            (folder / "go").touch()
+    def open(self, *stages: str) -> None:
+        """Let all through, or those of some stages."""
+        for stage in stages or STAGES:
+            (self._folders[stage] / "go").touch()
 
     def reached(self, stage: str) -> int | None:
         """The id of a process that waits in a stage."""
@@ -126,6 +126,8 @@ class Deployment:
             "GABLEWORK_SCHEDULER": self.scheduler_address,
             "GABLEWORK_LEASE_S": "3",
             "GABLEWORK_POLL_S": "0.1",
+            # one job is struck in every stage
+            "GABLEWORK_MAX_ATTEMPTS": str(len(STAGES) + 2),
             "GABLEWORK_PORT": str(self._ports["api"]),
             "OPENBLAS_NUM_THREADS": "1",
             **(variables or {}),
@@ -186,11 +188,15 @@ class Deployment:
                 self.start(name)
 
     def settle(self) -> None:
+        """Let all through, bring back everything, and wait until it answers."""
+        self.gates.open()
+        self.restore()
+
+    def restore(self) -> None:
         """Bring back everything, and wait until it answers and the scheduler knows all workers."""
         from distributed import Client
 
         self.gone.clear()
-        self.gates.open()
         self.supervise()
         self.running["scheduler"].wait_for_port(self._ports["scheduler"])
         self.running["api"].wait_for_port(self._ports["api"])
@@ -268,9 +274,10 @@ class Deployment:
         return self._store.events(job_id, limit=10_000)
 
     def held(self, job_id: str, stage: str) -> int:
-        """Wait until a job is held in a stage; the id of a process that waits there."""
+        """Wait until a job is held in a stage, and bring back what dies; the id of a process that waits there."""
 
         def reached() -> int | None:
+            self.supervise()
             job = self.job(job_id)
             assert not job.status.is_over, f"the job ended before {stage}: {job.status}, {job.message}"
             return self.gates.reached(stage)

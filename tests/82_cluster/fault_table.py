@@ -1,4 +1,4 @@
-"""Faults, the stages at which they strike, and what became of the job, as rows of a table."""
+"""Faults, the stages in which they strike, and what became of the job, as rows of a table."""
 
 from __future__ import annotations
 
@@ -63,24 +63,30 @@ def killed(name: str) -> Callable[[Deployment, Moment], None]:
 def freeze_driver(service: Deployment, moment: Moment) -> None:
     """A driver falls silent, another takes its job, and then the first goes on as if nothing had been."""
     silent = service.freeze("driver")
+    attempt = service.job(moment.job_id).attempt
     service.start("driver")
-    wait_for(lambda: service.job(moment.job_id).attempt == 2, "the claim of another driver")
+    wait_for(lambda: service.job(moment.job_id).attempt == attempt + 1, "the claim of another driver")
     silent.process.send_signal(signal.SIGCONT)
     service.replaced.append(silent)
 
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """Something that goes wrong while a job is in a stage."""
+    """Something that goes wrong while a job is in a stage, and again in the next."""
 
     name: str
     """As the table tells it."""
     strike: Callable[[Deployment, Moment], None]
     """Does it."""
     stages: Sequence[str]
-    """Where it strikes."""
+    """Where it strikes, in the order of a job."""
     begun_again: Sequence[str] = ()
-    """Where the job is begun a second time."""
+    """Where the job is begun once more."""
+
+    @property
+    def begun(self) -> int:
+        """How often the job is begun by its end."""
+        return 1 + sum(stage in self.begun_again for stage in self.stages)
 
 
 FAULTS = (
@@ -89,7 +95,8 @@ FAULTS = (
     Fault("all workers killed, others come later", kill_all_workers, ("reconstruct",)),
     Fault("scheduler killed", killed("scheduler"), EVERYWHERE, begun_again=ON_WORKERS),
     Fault("driver killed", killed("driver"), EVERYWHERE, begun_again=STAGES),
-    Fault("driver frozen until another has the job", freeze_driver, ("split", "outputs"), begun_again=STAGES),
+    Fault("driver frozen until another has the job", freeze_driver, ("split",), begun_again=STAGES),
+    Fault("driver frozen until another has the job", freeze_driver, ("outputs",), begun_again=STAGES),
     Fault("API killed", killed("api"), EVERYWHERE),
 )
 
@@ -99,7 +106,8 @@ class Row:
     """What became of a job."""
 
     fault: str
-    stage: str
+    stages: str
+    """Where it struck, one after the other."""
     status: str
     begun: int
     """How often it was begun."""
@@ -115,27 +123,37 @@ class Row:
     @property
     def outcome(self) -> tuple[str, ...]:
         """All but the seconds, which no two runs share."""
-        return (self.fault, self.stage, self.status, str(self.begun), str(self.ended), self.content, self.marked)
+        return (self.fault, self.stages, self.status, str(self.begun), str(self.ended), self.content, self.marked)
 
 
-def strike(service: Deployment, fault: Fault, stage: str, tile: Path, settings: Mapping[str, Any]) -> Ended:
-    """Submit a job, let the fault strike once the job is in the stage, and wait for its end."""
-    if stage == QUEUE:
+def strike(service: Deployment, fault: Fault, tile: Path, settings: Mapping[str, Any]) -> Ended:
+    """Submit a job, let the fault strike in its stages, one after the other, and wait for the job's end."""
+    stages = [stage for stage in fault.stages if stage != QUEUE]
+    title = f"{fault.name}: {', '.join(fault.stages)}"
+    service.gates.close(stages[0])
+    if QUEUE in fault.stages:
         idle = service.freeze("driver")
-        job_id = service.submit(tile, settings, f"{fault.name}: {stage}")
+        job_id = service.submit(tile, settings, title)
         fault.strike(service, Moment(job_id, 0))
         if idle.alive:
             idle.process.send_signal(signal.SIGCONT)
     else:
-        service.gates.close(stage)
-        job_id = service.submit(tile, settings, f"{fault.name}: {stage}")
+        job_id = service.submit(tile, settings, title)
+    begun = 1
+    for stage, following in zip(stages, (*stages[1:], None), strict=True):
         pid = service.held(job_id, stage)
+        assert service.job(job_id).attempt == begun, f"begun {service.job(job_id).attempt} times before {stage}"
+        begun += stage in fault.begun_again
+        if following is not None:
+            service.gates.close(following)
+        # what the stage before has cost is there again
+        service.restore()
         fault.strike(service, Moment(job_id, pid))
-        service.gates.open()
+        service.gates.open(stage)
     return service.ended(job_id)
 
 
-def row(fault: str, stage: str, ended: Ended, undisturbed: Ended) -> Row:
+def row(fault: str, stages: Sequence[str], ended: Ended, undisturbed: Ended) -> Row:
     """What became of a job, against an undisturbed one."""
     reasons = {name: reason for name, (_, reason) in ended.buildings.items() if reason in COSTLY}
     rest_is_same = {name: told for name, told in ended.buildings.items() if name not in reasons} == {
@@ -144,7 +162,7 @@ def row(fault: str, stage: str, ended: Ended, undisturbed: Ended) -> Row:
     content = "same" if ended.digest == undisturbed.digest else "same but for them" if rest_is_same else "differs"
     return Row(
         fault=fault,
-        stage=stage,
+        stages=", ".join(stages),
         status=ended.job.status.value,
         begun=ended.job.attempt,
         ended=ended.ends,
@@ -156,7 +174,7 @@ def row(fault: str, stage: str, ended: Ended, undisturbed: Ended) -> Row:
 
 COSTLY = ("crashed", "timed_out", "out_of_memory")
 
-HEADER = ("fault", "while the job is in", "job", "begun", "ended", "content", "buildings marked", "seconds lost")
+HEADER = ("fault", "strikes in", "job", "begun", "ended", "content", "buildings marked", "seconds lost")
 
 
 def markdown(rows: Sequence[Row]) -> str:

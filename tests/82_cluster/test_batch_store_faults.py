@@ -5,23 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from batch_faults import BatchRun, Fault, cases, check
+from batch_faults import BatchRun, Fault, Undisturbed, cases, check
 from object_store import FaultyProxy
 from processes import Programs
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize(("fault", "stage"), cases(in_store=True))
+@pytest.mark.parametrize("fault", cases(in_store=True))
 def test_a_batch_run_outlives(
     fault: Fault,
-    stage: str,
     town_tile: Path,
-    undisturbed_batch: BatchRun,
+    undisturbed_batch: Undisturbed,
     tmp_path: Path,
     programs: Programs,
     s3: FaultyProxy,
     bucket: str,
 ) -> None:
     run = BatchRun(programs, tmp_path / "run", town_tile, faults={"impatient": 2.0}, store=s3, bucket=bucket)
-    check(run, fault, stage, undisturbed_batch)
+    check(run, fault, undisturbed_batch)
