@@ -26,6 +26,7 @@ from numba.core.runtime import _nrt_python
 from numba.core.targetconfig import ConfigStack
 
 from pipeline.compiler import store
+from pipeline.compiler.processor import GENERIC, processor
 from pipeline.compiler.store import Stored
 
 types: Any = numba.types
@@ -33,6 +34,10 @@ KNOWN = ("0.68.",)
 """Versions of numba whose inside is known."""
 COMMON_OPTIONS = {"nopython": True, "nogil": True}
 """Of all kernels."""
+# before numba makes its code generator, which asks for them once
+config.CPU_NAME = processor()
+if config.CPU_NAME == GENERIC:
+    config.CPU_FEATURES = ""
 _ENVIRONMENTS = "_ZN08NumbaEnv"
 
 

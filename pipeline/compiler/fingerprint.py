@@ -43,10 +43,12 @@ def fingerprint(function: Callable[..., Any], options: Mapping[str, Any], source
         one, with_options = waiting.pop()
         name = f"{one.__module__}.{one.__qualname__}"
         if name not in found:
-            own = _Own(source_of)
-            own.add(repr(sorted(with_options.items())), *_of_function(one, own))
-            found[name] = own.digest()
-            waiting.extend(own.calls)
+            if one not in _KNOWN:
+                own = _Own(source_of)
+                own.add(repr(sorted(with_options.items())), *_of_function(one, own))
+                _KNOWN[one] = (own.digest(), tuple(own.calls))
+            found[name], calls = _KNOWN[one]
+            waiting.extend(calls)
     whole = hashlib.sha256()
     for name in sorted(found):
         whole.update(name.encode() + b"\0" + found[name])
@@ -55,6 +57,10 @@ def fingerprint(function: Callable[..., Any], options: Mapping[str, Any], source
 
 Kerneled = tuple[Callable[..., Any], Mapping[str, Any]]
 SourceOf = Callable[[Any], Kerneled | None]
+
+
+_KNOWN: dict[Callable[..., Any], tuple[bytes, tuple[Kerneled, ...]]] = {}
+"""Hashes of kernels' own code, and what they call, by function: many kernels call the same."""
 
 
 class _Own:

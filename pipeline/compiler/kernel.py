@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib.util
 import operator
 import os
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, TypeVar, overload
 
 from pipeline.compiler import store
 from pipeline.compiler.fingerprint import Kerneled, fingerprint
+from pipeline.compiler.processor import processor
 
 
 class Kernel:
@@ -40,7 +43,7 @@ class Kernel:
     @property
     def prefix(self) -> str:
         """With which the names of its files begin."""
-        place = f"{sys.implementation.cache_tag}-{os.uname().machine}-{_processor()}"
+        place = f"{sys.implementation.cache_tag}-{os.uname().machine}-{processor()}"
         return f"{self.py_func.__module__}.{self.py_func.__qualname__}.{place}-"
 
     @property
@@ -51,7 +54,6 @@ class Kernel:
     @functools.cached_property
     def dispatcher(self) -> Any:
         """Numba's own object; the function itself where numba is switched off."""
-        os.environ["NUMBA_CPU_NAME"] = _processor()
         from pipeline.compiler.backend import dispatcher_of
 
         return dispatcher_of(self.py_func, self.options, self.prefix, lambda: self.fingerprint)
@@ -69,20 +71,16 @@ class Kernel:
         return self.py_func.__qualname__
 
 
-def _processor() -> str:
-    """The processor to compile for: by default any of this machine's kind.
-
-    Such code is as fast as that for the very processor, and its files can be carried from machine to machine.
-    """
-    return os.environ.get("NUMBA_CPU_NAME") or "generic"
-
-
 @functools.cache
 def _versions() -> bytes:
-    """The versions that machine code hangs on."""
-    from importlib.metadata import version
-
-    return repr([version(name) for name in ("numba", "llvmlite")]).encode()
+    """What tells versions of numba and llvmlite apart, without importing them."""
+    told = b""
+    for name in ("numba", "llvmlite"):
+        found = importlib.util.find_spec(name)
+        assert found is not None
+        assert found.origin is not None
+        told += Path(found.origin).with_name("_version.py").read_bytes()
+    return told
 
 
 def _source_of(value: Any) -> Kerneled | None:
