@@ -20,7 +20,7 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import numba
-from numba.core import codegen, compiler, config, event, registry, serialize, sigutils
+from numba.core import cgutils, codegen, compiler, config, event, registry, serialize, sigutils
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.runtime import _nrt_python
 from numba.core.targetconfig import ConfigStack
@@ -92,7 +92,16 @@ def _prepare() -> None:
             library.codegen.set_env(referenced.env_name, referenced)
         return made
 
+    dynamic_address = context.add_dynamic_addr
+
+    def add_dynamic_addr(builder: Any, address: int, info: str) -> Any:
+        """An address of this process in the code, which cannot be kept then; none for a kernel that is only called."""
+        if info == "Kernel":
+            return cgutils.voidptr_t(None)
+        return dynamic_address(builder, address, info)
+
     context.get_executable = get_executable
+    context.add_dynamic_addr = add_dynamic_addr
     context.create_cfunc_wrapper = _no_wrapper
     for name, address in _nrt_python.c_helpers.items():
         llvm.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
