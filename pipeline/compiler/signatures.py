@@ -51,10 +51,8 @@ def written(kind: Any) -> Any:
 def read(told: Any) -> Any:
     """The type of numba's that `written` wrote.
 
-    >>> read(["float64", 2, "C", "readonly"])
-    Array(float64, 2, 'C', False, aligned=True)
-    >>> read({"tuple": ["int64", "boolean"]})
-    Tuple(int64, bool)
+    >>> print(read(["float64", 2, "C", "readonly"]), read({"tuple": ["int64", "boolean"]}))
+    readonly array(float64, 2d, C) Tuple(int64, bool)
     """
     if isinstance(told, str):
         return getattr(types, {"bool": "boolean"}.get(told, told))

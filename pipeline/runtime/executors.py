@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -203,6 +204,8 @@ class Cluster:
                     preload=[worker_setup.__name__],
                     security=self.security,
                     resources={RESOURCE: each_bytes},
+                    # the server that they are forked from may have begun with another one
+                    env=dict(os.environ),
                 )
                 self._while_running = starting.pop_all()
         except (OSError, RuntimeError, TimeoutError) as error:

@@ -169,7 +169,7 @@ def test_a_cell_that_is_far_at_all_corners_is_found_and_left_whole() -> None:
 def test_a_plane_costs_where_it_goes_on_by_more_than_its_slope(plane: tuple[float, float, float], *, far: bool) -> None:
     hall = Hall(LOW, [plane, LOW])
     hall.points[:, 2] = 3.0
-    around = heights_around(hall.plan.xy, 4, heights_raster(hall.points, SPACING_M))
+    around = heights_around(hall.plan, heights_raster(hall.points, SPACING_M))
     costs, misfits = np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64)
     add_costs_of_far_planes(hall.plan, hall.planes, around, FAR_M, costs, misfits)
     assert (costs[0, 0] > 0, costs[0, 1]) == (far, 0)
@@ -180,7 +180,7 @@ def test_a_plane_costs_where_it_goes_on_by_more_than_its_slope(plane: tuple[floa
 def test_a_plane_costs_by_the_metre_up_to_a_limit(height_m: float, cost: int) -> None:
     hall = Hall(LOW, [(0.0, 0.0, height_m), LOW])
     hall.points[:, 2] = 3.0
-    around = heights_around(hall.plan.xy, 4, heights_raster(hall.points, SPACING_M))
+    around = heights_around(hall.plan, heights_raster(hall.points, SPACING_M))
     costs, misfits = np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64)
     add_costs_of_far_planes(hall.plan, hall.planes, around, FAR_M, costs, misfits)
     assert costs.tolist() == misfits.tolist() == [[cost, 0]]
@@ -191,7 +191,7 @@ def test_steep_planes_go_on_no_farther_than_one_of_45_degrees(slope: float, *, i
     hall = Hall(LOW, [(0.0, slope, 3.0)])
     hall.points[:, 2] = 3.0 + slope * hall.points[:, 1]
     # the eave is a metre from the first points, so that those of the next cells tell
-    around = heights_around(hall.plan.xy, 4, heights_raster(hall.points[hall.points[:, 1] > 0.9], SPACING_M))
+    around = heights_around(hall.plan, heights_raster(hall.points[hall.points[:, 1] > 0.9], SPACING_M))
     extended = with_level_planes(hall.plan, hall.planes, hall.labels, around, FAR_M)
     assert (len(extended) > 1) == is_far
 

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,7 @@ def no_children_left() -> Iterator[None]:
     children.kill_children()
     yield
     children.kill_children()
-    assert [
-        process for process in psutil.Process().children(recursive=True) if process.name().startswith("gable")
-    ] == []
+    assert ours() == []
 
 
 @pytest.fixture
@@ -70,9 +69,16 @@ def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return asked
 
 
+def ours() -> list[psutil.Process]:
+    """Children and servers of this process, but for the server of Dask's workers, which outlives other tests."""
+    of_dask = forkserver._forkserver._forkserver_pid
+    found = psutil.Process().children(recursive=True)
+    return [process for process in found if process.name().startswith("gable") and process.pid != of_dask]
+
+
 def servers() -> list[psutil.Process]:
     """The servers of this process that live."""
-    found = [process for process in psutil.Process().children() if process.name() == process_server.NAME]
+    found = [process for process in ours() if process.name() == process_server.NAME]
     return [process for process in found if process.status() != psutil.STATUS_ZOMBIE]
 
 

@@ -13,12 +13,12 @@ from object_store import SECRET
 
 from pipeline.errors import EmptyInputError, InputError, RunError, UnreadableInputError
 from pipeline.evaluation.reading import read_models
+from pipeline.export import tile as tile_files
 from pipeline.io import storage_at
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.retries import persistently
 from pipeline.io.urls import filesystem_of
 from pipeline.report.table import run_statistics
-from pipeline.runtime import publish as publishing
 from pipeline.runtime.bundle import read_bundle
 from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.digest import run_digest
@@ -189,7 +189,7 @@ def test_a_run_that_breaks_off_says_so(tile, bucket, monkeypatch):
     def fail(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(publishing, "write_tile", fail)
+    monkeypatch.setattr(tile_files, "write_tile", fail)
     with pytest.raises(KeyboardInterrupt):
         run(request(tile, bucket))
     assert read_manifest(f"{bucket}/run").status is RunStatus.CANCELLED

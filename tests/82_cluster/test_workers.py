@@ -43,6 +43,12 @@ def version(name, real=importlib.metadata.version):
 
 importlib.metadata.version = distributed.versions.version = version
 distributed.versions._version_cached.cache_clear()
+
+import pipeline.runtime.versions as ours
+
+ours._version = version
+ours.versions_here.cache_clear()
+ours.fingerprint.cache_clear()
 """
 
 
