@@ -11,6 +11,7 @@ It is written against the versions in `KNOWN`. With any other numba, or with `GA
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import pickle
@@ -26,6 +27,7 @@ from numba.core.runtime import _nrt_python
 from numba.core.targetconfig import ConfigStack
 
 from pipeline.compiler import store
+from pipeline.compiler.frame_room import with_room_for_frames
 from pipeline.compiler.processor import GENERIC, processor
 from pipeline.compiler.store import Stored
 
@@ -132,10 +134,6 @@ class _Library(codegen.JITCodeLibrary):
     _has_code = False
     _shared_module: Any
     _bitcode: bytes | None = None
-
-    def _optimize_functions(self, ll_module: Any) -> None:
-        """Leave functions as they are: they are optimised with the code that they are linked into."""
-        ll_module.data_layout = self._codegen._data_layout
 
     def finalize(self) -> None:
         """Link what it calls, and no more."""
@@ -287,13 +285,8 @@ class KernelDispatcher(registry.CPUDispatcher):
             result = self._with_wrapper(known)
         else:
             store.say_what_does_not_fit(self._prefix)
-            details = {"dispatcher": self, "args": arguments, "return_type": None}
-            _DEPTH.value += 1
-            try:
-                with event.trigger_event("numba:compile", data=details):
-                    result = self._compiler.compile(arguments, None)
-            finally:
-                _DEPTH.value -= 1
+            compiling = functools.partial(self._compiled, arguments)
+            result = compiling() if _DEPTH.value else with_room_for_frames(compiling)
         self._take(arguments, result, runnable=for_python)
         library, fndesc = result.library, result.fndesc
         library._ensure_finalized()
@@ -311,6 +304,16 @@ class KernelDispatcher(registry.CPUDispatcher):
         )
         code = library._get_compiled_object() if for_python else b""
         store.save(name, self._fingerprint(), Stored(facts=serialize.dumps(facts), machine_code=code, bitcode=bitcode))
+
+    def _compiled(self, arguments: tuple[Any, ...]) -> Any:
+        """What numba makes of the kernel, and of what it calls on the way."""
+        _DEPTH.value += 1
+        try:
+            details = {"dispatcher": self, "args": arguments, "return_type": None}
+            with event.trigger_event("numba:compile", data=details):
+                return self._compiler.compile(arguments, None)
+        finally:
+            _DEPTH.value -= 1
 
     def _with_wrapper(self, known: Any) -> Any:
         """A kernel that kernels called so far, made callable from Python."""
