@@ -45,6 +45,7 @@ THREADED = 75
 """Exit code of a server that has more than one thread: a forked child would wait for locks that nobody lets go."""
 _PIECE = 2**16
 _DESCRIPTORS = 4
+_STANDARD = 3
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -62,13 +63,13 @@ def main(arguments: Sequence[str]) -> None:
     serve(socket.socket(fileno=int(arguments[1])))
 
 
-def _close_all_from(first: int) -> None:
-    """Close all descriptors from a number on but files that are read.
+def _close_all_but(orders: int) -> None:
+    """Close all descriptors but the standard ones, one more, and files that are read.
 
     A library that was loaded before the fork, such as PROJ with its data base, goes on to read them by their numbers.
     """
     for number in sorted(int(name) for name in os.listdir("/proc/self/fd")):  # noqa: PTH208 - numbers, no paths
-        if number < first:
+        if number < _STANDARD or number == orders:
             continue
         with contextlib.suppress(OSError):  # the listing's own is closed by now
             read_only = fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY
@@ -103,14 +104,14 @@ def serve_forked(owner: int, orders: socket.socket, stderr: int, loads: Sequence
         os.setsid()
         child.end_with_parent(owner)
         nothing = os.open(os.devnull, os.O_RDWR)
-        for number, descriptor in enumerate((nothing, nothing, stderr, orders.detach())):
+        for number, descriptor in enumerate((nothing, nothing, stderr)):
             os.dup2(descriptor, number)
-        _close_all_from(4)
+        _close_all_but(orders.fileno())
         signal.set_wakeup_fd(-1)
         for name in (signal.SIGCHLD, signal.SIGINT):
             signal.signal(name, signal.SIG_DFL)
         _load(loads)
-        serve(socket.socket(fileno=3))
+        serve(orders)
     except BaseException:  # noqa: BLE001 - as an interpreter ends
         traceback.print_exc()
     finally:
