@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -194,3 +195,24 @@ def test_a_child_that_is_called_off_before_its_server_has_loaded_never_begins(
     ):
         pytest.fail("it is not ready")
     assert children._children._all == set()
+
+
+FIRST_FILE = """
+import functools, os, sys
+held = os.open(sys.argv[1], os.O_RDONLY)
+assert held == 3, held
+from pipeline.runtime import children
+from pipeline.runtime.isolation import IsolationLimits, supervise
+children.fork_server()
+limits = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
+for turn in range(2):
+    print([found for _, found in supervise(functools.partial(os.pread, 3, 5), [0, 1], limits)])
+"""
+
+
+def test_a_file_that_was_opened_before_anything_else_is_read_in_children_by_its_number(tmp_path: Path) -> None:
+    """Libraries such as PROJ keep the number of their data base's descriptor; a pipe there broke them and the pipe."""
+    (tmp_path / "data").write_bytes(b"held data")
+    command = [sys.executable, "-P", "-c", FIRST_FILE, str(tmp_path / "data")]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.stdout.splitlines() == ["[b'held ', b'eld d']"] * 2, ended.stderr
