@@ -148,7 +148,8 @@ def show_evaluation(console: Console, evaluation: Evaluation) -> dict[str, Any]:
 
     document: dict[str, Any] = {"models": evaluation.models.path, "notes": list(all_notes(evaluation))}
     if evaluation.models.kind == "run":
-        from pipeline.report.table import run_statistics, statistics_tables
+        from pipeline.report.statistics import run_statistics
+        from pipeline.report.table import statistics_tables
 
         document["statistics"] = run_statistics(evaluation.models.path)
         for table in statistics_tables(document["statistics"]):

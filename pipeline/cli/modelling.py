@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -337,11 +337,29 @@ def _run_settings(path: str | None, **overrides: str | None) -> RunSettings:
     return RunSettings.from_toml(path, given)
 
 
+def _statistics_of(run_dir: str) -> dict[str, Any]:
+    """The figures of a run, read by a child of the run if there is one: it has loaded Arrow, which takes longer."""
+    from pipeline.runtime.children import has_idle_child
+
+    if has_idle_child():
+        from pipeline.runtime.events import Watch
+        from pipeline.runtime.local import LocalExecutor
+
+        return LocalExecutor(1).apart("report", _read_statistics, run_dir, Watch())
+    return _read_statistics(run_dir)
+
+
+def _read_statistics(run_dir: str) -> dict[str, Any]:
+    from pipeline.report.statistics import run_statistics
+
+    return run_statistics(run_dir)
+
+
 def show_summary(console: Console, summary: RunSummary) -> None:
     """What a run found, as tables or as the JSON document."""
-    from pipeline.report.table import run_statistics, statistics_tables
+    from pipeline.report.table import statistics_tables
 
-    for table in statistics_tables(run_statistics(summary.run_dir)):
+    for table in statistics_tables(_statistics_of(summary.run_dir)):
         console.show(table)
     console.table(
         "Time", ["stage", "wall clock"], [(k, f"{seconds:.1f} s") for k, seconds in summary.timings_s.items()]

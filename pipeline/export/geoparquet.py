@@ -8,7 +8,7 @@ skip row groups. In `buildings` the footprint is the primary geometry; the solid
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -171,6 +171,51 @@ def files_dataset(files: Sequence[str], schema: pa.Schema, filesystem: pafs.File
         return pads.dataset(schema.empty_table())
     partitioning = pads.partitioning(pa.schema([("tile", pa.string())]), flavor="hive")
     return pads.dataset(files, schema=schema, filesystem=filesystem, format="parquet", partitioning=partitioning)
+
+
+def table_batches(
+    run_dir: str,
+    table_name: str,
+    columns: Sequence[str],
+    filesystem: pafs.FileSystem,
+    tiles: Sequence[str] | None = None,
+    rows: int = 65_536,
+) -> Iterator[pa.RecordBatch]:
+    """Columns of one table of a run, some rows at a time; quicker to begin than `table_dataset`.
+
+    Parameters
+    ----------
+    run_dir, table_name, filesystem, tiles
+        As `table_dataset` has them.
+    columns : sequence of str
+        Columns that are stored, so not `tile`.
+    rows : int
+        Most rows of a batch.
+
+    Raises
+    ------
+    RunError
+        The folder does not exist, or holds what is no Parquet.
+    """
+    schema = stored_schema(table_name)
+    try:
+        for path in table_files(run_dir, table_name, filesystem, tiles):
+            with filesystem.open_input_file(path) as stream:
+                file = pq.ParquetFile(stream)
+                if _holds(file.schema_arrow, schema, columns):
+                    yield from file.iter_batches(rows, columns=list(columns))
+                    continue
+            # another writer's types, or a column that is not there: the dataset reads them as ours, but takes longer
+            dataset = files_dataset([path], schema, filesystem)
+            yield from dataset.to_batches(columns=list(columns), batch_size=rows, fragment_readahead=1)
+    except (pa.ArrowInvalid, OSError) as error:
+        folder = f"{str(run_dir).rstrip('/')}/{table_name}"
+        raise RunError(f"{folder} cannot be read as Parquet: {error}") from error
+
+
+def _holds(found: pa.Schema, wanted: pa.Schema, columns: Sequence[str]) -> bool:
+    """Whether a file has all columns of the types in which they are written."""
+    return all(column in found.names and found.field(column).type == wanted.field(column).type for column in columns)
 
 
 def table_dataset(

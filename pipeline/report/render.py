@@ -23,7 +23,7 @@ from pipeline.export.geoparquet import read_table
 from pipeline.io import arrow_at
 from pipeline.model import RoofType, Status
 from pipeline.report.perspective import MAP_SUN, View, ViewedFace, draw_view, drawn_path, lambert, shaded
-from pipeline.report.table import run_statistics
+from pipeline.report.statistics import run_statistics
 from pipeline.runtime.manifest import NAME, read_manifest
 
 ROOF_COLOURS = {

@@ -22,7 +22,7 @@ from pipeline.report.class_map import MOST_DRAWN, ROWS, ClassMap, MapClass
 from pipeline.report.evaluation_maps import BAD, FAIR, GOOD, MISSING
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
-from pipeline.report.table import QUANTILES, run_statistics
+from pipeline.report.statistics import QUANTILES, run_statistics
 from pipeline.runtime.manifest import NAME, PAGE, RunManifest, RunStatus, read_manifest
 
 LISTED = 500

@@ -81,6 +81,11 @@ class _Children:
             if not self._closed:
                 self._serving(loads)
 
+    def has_idle(self) -> bool:
+        """Whether a living child has nothing to do."""
+        with self._lock:
+            return any(child.alive for child in self._idle)
+
     def kill(self) -> None:
         """Kill all children; the next work starts others."""
         with self._lock:
@@ -213,6 +218,11 @@ def preload(loads: Sequence[str]) -> None:
 def fork_server() -> None:
     """Have this process forked to be the server of its children, with all that it has loaded; it has one thread."""
     _children.take(ProcessServer(functools.partial(forked_server, ())))
+
+
+def has_idle_child() -> bool:
+    """Whether a child of this process is there and has nothing to do."""
+    return _children.has_idle()
 
 
 def kill_children() -> None:

@@ -18,10 +18,9 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.fs as pafs
-import pyarrow.parquet as pq
 
 from pipeline.errors import RunError
-from pipeline.export.geoparquet import files_dataset, stored_schema, table_files
+from pipeline.export.geoparquet import stored_schema, table_batches
 from pipeline.export.records import KEYS
 from pipeline.io import arrow_at
 
@@ -72,7 +71,8 @@ def _row_hashes(
     """The key columns of a table, and the hash of every row, shape (n, 32)."""
     key_parts: list[list[npt.NDArray[Any]]] = [[] for _ in key]
     hash_parts = [np.empty((0, _HASH_BYTES), np.uint8)]
-    for batch in _batches(run_dir, name, filesystem, tiles):
+    columns = [column for column in stored_schema(name).names if column not in NOT_CONTENT]
+    for batch in table_batches(run_dir, name, columns, filesystem, tiles, ROWS_A_BATCH):
         if batch.num_rows == 0:
             continue
         digests = b"".join(hashlib.sha256(row).digest() for row in canonical_rows(batch))
@@ -81,32 +81,6 @@ def _row_hashes(
             part.append(_key_values(batch.column(column), f"{run_dir}/{name}", column))
     keys = [np.concatenate(part) if part else np.empty(0, "S1") for part in key_parts]
     return keys, np.concatenate(hash_parts)
-
-
-def _batches(
-    run_dir: str, name: str, filesystem: pafs.FileSystem, tiles: Sequence[str] | None
-) -> Iterator[pa.RecordBatch]:
-    """The rows of a table, some thousand at a time, with the columns that are content."""
-    folder = f"{run_dir.rstrip('/')}/{name}"
-    schema = stored_schema(name)
-    columns = [column for column in schema.names if column not in NOT_CONTENT]
-    try:
-        for path in table_files(run_dir, name, filesystem, tiles):
-            with filesystem.open_input_file(path) as stream:
-                file = pq.ParquetFile(stream)
-                if _holds(file.schema_arrow, schema, columns):
-                    yield from file.iter_batches(ROWS_A_BATCH, columns=columns)
-                    continue
-            # another writer's types, or a column that is not there: the dataset reads them as ours, but takes longer
-            dataset = files_dataset([path], schema, filesystem)
-            yield from dataset.to_batches(columns=columns, batch_size=ROWS_A_BATCH, fragment_readahead=1)
-    except (pa.ArrowInvalid, OSError) as error:
-        raise RunError(f"{folder} cannot be read as Parquet: {error}") from error
-
-
-def _holds(found: pa.Schema, wanted: pa.Schema, columns: Sequence[str]) -> bool:
-    """Whether a file has all columns of the types in which they are written."""
-    return all(column in found.names and found.field(column).type == wanted.field(column).type for column in columns)
 
 
 def _key_values(column: pa.Array, folder: str, name: str) -> npt.NDArray[Any]:

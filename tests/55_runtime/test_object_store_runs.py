@@ -18,7 +18,7 @@ from pipeline.io import storage_at
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.retries import persistently
 from pipeline.io.urls import filesystem_of
-from pipeline.report.table import run_statistics
+from pipeline.report.statistics import run_statistics
 from pipeline.runtime.bundle import read_bundle
 from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.digest import run_digest

@@ -12,7 +12,8 @@ import small_buildings as small
 from rich.console import Console
 
 from pipeline.errors import RunError
-from pipeline.report.table import run_statistics, statistics_tables
+from pipeline.report.statistics import run_statistics
+from pipeline.report.table import statistics_tables
 
 
 def test_statuses_reasons_and_types_are_counted(street_run: Path) -> None:
