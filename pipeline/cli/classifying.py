@@ -22,7 +22,7 @@ from pipeline.cli.options import (
     Workers,
 )
 from pipeline.console import Console
-from pipeline.runtime.early import start_early
+from pipeline.runtime.early import start_early, surely_small
 
 if TYPE_CHECKING:
     from pipeline.runtime.classify import ClassifySummary
@@ -61,7 +61,10 @@ def classify(
         from pipeline.runtime.tls import given_tls
         from pipeline.settings import RunSettings
 
-        start_early("classify", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None)
+        if not surely_small(tiles):
+            start_early(
+                "classify", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None
+            )
 
         request = ClassifyRequest(
             inputs=tuple(tiles),

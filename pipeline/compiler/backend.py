@@ -16,13 +16,14 @@ import hashlib
 import os
 import pickle
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import llvmlite.binding as llvm
 import numba
 from numba.core import cgutils, codegen, compiler, config, event, registry, serialize, sigutils
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.environment import Environment
 from numba.core.runtime import _nrt_python
 from numba.core.targetconfig import ConfigStack
 
@@ -90,8 +91,7 @@ def _prepare() -> None:
         if flags is not None and flags.no_cpython_wrapper:
             return _no_code()
         made = make_executable(library, fndesc, environment)
-        for referenced in _environments(library):
-            library.codegen.set_env(referenced.env_name, referenced)
+        _set_environments(library, *_environments(library))
         return made
 
     dynamic_address = context.add_dynamic_addr
@@ -113,6 +113,10 @@ def _no_wrapper(*of_function: Any) -> None:
     """Make no wrapper for callers in C; there are none."""
 
 
+_NOTHING = Environment({})
+"""Stands for all environments that hold nothing."""
+
+
 def _no_code() -> Any:
     """What stands where numba wants a C function, and each time another: numba knows compiled functions by them.
 
@@ -121,11 +125,24 @@ def _no_code() -> Any:
     return {}.popitem
 
 
-def _environments(library: Any) -> list[Any]:
-    """The environments that a library's code refers to: its own and those of what is linked into it."""
-    names = (variable.name for variable in library._final_module.global_variables)
-    found = (compiler.lookup_environment(name) for name in names if name.startswith(_ENVIRONMENTS))
-    return [environment for environment in found if environment is not None and environment.can_cache()]
+def _environments(library: Any) -> tuple[tuple[Any, ...], tuple[str, ...]]:
+    """The environments that a library's code refers to: those that hold constants, and the names of the others.
+
+    An environment knows its module, so to load one imports that; numba's own modules take a tenth of a second. Most
+    hold nothing, and any other empty one does as well.
+    """
+    names = [v.name for v in library._final_module.global_variables if v.name.startswith(_ENVIRONMENTS)]
+    found = {name: compiler.lookup_environment(name) for name in names}
+    full = {name: one for name, one in found.items() if one is not None and one.consts}
+    return tuple(full.values()), tuple(name for name in names if name not in full)
+
+
+def _set_environments(library: Any, full: Iterable[Any], empty: Iterable[str]) -> None:
+    """Have a library's code, which is loaded, find its environments."""
+    for one in full:
+        library.codegen.set_env(one.env_name, one)
+    for name in empty:
+        library.codegen.set_env(name, _NOTHING)
 
 
 class _Library(codegen.JITCodeLibrary):
@@ -257,8 +274,8 @@ class KernelDispatcher(registry.CPUDispatcher):
         library.load(stored, defined)
         runnable = bool(stored.machine_code)
         entry = self.targetctx.get_executable(library, fndesc, environment) if runnable else _no_code()
-        for referenced in environments if runnable else ():
-            library.codegen.set_env(referenced.env_name, referenced)
+        if runnable:
+            _set_environments(library, *environments)
         self._take(
             arguments,
             compiler.compile_result(
@@ -272,6 +289,7 @@ class KernelDispatcher(registry.CPUDispatcher):
                 objectmode=False,
                 lifted=(),
                 reload_init=reload_init,
+                referenced_envs=environments[0],
             ),
             runnable=runnable,
         )
@@ -290,7 +308,8 @@ class KernelDispatcher(registry.CPUDispatcher):
         self._take(arguments, result, runnable=for_python)
         library, fndesc = result.library, result.fndesc
         library._ensure_finalized()
-        if library.has_dynamic_globals:
+        environments = _environments(library)
+        if library.has_dynamic_globals or not all(one.can_cache() for one in environments[0]):
             return
         bitcode = library._get_module_for_linking().as_bitcode()
         fndesc.typemap = fndesc.calltypes = None
@@ -299,7 +318,7 @@ class KernelDispatcher(registry.CPUDispatcher):
             result.environment,
             result.signature,
             result.reload_init,
-            tuple(_environments(library)),
+            environments,
             (fndesc.llvm_func_name, fndesc.llvm_cpython_wrapper_name),
         )
         code = library._get_compiled_object() if for_python else b""

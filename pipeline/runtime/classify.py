@@ -178,6 +178,7 @@ def classify(
             local_directory=str(scratch_dir / "dask"),
             work=expected(plan, 0),
             tls=request.tls,
+            isolates=False,
         )
         with calling_off(scratch, cancelled) as called_off, engine:
             progress.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)

@@ -5,6 +5,8 @@ The server loads what they need while the command itself reads its options, impo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 Job = Literal["reconstruct", "classify"]
@@ -17,6 +19,16 @@ _LOADS = {
     "classify": ("pipeline.runtime.labelling", "pipeline.runtime.classified_files"),
 }
 _SCENE = "pipeline.runtime.rehearsal:rehearse_scene"
+
+
+_SMALL_BYTES = 500_000
+"""About 120 thousand points as LAZ, which one process classifies in half a second (`engine.ALONE_S`)."""
+
+
+def surely_small(inputs: Sequence[str]) -> bool:
+    """Whether inputs without buildings to model are files of this machine so small that no children will be needed."""
+    paths = [Path(name) for name in inputs]
+    return all(path.is_file() for path in paths) and sum(path.stat().st_size for path in paths) < _SMALL_BYTES
 
 
 def start_early(job: Job, *, workers: int | None, scheduler: str | None, footprints: bool, method: str | None) -> None:

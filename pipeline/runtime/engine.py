@@ -15,10 +15,18 @@ Engine = Literal["serial", "local", "cluster"]
 
 SMALL_S = 10.0 * RATES.cluster_start_s
 """Jobs that take less wall time on all cores need no cluster: its start would cost them more than a tenth."""
+ALONE_S = 0.5
+"""Jobs without buildings that take less CPU time need no children: their start would cost more than they save."""
 
 
 def engine_of(
-    *, workers: int | None, scheduler: str | None, expected_cpu_s: float, at: int, performance_report: bool = False
+    *,
+    workers: int | None,
+    scheduler: str | None,
+    expected_cpu_s: float,
+    at: int,
+    performance_report: bool = False,
+    isolates: bool = True,
 ) -> tuple[Engine, int]:
     """The engine of a job, and how many processes it has; those of a scheduler elsewhere are its own.
 
@@ -34,6 +42,8 @@ def engine_of(
         Cores of this machine.
     performance_report : bool
         Whether a page about the time of workers is asked for, which only a cluster has.
+    isolates : bool
+        Whether buildings are modelled, which children must do.
 
     Examples
     --------
@@ -48,6 +58,8 @@ def engine_of(
         return ("cluster", workers) if workers else ("serial", 1)
     if performance_report or expected_cpu_s / at > SMALL_S:
         return "cluster", at
+    if not isolates and expected_cpu_s < ALONE_S:
+        return "serial", 1
     return "local", at
 
 
@@ -61,6 +73,7 @@ def executor_for(
     traffic: Traffic = "interactive",
     tls: TlsFiles | None = None,
     performance_report: str | None = None,
+    isolates: bool = True,
 ) -> Executor:
     """The executor that a request asks for.
 
@@ -74,6 +87,8 @@ def executor_for(
         What there is to do; without, a job counts as small.
     priority, traffic, performance_report
         As `Cluster.executor` has them.
+    isolates
+        As `engine_of` has it.
 
     Raises
     ------
@@ -86,6 +101,7 @@ def executor_for(
         expected_cpu_s=0.0 if work is None else sum(work.cpu_s().values()),
         at=cores(),
         performance_report=performance_report is not None,
+        isolates=isolates,
     )
     if engine == "serial":
         if performance_report is not None:
