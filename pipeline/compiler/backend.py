@@ -11,6 +11,7 @@ It is written against the versions in `KNOWN`. With any other numba, or with `GA
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import hashlib
 import os
@@ -138,11 +139,17 @@ def _environments(library: Any) -> tuple[tuple[Any, ...], tuple[str, ...]]:
 
 
 def _set_environments(library: Any, full: Iterable[Any], empty: Iterable[str]) -> None:
-    """Have a library's code, which is loaded, find its environments."""
+    """Have a library's code, which is loaded, find its environments.
+
+    All code of a process shares one pointer per name. A kernel that kernels call has no constants; made callable from
+    Python it has some, under the same name: what is set already stays.
+    """
     for one in full:
         library.codegen.set_env(one.env_name, one)
     for name in empty:
-        library.codegen.set_env(name, _NOTHING)
+        address = library.codegen._engine.get_global_value_address(name)
+        if not ctypes.c_void_p.from_address(address).value:
+            library.codegen.set_env(name, _NOTHING)
 
 
 class _Library(codegen.JITCodeLibrary):

@@ -41,6 +41,10 @@ def total(values):
 @kernel
 def halves(values):
     return values.copy(), len(values) // 2
+
+@kernel
+def first_of_halves(values):
+    return halves(values)[0][0]
 """
 COUNTED = """
 import json, warnings
@@ -143,6 +147,16 @@ def test_one_process_calls_a_kernel_from_kernels_and_from_python_in_any_order(so
     assert sources.run(kernels_first)[0] == [21.0, 6.0, 7.0]
     both = f"told = [callee.scaled(2.0), caller.total({VALUES})]"
     assert Sources.run(sources, both, NUMBA_CACHE_DIR=str(sources.folder / "other"))[0] == [6.0, 21.0]
+
+
+@pytest.mark.parametrize("order", ["python, kernel, python", "kernel, python", "python, kernel"])
+def test_loaded_kernels_give_python_arrays_whoever_calls_them_first(sources: Sources, order: str) -> None:
+    python, called = f"caller.halves({VALUES})[0].sum()", f"caller.first_of_halves({VALUES})"
+    sources.run(f"told = [{called}, {python}]")
+    words = [{"python": python, "kernel": called}[name] for name in order.split(", ")]
+    told, compiled, _ = sources.run(f"told = [{', '.join(words)}]")
+    assert told == [{"python": 7.0, "kernel": 1.0}[name] for name in order.split(", ")]
+    assert compiled == []
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "other"])
