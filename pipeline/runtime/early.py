@@ -47,8 +47,15 @@ def start_early(job: Job, *, workers: int | None, scheduler: str | None, footpri
     """
     if workers is not None or scheduler is not None:
         return
-    import pipeline.io.las  # noqa: F401 - nearly every job reads LAS, and this process forks the server
+    # what this process needs, too, is loaded before the server is forked from it: nearly every job reads LAS
+    import pipeline.io.las  # noqa: F401
+    from pipeline.methods import METHODS
     from pipeline.runtime.children import preload
+
+    if job == "reconstruct":
+        METHODS.get(method or _METHOD)
+        if footprints:
+            import pyarrow as pa  # noqa: F401 - what reads footprints loads it
 
     loads = [*_STAGES, *_LOADS[job], f"{_SCENE}:given" if footprints else _SCENE]
     if job == "reconstruct":

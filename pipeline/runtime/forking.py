@@ -19,6 +19,7 @@ from typing import IO
 from pipeline.runtime.executed import environment_with_this_package, in_starter_thread
 from pipeline.runtime.messages import NUMBER, Order, frame
 from pipeline.runtime.process_server import THREADED, kill_with_group, serve_forked
+from pipeline.runtime.start_up import WITHOUT_THREADS
 
 _READ_AT_START = (
     *("PYTHON", "LD_", "LC_", "LANG", "TZ"),
@@ -31,8 +32,6 @@ _READ_LATER = (
 )
 """Beginnings of variables that look like those, but matter to no child: Dask sets one, and pyogrio the last two as it
 is loaded."""
-WITHOUT_THREADS = {"OPENBLAS_NUM_THREADS": "1", "JE_ARROW_MALLOC_CONF": "background_thread:false"}
-"""What keeps libraries from starting threads when they are loaded: those of matrices, and one that tidies memory."""
 
 
 _SAID_BYTES = 2000

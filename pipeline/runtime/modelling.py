@@ -283,7 +283,7 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
     reused = False
     try:
         candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, beside=task.settings.roof.at_walls)
-        made_from = key_of(candidate, task.method, task.settings)
+        made_from = key_of(candidate, task.method, _settings_key(task.settings))
         earlier = _modelled_before(task, site.building_id, made_from)
         reused = earlier is not None
         result = earlier or reconstruct_building(candidate, task.method, task.settings)
@@ -297,6 +297,12 @@ def model_site(task: BatchTask, site: CandidateSite) -> Packed:
         result = _kept(task, candidate, result, incident)
         made_from = ""
     return _packed(task, site, result, facts, seconds, made_from, reused=reused)
+
+
+@functools.lru_cache(maxsize=8)
+def _settings_key(settings: ReconstructSettings) -> str:
+    """Digest of settings, which most buildings of a batch share: they have more values than a small building has."""
+    return key_of(settings)
 
 
 def _modelled_before(task: BatchTask, building_id: str, made_from: str) -> BuildingResult | None:

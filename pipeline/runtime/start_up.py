@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import gc
 import os
 import sys
@@ -11,12 +12,21 @@ from importlib.abc import MetaPathFinder
 
 from pipeline.errors import SettingsError
 
+WITHOUT_THREADS = {"OPENBLAS_NUM_THREADS": "1", "JE_ARROW_MALLOC_CONF": "background_thread:false"}
+"""What keeps libraries from starting threads when they are loaded: those of matrices, which are small here, and one
+that tidies memory. They would cost time, and a process with threads cannot be forked."""
+
 _OBJECTS_A_COLLECTION = 300_000
 """New objects, of those that can be in cycles, between two collections of the youngest; Python's own is 700. Modules
 and models are built of many objects and few cycles: start-up makes 200 thousand objects that all stay, a town of 160
 buildings then leaves less than a hundred in cycles. With Python's own number a run over such a town takes a twelfth
 more of processor time, and with 50 thousand a fiftieth more."""
 
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_FREED_BYTES = 2**25
+"""Up to this size, memory that was freed is kept for the next array. glibc gives a block back to the system at first
+from 128 KiB on, learns of larger ones as they are freed, and ends here; until then every array of a tile is made of new
+pages, each of them a fault: a thirtieth of the processor time of a small run."""
 
 NOT_OURS = frozenset({"cffi", "pandas", "requests"})
 """What libraries load where they find it, though nothing here uses it and no lock of the product has it: numba, pyarrow
@@ -51,8 +61,9 @@ def start_own_process() -> None:
     """
     if not any(isinstance(finder, _WithoutThem) for finder in sys.meta_path):
         sys.meta_path.insert(0, _WithoutThem())
-    # matrices are small here: threads for them cost time to start, and a process with threads cannot be forked
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for name, value in WITHOUT_THREADS.items():
+        os.environ.setdefault(name, value)
+    _keep_freed_memory()
     gc.set_threshold(_OBJECTS_A_COLLECTION, *gc.get_threshold()[1:])
     atexit.unregister(gc.freeze)
     atexit.register(gc.freeze)
@@ -63,3 +74,11 @@ def start_own_process() -> None:
         with contextlib.suppress(SettingsError):
             if logs.wants_json():
                 logs.let_all_speak_json()
+
+
+def _keep_freed_memory() -> None:
+    """Tell glibc what it would learn; other systems have no such setting."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _FREED_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, 2 * _FREED_BYTES)

@@ -15,7 +15,8 @@ from multiprocessing import forkserver
 from typing import Any
 
 from pipeline.runtime.executed import environment_with_this_package, in_starter_thread
-from pipeline.runtime.forking import WITHOUT_THREADS, can_fork, read_at_start
+from pipeline.runtime.forking import can_fork, read_at_start
+from pipeline.runtime.start_up import WITHOUT_THREADS
 
 _PRELOADED = ("distributed.nanny", "pipeline.runtime.worker_birth")
 _SETTINGS = {"distributed.worker.multiprocessing-method": "forkserver"}
