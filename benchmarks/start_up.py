@@ -22,12 +22,14 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 _PR_SET_CHILD_SUBREAPER = 36
 
+ENGINES = ("classify", "east", "given", "both", "city")
+"""Rows whose job is also run by explicit numbers of workers."""
 IMPORT = "import pipeline.runtime.run"
 BUILDINGS = """
 import time
@@ -183,6 +185,25 @@ def measured(row: Row, baseline: Path, repeat: int) -> list[list[str]]:
     return sorted(lines)
 
 
+def engines(every: dict[str, Row], repeat: int) -> list[list[str]]:
+    """Lines of wall seconds: what `auto` takes, both explicit choices, and its ratio to the better of them."""
+    lines = []
+    for name in ENGINES:
+        if name not in every:
+            continue
+        ways = [every[name].ours, *([*every[name].ours, "--workers", count] for count in ("0", "2"))]
+        walls: list[list[float]] = [[] for _ in ways]
+        for turn in range(repeat + 1):
+            for way, found in zip(ways, walls, strict=True):
+                wall_s = cost(way, ROOT).wall_s
+                if turn:
+                    found.append(wall_s)
+        auto, *explicit = map(statistics.median, walls)
+        label = every[name].label.removesuffix(", default options")
+        lines.append([label, *(f"{wall:.2f} s" for wall in (auto, *explicit)), f"{auto / min(explicit):.2f}"])
+    return lines
+
+
 def line(label: str, mine: float, other: float, unit: str, required: float | None, stretch: float | None) -> list[str]:
     """A line of the table."""
     marks = ["" if mark is None else f"{mark:.2f}" for mark in (required, stretch)]
@@ -214,8 +235,8 @@ def demos(baseline: Path, out: Path, repeat: int) -> list[list[str]]:
     ):
         mine, other = (statistics.median(map(way, costs)) for costs in (ours, theirs))
         lines.append(line(label, mine, other, "s", *marks))
-    for label, marks, place in (("kernels", ("300", "200"), 1), ("compilations", ("450", "300"), 2)):
-        lines.append([f"The same: {label}", str(theirs[0][place]), str(ours[0][place]), "", *marks])
+    for label, bounds, place in (("kernels", ("300", "200"), 1), ("compilations", ("450", "300"), 2)):
+        lines.append([f"The same: {label}", str(theirs[0][place]), str(ours[0][place]), "", *bounds])
     return lines
 
 
@@ -226,7 +247,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
     parser.add_argument("--city", type=Path, help="the tiles that benchmarks/city_tiles.py made; without, no such row")
-    parser.add_argument("--rows", nargs="*", help="demo, given, both, east, classify, import, buildings, city; all")
+    parser.add_argument(
+        "--rows", nargs="*", help="demo, given, both, east, classify, import, buildings, city, engines; all"
+    )
     parser.add_argument("--repeat", type=int, default=3)
     arguments = parser.parse_args()
     become_reaper()
@@ -234,20 +257,39 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     every = rows(baseline, arguments.data.resolve(), out, arguments.city)
-    wanted = arguments.rows or ["demo", *every]
-    unknown = [name for name in wanted if name not in {"demo", *every}]
+    known = ["demo", *every, "engines"]
+    wanted = arguments.rows or known
+    unknown = [name for name in wanted if name not in known]
     if unknown:
-        sys.exit(f"unknown rows {unknown}: use {', '.join(['demo', *every])}")
-    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before, medians of {arguments.repeat}\n")
-    print("| | before | now | ratio | required | stretch |\n| --- | --- | --- | --- | --- | --- |", flush=True)
+        sys.exit(f"unknown rows {unknown}: use {', '.join(known)}")
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before, medians of {arguments.repeat}")
+    table("", "before", "now", "ratio", "required", "stretch")
     for name in wanted:
+        if name == "engines":
+            continue
         lines = (
             demos(baseline, out, arguments.repeat)
             if name == "demo"
             else measured(every[name], baseline, arguments.repeat)
         )
         for cells in lines:
-            print("| " + " | ".join(cells) + " |", flush=True)
+            told(cells)
+    if "engines" in wanted:
+        table("wall", "`--workers auto`", "`--workers 0`", "`--workers 2`", "`auto` to the better of both")
+        for cells in engines(every, arguments.repeat):
+            told(cells)
+
+
+def table(*heads: str) -> None:
+    """Begin a table."""
+    print()
+    told(heads)
+    told(["---"] * len(heads))
+
+
+def told(cells: Sequence[str]) -> None:
+    """Print a line of a table."""
+    print("| " + " | ".join(cells) + " |", flush=True)
 
 
 if __name__ == "__main__":
