@@ -134,6 +134,7 @@ def warm_up(
         from pipeline.compiler import warm_up
         from pipeline.errors import SettingsError
         from pipeline.runtime.events import Event
+        from pipeline.runtime.machine import cores
 
         groups = warm_up.groups()
         wanted = what or ["reconstruct"]
@@ -148,7 +149,7 @@ def warm_up(
 
         kernels = warm_up.listed(None if "all" in wanted else wanted)
         console.on_event(Event(kind="stage", stage="compile", total=len(kernels)))
-        warm_up.compile_kernels(kernels, on_progress=on_progress)
+        warm_up.compile_kernels(kernels, cores(), on_progress)
         if into is not None:
             warm_up.ship(Path(into))
         seconds = time.perf_counter() - started

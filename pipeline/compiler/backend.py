@@ -6,7 +6,8 @@ does for its own helpers (`np.argsort` and the like). Here code is optimised and
 Python. What is compiled is kept in files of ours (`pipeline.compiler.store`) under fingerprints that cover callees.
 
 It is written against the versions in `KNOWN`. With any other numba, or with `GABLEWORK_PLAIN_NUMBA` set, kernels are
-`numba.njit(cache=True)` and nothing more: slower to compile, equal in what they compute.
+`numba.njit(cache=True)`, whose files are stamped with the same fingerprints, and nothing more: slower to compile, equal
+in what they compute.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import hashlib
 import os
 import pickle
 import threading
-from collections.abc import Callable, Iterable, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -43,11 +45,23 @@ config.CPU_NAME = processor()
 if config.CPU_NAME == GENERIC:
     config.CPU_FEATURES = ""
 _ENVIRONMENTS = "_ZN08NumbaEnv"
+_PLAIN = "GABLEWORK_PLAIN_NUMBA"
 
 
 def is_known() -> bool:
     """Whether kernels are compiled in our way."""
-    return numba.__version__.startswith(KNOWN) and not os.environ.get("GABLEWORK_PLAIN_NUMBA")
+    return numba.__version__.startswith(KNOWN) and not os.environ.get(_PLAIN)
+
+
+@functools.cache
+def _say_unknown() -> None:
+    """Warn once that everything is slower to compile."""
+    warnings.warn(
+        f"numba {numba.__version__} is not one of those that gablework knows ({', '.join(KNOWN)}x): it compiles all "
+        "kernels in its own way, which takes three times as long, and loads none that were compiled ahead",
+        RuntimeWarning,
+        stacklevel=3,
+    )
 
 
 def dispatcher_of(
@@ -69,7 +83,12 @@ def dispatcher_of(
     if config.DISABLE_JIT:
         return function
     if not is_known():
-        return numba.njit(cache=True, nogil=True, **options)(function)
+        if not os.environ.get(_PLAIN):
+            _say_unknown()
+        made = numba.njit(cache=True, nogil=True, **options)(function)
+        # in place of a stamp of the kernel's own file: an edited callee counts, too
+        made._cache._cache_file._source_stamp = fingerprint().hex()
+        return made
     _prepare()
     return KernelDispatcher(function, {**COMMON_OPTIONS, **options}, prefix, fingerprint)
 
@@ -227,6 +246,16 @@ def _common(kind: Any) -> Any:
     return types.int64 if isinstance(kind, types.Integer) and kind.signed else kind
 
 
+def _fields_in(kinds: Iterable[Any]) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """The named tuples among types: numba tells them by the types of their fields alone."""
+    for kind in kinds:
+        if isinstance(kind, types.BaseNamedTuple):
+            one = kind.instance_class
+            yield one.__module__, one.__qualname__, kind.fields
+        if isinstance(kind, types.BaseTuple):
+            yield from _fields_in(kind)
+
+
 class KernelDispatcher(registry.CPUDispatcher):
     """numba's dispatcher with files of ours."""
 
@@ -265,12 +294,13 @@ class KernelDispatcher(registry.CPUDispatcher):
     def _suffix(arguments: tuple[Any, ...]) -> str:
         """Tells files of one kernel apart: by signature and processor."""
         processor = registry.cpu_target.target_context.codegen().magic_tuple()
-        return hashlib.sha256(repr((str(arguments), processor)).encode()).hexdigest()[:16]
+        told = repr((str(arguments), [*_fields_in(arguments)], processor))
+        return hashlib.sha256(told.encode()).hexdigest()[:16]
 
     def _load(self, name: str, arguments: tuple[Any, ...], *, for_python: bool) -> bool:
         """Load the kernel if there is a file of it that serves."""
-        stored = store.load(name, self._fingerprint())
-        if stored is None or (for_python and not stored.machine_code):
+        stored = store.load(name, self._fingerprint(), runnable=for_python)
+        if stored is None:
             return False
         fndesc, environment, signature, reload_init, environments, defined = pickle.loads(stored.facts)  # noqa: S301
         for again in reload_init:

@@ -88,6 +88,10 @@ class _Own:
             return f"{type(value).__qualname__}.{value.name}={value.value!r}"
         if isinstance(value, _PLAIN):
             return f"{type(value).__name__} {value!r}"
+        if value is Ellipsis:
+            return "..."
+        if isinstance(value, slice):
+            return f"slice({self.value((value.start, value.stop, value.step))})"
         if isinstance(value, tuple | frozenset):
             items = sorted(map(repr, value)) if isinstance(value, frozenset) else map(self.value, value)
             return f"{type(value).__qualname__}({', '.join(items)})"
@@ -95,9 +99,12 @@ class _Own:
             return f"array {value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
         if isinstance(value, types.ModuleType):
             return f"module {value.__name__}"
+        if isinstance(value, enum.EnumMeta):
+            members = {name: value[name].value for name in value.__members__}
+            return f"enum {value.__module__}.{value.__qualname__} {members!r}"
         if isinstance(value, type):
-            fields = getattr(value, "_fields", ())
-            return f"class {value.__module__}.{value.__qualname__}{fields!r}"
+            fields = (getattr(value, "_fields", ()), getattr(value, "_field_defaults", {}))
+            return f"class {value.__module__}.{value.__qualname__} {fields!r}"
         if inspect.isfunction(value):
             return "\0".join(_of_function(value, self))
         if callable(value):

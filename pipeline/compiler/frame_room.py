@@ -8,7 +8,7 @@ that it calls.
 
 from __future__ import annotations
 
-import functools
+import types
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -24,12 +24,13 @@ def with_room_for_frames(function: Callable[[], Value]) -> Value:
     >>> with_room_for_frames(lambda: 7)
     7
     """
-    value: Value = _large_frame()(function)
+    value: Value = _from_large_frame(function)
     return value
 
 
-@functools.cache
-def _large_frame() -> Callable[[Callable[[], Any]], Any]:
-    """A function that evaluates its argument first and then more constants than it needs."""
-    made: Callable[[Callable[[], Any]], Any] = eval(f"lambda function: (function(), {'0, ' * _SLOTS})[0]")  # noqa: S307
-    return made
+def _called(function: Callable[[], Any]) -> Any:
+    return function()
+
+
+_from_large_frame = types.FunctionType(_called.__code__.replace(co_stacksize=_SLOTS), globals())
+"""The same, in a frame with room for far more values than it needs."""

@@ -49,7 +49,7 @@ class Kernel:
     @property
     def is_compiled(self) -> bool:
         """Whether there is a file of it, of whatever signature; numba is not asked."""
-        return bool(os.environ.get("NUMBA_DISABLE_JIT")) or store.is_kept(self.prefix, self.fingerprint)
+        return is_off() or store.is_kept(self.prefix, self.fingerprint)
 
     @functools.cached_property
     def dispatcher(self) -> Any:
@@ -69,6 +69,11 @@ class Kernel:
     def __reduce__(self) -> str:
         """Kernels travel by name."""
         return self.py_func.__qualname__
+
+
+def is_off() -> bool:
+    """Whether nothing is to be compiled, as numba reads `NUMBA_DISABLE_JIT`."""
+    return os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 
 
 @functools.cache

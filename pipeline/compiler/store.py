@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import errno
 import fcntl
 import functools
 import glob
@@ -71,7 +70,7 @@ class Stored:
         )
 
 
-def load(name: str, fingerprint: bytes) -> Stored | None:
+def load(name: str, fingerprint: bytes, *, runnable: bool) -> Stored | None:
     """A compiled kernel; None where there is none of this fingerprint.
 
     Parameters
@@ -80,6 +79,8 @@ def load(name: str, fingerprint: bytes) -> Stored | None:
         Of the file, without its ending.
     fingerprint : bytes
         Of the kernel, 32 bytes.
+    runnable : bool
+        Whether it must have machine code: what came with a package may have none where only kernels called it.
     """
     file_name = name + ENDING
     listed = _shipped_hashes().get(file_name)
@@ -92,7 +93,7 @@ def load(name: str, fingerprint: bytes) -> Stored | None:
             _warn(f"{folder / file_name} is not the file that {LIST} names: this kernel is compiled anew")
             continue
         stored = Stored.unpacked(content, fingerprint)
-        if stored is not None:
+        if stored is not None and (stored.machine_code or not runnable):
             return stored
     return None
 
@@ -101,8 +102,9 @@ def say_what_does_not_fit(name: str) -> None:
     """Warn once where kernels came with the package and the one that is about to be compiled is not among them."""
     if _shipped_hashes():
         _warn(
-            f"{name} is compiled now: the kernels in {shipped_folder()} were made for another Python, numba or "
-            "processor, or are called in a new way"
+            f"kernels are compiled, {name} first: those in {shipped_folder()} were made for another Python, numba or "
+            "processor, or are called in a new way",
+            once="what came does not fit",
         )
 
 
@@ -118,7 +120,8 @@ def save(name: str, fingerprint: bytes, stored: Stored) -> None:
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
-        _warn(f"compiled kernels cannot be kept in {folder}: {error.strerror}. Name a folder by NUMBA_CACHE_DIR")
+        told = f"compiled kernels cannot be kept in {folder}: {error.strerror}. Name a folder by NUMBA_CACHE_DIR"
+        _warn(told, once="cannot be kept")
 
 
 def is_kept(prefix: str, fingerprint: bytes) -> bool:
@@ -151,16 +154,14 @@ def claimed(name: str) -> Iterator[None]:
         yield
         return
     at = zlib.crc32(name.encode()) % _LOCK_RANGE
-    try:
+    # some file systems have no locks; two kernels may share a byte, so that two processes would wait for each other
+    with contextlib.suppress(OSError):
         fcntl.lockf(file, fcntl.LOCK_EX, 1, at)
-    except OSError as error:
-        # two kernels may share a byte, so that two processes could wait for each other
-        if error.errno not in (errno.EDEADLK, errno.ENOLCK):
-            raise
     try:
         yield
     finally:
-        fcntl.lockf(file, fcntl.LOCK_UN, 1, at)
+        with contextlib.suppress(OSError):
+            fcntl.lockf(file, fcntl.LOCK_UN, 1, at)
 
 
 def ship(folder: Path, is_current: Callable[[str, bytes], bool]) -> int:
@@ -224,7 +225,14 @@ def _lock_file() -> int | None:
         return None
 
 
-@functools.cache
-def _warn(text: str) -> None:
-    """Warn once."""
-    warnings.warn(text, RuntimeWarning, stacklevel=2)
+# locks belong to a process: a forked one opens the file for itself, as its copy of the descriptor may be closed
+os.register_at_fork(after_in_child=_lock_file.cache_clear)
+
+_said: set[str] = set()
+
+
+def _warn(text: str, *, once: str = "") -> None:
+    """Warn once of each thing."""
+    if (once or text) not in _said:
+        _said.add(once or text)
+        warnings.warn(text, RuntimeWarning, stacklevel=3)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -18,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compiler import store
-from pipeline.compiler.kernel import Kernel
+from pipeline.compiler.kernel import Kernel, is_off
+from pipeline.errors import RunError
 
 LIST = Path(__file__).with_name("kernels.json")
 """Written by `make kernels`."""
@@ -61,7 +61,7 @@ def listed(groups: Iterable[str] | None = None) -> list[Listed]:
 
 def compile_kernels(
     kernels: Iterable[Listed],
-    processes: int | None = None,
+    processes: int,
     on_progress: Callable[[int, int, float], None] | None = None,
 ) -> int:
     """Compile kernels that are not compiled yet.
@@ -70,8 +70,8 @@ def compile_kernels(
     ----------
     kernels : iterable of Listed
         Those of `listed`.
-    processes : int, optional
-        How many compile at once; by default one per core that this process may use.
+    processes : int
+        How many compile at once.
     on_progress : callable, optional
         Gets how many are done, of how many, and the seconds that the rest may take.
 
@@ -84,8 +84,7 @@ def compile_kernels(
     whole = sum(one.weight for one in waiting) or 1
     began = time.perf_counter()
     done = weight = 0
-    count = processes or len(os.sched_getaffinity(0))
-    with ProcessPoolExecutor(min(count, len(waiting)) or 1, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(min(processes, len(waiting)) or 1, mp_context=get_context("spawn")) as pool:
         for future in as_completed([pool.submit(_compile, one) for one in waiting]):
             weight += future.result()
             done += 1
@@ -100,13 +99,19 @@ def _compile(one: Listed) -> int:
     from pipeline.compiler.signatures import kernel_named, read
 
     kernel = kernel_named(one.kernel)
-    if not os.environ.get("NUMBA_DISABLE_JIT"):
+    if not is_off():
         kernel.dispatcher.compile(tuple(read(kind) for kind in one.arguments))
     return one.weight
 
 
 def ship(folder: Path) -> int:
-    """Copy all compiled kernels of this version to a folder that a package takes along; how many files."""
+    """Copy all compiled kernels of this version to a folder that a package takes along; how many files.
+
+    Raises
+    ------
+    RunError
+        There are none: another numba, or none at all, compiled what was called.
+    """
     from pipeline.compiler.signatures import kernel_named
 
     def is_current(name: str, fingerprint: bytes) -> bool:
@@ -116,7 +121,13 @@ def ship(folder: Path) -> int:
             return False
         return isinstance(kernel, Kernel) and kernel.fingerprint == fingerprint
 
-    return store.ship(folder, is_current)
+    shipped = store.ship(folder, is_current)
+    if not shipped:
+        raise RunError(
+            f"no compiled kernel lies in {store.folder_of_kernels()}: with the numba of the locks, and without "
+            "GABLEWORK_PLAIN_NUMBA and NUMBA_DISABLE_JIT, the warm-up leaves them there"
+        )
+    return shipped
 
 
 def write_list(groups: dict[str, list[Listed]], path: Path = LIST) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -19,6 +18,7 @@ from typing import Any, Self
 from pipeline.errors import ClusterError, VersionMismatchError
 from pipeline.runtime import worker_setup
 from pipeline.runtime.events import Watch
+from pipeline.runtime.executed import environment_with_this_package
 from pipeline.runtime.flight import SETTLE_INTERRUPTED_S, SETTLE_S, TICK_S, Flight, Lookout
 from pipeline.runtime.measured import Measured, Result, Task, mismatch_told
 from pipeline.runtime.needs import RESOURCE
@@ -205,7 +205,7 @@ class Cluster:
                     security=self.security,
                     resources={RESOURCE: each_bytes},
                     # the server that they are forked from may have begun with another one
-                    env=dict(os.environ),
+                    env=environment_with_this_package(),
                 )
                 self._while_running = starting.pop_all()
         except (OSError, RuntimeError, TimeoutError) as error:

@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> None:
     """
     start_own_process()
     child.end_with_parent(int(arguments[0]))
-    _load(arguments[2:])
+    load_all(arguments[2:])
     serve(socket.socket(fileno=int(arguments[1])))
 
 
@@ -77,7 +77,7 @@ def _close_all_but(orders: int) -> None:
                 os.close(number)
 
 
-def _load(loads: Sequence[str]) -> None:
+def load_all(loads: Sequence[str]) -> None:
     """Load what children will need; what cannot be loaded is left to them, who tell why."""
     for name in loads:
         try:
@@ -101,6 +101,7 @@ def serve_forked(owner: int, orders: socket.socket, stderr: int, loads: Sequence
         What is loaded besides, as `pipeline.runtime.child` takes it.
     """
     try:
+        start_own_process()
         os.setsid()
         child.end_with_parent(owner)
         nothing = os.open(os.devnull, os.O_RDWR)
@@ -110,7 +111,7 @@ def serve_forked(owner: int, orders: socket.socket, stderr: int, loads: Sequence
         signal.set_wakeup_fd(-1)
         for name in (signal.SIGCHLD, signal.SIGINT):
             signal.signal(name, signal.SIG_DFL)
-        _load(loads)
+        load_all(loads)
         serve(orders)
     except BaseException:  # noqa: BLE001 - as an interpreter ends
         traceback.print_exc()
@@ -173,7 +174,11 @@ class _Server:
         if order is None:
             control.close()
         else:
-            self._fork(order, control, descriptors[1:])
+            try:
+                self._fork(order, control, descriptors[1:])
+            except OSError:  # no room for one more process: its owner hears that it is gone, the others go on
+                traceback.print_exc()
+                control.close()
         for descriptor in descriptors[1:]:
             os.close(descriptor)
 
@@ -184,7 +189,12 @@ class _Server:
         pid = os.fork()
         if not pid:
             self._be_child(server, order, control, standard)
-        known = _Child(pid, control)
+        try:
+            known = _Child(pid, control)
+        except OSError:
+            kill_with_group(pid)
+            os.waitpid(pid, 0)
+            raise
         self._children |= {control.fileno(): known, known.lives: known}
         self._poll.register(known.lives, select.POLLIN)
         self._poll.register(control, select.POLLIN)

@@ -384,7 +384,8 @@ def run_variants(
     for k, (run_dir, own) in enumerate(zip(run_dirs, progresses, strict=True)):
         finishing = time.perf_counter()
         content = (run_dir, _with_tables(run_dir, joined, modelled[k], published[k]))
-        digest = engine.apart("digest", _digest_of, content, shared.watch)
+        # the run can be called off no more
+        digest = engine.apart("digest", _digest_of, content, Watch())
         own.timings["digest"] = time.perf_counter() - finishing
         # of several variants each is told with what it took alone: the shared stages and its own
         alone = len(variants) == 1

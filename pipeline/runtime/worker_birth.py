@@ -7,7 +7,6 @@ itself (`pipeline.runtime.process_server`), so that they begin with the same.
 from __future__ import annotations
 
 import gc
-import importlib
 import os
 import signal
 
@@ -24,10 +23,10 @@ def _prepare() -> None:
     child.be_named(process_server.NAME)
     # the stop of a service goes to all its processes: workers, which finish their tasks, must not lose this one
     signal.signal(signal.SIGTERM, _left_to_the_nanny)
-    for name in STAGES:
-        importlib.import_module(name)
+    loads = list(STAGES)
     if kernels_are_compiled():  # or else each compiles what it needs, when the run tells that it does
-        child.load(f"pipeline.runtime.modelling:load_once:{_METHOD}")
+        loads.append(f"pipeline.runtime.modelling:load_once:{_METHOD}")
+    process_server.load_all(loads)
     gc.freeze()  # a collection would write to all objects, and so copy the memory that is shared
     server = os.getpid()
 
