@@ -25,6 +25,7 @@ COMPILE := $(UV) pip compile --quiet --universal --python-version 3.11 --generat
 	--no-emit-find-links --custom-compile-command "make lock" pyproject.toml --extra postgres --extra s3
 
 KERNEL_SOURCES := $(shell grep -rl --include='*.py' kernel pipeline | LC_ALL=C sort)
+KERNEL_LIST := pipeline/compiler/kernels.json
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test check unit slow everything all-tests viewer wheel kernels serve ruler lock docs format clean
@@ -61,11 +62,11 @@ $(VENV)/.test-stamp: requirements-test.lock $(VENV)/.build-stamp pyproject.toml
 
 # Kernels, compiled on all cores. Each is kept under a hash of its code and of what it calls, so after an edit only what
 # depends on it is compiled anew. The demo needs a part of them, the tests all.
-$(VENV)/.warm-demo-stamp: requirements.lock $(KERNEL_SOURCES) | $(VENV)/.run-stamp
+$(VENV)/.warm-demo-stamp: requirements.lock $(KERNEL_SOURCES) $(KERNEL_LIST) | $(VENV)/.run-stamp
 	@$(BIN)/gablework warm-up reconstruct simulate evaluate
 	@touch $@
 
-$(VENV)/.warm-stamp: requirements.lock $(KERNEL_SOURCES) | $(VENV)/.run-stamp
+$(VENV)/.warm-stamp: requirements.lock $(KERNEL_SOURCES) $(KERNEL_LIST) | $(VENV)/.run-stamp
 	@$(BIN)/gablework warm-up all
 	@touch $@
 
@@ -120,12 +121,13 @@ all-tests: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
 
 viewer: service/viewer/dist/index.html
 
-# A wheel for this platform and Python, with all kernels compiled: the first model compiles nothing.
+# A wheel for this platform and Python, with all kernels compiled: the first model compiles nothing. What was compiled for
+# it is removed however this ends, since a checkout that holds it would use it.
 wheel: $(VENV)/.run-stamp viewer
 	@rm -rf pipeline/compiled
-	@$(BIN)/gablework warm-up all --into pipeline/compiled
-	@$(BIN)/python -m hatchling build --target wheel --directory dist
-	@rm -rf pipeline/compiled
+	@trap 'rm -rf pipeline/compiled' EXIT; trap 'exit 1' HUP INT TERM; \
+		$(BIN)/gablework warm-up all --into pipeline/compiled && \
+		$(BIN)/python -m hatchling build --target wheel --directory dist
 
 # What is compiled ahead: recorded from runs, some minutes.
 kernels: $(VENV)/.run-stamp
@@ -151,5 +153,5 @@ format: $(VENV)/.test-stamp
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis demo runs
+	rm -rf $(VENV) pipeline/compiled .cache .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis demo runs
 	find pipeline service tests docs -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -3,8 +3,8 @@
     [--data ../shared/data] [--survey delft] [--methods METHOD[:PRESET] ...] [--skip PART ...] [--cold] [--repeat 3]
 
 roofer's figures were measured once on `delft_west` and `delft_east` with the given footprints and the file's classes;
-the methods are run here. A survey without given footprints is held against the outlines of its own class 6, and has
-no figures of roofer.
+its times were those of another machine and are left out. The methods are run here. A survey without given footprints is
+held against the outlines of its own class 6, and has no figures of roofer.
 
 - Processor seconds are those of a whole run of the command line, serial, in a process of its own, with all that it
   starts: the least of `--repeat` runs after one that compiled what was missing. `--cold` measures one run with empty
@@ -293,12 +293,11 @@ def _told_less_rows() -> Iterator[Row]:
 
 
 ROWS: tuple[Row, ...] = (
-    # roofer's seconds were those of another machine: docs/results/roofer.md holds runs in turns instead
+    # roofer's times, these and those of a building, were another machine's: they have no place beside ours
     Row(label="CPU seconds in all, warm", cell=lambda found: _seconds(found.warm)),
     Row(label="the same, cold", cell=lambda found: _seconds(found.cold)),
     Row(
         label="reconstruction of a building, ms, mean / median",
-        roofer="14 / 11",
         required="10 / 5",
         stretch="3 / 1.5",
         cell=_milliseconds,

@@ -60,6 +60,9 @@ def default_of(parameter: Any) -> str:
     """The default of an option, as written on the command line."""
     if parameter.required:
         return "required"
+    shown = getattr(parameter, "show_default", None)
+    if isinstance(shown, str):
+        return f"`{shown}`"
     default = parameter.default
     return "" if default is None or default is False or default == () else f"`{default}`"
 
@@ -97,6 +100,8 @@ def allowed(field: dataclasses.Field[Any]) -> str:
         return "`true`, `false`"
     if low is None and high is None:
         return "any"
+    if isinstance(field.default, str):
+        return f"`{field.default}`, or {low:g} to {high:g}"
     if high is None:
         return f"{low:g} or more"
     return f"up to {high:g}" if low is None else f"{low:g} to {high:g}"

@@ -1,7 +1,7 @@
 """The settings of a run, as the API process knows them: read from `catalogue.json`, which is written from the code.
 
-Importing the settings classes themselves would bring numba and the kernels of every stage into a process that only
-answers requests (78 MB and a second). So their fields are kept as data beside this module; `make docs` writes the file
+Importing the settings classes themselves would bring the science of every stage, module after module, into a process
+that only answers requests. So their fields are kept as data beside this module; `make docs` writes the file
 and a test holds it against the classes. Values are checked by the same code as in a run; what concerns several
 settings at once is checked by the driver, but for the tables of `WHOLE`, whose classes are light enough.
 """

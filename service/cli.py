@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pipeline.cli import AsJson, app
-from pipeline.cli.options import TlsCa, TlsCert, TlsKey
+from pipeline.cli.options import TlsCa, TlsCert, TlsKey, count_or_auto
 from pipeline.console import Console
 from pipeline.errors import RunError, SettingsError
 from pipeline.runtime.start_up import start_own_process
@@ -30,7 +31,12 @@ DatabaseUrl = Annotated[
     str | None, typer.Option(metavar="URL", help="SQLAlchemy URL of the database; default SQLite in the state folder.")
 ]
 ServiceWorkers = Annotated[
-    int | None, typer.Option(metavar="N", min=1, help="Processes of the embedded cluster; default GABLEWORK_WORKERS.")
+    str | None,
+    typer.Option(
+        metavar="N|auto",
+        parser=functools.partial(count_or_auto, least=1),
+        help="Processes of the embedded cluster, auto for one per core; default GABLEWORK_WORKERS.",
+    ),
 ]
 Scheduler = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler to use in place of the embedded cluster.")

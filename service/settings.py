@@ -76,8 +76,8 @@ class ServiceSettings(BaseSettings):
     )
     tls_cert: str | None = Field(default=None, description="The driver's own certificate for the cluster, PEM.")
     tls_key: str | None = Field(default=None, description="Its key, PEM, where it is not in the same file.")
-    workers: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
-        default="auto", description="Processes of the embedded cluster; auto takes one a core."
+    workers: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = Field(
+        default="auto", description="Processes of the embedded cluster; auto takes one per core."
     )
     driver_jobs: int = Field(default=2, ge=1, description="Jobs that one driver runs at once.")
     lease_s: float = Field(

@@ -14,30 +14,56 @@ Crs = Annotated[
 VerticalUnit = Annotated[
     str | None, typer.Option(metavar="UNIT", help="Unit of elevations: m, ft or us-ft; default as the header says.")
 ]
+AUTO = "auto"
+"""The word for as many workers as the machine or the job wants."""
 _MOST_WORKERS = 1024
 
 
+def count_or_auto(text: str, *, least: int) -> str:
+    """The word of an option for workers: `auto`, or a number without leading zeros.
+
+    Parameters
+    ----------
+    text : str
+        As it was given.
+    least : int
+        The smallest number that is allowed.
+
+    Raises
+    ------
+    BadParameter
+        It is neither `auto` nor a number of processes.
+
+    Examples
+    --------
+    >>> count_or_auto("02", least=1), count_or_auto("auto", least=1)
+    ('2', 'auto')
+    """
+    if text == AUTO:
+        return AUTO
+    if text.isdecimal() and least <= int(text) <= _MOST_WORKERS:
+        return str(int(text))
+    raise typer.BadParameter(f"{text!r}: use {AUTO}, or a whole number from {least} to {_MOST_WORKERS}")
+
+
 def worker_count(text: str) -> int | None:
-    """How many workers an option asks for; None for `auto`.
+    """How many workers an option asks for; 0 for none, None for `auto`.
 
     Raises
     ------
     BadParameter
         It is neither `auto` nor a number of processes.
     """
-    if text == "auto":
-        return None
-    if text.isdecimal() and int(text) <= _MOST_WORKERS:
-        return int(text)
-    raise typer.BadParameter(f"{text!r}: use auto, or a whole number from 0 to {_MOST_WORKERS}")
+    word = count_or_auto(text, least=0)
+    return None if word == AUTO else int(word)
 
 
 Workers = Annotated[
     int | None,
     typer.Option(
-        metavar="N",
+        metavar="N|auto",
         parser=worker_count,
-        show_default="auto",
+        show_default=AUTO,
         help="Processes of the embedded cluster; 0 runs serially in this process, auto starts a cluster for large "
         "jobs only.",
     ),

@@ -1,7 +1,8 @@
 """What a run is expected to cost, by its plan: the one place of measured rates.
 
-Rates are CPU seconds of one core of the machine that `docs/how_to/plan_a_run.md` names, kernels compiled and loaded.
-Machines and scenes differ by a factor of two either way.
+Rates were measured by hand on two cores of a shared x86_64 machine: the stage times that `run.json` tells of serial
+runs in one process, kernels compiled and loaded, so that wall time stands for CPU time; `docs/how_to/plan_a_run.md`
+names the surveys. Machines and scenes differ by a factor of two either way.
 """
 
 from __future__ import annotations

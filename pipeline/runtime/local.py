@@ -1,7 +1,9 @@
 """Small jobs without a cluster: tasks in supervised child processes of this one, as many at once as there are cores.
 
-This process plans, joins and writes the manifest; its children do all else, and stay from stage to stage. What may
-happen to a child, and what comes of it, is as on a cluster (`pipeline.runtime.flight`):
+This process plans, brings results together and writes the manifest. Its children do all else, and stay from stage to
+stage; the join of surfaces and the digest are a task of one child each (`apart`), since they need kernels and libraries
+that this process does not load. What may happen to a child, and what comes of it, is as on a cluster
+(`pipeline.runtime.flight`):
 
 | event | outcome |
 | --- | --- |
@@ -45,7 +47,7 @@ class LocalExecutor:
     Parameters
     ----------
     children : int, optional
-        Tasks at once; by default one a core.
+        Tasks at once; by default one per core.
     memory_limit_bytes : int, optional
         What all of them may take together; by default the machine's memory.
     """

@@ -15,8 +15,8 @@ owner                               server
     (closes) ─────────────────────▶          it is killed if it lives, and waited for
 ```
 
-It ends with its owner, and children end with it, both by the kernel's hand. Where the owner closes the socket it forks
-no more, and ends after its last child.
+Linux ends it when its owner dies, and its children when it dies (`PR_SET_PDEATHSIG`). Where the owner closes the socket
+it forks no more, and ends after its last child.
 """
 
 from __future__ import annotations

@@ -147,6 +147,42 @@ def test_another_process_reads_the_same_settings_from_its_environment(tmp_path: 
     assert ServiceSettings() == settings
 
 
+@pytest.fixture
+def handed_on(monkeypatch) -> list[ServiceSettings]:
+    """The settings with which `serve` and `driver` would have started, in their order."""
+    taken: list[ServiceSettings] = []
+    monkeypatch.setattr("service.supervisor.serve", lambda settings, *_, **__: taken.append(settings))
+    monkeypatch.setattr("service.driver.run_driver", lambda settings, **_: taken.append(settings))
+    monkeypatch.setattr("service.cli._log_to_stderr", lambda: None)
+    monkeypatch.setenv("GABLEWORK_WORKERS", "2")
+    return taken
+
+
+@pytest.mark.parametrize("command", ["serve", "driver"])
+@pytest.mark.parametrize(("words", "workers"), [((), 2), (("--workers", "auto"), "auto"), (("--workers", "7"), 7)])
+def test_the_option_for_workers_stands_above_the_environment_also_for_the_driver_beside(
+    handed_on: list[ServiceSettings], tmp_path: Path, command: str, words: tuple[str, ...], workers: int | str
+) -> None:
+    found = invoke(command, "--state", str(tmp_path), *words)
+    assert found.exit_code == 0, found.output
+    (settings,) = handed_on
+    assert settings.workers == workers
+    assert environment_of(settings, os.environ)["GABLEWORK_WORKERS"] == str(workers)
+
+
+@pytest.mark.parametrize("command", ["serve", "driver"])
+@pytest.mark.parametrize("word", ["0", "1025", "-1", "all", "1.5", ""])
+def test_numbers_of_workers_that_cannot_be_are_refused_as_option_and_in_the_environment(
+    handed_on: list[ServiceSettings], tmp_path: Path, monkeypatch, command: str, word: str
+) -> None:
+    found = invoke(command, "--state", str(tmp_path), "--workers", word)
+    assert found.exit_code == 2
+    assert "use auto, or a whole number from 1 to 1024" in found.output
+    monkeypatch.setenv("GABLEWORK_WORKERS", word)
+    assert invoke(command, "--state", str(tmp_path)).exit_code == 2
+    assert handed_on == []
+
+
 def test_port_0_takes_a_free_port_and_a_taken_one_is_told(tmp_path: Path) -> None:
     from service.errors import StartUpError
 

@@ -77,6 +77,7 @@ def test_nothing_else_is_sent_to_the_builder(root: Path) -> None:
     rules = (root / ".dockerignore").read_text()
     private = [".git", ".venv", "tests", "docs", "docker/secrets/postgres_password", "requirements-test.lock", ".env"]
     private += ["service/viewer/node_modules", "service/viewer/dist/index.html", "pipeline/__pycache__/model.pyc"]
+    private += ["pipeline/compiled/kernels.json"]
     assert [path for path in private if sent_to_the_builder(path, rules)] == []
 
 
@@ -283,7 +284,7 @@ def test_the_wheel_of_the_image_holds_all_modules_and_the_page(image: Image, roo
             continue
         for name in one.words[:-1]:
             if (root / name).is_dir():
-                ignored = shutil.ignore_patterns("__pycache__", "node_modules", "viewer")
+                ignored = shutil.ignore_patterns("__pycache__", "node_modules", "viewer", "compiled")
                 shutil.copytree(root / name, source / name, ignore=ignored)
             else:
                 shutil.copy2(root / name, source / name)

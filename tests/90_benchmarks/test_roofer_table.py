@@ -241,7 +241,7 @@ def test_only_what_was_measured_has_a_line_and_roofer_stands_beside_delft_alone(
     assert heads == "|  | roofer 1.1.0-beta.1 | required | stretch | arrangement | kmeans |"
     for line in (
         "| CPU seconds in all, warm |  |  |  | 2.5 |  |",
-        "| reconstruction of a building, ms, mean / median | 14 / 11 | 10 / 5 | 3 / 1.5 | 4.0 / 2.0 |  |",
+        "| reconstruction of a building, ms, mean / median |  | 10 / 5 | 3 / 1.5 | 4.0 / 2.0 |  |",
         "| buildings that differ between runs | 2 to 5 | 0 | 0 | 0 |  |",
         "| 2 class-6 points a m2: within 0.2 m of the full cloud | .53 | .70 | .75 | 0.750 |  |",
         "| 2 class-6 points a m2: what kept the others |  |  |  | 1 no_plane |  |",
