@@ -360,6 +360,7 @@ def _checked_search(points: FloatArray, k: int, cell_size_m: float | None) -> tu
 
 _SPACING_NEIGHBOURS = 8
 _UNEVEN = 1.3
+_LOWEST = -(2**63)
 """Spacings over the area and over the points that differ by more come of several densities."""
 
 
@@ -470,7 +471,7 @@ def _covered(xyz_mm: IntArray, points: FloatArray, radius_mm: int, height_mm: in
     covered = np.zeros(n, np.bool_)
     x_min, y_min, size, columns, rows = _grid_shape(points, radius_mm / 1000.0 + 0.001)
     start, members = _sort_into_grid(points, x_min, y_min, size, columns, rows)
-    top = np.full(columns * rows, np.iinfo(np.int64).min)
+    top = np.full(columns * rows, _LOWEST)
     for c in range(columns * rows):
         for q in range(start[c], start[c + 1]):
             top[c] = max(top[c], xyz_mm[members[q], 2])

@@ -29,6 +29,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import Environment
 from numba.core.runtime import _nrt_python
 from numba.core.targetconfig import ConfigStack
+from numba.core.typing import templates
 
 from pipeline.compiler import store
 from pipeline.compiler.frame_room import with_room_for_frames
@@ -122,6 +123,19 @@ def _prepare() -> None:
             return cgutils.voidptr_t(None)
         return dynamic_address(builder, address, info)
 
+    build = templates._OverloadFunctionTemplate._get_impl
+
+    def get_implementation(template: Any, args: Any, kws: Any) -> Any:
+        """numba's own helper for some types: one for callers with a wrapper and without, which numba tells apart."""
+        flags = ConfigStack.top_or_none()
+        if flags is None or flags.no_cpython_wrapper:
+            return build(template, args, kws)
+        plain = flags.copy()
+        plain.no_cpython_wrapper = True
+        with ConfigStack().enter(plain):
+            return build(template, args, kws)
+
+    templates._OverloadFunctionTemplate._get_impl = get_implementation
     context.get_executable = get_executable
     context.add_dynamic_addr = add_dynamic_addr
     context.create_cfunc_wrapper = _no_wrapper

@@ -100,7 +100,7 @@ class _Own:
         if isinstance(value, types.ModuleType):
             return f"module {value.__name__}"
         if isinstance(value, enum.EnumMeta):
-            members = {name: value[name].value for name in value.__members__}
+            members: dict[str, Any] = {name: value[name].value for name in value.__members__}
             return f"enum {value.__module__}.{value.__qualname__} {members!r}"
         if isinstance(value, type):
             fields = (getattr(value, "_fields", ()), getattr(value, "_field_defaults", {}))

@@ -21,13 +21,13 @@ class Heap(NamedTuple):
     """(room,) int64, whatever belongs to each entry."""
 
 
-@kernel
+@kernel(inline="always")
 def heap_with_room(room: int) -> Heap:
     """An empty heap."""
     return Heap(np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64))
 
 
-@kernel
+@kernel(inline="always")
 def _comes_first(heap: Heap, i: int, key: float, rank: int) -> bool:
     """Whether entry i comes before one of that key and rank."""
     return bool(heap.keys[i] < key or (heap.keys[i] == key and heap.ranks[i] < rank))

@@ -37,7 +37,7 @@ def same_ray(xy: IntArray, a: int, b: int, c: int) -> bool:
     return bool(along > 0)
 
 
-@kernel
+@kernel(inline="always")
 def lies_between(xy: IntArray, a: int, b: int, p: int) -> bool:
     """Whether p, which is on the line through a and b, is between them or at an end."""
     between_x: bool = min(xy[a, 0], xy[b, 0]) <= xy[p, 0] <= max(xy[a, 0], xy[b, 0])

@@ -176,8 +176,8 @@ def _laid_out(
     for f in range(n):
         edge_starts[f + 1] = max(edge_starts[f + 1], edge_starts[f])
         if boxes[f, 0] <= boxes[f, 2]:
-            boxes[f, :2] -= tolerance
-            boxes[f, 2:] += tolerance
+            boxes[f, 0], boxes[f, 1] = boxes[f, 0] - tolerance, boxes[f, 1] - tolerance
+            boxes[f, 2], boxes[f, 3] = boxes[f, 2] + tolerance, boxes[f, 3] + tolerance
             low_x, low_y = min(low_x, boxes[f, 0]), min(low_y, boxes[f, 1])
             high_x, high_y = max(high_x, boxes[f, 2]), max(high_y, boxes[f, 3])
     width, depth = high_x - low_x, high_y - low_y

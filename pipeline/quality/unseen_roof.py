@@ -10,7 +10,7 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray
 
 
-@kernel
+@kernel(inline="always")
 def middles_of_cells(low_x: float, low_y: float, cell: float, columns: int, rows: int) -> tuple[FloatArray, FloatArray]:
     """Middles of a raster's cells, line by line, x and y, (rows * columns,) metres."""
     x = np.empty(rows * columns)

@@ -10,6 +10,7 @@ from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 _MAX_CELLS = 4_000_000
+_FARTHEST = 2**63 - 1
 
 SAME_ROOF_M = 0.15
 """Planes that differ by less than this at a point are equally good for it."""
@@ -53,7 +54,7 @@ def _nearest(x: IntArray, y: IntArray, query_x: IntArray, query_y: IntArray, cel
     west, east = _filled_beside(starts, columns, rows)
     n = len(query_x)
     found = np.full(n, -1, np.int32)
-    squared = np.full(n, np.iinfo(np.int64).max, np.int64)
+    squared = np.full(n, _FARTHEST, np.int64)
     for q in range(n):
         px, py = query_x[q] - low_x, query_y[q] - low_y
         column, row = px // cell, py // cell

@@ -275,7 +275,8 @@ def _march(
                 w = facets[t, k]
                 if count + 2 > capacity:
                     grown = np.empty((2 * capacity, 2))
-                    grown[:count] = nodes[:count]
+                    for c in range(count):
+                        grown[c, 0], grown[c, 1] = nodes[c, 0], nodes[c, 1]
                     nodes = grown
                     capacity *= 2
                 p, q = (a, b) if a < b else (b, a)

@@ -41,9 +41,12 @@ def _empty_cells(
         A void consists of cells farther than `gap_m` from every point that hang together, at least one of them
         farther than `far_m`.
     """
-    low_x, low_y = edges[:, 0].min(), edges[:, 1].min()
-    columns = int((edges[:, 0].max() - low_x) / pitch_m) + 1
-    rows = int((edges[:, 1].max() - low_y) / pitch_m) + 1
+    low_x, low_y, high_x, high_y = edges[0, 0], edges[0, 1], edges[0, 0], edges[0, 1]
+    for e in range(len(edges)):
+        low_x, low_y = min(low_x, edges[e, 0]), min(low_y, edges[e, 1])
+        high_x, high_y = max(high_x, edges[e, 0]), max(high_y, edges[e, 1])
+    columns = int((high_x - low_x) / pitch_m) + 1
+    rows = int((high_y - low_y) / pitch_m) + 1
     number, place = raster_cells(edges, low_x, low_y, pitch_m, columns, rows)
     # points by cells, as linked lists
     first = np.full(rows * columns, -1, np.int32)

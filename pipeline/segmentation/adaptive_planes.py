@@ -282,7 +282,8 @@ def merge_by_f_test(sums: FloatArray, pairs: IntArray, sigma_m: float) -> LabelA
             break
         kept = min(first[best], second[best])
         gone = max(first[best], second[best])
-        sums[kept] += sums[gone]
+        for k in range(sums.shape[1]):
+            sums[kept, k] += sums[gone, k]
         for k in range(n):
             if root[k] == gone:
                 root[k] = kept

@@ -79,7 +79,7 @@ def local_planes(points: FloatArray, neighbours: LabelArray) -> tuple[FloatArray
     return planes, variances
 
 
-@kernel
+@kernel(inline="always")
 def noise_of_local_planes(variances: FloatArray, order: IntArray) -> float:
     """Standard deviation of the noise, metres, from what `local_planes` tells; 0 where there is no plane.
 

@@ -66,7 +66,7 @@ class FlightLine(NamedTuple):
     """The strip's own error, up."""
 
 
-@kernel
+@kernel(inline="always")
 def _normal_of(state: np.uint64, draw: int) -> float:
     """A standard normal number from two draws (Box and Muller 1958)."""
     radius = math.sqrt(-2.0 * math.log(uniform_of(state, draw)))
@@ -81,13 +81,13 @@ def line_state(seed: int, strip: int, line: int) -> np.uint64:
     return mixed_bits(state ^ mixed_bits(np.uint64(line) + np.uint64(0x8CB92BA72F3D8DD7)))
 
 
-@kernel
+@kernel(inline="always")
 def _pulse_state(line: np.uint64, pulse: int) -> np.uint64:
     """The random state of one pulse, from that of its line."""
     return mixed_bits(line ^ mixed_bits(np.uint64(pulse) + np.uint64(0xABC98388FB8FAC03)))
 
 
-@kernel
+@kernel(inline="always")
 def row_chance(line: np.uint64, draw: int) -> float:
     """A number in (0, 1) that decides a fault of a whole scan line, from the line's state."""
     return uniform_of(line ^ np.uint64(_WRONG_ROW), draw)
@@ -302,7 +302,7 @@ def _most_frequent(kind: IntArray, thing: IntArray, face: IntArray, first: int, 
     return best, 0 if most == stop - first else 1
 
 
-@kernel
+@kernel(inline="always")
 def _class_of(kind: int) -> int:
     """ASPRS class of a kind of hit."""
     if kind == GROUND:
@@ -314,7 +314,7 @@ def _class_of(kind: int) -> int:
     return 6
 
 
-@kernel
+@kernel(inline="always")
 def _intensity(kind: int, share: float) -> int:
     """Share of the beam times a reflectance in 16 bits."""
     reflectance = 0.35

@@ -310,7 +310,7 @@ def first_hit(
     return best, kind, thing, face
 
 
-@kernel
+@kernel(inline="always")
 def is_wet(spot_start: LabelArray, spots: FloatArray, building: int, x: float, y: float) -> bool:
     """Whether a place on a building's roof lies in one of its wet spots."""
     for spot in range(spot_start[building], spot_start[building + 1]):

@@ -17,7 +17,7 @@ _HIGH = np.int32(2**30)
 _LOW = np.int32(-(2**30))
 
 
-@kernel
+@kernel(inline="always")
 def _is_square(number: int) -> bool:
     """Whether the n-th piece of an octagon is a square: 29 of 70 are, as sqrt(2) - 1 asks; the others are crosses."""
     return number * 29 // 70 > (number - 1) * 29 // 70
@@ -40,7 +40,9 @@ def _widened(values: Elevations, across: Elevations, is_square: bool, want_low: 
                 out[c] = max(below[c], v)
     for r in range(1, rows - 1):
         # a square takes the neighbours of the column's extremes, a cross those of the row itself
-        row[:] = across[r] if is_square else values[r]
+        taken = across[r] if is_square else values[r]
+        for c in range(columns):
+            row[c] = taken[c]
         west, middle, east, out = row[:-2], across[r, 1:-1], row[2:], values[r, 1:-1]
         if want_low:
             for c in range(columns - 2):
@@ -64,7 +66,7 @@ def framed(surface: Elevations) -> Elevations:
     return out
 
 
-@kernel
+@kernel(inline="always")
 def erode_once(eroded: Elevations, scratch: Elevations, radius: int) -> None:
     """From the erosion by the octagon of radius - 1 to that of radius, in place; both arrays are framed."""
     _widened(eroded, scratch, _is_square(radius), True)

@@ -176,7 +176,8 @@ def sum_fragments(
                 sums[fragment, 9] += length
                 if n_along == capacity:
                     grown = np.empty((2 * capacity, 3), np.int64)
-                    grown[:capacity] = along
+                    for m in range(capacity):
+                        grown[m, 0], grown[m, 1], grown[m, 2] = along[m, 0], along[m, 1], along[m, 2]
                     along = grown
                     capacity *= 2
                 along[n_along, 0] = fragment

@@ -90,6 +90,17 @@ def smallest_eigenvalue(xx: float, xy: float, xz: float, yy: float, yz: float, z
 
 
 @kernel
+def _in_order(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, members: LabelArray) -> FloatArray:
+    """Some points in an order, (3, m), from the lowest x and y of all."""
+    low_x, low_y = x_mm.min(), y_mm.min()
+    points = np.empty((3, members.size))
+    for k in range(members.size):
+        i = members[k]
+        points[0, k], points[1, k], points[2, k] = x_mm[i] - low_x, y_mm[i] - low_y, z_mm[i]
+    return points
+
+
+@kernel
 def _block_around(
     points: FloatArray, start: LabelArray, cell: tuple[int, int], shape: tuple[int, int], reach: int, block: FloatArray
 ) -> tuple[FloatArray, int]:
@@ -101,7 +112,9 @@ def _block_around(
         low, high = start[rr * columns + west], start[rr * columns + east + 1]
         if count + high - low > block.shape[1]:
             larger = np.empty((3, 2 * (count + high - low)))
-            larger[:, :count] = block[:, :count]
+            for k in range(3):
+                for m in range(count):
+                    larger[k, m] = block[k, m]
             block = larger
         for k in range(3):
             for m in range(high - low):
@@ -197,8 +210,7 @@ def _planar(
     # cells as wide as the radius: the window in the middle reaches one of them far, the shifted ones two
     start, members, _, _, columns, rows = points_by_cell(x_mm, y_mm, np.ones(n, np.bool_), radius_mm)
     # copies in the order of the cells: neighbouring cells of a row are one run of memory
-    points = np.empty((3, n))
-    points[0], points[1], points[2] = (x_mm - x_mm.min())[members], (y_mm - y_mm.min())[members], z_mm[members]
+    points = _in_order(x_mm, y_mm, z_mm, members)
     block, wide, near = np.empty((3, 256)), np.empty((3, 256)), np.empty((3, 256))
     planar_mm2 = roughness_mm * roughness_mm
     for cell in range(rows * columns):
@@ -287,8 +299,7 @@ def _crowns(
         return out
     limit = float(radius_mm * radius_mm)
     start, members, _, _, columns, rows = points_by_cell(x_mm, y_mm, planar >= 0, -(-radius_mm // 2))
-    points = np.empty((3, members.size))
-    points[0], points[1], points[2] = (x_mm - x_mm.min())[members], (y_mm - y_mm.min())[members], z_mm[members]
+    points = _in_order(x_mm, y_mm, z_mm, members)
     # one number for all three counts: of the judged, of the rough among them, and of the pierced
     marks = 1 + ((planar[members] == 0).astype(np.int64) << 20) + (several[members].astype(np.int64) << 40)
     for cell in range(rows * columns):

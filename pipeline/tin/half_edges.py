@@ -17,13 +17,13 @@ from pipeline.model import FloatArray, LabelArray
 from pipeline.tin.predicates import lies_in_circumcircle, orientation
 
 
-@kernel
+@kernel(inline="always")
 def following(e: int) -> int:
     """The next half-edge of the same facet."""
     return e - 2 if e & 3 == 2 else e + 1
 
 
-@kernel
+@kernel(inline="always")
 def preceding(e: int) -> int:
     """The previous half-edge of the same facet."""
     return e + 2 if e & 3 == 0 else e - 1
@@ -84,7 +84,7 @@ def split_facet(origin: LabelArray, twin: LabelArray, facet: int, first_new: int
     twin[e] = g + 2
 
 
-@kernel
+@kernel(inline="always")
 def must_flip(x: FloatArray, y: FloatArray, p: int, u: int, v: int, q: int) -> bool:
     """Whether the edge u, v between the facets (p, u, v) and (v, u, q) is not Delaunay; p is the new vertex."""
     infinity = len(x) - 1

@@ -30,7 +30,7 @@ def _apex_angle(corners: IntArray, apex: int, a: int, b: int) -> tuple[float, fl
     return np.sqrt(cross_x * cross_x + cross_y * cross_y + cross_z * cross_z), ux * vx + uy * vy + uz * vz
 
 
-@kernel
+@kernel(inline="always")
 def _prefers_diagonal(corners: IntArray, a: int, c: int, b: int, d: int) -> bool:
     """Whether the quadrangle a, b, c, d is better cut from b to d than from a to c."""
     sine_b, cosine_b = _apex_angle(corners, b, a, c)

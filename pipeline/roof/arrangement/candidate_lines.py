@@ -77,7 +77,7 @@ def border_places(
     pairs : (m,) int64
         low * n_planes + high, ascending.
     """
-    number = np.full(place.max() + columns + 2 if len(place) > 0 else 1, -1, np.int32)
+    number = np.full(place[-1] + columns + 2 if len(place) > 0 else 1, -1, np.int32)
     for i in range(len(place)):
         number[place[i]] = i
     places = np.empty((2 * len(place), 2))
@@ -259,8 +259,9 @@ def candidate_lines(
                 n_lines += 1
             else:
                 line_of[first:last] = -1
-        directions[: len(outline)] = outline
         n = len(outline)
+        for k in range(n):
+            directions[k] = outline[k]
         for plane in (a, b):
             if math.hypot(planes[plane, 0], planes[plane, 1]) > _LEAST_SLOPE:
                 fall = math.atan2(planes[plane, 1], planes[plane, 0])

@@ -191,7 +191,7 @@ def connected_faces(labels: LabelArray, pairs: IntArray) -> tuple[LabelArray, in
     return numbered_sets(parent)
 
 
-@kernel
+@kernel(inline="always")
 def points_per_cell(cells: IntArray, n_cells: int) -> LabelArray:
     """How many points lie in each cell, (c,) int32; `cells` as from `cells_of_points`."""
     held = np.zeros(n_cells, np.int32)

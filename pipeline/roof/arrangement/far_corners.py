@@ -125,7 +125,7 @@ def _add_heights(plan: Subdivision, first: int, raster: HeightsRaster, around: H
         around.lowest[v], around.highest[v], around.within[v] = lowest, highest, within
 
 
-@kernel
+@kernel(inline="always")
 def heights_around(plan: Subdivision, raster: HeightsRaster) -> HeightsAround:
     """Lowest and highest point around every vertex."""
     room = len(plan.xy)

@@ -86,7 +86,8 @@ def _cut(
     current = np.empty(n + 2, np.int32)
     path = np.empty(n + 2, np.int32)
     while _distances(first, following, target, capacity, distance, n):
-        current[:] = first[: n + 2]
+        for k in range(n + 2):
+            current[k] = first[k]
         node = n
         depth = 0
         while True:
@@ -306,7 +307,7 @@ def expand_labels(
             number[p] = -1
 
 
-@kernel
+@kernel(inline="always")
 def every_label(n: int, k: int) -> tuple[LabelArray, LabelArray]:
     """The lists of `expand_labels` where every node can take every label."""
     allowed = np.empty(n * k, np.int32)

@@ -23,7 +23,7 @@ def labels_of_points(
     points: FloatArray, labels: LabelArray, place: LabelArray, low_x: float, low_y: float, cell_m: float, columns: int
 ) -> LabelArray:
     """The label of the raster cell in which each point lies, (n,) int32; -1 outside."""
-    cells = np.full(place.max() + 1 if len(place) > 0 else 1, -1, np.int32)
+    cells = np.full(place[-1] + 1 if len(place) > 0 else 1, -1, np.int32)
     for i in range(len(place)):
         cells[place[i]] = labels[i]
     found = np.full(len(points), -1, np.int32)
@@ -94,11 +94,11 @@ def refitted_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, 
                 change -= min(vertical_distance_m(points[i], better[label]), cap_m)
             if change >= 0.0:
                 break
-            better[label] = fitted
+            better[label, 0], better[label, 1], better[label, 2] = fitted[0], fitted[1], fitted[2]
     return better
 
 
-@kernel
+@kernel(inline="always")
 def support_of_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, cap_m: float) -> FloatArray:
     """Points that each plane explains of those with its label, and their squared vertical residuals, (k, 2) float64."""
     support = np.zeros((len(planes), 2))

@@ -50,7 +50,7 @@ def raster_cells(
     number : (rows * columns,) int32
         Number of every cell, row by row; -1 outside.
     place : (n,) int32
-        Where in the raster each numbered cell lies.
+        Where in the raster each numbered cell lies, ascending.
     """
     number = np.full(rows * columns, -1, np.int32)
     place = np.empty(rows * columns, np.int32)
@@ -188,7 +188,7 @@ def _near_own_points(
                     j = number[rr * columns + cc]
                     if j >= 0:
                         allowed[label, j] = 1
-    nodes = np.empty(int(allowed.sum()), np.int32)
+    nodes = np.empty(k * n, np.int32)
     starts = np.zeros(k + 1, np.int32)
     m = 0
     for label in range(k):
@@ -197,7 +197,7 @@ def _near_own_points(
                 nodes[m] = i
                 m += 1
         starts[label + 1] = m
-    return nodes, starts
+    return nodes[:m], starts
 
 
 @kernel

@@ -162,7 +162,7 @@ def _corner(plan: Subdivision, v: int, towards: int, face: int) -> int:
     return -1
 
 
-@kernel
+@kernel(inline="always")
 def _twice_loop_area(plan: Subdivision, start: int) -> int:
     """Twice the signed area of the loop of a half-edge in mm2; exact."""
     xy, graph = plan.xy, plan.graph
@@ -254,7 +254,7 @@ def insert_chord(plan: Subdivision, u: int, v: int, face: int, line: int) -> int
     return 1
 
 
-@kernel
+@kernel(inline="always")
 def between_vertices(y: float) -> float:
     """The nearest ordinate half-way between those that vertices can have: a ray there passes none."""
     return math.floor(y) + 0.5
