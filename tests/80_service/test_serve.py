@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import httpx
 import psutil
@@ -145,6 +145,41 @@ def test_another_process_reads_the_same_settings_from_its_environment(tmp_path: 
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     assert ServiceSettings() == settings
+
+
+@pytest.mark.parametrize(("told", "started"), [("auto", 7), (None, 7), ("3", 3)])
+def test_the_embedded_cluster_has_a_worker_a_core_unless_a_number_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str | None, started: int
+) -> None:
+    from service.driver import clusters
+
+    counts: list[int] = []
+
+    class Engine:
+        def __init__(self, *, workers: int, **_: object) -> None:
+            counts.append(workers)
+
+        def __enter__(self) -> Self:
+            return self
+
+    monkeypatch.delenv("GABLEWORK_WORKERS", raising=False)
+    if told is not None:
+        monkeypatch.setenv("GABLEWORK_WORKERS", told)
+    monkeypatch.setattr(clusters, "cores", lambda: 7)
+    monkeypatch.setattr(clusters, "Cluster", Engine)
+    clusters.SharedCluster(ServiceSettings(state=tmp_path)).engine()
+    assert counts == [started]
+
+
+@pytest.mark.parametrize("told", ["many", "0", "-1", "1.5"])
+def test_a_number_of_workers_that_is_none_is_refused_by_its_variable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str
+) -> None:
+    monkeypatch.setenv("GABLEWORK_WORKERS", told)
+    with pytest.raises(ValidationError) as raised:
+        ServiceSettings(state=tmp_path)
+    assert {fault["loc"][0] for fault in raised.value.errors()} == {"workers"}
+    assert {fault["input"] for fault in raised.value.errors()} == {told}
 
 
 def test_port_0_takes_a_free_port_and_a_taken_one_is_told(tmp_path: Path) -> None:
