@@ -288,7 +288,8 @@ def _nearest_neighbours(
             ring += 1
             if ring > max(columns, rows):
                 break
-        squares[members[s]] = least
+        for m in range(k):
+            squares[members[s], m] = least[m]
         if not named:
             continue
         # then who has them
@@ -359,8 +360,8 @@ def _checked_search(points: FloatArray, k: int, cell_size_m: float | None) -> tu
 
 
 _SPACING_NEIGHBOURS = 8
-_UNEVEN = 1.3
 _LOWEST = -(2**63)
+_UNEVEN = 1.3
 """Spacings over the area and over the points that differ by more come of several densities."""
 
 

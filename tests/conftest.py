@@ -31,6 +31,7 @@ REQUIRED_PROGRAMS = "GABLEWORK_REQUIRE_PROGRAMS"
 LONGEST_FIRST = (
     "82_cluster/test_batch_faults.py",
     "82_cluster/test_faults.py",
+    "03_compiler/test_wheel.py",
     "84_web/test_page.py",
     "82_cluster/test_batch_store_faults.py",
     "82_cluster/test_workers.py",

@@ -126,7 +126,7 @@ def _prepare() -> None:
     build = templates._OverloadFunctionTemplate._get_impl
 
     def get_implementation(template: Any, args: Any, kws: Any) -> Any:
-        """numba's own helper for some types: one for callers with a wrapper and without, which numba tells apart."""
+        """Find a helper of numba: the same for callers with a wrapper and without one, which numba tells apart."""
         flags = ConfigStack.top_or_none()
         if flags is None or flags.no_cpython_wrapper:
             return build(template, args, kws)

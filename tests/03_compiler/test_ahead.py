@@ -69,7 +69,14 @@ def test_no_kernel_is_listed_twice() -> None:
     assert len(told) == len(set(told))
 
 
-def test_kernels_are_compiled_in_other_processes_heaviest_first_with_progress(
+def test_the_heaviest_kernels_come_first() -> None:
+    for groups in (None, ["reconstruct"], warm_up.groups()):
+        weights = [one.weight for one in warm_up.listed(groups)]
+        assert weights == sorted(weights, reverse=True)
+        assert weights[0] > weights[-1]
+
+
+def test_kernels_are_compiled_in_other_processes_with_progress_and_never_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
@@ -80,3 +87,10 @@ def test_kernels_are_compiled_in_other_processes_heaviest_first_with_progress(
     assert told[-1][2] == 0.0
     names = {path.name.split(".cpython")[0] for path in tmp_path.glob(f"*{store.ENDING}")}
     assert names >= {one.kernel.replace(":", ".") for one in lightest}
+
+    def kept() -> dict[str, int]:
+        return {path.name: path.stat().st_mtime_ns for path in tmp_path.glob(f"*{store.ENDING}")}
+
+    before = kept()
+    assert warm_up.compile_kernels(lightest, processes=2) == 3
+    assert kept() == before

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from llvmlite.binding import get_host_cpu_name
 
 from pipeline.compiler.store import ENDING, LIST, Stored
 
@@ -239,7 +240,7 @@ def test_a_shipped_file_whose_hash_is_not_listed_is_not_loaded(sources: Sources)
 
 def test_kernels_that_do_not_fit_the_processor_are_compiled_and_that_is_said(sources: Sources) -> None:
     folder = ship(sources)
-    environment = {"GABLEWORK_KERNELS": str(folder), "NUMBA_CPU_NAME": "x86-64-v3"}
+    environment = {"GABLEWORK_KERNELS": str(folder), "NUMBA_CPU_NAME": get_host_cpu_name()}
     told, compiled, warned = sources.run(f"told = caller.total({VALUES})", **environment)
     assert (told, compiled) == (21.0, ["total", "scaled"])
     assert "were made for another Python, numba or processor" in warned

@@ -1,4 +1,4 @@
-"""The wheel that `make wheel` builds: its kernels serve the first model, and nothing is compiled."""
+"""Kernels compiled ahead, also in the wheel that `make wheel` builds: they serve all commands, nothing is compiled."""
 
 from __future__ import annotations
 
@@ -31,9 +31,90 @@ event.register("numba:compile", Counting())
 """
 
 
+PROGRAM = [sys.executable, "-P", "-m", "service.cli"]
+
+METHODS = ("arrangement", "fuzzy-sart", "parameter-space-2d", "parameter-space-3d", "kmeans")
+COMMANDS = (
+    "simulate suburb --size 70 70 --with-classes --out scene",
+    *(f"reconstruct scene/suburb.laz --method {method} --out {method}" for method in METHODS),
+    "reconstruct scene/suburb.laz --classes ignore --workers 0 --out serial",
+    "reconstruct scene/suburb.laz --classes ignore --workers 2 --out cluster",
+    "evaluate arrangement --truth scene/truth --out against-truth",
+    "evaluate arrangement --points scene/suburb.laz --out against-points",
+    "classify scene/suburb.laz --classes ignore --out classified",
+    "classify scene/suburb.laz --classes ignore --rasters --workers 0 --out with-rasters",
+    f"compare scene/suburb.laz --methods {','.join(METHODS)} --truth scene/truth --out compared",
+    "compare scene/suburb.laz --methods kmeans,fuzzy-sart:faithful --workers 0 --out compared-serially",
+    "batch diff arrangement kmeans --out changes",
+)
+"""What docs/how_to/plan_a_run.md promises to compile nothing after `warm-up all`.
+
+The suite hofmann310 is left out: `simulate` calls `pipeline.synthetic.survey_faults.move_faulty` for it, which
+`kernels.json` lacks.
+"""
+
+
+def done(command: list[str], folder: Path, **environment: str) -> str:
+    """What a command prints in a folder; it must succeed."""
+    ended = subprocess.run(
+        command, cwd=folder, env={**os.environ, **environment}, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, f"{' '.join(command)}\n{ended.stderr}"
+    return ended.stdout + ended.stderr
+
+
+@pytest.fixture(scope="module")
+def ahead(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the kernels that `warm-up all` compiles, and no other."""
+    folder = tmp_path_factory.mktemp("ahead") / "kernels"
+    done([*PROGRAM, "warm-up", "all", "--quiet"], ROOT, NUMBA_CACHE_DIR=str(folder))
+    return folder
+
+
+@pytest.fixture
+def counted(tmp_path: Path) -> Path:
+    """A folder that, on PYTHONPATH, has every Python process note what it compiles in the file `COMPILED`."""
+    folder = tmp_path / "counted"
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(COUNTING)
+    return folder
+
+
+def noted(path: Path) -> list[str]:
+    """Names of what was compiled, in all processes."""
+    return [line.split()[1] for line in path.read_text().splitlines()] if path.exists() else []
+
+
+@pytest.mark.slow
+def test_no_command_compiles_anything_after_warm_up_all(ahead: Path, counted: Path, tmp_path: Path) -> None:
+    kernels, compiled = tmp_path / "kernels", tmp_path / "compiled.txt"
+    shutil.copytree(ahead, kernels)
+    environment = {
+        "PYTHONPATH": os.pathsep.join((str(counted), str(ROOT))),
+        "NUMBA_CACHE_DIR": str(kernels),
+        "COMPILED": str(compiled),
+    }
+    found = {}
+    for command in COMMANDS:
+        done([*PROGRAM, *command.split(), "--quiet"], tmp_path, **environment)
+        found[command] = noted(compiled)
+        compiled.unlink(missing_ok=True)
+    assert {command: names for command, names in found.items() if names} == {}
+    for method in METHODS:
+        manifest = json.loads((tmp_path / method / "run.json").read_text())
+        assert manifest["counts"]["candidates"] > 0
+        assert manifest["settings"]["general"]["method"] == method
+
+    # what the children of a command compile is seen, too
+    (lost,) = kernels.glob("pipeline.roof.arrangement.arranging._arranged.*")
+    lost.unlink()
+    done([*PROGRAM, *COMMANDS[1].split(), "--overwrite", "--quiet"], tmp_path, **environment)
+    assert "_arranged" in noted(compiled)
+
+
 @pytest.mark.slow
 def test_a_wheel_with_kernels_compiles_nothing_in_any_process_also_where_nothing_can_be_written(
-    tmp_path: Path,
+    ahead: Path, counted: Path, tmp_path: Path
 ) -> None:
     source = tmp_path / "source"
     for name in ("pipeline", "service"):
@@ -45,15 +126,8 @@ def test_a_wheel_with_kernels_compiles_nothing_in_any_process_also_where_nothing
     page.mkdir(parents=True)
     (page / "index.html").write_text("<!doctype html>")
 
-    def done(command: list[str], **environment: str) -> str:
-        ended = subprocess.run(
-            command, cwd=tmp_path, env={**os.environ, **environment}, capture_output=True, text=True, check=False
-        )
-        assert ended.returncode == 0, ended.stderr
-        return ended.stdout + ended.stderr
-
-    program = [sys.executable, "-P", "-m", "service.cli"]
-    done([*program, "warm-up", "all", "--into", str(source / "pipeline" / "compiled"), "--quiet"])
+    into = str(source / "pipeline" / "compiled")
+    done([*PROGRAM, "warm-up", "all", "--into", into, "--quiet"], ROOT, NUMBA_CACHE_DIR=str(ahead))
     build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(tmp_path)]
     ended = subprocess.run(build, cwd=source, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
@@ -62,12 +136,10 @@ def test_a_wheel_with_kernels_compiles_nothing_in_any_process_also_where_nothing
     platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
     assert wheel.name.endswith(f"-{version}-{version}-{platform}.whl")
 
-    installed, counted = tmp_path / "installed", tmp_path / "counted"
+    installed = tmp_path / "installed"
     with zipfile.ZipFile(wheel) as packed:
         packed.extractall(installed)
-    counted.mkdir()
-    (counted / "sitecustomize.py").write_text(COUNTING)
-    done([*program, "simulate", "suburb", "--size", "70", "70", "--out", "scene", "--quiet"])
+    done([*PROGRAM, "simulate", "suburb", "--size", "70", "70", "--out", "scene", "--quiet"], tmp_path)
     (tmp_path / "file").write_text("")
     environment = {
         "PYTHONPATH": os.pathsep.join((str(counted), str(installed))),
@@ -76,10 +148,9 @@ def test_a_wheel_with_kernels_compiles_nothing_in_any_process_also_where_nothing
     }
     for words in (["--workers", "0", "--isolate"], ["--workers", "2"], []):
         out = tmp_path / f"models{len(words)}"
-        command = [*program, "reconstruct", "scene/suburb.laz", "--out", str(out), *words, "--quiet"]
-        said = done(command, **environment)
+        command = [*PROGRAM, "reconstruct", "scene/suburb.laz", "--out", str(out), *words, "--quiet"]
+        said = done(command, tmp_path, **environment)
         assert "is compiled now" not in said, said
         manifest = json.loads((out / "run.json").read_text())
         assert manifest["counts"]["candidates"] > 0
-    compiled = tmp_path / "compiled.txt"
-    assert (compiled.read_text() if compiled.exists() else "") == ""
+    assert noted(tmp_path / "compiled.txt") == []

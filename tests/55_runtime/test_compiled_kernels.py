@@ -1,4 +1,4 @@
-"""Whether kernels are compiled is told from what numba keeps on disk, without compiling any."""
+"""Whether kernels are compiled is told from the files that are kept of them, without compiling any."""
 
 from __future__ import annotations
 

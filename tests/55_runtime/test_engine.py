@@ -8,8 +8,8 @@ import pytest
 
 from pipeline.errors import SettingsError
 from pipeline.io import ReadOptions
-from pipeline.runtime import machine
-from pipeline.runtime.engine import SMALL_S, engine_of, executor_for
+from pipeline.runtime import early, machine
+from pipeline.runtime.engine import ALONE_S, SMALL_S, engine_of, executor_for
 from pipeline.runtime.expected import RATES, Expected, expected
 from pipeline.runtime.local import LocalExecutor
 from pipeline.runtime.plan import make_plan
@@ -40,15 +40,59 @@ def test_what_is_asked_for_counts_before_what_a_job_costs(
     assert found == engine
 
 
-def test_a_cluster_starts_only_where_its_start_is_less_than_a_tenth_of_the_job() -> None:
-    assert 10.0 * RATES.cluster_start_s <= SMALL_S
+@pytest.mark.parametrize(("starts", "engine"), [(9.0, "local"), (11.0, "cluster")])
+@pytest.mark.parametrize("at", [1, 2, 16])
+def test_a_cluster_starts_only_where_its_start_is_less_than_a_tenth_of_the_job(
+    at: int, starts: float, engine: str
+) -> None:
+    cpu_s = starts * RATES.cluster_start_s * at
+    assert engine_of(workers=None, scheduler=None, expected_cpu_s=cpu_s, at=at) == (engine, at)
+
+
+@pytest.mark.parametrize(
+    ("workers", "isolates", "cpu_s", "report", "engine"),
+    [
+        (None, False, 0.0, False, ("serial", 1)),
+        (None, False, 0.9 * ALONE_S, False, ("serial", 1)),
+        (None, True, 0.9 * ALONE_S, False, ("local", 4)),
+        (None, False, ALONE_S, False, ("local", 4)),
+        (None, False, 4 * SMALL_S + 1.0, False, ("cluster", 4)),
+        (None, False, 0.0, True, ("cluster", 4)),
+        (2, False, 0.0, False, ("cluster", 2)),
+    ],
+)
+def test_only_the_smallest_jobs_without_buildings_need_no_children(
+    workers: int | None, isolates: bool, cpu_s: float, report: bool, engine: tuple[str, int]
+) -> None:
+    found = engine_of(
+        workers=workers, scheduler=None, expected_cpu_s=cpu_s, at=4, performance_report=report, isolates=isolates
+    )
+    assert found == engine
 
 
 def test_executors_are_what_the_engine_says() -> None:
     assert isinstance(executor_for(workers=0, scheduler=None, local_directory=""), SerialExecutor)
     assert isinstance(executor_for(workers=None, scheduler=None, local_directory=""), LocalExecutor)
+    assert isinstance(executor_for(workers=None, scheduler=None, local_directory="", isolates=False), SerialExecutor)
     with pytest.raises(SettingsError, match="--workers 1"):
         executor_for(workers=0, scheduler=None, local_directory="", performance_report="time.html")
+
+
+def test_inputs_are_surely_small_where_all_are_files_of_this_machine_and_small_together(tmp_path: Path) -> None:
+    def file(name: str, size: int) -> str:
+        with (tmp_path / name).open("wb") as stream:
+            stream.truncate(size)
+        return str(tmp_path / name)
+
+    most = early._SMALL_BYTES
+    half, rest, more = file("half.laz", most // 2), file("rest.laz", most - most // 2 - 1), file("more.laz", most)
+    assert early.surely_small([half])
+    assert early.surely_small([half, rest])
+    assert not early.surely_small([half, half])
+    assert not early.surely_small([more])
+    assert not early.surely_small([half, str(tmp_path)])
+    assert not early.surely_small([half, str(tmp_path / "none.laz")])
+    assert not early.surely_small(["s3://bucket/half.laz"])
 
 
 def test_more_points_buildings_and_halos_cost_more() -> None:

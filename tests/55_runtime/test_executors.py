@@ -23,6 +23,7 @@ from pipeline.runtime.events import Event, Watch
 from pipeline.runtime.executors import Cluster
 from pipeline.runtime.flight import Lookout
 from pipeline.runtime.forking import can_fork
+from pipeline.runtime.local import LocalExecutor
 from pipeline.runtime.measured import Measured, measure_packed, packed
 from pipeline.runtime.serial import SerialExecutor
 from pipeline.runtime.versions import ENGINE, differences, fingerprint, versions_here, versions_of
@@ -176,6 +177,14 @@ def test_higher_priorities_go_first(tmp_path: Path) -> None:
     assert order[0].startswith("first")
     high, low = (max(order.index(f"{name}{k}") for k in range(2)) for name in ("high", "low"))
     assert high < min(order.index("low0"), order.index("low1")) <= low
+
+
+def test_the_content_is_that_of_children_of_this_process(cluster: Cluster, suburb: Path, reconstruct: Any) -> None:
+    settings = {"tile_size_m": 40.0}
+    far = reconstruct(suburb, settings=settings, executor=cluster.executor(), workers=None)
+    near = reconstruct(suburb, settings=settings, executor=LocalExecutor(2), workers=None)
+    assert far.statuses["ok"] >= 1
+    assert (near.digest, near.statuses, near.reasons) == (far.digest, far.statuses, far.reasons)
 
 
 # --- called off ------------------------------------------------------------------------------------------------------

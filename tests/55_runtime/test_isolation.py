@@ -301,7 +301,7 @@ WORKER = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started us with SIGINT ignored
 sys.path.insert(0, sys.argv[1])
-from pipeline.runtime import child, children
+from pipeline.runtime import children
 from pipeline.runtime.isolation import IsolationLimits, supervise
 children._LOADS = ()
 import orders_of_a_test

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from faults.asked import environment
+from processes import wait_for
 
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime import children
 from pipeline.runtime.events import Watch
 from pipeline.runtime.local import LocalExecutor
 from pipeline.runtime.manifest import read_manifest
-from pipeline.runtime.measured import peak_of_process
+from pipeline.runtime.measured import Measured, peak_of_process
 
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
 
 import chores
-
-LONG_S = 120.0
 
 
 @pytest.fixture(autouse=True)
@@ -49,18 +48,27 @@ def test_every_task_gives_its_result_however_many_children_there_are(count: int)
     assert executor.apart("test", chores.double, 21, Watch()) == 42
 
 
-def test_as_many_tasks_run_at_once_as_there_are_children(tmp_path: Path) -> None:
-    found: list[str] = []
-    tasks = [(str(tmp_path), name) for name in ("a", "b", "c")]
-    running = threading.Thread(target=lambda: found.extend(results(LocalExecutor(2), chores.wait_for_mark, tasks)))
+def largest_overlap(done: list[Measured[Any]]) -> int:
+    """How many tasks ran at once at most."""
+    return max(sum(one.began_s <= other.began_s < one.began_s + one.seconds for one in done) for other in done)
+
+
+def test_as_many_tasks_run_at_once_as_there_are_children_and_no_more(tmp_path: Path) -> None:
+    # children that wait for work: a task too many would begin with the first two
+    results(LocalExecutor(4), chores.meet, [(str(tmp_path), f"before-{k}", 4) for k in range(4)])
+    shutil.rmtree(tmp_path)
+    tmp_path.mkdir()
+    done: list[Measured[Any]] = []
+    tasks = [(str(tmp_path), name) for name in "abcdef"]
+    running = threading.Thread(
+        target=lambda: done.extend(LocalExecutor(2).map("test", chores.wait_for_mark, tasks, Watch()))
+    )
     running.start()
-    end = time.monotonic() + LONG_S
-    while len(list(tmp_path.glob("started-*"))) < 2 and time.monotonic() < end:
-        time.sleep(0.02)
-    assert len(list(tmp_path.glob("started-*"))) == 2
+    wait_for(lambda: len(list(tmp_path.glob("started-*"))) >= 2, "two tasks at once")
     (tmp_path / "go").touch()
     running.join()
-    assert sorted(found) == ["a", "b", "c"]
+    assert sorted(one.result for one in done) == list("abcdef")
+    assert largest_overlap(done) == 2
 
 
 def test_tasks_that_need_more_memory_than_there_is_run_one_after_the_other(tmp_path: Path) -> None:

@@ -81,6 +81,21 @@ def test_all_that_can_be_said_reaches_the_engine(tmp_path: Path) -> None:
     assert (request.meshes, request.overwrite) == ("glb", True)
 
 
+@pytest.mark.parametrize(("told", "workers"), [('"auto"', None), ("0", 0), ("3", 3)])
+def test_workers_are_a_number_or_left_to_the_estimate(tmp_path: Path, told: str, workers: int | None) -> None:
+    batch = read_batch(written(tmp_path, f"{LEAST}[cluster]\nworkers = {told}\n"))
+    assert batch.workers == batch.request().workers == workers
+
+
+@pytest.mark.parametrize("told", ['"many"', '"3"', "1025", "1.5", "true"])
+def test_workers_that_are_no_number_are_named_with_what_to_use(tmp_path: Path, told: str) -> None:
+    with pytest.raises(SettingsError) as raised:
+        read_batch(written(tmp_path, f"{LEAST}[cluster]\nworkers = {told}\n"))
+    (fault,) = raised.value.faults
+    value = told.replace('"', "'").replace("true", "True")
+    assert f"workers is {value}: use 'auto' or a whole number from 0 to 1024" in fault
+
+
 def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
     text = """
     [inputs]

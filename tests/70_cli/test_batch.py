@@ -74,6 +74,22 @@ def test_a_batch_is_planned_run_and_told(folder: Path) -> None:
     assert all(stage["kept"] == stage["done"] for name, stage in status["stages"].items() if name != "join")
 
 
+def test_a_batch_that_leaves_its_workers_to_the_estimate_gives_what_one_process_gives(
+    folder: Path, tmp_path: Path
+) -> None:
+    text = (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
+    digests = {}
+    for workers in ("0", '"auto"'):
+        file = tmp_path / f"city{len(digests)}.toml"
+        file.write_text(text.replace("workers = 0", f"workers = {workers}").replace('"models"', f'"{file.stem}"'))
+        code, told, error = call("run", file, "--json")
+        assert code == 0, error
+        digests[workers] = json.loads(told)["digest"]
+        manifest = json.loads((tmp_path / file.stem / "run.json").read_text())
+        assert (len(manifest["peak_memory_bytes"]) > 1) is (workers != "0")
+    assert digests['"auto"'] == digests["0"]
+
+
 @pytest.mark.slow
 def test_a_tile_index_and_a_bucket_are_inputs_and_results_of_a_batch(folder: Path, tmp_path: Path, bucket: str) -> None:
     (tmp_path / "index").mkdir()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -12,6 +13,9 @@ import typer
 from typer.testing import CliRunner
 
 from pipeline.cli.classifying import classify
+from pipeline.runtime import engine
+from pipeline.runtime.local import LocalExecutor
+from pipeline.runtime.serial import Executor, SerialExecutor
 
 
 def invoke(*words: str) -> tuple[int, str, str]:
@@ -49,6 +53,29 @@ def test_a_file_comes_back_with_classes_and_rasters(house: Path, tmp_path: Path)
     assert told["buildings"] == 1
     names = {"house.laz", "terrain.tif", "surface.tif", "height.tif"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
+
+
+@pytest.mark.parametrize("is_small", [True, False])
+def test_this_process_or_its_children_as_the_estimate_says_give_the_same_file(
+    house: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_small: bool
+) -> None:
+    serial = tmp_path / "serial"
+    assert invoke(str(house), "--out", str(serial), "--workers", "0", "--quiet")[0] == 0
+    engines: list[Executor] = []
+
+    def executor_for(**asked: Any) -> Executor:
+        engines.append(engine.executor_for(**asked))
+        return engines[-1]
+
+    monkeypatch.setattr("pipeline.runtime.classify.executor_for", executor_for)
+    if not is_small:
+        monkeypatch.setattr(engine, "ALONE_S", 0.0)
+        monkeypatch.setattr("pipeline.runtime.early._SMALL_BYTES", 0)
+    code, out, _ = invoke(str(house), "--out", str(tmp_path / "auto"), "--json")
+    assert code == 0
+    assert [type(one) for one in engines] == [SerialExecutor if is_small else LocalExecutor]
+    (told,) = json.loads(out)["files"]
+    assert (laspy.read(told["path"]).points.array == laspy.read(serial / "house.laz").points.array).all()
 
 
 def test_people_see_a_table_of_classes(house: Path, tmp_path: Path) -> None:

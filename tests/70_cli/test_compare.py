@@ -84,6 +84,21 @@ def test_the_page_names_every_method_and_every_building(compared: tuple[Path, di
         assert building_id in page
 
 
+def test_children_give_what_this_process_gives(
+    scene: Path, compared: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    methods = ("--methods", "fuzzy-sart,kmeans:faithful,parameter-space-3d")
+    options = ("--truth", str(scene / "truth"), "--json")
+    code, said, told = invoke("compare", str(scene / "suburb.laz"), *methods, "--out", str(tmp_path / "out"), *options)
+    assert code == 0, told
+    local, serial = json.loads(said)["variants"], compared[1]["variants"]
+    for name in ("label", "statuses", "counts", "content_sha256"):
+        assert [one[name] for one in local] == [one[name] for one in serial]
+    for one in local:
+        manifest = json.loads((tmp_path / "out" / one["run_dir"] / "run.json").read_text())
+        assert len(manifest["peak_memory_bytes"]) > 1, "this process, and children"
+
+
 def test_bad_variants_are_refused_before_anything_is_written(scene: Path, tmp_path: Path) -> None:
     code, _, told = invoke(
         "compare", str(scene / "suburb.laz"), "--methods", "magic,fuzzy-sart:bold", "--out", str(tmp_path / "out")

@@ -95,7 +95,8 @@ def test_a_building_is_overridden_and_the_run_brought_in_line(
     rejected = json.loads(said)
     assert (rejected["statuses"], rejected["rejected"]["overridden"]) == ({}, 1)
     overrides.write_text("")
-    code, said, _ = invoke("rerun", out, "--workers", "0", "--json")
+    # by children, as nothing says otherwise
+    code, said, _ = invoke("rerun", out, "--json")
     assert code == 0
     assert json.loads(said)["buildings"] == {name: "ok"}
     assert json.loads(said)["digest"] == summary["digest"]
@@ -113,13 +114,16 @@ def test_a_second_run_needs_leave_to_overwrite_and_gives_the_same(
     scene: Path, run: tuple[Path, dict[str, Any], Any], tmp_path: Path
 ) -> None:
     folder, summary, _ = run
-    again = ("reconstruct", str(scene), "--out", str(folder), "--workers", "0", "--json")
+    # by children, as nothing says otherwise; the first run was serial
+    again = ("reconstruct", str(scene), "--out", str(folder), "--json")
     code, said, _ = invoke(*again)
     assert code == 4
     assert "--overwrite" in json.loads(said)["error"]["message"]
+    assert len(json.loads((folder / "run.json").read_text())["peak_memory_bytes"]) == 1
     code, said, _ = invoke(*again, "--overwrite", "--meshes", "none")
     assert code == 0
     assert json.loads(said)["digest"] == summary["digest"]
+    assert len(json.loads((folder / "run.json").read_text())["peak_memory_bytes"]) > 1
     assert not list(folder.glob("meshes/*/*.obj"))
 
 

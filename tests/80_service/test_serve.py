@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import httpx
 import psutil
@@ -181,6 +181,30 @@ def test_numbers_of_workers_that_cannot_be_are_refused_as_option_and_in_the_envi
     monkeypatch.setenv("GABLEWORK_WORKERS", word)
     assert invoke(command, "--state", str(tmp_path)).exit_code == 2
     assert handed_on == []
+
+
+@pytest.mark.parametrize(("told", "started"), [("auto", 7), (None, 7), ("3", 3)])
+def test_the_embedded_cluster_has_a_worker_a_core_unless_a_number_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str | None, started: int
+) -> None:
+    from service.driver import clusters
+
+    counts: list[int] = []
+
+    class Engine:
+        def __init__(self, *, workers: int, **_: object) -> None:
+            counts.append(workers)
+
+        def __enter__(self) -> Self:
+            return self
+
+    monkeypatch.delenv("GABLEWORK_WORKERS", raising=False)
+    if told is not None:
+        monkeypatch.setenv("GABLEWORK_WORKERS", told)
+    monkeypatch.setattr(clusters, "cores", lambda: 7)
+    monkeypatch.setattr(clusters, "Cluster", Engine)
+    clusters.SharedCluster(ServiceSettings(state=tmp_path)).engine()
+    assert counts == [started]
 
 
 def test_port_0_takes_a_free_port_and_a_taken_one_is_told(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from batch_faults import FAULTS, BatchRun, Fault, Undisturbed, cases, check, rows_told
+from batch_faults import FAULTS, BatchRun, Fault, Undisturbed, cases, check, modelled_twice, rows_told
 from processes import Programs, program
 
 pytestmark = pytest.mark.slow
@@ -21,6 +21,19 @@ def test_a_batch_run_outlives(
 ) -> None:
     run = BatchRun(programs, tmp_path / "run", town_tile, external=fault.external)
     check(run, fault, undisturbed_batch)
+
+
+@pytest.mark.parametrize(
+    ("runs", "twice"),
+    [
+        ([(0, 0), (0, 0), (0, 7), (7, 24), (24, 24)], False),
+        ([(0, 0), (0, 7), (0, 24), (24, 24)], True),
+        ([(0, 7), (7, 24), (20, 24)], True),
+    ],
+    ids=["none", "after a strike in reconstruct", "in the last run"],
+)
+def test_a_building_that_any_run_models_again_is_noticed(runs: list[tuple[int, int]], twice: bool) -> None:
+    assert modelled_twice(runs) is twice
 
 
 def test_the_page_tells_all_rows_and_no_other() -> None:

@@ -48,6 +48,18 @@ def wait_for_mark(task: tuple[str, str]) -> str:
     return name
 
 
+def meet(task: tuple[str, str, int]) -> str:
+    """Say that it runs, then wait until so many tasks have said so."""
+    folder, name, others = task
+    Path(folder, f"met-{name}").touch()
+    end = time.monotonic() + DEADLINE_S
+    while len(list(Path(folder).glob("met-*"))) < others:
+        if time.monotonic() > end:
+            raise TimeoutError(f"{name} met too few")
+        time.sleep(0.02)
+    return name
+
+
 def tasks_held(dask_worker: object) -> int:
     """How many tasks a worker has, whether they run or wait."""
     return len(dask_worker.state.tasks)  # type: ignore[attr-defined]
