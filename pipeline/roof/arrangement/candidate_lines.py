@@ -260,8 +260,8 @@ def candidate_lines(
             else:
                 line_of[first:last] = -1
         n = len(outline)
-        for k in range(n):
-            directions[k] = outline[k]
+        for q in range(n):
+            directions[q] = outline[q]
         for plane in (a, b):
             if math.hypot(planes[plane, 0], planes[plane, 1]) > _LEAST_SLOPE:
                 fall = math.atan2(planes[plane, 1], planes[plane, 0])
