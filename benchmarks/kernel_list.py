@@ -37,7 +37,11 @@ def commands(folder: Path) -> dict[str, list[str]]:
             f"reconstruct {tile} --out {folder}/given --workers 0 --footprints {truth}/buildings/*/*.parquet",
             f"reconstruct {gables}/hofmann310.laz --out {folder}/others --workers 0 --meshes glb",
         ],
-        "simulate": [f"simulate suburb --out {folder}/again", f"simulate city --size 60 60 --out {folder}/city"],
+        "simulate": [
+            f"simulate suburb --out {folder}/again",
+            f"simulate city --size 60 60 --out {folder}/city",
+            f"simulate hofmann310 --out {folder}/gables_again",
+        ],
         "evaluate": [
             f"evaluate {folder}/plain --truth {truth} --out {folder}/report",
             f"evaluate {folder}/plain --points {tile} --out {folder}/measured",
