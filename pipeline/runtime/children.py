@@ -24,10 +24,10 @@ _START_TIMEOUT_S = 900.0
 """With compiled kernels a child takes two seconds; without, it compiles them."""
 
 
-def start_fault(told: str, stderr: str) -> str:
-    """The message where children do not last."""
+def start_fault(told: str, stderr: str, work: str = "models buildings") -> str:
+    """The message where children that do some work do not last."""
     said = f". It said: {stderr}" if stderr else ""
-    return f"the process that models buildings does not last, {FRUITLESS_STARTS} times in a row: {told}{said}"
+    return f"the process that {work} does not last, {FRUITLESS_STARTS} times in a row: {told}{said}"
 
 
 class _Children:

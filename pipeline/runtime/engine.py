@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 from pipeline.errors import SettingsError
+from pipeline.runtime.children import kill_children
 from pipeline.runtime.expected import RATES, Expected
-from pipeline.runtime.machine import cores
+from pipeline.runtime.machine import cores, memory_bytes
 from pipeline.runtime.priorities import Traffic, priority_of
 from pipeline.runtime.serial import Executor, SerialExecutor
 from pipeline.runtime.tls import TlsFiles
@@ -39,7 +40,7 @@ def engine_of(
     expected_cpu_s : float
         CPU seconds of the job.
     at : int
-        Cores of this machine.
+        Workers that this machine has cores and memory for.
     performance_report : bool
         Whether a page about the time of workers is asked for, which only a cluster has.
     isolates : bool
@@ -61,6 +62,26 @@ def engine_of(
     if not isolates and expected_cpu_s < ALONE_S:
         return "serial", 1
     return "local", at
+
+
+def workers_that_fit(at: int, memory: int, task_bytes: int) -> int:
+    """Workers that a machine has cores and memory for, at least one.
+
+    Parameters
+    ----------
+    at : int
+        Its cores.
+    memory : int
+        Its bytes.
+    task_bytes : int
+        Of the largest task, above the process's own size.
+
+    Examples
+    --------
+    >>> workers_that_fit(8, 16 * 2**30, 3 * 2**30), workers_that_fit(8, 2**30, 3 * 2**30)
+    (4, 1)
+    """
+    return max(1, min(at, int(memory // (RATES.process_gib * 2**30 + task_bytes))))
 
 
 def executor_for(
@@ -99,7 +120,7 @@ def executor_for(
         workers=workers,
         scheduler=scheduler,
         expected_cpu_s=0.0 if work is None else sum(work.cpu_s().values()),
-        at=cores(),
+        at=workers_that_fit(cores(), memory_bytes(), 0 if work is None else work.task_bytes),
         performance_report=performance_report is not None,
         isolates=isolates,
     )
@@ -111,6 +132,8 @@ def executor_for(
         from pipeline.runtime.local import LocalExecutor
 
         return LocalExecutor(processes)
+    if scheduler is None:
+        kill_children()  # the server that was started early, in case the job was small
     from pipeline.runtime.executors import Cluster, DaskExecutor
 
     cluster = Cluster(workers=processes, scheduler=scheduler, local_directory=local_directory, tls=tls)

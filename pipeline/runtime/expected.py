@@ -57,6 +57,8 @@ class Expected:
     """Points of the tiles' windows, halos and all."""
     buildings: int
     """How many."""
+    task_bytes: int = 0
+    """Of its largest task, above the process's own size."""
 
     @property
     def points(self) -> int:
@@ -117,4 +119,5 @@ def expected(plan: Plan, buildings: int | None = None) -> Expected:
         # tiles at the edge of the data see less: no window sees more than there is
         seen_points=total * min(halo_share, max(1.0, len(tiles))),
         buildings=round(total / 1e6 * RATES.buildings_per_million) if buildings is None else buildings,
+        task_bytes=plan.window_bytes,
     )

@@ -51,12 +51,13 @@ _NOT_SHARED = (
 )
 
 
-def blame(stage: str, task: object) -> str:
-    """The message where processes died of one task, whatever else ran."""
+def blame(stage: str, task: object, *, here: bool = False) -> str:
+    """The message where processes died of one task, whatever else ran; `here` where they are no workers."""
     smaller = ", or set a smaller tile_size_m" if stage == "split" else ""
+    who, advice = ("processes", "Use a machine with more memory") if here else ("workers", "Give them more memory")
     return (
-        f"stage {stage}: workers died again and again on one task, also when it ran alone: {repr(task)[:300]}. "
-        f"Give them more memory{smaller}"
+        f"stage {stage}: {who} died again and again on one task, also when it ran alone: {repr(task)[:300]}. "
+        f"{advice}{smaller}"
     )
 
 

@@ -20,6 +20,7 @@ import contextlib
 import contextvars
 import math
 import queue
+import sys
 import threading
 import time
 from collections import deque
@@ -27,7 +28,7 @@ from collections.abc import Callable, Generator, Sequence
 from types import TracebackType
 from typing import Any, Generic, Self
 
-from pipeline.errors import RunError
+from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.children import FRUITLESS_STARTS, lent_child, start_fault
 from pipeline.runtime.events import Watch
 from pipeline.runtime.flight import SETTLE_INTERRUPTED_S, TICK_S, blame
@@ -39,6 +40,8 @@ from pipeline.runtime.tallies import TALLIES
 
 _WORN_BYTES = 2**30
 """A child that keeps more than this between tasks is not used again: buildings have their own limits."""
+
+_SAID: set[str] = set()
 
 
 class LocalExecutor:
@@ -175,7 +178,7 @@ class _Stage(Generic[Task, Result]):
                 if isinstance(outcome, Measured):
                     landed = outcome
                 elif self._alone:
-                    landed = RunError(blame(self._stage, self._tasks[number]))
+                    landed = RunError(blame(self._stage, self._tasks[number], here=True))
                 else:
                     facts = {"stage": self._stage, **facts_of_task(self._tasks[number])}
                     LOG.warning("a process died of the task (%s): it is tried alone", outcome.told, extra=facts)
@@ -227,6 +230,10 @@ class _Stage(Generic[Task, Result]):
         began, outcome = time.perf_counter(), "failed"
         try:
             found = self._in_child(task)
+        except RunCancelledError:
+            outcome = "called off"
+            raise
+        else:
             outcome = "done" if isinstance(found, Measured) else "failed"
             return found
         finally:
@@ -249,8 +256,11 @@ class _Stage(Generic[Task, Result]):
                     timeout_s=math.inf,
                     memory_bytes=self._memory_bytes,
                     cancelled=self._killed.is_set,
+                    one="task",
                 ):
                     found = said
+                if not isinstance(found, End):
+                    self._pass_on(child.new_words())
                 if isinstance(found, End) or child.memory_bytes > _WORN_BYTES:
                     child.end()
             if not isinstance(found, End):
@@ -258,4 +268,11 @@ class _Stage(Generic[Task, Result]):
                 return measured
             if found.index is not None:
                 return found
-        raise RunError(start_fault(found.told, found.stderr))
+        raise RunError(start_fault(found.told, found.stderr, f"does the tasks of the stage {self._stage}"))
+
+    @staticmethod
+    def _pass_on(words: str) -> None:
+        """Say what a child said, warnings and log lines; the same words of several children once."""
+        if words and words not in _SAID:
+            _SAID.add(words)
+            sys.stderr.write(words)

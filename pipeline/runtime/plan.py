@@ -22,6 +22,8 @@ _ASKED_AT_ONCE = 8
 """Files elsewhere whose headers are read together: a header takes some ten requests, tens of milliseconds each."""
 _BYTES_PER_POINT = 220
 """Measured peak of a split above the size of its process, bytes a point of the window, at 3 and 5 million points."""
+LARGEST_TASK_BYTES = _POINTS_PER_WINDOW * _BYTES_PER_POINT
+"""Of the plans that choose their tiles."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -78,6 +78,7 @@ class SupervisedChild:
         self._nonsense = ""
         self.begun = 0
         """Items that it announced so far."""
+        self._heard = 0
         self._told_cpu_s = 0.0
         self._seen_cpu_s = 0.0
 
@@ -147,8 +148,11 @@ class SupervisedChild:
         timeout_s: float,
         memory_bytes: int,
         cancelled: Callable[[], bool],
+        one: str = "building",
     ) -> Iterator[Finished | End]:
         """Work off items; every result as it comes, and an `End` as the last one where the child did not last.
+
+        `one` is what an item is called where it took too much.
 
         Raises
         ------
@@ -160,7 +164,7 @@ class SupervisedChild:
         batch = Batch(function=function, items=items, data_limit_bytes=memory_bytes + _DATA_MARGIN_BYTES)
         with contextlib.suppress(BrokenPipeError):  # its end is told below
             self._write(frame(batch))
-        allowed = f"the {memory_bytes / 2**30:g} GiB that a building may take"
+        allowed = f"the {memory_bytes / 2**30:g} GiB that a {one} may take"
         kills = _system_kills()
         left = len(items)
         at_work: int | None = None
@@ -293,6 +297,12 @@ class SupervisedChild:
     def _end_of_stderr(self) -> bytes:
         size = os.fstat(self._stderr.fileno()).st_size
         return os.pread(self._stderr.fileno(), _STDERR_TOLD_BYTES, max(0, size - _STDERR_TOLD_BYTES))
+
+    def new_words(self) -> str:
+        """What it wrote to its standard error since this was last asked."""
+        size = os.fstat(self._stderr.fileno()).st_size
+        begin, self._heard = min(self._heard, size), size
+        return os.pread(self._stderr.fileno(), size - begin, begin).decode("utf-8", errors="replace")
 
     @property
     def last_words(self) -> str:

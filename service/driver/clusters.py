@@ -10,9 +10,11 @@ from collections.abc import Callable
 from urllib.parse import urlsplit
 
 from pipeline.errors import ClusterError, RunCancelledError
+from pipeline.runtime.engine import workers_that_fit
 from pipeline.runtime.events import Event
 from pipeline.runtime.executors import Cluster
-from pipeline.runtime.machine import cores
+from pipeline.runtime.machine import cores, memory_bytes
+from pipeline.runtime.plan import LARGEST_TASK_BYTES
 from pipeline.runtime.tls import given_tls
 from service.driver.held import LOG, Engine, HeldJob
 from service.settings import ServiceSettings
@@ -22,6 +24,11 @@ _AGAIN_S = 1.0
 """A scheduler that does not answer is tried again after so long."""
 _TELL_S = 30.0
 """That the job waits is told again after so long."""
+
+
+def _as_many_as_fit() -> int:
+    """A worker per core, as long as each has memory for the largest task that plans make; two in any case."""
+    return min(cores(), max(2, workers_that_fit(cores(), memory_bytes(), LARGEST_TASK_BYTES)))
 
 
 class SharedCluster:
@@ -43,7 +50,7 @@ class SharedCluster:
     def __init__(self, settings: ServiceSettings, make: Callable[[], Engine] | None = None) -> None:
         self._scheduler = settings.scheduler
         tls = given_tls(settings.tls_ca, settings.tls_cert, settings.tls_key)
-        workers = cores() if settings.workers == "auto" else settings.workers
+        workers = _as_many_as_fit() if settings.workers == "auto" else settings.workers
         self._make = make or (lambda: Cluster(workers=workers, scheduler=settings.scheduler, tls=tls))
         self._lock = threading.Lock()
         self._engine: Engine | None = None

@@ -9,9 +9,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from llvmlite.binding import get_host_cpu_name
 
+from pipeline.compiler import frame_room
+from pipeline.compiler.fingerprint import _Own
 from pipeline.compiler.store import ENDING, LIST, Stored
 
 CALLEE = """
@@ -131,6 +134,80 @@ def test_touching_a_file_commenting_it_or_editing_another_kernel_in_it_recompile
     assert sources.run(f"told = caller.total({VALUES})")[:2] == (21.0, [])
 
 
+TYPES = """
+import enum
+from typing import NamedTuple
+from pipeline.compiler import kernel
+
+class Kind(enum.IntEnum):
+    ROOF = {roof}
+
+class Pair(NamedTuple):
+    {one}: float
+    {other}: float
+
+@kernel
+def kind_of(x):
+    return x + Kind.ROOF
+
+@kernel
+def low_of(pair):
+    return pair.low
+
+@kernel(inline="always")
+def after(x):
+    return x + {step}
+
+@kernel
+def twice_after(x):
+    return after(after(x))
+
+@kernel
+def all_but_first(values):
+    return values[1:].sum()
+"""
+
+
+def test_a_new_value_of_an_enum_and_other_fields_of_a_tuple_make_kernels_anew(sources: Sources) -> None:
+    path = sources.folder / "caller.py"
+    words = "told = [caller.kind_of(1), caller.low_of(caller.Pair(2.0, 3.0)), caller.twice_after(1)]"
+    path.write_text(TYPES.format(roof=4, one="low", other="high", step=1))
+    assert sources.run(words)[0] == [5, 2.0, 3]
+    path.write_text(TYPES.format(roof=6, one="high", other="low", step=10))
+    assert sources.run(words)[0] == [7, 3.0, 21]
+
+
+def test_what_is_inlined_is_not_compiled_and_has_no_file(sources: Sources) -> None:
+    (sources.folder / "caller.py").write_text(TYPES.format(roof=4, one="low", other="high", step=1))
+    words = "told = [caller.twice_after(1), 'after' in counting.seen, 'twice_after' in counting.seen]"
+    assert sources.run(words)[0] == [3, False, True]
+    assert list(sources.held()) == ["caller.twice_after"]
+    assert sources.run(f"{words}[:1] + [caller.after(1)]")[0] == [3, 2]
+
+
+def test_constants_of_every_kind_have_a_fingerprint() -> None:
+    own = _Own(lambda _: None)
+    values = (
+        slice(1, None),
+        slice(None, 1),
+        (slice(None), 0),
+        (0, slice(None)),
+        ...,
+        None,
+        1,
+        1.0,
+        "1",
+        b"1",
+        np.int8(1),
+    )
+    told = [own.value(value) for value in values]
+    assert len(set(told)) == len(values)
+
+
+def test_a_deep_recursion_lies_in_one_frame_of_python() -> None:
+    assert frame_room._from_large_frame.__code__.co_stacksize == frame_room._SLOTS
+
+
 def test_what_only_kernels_call_has_no_machine_code_until_python_calls_it(sources: Sources) -> None:
     sources.run(f"told = caller.total({VALUES})")
     assert {name: bool(stored.machine_code) for name, stored in sources.held().items()} == {
@@ -177,9 +254,18 @@ def test_plain_numba_computes_the_same_and_keeps_its_own_files(sources: Sources)
     assert list(sources.kept.rglob("*.nbc"))
 
 
-def test_a_numba_that_is_not_known_is_used_plainly(sources: Sources) -> None:
+def test_plain_numba_follows_an_edit_of_a_callee_in_another_file(sources: Sources) -> None:
+    for factor, total in (("3.0", 21.0), ("5.0", 35.0), ("5.0", 35.0)):
+        sources.write(factor=factor)
+        assert sources.run(f"told = caller.total({VALUES})", GABLEWORK_PLAIN_NUMBA="1")[0] == total
+    assert sources.run(f"told = caller.total({VALUES})", GABLEWORK_PLAIN_NUMBA="1")[1] == []
+
+
+def test_a_numba_that_is_not_known_is_used_plainly_and_that_is_said(sources: Sources) -> None:
     words = f"import pipeline.compiler.backend as backend; backend.KNOWN = ('0.1.',); told = caller.total({VALUES})"
-    assert sources.run(words)[0] == 21.0
+    told, _, warned = sources.run(words)
+    assert told == 21.0
+    assert warned.count("is not one of those that gablework knows") == 1
     assert sources.held() == {}
 
 
@@ -225,6 +311,14 @@ def test_shipped_kernels_are_loaded_and_nothing_is_written(sources: Sources) -> 
     told, compiled, warned = sources.run(f"told = caller.total({VALUES})", GABLEWORK_KERNELS=str(folder))
     assert (told, compiled, warned) == (21.0, [], "")
     assert sources.held() == {}
+
+
+def test_a_shipped_kernel_that_only_kernels_called_is_compiled_once_for_python_and_kept(sources: Sources) -> None:
+    folder = str(ship(sources))
+    for _ in range(2):
+        assert sources.run("told = callee.scaled(2.0)", GABLEWORK_KERNELS=folder)[0] == 6.0
+        assert sources.held()["callee.scaled"].machine_code
+    assert sources.run("told = callee.scaled(2.0)", GABLEWORK_KERNELS=folder)[:2] == (6.0, [])
 
 
 def test_a_shipped_file_whose_hash_is_not_listed_is_not_loaded(sources: Sources) -> None:

@@ -70,6 +70,18 @@ def test_only_the_smallest_jobs_without_buildings_need_no_children(
     assert found == engine
 
 
+def test_a_large_job_has_no_more_workers_than_there_is_memory_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+    monkeypatch.setattr("pipeline.runtime.executors.Cluster", lambda **given: made.append(given["workers"]))
+    monkeypatch.setattr("pipeline.runtime.executors.DaskExecutor", lambda *_, **__: None)
+    monkeypatch.setattr("pipeline.runtime.engine.cores", lambda: 8)
+    monkeypatch.setattr("pipeline.runtime.engine.memory_bytes", lambda: 16 * 2**30)
+    large = Expected(points_by_file={"a": 10**9}, tiles=99, seen_points=2e9, buildings=10**6, task_bytes=3 * 2**30)
+    for workers in (None, 8):
+        executor_for(workers=workers, scheduler=None, local_directory="", work=large)
+    assert made == [4, 8]
+
+
 def test_executors_are_what_the_engine_says() -> None:
     assert isinstance(executor_for(workers=0, scheduler=None, local_directory=""), SerialExecutor)
     assert isinstance(executor_for(workers=None, scheduler=None, local_directory=""), LocalExecutor)

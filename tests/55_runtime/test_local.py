@@ -95,7 +95,7 @@ def test_a_task_that_costs_its_child_is_tried_alone_and_then_counts(tmp_path: Pa
 
 
 def test_a_task_that_kills_its_child_alone_too_ends_the_run_and_is_named() -> None:
-    with pytest.raises(RunError, match=r"stage test: workers died again and again on one task.*: 5\. Give them more"):
+    with pytest.raises(RunError, match=r"stage test: processes died again and again on one task.*: 5\. Use a machine"):
         results(LocalExecutor(2), chores.die_if_five, list(range(8)))
 
 

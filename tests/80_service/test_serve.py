@@ -183,9 +183,12 @@ def test_numbers_of_workers_that_cannot_be_are_refused_as_option_and_in_the_envi
     assert handed_on == []
 
 
-@pytest.mark.parametrize(("told", "started"), [("auto", 7), (None, 7), ("3", 3)])
-def test_the_embedded_cluster_has_a_worker_a_core_unless_a_number_is_given(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str | None, started: int
+@pytest.mark.parametrize(
+    ("told", "gib", "started"),
+    [("auto", 64, 7), (None, 64, 7), ("3", 64, 3), ("auto", 15, 5), ("auto", 1, 2), ("7", 1, 7)],
+)
+def test_the_embedded_cluster_has_a_worker_per_core_with_memory_for_each_unless_a_number_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str | None, gib: int, started: int
 ) -> None:
     from service.driver import clusters
 
@@ -202,6 +205,7 @@ def test_the_embedded_cluster_has_a_worker_a_core_unless_a_number_is_given(
     if told is not None:
         monkeypatch.setenv("GABLEWORK_WORKERS", told)
     monkeypatch.setattr(clusters, "cores", lambda: 7)
+    monkeypatch.setattr(clusters, "memory_bytes", lambda: gib * 2**30)
     monkeypatch.setattr(clusters, "Cluster", Engine)
     clusters.SharedCluster(ServiceSettings(state=tmp_path)).engine()
     assert counts == [started]
