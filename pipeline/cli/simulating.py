@@ -88,7 +88,9 @@ def demo(
         from pipeline.evaluation.chapters import chapters
         from pipeline.evaluation.writing import measures_table
         from pipeline.report.evaluation_page import headline
+        from pipeline.runtime.early import start_early
 
+        start_early("reconstruct", workers=workers, scheduler=None, footprints=False, method=None)
         made = demonstrate(out, console.on_event, workers=workers, overwrite=overwrite, size_m=size, seed=seed)
         show_summary(console, made.summary)
         decisive = headline(chapters(made.evaluation))

@@ -19,6 +19,7 @@ from pipeline.runtime.classified_files import (
     output_name,
     write_classified,
 )
+from pipeline.runtime.early import loads_of
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.expected import expected
@@ -179,6 +180,7 @@ def classify(
             work=expected(plan, 0),
             tls=request.tls,
             isolates=False,
+            loads=loads_of("classify", footprints=request.footprints is not None),
         )
         with calling_off(scratch, cancelled) as called_off, engine:
             progress.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)

@@ -1,6 +1,6 @@
 """Whether the kernels of a run are compiled already.
 
-A run that meets none compiles them in each of its processes at once, which takes longer than many a run.
+A run that meets none compiles them first, which takes longer than many a run.
 """
 
 from __future__ import annotations

@@ -31,6 +31,14 @@ def surely_small(inputs: Sequence[str]) -> bool:
     return all(path.is_file() for path in paths) and sum(path.stat().st_size for path in paths) < _SMALL_BYTES
 
 
+def loads_of(job: Job, *, footprints: bool, method: str | None = None) -> list[str]:
+    """What the children of a job need, as `pipeline.runtime.child` takes it; `footprints` and `method` as below."""
+    loads = [*_STAGES, *_LOADS[job], f"{_SCENE}:given" if footprints else _SCENE]
+    if job == "reconstruct":
+        loads.append(f"pipeline.runtime.modelling:load_once:{method or _METHOD}")
+    return loads
+
+
 def start_early(job: Job, *, workers: int | None, scheduler: str | None, footprints: bool, method: str | None) -> None:
     """Start the server of a job that may be small; nothing where it was told to run elsewhere, or was started before.
 
@@ -57,7 +65,4 @@ def start_early(job: Job, *, workers: int | None, scheduler: str | None, footpri
         if footprints:
             import pyarrow as pa  # noqa: F401 - what reads footprints loads it
 
-    loads = [*_STAGES, *_LOADS[job], f"{_SCENE}:given" if footprints else _SCENE]
-    if job == "reconstruct":
-        loads.append(f"pipeline.runtime.modelling:load_once:{method or _METHOD}")
-    preload(loads)
+    preload(loads_of(job, footprints=footprints, method=method))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 from pipeline.errors import SettingsError
-from pipeline.runtime.children import kill_children
+from pipeline.runtime.children import kill_children, preload
 from pipeline.runtime.expected import RATES, Expected
 from pipeline.runtime.machine import cores, memory_bytes
 from pipeline.runtime.priorities import Traffic, priority_of
@@ -95,6 +96,7 @@ def executor_for(
     tls: TlsFiles | None = None,
     performance_report: str | None = None,
     isolates: bool = True,
+    loads: Sequence[str] = (),
 ) -> Executor:
     """The executor that a request asks for.
 
@@ -110,6 +112,8 @@ def executor_for(
         As `Cluster.executor` has them.
     isolates
         As `engine_of` has it.
+    loads : sequence of str
+        What children are to load, as `pipeline.runtime.early` tells it, unless they are started already.
 
     Raises
     ------
@@ -131,6 +135,8 @@ def executor_for(
     if engine == "local":
         from pipeline.runtime.local import LocalExecutor
 
+        if loads:
+            preload(loads)
         return LocalExecutor(processes)
     if scheduler is None:
         kill_children()  # the server that was started early, in case the job was small

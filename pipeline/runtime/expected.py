@@ -34,8 +34,8 @@ class Rates:
     """A building."""
     buildings_per_million: float = 300.0
     """To be expected in a million points where nothing else tells."""
-    compiling_s: float = 120.0
-    """Wall seconds of the first run on two cores whose processes all compile the kernels, over those of the next."""
+    compiling_s: float = 45.0
+    """Wall seconds of the first run, which compiles the kernels that it calls, over those of the next."""
     process_gib: float = 0.3
     """Memory of a process with its libraries and kernels; the largest task of the plan comes on top."""
 

@@ -36,6 +36,7 @@ from pipeline.runtime.earlier import (
     earlier_run,
     request_of,
 )
+from pipeline.runtime.early import loads_of
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.expected import expected
@@ -185,6 +186,7 @@ def _rerun(
         # a few tiles are split for it; they are not known yet, and all inputs are read
         work=dataclasses.replace(expected(plan, 0), seen_points=0.0),
         tls=request.tls,
+        loads=loads_of("reconstruct", footprints=False, method=wanted.settings.general.method),
     )
     scratch.create()
     try:

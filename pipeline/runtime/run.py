@@ -30,6 +30,7 @@ from pipeline.io import (
 from pipeline.io.footprints import read_area
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.tile_index import TileIndex
+from pipeline.runtime.early import loads_of
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.expected import expected
@@ -316,6 +317,7 @@ def run_variants(
             traffic=request.traffic,
             tls=request.tls,
             performance_report=request.performance_report,
+            loads=loads_of("reconstruct", footprints=footprints is not None, method=settings.general.method),
         )
         starting = time.perf_counter()
         with about(run=scratch.name), calling_off(scratch, cancelled) as called_off, engine:
