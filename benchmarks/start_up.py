@@ -2,10 +2,11 @@
 
     python -m benchmarks.start_up --baseline CHECKOUT --out DIR [--data ../shared/data] [--rows NAME ...] [--repeat 3]
 
-CHECKOUT is another checkout of this repository with its environment (`make .venv/.run-stamp`), `d53c62d` for the table
-in docs/results/start_up.md. Both versions run in turns, the medians of their runs are divided. Processor seconds are
-those of a command and of everything that it starts, also of what outlives it for a moment: such processes are waited
-for. Compiled kernels are there, but for the rows of the demo, which clone both checkouts and begin with nothing. A machine that others use at the same time tells the ratios of processor seconds all the same; those of wall
+CHECKOUT is another checkout of this repository with its environment (`make .venv/.run-stamp`), `d53c62d` for the
+table in docs/results/start_up.md. Both versions run in turns, the medians of their runs are divided. Processor
+seconds are those of a command and of everything that it starts, also of what outlives it for a moment: such processes
+are waited for. Compiled kernels are there, but for the rows of the demo, which clone both checkouts and begin with
+nothing. A machine that others use at the same time tells the ratios of processor seconds all the same; those of wall
 seconds want a quiet one.
 """
 
