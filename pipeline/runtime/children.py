@@ -11,7 +11,14 @@ from collections.abc import Callable, Iterator, Sequence
 
 from pipeline.errors import RunError
 from pipeline.runtime.executed import Executed
-from pipeline.runtime.forking import ProcessServer, can_fork, executed_server, forked_server, has_one_thread
+from pipeline.runtime.forking import (
+    ProcessServer,
+    can_fork,
+    executed_server,
+    forked_server,
+    has_one_thread,
+    read_by_children,
+)
 from pipeline.runtime.logs import LOG
 from pipeline.runtime.measured import charge
 from pipeline.runtime.supervised import SupervisedChild
@@ -82,9 +89,10 @@ class _Children:
                 self._serving(loads)
 
     def has_idle(self) -> bool:
-        """Whether a living child has nothing to do."""
+        """Whether a living child has nothing to do, and would do it with the environment of now."""
+        environment = read_by_children(os.environ)
         with self._lock:
-            return any(child.alive for child in self._idle)
+            return any(child.alive and child.environment == environment for child in self._idle)
 
     def kill(self) -> None:
         """Kill all children; the next work starts others."""
@@ -127,8 +135,9 @@ class _Children:
         with self._lock:
             if self._closed:
                 raise RunError("this process is about to end: it models no buildings any more")
+            environment = read_by_children(os.environ)
             for child in tuple(self._idle):
-                if not child.alive:
+                if not child.alive or child.environment != environment:
                     self._idle.remove(child)
                     self._all.discard(child)
                     child.end()

@@ -291,6 +291,11 @@ def _folder() -> str:
         return ""
 
 
+def read_by_children(environment: Mapping[str, str]) -> dict[str, str]:
+    """The variables that may matter to a child: keys of an object store, say, which it reads when it works."""
+    return {name: value for name, value in environment.items() if not name.startswith(_READ_LATER)}
+
+
 def read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
     """The variables that count once only, when a process starts."""
     return {

@@ -17,6 +17,7 @@ from typing import Any
 
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.executed import Started
+from pipeline.runtime.forking import read_by_children
 from pipeline.runtime.messages import Batch, Begun, Finished, Frames, OutOfMemory, Raised, Ready, frame
 
 _PIECE = 2**20
@@ -76,6 +77,8 @@ class SupervisedChild:
         self._frames = Frames()
         self._ready = False
         self._nonsense = ""
+        self.environment = read_by_children(os.environ)
+        """What it was started with."""
         self.begun = 0
         """Items that it announced so far."""
         self._heard = 0

@@ -48,6 +48,22 @@ def test_every_task_gives_its_result_however_many_children_there_are(count: int)
     assert executor.apart("test", chores.double, 21, Watch()) == 42
 
 
+def test_tasks_see_the_environment_of_now_also_where_older_children_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    executor = LocalExecutor(1)
+    for key in ("one", "two"):
+        monkeypatch.setenv("AWS_ACCESS_KEY_ID", key)
+        assert results(executor, chores.variable, ["AWS_ACCESS_KEY_ID"]) == [key]
+    assert children.has_idle_child()
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "three")
+    assert not children.has_idle_child()
+
+
+def test_what_tasks_say_is_said_by_the_command_the_same_of_several_children_once(capfd: Any) -> None:
+    words = [f"tile {os.getpid()} is odd", "another one", f"tile {os.getpid()} is odd"]
+    assert len(set(results(LocalExecutor(1), chores.say, words))) == 1
+    assert capfd.readouterr().err.splitlines() == words[:2]
+
+
 def largest_overlap(done: list[Measured[Any]]) -> int:
     """How many tasks ran at once at most."""
     return max(sum(one.began_s <= other.began_s < one.began_s + one.seconds for one in done) for other in done)

@@ -18,7 +18,10 @@ def compiled(monkeypatch: pytest.MonkeyPatch) -> list[list[Listed]]:
     """The kernels of each call of the compiler, which reports them one by one and compiles none."""
     calls: list[list[Listed]] = []
 
-    def compile_kernels(kernels: Iterable[Listed], on_progress: Callable[[int, int, float], None]) -> int:
+    def compile_kernels(
+        kernels: Iterable[Listed], processes: int, on_progress: Callable[[int, int, float], None]
+    ) -> int:
+        assert processes >= 1
         calls.append(list(kernels))
         total = len(calls[-1])
         for done in range(1, total + 1):

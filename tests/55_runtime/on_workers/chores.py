@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -63,6 +64,17 @@ def meet(task: tuple[str, str, int]) -> str:
 def tasks_held(dask_worker: object) -> int:
     """How many tasks a worker has, whether they run or wait."""
     return len(dask_worker.state.tasks)  # type: ignore[attr-defined]
+
+
+def variable(name: str) -> str:
+    """A variable of the environment."""
+    return os.environ.get(name, "")
+
+
+def say(words: str) -> int:
+    """Say something to standard error; the process's number."""
+    print(words, file=sys.stderr, flush=True)
+    return os.getpid()
 
 
 def fail(message: str) -> None:
