@@ -63,6 +63,6 @@ def start_early(job: Job, *, workers: int | None, scheduler: str | None, footpri
     if job == "reconstruct":
         METHODS.get(method or _METHOD)
         if footprints:
-            import pyarrow as pa  # noqa: F401 - what reads footprints loads it
+            import pyarrow as pa  # noqa: F401 - what reads footprints loads both
 
     preload(loads_of(job, footprints=footprints, method=method))
