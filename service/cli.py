@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.main import get_command_name
+from typer.models import CommandInfo
 
 from pipeline.cli import AsJson, app
 from pipeline.cli.options import TlsCa, TlsCert, TlsKey, count_or_auto
@@ -278,10 +282,33 @@ def revoke_key(
         console.document({"revoked": key_id})
 
 
+def only_called(every: typer.Typer, words: Sequence[str]) -> typer.Typer:
+    """The command line with no other command than the one that is called, so that the options of one are built.
+
+    Parameters
+    ----------
+    every : typer.Typer
+        The whole command line.
+    words : sequence of str
+        What was typed after `gablework`; all commands stay where the first word is none of them.
+    """
+    called = next(iter(words), None)
+    commands = [one for one in every.registered_commands if _name_of(one) == called]
+    groups = [one for one in every.registered_groups if one.name == called]
+    if commands or groups:
+        every = copy.copy(every)
+        every.registered_commands, every.registered_groups = commands, groups
+    return every
+
+
+def _name_of(command: CommandInfo) -> str:
+    return command.name or get_command_name(getattr(command.callback, "__name__", ""))
+
+
 def main() -> None:
     """Run the command line; ends the process with an exit code of `pipeline.console.ExitCode`."""
     start_own_process()
-    app(prog_name="gablework")
+    only_called(app, sys.argv[1:])(prog_name="gablework")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ _METHOD = "arrangement"
 """The default method; a child loads another one by itself."""
 _STAGES = ("numpy.ma", "pipeline.runtime.ingest", "pipeline.runtime.split")
 _LOADS = {
-    "reconstruct": ("pipeline.runtime.publish", "pipeline.export.tile"),
+    "reconstruct": ("pipeline.runtime.publish", "pipeline.export.tile", "pipeline.runtime.digest"),
     "classify": ("pipeline.runtime.labelling", "pipeline.runtime.classified_files"),
 }
 _SCENE = "pipeline.runtime.rehearsal:rehearse_scene"
