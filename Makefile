@@ -106,8 +106,9 @@ check: $(VENV)/.test-stamp
 # A file stays in one process, the longest come first (tests/conftest.py).
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder --durations=15
 
+# A third of the examples of hypothesis; CI draws all.
 unit: $(VENV)/.test-stamp $(VENV)/.warm-stamp
-	$(PYTEST) --numprocesses 3 -m "not slow"
+	HYPOTHESIS_PROFILE=$${HYPOTHESIS_PROFILE:-quick} $(PYTEST) --numprocesses 3 -m "not slow"
 
 slow: $(VENV)/.test-stamp $(VENV)/.warm-stamp viewer
 	$(PYTEST) --numprocesses 4 -m slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import gc
 import os
 import shutil
 from collections.abc import Callable, Generator
@@ -10,15 +12,22 @@ from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
+import typer.testing
+from examples import PROFILE, examples
 
 if TYPE_CHECKING:
     from object_store import FaultyProxy
 
+    from pipeline.model import BoolArray
+    from pipeline.terrain.lattice import Elevations
+    from pipeline.terrain.morphological import MorphologicalFilterSettings
+
 # The same examples in every run: a change fails by what it changed, not by the draw. To search for new ones:
 # HYPOTHESIS_PROFILE=search make unit
 hypothesis.settings.register_profile("repeatable", derandomize=True)
+hypothesis.settings.register_profile("quick", derandomize=True, max_examples=examples(100))
 hypothesis.settings.register_profile("search", print_blob=True)
-hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
+hypothesis.settings.load_profile(PROFILE)
 
 SHARED_DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 
@@ -63,6 +72,41 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Bring the longest files to the front; pytest-xdist hands out whole files in this order."""
     places = {Path(__file__).parent / name: place for place, name in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: places.get(item.path, len(places)))
+
+
+def pytest_configure() -> None:
+    """Look for cycles more rarely: as `start_own_process` has it, and why."""
+    gc.set_threshold(100_000, *gc.get_threshold()[1:])
+
+
+def pytest_collection_finish() -> None:
+    """Look for no cycles among modules and tests, which all stay."""
+    gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def computed_once() -> Generator[None]:
+    """Keep what pure functions gave for the same input, where tests would compute it hundreds of times.
+
+    The ground of the few scenes that most runs of the tests are of takes a third of such a run, and the command line's
+    options are built anew by each call. The tests of both call the functions themselves.
+    """
+    import pipeline.terrain.ground as ground
+
+    filtered = ground.morphological_ground
+    command = functools.cache(typer.testing._get_command)
+    masks: dict[object, BoolArray] = {}
+
+    def kept(lowest: Elevations, corner: tuple[int, int], settings: MorphologicalFilterSettings) -> BoolArray:
+        key = (lowest.shape, lowest.tobytes(), corner, settings)
+        if key not in masks:
+            masks[key] = filtered(lowest, corner, settings)
+        return masks[key].copy()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ground, "morphological_ground", kept)
+        patch.setattr(typer.testing, "_get_command", command)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ import contextlib
 import datetime as dt
 import sqlite3
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ _WRITES = "gablework_writes"
 _POOL_SIZE = 10
 _WAIT_S = 30
 """Seconds for which a statement waits: for SQLite's write lock, for a connection, for PostgreSQL's answer."""
+_TRY_AGAIN_S = 0.01
 _LOCK_MIGRATIONS = 0x6761626C01
 LOCK_SUBMISSIONS = 0x6761626C02
 """Numbers of PostgreSQL's advisory locks."""
@@ -187,8 +189,7 @@ def _sqlite_engine(url: URL) -> Engine:
         cursor.execute("PRAGMA foreign_keys = ON")
         # a job that was answered with 201 survives a power cut
         cursor.execute("PRAGMA synchronous = FULL")
-        if cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
-            cursor.execute("PRAGMA journal_mode = WAL")
+        _use_wal(cursor)
         cursor.close()
 
     @event.listens_for(engine, "begin")
@@ -198,6 +199,22 @@ def _sqlite_engine(url: URL) -> Engine:
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
     return engine
+
+
+def _use_wal(cursor: sqlite3.Cursor) -> None:
+    """Have a new database use a write-ahead log.
+
+    Where two connections switch at the same time, each holds the lock that the other waits for: SQLite then refuses one
+    of them at once, whatever its time-out. It finds the work done a moment later.
+    """
+    until = time.monotonic() + _WAIT_S
+    while cursor.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
+        try:
+            cursor.execute("PRAGMA journal_mode = WAL")
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() > until:
+                raise
+            time.sleep(_TRY_AGAIN_S)
 
 
 def _postgresql_engine(url: URL) -> Engine:

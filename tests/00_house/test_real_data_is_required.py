@@ -43,7 +43,8 @@ def outcome(house: Path, required: str) -> str:
 def test_a_skip_becomes_a_failure_only_where_the_data_are_required(tmp_path: Path, data_are_there: bool) -> None:
     house = tmp_path / "house"
     (house / "tests").mkdir(parents=True)
-    shutil.copy(TESTS / "conftest.py", house / "tests")
+    for name in ("conftest.py", "examples.py"):
+        shutil.copy(TESTS / name, house / "tests")
     (house / "tests" / "test_skipping.py").write_text(SKIPPING)
     if data_are_there:
         (tmp_path / "shared" / "data").mkdir(parents=True)

@@ -76,6 +76,7 @@ def test_the_heaviest_kernels_come_first() -> None:
         assert weights[0] > weights[-1]
 
 
+@pytest.mark.slow
 def test_kernels_are_compiled_in_other_processes_with_progress_and_never_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

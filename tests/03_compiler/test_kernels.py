@@ -84,7 +84,9 @@ class Sources:
 
     def start(self, words: str, **environment: str) -> subprocess.Popen[str]:
         path = os.pathsep.join([str(self.folder), *filter(None, sys.path)])
-        env = {**os.environ, "NUMBA_CACHE_DIR": str(self.kept), "PYTHONPATH": path, **environment}
+        # an edit within a second, of no other length, is one that Python's own cache does not see
+        own = {"NUMBA_CACHE_DIR": str(self.kept), "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
+        env = {**os.environ, **own, **environment}
         code = f"{COUNTED}\n{words}\nprint(json.dumps([told, counting.seen]))"
         return subprocess.Popen(
             [sys.executable, "-c", code], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -168,6 +170,7 @@ def all_but_first(values):
 """
 
 
+@pytest.mark.slow
 def test_a_new_value_of_an_enum_and_other_fields_of_a_tuple_make_kernels_anew(sources: Sources) -> None:
     path = sources.folder / "caller.py"
     words = "told = [caller.kind_of(1), caller.low_of(caller.Pair(2.0, 3.0)), caller.twice_after(1)]"
@@ -177,6 +180,7 @@ def test_a_new_value_of_an_enum_and_other_fields_of_a_tuple_make_kernels_anew(so
     assert sources.run(words)[0] == [7, 3.0, 21]
 
 
+@pytest.mark.slow
 def test_what_is_inlined_is_not_compiled_and_has_no_file(sources: Sources) -> None:
     (sources.folder / "caller.py").write_text(TYPES.format(roof=4, one="low", other="high", step=1))
     words = "told = [caller.twice_after(1), 'after' in counting.seen, 'twice_after' in counting.seen]"
@@ -208,6 +212,7 @@ def test_a_deep_recursion_lies_in_one_frame_of_python() -> None:
     assert frame_room._from_large_frame.__code__.co_stacksize == frame_room._SLOTS
 
 
+@pytest.mark.slow
 def test_what_only_kernels_call_has_no_machine_code_until_python_calls_it(sources: Sources) -> None:
     sources.run(f"told = caller.total({VALUES})")
     assert {name: bool(stored.machine_code) for name, stored in sources.held().items()} == {
@@ -219,6 +224,7 @@ def test_what_only_kernels_call_has_no_machine_code_until_python_calls_it(source
     assert sources.held()["callee.scaled"].machine_code
 
 
+@pytest.mark.slow
 def test_one_process_calls_a_kernel_from_kernels_and_from_python_in_any_order(sources: Sources) -> None:
     again = "from pipeline.compiler import kernel; other = kernel(lambda x: callee.scaled(x) + 1.0)"
     kernels_first = f"{again}; told = [caller.total({VALUES}), callee.scaled(2.0), other(2.0)]"
@@ -227,6 +233,7 @@ def test_one_process_calls_a_kernel_from_kernels_and_from_python_in_any_order(so
     assert Sources.run(sources, both, NUMBA_CACHE_DIR=str(sources.folder / "other"))[0] == [6.0, 21.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["python, kernel, python", "kernel, python", "python, kernel"])
 def test_loaded_kernels_give_python_arrays_whoever_calls_them_first(sources: Sources, order: str) -> None:
     python, called = f"caller.halves({VALUES})[0].sum()", f"caller.first_of_halves({VALUES})"
@@ -237,6 +244,7 @@ def test_loaded_kernels_give_python_arrays_whoever_calls_them_first(sources: Sou
     assert compiled == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["cut", "empty", "other"])
 def test_a_damaged_file_is_compiled_anew(sources: Sources, damage: str) -> None:
     sources.run(f"told = caller.total({VALUES})")
@@ -247,6 +255,7 @@ def test_a_damaged_file_is_compiled_anew(sources: Sources, damage: str) -> None:
     assert path.read_bytes() != b""
 
 
+@pytest.mark.slow
 def test_plain_numba_computes_the_same_and_keeps_its_own_files(sources: Sources) -> None:
     words = f"told = [caller.total({VALUES}), caller.halves({VALUES})[1], callee.scaled(2.0)]"
     ours = sources.run(words)[0]
@@ -254,6 +263,7 @@ def test_plain_numba_computes_the_same_and_keeps_its_own_files(sources: Sources)
     assert list(sources.kept.rglob("*.nbc"))
 
 
+@pytest.mark.slow
 def test_plain_numba_follows_an_edit_of_a_callee_in_another_file(sources: Sources) -> None:
     for factor, total in (("3.0", 21.0), ("5.0", 35.0), ("5.0", 35.0)):
         sources.write(factor=factor)
@@ -261,6 +271,7 @@ def test_plain_numba_follows_an_edit_of_a_callee_in_another_file(sources: Source
     assert sources.run(f"told = caller.total({VALUES})", GABLEWORK_PLAIN_NUMBA="1")[1] == []
 
 
+@pytest.mark.slow
 def test_a_numba_that_is_not_known_is_used_plainly_and_that_is_said(sources: Sources) -> None:
     words = f"import pipeline.compiler.backend as backend; backend.KNOWN = ('0.1.',); told = caller.total({VALUES})"
     told, _, warned = sources.run(words)
@@ -275,11 +286,13 @@ def test_the_numba_of_the_locks_is_known() -> None:
     assert is_known()
 
 
+@pytest.mark.slow
 def test_without_numba_kernels_are_plain_functions(sources: Sources) -> None:
     told, compiled, _ = sources.run(f"told = float(caller.total({VALUES}))", NUMBA_DISABLE_JIT="1")
     assert (told, compiled) == (21.0, [])
 
 
+@pytest.mark.slow
 def test_two_processes_that_meet_no_kernels_compile_each_once(sources: Sources) -> None:
     started = [sources.start(f"told = caller.total({VALUES})") for _ in range(2)]
     compiled: list[str] = []
@@ -306,6 +319,7 @@ def ship(sources: Sources) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_shipped_kernels_are_loaded_and_nothing_is_written(sources: Sources) -> None:
     folder = ship(sources)
     told, compiled, warned = sources.run(f"told = caller.total({VALUES})", GABLEWORK_KERNELS=str(folder))
@@ -313,6 +327,7 @@ def test_shipped_kernels_are_loaded_and_nothing_is_written(sources: Sources) -> 
     assert sources.held() == {}
 
 
+@pytest.mark.slow
 def test_a_shipped_kernel_that_only_kernels_called_is_compiled_once_for_python_and_kept(sources: Sources) -> None:
     folder = str(ship(sources))
     for _ in range(2):
@@ -321,6 +336,7 @@ def test_a_shipped_kernel_that_only_kernels_called_is_compiled_once_for_python_a
     assert sources.run("told = callee.scaled(2.0)", GABLEWORK_KERNELS=folder)[:2] == (6.0, [])
 
 
+@pytest.mark.slow
 def test_a_shipped_file_whose_hash_is_not_listed_is_not_loaded(sources: Sources) -> None:
     folder = ship(sources)
     (path,) = folder.glob("caller.total*")
@@ -332,6 +348,7 @@ def test_a_shipped_file_whose_hash_is_not_listed_is_not_loaded(sources: Sources)
     assert f"is not the file that {LIST} names" in warned
 
 
+@pytest.mark.slow
 def test_kernels_that_do_not_fit_the_processor_are_compiled_and_that_is_said(sources: Sources) -> None:
     folder = ship(sources)
     environment = {"GABLEWORK_KERNELS": str(folder), "NUMBA_CPU_NAME": get_host_cpu_name()}
@@ -340,6 +357,7 @@ def test_kernels_that_do_not_fit_the_processor_are_compiled_and_that_is_said(sou
     assert "were made for another Python, numba or processor" in warned
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_written_kernels_are_compiled_and_that_is_said(sources: Sources) -> None:
     (sources.folder / "file").write_text("")
     nowhere = str(sources.folder / "file" / "kernels")

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import Polygon
@@ -156,7 +157,7 @@ def slow_neighbours(points: FloatArray, k: int) -> list[list[int]]:
     return rows
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(
     st.lists(st.tuples(*[st.integers(0, 6)] * 3), min_size=1, max_size=25),
     st.integers(0, 6),
@@ -246,7 +247,7 @@ def slow_top_visible(points: FloatArray) -> list[bool]:
     return [not any((q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 <= 500**2 and q[2] - p[2] > 1100 for q in mm) for p in mm]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 30), st.integers(0, 40)), min_size=1, max_size=40))
 def test_top_visible_equals_the_slow_definition(lattice: list[tuple[int, int, int]]) -> None:
     points = np.array(lattice) * 0.1

@@ -8,6 +8,7 @@ import random
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -110,7 +111,7 @@ def test_triangles_are_delaunay_as_qhull_has_them() -> None:
 
 
 @given(seed=st.integers(0, 10_000), start=st.integers(0, 100), permutation=st.randoms(use_true_random=False))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 def test_the_triangles_do_not_depend_on_numbering_or_on_where_a_ring_starts(
     seed: int, start: int, permutation: random.Random
 ) -> None:

@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import numpy.typing as npt
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -101,14 +102,14 @@ def random_unique(seed: int, n: int, size: int) -> IntArray:
 small_sets = st.lists(st.tuples(st.integers(0, 7), st.integers(0, 7)), min_size=1, max_size=14, unique=True)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(small_sets)
 def test_it_equals_the_brute_force_definition_on_small_lattices_full_of_ties(points: list[Point]) -> None:
     xy = np.array(points, np.int64)
     assert triangles(triangulate(xy), xy) == brute_force(xy)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(-900_000, 900_000), st.integers(-900_000, 900_000)), min_size=3, max_size=9, unique=True
@@ -123,7 +124,7 @@ coordinate = st.integers(0, 1 << 21) | st.integers(0, 30) | st.integers((1 << 21
 vertex = st.tuples(coordinate, coordinate)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=examples(500), deadline=None)
 @given(st.lists(vertex, min_size=4, max_size=4, unique=True))
 def test_the_predicates_equal_exact_arithmetic(points: list[Point]) -> None:
     a, b, c, d = points
@@ -187,7 +188,7 @@ def test_clusters_and_lines_are_sound() -> None:
         assert_sound(triangulate(xy), xy)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from([12, 60, 5_000]))
 def test_the_order_of_points_changes_nothing(seed: int, size: int) -> None:
     xy = random_unique(seed, 120, size)
@@ -271,7 +272,7 @@ def test_duplicates_are_refused_with_their_position(points: list[list[int]]) -> 
         triangulate(np.array(points))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50), deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3), st.integers(-5, 5)), max_size=30))
 def test_unique_xy_keeps_the_highest_of_every_position(points: list[tuple[int, int, int]]) -> None:
     xyz = np.array(points, np.int64).reshape(-1, 3)

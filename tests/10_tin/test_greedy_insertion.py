@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -137,7 +138,7 @@ lattice_points = st.lists(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(lattice_points, st.sampled_from(["bucket", "insert"]), st.sampled_from([0.0, 0.2, 0.5]), st.integers(0, 1))
 def test_it_equals_the_slow_twin_on_lattices_full_of_ties(
     points_mm: list[tuple[int, int, int]], absorption: str, distance_m: float, corner_m: int
@@ -249,7 +250,7 @@ def test_the_worst_point_is_inserted_first() -> None:
     assert greedy.vertices[4:].tolist() == [[10, 10, 6]]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from(["bucket", "insert"]), st.booleans())
 def test_the_order_of_points_changes_nothing(seed: int, absorption: str, is_coarse: bool) -> None:
     rules = GreedyInsertionSettings(absorption=absorption)

@@ -8,6 +8,7 @@ import itertools
 import zoneinfo
 
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -123,7 +124,7 @@ def twin(fields: Fields, zone: str, after: dt.datetime, until: dt.datetime) -> l
 
 @pytest.mark.parametrize("zone", SHIFTS)
 @given(fields=FIELD_SETS, which=st.integers(0, 1), begin=st.integers(-120, 300))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 def test_the_times_around_a_shift_are_those_of_the_twin(zone: str, fields: Fields, which: int, begin: int) -> None:
     after = start_of(SHIFTS[zone][which], zone).astimezone(dt.UTC) + begin * MINUTE
     until = after + dt.timedelta(hours=9)
@@ -138,7 +139,7 @@ def test_the_times_around_a_shift_are_those_of_the_twin(zone: str, fields: Field
 
 
 @given(fields=FIELD_SETS, zone=st.sampled_from(sorted(SHIFTS)))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 def test_times_strictly_increase_and_from_each_the_next_is_found(fields: Fields, zone: str) -> None:
     if expression_faults(fields.text()):
         return
@@ -276,7 +277,7 @@ def test_a_bad_expression_is_told_with_its_field_and_the_fix(expression: str, to
 
 
 @given(st.text(max_size=40) | st.from_regex(r"([0-9*,/#LW-]{1,6} ){4}[0-9*,/#L-]{1,6}", fullmatch=True))
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=examples(120), deadline=None)
 def test_any_text_is_an_expression_or_a_told_fault(text: str) -> None:
     faults = expression_faults(text)
     if faults:

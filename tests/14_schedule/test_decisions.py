@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import itertools
 
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -34,7 +35,7 @@ def test_a_clock_that_is_put_back_brings_nothing_again() -> None:
 
 
 @given(steps=st.lists(st.integers(1, 7000), min_size=1, max_size=30), autumn=st.booleans())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_however_often_it_is_looked_each_slot_is_counted_once(steps: list[int], autumn: bool) -> None:
     start = dt.datetime(2026, 10, 24, 20, tzinfo=dt.UTC) if autumn else dt.datetime(2026, 3, 28, 20, tzinfo=dt.UTC)
     cron = Cron("*/20 * * * *", "Europe/Amsterdam")

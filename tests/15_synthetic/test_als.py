@@ -239,6 +239,7 @@ def test_another_seed_gives_other_points(block: ScanBlock) -> None:
     assert (block.points.xyz[:n] == other.points.xyz[:n]).all(axis=1).mean() < 0.001
 
 
+@pytest.mark.slow
 def test_chunks_stay_small_however_large_the_scene() -> None:
     scene = dataclasses.replace(FIELD, extent=(0.0, 0.0, 600.0, 600.0))
     sizes = [len(part) for part in scan(scene, PLAIN, 1, chunk_points=200_000)]

@@ -50,6 +50,7 @@ def in_order(xyz: FloatArray) -> FloatArray:
     return xyz[np.lexsort(xyz.T)]
 
 
+@pytest.mark.slow
 def test_the_tiles_together_hold_exactly_the_points_of_the_whole_scan(whole: Scene, made: ScenePaths) -> None:
     block: ScanBlock = scan_all(whole, SPARSE, 1_005)
     tiles = np.concatenate([laspy.read(path).xyz for path in sorted((made.laz).iterdir())])

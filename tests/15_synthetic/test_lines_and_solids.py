@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -164,7 +165,7 @@ def test_the_ground_of_a_courtyard_is_seen_between_its_walls() -> None:
     assert (walls & near_court).sum() > 30
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     slope_deg=st.floats(0.0, 30.0),
     aspect_deg=st.floats(0.0, 360.0),

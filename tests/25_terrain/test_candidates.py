@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from slow_join import slowly_judged
@@ -200,7 +201,7 @@ nearly_roofs = st.tuples(some_sums, st.sets(st.sampled_from(list(Sum)), max_size
 )
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=examples(300))
 @given(
     rows=st.lists(st.one_of(some_sums, nearly_roofs), min_size=1, max_size=8),
     kinds=st.lists(st.sampled_from(FacetKind), min_size=8, max_size=8),
@@ -355,7 +356,7 @@ def slow_twin(surfaces: Surfaces) -> list[int]:
     return found
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=examples(200))
 @given(members=scenes, links=link_lists)
 def test_uniting_agrees_with_climbing_from_each_surface(
     members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int, int]]
@@ -364,7 +365,7 @@ def test_uniting_agrees_with_climbing_from_each_surface(
     assert leaders(surfaces) == slow_twin(surfaces)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=examples(200))
 @given(members=scenes, links=link_lists)
 def test_every_leader_is_a_candidate_that_leads_itself(
     members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int, int]]
@@ -379,7 +380,7 @@ def test_every_leader_is_a_candidate_that_leads_itself(
             assert not is_solid(surfaces.kind[k]) or judge_surface(int(surfaces.kind[k]), surfaces.sums[k], SETTINGS)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=examples(200))
 @given(members=scenes, links=link_lists, seed=st.integers(0, 10_000))
 def test_the_numbering_of_the_surfaces_does_not_matter(
     members: list[tuple[int, int, int, FacetKind]], links: list[tuple[int, int]], seed: int

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import convolve
@@ -81,7 +82,7 @@ def test_a_lone_pair_is_dropped_and_five_close_points_stay() -> None:
     assert not kept_of(five[:4]).any()
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 @given(points=point_lists, seed=st.integers(0, 1000), shift=st.tuples(*[st.integers(-400, 400)] * 3))
 def test_neither_order_nor_a_shift_by_whole_cubes_matters(
     points: list[tuple[int, int, int]], seed: int, shift: tuple[int, int, int]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -48,7 +49,7 @@ def test_it_agrees_with_a_dict_of_cells(members: list[tuple[int, int, int, bool,
     assert [tuple(p) for p in points[chosen].tolist()] == expected
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=examples(30))
 @given(members=rows, seed=st.integers(0, 1000))
 def test_the_order_of_the_points_does_not_matter(members: list[tuple[int, int, int, bool, bool]], seed: int) -> None:
     points, preferred, used = as_arrays(members)
@@ -58,7 +59,7 @@ def test_the_order_of_the_points_does_not_matter(members: list[tuple[int, int, i
     np.testing.assert_array_equal(again, first)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=examples(30))
 @given(members=rows)
 def test_the_result_is_sorted_and_no_position_repeats(members: list[tuple[int, int, int, bool, bool]]) -> None:
     points, preferred, used = as_arrays(members)

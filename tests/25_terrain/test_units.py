@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -206,7 +207,7 @@ def test_what_is_one_house_or_shows_no_border_stays_one_unit(name: str, per_m2: 
     assert cloud_of(TOGETHER[name], per_m2=per_m2).units().max() == 0
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(
     name=st.sampled_from(sorted(TOLD_APART | TOGETHER)),
     turn_deg=st.floats(0.0, 360.0),
@@ -221,7 +222,7 @@ def test_turned_and_mirrored_roofs_have_the_same_units(name: str, turn_deg: floa
     assert agreement(found, cloud.house if expected else np.zeros_like(cloud.house)) > 0.95
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(
     seed=st.integers(0, 99),
     columns=st.integers(-40, 40),

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -232,7 +233,7 @@ def test_every_plane_is_the_regression_of_its_points_and_has_as_many_as_asked(de
         np.testing.assert_allclose(coefficients, np.linalg.lstsq(design, members[:, 2])[0], atol=1e-7)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(
     seed=st.integers(0, 50),
     east=st.integers(-3000, 3000),
@@ -248,7 +249,7 @@ def test_whole_metres_of_shift_change_no_label(seed: int, east: int, north: int,
     np.testing.assert_allclose(there.coefficients[:, :2], here.coefficients[:, :2], atol=2e-3)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(seed=st.integers(0, 50), turn_deg=st.floats(0, 360), density=st.sampled_from([2.0, 8.0, 24.0]))
 def test_a_turned_hip_roof_keeps_its_four_planes(seed: int, turn_deg: float, density: float) -> None:
     points, face = hip(density, 0.03, seed)

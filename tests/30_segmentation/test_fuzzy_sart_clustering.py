@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -150,7 +151,7 @@ def test_the_clustering_of_footpoints_equals_its_plain_twin(seed: int) -> None:
     np.testing.assert_allclose(found.templates, templates, atol=1e-9)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(st.integers(0, 10_000))
 def test_every_clustered_vector_matches_its_own_neuron_best(seed: int) -> None:
     normals, areas = noisy_normals(seed, count=25)

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -127,7 +128,7 @@ def test_noise_is_that_of_the_points_whatever_stands_on_the_roof() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 def test_the_nearest_point_of_every_cell_is_that_of_a_plain_search_to_a_tenth_of_a_cell(seed: int) -> None:
     rng = np.random.default_rng(seed)
     columns, rows, cell = int(rng.integers(1, 30)), int(rng.integers(1, 30)), 0.4
@@ -236,7 +237,7 @@ def test_a_plane_of_three_points_has_no_sigma() -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=6))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 def test_the_weights_of_planes_leave_the_least_gradient(gradients: list[tuple[float, float]]) -> None:
     weights, left = _weights(gradients)
     hull = shapely.MultiPoint(gradients).convex_hull

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -82,7 +83,7 @@ moves = st.tuples(millimetres, millimetres, millimetres, st.integers(0, 3), st.i
 
 
 @given(move=moves, chance=st.randoms(use_true_random=False), which=st.integers(0, 10_000))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 def test_moves_and_relabelling_keep_the_verdict(
     move: tuple[int, int, int, int, int, bool],
     chance: random.Random,
@@ -97,7 +98,7 @@ def test_moves_and_relabelling_keep_the_verdict(
 
 
 @given(angle=st.floats(0.0, 2.0 * np.pi), which=st.integers(0, 10_000))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 def test_a_sound_solid_stays_sound_when_turned_and_rounded(angle: float, which: int, all_cases: list[Case]) -> None:
     sound = [solid for codes, solid in all_cases if not codes]
     solid = sound[which % len(sound)]

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -66,7 +67,7 @@ def _degenerate(vertices: IntArray, triangle: IntArray) -> bool:
     shared=st.integers(0, 3),
     large=st.booleans(),
 )
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=examples(400), deadline=None)
 def test_triangle_pairs_intersect_as_in_rational_numbers(
     coordinates: list[tuple[int, int, int]], shared: int, large: bool
 ) -> None:
@@ -90,7 +91,7 @@ def test_triangle_pairs_intersect_as_in_rational_numbers(
     weights=st.tuples(st.integers(-3, 3), st.integers(-3, 3)),
     off=st.integers(-1, 1),
 )
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 def test_the_side_of_a_plane_is_exact_over_kilometres(
     base: list[tuple[int, int, int]], weights: tuple[int, int], off: int
 ) -> None:
@@ -102,7 +103,7 @@ def test_the_side_of_a_plane_is_exact_over_kilometres(
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=3, max_size=8, unique=True))
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=examples(400), deadline=None)
 def test_a_ring_is_simple_where_shapely_says_so(places: list[tuple[int, int]]) -> None:
     flat = np.array(places, dtype=np.int64)
     polygon = shapely.Polygon(places)
@@ -160,7 +161,7 @@ def test_polygons_with_holes_are_sound_where_shapely_says_so() -> None:
     st.lists(st.tuples(*[st.integers(-20_000, 20_000)] * 3), min_size=4, max_size=12),
     st.integers(1, 20_000),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 def test_the_distance_to_the_plane_is_that_of_numpys_eigenvectors(
     places: list[tuple[int, int, int]], flatness: int
 ) -> None:

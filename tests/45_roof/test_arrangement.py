@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon
@@ -330,7 +331,7 @@ def test_an_empty_outline_is_refused() -> None:
     assert error.value.reason is Reason.NO_PARTITION
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_any_outline_with_any_planes_is_filled_exactly_and_makes_valid_solids(seed: int) -> None:
     rng = np.random.default_rng(seed)

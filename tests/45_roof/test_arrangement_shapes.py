@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -115,7 +116,7 @@ def test_with_two_points_a_square_metre_the_volume_is_right_to_a_fiftieth(shape:
     assert share == pytest.approx(1.0, abs=0.02)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(shape=st.sampled_from(sorted(SHAPES)), turn_deg=st.floats(0.0, 90.0), density=st.sampled_from([1.0, 4.0, 12.0]))
 def test_they_are_sound_at_any_turn_and_density(shape: str, turn_deg: float, density: float) -> None:
     arranged_volume(shape, turn_deg, density, 0.05, lambda _: 1.0)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -99,7 +100,7 @@ def test_the_outline_stays(exact_roof: ExactRoofs) -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_any_partition_stays_a_coverage_with_the_same_faces(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n, k = int(rng.integers(30, 300)), int(rng.integers(2, 7))

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon
@@ -65,7 +66,7 @@ def test_a_round_outline_is_not_forced_square() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.2, 2.0))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 def test_any_outline_stays_valid_and_near(seed: int, spacing_m: float) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(3, 40))
@@ -130,7 +131,7 @@ def test_a_courtyard_stays_a_hole_and_is_as_square_as_the_outside() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.2, 1.5), st.floats(0.0, 0.6))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_any_outline_stays_valid_with_any_points(seed: int, spacing_m: float, split_share: float) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(3, 30))

@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 import numpy as np
+import pytest
 import shapely
 
 from pipeline.model import Candidate, FloatArray
@@ -186,6 +187,7 @@ def test_last_of_several_returns_are_told_too_far_inside_by_the_reach() -> None:
     assert south(facades(street(), hit), reach_m=0.12).overhang_m == deep
 
 
+@pytest.mark.slow
 def test_scanned_buildings_without_overhangs_keep_their_true_area() -> None:
     scene = sweep(seed_of("dev", 1))
     block = scan_all(scene, dataclasses.replace(SCANNER, pulse_density_per_m2=8.0), 3)

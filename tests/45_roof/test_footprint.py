@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -98,7 +99,7 @@ def test_a_block_with_a_courtyard_has_ten_faces() -> None:
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 1.0]))
 @example(7283152, 0.0)  # a hole that touches the outline
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 def test_a_block_is_valid_over_any_footprint(seed: int, tolerance_m: float) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(3, 30))

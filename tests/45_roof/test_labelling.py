@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,7 +13,7 @@ from pipeline.tin.delaunay import triangulate
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 def test_the_nearest_point_is_that_of_a_plain_search(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.integers(-20, 20, (int(rng.integers(1, 60)), 2)) * 250

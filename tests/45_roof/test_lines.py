@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +19,7 @@ def along(x: float, y: float, direction: float, length: float = 1000.0) -> Run:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 def test_a_fitted_line_is_that_of_the_densely_sampled_border(seed: int) -> None:
     rng = np.random.default_rng(seed)
     border = np.cumsum(rng.uniform(-300, 1000, (8, 2)), axis=0)

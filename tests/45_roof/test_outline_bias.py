@@ -58,6 +58,7 @@ def outlines(density: float, beam_radius_m: float, *, tell_returns: bool = True)
     return np.array(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("density", "beam_radius_m", "least_iou"),
     [(0.7, 0.12, 0.9), (2.0, 0.05, 0.95), (2.0, 0.3, 0.95), (6.0, 0.12, 0.98)],
@@ -71,6 +72,7 @@ def test_outlines_have_the_true_area_whatever_density_and_beam(
     assert np.median(rows[:, 0]) > least_iou
 
 
+@pytest.mark.slow
 def test_without_told_returns_a_roof_is_as_large_as_the_scanner_sees_it() -> None:
     rows, told = outlines(2.0, 0.3, tell_returns=False), outlines(2.0, 0.3)
     grown = np.sqrt(rows[:, 1]) - np.sqrt(told[:, 1])

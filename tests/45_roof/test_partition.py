@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -73,7 +74,7 @@ def slow_regions(facets: LabelArray, labels: Any) -> list[frozenset[int]]:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 def test_any_labels_give_a_coverage_with_one_polygon_a_region(seed: int) -> None:
     rng = np.random.default_rng(seed)
     xy, tin, labels = labelled(7, rng.integers(-1, 3, (7, 7)))
@@ -94,7 +95,7 @@ def test_any_labels_give_a_coverage_with_one_polygon_a_region(seed: int) -> None
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 def test_regions_are_those_of_a_plain_search(seed: int) -> None:
     _, tin, labels = labelled(6, np.random.default_rng(seed).integers(-1, 2, (6, 6)))
     regions, count = connected_regions(tin.facets, labels)
@@ -228,7 +229,7 @@ def test_a_mirrored_roof_gives_a_valid_solid_of_the_same_volume(
 
 
 @given(st.integers(0, 2**32 - 1), st.booleans())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_random_labels_and_planes_always_give_some_valid_form(seed: int, with_footprint: bool) -> None:
     rng = np.random.default_rng(seed)
     n, k = int(rng.integers(20, 400)), int(rng.integers(1, 10))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import Polygon
@@ -118,7 +119,7 @@ def test_scattered_points_have_no_template() -> None:
     assert caught.value.reason is Reason.NO_PLANE
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(
     seed=st.integers(0, 10_000), shift=st.tuples(st.integers(-500, 500), st.integers(-500, 500), st.integers(0, 100))
 )

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import Polygon
@@ -24,7 +25,7 @@ def face(polygon: Polygon, index: int) -> RoofFace:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 def test_the_top_surface_is_that_of_a_plain_search(seed: int) -> None:
     rng = np.random.default_rng(seed)
     faces, planes = [], []

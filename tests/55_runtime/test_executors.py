@@ -179,6 +179,7 @@ def test_higher_priorities_go_first(tmp_path: Path) -> None:
     assert high < min(order.index("low0"), order.index("low1")) <= low
 
 
+@pytest.mark.slow
 def test_the_content_is_that_of_children_of_this_process(cluster: Cluster, suburb: Path, reconstruct: Any) -> None:
     settings = {"tile_size_m": 40.0}
     far = reconstruct(suburb, settings=settings, executor=cluster.executor(), workers=None)

@@ -126,7 +126,10 @@ def test_results_come_from_one_child_that_stays(orders: Callable[[str], str]) ->
         ("os._exit(3)", Reason.CRASHED, "exit code 3"),
         ("os.kill(os.getpid(), signal.SIGKILL)", Reason.CRASHED, "signal 9 (SIGKILL)"),
         ("os.closerange(3, 100)", Reason.CRASHED, "process"),
-        ("held = [bytes(b'1' * 2**25) for _ in range(10**6)]", Reason.OUT_OF_MEMORY, "1 GiB"),
+        pytest.param(
+            *("held = [bytes(b'1' * 2**25) for _ in range(10**6)]", Reason.OUT_OF_MEMORY, "1 GiB"),
+            marks=pytest.mark.slow,
+        ),
         ("held = bytearray(2**46)", Reason.OUT_OF_MEMORY, "1 GiB"),
         ("raise MemoryError", Reason.OUT_OF_MEMORY, "1 GiB"),
     ],
@@ -141,6 +144,7 @@ def test_an_item_that_costs_its_process_costs_only_itself(
     assert words in loss.detail
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "order", ["while True: pass", "import collections, itertools; collections.deque(itertools.repeat(0), maxlen=0)"]
 )

@@ -13,6 +13,7 @@ import laspy
 import numpy as np
 import numpy.typing as npt
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from slow_join import WholeSplit, whole_join, whole_surfaces
@@ -169,7 +170,7 @@ easy = st.sampled_from(
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(scene=patchworks, grid=grids, judging=easy)
 def test_patches_of_many_levels_are_joined_as_by_the_slow_join(
     scene: Patchwork, grid: TileGrid, judging: CandidateSettings
@@ -178,14 +179,14 @@ def test_patches_of_many_levels_are_joined_as_by_the_slow_join(
     assert found == slow
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=examples(10), deadline=None)
 @given(scene=patchworks, grid=grids)
 def test_only_some_of_the_tiles_are_joined_as_by_the_slow_join(scene: Patchwork, grid: TileGrid) -> None:
     slow, found = both_joins(scene.cut(grid)[::2], grid, CUT, EASY)
     assert found == slow
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=examples(12), deadline=None)
 @given(scene=patchworks, grid=grids)
 def test_the_tiles_do_not_decide_what_is_found(scene: Patchwork, grid: TileGrid) -> None:
     everything = TileGrid(size_mm=200_000, halo_mm=8_000, origin_x_mm=-90_000, origin_y_mm=-90_000)
@@ -303,7 +304,7 @@ def any_fragments(seed: int, most: int, facets: int) -> list[WholeSplit]:
     return found
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(
     seed=st.integers(0, 10**9),
     most=st.integers(1, 14),

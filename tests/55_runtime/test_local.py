@@ -121,6 +121,7 @@ def test_an_error_of_a_task_is_raised_here_and_says_where_it_happened() -> None:
     assert "in fail" in raised.value.__notes__[0]
 
 
+@pytest.mark.slow
 def test_calling_off_ends_the_tasks_that_run_and_tells_them(tmp_path: Path) -> None:
     told = threading.Event()
 
@@ -134,6 +135,7 @@ def test_calling_off_ends_the_tasks_that_run_and_tells_them(tmp_path: Path) -> N
     assert len(list(tmp_path.glob("started-*"))) <= 2, "no other task began"
 
 
+@pytest.mark.slow
 def test_the_content_is_that_of_a_serial_run(suburb: Path, reconstruct: Any) -> None:
     serial = reconstruct(suburb, settings={"tile_size_m": 40.0})
     local = reconstruct(suburb, settings={"tile_size_m": 40.0}, workers=None)

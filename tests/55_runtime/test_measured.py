@@ -36,6 +36,7 @@ def in_child(order: str) -> int:
     return len(list(supervise(exec, [order], LIMITS)))
 
 
+@pytest.mark.slow
 def test_a_task_is_charged_with_what_its_thread_spins() -> None:
     measured = measure(spin, 0.2)
     assert 0.2 <= measured.cpu_s <= measured.seconds + 0.01
@@ -54,6 +55,7 @@ def test_a_child_is_charged_once_though_it_lives_on() -> None:
     assert second.cpu_s < first.cpu_s / 2
 
 
+@pytest.mark.slow
 def test_a_child_that_dies_is_charged_with_what_was_seen_of_it() -> None:
     measured = measure(in_child, f"{BURN}\nimport os, signal\nos.kill(os.getpid(), signal.SIGKILL)")
     assert measured.cpu_s > SPUN_S - 0.05

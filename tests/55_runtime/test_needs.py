@@ -114,6 +114,7 @@ def test_two_giants_that_do_not_fit_together_never_run_at_once_and_small_ones_pa
     assert bench.events == []
 
 
+@pytest.mark.slow
 def test_giants_go_to_the_worker_that_has_room_for_them(bench: Bench) -> None:
     add_worker(bench, GIB)
     add_worker(bench, 8 * GIB)

@@ -64,6 +64,7 @@ def files(place):
     return {key: storage.get(key) for key in names if key != "run.json"}
 
 
+@pytest.mark.slow
 def test_a_run_in_a_bucket_is_that_in_a_folder_byte_by_byte(local, tile, bucket):
     summary = run(request(tile, bucket))
     assert summary.digest == local.digest == run_digest(f"{bucket}/run")

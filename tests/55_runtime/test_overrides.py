@@ -13,6 +13,7 @@ from typing import Any
 import pyarrow.dataset as ds
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -343,7 +344,7 @@ ANYTHING = st.recursive(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.dictionaries(KEYS, ANYTHING, max_size=5))
 def test_no_entry_breaks_the_reader(entry: dict[str, Any]) -> None:
     # none of these is a valid entry: what is drawn at random is no action and no polygon

@@ -244,7 +244,7 @@ def test_a_building_that_fails_again_is_exit_code_1(path: Path, monkeypatch: pyt
     assert json.loads(said)["record"]["reason"] == "internal_error"
 
 
-@pytest.mark.parametrize("fault", ["crash", "eat_memory"])
+@pytest.mark.parametrize("fault", ["crash", pytest.param("eat_memory", marks=pytest.mark.slow)])
 def test_a_building_that_kills_again_kills_only_the_child(
     path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
@@ -33,7 +34,7 @@ def seen() -> dict[str, Any]:
 
 
 @settings(
-    max_examples=6,
+    max_examples=examples(6),
     deadline=None,
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # a smaller failing grid is no clearer, and costs minutes
     suppress_health_check=[HealthCheck.function_scoped_fixture],
@@ -79,6 +80,7 @@ def test_a_halo_below_the_support_is_refused() -> None:
         RunSettings.from_mapping({"halo_m": 20.0})
 
 
+@pytest.mark.slow
 def test_two_dask_workers_give_the_content_of_a_serial_run(suburb: Path, reconstruct: Any) -> None:
     serial = reconstruct(suburb, settings={"tile_size_m": 40.0})
     cluster = reconstruct(suburb, settings={"tile_size_m": 40.0}, workers=2)
@@ -87,7 +89,7 @@ def test_two_dask_workers_give_the_content_of_a_serial_run(suburb: Path, reconst
 
 
 SLOW = settings(
-    max_examples=4,
+    max_examples=examples(4),
     deadline=None,
     phases=[Phase.explicit, Phase.reuse, Phase.generate],
     suppress_health_check=[HealthCheck.function_scoped_fixture],

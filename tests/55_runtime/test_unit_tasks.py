@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import shapely
+from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from shapely import MultiPolygon
@@ -87,7 +88,7 @@ def divided(site: CandidateSite, grid: TileGrid, scratch: Scratch, own: UnitSett
 ONE_TILE = TileGrid(size_mm=1_000_000, halo_mm=0)
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     size_mm=st.integers(3_000, 40_000),
     shift_x_mm=st.integers(0, 20_000),

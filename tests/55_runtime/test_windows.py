@@ -71,6 +71,7 @@ def grids(monkeypatch: pytest.MonkeyPatch) -> list[TileGrid]:
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [False, True], ids=["found", "given"])
 @pytest.mark.parametrize("trust", ["trust", "ignore"])
 def test_narrow_windows_give_the_content_of_one_that_sees_everything(

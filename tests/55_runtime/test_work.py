@@ -161,6 +161,7 @@ def stop_at(stage: str, done: int) -> Callable[[Event], None]:
     return on_event
 
 
+@pytest.mark.slow
 def test_a_run_in_a_work_folder_is_any_run(place: Place) -> None:
     assert place.run().digest == place.fresh().digest
     assert files_of(place.folder / "run") == files_of(place.folder / "fresh")
@@ -230,6 +231,7 @@ def test_a_file_that_is_gone_and_one_that_is_new(used: Place, finished: Finished
     assert files_of(used.folder / "run") == files_of(finished.aside / "run")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [

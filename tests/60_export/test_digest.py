@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 import small_buildings as small
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_buildings import Contexts, RejectedObjects
@@ -54,7 +55,7 @@ def with_value(table: pa.Table, column: str, row: int, value: object) -> pa.Tabl
     return table.set_column(index, field, pa.array(values, field.type))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(data=st.data())
 def test_rows_may_lie_in_any_files_row_groups_and_order(
     data: st.DataObject, run_dir: Path, tmp_path_factory: pytest.TempPathFactory

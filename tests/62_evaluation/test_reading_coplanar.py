@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -49,7 +50,7 @@ def lattice(columns: int, rows: int, step_m: float) -> tuple[FloatArray, Triangl
 SLOPE = st.floats(-2.0, 2.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(a=SLOPE, b=SLOPE, step=st.floats(0.05, 5.0), seed=st.integers(0, 999))
 def test_triangles_of_a_plane_are_one_region_after_rounding_to_millimetres(
     a: float, b: float, step: float, seed: int
@@ -61,7 +62,7 @@ def test_triangles_of_a_plane_are_one_region_after_rounding_to_millimetres(
     assert set(regions(np.round(xyz, 3), [[triangle] for triangle in triangles])) == {0}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     slope=st.floats(0.0, 1.2),
     bend_deg=st.floats(1.0, 60.0),
@@ -130,7 +131,7 @@ def test_vertical_faces_and_faces_without_area_join_nothing() -> None:
     assert len(set(found)) == 3
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     corners=st.lists(st.tuples(st.integers(-50, 50), st.integers(-50, 50)), min_size=3, max_size=8, unique=True),
     a=SLOPE,

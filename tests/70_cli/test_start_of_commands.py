@@ -9,6 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer.main
+
+from service.cli import app, only_called
 
 SCIENCE = {"numba", "llvmlite", "scipy", "pyarrow", "matplotlib", "dask", "distributed", "laspy", "pyogrio"}
 """Packages of models, tables, pictures and clusters."""
@@ -77,3 +80,12 @@ def test_the_service_that_answers_imports_no_science(tmp_path: Path) -> None:
     found = imported(SERVED, tmp_path, str(tmp_path / "state"))
     assert found >= {"fastapi", "sqlalchemy"}
     assert not found & SCIENCE
+
+
+def test_the_command_that_is_called_is_built_alone_and_is_the_same() -> None:
+    whole = typer.main.get_command(app)
+    for name, command in whole.commands.items():
+        alone = typer.main.get_command(only_called(app, [name, "--help"]))
+        assert list(alone.commands) == [name]
+        assert [one.opts for one in alone.commands[name].params] == [one.opts for one in command.params]
+    assert only_called(app, ["recontruct"]) is only_called(app, ["--version"]) is only_called(app, []) is app

@@ -20,6 +20,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -399,7 +400,7 @@ def edited(content: bytes, changes: list[tuple[str, float, bytes]], head: int) -
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("number", range(10))
 @given(edits, st.sampled_from([150, 400, 10**9]))
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=examples(60), deadline=None, suppress_health_check=list(HealthCheck))
 def test_a_damaged_header_is_understood_or_refused_by_an_error_that_is_meant(
     tmp_path: Path,
     whole_files: list[tuple[str, bytes]],

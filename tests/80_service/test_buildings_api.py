@@ -13,6 +13,7 @@ from typing import Any
 import geopandas
 import pytest
 import shapely
+from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
@@ -304,7 +305,7 @@ def test_pages_are_what_a_look_at_every_building_finds(
     features = [json.loads(text) for text in every.features()]
     assert len(features) == 108
 
-    @settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+    @settings(max_examples=examples(150), suppress_health_check=[HealthCheck.too_slow], deadline=None)
     @given(queries())
     def check(query: BuildingQuery) -> None:
         expected = twin(features, query)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from service.errors import StartUpError, StoreError
-from service.store import JobStore
+from service.store import JobStore, database
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 pytest.register_assert_rewrite("store_contract")
@@ -25,6 +25,31 @@ class TestOnSqlite(StoreContract):
     def url(self, tmp_path: Path, request: pytest.FixtureRequest) -> str:
         url = f"sqlite:///{tmp_path / 'some % folder' / 'service.db'}"
         return with_tables(url) if "store" in request.fixturenames else url
+
+
+class OnceRefused:
+    """A cursor on a database that another connection switches to a log at the same time."""
+
+    def __init__(self, code: int) -> None:
+        self.code = code
+        self.mode = "delete"
+
+    def execute(self, words: str) -> OnceRefused:
+        if "=" in words:
+            self.mode = "wal"
+            error = sqlite3.OperationalError("refused")
+            error.sqlite_errorcode = self.code
+            raise error
+        return self
+
+    def fetchone(self) -> tuple[str]:
+        return (self.mode,)
+
+
+def test_connections_that_open_a_new_database_together_all_get_in() -> None:
+    database._use_wal(OnceRefused(sqlite3.SQLITE_BUSY))
+    with pytest.raises(sqlite3.OperationalError, match="refused"):
+        database._use_wal(OnceRefused(sqlite3.SQLITE_READONLY))
 
 
 def test_a_killed_writer_leaves_no_lock_and_no_half_a_job(tmp_path: Path) -> None:

@@ -74,6 +74,7 @@ def test_processes_are_told_apart_by_what_they_run() -> None:
     assert role_of("python", ["resource_tracker"], {}, 3) == OTHER
 
 
+@pytest.mark.slow
 def test_what_a_process_spends_is_seen_from_outside() -> None:
     burn = "import time\nblock = b'x' * 60_000_000\nwhile time.process_time() < 0.8: pass\ninput()"
     process = subprocess.Popen([sys.executable, "-c", burn], stdin=subprocess.PIPE)

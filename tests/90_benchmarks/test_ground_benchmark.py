@@ -32,6 +32,7 @@ def test_figures_are_those_of_the_table_of_right_and_wrong_points() -> None:
     assert everything.kappa == pytest.approx(0.0)
 
 
+@pytest.mark.slow
 def test_the_default_filter_keeps_what_it_reached_on_drawn_scenes() -> None:
     limits = {"embankments": 0.5, "quarry": 1.0, "gaps": 0.2, "houses_on_a_slope": 0.6, "hills_and_halls": 4.0}
     ground_filter = product_filter(GroundSettings())
@@ -41,6 +42,7 @@ def test_the_default_filter_keeps_what_it_reached_on_drawn_scenes() -> None:
             assert figures_of(scene, labels_of(scene, ground_filter)).total < limits[kind], scene.name
 
 
+@pytest.mark.slow
 def test_the_mean_over_the_samples_stays_below_four_per_cent(shared_data: Path) -> None:
     ground_filter = product_filter(GroundSettings())
     rows = [figures_of(scene, labels_of(scene, ground_filter)) for scene in samples(shared_data)]

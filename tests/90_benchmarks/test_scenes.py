@@ -130,6 +130,7 @@ def test_nothing_is_asked_for_where_the_survey_saw_nothing() -> None:
     assert cut.extent.area == pytest.approx(92 * 52)  # no hole where the roof was wet
 
 
+@pytest.mark.slow
 def test_a_small_city_is_found_measured_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene_suites, "SIZE_M", (130.0, 110.0))
     monkeypatch.setattr(scene_suites, "PICTURED", ((20.0, 2.0),))
