@@ -49,6 +49,7 @@ def test_the_surface_is_that_of_the_solids_faces(scene: Scene) -> None:
     assert np.array_equal(hits.on_roof, hits.kind == ROOF)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [SUBURB, TOWN], ids=["suburb", "town"])
 def test_a_leaning_line_hits_where_walking_down_along_it_ends(scene: Scene) -> None:
     """The twin walks down in steps of 4 mm until the surface is above it."""

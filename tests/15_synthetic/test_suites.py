@@ -56,6 +56,7 @@ def test_every_roof_shape_is_a_suite_beside_the_scenes() -> None:
         suite_named("village")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(SUITES))
 def test_the_same_seed_gives_the_same_scene_and_another_one_another(name: str) -> None:
     first, again, other = scene_of(name, 1003), scene_of.__wrapped__(name, 1003), scene_of(name, 1004)

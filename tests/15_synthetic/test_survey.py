@@ -93,6 +93,7 @@ def rows(block: ScanBlock, scene: Scene) -> list[tuple[object, ...]]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "azimuth_deg", [37.0, 251.0, *(pytest.param(along, marks=pytest.mark.slow) for along in (0.0, 90.0))]
 )
@@ -114,6 +115,7 @@ def test_the_tiles_of_a_survey_give_together_the_returns_of_the_whole(azimuth_de
     assert sorted(found) == rows(whole, scene)
 
 
+@pytest.mark.slow
 def test_tiles_of_a_steep_survey_hold_what_their_beams_can_reach() -> None:
     random = np.random.default_rng(8)
     terrain = undulating_terrain(100.0, 25.0, 100.0, 2.0, 200.0, random)

@@ -136,6 +136,7 @@ def test_text_of_the_users_is_no_markup(pair: tuple[Path, Path], tmp_path: Path)
     assert "<script>alert" not in page(made, rows)
 
 
+@pytest.mark.slow
 def test_a_map_of_very_many_buildings_keeps_its_bounds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(class_map, "MOST_ORDINARY", 20)
     monkeypatch.setattr(class_map, "MOST_DRAWN", 10)

@@ -463,6 +463,7 @@ def test_the_page_is_one_file_that_loads_nothing_and_shows_every_run_of_every_ch
     assert len(text) < 5_000_000 / 4
 
 
+@pytest.mark.slow
 def test_a_page_of_five_methods_and_twelve_buildings_stays_below_five_megabytes(
     make_run: MakeRun, tmp_path: Path
 ) -> None:
