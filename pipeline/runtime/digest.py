@@ -1,7 +1,7 @@
 """The digest of a run: one sha256 over its content, whatever the workers, the tiles, the files or the Parquet writer.
 
-Content is all columns of buildings, planes and rejected but `tile`, `mesh_path` and `input_hash`, in the order of the
-rows' keys. Every row is hashed by itself in a canonical form (columns by name; integers, floats and times as eight
+Content is all columns of buildings, planes and rejected except `NOT_CONTENT`, in the order of the rows' keys. Of
+`reason_detail` only the figures count, so that a better wording changes no digest. Every row is hashed by itself in a canonical form (columns by name; integers, floats and times as eight
 bytes, texts as UTF-8, null told apart from all values), then the row hashes are hashed in the order of the keys. So
 only keys and 32 bytes a row are held, not the rows.
 """
@@ -9,6 +9,7 @@ only keys and 32 bytes a row are held, not the rows.
 from __future__ import annotations
 
 import hashlib
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -24,11 +25,14 @@ from pipeline.export.geoparquet import stored_schema, table_batches
 from pipeline.export.records import KEYS
 from pipeline.io import arrow_at
 
-NOT_CONTENT = frozenset({"tile", "mesh_path", "input_hash"})
-"""Columns that may differ between tilings of one result."""
+NOT_CONTENT = frozenset({"tile", "mesh_path", "input_hash", "settings_hash", "engine_version"})
+"""Columns that may differ between two runs with one result: by tiling, or by the names of settings and the version."""
+FIGURES_ONLY = "reason_detail"
+"""The column of which only the figures count, not the words."""
 ROWS_A_BATCH = 8192
 """Rows that are held at once."""
 
+_FIGURE = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?!\w)")
 _NULL, _PRESENT = b"\x00", b"\x01"
 _HASH_BYTES = hashlib.sha256().digest_size
 
@@ -54,7 +58,7 @@ def run_digest(run_dir: str, filesystem: pafs.FileSystem | None = None, tiles: S
     """
     if filesystem is None:
         filesystem, run_dir = arrow_at(run_dir)
-    whole = hashlib.sha256(b"gablework content 1\n")
+    whole = hashlib.sha256(b"gablework content 2\n")
     for name, key in KEYS.items():
         keys, hashes = _row_hashes(run_dir, name, key, filesystem, tiles)
         order = np.lexsort(tuple(reversed(keys)))
@@ -117,6 +121,17 @@ def canonical_rows(batch: pa.RecordBatch) -> Iterator[bytes]:
         yield heading + b"".join(row)
 
 
+def figures_of(detail: str) -> str:
+    """The figures of a reason's wording, sorted, so that their order in the sentence does not count.
+
+    Examples
+    --------
+    >>> figures_of("12 points, fewer than min_points 24.5")
+    '12 24.5'
+    """
+    return " ".join(sorted(_FIGURE.findall(detail)))
+
+
 def _is_text(kind: pa.DataType) -> bool:
     """Whether a type is a string type, also dictionary encoded."""
     if pa.types.is_dictionary(kind):
@@ -132,6 +147,9 @@ def _is_binary(kind: pa.DataType) -> bool:
 def _cells(column: pa.Array, name: str) -> list[bytes]:
     """The cells of a column: a zero byte for null, else a one byte and the value."""
     kind = column.type
+    if name == FIGURES_ONLY:
+        column = pa.array([None if text is None else figures_of(text) for text in column.to_pylist()], pa.string())
+        kind = column.type
     if _is_text(kind):
         return [_NULL if text is None else _sized(text.encode()) for text in column.to_pylist()]
     if _is_binary(kind):

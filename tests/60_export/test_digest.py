@@ -25,7 +25,7 @@ from pipeline.export.geoparquet import read_table
 from pipeline.export.records import BUILDINGS, SCHEMAS, CandidateFacts
 from pipeline.export.tile import write_tile
 from pipeline.runtime import digest
-from pipeline.runtime.digest import NOT_CONTENT, canonical_rows, run_digest
+from pipeline.runtime.digest import FIGURES_ONLY, NOT_CONTENT, canonical_rows, run_digest
 
 BUILT = (small.gable, small.courtyard, small.two_parts, small.failed, small.pent, small.levelled)
 
@@ -91,7 +91,7 @@ def test_one_changed_value_changes_the_digest(run_dir: Path, tmp_path: Path, col
     changes = {"ground_z": 2.001, "volume_m3": 0.001, "n_points": 319, "valid": False, "validity_codes": [203]}
 
     def change(table: pa.Table) -> pa.Table:
-        return with_value(table, column, 0, changes.get(column, "another"))
+        return with_value(table, column, 0, changes.get(column, "another 12"))
 
     assert run_digest(str(rewritten(run_dir, tmp_path, "buildings", change))) != run_digest(str(run_dir))
 
@@ -107,12 +107,32 @@ def test_every_column_of_content_counts(run_dir: Path, tmp_path: Path, name: str
             float: lambda: value + 0.001,
             list: lambda: value[:-1],
         }
-        other = kinds.get(type(value), lambda: f"{value}x")
+        other = kinds.get(type(value), lambda: f"{value} 7" if name == FIGURES_ONLY else f"{value}x")
         if isinstance(value, dt.datetime):
             return with_value(table, name, row, value + dt.timedelta(microseconds=1))
         return with_value(table, name, row, value + b"x" if isinstance(value, bytes) else other())
 
     assert run_digest(str(rewritten(run_dir, tmp_path, "buildings", change))) != run_digest(str(run_dir))
+
+
+def test_only_the_figures_of_a_reason_count(run_dir: Path, tmp_path: Path) -> None:
+    def detail(text: str) -> str:
+        def change(table: pa.Table) -> pa.Table:
+            return with_value(table, FIGURES_ONLY, 0, text)
+
+        return run_digest(str(rewritten(run_dir, tmp_path / str(len(text)), "buildings", change)))
+
+    first = detail("12 points, fewer than least_points 24.5")
+    assert detail("min_points is 24.5, and the candidate has 12 points") == first
+    assert detail("12 points, fewer than 24.6") != first
+
+
+@pytest.mark.parametrize("column", ["settings_hash", "engine_version"])
+def test_names_of_settings_and_the_version_are_not_content(run_dir: Path, tmp_path: Path, column: str) -> None:
+    def change(table: pa.Table) -> pa.Table:
+        return with_value(table, column, 0, "another")
+
+    assert run_digest(str(rewritten(run_dir, tmp_path, "buildings", change))) == run_digest(str(run_dir))
 
 
 @pytest.mark.parametrize("table", list(SCHEMAS))
