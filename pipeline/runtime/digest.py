@@ -1,9 +1,9 @@
 """The digest of a run: one sha256 over its content, whatever the workers, the tiles, the files or the Parquet writer.
 
 Content is all columns of buildings, planes and rejected except `NOT_CONTENT`, in the order of the rows' keys. Of
-`reason_detail` only the figures count, so that a better wording changes no digest. Every row is hashed by itself in a canonical form (columns by name; integers, floats and times as eight
-bytes, texts as UTF-8, null told apart from all values), then the row hashes are hashed in the order of the keys. So
-only keys and 32 bytes a row are held, not the rows.
+`reason_detail` only the figures count, so a better wording changes no digest. Every row is hashed by itself in a
+canonical form (columns by name; integers, floats and times as eight bytes, texts as UTF-8, null unlike any value). The
+row hashes are then hashed in the order of the keys, so only the keys and 32 bytes per row are held in memory.
 """
 
 from __future__ import annotations
