@@ -4,7 +4,7 @@
         [--outside FOOTPRINTS] [--edges] [--across 4] [--down 3]
 
 Every building is one cell: its points in plan by height, then the model of each run with the points over it, coloured
-by their distance to the roof (`pipeline.report.section`). The share of its points within 0.2 m stands beneath. Of more
+by their distance to the roof (`report.section`). The share of its points within 0.2 m stands beneath. Of more
 buildings than `--most`, every k-th in the order of their ids is drawn: no choice by result. `--outside` leaves out what
 meets a polygon of a vector file in the CRS of the points; `--edges` draws the edges of the first run's faces into the
 plan, where no wall hides them. `sheets.md` in DIR lists the cells, for notes.
@@ -23,13 +23,13 @@ import numpy as np
 import shapely
 from PIL import Image, ImageDraw
 
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reading import read_models
 from pipeline.io import ReadOptions
 from pipeline.io.vector_layer import read_layer
 from pipeline.model import FloatArray
-from pipeline.report.comparison_pictures import LOW_M, BuildingPictures, draw_building
-from pipeline.report.comparison_points import PointFiles, points_within
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.report.comparison_pictures import LOW_M, BuildingPictures, draw_building
+from pipeline.ruler.report.comparison_points import PointFiles, points_within
 
 COLUMNS, ROWS = 4, 3
 """Buildings across and down a sheet, where nothing else is asked."""

@@ -10,14 +10,14 @@ from pathlib import Path
 from pipeline.io import ReadOptions
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import Candidate
-from pipeline.runtime.events import ignore
-from pipeline.runtime.gather import gather
-from pipeline.runtime.join import RejectedSite
+from pipeline.runtime.cluster.serial import SerialExecutor
+from pipeline.runtime.monitoring.events import ignore
 from pipeline.runtime.plan import make_plan
-from pipeline.runtime.progress import Progress
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.serial import SerialExecutor
-from pipeline.runtime.stages import Stages, given_footprints
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.stages.gather import gather
+from pipeline.runtime.stages.join import RejectedSite
+from pipeline.runtime.stages.progress import Progress
+from pipeline.runtime.stages.stages import Stages, given_footprints
 from pipeline.settings import RunSettings
 
 

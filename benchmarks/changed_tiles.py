@@ -27,7 +27,7 @@ import laspy
 import numpy as np
 
 from benchmarks.city_tiles import main as make_tiles
-from pipeline.runtime.events import Event
+from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.settings import RunSettings
 

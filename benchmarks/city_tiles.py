@@ -23,9 +23,9 @@ import laspy
 import numpy as np
 
 from pipeline.model import ByteArray
-from pipeline.synthetic.als import ScanBlock, scan
-from pipeline.synthetic.city import CITY_SCANNER, CityPlan, Extent
-from pipeline.synthetic.survey_files import las_header
+from pipeline.ruler.simulation.als import ScanBlock, scan
+from pipeline.ruler.simulation.city import CITY_SCANNER, CityPlan, Extent
+from pipeline.ruler.simulation.survey_files import las_header
 
 SUFFIX = ".laz"
 

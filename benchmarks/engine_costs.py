@@ -35,16 +35,16 @@ from benchmarks.city_scale import free_port, wait_for_listener
 from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions
 from pipeline.model import IntArray
+from pipeline.runtime.cluster.executors import Cluster, DaskExecutor
 from pipeline.runtime.engine import executor_for
-from pipeline.runtime.events import Watch, ignore
-from pipeline.runtime.executors import Cluster, DaskExecutor
-from pipeline.runtime.join import NOWHERE, join
-from pipeline.runtime.kept import result_of
-from pipeline.runtime.open_fragments import BorderFacets
+from pipeline.runtime.monitoring.events import Watch, ignore
 from pipeline.runtime.plan import Plan, make_plan
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.split import Split
-from pipeline.runtime.stages import Progress, Stages
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.outcomes import result_of
+from pipeline.runtime.stages.join import NOWHERE, join
+from pipeline.runtime.stages.open_fragments import BorderFacets
+from pipeline.runtime.stages.split import Split
+from pipeline.runtime.stages.stages import Progress, Stages
 from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
 

@@ -28,22 +28,22 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.evaluation.evaluate import Evaluation, evaluate
-from pipeline.evaluation.ground import GroundOfRun
-from pipeline.evaluation.reading import read_models
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.reference_points import read_points_reference
-from pipeline.evaluation.reference_truth import read_truth_reference
-from pipeline.evaluation.writing import write_tables
 from pipeline.io.source import ReadOptions
 from pipeline.methods import METHODS
+from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
+from pipeline.ruler.evaluation.ground import GroundOfRun
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.reference_points import read_points_reference
+from pipeline.ruler.evaluation.reference_truth import read_truth_reference
+from pipeline.ruler.evaluation.writing import write_tables
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.ruler.simulation.sweep import CELLS, Cell
 from pipeline.runtime.compare import Variant, settings_of
-from pipeline.runtime.modelling import load
 from pipeline.runtime.run import RunRequest, RunVariant, run_variants
+from pipeline.runtime.stages.reconstruct import load
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
-from pipeline.synthetic.seeds import seed_of
-from pipeline.synthetic.sweep import CELLS, Cell
 
 GROUND = "ground."
 """Beginning of the names of the measures that are of the scene, not of a method."""
@@ -244,7 +244,7 @@ def _evaluate(entry: Entry, variants: Sequence[Variant], place: Workplace) -> No
             evaluation = _with_ground(evaluate(models, reference), found)
         folder = place.report(variant, entry)
         if entry.has_page:
-            from pipeline.report.evaluation_page import write_page
+            from pipeline.ruler.report.evaluation_page import write_page
 
             write_page(evaluation, folder)
         write_tables(evaluation, folder)

@@ -26,8 +26,8 @@ import shapely
 
 from benchmarks.entries import markdown_table
 from benchmarks.results_page import filled
-from pipeline.epochs.records import Change
 from pipeline.export.geoparquet import geo_metadata, parquet_bytes, stored_schema
+from pipeline.ruler.epochs.records import Change
 from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_manifest
 
 ORIGIN = np.array([560_000.0, 5_930_000.0])

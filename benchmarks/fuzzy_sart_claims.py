@@ -41,9 +41,9 @@ from benchmarks.fuzzy_sart_roofs import SyntheticRoof, all_planes_right
 from pipeline.geometry import point_spacing_m
 from pipeline.methods.fuzzy_sart import FuzzySartSettings, segment
 from pipeline.model import FloatArray, Segmentation
+from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
+from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.segmentation.fuzzy_sart import centre_of_building, facet_vectors
-from pipeline.synthetic.roofs import RoofDimensions, RoofShape
-from pipeline.synthetic.seeds import seed_of
 
 DENSITIES_PER_M2 = (0.77, 2.0, 8.0)
 NOISES_M = (0.02, 0.05, 0.10)

@@ -24,7 +24,7 @@ from pipeline.methods.fuzzy_sart import FuzzySartSettings
 from pipeline.model import FaceKind, FloatArray, LabelArray, Solid
 from pipeline.reconstruct import reconstruct_building
 from pipeline.report.perspective import View, ViewedFace, draw_view
-from pipeline.synthetic.roofs import RoofDimensions, RoofShape
+from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt

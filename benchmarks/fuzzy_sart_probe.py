@@ -22,14 +22,14 @@ from pipeline.geometry import facet_areas_m2, facet_normals
 from pipeline.methods import fuzzy_sart
 from pipeline.methods.fuzzy_sart import FuzzySartSettings
 from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Segmentation
+from pipeline.ruler.simulation.additions import random_dormers
+from pipeline.ruler.simulation.random_dimensions import random_dimensions
+from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
+from pipeline.ruler.simulation.scene import Terrain, place_building
+from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.segmentation import fuzzy_sart as clustering
 from pipeline.segmentation.fuzzy_sart import centre_of_building, facet_vectors
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
-from pipeline.synthetic.additions import random_dormers
-from pipeline.synthetic.random_dimensions import random_dimensions
-from pipeline.synthetic.roofs import RoofDimensions, RoofShape
-from pipeline.synthetic.scene import Terrain, place_building
-from pipeline.synthetic.seeds import seed_of
 
 HOUSES = ("flat", "gable", "hip", "l_shape")
 """Houses of 60 to 200 m2, 25 to 45 degrees."""

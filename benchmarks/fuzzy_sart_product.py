@@ -20,14 +20,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from benchmarks.fuzzy_sart_probe import LARGE, dimensions_of
-from pipeline.evaluation.faces import MIN_FACE_AREA_M2
-from pipeline.evaluation.files import EvaluationRequest, evaluate_files
-from pipeline.synthetic.als import ScannerSettings
-from pipeline.synthetic.dataset import simulate
-from pipeline.synthetic.plots import PlannedBuilding, packed_plots
-from pipeline.synthetic.scene import Scene, Terrain, place_building
-from pipeline.synthetic.seeds import seed_of
-from pipeline.synthetic.suites import SUITES, Suite
+from pipeline.ruler.evaluation.faces import MIN_FACE_AREA_M2
+from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
+from pipeline.ruler.simulation.als import ScannerSettings
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.plots import PlannedBuilding, packed_plots
+from pipeline.ruler.simulation.scene import Scene, Terrain, place_building
+from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.ruler.simulation.suites import SUITES, Suite
 
 Figure = TypeVar("Figure")
 """A share or a mean with its interval."""

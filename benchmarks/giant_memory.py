@@ -1,4 +1,4 @@
-"""Memory that one building takes in its child process, by its points: the figures of `pipeline/runtime/needs.py`.
+"""Memory that one building takes in its child process, by its points: the figures of `cluster/needs.py`.
 
     .venv/bin/python benchmarks/giant_memory.py [--points 50000 200000 1000000 3000000] [--method arrangement]
 
@@ -54,7 +54,7 @@ def peak() -> int:
 def model(kind: str, count: int, method: str, answers: Connection) -> None:
     """Model one giant and tell what it took."""
     from pipeline.reconstruct import reconstruct_building
-    from pipeline.runtime.modelling import load
+    from pipeline.runtime.stages.reconstruct import load
 
     load(*METHODS)
     before = peak()

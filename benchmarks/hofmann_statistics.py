@@ -21,11 +21,11 @@ import shapely
 
 from pipeline.geometry import aspects_deg, facet_normals, o_distances_m
 from pipeline.model import FloatArray
-from pipeline.synthetic.als import joined, scan
-from pipeline.synthetic.hofmann310 import SCANNER, hofmann310
-from pipeline.synthetic.scene import Building
-from pipeline.synthetic.seeds import seed_of
-from pipeline.synthetic.survey_files import last_returns
+from pipeline.ruler.simulation.als import joined, scan
+from pipeline.ruler.simulation.hofmann310 import SCANNER, hofmann310
+from pipeline.ruler.simulation.scene import Building
+from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.ruler.simulation.survey_files import last_returns
 from pipeline.tin.delaunay import triangulate, unique_xy
 
 SURROUNDINGS_M = 5.0

@@ -28,8 +28,8 @@ from types import MappingProxyType
 import numpy as np
 
 from benchmarks.entries import Workplace, all_variants, hofmann_entries, markdown_table, measure_all
-from pipeline.evaluation.bootstrap import Estimate, Sums, bootstrap, share
 from pipeline.model import BoolArray, FloatArray, RoofType
+from pipeline.ruler.evaluation.bootstrap import Estimate, Sums, bootstrap, share
 from pipeline.runtime.compare import Variant
 
 OUTCOMES = ("correct", "passable", "false")

@@ -20,9 +20,9 @@ from pathlib import Path
 
 import psutil
 
-from pipeline.runtime.executors import Cluster
+from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.serial import Executor, SerialExecutor
 from pipeline.runtime.run import RunRequest, run
-from pipeline.runtime.serial import Executor, SerialExecutor
 
 STAGES = ("split", "reconstruct", "total")
 COMPARED = ("reconstruct", "total", "cpu")

@@ -72,7 +72,7 @@ def tiles_of(run: Path) -> dict[str, list[Path]]:
 
 
 def publish(storage: Storage, run: Path, tiles: dict[str, list[Path]]) -> None:
-    """Put all tiles as `pipeline.runtime.publish` does."""
+    """Put all tiles as `pipeline.runtime.stages.publish` does."""
     for key, paths in tiles.items():
         with storage.several(lambda: None) as puts:
             for path in paths:

@@ -34,9 +34,6 @@ from benchmarks.candidates import found_scene
 from benchmarks.entries import markdown_table
 from benchmarks.scene_scores import OBJECT_M2, footprint_score, outlined_models
 from pipeline.errors import BuildingError
-from pipeline.evaluation.blocks import joined_reference
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reference_truth import read_truth_reference
 from pipeline.geometry import top_visible
 from pipeline.model import BoolArray, FloatArray
 from pipeline.roof.block import block_plane
@@ -44,12 +41,15 @@ from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
 from pipeline.roof.facades import eave_of
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.plan import partition_roof, roof_points
+from pipeline.ruler.evaluation.blocks import joined_reference
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference_truth import read_truth_reference
+from pipeline.ruler.simulation.city import CITY_SCANNER
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.ruler.simulation.sweep import DENSITIES_PER_M2, NOISES_M, cell_name
 from pipeline.scene import BUILDING_CLASS
 from pipeline.settings import RunSettings
-from pipeline.synthetic.city import CITY_SCANNER
-from pipeline.synthetic.dataset import simulate
-from pipeline.synthetic.seeds import seed_of
-from pipeline.synthetic.sweep import DENSITIES_PER_M2, NOISES_M, cell_name
 
 BEAM_RADII_M = (0.05, 0.12, 0.25, 0.4)
 AZIMUTHS_DEG = (90.0, 30.0)

@@ -18,13 +18,14 @@ from typing import Self
 
 import psutil
 
-from pipeline.runtime import child, process_server, worker_setup
+from pipeline.runtime.cluster import worker_setup
+from pipeline.runtime.isolation import child_main, fork_server
 
 LOOK_S = 0.25
 DRIVER, SCHEDULER, NANNY, WORKER, CHILD, OTHER = "driver", "scheduler", "nanny", "worker", "child", "other"
 FORKING = "process server"
 ROLES = (DRIVER, SCHEDULER, NANNY, FORKING, WORKER, CHILD, OTHER)
-_NAMES = {child.NAME: CHILD, process_server.NAME: FORKING, worker_setup.NAME: WORKER}
+_NAMES = {child_main.NAME: CHILD, fork_server.NAME: FORKING, worker_setup.NAME: WORKER}
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -42,7 +43,7 @@ class Seen:
 def role_of(name: str, command: Sequence[str], roots: dict[int, str], pid: int) -> str:
     """What a process is, by its name, its command line and its id.
 
-    >>> role_of("gablework-child", ["python", "-P", "-m", "pipeline.runtime.process_server", "7"], {}, 8)
+    >>> role_of("gablework-child", ["python", "-P", "-m", "pipeline.runtime.isolation.fork_server", "7"], {}, 8)
     'child'
     """
     if pid in roots:

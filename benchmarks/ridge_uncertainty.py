@@ -26,10 +26,10 @@ import shapely
 
 from benchmarks.entries import Entry, Workplace, hofmann_entries, markdown_table, measure_all, sweep_entries
 from benchmarks.results_page import filled
-from pipeline.evaluation.matching import match_footprints
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reading import read_models
-from pipeline.evaluation.reference_truth import read_truth_reference
+from pipeline.ruler.evaluation.matching import match_footprints
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reference_truth import read_truth_reference
 from pipeline.runtime.compare import Variant
 
 ONE_SIGMA = 0.6827

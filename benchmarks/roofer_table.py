@@ -47,9 +47,9 @@ from benchmarks.method_times import Times, clock
 from benchmarks.run_scores import RunScore, ScoreLoss, differing_buildings, score_loss, score_run
 from benchmarks.survey_runs import Seconds, candidates_of, cold_run, run_survey
 from benchmarks.thinned_surveys import Change, roof_density, thinned, without_buildings, write_changed
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.reference_points import read_points_reference
 from pipeline.io import ReadOptions
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.runtime.compare import Variant
 
 PARTS = ("times", "seconds", "differences", "thinned", "told-less")

@@ -30,8 +30,8 @@ from benchmarks.entries import (
     measure_all,
     sweep_entries,
 )
+from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.runtime.compare import Variant
-from pipeline.synthetic.seeds import seed_of
 
 CUBES = 20
 """Draws of the cube: it is one building."""

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reading import read_models
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.residuals import BuildingResiduals, building_residuals
-from pipeline.evaluation.validity import validity
 from pipeline.export.geoparquet import read_table
 from pipeline.model import Status
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.residuals import BuildingResiduals, building_residuals
+from pipeline.ruler.evaluation.validity import validity
 from pipeline.runtime.digest import NOT_CONTENT
 
 LOD2 = "2.2"

@@ -32,8 +32,8 @@ import numpy as np
 from benchmarks.city_scale import is_mark
 from benchmarks.entries import markdown_table
 from pipeline.model import FloatArray
-from pipeline.runtime.flight import TASKS_A_THREAD
-from pipeline.runtime.scratch import POINT
+from pipeline.runtime.cluster.flight import TASKS_A_THREAD
+from pipeline.runtime.scratch.folder import POINT
 
 _SEED = 20
 _HALO_M = 240.0

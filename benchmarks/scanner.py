@@ -17,11 +17,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pipeline.synthetic.als import ScannerSettings, scan
-from pipeline.synthetic.city import CITY_SCANNER, CityPlan
-from pipeline.synthetic.dataset import simulate
-from pipeline.synthetic.scene import Scene
-from pipeline.synthetic.suites import SUITES
+from pipeline.ruler.simulation.als import ScannerSettings, scan
+from pipeline.ruler.simulation.city import CITY_SCANNER, CityPlan
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.suites import SUITES
 
 DENSITIES_PER_M2 = (1.0, 8.0, 30.0)
 

@@ -12,10 +12,10 @@ import shapely
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from pipeline.evaluation.building_raster import CELL_M, CellWindow, PlanRaster, PointRaster
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reference import Reference
 from pipeline.model import BoolArray, FloatArray
+from pipeline.ruler.evaluation.building_raster import CELL_M, CellWindow, PlanRaster, PointRaster
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference
 from pipeline.scene import BUILDING_CLASS
 
 _SUN_AZIMUTH_DEG, _SUN_HEIGHT_DEG = 315.0, 45.0

@@ -15,16 +15,16 @@ import shapely
 from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import BuildingError
-from pipeline.evaluation.detection import Detection, detect
-from pipeline.evaluation.footprints import FootprintRow, score_footprints
-from pipeline.evaluation.matching import match_footprints, sound_polygons
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reference import Reference
 from pipeline.model import Candidate, RoofType, Status
 from pipeline.roof.block import block_plane
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.plan import partition_roof, roof_points
 from pipeline.roof.settings import RoofSettings
+from pipeline.ruler.evaluation.detection import Detection, detect
+from pipeline.ruler.evaluation.footprints import FootprintRow, score_footprints
+from pipeline.ruler.evaluation.matching import match_footprints, sound_polygons
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference
 from pipeline.scene import BUILDING_CLASS
 
 OBJECT_M2 = 16.0

@@ -33,16 +33,16 @@ import numpy as np
 
 from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.runtime.cluster.serial import Executor, SerialExecutor
 from pipeline.runtime.engine import executor_for
-from pipeline.runtime.events import ignore
+from pipeline.runtime.monitoring.events import ignore
 from pipeline.runtime.plan import Plan, make_plan
-from pipeline.runtime.progress import Progress
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.serial import Executor, SerialExecutor
-from pipeline.runtime.stages import Stages
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.stages.progress import Progress
+from pipeline.runtime.stages.stages import Stages
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
-from pipeline.synthetic.seeds import seed_of
 
 STAGES = ("ingest", "split", "join")
 REQUIRED_POINTS_A_SECOND = 300_000.0

@@ -38,14 +38,14 @@ from benchmarks.scene_scores import (
     houses_alone,
     outlined_models,
 )
-from pipeline.evaluation.blocks import joined_reference
-from pipeline.evaluation.ground import GroundOfRun, TileGround, ground_blocks, tile_figures
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.reference_truth import read_truth_reference
 from pipeline.roof.footprint import polygons_of
+from pipeline.ruler.evaluation.blocks import joined_reference
+from pipeline.ruler.evaluation.ground import GroundOfRun, TileGround, ground_blocks, tile_figures
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.reference_truth import read_truth_reference
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
-from pipeline.synthetic.seeds import seed_of
 
 SLOPES_DEG = (0.0, 10.0, 20.0, 30.0)
 DENSITIES = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0, 30.0)

@@ -47,12 +47,12 @@ from benchmarks.scene_suites import (
     measure_cities,
     suite_tables,
 )
-from pipeline.evaluation.detection import Detection
-from pipeline.evaluation.footprints import FootprintRow
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reference import Reference, ReferencePoints
-from pipeline.evaluation.reference_points import read_points_reference
 from pipeline.io import ReadOptions, open_source
+from pipeline.ruler.evaluation.detection import Detection
+from pipeline.ruler.evaluation.footprints import FootprintRow
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
+from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.settings import RunSettings, read_table
 
 

@@ -30,11 +30,11 @@ from scipy import ndimage
 
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import BoolArray, ByteArray, FloatArray
-from pipeline.synthetic.als import ScannerSettings, scan_all
-from pipeline.synthetic.city import CITY_SCANNER, CityPlan
-from pipeline.synthetic.scene import Scene
-from pipeline.synthetic.seeds import seed_of
-from pipeline.synthetic.sweep import SCANNER, cell_name, sweep
+from pipeline.ruler.simulation.als import ScannerSettings, scan_all
+from pipeline.ruler.simulation.city import CITY_SCANNER, CityPlan
+from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.ruler.simulation.sweep import SCANNER, cell_name, sweep
 
 NEIGHBOURS = 8
 RAISED_M = 3.0

@@ -23,8 +23,8 @@ from typing import Any
 
 from benchmarks.entries import Workplace, all_variants, markdown_table, measure_all, sweep_entries
 from benchmarks.ruler import sweep_qualities
+from pipeline.ruler.simulation.sweep import CELLS
 from pipeline.runtime.compare import Variant
-from pipeline.synthetic.sweep import CELLS
 
 LEVELS = (0.8, 0.5)
 """Qualities whose limits are told."""

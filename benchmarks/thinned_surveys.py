@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pipeline.evaluation.reference import Reference
 from pipeline.model import BoolArray, IntArray
+from pipeline.ruler.evaluation.reference import Reference
 from pipeline.scene import BUILDING_CLASS
 
 UNCLASSIFIED = 1

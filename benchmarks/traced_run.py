@@ -23,11 +23,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from pipeline.runtime.cluster.serial import Executor
 from pipeline.runtime.engine import executor_for
-from pipeline.runtime.events import Event, Watch
-from pipeline.runtime.measured import Measured, Result, Task
+from pipeline.runtime.monitoring.events import Event, Watch
+from pipeline.runtime.monitoring.measured import Measured, Result, Task
 from pipeline.runtime.run import RunRequest, run
-from pipeline.runtime.serial import Executor
 from pipeline.settings import RunSettings
 
 SIZED_EVERY = 8

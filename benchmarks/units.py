@@ -22,13 +22,13 @@ import shapely
 
 from benchmarks.candidates import candidates_of
 from benchmarks.entries import markdown_table
-from pipeline.evaluation.reference_truth import read_truth_reference
 from pipeline.io import ReadOptions, open_source
 from pipeline.io.footprints import read_footprints
 from pipeline.model import IntArray
+from pipeline.ruler.evaluation.reference_truth import read_truth_reference
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
-from pipeline.synthetic.seeds import seed_of
 
 MIN_SHARE = 0.2
 """Share of the points of either from which on a candidate and a house belong together."""

@@ -15,13 +15,13 @@ import typer
 
 from pipeline.batch.batch_file import TABLES
 from pipeline.console import EXIT_CODES
-from pipeline.epochs import records as changes_of
-from pipeline.epochs.settings import DiffSettings
-from pipeline.evaluation.chapters import TITLES
-from pipeline.evaluation.definitions import DEFINITIONS
 from pipeline.methods import METHODS
 from pipeline.parameters import Parameters
 from pipeline.quality import validity as checker
+from pipeline.ruler.epochs import records as changes_of
+from pipeline.ruler.epochs.settings import DiffSettings
+from pipeline.ruler.evaluation.chapters import TITLES
+from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.settings import SECTIONS, GeneralSettings
 from service import catalogue
 from service.cli import app

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.progress import Progress, TaskID
 
-    from pipeline.runtime.events import Event
+    from pipeline.runtime.monitoring.events import Event
 
 LOG_INTERVAL_S = 2.0
 """A log line of progress follows the last one of its stage after this time at the earliest."""
@@ -129,7 +129,7 @@ class Console:
             `GABLEWORK_LOG_JSON` is neither 1 nor 0.
         """
         if self._log_json or os.environ.get("GABLEWORK_LOG_JSON"):
-            from pipeline.runtime import logs
+            from pipeline.runtime.monitoring import logs
 
             try:
                 self._log_json = logs.wants_json() or self._log_json
@@ -205,7 +205,7 @@ class Console:
             return
         self._last_line_s[event.stage] = now
         if self._log_json:
-            from pipeline.runtime.logs import LOG
+            from pipeline.runtime.monitoring.logs import LOG
 
             facts = {"stage": event.stage or None, "done": event.done, "total": event.total, "failed": event.failed}
             level = "warning" if event.kind == "waiting" else "info"
@@ -227,7 +227,7 @@ class Console:
     def warn(self, message: str, stage: str = "") -> None:
         """Say on standard error what is usable but not as it should be."""
         if self._log_json:
-            from pipeline.runtime.logs import LOG
+            from pipeline.runtime.monitoring.logs import LOG
 
             LOG.warning(message, extra={"stage": stage or None})
         elif self.as_json:
@@ -246,7 +246,7 @@ class Console:
     def tell(self, message: str) -> None:
         """Say how a command fares that runs until it is told to end: a line for people, or one of its log."""
         if self._log_json:
-            from pipeline.runtime.logs import LOG
+            from pipeline.runtime.monitoring.logs import LOG
 
             LOG.info(message)
         else:
@@ -283,7 +283,7 @@ class Console:
     def _tell_error(self, error: BaseException, code: ExitCode) -> None:
         message = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
         if self._log_json:
-            from pipeline.runtime.logs import LOG
+            from pipeline.runtime.monitoring.logs import LOG
 
             LOG.error(message, exc_info=error if code is ExitCode.INTERNAL else None)
         elif code is ExitCode.INTERNAL:

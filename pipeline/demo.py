@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from pipeline.evaluation.evaluate import Evaluation
-from pipeline.evaluation.files import EvaluationRequest, evaluate_files
-from pipeline.evaluation.writing import write_tables
-from pipeline.report.evaluation_page import write_page
 from pipeline.report.render import render_run
-from pipeline.runtime.events import Event, Listener
+from pipeline.ruler.evaluation.evaluate import Evaluation
+from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
+from pipeline.ruler.evaluation.writing import write_tables
+from pipeline.ruler.report.evaluation_page import write_page
+from pipeline.ruler.simulation.dataset import ScenePaths, simulate
+from pipeline.runtime.monitoring.events import Event, Listener
 from pipeline.runtime.run import RunRequest, RunSummary, run
-from pipeline.synthetic.dataset import ScenePaths, simulate
 
 SUITE = "suburb"
 """What is simulated."""

@@ -17,7 +17,7 @@ from pipeline.cli import AsJson, app
 from pipeline.cli.options import TlsCa, TlsCert, TlsKey, count_or_auto
 from pipeline.console import Console
 from pipeline.errors import RunError, SettingsError
-from pipeline.runtime.start_up import start_own_process
+from pipeline.runtime.isolation.start_up import start_own_process
 
 if TYPE_CHECKING:
     from service.settings import ServiceSettings
@@ -134,7 +134,7 @@ def serve(
 ) -> None:
     """Answer REST requests and the web page, with a job driver and a cluster beside it."""
     with Console(as_json=as_json) as console, _service_errors():
-        from pipeline.runtime.tls import given_tls
+        from pipeline.runtime.cluster.tls import given_tls
         from service.supervisor import serve as serve_until_told
 
         _log_to_stderr()

@@ -10,13 +10,13 @@ import pyarrow as pa
 import shapely
 from shapely import affinity
 
-from pipeline.evaluation.evaluate import Evaluation
-from pipeline.evaluation.measure import Better, Definition, Group, Measure
-from pipeline.evaluation.models import ModelSet, RoofModel, RoofSurface
-from pipeline.evaluation.reference import Reference, ReferencePoints
 from pipeline.model import RoofType, Status
-from pipeline.synthetic.solids import building_solid
-from pipeline.synthetic.suburb import suburb
+from pipeline.ruler.evaluation.evaluate import Evaluation
+from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.models import ModelSet, RoofModel, RoofSurface
+from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
+from pipeline.ruler.simulation.solids import building_solid
+from pipeline.ruler.simulation.suburb import suburb
 
 WITHIN_M = 0.2
 DEFINITIONS = {

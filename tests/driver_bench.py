@@ -14,7 +14,7 @@ from migrated import with_tables
 
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.compare import CompareRequest, CompareSummary
-from pipeline.runtime.events import Event
+from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.run import RunSummary
 from service.driver.attempt import Tools
 from service.driver.clusters import SharedCluster

@@ -11,13 +11,13 @@ import numpy as np
 import shapely
 from shapely import affinity
 
-from pipeline.evaluation.measure import Measure
-from pipeline.evaluation.models import RoofModel, RoofSurface
-from pipeline.evaluation.reference import Conditions, Reference
 from pipeline.model import RoofType
-from pipeline.synthetic.random_dimensions import random_dimensions
-from pipeline.synthetic.roofs import RoofShape
-from pipeline.synthetic.scene import Scene, Terrain, place_building
+from pipeline.ruler.evaluation.measure import Measure
+from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
+from pipeline.ruler.evaluation.reference import Conditions, Reference
+from pipeline.ruler.simulation.random_dimensions import random_dimensions
+from pipeline.ruler.simulation.roofs import RoofShape
+from pipeline.ruler.simulation.scene import Scene, Terrain, place_building
 
 ORIGIN = (1000.0, 2000.0, 0.0)
 EXTENT = shapely.box(900.0, 1900.0, 1600.0, 2300.0)

@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import SettingsError
 from pipeline.export.mesh_kinds import MESHES
 from pipeline.parameters import Parameters, build, parameter
-from pipeline.runtime.isolation import IsolationLimits
-from pipeline.runtime.tls import given_tls
+from pipeline.runtime.cluster.tls import given_tls
+from pipeline.runtime.isolation.isolated_items import IsolationLimits
 from pipeline.schedule import Cron, Missed, Overlap
 from pipeline.settings import RunSettings
 

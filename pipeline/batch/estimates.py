@@ -20,19 +20,19 @@ from pipeline.batch.wording import as_keys, said_in_keys
 from pipeline.errors import EmptyInputError, InputError, RunError
 from pipeline.inspection import inspect
 from pipeline.io import shown
-from pipeline.runtime.compiled_kernels import kernels_are_compiled
+from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
+from pipeline.runtime.cluster.executors import memory_of_workers
+from pipeline.runtime.cluster.performance import PerformanceReport
 from pipeline.runtime.engine import engine_of
-from pipeline.runtime.events import ignore
-from pipeline.runtime.executors import memory_of_workers
 from pipeline.runtime.expected import RATES, expected
-from pipeline.runtime.machine import cores, memory_bytes
-from pipeline.runtime.performance import PerformanceReport
+from pipeline.runtime.monitoring.events import ignore
+from pipeline.runtime.monitoring.machine import cores, memory_bytes
 from pipeline.runtime.plan import Plan, check_memory
-from pipeline.runtime.progress import Progress
 from pipeline.runtime.run import check_out, plan_inputs
-from pipeline.runtime.scratch import POINT
-from pipeline.runtime.stages import given_footprints
-from pipeline.runtime.work_folder import refuse_foreign
+from pipeline.runtime.scratch.folder import POINT
+from pipeline.runtime.scratch.work_folder import refuse_foreign
+from pipeline.runtime.stages.progress import Progress
+from pipeline.runtime.stages.stages import given_footprints
 from pipeline.tiling import MM
 
 _RANGE = 2.0

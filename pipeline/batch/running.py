@@ -13,11 +13,11 @@ from pipeline.batch.status import StatusWriter, buildings_before
 from pipeline.batch.wording import as_keys, said_in_keys
 from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.report.run_page import write_run_page
-from pipeline.runtime.events import Event, Listener, ignore, never
+from pipeline.runtime.cluster.run_metrics import RunMetrics, both, serve_metrics
+from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.monitoring.events import Event, Listener, ignore, never
 from pipeline.runtime.run import RunSummary, run
-from pipeline.runtime.run_metrics import RunMetrics, both, serve_metrics
-from pipeline.runtime.serial import Executor
-from pipeline.runtime.work_folder import DRIVER_LOCK, held_lock, make_work, refuse_held
+from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, held_lock, make_work, refuse_held
 
 _READ = 1
 """Inputs that are read in whole for the estimate of a run: it is to begin soon."""

@@ -21,8 +21,8 @@ from pipeline.batch.batch_file import Batch, read_batch
 from pipeline.batch.schedule_state import NAME, Entry, Outcome, ScheduleState, iso, look, missed, read_schedule
 from pipeline.errors import RunError, SettingsError
 from pipeline.io import LocalStorage
-from pipeline.runtime.events import Event, EventKind, Listener, ignore
-from pipeline.runtime.work_folder import held_lock, is_at_work, is_held, make_work, take_lock
+from pipeline.runtime.monitoring.events import Event, EventKind, Listener, ignore
+from pipeline.runtime.scratch.work_folder import held_lock, is_at_work, is_held, make_work, take_lock
 from pipeline.schedule import Cron
 
 LOCK, RUN_LOCK = "schedule.lock", "run.lock"

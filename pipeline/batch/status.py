@@ -18,8 +18,8 @@ from typing import Any
 from pipeline.batch.eta import StageProgress, duration, remaining_s
 from pipeline.errors import RunError
 from pipeline.io import LocalStorage
-from pipeline.runtime.events import Event
-from pipeline.runtime.work_folder import is_at_work
+from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.scratch.work_folder import is_at_work
 
 NAME = "status.json"
 _EVERY_S = 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pipeline.cli import app
-from pipeline.runtime.start_up import start_own_process
+from pipeline.runtime.isolation.start_up import start_own_process
 
 if __name__ == "__main__":
     start_own_process()

@@ -22,7 +22,7 @@ from pipeline.cli.options import (
     Workers,
 )
 from pipeline.console import Console
-from pipeline.runtime.early import start_early, surely_small
+from pipeline.runtime.isolation.preloading import start_early, surely_small
 
 if TYPE_CHECKING:
     from pipeline.runtime.classify import ClassifySummary
@@ -58,7 +58,7 @@ def classify(
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.classify import ClassifyRequest
         from pipeline.runtime.classify import classify as classify_files
-        from pipeline.runtime.tls import given_tls
+        from pipeline.runtime.cluster.tls import given_tls
         from pipeline.settings import RunSettings
 
         if not surely_small(tiles):

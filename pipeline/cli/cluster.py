@@ -40,9 +40,9 @@ def worker(
 ) -> None:
     """Work for a Dask scheduler; on SIGTERM finish what runs, then leave."""
     with Console(log_json=log_json) as console:
-        from pipeline.runtime.logs import wants_json
-        from pipeline.runtime.tls import given_tls
-        from pipeline.runtime.worker import WorkerOptions, serve_worker
+        from pipeline.runtime.cluster.tls import given_tls
+        from pipeline.runtime.cluster.worker import WorkerOptions, serve_worker
+        from pipeline.runtime.monitoring.logs import wants_json
 
         options = WorkerOptions(
             scheduler=scheduler,

@@ -10,7 +10,7 @@ from pipeline.cli.options import AsJson, Quiet
 from pipeline.console import Console
 
 if TYPE_CHECKING:
-    from pipeline.epochs.diff import Diff
+    from pipeline.ruler.epochs.diff import Diff
 
 
 def diff(
@@ -43,13 +43,13 @@ def diff(
 ) -> None:
     """Tell new, gone, raised, lowered, reshaped and unchanged buildings between two runs of one place."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.epochs.diff import DiffRequest, refuse_run_as_out
-        from pipeline.epochs.diff import diff as compare_runs
-        from pipeline.epochs.settings import read_settings
         from pipeline.io.places import made_here, place_below
-        from pipeline.report.epochs_map import epochs_map, gathering
-        from pipeline.report.epochs_page import write_page
-        from pipeline.runtime.events import Event
+        from pipeline.ruler.epochs.diff import DiffRequest, refuse_run_as_out
+        from pipeline.ruler.epochs.diff import diff as compare_runs
+        from pipeline.ruler.epochs.settings import read_settings
+        from pipeline.ruler.report.epochs_map import epochs_map, gathering
+        from pipeline.ruler.report.epochs_page import write_page
+        from pipeline.runtime.monitoring.events import Event
 
         chosen = read_settings(
             settings,
@@ -85,7 +85,7 @@ def diff(
 
 def _show(console: Console, found: Diff) -> None:
     """The sums as tables, and what is to be known of them."""
-    from pipeline.epochs.records import INCOMPARABLE
+    from pipeline.ruler.epochs.records import INCOMPARABLE
 
     for warning in found.warnings:
         console.warn(warning)

@@ -19,7 +19,7 @@ from pipeline.cli.options import (
 from pipeline.console import Console
 
 if TYPE_CHECKING:
-    from pipeline.evaluation.evaluate import Evaluation
+    from pipeline.ruler.evaluation.evaluate import Evaluation
 
 
 def inspect(
@@ -33,7 +33,7 @@ def inspect(
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.inspection import inspect as inspect_tile
         from pipeline.io.source import ReadOptions
-        from pipeline.runtime.events import Event
+        from pipeline.runtime.monitoring.events import Event
 
         def on_progress(done: int, total: int) -> None:
             console.on_event(Event(kind="progress", stage="read", done=done, total=total))
@@ -104,8 +104,8 @@ def evaluate(
 ) -> None:
     """Measure models: against simulated truth, against classified points, or by themselves."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.evaluation.files import EvaluationRequest, evaluate_files
-        from pipeline.runtime.events import Event
+        from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
+        from pipeline.runtime.monitoring.events import Event
 
         request = EvaluationRequest(
             models=models,
@@ -125,8 +125,8 @@ def evaluate(
         evaluation = evaluate_files(request, on_step)
         document = show_evaluation(console, evaluation)
         if out is not None:
-            from pipeline.evaluation.writing import write_tables
-            from pipeline.report.evaluation_page import write_page
+            from pipeline.ruler.evaluation.writing import write_tables
+            from pipeline.ruler.report.evaluation_page import write_page
 
             on_step("page")
             written = [*write_tables(evaluation, out), write_page(evaluation, out)]
@@ -143,8 +143,8 @@ def evaluate(
 
 def show_evaluation(console: Console, evaluation: Evaluation) -> dict[str, Any]:
     """An evaluation as tables; returns it as plain JSON values."""
-    from pipeline.evaluation.chapters import chapters
-    from pipeline.evaluation.writing import all_notes, measures_table
+    from pipeline.ruler.evaluation.chapters import chapters
+    from pipeline.ruler.evaluation.writing import all_notes, measures_table
 
     document: dict[str, Any] = {"models": evaluation.models.path, "notes": list(all_notes(evaluation))}
     if evaluation.models.kind == "run":

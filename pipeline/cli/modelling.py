@@ -39,7 +39,7 @@ from pipeline.cli.options import (
     Workers,
 )
 from pipeline.console import Console, ExitCode
-from pipeline.runtime.early import start_early
+from pipeline.runtime.isolation.preloading import start_early
 
 if TYPE_CHECKING:
     from pipeline.runtime.run import RunSummary
@@ -89,8 +89,8 @@ def reconstruct(
 ) -> None:
     """Reconstruct buildings from tiles into a run directory."""
     with Console(as_json=as_json, quiet=quiet) as console:
+        from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.run import RunRequest, run
-        from pipeline.runtime.tls import given_tls
 
         start_early(
             "reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=method
@@ -148,10 +148,10 @@ def rerun(
 ) -> None:
     """Model single buildings of a run again, after other overrides; all others stay untouched."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.runtime.isolation import IsolationLimits
+        from pipeline.runtime.cluster.tls import given_tls
+        from pipeline.runtime.isolation.isolated_items import IsolationLimits
         from pipeline.runtime.rerun import RerunRequest
         from pipeline.runtime.rerun import rerun as rerun_buildings
-        from pipeline.runtime.tls import given_tls
 
         start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=False, method=None)
 
@@ -209,13 +209,13 @@ def compare(
 ) -> None:
     """Model the same candidates by several methods and write one page on what came out."""
     with Console(as_json=as_json, quiet=quiet) as console:
-        from pipeline.evaluation.chapters import chapters
-        from pipeline.evaluation.files import EvaluationRequest
-        from pipeline.report.compare_files import compare_files, comparison_facts
-        from pipeline.report.evaluation_page import headline
+        from pipeline.ruler.evaluation.chapters import chapters
+        from pipeline.ruler.evaluation.files import EvaluationRequest
+        from pipeline.ruler.report.compare_files import compare_files, comparison_facts
+        from pipeline.ruler.report.evaluation_page import headline
+        from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
         from pipeline.runtime.run import RunRequest
-        from pipeline.runtime.tls import given_tls
         from pipeline.settings import RunSettings, read_table
 
         start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None)
@@ -298,8 +298,8 @@ def replay(
     with Console(as_json=as_json) as console:
         from pipeline import __version__
         from pipeline.io.remote_file import on_this_machine
-        from pipeline.runtime.bundle import read_bundle
-        from pipeline.runtime.isolation import IsolationLimits
+        from pipeline.runtime.isolation.isolated_items import IsolationLimits
+        from pipeline.runtime.isolation.replay_bundle import read_bundle
         from pipeline.runtime.replay import replay as replay_building
         from pipeline.runtime.replay import replay_row, write_replay
 
@@ -339,11 +339,11 @@ def _run_settings(path: str | None, **overrides: str | None) -> RunSettings:
 
 def _statistics_of(run_dir: str) -> dict[str, Any]:
     """The figures of a run, read by a child of the run if there is one: it has loaded Arrow, which takes longer."""
-    from pipeline.runtime.children import has_idle_child
+    from pipeline.runtime.isolation.child_pool import has_idle_child
 
     if has_idle_child():
-        from pipeline.runtime.events import Watch
-        from pipeline.runtime.local import LocalExecutor
+        from pipeline.runtime.cluster.local import LocalExecutor
+        from pipeline.runtime.monitoring.events import Watch
 
         return LocalExecutor(1).apart("report", _read_statistics, run_dir, Watch())
     return _read_statistics(run_dir)

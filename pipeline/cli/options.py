@@ -158,6 +158,6 @@ BuildingMemory = Annotated[
     float, typer.Option(metavar="GIB", help="Memory that a building's child process may take, in GiB.")
 ]
 BUILDING_TIMEOUT_S, BUILDING_MEMORY_GIB = 600.0, 4.0
-"""Defaults of `pipeline.runtime.isolation.IsolationLimits`, which is too slow to import for `--help`."""
+"""Defaults of `pipeline.runtime.isolation.isolated_items.IsolationLimits`, which is too slow to import for `--help`."""
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already there.")]

@@ -49,9 +49,9 @@ def simulate(
     """Simulate a scene as LAZ tiles, with the exact truth beside them."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.errors import SettingsError
-        from pipeline.runtime.events import Event
-        from pipeline.synthetic.dataset import simulate as simulate_scene
-        from pipeline.synthetic.seeds import seed_of
+        from pipeline.ruler.simulation.dataset import simulate as simulate_scene
+        from pipeline.ruler.simulation.seeds import seed_of
+        from pipeline.runtime.monitoring.events import Event
 
         if split is None and draw != 0:
             raise SettingsError([f"draw is {draw} of no split: give --split dev or --split test with it"])
@@ -85,10 +85,10 @@ def demo(
     """Simulate a small suburb, reconstruct it, measure it against the truth, draw it."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.demo import demonstrate
-        from pipeline.evaluation.chapters import chapters
-        from pipeline.evaluation.writing import measures_table
-        from pipeline.report.evaluation_page import headline
-        from pipeline.runtime.early import start_early
+        from pipeline.ruler.evaluation.chapters import chapters
+        from pipeline.ruler.evaluation.writing import measures_table
+        from pipeline.ruler.report.evaluation_page import headline
+        from pipeline.runtime.isolation.preloading import start_early
 
         start_early("reconstruct", workers=workers, scheduler=None, footprints=False, method=None)
         made = demonstrate(out, console.on_event, workers=workers, overwrite=overwrite, size_m=size, seed=seed)
@@ -135,8 +135,8 @@ def warm_up(
 
         from pipeline.compiler import warm_up
         from pipeline.errors import SettingsError
-        from pipeline.runtime.events import Event
-        from pipeline.runtime.machine import cores
+        from pipeline.runtime.monitoring.events import Event
+        from pipeline.runtime.monitoring.machine import cores
 
         groups = warm_up.groups()
         wanted = what or ["reconstruct"]

@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 import shapely
 
 from pipeline.model import FloatArray
-from pipeline.report.evaluation_maps import Entry, Layer, Map, draw_map
+from pipeline.report.maps import Entry, Layer, Map, draw_map
 
 MOST_DRAWN, MOST_ORDINARY = 30_000, 20_000
 """Footprints that are drawn. Of more that are not ordinary the largest are; where more are ordinary, the cells that

@@ -14,12 +14,11 @@ import pyarrow.compute as pc
 import shapely
 
 from pipeline.errors import RunError
-from pipeline.evaluation.chapters import NOTHING
 from pipeline.export.geoparquet import table_dataset
 from pipeline.io import arrow_at, storage_at
 from pipeline.model import REASONS, Reason, Status
 from pipeline.report.class_map import MOST_DRAWN, ROWS, ClassMap, MapClass
-from pipeline.report.evaluation_maps import BAD, FAIR, GOOD, MISSING
+from pipeline.report.maps import BAD, FAIR, GOOD, MISSING, NO_FIGURE
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
 from pipeline.report.statistics import QUANTILES, run_statistics
@@ -118,7 +117,7 @@ def run_page(run_dir: str) -> str:
         rejected=[(reason, _meaning(reason), n) for reason, n in statistics["rejected_reasons"].items()],
         inputs=manifest.inputs[:INPUTS],
         digits=_DIGITS,
-        nothing=NOTHING,
+        nothing=NO_FIGURE,
         manifest_name=NAME,
     )
 

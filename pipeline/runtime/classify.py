@@ -12,25 +12,22 @@ from uuid import uuid4
 from pipeline.errors import InputError, RunError, SettingsError
 from pipeline.export.raster import RasterLattice
 from pipeline.io import SpatialReference, is_url, shown
-from pipeline.runtime.classified_files import (
-    ClassifiedFile,
-    ClassifiedTask,
-    check_writable,
-    output_name,
-    write_classified,
-)
-from pipeline.runtime.early import loads_of
+from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.tls import TlsFiles
 from pipeline.runtime.engine import executor_for
-from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.expected import expected
-from pipeline.runtime.held_folder import held_folder, remove_abandoned
-from pipeline.runtime.ingest import Ingested, part_of
-from pipeline.runtime.join import Joined, PointRange
-from pipeline.runtime.labelling import LabelTask, label, neighbourhood
-from pipeline.runtime.measured import peak_of_process
+from pipeline.runtime.isolation.preloading import loads_of
+from pipeline.runtime.monitoring.events import Listener, Watch, ignore, never
+from pipeline.runtime.monitoring.measured import peak_of_process
 from pipeline.runtime.plan import check_memory
-from pipeline.runtime.progress import Progress
-from pipeline.runtime.rasters import (
+from pipeline.runtime.run import RunRequest, calling_off, plan_inputs
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.folder_lock import held_folder, remove_abandoned
+from pipeline.runtime.stages.ingest import Ingested, part_of
+from pipeline.runtime.stages.join import Joined, PointRange
+from pipeline.runtime.stages.label import LabelTask, label, neighbourhood
+from pipeline.runtime.stages.progress import Progress
+from pipeline.runtime.stages.rasters import (
     RASTERS,
     MosaicTask,
     RasterTask,
@@ -39,11 +36,14 @@ from pipeline.runtime.rasters import (
     with_neighbours,
     write_mosaic,
 )
-from pipeline.runtime.run import RunRequest, calling_off, plan_inputs
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.serial import Executor
-from pipeline.runtime.stages import Stages, classes_in_use, given_footprints
-from pipeline.runtime.tls import TlsFiles
+from pipeline.runtime.stages.stages import Stages, classes_in_use, given_footprints
+from pipeline.runtime.stages.write_classified import (
+    ClassifiedFile,
+    ClassifiedTask,
+    check_writable,
+    output_name,
+    write_classified,
+)
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile
 

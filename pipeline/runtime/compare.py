@@ -12,10 +12,10 @@ from typing import Any
 from pipeline.errors import RunError, SettingsError
 from pipeline.methods import METHODS, PRESETS, method_named
 from pipeline.parameters import build
-from pipeline.runtime.events import Listener, ignore, never
+from pipeline.runtime.cluster.serial import Executor
 from pipeline.runtime.manifest import NAME as MANIFEST
+from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.run import RunRequest, RunSummary, RunVariant, run_variants
-from pipeline.runtime.serial import Executor
 from pipeline.settings import RunSettings
 
 RUNS = "runs"

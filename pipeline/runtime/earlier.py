@@ -17,9 +17,9 @@ from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_dataset
 from pipeline.export.records import KEYS
 from pipeline.io.urls import has_mark, is_url, shown
-from pipeline.runtime.ingest import Ingested
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
 from pipeline.runtime.run import OVERRIDES, RunRequest, told_file
+from pipeline.runtime.stages.ingest import Ingested
 from pipeline.settings import RunSettings
 
 REJECTED = "rejected"

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import Literal
 
 from pipeline.errors import SettingsError
-from pipeline.runtime.children import kill_children, preload
+from pipeline.runtime.cluster.priorities import Traffic, priority_of
+from pipeline.runtime.cluster.serial import Executor, SerialExecutor
+from pipeline.runtime.cluster.tls import TlsFiles
 from pipeline.runtime.expected import RATES, Expected
-from pipeline.runtime.machine import cores, memory_bytes
-from pipeline.runtime.priorities import Traffic, priority_of
-from pipeline.runtime.serial import Executor, SerialExecutor
-from pipeline.runtime.tls import TlsFiles
+from pipeline.runtime.isolation.child_pool import kill_children, preload
+from pipeline.runtime.monitoring.machine import cores, memory_bytes
 
 Engine = Literal["serial", "local", "cluster"]
 
@@ -113,7 +113,7 @@ def executor_for(
     isolates
         As `engine_of` has it.
     loads : sequence of str
-        What children are to load, as `pipeline.runtime.early` tells it, unless they are started already.
+        What children are to load, as `pipeline.runtime.isolation.preloading` tells it, unless they are started already.
 
     Raises
     ------
@@ -133,14 +133,14 @@ def executor_for(
             raise SettingsError(["a performance report tells the time of workers, and there are none: use --workers 1"])
         return SerialExecutor()
     if engine == "local":
-        from pipeline.runtime.local import LocalExecutor
+        from pipeline.runtime.cluster.local import LocalExecutor
 
         if loads:
             preload(loads)
         return LocalExecutor(processes)
     if scheduler is None:
         kill_children()  # the server that was started early, in case the job was small
-    from pipeline.runtime.executors import Cluster, DaskExecutor
+    from pipeline.runtime.cluster.executors import Cluster, DaskExecutor
 
     cluster = Cluster(workers=processes, scheduler=scheduler, local_directory=local_directory, tls=tls)
     return DaskExecutor(

@@ -17,9 +17,9 @@ from pipeline.export.records import building_row
 from pipeline.export.solid_geometry import SOLID_COLUMNS
 from pipeline.model import BuildingResult, Reason
 from pipeline.reconstruct import failed_building
-from pipeline.runtime.bundle import Bundle
-from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
-from pipeline.runtime.modelling import model_bundle
+from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
+from pipeline.runtime.isolation.replay_bundle import Bundle
+from pipeline.runtime.stages.reconstruct import model_bundle
 
 _OF_THE_RUN = ("geometry", "acquired_from", "acquired_to", "mesh_path", "input_hash", "settings_hash", *SOLID_COLUMNS)
 

@@ -25,7 +25,8 @@ from pipeline.errors import RunError
 from pipeline.export.tile_update import updated_tile
 from pipeline.io import LocalStorage
 from pipeline.model import Reason
-from pipeline.runtime.bundle import SUFFIX
+from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.tls import TlsFiles
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.earlier import (
     REJECTED,
@@ -36,22 +37,15 @@ from pipeline.runtime.earlier import (
     earlier_run,
     request_of,
 )
-from pipeline.runtime.early import loads_of
 from pipeline.runtime.engine import executor_for
-from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.expected import expected
-from pipeline.runtime.gather import gather
-from pipeline.runtime.held_folder import held_results
-from pipeline.runtime.ingest import Ingested
-from pipeline.runtime.isolation import IsolationLimits
-from pipeline.runtime.join import CandidateSite, Joined, RejectedSite
+from pipeline.runtime.isolation.isolated_items import IsolationLimits
+from pipeline.runtime.isolation.preloading import loads_of
+from pipeline.runtime.isolation.replay_bundle import SUFFIX
 from pipeline.runtime.manifest import PAGE, SLOWEST, RunManifest, RunStatus, SlowBuilding, write_manifest
-from pipeline.runtime.modelling import Modelled, StoredResult
-from pipeline.runtime.overrides import Override, read_overrides
-from pipeline.runtime.overriding import WARNING, EntryOutcome
+from pipeline.runtime.monitoring.events import Listener, Watch, ignore, never
+from pipeline.runtime.overrides.overrides_file import Override, read_overrides
 from pipeline.runtime.plan import check_memory
-from pipeline.runtime.progress import Progress
-from pipeline.runtime.publish import QUARANTINE, rejected_object
 from pipeline.runtime.run import (
     OVERRIDES,
     RunRequest,
@@ -61,11 +55,17 @@ from pipeline.runtime.run import (
     told_file,
     told_request,
 )
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.scratch_folder import SCRATCH, remove_folder
-from pipeline.runtime.serial import Executor
-from pipeline.runtime.stages import GivenFootprints, Models, Splits, Stages, given_footprints, points_by_tile
-from pipeline.runtime.tls import TlsFiles
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.folder_lock import held_results
+from pipeline.runtime.scratch.location import SCRATCH, remove_folder
+from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome
+from pipeline.runtime.stages.gather import gather
+from pipeline.runtime.stages.ingest import Ingested
+from pipeline.runtime.stages.join import CandidateSite, Joined, RejectedSite
+from pipeline.runtime.stages.progress import Progress
+from pipeline.runtime.stages.publish import QUARANTINE, rejected_object
+from pipeline.runtime.stages.reconstruct import Modelled, StoredResult
+from pipeline.runtime.stages.stages import GivenFootprints, Models, Splits, Stages, given_footprints, points_by_tile
 from pipeline.tiling import MM, Tile
 
 AROUND_M = 30.0

@@ -30,16 +30,14 @@ from pipeline.io import (
 from pipeline.io.footprints import read_area
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.tile_index import TileIndex
-from pipeline.runtime.early import loads_of
+from pipeline.runtime.cluster.flight import TICK_S
+from pipeline.runtime.cluster.priorities import Traffic
+from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.tls import TlsFiles
 from pipeline.runtime.engine import executor_for
-from pipeline.runtime.events import Listener, Watch, ignore, never
 from pipeline.runtime.expected import expected
-from pipeline.runtime.flight import TICK_S
-from pipeline.runtime.held_folder import held_results
-from pipeline.runtime.ingest import Ingested
-from pipeline.runtime.isolation import IsolationLimits
-from pipeline.runtime.join import Joined
-from pipeline.runtime.logs import about
+from pipeline.runtime.isolation.isolated_items import IsolationLimits
+from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import (
     NAME,
     PAGE,
@@ -49,20 +47,22 @@ from pipeline.runtime.manifest import (
     read_manifest,
     write_manifest,
 )
-from pipeline.runtime.measured import peak_of_process
-from pipeline.runtime.overrides import read_overrides
+from pipeline.runtime.monitoring.events import Listener, Watch, ignore, never
+from pipeline.runtime.monitoring.logs import about
+from pipeline.runtime.monitoring.measured import peak_of_process
+from pipeline.runtime.overrides.overrides_file import read_overrides
 from pipeline.runtime.plan import Plan, check_memory, make_plan, without_far_files
-from pipeline.runtime.priorities import Traffic
-from pipeline.runtime.progress import Progress
-from pipeline.runtime.publish import QUARANTINE, Published
-from pipeline.runtime.run_counts import Counted, told_counts
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.scratch_folder import check_scratch, remove_folder, scratch_folder
-from pipeline.runtime.serial import Executor
-from pipeline.runtime.stages import MODELS, Models, Stages, given_footprints
-from pipeline.runtime.stale import tidy
-from pipeline.runtime.tls import TlsFiles
-from pipeline.runtime.work_folder import held_work
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.folder_lock import held_results
+from pipeline.runtime.scratch.location import check_scratch, remove_folder, scratch_folder
+from pipeline.runtime.scratch.work_folder import held_work
+from pipeline.runtime.stages.cleanup import tidy
+from pipeline.runtime.stages.counts import Counted, told_counts
+from pipeline.runtime.stages.ingest import Ingested
+from pipeline.runtime.stages.join import Joined
+from pipeline.runtime.stages.progress import Progress
+from pipeline.runtime.stages.publish import QUARANTINE, Published
+from pipeline.runtime.stages.stages import MODELS, Models, Stages, given_footprints
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM
 
@@ -87,7 +87,7 @@ class RunRequest:
     footprints: str | None = None
     """A vector file of building outlines to be modelled."""
     overrides: str | None = None
-    """A TOML file that says of single buildings what is to be done; `pipeline.runtime.overrides`."""
+    """A TOML file that says of single buildings what is to be done; `pipeline.runtime.overrides.overrides_file`."""
     crs: str | None = None
     """Stands above the headers' CRS."""
     vertical_unit: str | None = None

@@ -11,10 +11,10 @@ from typing import Any, Protocol
 
 from pipeline import __version__
 from pipeline.errors import RunCancelledError
+from pipeline.runtime.cluster.serial import Executor
 from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
-from pipeline.runtime.events import Event, Listener
+from pipeline.runtime.monitoring.events import Event, Listener
 from pipeline.runtime.run import RunRequest, RunSummary, run
-from pipeline.runtime.serial import Executor
 from pipeline.settings import RunSettings
 from service.driver.clusters import SharedCluster
 from service.driver.held import HeldJob
@@ -88,8 +88,8 @@ class WriteComparison(Protocol):
 def compare(
     request: CompareRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
 ) -> CompareSummary:
-    """`pipeline.report.compare_files.compare_files` without a reference; it loads the library that draws, so late."""
-    from pipeline.report.compare_files import compare_files
+    """`report.compare_files.compare_files` without a reference; it loads the library that draws, so late."""
+    from pipeline.ruler.report.compare_files import compare_files
 
     return compare_files(request, on_event=on_event, executor=executor, cancelled=cancelled).summary
 

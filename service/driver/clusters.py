@@ -10,12 +10,12 @@ from collections.abc import Callable
 from urllib.parse import urlsplit
 
 from pipeline.errors import ClusterError, RunCancelledError
+from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.tls import given_tls
 from pipeline.runtime.engine import workers_that_fit
-from pipeline.runtime.events import Event
-from pipeline.runtime.executors import Cluster
-from pipeline.runtime.machine import cores, memory_bytes
+from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.machine import cores, memory_bytes
 from pipeline.runtime.plan import LARGEST_TASK_BYTES
-from pipeline.runtime.tls import given_tls
 from service.driver.held import LOG, Engine, HeldJob
 from service.settings import ServiceSettings
 

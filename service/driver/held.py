@@ -9,8 +9,8 @@ from enum import IntEnum
 from types import TracebackType
 from typing import Protocol, Self
 
-from pipeline.runtime.events import Event
-from pipeline.runtime.serial import Executor
+from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.monitoring.events import Event
 from service.driver.progress import WORDS, percent
 from service.driver.wording import Scrubber
 from service.errors import LeaseLostError, StoreError
@@ -26,7 +26,7 @@ _MOST_PENDING = 500
 
 
 class Engine(Protocol):
-    """`pipeline.runtime.executors.Cluster`."""
+    """`pipeline.runtime.cluster.executors.Cluster`."""
 
     def executor(self, priority: int = 0) -> Executor:
         """An executor for one run."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 
-from pipeline.runtime import logs
-from pipeline.runtime.logs import JsonLines, PlainLines
+from pipeline.runtime.monitoring import logs
+from pipeline.runtime.monitoring.logs import JsonLines, PlainLines
 
 __all__ = ["JsonLines", "PlainLines", "configure", "quieten"]
 

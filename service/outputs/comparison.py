@@ -10,7 +10,7 @@ from typing import Any
 
 from markupsafe import escape
 
-from pipeline.evaluation.markdown import markdown_cell
+from pipeline.ruler.evaluation.markdown import markdown_cell
 from service.outputs.assemble import Progress, published_tiles, write_outputs
 from service.outputs.catalogue import NAME as CATALOGUE_NAME
 from service.outputs.catalogue import Catalogue, StoredOutput, read_catalogue, run_outputs

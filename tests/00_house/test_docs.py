@@ -13,14 +13,14 @@ from types import ModuleType
 import pytest
 
 from pipeline.batch.batch_file import read_batch
-from pipeline.epochs.settings import DiffSettings, read_settings
 from pipeline.export.records import SCHEMAS
 from pipeline.io import SpatialReference
 from pipeline.methods.fuzzy_sart import FuzzySartSettings
 from pipeline.model import REASONS, Reason, RoofType, Status
 from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings
-from pipeline.runtime.overrides import overrides_of
+from pipeline.ruler.epochs.settings import DiffSettings, read_settings
+from pipeline.runtime.overrides.overrides_file import overrides_of
 from pipeline.settings import RunSettings
 
 ROOT = Path(__file__).resolve().parents[2]

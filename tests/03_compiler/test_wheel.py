@@ -49,7 +49,7 @@ COMMANDS = (
 )
 """What docs/how_to/plan_a_run.md promises to compile nothing after `warm-up all`.
 
-The suite hofmann310 is left out: `simulate` calls `pipeline.synthetic.survey_faults.move_faulty` for it, which
+The suite hofmann310 is left out: `simulate` calls `pipeline.ruler.simulation.survey_faults.move_faulty` for it, which
 `kernels.json` lacks.
 """
 

@@ -10,10 +10,10 @@ import shapely
 
 from pipeline.errors import SettingsError
 from pipeline.model import FloatArray, PointCloud
-from pipeline.synthetic.als import ScanBlock, ScannerSettings, scan, scan_all, strip_count
-from pipeline.synthetic.roofs import RoofDimensions, RoofShape
-from pipeline.synthetic.scene import Scene, Terrain
-from pipeline.synthetic.suites import SUITES, single_building
+from pipeline.ruler.simulation.als import ScanBlock, ScannerSettings, scan, scan_all, strip_count
+from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
+from pipeline.ruler.simulation.scene import Scene, Terrain
+from pipeline.ruler.simulation.suites import SUITES, single_building
 
 PLAIN = ScannerSettings(strip_overlap=0.0, strip_spacing_m=100.0, drop_out=0.0)
 FIELD = Scene(

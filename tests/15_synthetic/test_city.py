@@ -17,17 +17,17 @@ import pytest
 import shapely
 
 from pipeline.errors import SettingsError
-from pipeline.evaluation.reading import read_models
 from pipeline.model import FloatArray
-from pipeline.synthetic import suites
-from pipeline.synthetic.als import ScanBlock, scan_all
-from pipeline.synthetic.city import CITY_SCANNER, CityPlan, city
-from pipeline.synthetic.conditions import terrain_slope_deg
-from pipeline.synthetic.dataset import ScenePaths, read_truth, simulate, tile_extents
-from pipeline.synthetic.scene import Defect, Scene
-from pipeline.synthetic.strips import reached
-from pipeline.synthetic.suites import SUITES
-from pipeline.synthetic.truth_files import write_models
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.simulation import suites
+from pipeline.ruler.simulation.als import ScanBlock, scan_all
+from pipeline.ruler.simulation.city import CITY_SCANNER, CityPlan, city
+from pipeline.ruler.simulation.conditions import terrain_slope_deg
+from pipeline.ruler.simulation.dataset import ScenePaths, read_truth, simulate, tile_extents
+from pipeline.ruler.simulation.scene import Defect, Scene
+from pipeline.ruler.simulation.strips import reached
+from pipeline.ruler.simulation.suites import SUITES
+from pipeline.ruler.simulation.truth_files import write_models
 
 SIZE = (300.0, 220.0)
 SPARSE = dataclasses.replace(CITY_SCANNER, pulse_density_per_m2=1.0)
@@ -207,7 +207,7 @@ def test_a_city_is_written_in_bounded_memory(tmp_path: Path) -> None:
     """Measured in a process of its own: four times the tiles, about the same peak."""
     program = (
         "import resource, sys\n"
-        "from pipeline.synthetic.dataset import simulate\n"
+        "from pipeline.ruler.simulation.dataset import simulate\n"
         "made = simulate('city', sys.argv[1], 1000, size_m=(float(sys.argv[2]),) * 2, density_per_m2=6.0)\n"
         "print(made.points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
     )

@@ -15,11 +15,11 @@ import pytest
 import shapely
 
 from pipeline.errors import InputError, SettingsError
-from pipeline.evaluation.reading import read_models
 from pipeline.io import open_source
-from pipeline.synthetic.conditions import CONDITIONS
-from pipeline.synthetic.dataset import ScenePaths, read_truth, simulate
-from pipeline.synthetic.suites import SUITES
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.simulation.conditions import CONDITIONS
+from pipeline.ruler.simulation.dataset import ScenePaths, read_truth, simulate
+from pipeline.ruler.simulation.suites import SUITES
 
 SIZE = (110.0, 90.0)
 
@@ -223,7 +223,7 @@ def test_ten_million_points_are_streamed_in_bounded_memory(tmp_path: Path) -> No
     """Measured in a process of its own: the peak may not grow with the number of points."""
     program = (
         "import resource, sys\n"
-        "from pipeline.synthetic.dataset import simulate\n"
+        "from pipeline.ruler.simulation.dataset import simulate\n"
         "made = simulate('town', sys.argv[1], size_m=(float(sys.argv[2]),) * 2, chunk_points=500_000)\n"
         "print(made.points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
     )

@@ -9,8 +9,8 @@ import pytest
 import shapely
 
 from pipeline.model import FloatArray
-from pipeline.synthetic.envelope import RoofPart, envelope
-from pipeline.synthetic.roof_dimensions import FaceRings, RoofFaces
+from pipeline.ruler.simulation.envelope import RoofPart, envelope
+from pipeline.ruler.simulation.roof_dimensions import FaceRings, RoofFaces
 
 Place = tuple[float, float]
 

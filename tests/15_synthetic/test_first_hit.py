@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.synthetic.first_hit import BOX, GROUND, ROOF, TREE, WALL, mixed_bits, uniform_of
-from pipeline.synthetic.line_hits import hits_of_lines, top_surface
-from pipeline.synthetic.scene import Scene, Terrain, Tree
-from pipeline.synthetic.scene_arrays import scene_arrays
-from pipeline.synthetic.solids import building_solid
-from pipeline.synthetic.suites import SUITES
+from pipeline.ruler.simulation.first_hit import BOX, GROUND, ROOF, TREE, WALL, mixed_bits, uniform_of
+from pipeline.ruler.simulation.line_hits import hits_of_lines, top_surface
+from pipeline.ruler.simulation.scene import Scene, Terrain, Tree
+from pipeline.ruler.simulation.scene_arrays import scene_arrays
+from pipeline.ruler.simulation.solids import building_solid
+from pipeline.ruler.simulation.suites import SUITES
 
 SUBURB = SUITES["suburb"].make(2, (120.0, 120.0))
 TOWN = SUITES["town"].make(2, (120.0, 120.0))

@@ -14,12 +14,12 @@ import shapely
 
 from pipeline.errors import SettingsError
 from pipeline.model import RoofType
-from pipeline.synthetic.als import scan_all
-from pipeline.synthetic.conditions import terrain_slope_deg
-from pipeline.synthetic.dataset import ScenePaths, read_truth, simulate
-from pipeline.synthetic.hofmann310 import SCANNER, hofmann310
-from pipeline.synthetic.roofs import RoofShape
-from pipeline.synthetic.scene import Defect, FaultKind, Scene
+from pipeline.ruler.simulation.als import scan_all
+from pipeline.ruler.simulation.conditions import terrain_slope_deg
+from pipeline.ruler.simulation.dataset import ScenePaths, read_truth, simulate
+from pipeline.ruler.simulation.hofmann310 import SCANNER, hofmann310
+from pipeline.ruler.simulation.roofs import RoofShape
+from pipeline.ruler.simulation.scene import Defect, FaultKind, Scene
 
 SURVEY_DEFECTS = {Defect.STRIP_SHIFT, Defect.WRONG_ROWS}
 

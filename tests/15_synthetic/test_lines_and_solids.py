@@ -15,15 +15,15 @@ from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
 from pipeline.model import FaceKind, FloatArray, IntArray
-from pipeline.synthetic.additions import can_have_dormers, random_dormers, random_superstructures
-from pipeline.synthetic.als import ScannerSettings, scan_all
-from pipeline.synthetic.first_hit import GROUND, ROOF, WALL
-from pipeline.synthetic.line_hits import hits_of_lines
-from pipeline.synthetic.random_dimensions import random_dimensions
-from pipeline.synthetic.roofs import RoofDimensions, RoofShape
-from pipeline.synthetic.scene import Building, Scene, Terrain, place_building, undulating_terrain
-from pipeline.synthetic.scene_arrays import scene_arrays
-from pipeline.synthetic.solids import building_solid
+from pipeline.ruler.simulation.additions import can_have_dormers, random_dormers, random_superstructures
+from pipeline.ruler.simulation.als import ScannerSettings, scan_all
+from pipeline.ruler.simulation.first_hit import GROUND, ROOF, WALL
+from pipeline.ruler.simulation.line_hits import hits_of_lines
+from pipeline.ruler.simulation.random_dimensions import random_dimensions
+from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
+from pipeline.ruler.simulation.scene import Building, Scene, Terrain, place_building, undulating_terrain
+from pipeline.ruler.simulation.scene_arrays import scene_arrays
+from pipeline.ruler.simulation.solids import building_solid
 
 LEAN = 0.45
 LINES = 3000

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.synthetic.plots import PlannedBuilding, packed_plots
-from pipeline.synthetic.roofs import ROOFS, RoofDimensions, RoofShape
-from pipeline.synthetic.scene import turned
+from pipeline.ruler.simulation.plots import PlannedBuilding, packed_plots
+from pipeline.ruler.simulation.roofs import ROOFS, RoofDimensions, RoofShape
+from pipeline.ruler.simulation.scene import turned
 
 
 def planned(count: int) -> list[PlannedBuilding]:

@@ -12,14 +12,14 @@ import shapely
 
 from pipeline.model import FloatArray
 from pipeline.roof.roof_type import RoofTypeSettings, roof_type
-from pipeline.synthetic.additions import (
+from pipeline.ruler.simulation.additions import (
     can_have_dormers,
     plan_rectangle,
     random_dormers,
     random_superstructures,
 )
-from pipeline.synthetic.random_dimensions import SHORTEST_SIDE_M, random_dimensions
-from pipeline.synthetic.roofs import (
+from pipeline.ruler.simulation.random_dimensions import SHORTEST_SIDE_M, random_dimensions
+from pipeline.ruler.simulation.roofs import (
     ROOF_TYPES,
     ROOFS,
     Addition,
@@ -29,8 +29,8 @@ from pipeline.synthetic.roofs import (
     RoofFaces,
     RoofShape,
 )
-from pipeline.synthetic.scene import Building, Terrain, place_building
-from pipeline.synthetic.solids import truth_record
+from pipeline.ruler.simulation.scene import Building, Terrain, place_building
+from pipeline.ruler.simulation.solids import truth_record
 
 SHAPES = list(RoofShape)
 WITH_STEPS = {RoofShape.MULTI_LEVEL_FLAT}

@@ -11,9 +11,9 @@ import shapely
 
 from pipeline.model import FaceKind, RoofType, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.synthetic.additions import random_dormers, random_superstructures
-from pipeline.synthetic.random_dimensions import random_dimensions
-from pipeline.synthetic.roofs import (
+from pipeline.ruler.simulation.additions import random_dormers, random_superstructures
+from pipeline.ruler.simulation.random_dimensions import random_dimensions
+from pipeline.ruler.simulation.roofs import (
     ROOF_TYPES,
     ROOFS,
     Addition,
@@ -22,9 +22,9 @@ from pipeline.synthetic.roofs import (
     RoofDimensions,
     RoofShape,
 )
-from pipeline.synthetic.scene import Building, Defect, Terrain, WetSpot, place_building, undulating_terrain
-from pipeline.synthetic.solids import building_solid, has_steps, truth_record
-from pipeline.synthetic.suites import SUITES
+from pipeline.ruler.simulation.scene import Building, Defect, Terrain, WetSpot, place_building, undulating_terrain
+from pipeline.ruler.simulation.solids import building_solid, has_steps, truth_record
+from pipeline.ruler.simulation.suites import SUITES
 
 SIZES = {
     RoofShape.FLAT: RoofDimensions(length_m=11.0, width_m=8.0),

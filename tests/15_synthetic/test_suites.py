@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.errors import SettingsError
-from pipeline.synthetic.roofs import RoofShape
-from pipeline.synthetic.scene import Scene
-from pipeline.synthetic.seeds import DRAWS, FIRST_SEEDS, Split, seed_of, split_of
-from pipeline.synthetic.suites import SUITES, suite_named
+from pipeline.ruler.simulation.roofs import RoofShape
+from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.seeds import DRAWS, FIRST_SEEDS, Split, seed_of, split_of
+from pipeline.ruler.simulation.suites import SUITES, suite_named
 
 SMALL = {"town": (150.0, 120.0), "city": (150.0, 100.0)}
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.model import BoolArray, FloatArray
-from pipeline.synthetic.als import ScanBlock, ScannerSettings, joined, reach_m, scan, scan_all, strip_count
-from pipeline.synthetic.roofs import RoofDimensions, RoofShape
-from pipeline.synthetic.scene import (
+from pipeline.ruler.simulation.als import ScanBlock, ScannerSettings, joined, reach_m, scan, scan_all, strip_count
+from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
+from pipeline.ruler.simulation.scene import (
     Building,
     FaultKind,
     Scene,
@@ -20,8 +20,8 @@ from pipeline.synthetic.scene import (
     place_building,
     undulating_terrain,
 )
-from pipeline.synthetic.strips import flight_lines, lines_over
-from pipeline.synthetic.town import town
+from pipeline.ruler.simulation.strips import flight_lines, lines_over
+from pipeline.ruler.simulation.town import town
 
 WHOLE = (0.0, 0.0, 220.0, 160.0)
 TOWN = dataclasses.replace(town(5, size_m=WHOLE[2:]), survey_extent=WHOLE)

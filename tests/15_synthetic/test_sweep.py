@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.errors import SettingsError
-from pipeline.synthetic.dataset import ScenePaths, simulate
-from pipeline.synthetic.roofs import RoofShape
-from pipeline.synthetic.sweep import CELLS, DENSITIES_PER_M2, NOISES_M, chosen_cells, sweep
+from pipeline.ruler.simulation.dataset import ScenePaths, simulate
+from pipeline.ruler.simulation.roofs import RoofShape
+from pipeline.ruler.simulation.sweep import CELLS, DENSITIES_PER_M2, NOISES_M, chosen_cells, sweep
 
 
 @pytest.fixture(scope="module")

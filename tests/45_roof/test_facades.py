@@ -14,9 +14,9 @@ from pipeline.roof.block import block_plane
 from pipeline.roof.facades import Eave, FacadePoints, at_walls, eave_of, mean_overhang_m
 from pipeline.roof.plan import partition_roof, roof_points
 from pipeline.roof.settings import RoofSettings
-from pipeline.synthetic.als import scan_all
-from pipeline.synthetic.seeds import seed_of
-from pipeline.synthetic.sweep import SCANNER, sweep
+from pipeline.ruler.simulation.als import scan_all
+from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.ruler.simulation.sweep import SCANNER, sweep
 
 EAVE_Z = 6.0
 NONE: FloatArray = np.zeros((0, 3))

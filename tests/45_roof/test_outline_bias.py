@@ -13,10 +13,10 @@ from pipeline.model import Candidate
 from pipeline.roof.block import block_plane
 from pipeline.roof.plan import partition_roof, roof_points
 from pipeline.roof.settings import RoofSettings
-from pipeline.synthetic.als import scan_all
-from pipeline.synthetic.scene import Scene
-from pipeline.synthetic.seeds import seed_of
-from pipeline.synthetic.sweep import SCANNER, sweep
+from pipeline.ruler.simulation.als import scan_all
+from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.ruler.simulation.sweep import SCANNER, sweep
 
 
 @functools.cache

@@ -12,10 +12,10 @@ import pytest
 from pipeline.model import RoofType
 from pipeline.roof.roof_type import RoofTypeSettings, roof_type
 from pipeline.roof.solid import solid_parts
-from pipeline.synthetic.random_dimensions import random_dimensions
-from pipeline.synthetic.roofs import ROOF_TYPES, RoofShape
-from pipeline.synthetic.scene import Terrain, place_building
-from pipeline.synthetic.solids import truth_record
+from pipeline.ruler.simulation.random_dimensions import random_dimensions
+from pipeline.ruler.simulation.roofs import ROOF_TYPES, RoofShape
+from pipeline.ruler.simulation.scene import Terrain, place_building
+from pipeline.ruler.simulation.solids import truth_record
 
 ExactRoofs = Callable[..., Any]
 

@@ -14,11 +14,11 @@ import pytest
 from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate
 from pipeline.reconstruct import reconstruct_building
-from pipeline.runtime.measured import Measured, measure
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.runtime.cluster.serial import SerialExecutor
+from pipeline.runtime.monitoring.measured import Measured, measure
 from pipeline.runtime.run import RunRequest, RunSummary, run
-from pipeline.runtime.serial import SerialExecutor
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
 
 
 @pytest.fixture(scope="session")

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from pipeline.errors import RunCancelledError
-from pipeline.runtime.events import Event
-from pipeline.runtime.kept import keep
+from pipeline.runtime.cluster.serial import SerialExecutor
 from pipeline.runtime.manifest import RunStatus, read_manifest
-from pipeline.runtime.measured import Measured, measure
+from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.measured import Measured, measure
 from pipeline.runtime.run import RunRequest, RunSummary, run
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.serial import SerialExecutor
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.outcomes import keep
 from pipeline.settings import RunSettings
 
 STAGES = ("ingest", "split", "reconstruct", "publish")

@@ -25,8 +25,8 @@ from pipeline.errors import (
 from pipeline.io import open_source
 from pipeline.io.las_frame import read_frame
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
-from pipeline.runtime.events import Event
-from pipeline.runtime.held_folder import held_folder, remove_abandoned
+from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.scratch.folder_lock import held_folder, remove_abandoned
 from pipeline.settings import RunSettings
 
 Classify = Callable[..., ClassifySummary]
@@ -60,7 +60,7 @@ def classes_in(summary: ClassifySummary, number: int = 0) -> np.ndarray[Any, Any
 @pytest.fixture(scope="session")
 def true_suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The suburb with its true classes."""
-    from pipeline.synthetic.dataset import simulate
+    from pipeline.ruler.simulation.dataset import simulate
 
     folder = tmp_path_factory.mktemp("true")
     simulate("suburb", folder, 3, size_m=(90.0, 90.0), density_per_m2=6.0, with_classes=True)

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import pytest
 
 from pipeline.errors import InputError, RunCancelledError, RunError, SettingsError
-from pipeline.runtime import modelling
 from pipeline.runtime.compare import (
     BUILDINGS,
     PAGE,
@@ -24,9 +23,10 @@ from pipeline.runtime.compare import (
     parse_variants,
     settings_of,
 )
-from pipeline.runtime.events import Event
-from pipeline.runtime.modelling import load_once
+from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.run import RunRequest, RunVariant, run, run_variants
+from pipeline.runtime.stages import reconstruct
+from pipeline.runtime.stages.reconstruct import load_once
 from pipeline.settings import RunSettings
 
 BOTH = parse_variants(["fuzzy-sart,fuzzy-sart:faithful"])
@@ -158,8 +158,8 @@ def test_no_building_is_charged_for_loading_its_method(
 ) -> None:
     loaded: list[str] = []
     # a clock that stands still but while a method is loaded
-    monkeypatch.setattr(modelling, "time", SimpleNamespace(perf_counter=lambda: 100.0 * len(loaded)))
-    monkeypatch.setattr(modelling, "load", loaded.append)
+    monkeypatch.setattr(reconstruct, "time", SimpleNamespace(perf_counter=lambda: 100.0 * len(loaded)))
+    monkeypatch.setattr(reconstruct, "load", loaded.append)
     load_once.cache_clear()
     try:
         variants = parse_variants(["fuzzy-sart,kmeans,fuzzy-sart:faithful"])
@@ -172,7 +172,7 @@ def test_no_building_is_charged_for_loading_its_method(
 
 def test_a_run_by_one_method_loads_nothing_ahead(suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded: list[str] = []
-    monkeypatch.setattr(modelling, "load_once", loaded.append)
+    monkeypatch.setattr(reconstruct, "load_once", loaded.append)
     run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "out"), workers=0))
     assert loaded == []
 

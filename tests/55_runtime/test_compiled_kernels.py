@@ -14,7 +14,7 @@ from pipeline.compiler import kernel
 def half(x):
     return x / {divisor}
 """
-ASKED = "from kernel import half; from pipeline.runtime.compiled_kernels import kernels_are_compiled as told; "
+ASKED = "from kernel import half; from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled as told; "
 
 
 def says(folder: Path, words: str, **environment: str) -> list[str]:
@@ -38,7 +38,7 @@ def test_a_kernel_is_compiled_once_it_was_called_here_and_no_more_when_source_or
 
 
 def test_an_empty_cache_is_told_and_stays_empty_and_without_numba_nothing_need_be_compiled(tmp_path: Path) -> None:
-    asked = "from pipeline.runtime.compiled_kernels import kernels_are_compiled as told; print(told())"
+    asked = "from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled as told; print(told())"
     assert says(tmp_path, asked) == ["False"]
     assert list((tmp_path / "cache").rglob("*.kernel")) == []
     assert says(tmp_path, asked, NUMBA_DISABLE_JIT="1") == ["True"]

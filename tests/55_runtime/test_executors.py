@@ -17,16 +17,16 @@ import pytest
 from distributed import Client, Status
 
 from pipeline.errors import ClusterError, RunCancelledError, RunError, VersionMismatchError
-from pipeline.runtime import worker_setup
+from pipeline.runtime.cluster import worker_setup
+from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.flight import Lookout
+from pipeline.runtime.cluster.local import LocalExecutor
+from pipeline.runtime.cluster.serial import SerialExecutor
 from pipeline.runtime.engine import executor_for
-from pipeline.runtime.events import Event, Watch
-from pipeline.runtime.executors import Cluster
-from pipeline.runtime.flight import Lookout
-from pipeline.runtime.forking import can_fork
-from pipeline.runtime.local import LocalExecutor
-from pipeline.runtime.measured import Measured, measure_packed, packed
-from pipeline.runtime.serial import SerialExecutor
-from pipeline.runtime.versions import ENGINE, differences, fingerprint, versions_here, versions_of
+from pipeline.runtime.isolation.forked_child import can_fork
+from pipeline.runtime.monitoring.events import Event, Watch
+from pipeline.runtime.monitoring.measured import Measured, measure_packed, packed
+from pipeline.runtime.monitoring.versions import ENGINE, differences, fingerprint, versions_here, versions_of
 
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
 
@@ -318,7 +318,7 @@ def test_a_broken_connection_to_the_scheduler_is_told_at_once() -> None:
 
 
 def test_a_scheduler_that_is_not_there_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.runtime.executors.CONNECT_S", 1.0)
+    monkeypatch.setattr("pipeline.runtime.cluster.executors.CONNECT_S", 1.0)
     executor = executor_for(workers=2, scheduler="tcp://127.0.0.1:9", local_directory="")
     with pytest.raises(ClusterError, match=r"tcp://127.0.0.1:9 does not answer.*Check the address"), executor:
         pytest.fail("it connected")

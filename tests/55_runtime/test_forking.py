@@ -18,8 +18,8 @@ import psutil
 import pytest
 
 from pipeline.errors import RunCancelledError, RunError
-from pipeline.runtime import children, process_server
-from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
+from pipeline.runtime.isolation import child_pool, fork_server
+from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
 DEADLINE_S = 120.0
@@ -45,9 +45,9 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are f
 @pytest.fixture(autouse=True)
 def no_children_left() -> Iterator[None]:
     """Neither children nor servers of other tests, and none afterwards."""
-    children.kill_children()
+    child_pool.kill_children()
     yield
-    children.kill_children()
+    child_pool.kill_children()
     assert ours() == []
 
 
@@ -60,9 +60,9 @@ def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     import loaded_by_a_test  # type: ignore[import-not-found]
 
     def asked(expression: str, loads: str = "loaded_by_a_test:load") -> Any:
-        for child in tuple(children._children._idle):
+        for child in tuple(child_pool._children._idle):
             child.begun = 1
-        with children.lent_child(lambda: False, fresh=True, loads=(loads,)) as child:
+        with child_pool.lent_child(lambda: False, fresh=True, loads=(loads,)) as child:
             child.begun = 1
         ((_, found),) = supervise(loaded_by_a_test.ask, [expression], LIMITS, loads=(loads,))
         return found
@@ -79,7 +79,7 @@ def ours() -> list[psutil.Process]:
 
 def servers() -> list[psutil.Process]:
     """The servers of this process that live."""
-    found = [process for process in ours() if process.name() == process_server.NAME]
+    found = [process for process in ours() if process.name() == fork_server.NAME]
     return [process for process in found if process.status() != psutil.STATUS_ZOMBIE]
 
 
@@ -100,13 +100,13 @@ def test_children_have_what_their_server_loaded(ask: Callable[..., Any]) -> None
 
 
 def test_a_server_is_there_before_anybody_asks_for_a_child(ask: Callable[..., Any]) -> None:
-    children.preload(["loaded_by_a_test"])
+    child_pool.preload(["loaded_by_a_test"])
     (server,) = wait_for(servers, "the server")
     assert ask("__import__('loaded_by_a_test').LOADED_BY") == server.pid
 
 
 def test_what_a_server_cannot_load_is_told_by_the_child(ask: Callable[..., Any]) -> None:
-    children.preload(["loaded_by_a_test:fail"])
+    child_pool.preload(["loaded_by_a_test:fail"])
     assert ask("1 + 1") == 2
     with pytest.raises(RunError, match=r"(?s)3 times in a row.*OSError: not loaded"):
         ask("1", "loaded_by_a_test:fail")
@@ -118,7 +118,7 @@ def test_children_have_the_environment_and_the_folder_of_now(
     server = ask("os.getppid()")
     monkeypatch.setenv("SOME_WORD", "new")
     monkeypatch.chdir(tmp_path)
-    children._children._idle[0].end()
+    child_pool._children._idle[0].end()
     assert ask("os.environ['SOME_WORD'], os.getcwd(), os.getppid()") == ("new", str(tmp_path), server)
 
 
@@ -127,7 +127,7 @@ def test_a_variable_that_is_read_once_gets_another_server(
 ) -> None:
     before = ask("os.getppid()")
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
-    children._children._idle[0].end()
+    child_pool._children._idle[0].end()
     after = ask("os.getppid()")
     assert after != before
     wait_for(lambda: [server.pid for server in servers()] == [after], "the end of the server that forks no more")
@@ -159,17 +159,17 @@ def test_children_of_a_server_that_is_killed_die_and_the_work_is_done_by_others(
 def test_a_service_that_is_told_to_end_keeps_its_server(ask: Callable[..., Any]) -> None:
     server = ask("os.getppid()")
     os.kill(server, signal.SIGTERM)
-    children._children._idle[0].end()
+    child_pool._children._idle[0].end()
     assert ask("os.getppid()") == server
 
 
 def test_nothing_is_forked_from_a_process_with_threads(
     ask: Callable[..., Any], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(children._children, "_can_fork", True)  # it is not afterwards
+    monkeypatch.setattr(child_pool._children, "_can_fork", True)  # it is not afterwards
     with caplog.at_level(logging.WARNING):
         assert ask("os.getppid()", "loaded_by_a_test:load_with_thread") == os.getpid()
-        children._children._idle[0].end()
+        child_pool._children._idle[0].end()
         assert ask("os.getppid()", "loaded_by_a_test:load") == os.getpid()
     assert "started threads" in caplog.text
 
@@ -177,7 +177,7 @@ def test_nothing_is_forked_from_a_process_with_threads(
 def test_where_nothing_can_be_forked_children_are_executed(
     ask: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(children._children, "_can_fork", False)
+    monkeypatch.setattr(child_pool._children, "_can_fork", False)
     assert ask("os.getppid()") == os.getpid()
     loss = ask("os.kill(os.getpid(), 11)")
     assert "signal 11 (SIGSEGV), also alone" in loss.detail
@@ -191,19 +191,19 @@ def test_a_child_that_is_called_off_before_its_server_has_loaded_never_begins(
     os.mkfifo(fifo)  # who opens it waits for somebody who writes
     with (
         pytest.raises(RunCancelledError),
-        children.lent_child(lambda: True, fresh=False, loads=(f"loaded_by_a_test:read:{fifo}",)),
+        child_pool.lent_child(lambda: True, fresh=False, loads=(f"loaded_by_a_test:read:{fifo}",)),
     ):
         pytest.fail("it is not ready")
-    assert children._children._all == set()
+    assert child_pool._children._all == set()
 
 
 FIRST_FILE = """
 import functools, os, sys
 held = os.open(sys.argv[1], os.O_RDONLY)
 assert held == 3, held
-from pipeline.runtime import children
-from pipeline.runtime.isolation import IsolationLimits, supervise
-children.fork_server()
+from pipeline.runtime.isolation import child_pool
+from pipeline.runtime.isolation.isolated_items import IsolationLimits, supervise
+child_pool.fork_server()
 limits = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
 for turn in range(2):
     print([found for _, found in supervise(functools.partial(os.pread, 3, 5), [0, 1], limits)])

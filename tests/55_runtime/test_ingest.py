@@ -14,8 +14,8 @@ from pipeline.io import ReadOptions
 from pipeline.io.las import LasFile
 from pipeline.io.records import PointRecords
 from pipeline.model import PointCloud
-from pipeline.runtime.ingest import IngestTask, ingest, spread_m, to_records
-from pipeline.runtime.scratch import POINT, Scratch
+from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.stages.ingest import IngestTask, ingest, spread_m, to_records
 from pipeline.tiling import TileGrid
 
 
@@ -93,7 +93,7 @@ def test_many_tiles_in_a_chunk_are_sorted_apart_as_few_are(
     suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = ingest(task(suburb, tmp_path / "few"))
-    monkeypatch.setattr("pipeline.runtime.ingest._TWO_BYTES", 1)
+    monkeypatch.setattr("pipeline.runtime.stages.ingest._TWO_BYTES", 1)
     many = ingest(task(suburb, tmp_path / "many"))
     assert many == few
     for key, bucket in stored(tmp_path / "few").items():

@@ -24,9 +24,9 @@ from faults.asked import environment
 import pipeline.reconstruct
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.model import Candidate, Reason
-from pipeline.runtime import child, children
-from pipeline.runtime.isolation import IsolationLimits, Loss, supervise
-from pipeline.runtime.messages import Frames, frame
+from pipeline.runtime.isolation import child_main, child_pool
+from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
+from pipeline.runtime.isolation.messages import Frames, frame
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
 DEADLINE_S = 120.0
@@ -35,16 +35,16 @@ DEADLINE_S = 120.0
 @pytest.fixture(autouse=True)
 def no_children_left() -> Iterator[None]:
     """Children that know no faults of other tests, and none afterwards."""
-    children.kill_children()
+    child_pool.kill_children()
     yield
-    children.kill_children()
+    child_pool.kill_children()
     assert child_processes() == []
 
 
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> None:
     """Children that load nothing, and so start at once."""
-    monkeypatch.setattr(children, "_LOADS", ())
+    monkeypatch.setattr(child_pool, "_LOADS", ())
 
 
 def child_processes(of: int | None = None) -> list[psutil.Process]:
@@ -52,7 +52,7 @@ def child_processes(of: int | None = None) -> list[psutil.Process]:
     found = []
     for process in psutil.Process(of).children(recursive=True):
         with contextlib.suppress(psutil.NoSuchProcess):
-            if process.name() == child.NAME and not ended(process):
+            if process.name() == child_main.NAME and not ended(process):
                 found.append(process)
     return found
 
@@ -265,7 +265,7 @@ def test_a_new_child_calls_what_it_is_told_to_load_with_its_argument(tmp_path: P
 
 
 def test_children_that_cannot_start_are_an_error_that_tells_what_they_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(children, "_LOADS", ("no_such_module:load",))
+    monkeypatch.setattr(child_pool, "_LOADS", ("no_such_module:load",))
     with pytest.raises(RunError, match=r"(?s)3 times in a row.*No module named 'no_such_module'"):
         outcomes(len, ["abc"])
 
@@ -305,9 +305,9 @@ WORKER = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started us with SIGINT ignored
 sys.path.insert(0, sys.argv[1])
-from pipeline.runtime import children
-from pipeline.runtime.isolation import IsolationLimits, supervise
-children._LOADS = ()
+from pipeline.runtime.isolation import child_pool
+from pipeline.runtime.isolation.isolated_items import IsolationLimits, supervise
+child_pool._LOADS = ()
 import orders_of_a_test
 for _ in supervise(orders_of_a_test.do, [sys.argv[2]], IsolationLimits()):
     print("done", flush=True)

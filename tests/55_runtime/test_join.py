@@ -20,12 +20,12 @@ from slow_join import WholeSplit, whole_join, whole_surfaces
 
 from pipeline.kernels.union_find import united
 from pipeline.model import IntArray, Tin
-from pipeline.runtime.border_facets import facet_names, telling_facets, united_by_name
-from pipeline.runtime.join import Joined, join
-from pipeline.runtime.open_fragments import open_fragments
-from pipeline.runtime.split import Split
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.runtime.stages.border_facets import facet_names, telling_facets, united_by_name
+from pipeline.runtime.stages.join import Joined, join
+from pipeline.runtime.stages.open_fragments import open_fragments
+from pipeline.runtime.stages.split import Split
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse, SceneSettings, WindowPoints, split_tile
-from pipeline.synthetic.dataset import simulate
 from pipeline.terrain.candidates import NOWHERE, CandidateSettings
 from pipeline.terrain.facets import FacetKind, VertexKind
 from pipeline.terrain.surfaces import N_SUMS, Fragments, ScenePoints, SceneVertices, Sum, SurfaceSettings, fragments_of

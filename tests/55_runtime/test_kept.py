@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import RunCancelledError, RunError
-from pipeline.runtime.kept import Keeper, Keeping, Place, keep, key_of, result_of, told_of, whole
-from pipeline.runtime.scratch import POINT, Scratch
-from pipeline.runtime.tile_content import content_of_window, zone_sums
+from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.scratch.outcomes import Keeper, Keeping, Place, keep, key_of, result_of, told_of, whole
+from pipeline.runtime.stages.tile_content import content_of_window, zone_sums
 from pipeline.tiling import MM, Tile, TileGrid
 
 
@@ -61,7 +61,7 @@ def test_different_things_have_different_keys() -> None:
 
 def test_equal_things_have_equal_keys_in_every_process() -> None:
     value = {"b": (1, 2.5, "x"), "a": One({"k": [1, 2]})}
-    program = "from pipeline.runtime.kept import key_of; print(key_of({'a': (1, 2.5), 'b': 'x'}))"
+    program = "from pipeline.runtime.scratch.outcomes import key_of; print(key_of({'a': (1, 2.5), 'b': 'x'}))"
     elsewhere = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert elsewhere.stdout.strip() == key_of({"b": "x", "a": [1, 2.5]})
     assert key_of(value) == key_of(pickle.loads(pickle.dumps(value)))

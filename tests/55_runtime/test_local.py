@@ -15,11 +15,11 @@ from faults.asked import environment
 from processes import wait_for
 
 from pipeline.errors import RunCancelledError, RunError
-from pipeline.runtime import children
-from pipeline.runtime.events import Watch
-from pipeline.runtime.local import LocalExecutor
+from pipeline.runtime.cluster.local import LocalExecutor
+from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.manifest import read_manifest
-from pipeline.runtime.measured import Measured, peak_of_process
+from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.measured import Measured, peak_of_process
 
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
 
@@ -29,10 +29,10 @@ import chores
 @pytest.fixture(autouse=True)
 def children_that_know_chores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Children of a server of its own, which finds the tasks of this file."""
-    children.kill_children()
+    child_pool.kill_children()
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent / "on_workers"), prepend=os.pathsep)
     yield
-    children.kill_children()
+    child_pool.kill_children()
 
 
 def results(executor: LocalExecutor, function: Any, tasks: list[Any], watch: Watch | None = None) -> list[Any]:
@@ -53,9 +53,9 @@ def test_tasks_see_the_environment_of_now_also_where_older_children_wait(monkeyp
     for key in ("one", "two"):
         monkeypatch.setenv("AWS_ACCESS_KEY_ID", key)
         assert results(executor, chores.variable, ["AWS_ACCESS_KEY_ID"]) == [key]
-    assert children.has_idle_child()
+    assert child_pool.has_idle_child()
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "three")
-    assert not children.has_idle_child()
+    assert not child_pool.has_idle_child()
 
 
 def test_what_tasks_say_is_said_by_the_command_the_same_of_several_children_once(capfd: Any) -> None:

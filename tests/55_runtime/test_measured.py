@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from pipeline.runtime import children
-from pipeline.runtime.isolation import IsolationLimits, supervise
-from pipeline.runtime.measured import charge, measure
+from pipeline.runtime.isolation import child_pool
+from pipeline.runtime.isolation.isolated_items import IsolationLimits, supervise
+from pipeline.runtime.monitoring.measured import charge, measure
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
 SPUN_S = 0.5
@@ -20,10 +20,10 @@ BURN = f"import time\nwhile time.process_time() < {SPUN_S}: pass"
 @pytest.fixture(autouse=True)
 def bare_children(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Children that load nothing, and none afterwards."""
-    children.kill_children()
-    monkeypatch.setattr(children, "_LOADS", ())
+    child_pool.kill_children()
+    monkeypatch.setattr(child_pool, "_LOADS", ())
     yield
-    children.kill_children()
+    child_pool.kill_children()
 
 
 def spin(seconds: float) -> None:

@@ -14,11 +14,8 @@ from typing import Any
 import pytest
 from distributed import Client, LocalCluster, Nanny
 
-from pipeline.runtime.events import Event, Watch
-from pipeline.runtime.executors import Cluster
-from pipeline.runtime.isolation import IsolationLimits
-from pipeline.runtime.modelling import BatchTask
-from pipeline.runtime.needs import (
+from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.needs import (
     BUILDING_BASE_BYTES,
     BUILDING_BYTES_PER_POINT,
     DECLARED_FROM_BYTES,
@@ -27,7 +24,10 @@ from pipeline.runtime.needs import (
     building_bytes,
     declared_bytes,
 )
+from pipeline.runtime.isolation.isolated_items import IsolationLimits
+from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.plan import window_bytes
+from pipeline.runtime.stages.reconstruct import BatchTask
 from pipeline.tiling import Tile, TileGrid
 
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
@@ -147,7 +147,7 @@ def test_a_need_that_no_worker_has_runs_where_most_is_and_it_is_told(bench: Benc
 def test_a_giant_does_not_wait_for_ever_for_a_worker_that_has_left(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.runtime.flight.Lookout.memory_s", 0.5)
+    monkeypatch.setattr("pipeline.runtime.cluster.flight.Lookout.memory_s", 0.5)
     add_worker(bench, 8 * GIB)
     with ThreadPoolExecutor(1) as thread:
         running = thread.submit(bench.run, [bench.task(f"giant{k}", 6 * GIB) for k in range(2)])

@@ -22,12 +22,12 @@ import pipeline.runtime.rerun
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.io import SpatialReference
 from pipeline.io.storage import sha256_of
+from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.earlier import Record
-from pipeline.runtime.join import CandidateSite
-from pipeline.runtime.overrides import overrides_of, own_modelling, read_overrides
+from pipeline.runtime.overrides.overrides_file import overrides_of, own_modelling, read_overrides
 from pipeline.runtime.rerun import RerunRequest, rerun
+from pipeline.runtime.stages.join import CandidateSite
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
 from pipeline.tiling import Tile
 
 TILES = {"tile_size_m": 40.0, "candidates": {"min_area_m2": 88.0}}

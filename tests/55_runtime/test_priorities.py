@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from distributed import Client
 
-from pipeline.runtime.events import Watch
-from pipeline.runtime.executors import Cluster
-from pipeline.runtime.priorities import PRIORITIES, Traffic, priority_of
+from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.priorities import PRIORITIES, Traffic, priority_of
+from pipeline.runtime.monitoring.events import Watch
 
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
 

@@ -15,7 +15,7 @@ import rasterio
 from pipeline.errors import SettingsError
 from pipeline.export.raster import NO_VALUE, RasterLattice, write_cog
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
-from pipeline.runtime.rasters import RASTERS
+from pipeline.runtime.stages.rasters import RASTERS
 from pipeline.settings import RunSettings
 
 FOOT = 0.3048

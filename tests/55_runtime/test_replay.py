@@ -30,8 +30,8 @@ from pipeline.model import Candidate, Status
 from pipeline.reconstruct import reconstruct_building
 from pipeline.roof.arrangement import ArrangementSettings
 from pipeline.roof.settings import RoofSettings
-from pipeline.runtime import children
-from pipeline.runtime.bundle import Bundle, Incident, read_bundle, write_bundle
+from pipeline.runtime.isolation import child_pool
+from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, read_bundle, write_bundle
 from pipeline.runtime.replay import replay
 
 FEET = SpatialReference(name="feet", horizontal_unit_m=0.3048, vertical_unit_m=0.3048)
@@ -130,14 +130,14 @@ def test_what_is_unknown_comes_back_as_unknown(bundle: Bundle, tmp_path: Path) -
 
 @pytest.mark.parametrize("isolated", [False, True])
 def test_a_replay_models_exactly_what_the_run_would(bundle: Bundle, path: Path, isolated: bool) -> None:
-    from pipeline.runtime.isolation import IsolationLimits
+    from pipeline.runtime.isolation.isolated_items import IsolationLimits
 
     here = reconstruct_building(bundle.candidate, bundle.method, bundle.settings)
     there = replay(read_bundle(str(path)), IsolationLimits() if isolated else None).result
     assert here.status is Status.OK
     assert pickle.dumps(there.solids) == pickle.dumps(here.solids)
     assert there.planes == here.planes
-    children.kill_children()
+    child_pool.kill_children()
 
 
 def test_no_code_in_a_bundle_is_executed(path: Path, tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_no_code_in_a_bundle_is_executed(path: Path, tmp_path: Path) -> None:
 
 
 def test_a_bomb_is_refused_before_it_is_unpacked(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.runtime.bundle._LARGEST_BYTES", 2**20)
+    monkeypatch.setattr("pipeline.runtime.isolation.replay_bundle._LARGEST_BYTES", 2**20)
     bomb = rewritten(path, points_npy=bytes(2**24))
     assert Path(bomb).stat().st_size < 2**20
     with pytest.raises(UnreadableInputError, match=r"points.npy is larger than 1 MiB"):
@@ -250,9 +250,9 @@ def test_a_building_that_kills_again_kills_only_the_child(
 ) -> None:
     for name, value in environment(**{fault: ["abcdefghijklmnopqrstuvwx"]}).items():
         monkeypatch.setenv(name, value)
-    children.kill_children()
+    child_pool.kill_children()
     code, said, _ = invoke("replay", str(path), "--building-memory", "1", "--json")
-    children.kill_children()
+    child_pool.kill_children()
     told = json.loads(said)
     assert code == 1
     assert told["record"]["reason"] == {"crash": "crashed", "eat_memory": "out_of_memory"}[fault]

@@ -16,10 +16,10 @@ import pipeline.export.tile
 import pipeline.reconstruct
 from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, RunError
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.events import Event
-from pipeline.runtime.held_folder import held_results
+from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.rerun import RerunRequest, rerun
 from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.scratch.folder_lock import held_results
 from pipeline.settings import RunSettings
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from pipeline.runtime.scratch import POINT, Scratch
+from pipeline.runtime.scratch.folder import POINT, Scratch
 
 ARRAYS: dict[str, npt.NDArray[Any]] = {
     "bytes": np.arange(POINT.itemsize * 7).astype(np.uint8),

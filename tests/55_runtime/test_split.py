@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.runtime.scratch import POINT
-from pipeline.runtime.split import _order_by_owner
+from pipeline.runtime.scratch.folder import POINT
+from pipeline.runtime.stages.split import _order_by_owner
 
 
 def points(n: int, side_mm: int, seed: int) -> np.ndarray:

@@ -9,7 +9,10 @@ import pytest
 
 STARTS = pytest.mark.parametrize(
     ("start", "ours"),
-    [("import service.cli", False), ("from pipeline.runtime.start_up import start_own_process as s; s(); s()", True)],
+    [
+        ("import service.cli", False),
+        ("from pipeline.runtime.isolation.start_up import start_own_process as s; s(); s()", True),
+    ],
     ids=["imported as a library", "a process of ours"],
 )
 

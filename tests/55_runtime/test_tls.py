@@ -19,9 +19,9 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from pipeline.errors import ClusterError, SettingsError
-from pipeline.runtime.executors import Cluster
-from pipeline.runtime.tls import VARIABLES, TlsFiles, check_address, given_tls, why_not
-from pipeline.runtime.worker import WorkerOptions, _start
+from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.tls import VARIABLES, TlsFiles, check_address, given_tls, why_not
+from pipeline.runtime.cluster.worker import WorkerOptions, _start
 
 
 class Authority:

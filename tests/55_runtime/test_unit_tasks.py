@@ -20,12 +20,12 @@ from pipeline.errors import RunCancelledError
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.reconstruct import ReconstructSettings, reconstruct_building
 from pipeline.roof.settings import RoofSettings
-from pipeline.runtime import outlines
-from pipeline.runtime.gather import gather, points_of
-from pipeline.runtime.join import CandidateSite, PointRange, object_id
-from pipeline.runtime.outlines import draw_outlines, outline_tasks
-from pipeline.runtime.scratch import POINT, Scratch
-from pipeline.runtime.units import divide, unit_tasks
+from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.stages import outline
+from pipeline.runtime.stages.gather import gather, points_of
+from pipeline.runtime.stages.join import CandidateSite, PointRange, object_id
+from pipeline.runtime.stages.outline import draw_outlines, outline_tasks
+from pipeline.runtime.stages.reconstruct_tasks import divide, unit_tasks
 from pipeline.terrain.lattice import CELL_MM
 from pipeline.terrain.units import UnitSettings
 from pipeline.tiling import TileGrid
@@ -154,7 +154,7 @@ def test_a_block_that_cannot_be_drawn_costs_its_outlines_and_is_told(
     def broken(*_: object) -> None:
         raise ValueError("a ring of two corners")
 
-    monkeypatch.setattr(outlines, "unit_outlines", broken)
+    monkeypatch.setattr(outline, "unit_outlines", broken)
     drawn = draw_outlines(task)
     assert drawn.outlines == {}
     (warning,) = drawn.warnings

@@ -21,15 +21,15 @@ from prometheus_client import CollectorRegistry, generate_latest
 
 from pipeline.console import Console
 from pipeline.errors import RunCancelledError, RunError, SettingsError
-from pipeline.runtime import logs
+from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.performance import BINS, ROWS, PerformanceReport
+from pipeline.runtime.cluster.run_metrics import RunMetrics, TallyMetrics, both, serve_metrics
 from pipeline.runtime.engine import executor_for
-from pipeline.runtime.events import Event, Watch
-from pipeline.runtime.executors import Cluster
-from pipeline.runtime.measured import Measured, measure
-from pipeline.runtime.performance import BINS, ROWS, PerformanceReport
-from pipeline.runtime.run_metrics import RunMetrics, TallyMetrics, both, serve_metrics
-from pipeline.runtime.scratch import Scratch
-from pipeline.runtime.tallies import TALLIES, Tallies
+from pipeline.runtime.monitoring import logs
+from pipeline.runtime.monitoring.events import Event, Watch
+from pipeline.runtime.monitoring.measured import Measured, measure
+from pipeline.runtime.monitoring.tallies import TALLIES, Tallies
+from pipeline.runtime.scratch.folder import Scratch
 from pipeline.tiling import Tile
 
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
@@ -200,7 +200,7 @@ def test_a_command_logs_its_events_as_json_lines_where_the_environment_asks(
 
 SPEAKS = """
 import logging, threading, warnings
-from pipeline.runtime.start_up import start_own_process
+from pipeline.runtime.isolation.start_up import start_own_process
 
 start_own_process()
 warnings.warn("odd")

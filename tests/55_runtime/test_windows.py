@@ -14,9 +14,9 @@ import shapely
 
 from pipeline.errors import InputError
 from pipeline.io import ReadOptions
-from pipeline.runtime import stages
 from pipeline.runtime.plan import Plan, check_windows, make_plan, split_grid
-from pipeline.runtime.split import Split, SplitTask, split
+from pipeline.runtime.stages import stages
+from pipeline.runtime.stages.split import Split, SplitTask, split
 from pipeline.scene import ClassesInUse, SceneSettings
 from pipeline.settings import RunSettings
 from pipeline.terrain.ground import GroundSettings

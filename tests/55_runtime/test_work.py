@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RunError
-from pipeline.runtime.events import Event
-from pipeline.runtime.measured import Measured
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.runtime.cluster.serial import SerialExecutor
+from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.monitoring.measured import Measured
 from pipeline.runtime.run import RunRequest, RunSummary, run
-from pipeline.runtime.serial import SerialExecutor
-from pipeline.runtime.work_folder import held_work, is_at_work
+from pipeline.runtime.scratch.work_folder import held_work, is_at_work
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
 
 STAGES = ("ingest", "split", "reconstruct", "publish")
 TILE_M = 40.0
@@ -286,7 +286,7 @@ def test_what_was_kept_shortly_before_a_loss_of_power_is_done_again(
     late = next(path for path in kept if path.parent.parent.name.startswith("models-"))
     late.write_bytes(late.read_bytes()[:20])
     used.tasks.clear()
-    monkeypatch.setattr("pipeline.runtime.work_folder.boot_id", lambda: "another-boot")
+    monkeypatch.setattr("pipeline.runtime.scratch.work_folder.boot_id", lambda: "another-boot")
     assert used.run().digest == whole.digest
     assert set(used.tasks) == {"join", "outline", "reconstruct", "publish"}
     used.tasks.clear()
@@ -298,7 +298,7 @@ def test_what_was_kept_shortly_before_a_loss_of_power_is_done_again(
 def test_another_machine_goes_on_with_all_that_was_kept(
     used: Place, finished: Finished, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.runtime.work_folder.boot_id", lambda: "another-boot")
+    monkeypatch.setattr("pipeline.runtime.scratch.work_folder.boot_id", lambda: "another-boot")
     monkeypatch.setattr("socket.gethostname", lambda: "elsewhere")
     assert used.run().digest == finished.summary.digest
     assert not used.tasks

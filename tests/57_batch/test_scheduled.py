@@ -19,8 +19,8 @@ from pipeline.batch.batch_file import Batch, ScheduleTable, read_batch
 from pipeline.batch.schedule_state import KEPT, NAME, Outcome, ScheduleState, look, read_schedule
 from pipeline.batch.scheduled import Ending, keep_schedule
 from pipeline.errors import RunError, SettingsError
-from pipeline.runtime.events import Event
-from pipeline.runtime.work_folder import held_lock, held_work, make_work
+from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.scratch.work_folder import held_lock, held_work, make_work
 
 AT = dt.datetime(2026, 3, 1, 2, 0, tzinfo=dt.UTC)
 HOUR = dt.timedelta(hours=1)

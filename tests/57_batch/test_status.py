@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from pipeline.batch.eta import StageProgress, remaining_s
 from pipeline.batch.status import NAME, StatusWriter, buildings_before, read_status
 from pipeline.errors import RunError
-from pipeline.runtime.events import Event
-from pipeline.runtime.work_folder import DRIVER_LOCK, held_lock, held_work
+from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, held_lock, held_work
 
 PLANNED = {"ingest": 10.0, "split": 20.0, "reconstruct": 100.0, "publish": 10.0}
 

@@ -17,11 +17,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "60_export"))
 
 import small_buildings as small
 
-from pipeline.evaluation.models import ModelSet, RoofModel
 from pipeline.export.records import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.io.crs import SpatialReference, parse_crs
 from pipeline.model import BuildingResult
+from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 from pipeline.triangulation import triangulate_face
 
 Json = dict[str, Any]

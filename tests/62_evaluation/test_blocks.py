@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.evaluation.blocks import BLOCK_SHAPE, joined_reference
-from pipeline.evaluation.models import RoofModel, RoofSurface
-from pipeline.evaluation.reference import Conditions, Reference, ReferencePoints
 from pipeline.model import RoofType
+from pipeline.ruler.evaluation.blocks import BLOCK_SHAPE, joined_reference
+from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
+from pipeline.ruler.evaluation.reference import Conditions, Reference, ReferencePoints
 
 
 def house(name: str, x: float, block: str | None, roof_type: RoofType = RoofType.PENT) -> RoofModel:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pipeline.evaluation.bootstrap import bootstrap, quality, quantile, ratio, root_mean, share
+from pipeline.ruler.evaluation.bootstrap import bootstrap, quality, quantile, ratio, root_mean, share
 
 RANDOM = np.random.default_rng(5)
 

@@ -9,12 +9,12 @@ import pytest
 import roofs_by_hand as by_hand
 from roofs_by_hand import flat, gable, hip, reference
 
-from pipeline.evaluation.delivery import DEFINITIONS, Delivered, Stands, measures, record_measures, score_delivery
-from pipeline.evaluation.matching import match_footprints
-from pipeline.evaluation.models import ModelSet, RoofModel
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.subsets import subsets
 from pipeline.model import Status
+from pipeline.ruler.evaluation.delivery import DEFINITIONS, Delivered, Stands, measures, record_measures, score_delivery
+from pipeline.ruler.evaluation.matching import match_footprints
+from pipeline.ruler.evaluation.models import ModelSet, RoofModel
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.subsets import subsets
 
 TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0), gable("d", 60.0)]
 

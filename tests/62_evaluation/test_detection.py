@@ -11,7 +11,8 @@ import pytest
 import shapely
 from scipy import ndimage
 
-from pipeline.evaluation.building_raster import (
+from pipeline.model import BoolArray, FloatArray, RoofType
+from pipeline.ruler.evaluation.building_raster import (
     CELL_M,
     CellWindow,
     PlanRaster,
@@ -22,12 +23,11 @@ from pipeline.evaluation.building_raster import (
     outlines_of,
     windows_of,
 )
-from pipeline.evaluation.detection import DEFINITIONS, Detection, detect, detection_measures
-from pipeline.evaluation.measure import Measure
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reference import Reference, ReferencePoints
-from pipeline.evaluation.subsets import subsets
-from pipeline.model import BoolArray, FloatArray, RoofType
+from pipeline.ruler.evaluation.detection import DEFINITIONS, Detection, detect, detection_measures
+from pipeline.ruler.evaluation.measure import Measure
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
+from pipeline.ruler.evaluation.subsets import subsets
 
 CROSS = ndimage.generate_binary_structure(2, 1)
 

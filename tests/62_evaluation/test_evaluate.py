@@ -7,9 +7,9 @@ import dataclasses
 import roofs_by_hand as by_hand
 from roofs_by_hand import flat, gable, hip, reference
 
-from pipeline.evaluation.evaluate import evaluate, needs_blocks, tells_types
-from pipeline.evaluation.models import ModelSet, RoofModel
 from pipeline.model import RoofType
+from pipeline.ruler.evaluation.evaluate import evaluate, needs_blocks, tells_types
+from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 
 TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0)]
 

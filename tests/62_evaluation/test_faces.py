@@ -14,13 +14,13 @@ from matplotlib.path import Path
 from roofs_by_hand import bent_gable, flat, gable, hip, lifted, moved, rectangle, reference, surface, turned, with_face
 from shapely import affinity
 
-from pipeline.evaluation.faces import DEFINITIONS, FaceScore, FaceVerdict, measures, score_faces
-from pipeline.evaluation.models import RoofModel, RoofSurface
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.subsets import subsets
-from pipeline.evaluation.topology import Topology
 from pipeline.model import RoofType
-from pipeline.synthetic.suburb import suburb
+from pipeline.ruler.evaluation.faces import DEFINITIONS, FaceScore, FaceVerdict, measures, score_faces
+from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.subsets import subsets
+from pipeline.ruler.evaluation.topology import Topology
+from pipeline.ruler.simulation.suburb import suburb
 
 TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0)]
 SHARES = [one.name for one in DEFINITIONS if one.unit == "share"]

@@ -11,11 +11,11 @@ import roofs_by_hand as by_hand
 import shapely
 from roofs_by_hand import flat, gable, hip, reference, shrunk
 
-from pipeline.evaluation.footprints import DEFINITIONS, FootprintRow, measures, score_footprints
-from pipeline.evaluation.matching import match_footprints
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.subsets import subsets
+from pipeline.ruler.evaluation.footprints import DEFINITIONS, FootprintRow, measures, score_footprints
+from pipeline.ruler.evaluation.matching import match_footprints
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.subsets import subsets
 
 TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0)]
 

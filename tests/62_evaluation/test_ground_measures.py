@@ -13,8 +13,9 @@ import pytest
 from scipy import stats
 
 from pipeline.errors import InconsistentInputError
-from pipeline.evaluation import ground
-from pipeline.evaluation.ground import (
+from pipeline.model import BoolArray, FloatArray
+from pipeline.ruler.evaluation import ground
+from pipeline.ruler.evaluation.ground import (
     DEFINITIONS,
     GroundBlock,
     GroundOfFiles,
@@ -25,10 +26,9 @@ from pipeline.evaluation.ground import (
     matched_points,
     tile_figures,
 )
-from pipeline.evaluation.reference import Reference, ReferencePoints
-from pipeline.evaluation.reference_points import read_points_reference
-from pipeline.evaluation.subsets import subsets
-from pipeline.model import BoolArray, FloatArray
+from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
+from pipeline.ruler.evaluation.reference_points import read_points_reference
+from pipeline.ruler.evaluation.subsets import subsets
 from pipeline.scene import ClassesInUse, SceneSettings, WindowPoints, terrain_of
 from pipeline.terrain.ground import ground_points
 from pipeline.tiling import Window

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.evaluation.definitions import DEFINITIONS
-from pipeline.evaluation.evaluate import Evaluation, evaluate
-from pipeline.evaluation.measure import Better, Measure
-from pipeline.evaluation.models import ModelSet, RoofModel, RoofSurface
-from pipeline.evaluation.reading import read_models
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.reference_truth import read_truth_reference
-from pipeline.synthetic.dataset import simulate
+from pipeline.ruler.evaluation.definitions import DEFINITIONS
+from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
+from pipeline.ruler.evaluation.measure import Better, Measure
+from pipeline.ruler.evaluation.models import ModelSet, RoofModel, RoofSurface
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.reference_truth import read_truth_reference
+from pipeline.ruler.simulation.dataset import simulate
 
 NOISE_M = 0.02
 

@@ -10,10 +10,10 @@ import roofs_by_hand as by_hand
 import shapely
 from roofs_by_hand import flat, gable, reference
 
-from pipeline.evaluation.matching import match_footprints, one_to_one, overlapping, sound_polygons
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.subsets import subsets, summed_over_units
 from pipeline.model import RoofType
+from pipeline.ruler.evaluation.matching import match_footprints, one_to_one, overlapping, sound_polygons
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.subsets import subsets, summed_over_units
 
 
 def outlined(name: str, footprint: shapely.Geometry) -> RoofModel:

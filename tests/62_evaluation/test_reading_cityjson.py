@@ -17,11 +17,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from model_files import Json
 
 from pipeline.errors import CrsError, InputError
-from pipeline.evaluation.models import ModelSet
-from pipeline.evaluation.reading import read_models
-from pipeline.evaluation.reading.cityjson import features
-from pipeline.evaluation.reading.collected import Collected
 from pipeline.model import FaceKind, RoofType, Status
+from pipeline.ruler.evaluation.models import ModelSet
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reading.cityjson import features
+from pipeline.ruler.evaluation.reading.collected import Collected
 
 SQUARE = [[0, 0], [8, 0], [8, 6], [0, 6]]
 SIDES = [[[1, 0, 4, 5]], [[2, 1, 5, 6]], [[3, 2, 6, 7]], [[0, 3, 7, 4]]]

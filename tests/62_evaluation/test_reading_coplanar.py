@@ -12,9 +12,9 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.evaluation.reading.coplanar import ANGLE_DEG, DISTANCE_M, coplanar_regions, face_vectors
-from pipeline.evaluation.reading.raw import RawFace, connected, grouped, is_closed, kind_in_name, raw_part
 from pipeline.model import FaceKind, FloatArray, IntArray
+from pipeline.ruler.evaluation.reading.coplanar import ANGLE_DEG, DISTANCE_M, coplanar_regions, face_vectors
+from pipeline.ruler.evaluation.reading.raw import RawFace, connected, grouped, is_closed, kind_in_name, raw_part
 
 Triangles = list[tuple[int, int, int]]
 

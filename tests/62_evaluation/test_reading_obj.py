@@ -14,9 +14,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 import model_files as files
 
 from pipeline.errors import InputError
-from pipeline.evaluation.models import ModelSet
-from pipeline.evaluation.reading import read_models
 from pipeline.model import FaceKind
+from pipeline.ruler.evaluation.models import ModelSet
+from pipeline.ruler.evaluation.reading import read_models
 
 FACES = {"roof": ["5 6 7 8"], "ground": ["4 3 2 1"], "wall": ["1 2 6 5", "2 3 7 6", "3 4 8 7", "4 1 5 8"]}
 

@@ -18,8 +18,8 @@ import model_files as files
 from model_files import small
 
 from pipeline.errors import InputError, RunError
-from pipeline.evaluation.reading import READERS, read_models
 from pipeline.export.obj import obj_text
+from pipeline.ruler.evaluation.reading import READERS, read_models
 from pipeline.runtime.manifest import RunManifest, RunStatus, write_manifest
 
 FOOT_M = 0.3048

@@ -14,13 +14,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 import model_files as files
 from model_files import small
 
-from pipeline.evaluation.reading import read_models
 from pipeline.export.records import RecordContext
 from pipeline.export.tile import write_tile
 from pipeline.model import BuildingResult, RoofType, Status
 from pipeline.quality.validity import check_solid
-from pipeline.synthetic.solids import truth_record
-from pipeline.synthetic.suites import suite_named
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.simulation.solids import truth_record
+from pipeline.ruler.simulation.suites import suite_named
 
 FOOT_M = 0.3048
 US_FOOT_M = 1200.0 / 3937.0

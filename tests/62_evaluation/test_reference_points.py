@@ -13,12 +13,12 @@ import pytest
 import shapely
 
 from pipeline.errors import InconsistentInputError, InputError, SettingsError
-from pipeline.evaluation.detection import detect, detection_measures
-from pipeline.evaluation.ground import ground_blocks
-from pipeline.evaluation.reference_points import read_points_reference
-from pipeline.evaluation.subsets import subsets
 from pipeline.io import ReadOptions
 from pipeline.model import FloatArray
+from pipeline.ruler.evaluation.detection import detect, detection_measures
+from pipeline.ruler.evaluation.ground import ground_blocks
+from pipeline.ruler.evaluation.reference_points import read_points_reference
+from pipeline.ruler.evaluation.subsets import subsets
 
 CORNER = np.array([690_000.0, 5_330_000.0, 0.0])
 HOUSES = {

@@ -15,13 +15,13 @@ import pytest
 import shapely
 
 from pipeline.errors import InconsistentInputError, InputError
-from pipeline.evaluation.detection import detect, detection_measures
-from pipeline.evaluation.reading import read_models
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.reference_truth import read_truth_reference
-from pipeline.evaluation.residuals import building_residuals, residual_measures
-from pipeline.evaluation.subsets import subsets
-from pipeline.synthetic.dataset import simulate
+from pipeline.ruler.evaluation.detection import detect, detection_measures
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.reference_truth import read_truth_reference
+from pipeline.ruler.evaluation.residuals import building_residuals, residual_measures
+from pipeline.ruler.evaluation.subsets import subsets
+from pipeline.ruler.simulation.dataset import simulate
 
 
 @pytest.fixture(scope="module")

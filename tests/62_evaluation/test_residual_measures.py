@@ -11,10 +11,11 @@ import pytest
 import shapely
 from scipy.spatial import cKDTree
 
-from pipeline.evaluation.measure import Measure
-from pipeline.evaluation.models import RoofModel, RoofSurface
-from pipeline.evaluation.reference import Reference, ReferencePoints
-from pipeline.evaluation.residuals import (
+from pipeline.model import FloatArray, LabelArray, RoofType
+from pipeline.ruler.evaluation.measure import Measure
+from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
+from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
+from pipeline.ruler.evaluation.residuals import (
     DEFINITIONS,
     EDGES_M,
     BuildingResiduals,
@@ -22,8 +23,7 @@ from pipeline.evaluation.residuals import (
     residual_measures,
     top_surface_of,
 )
-from pipeline.evaluation.subsets import subsets
-from pipeline.model import FloatArray, LabelArray, RoofType
+from pipeline.ruler.evaluation.subsets import subsets
 
 Bounds = tuple[float, float, float, float]
 

@@ -10,11 +10,12 @@ import pytest
 import roofs_by_hand as by_hand
 from roofs_by_hand import flat, gable, hip, lifted, reference, turned, with_face
 
-from pipeline.evaluation.faces import score_faces
-from pipeline.evaluation.matching import match_footprints
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.roof_types import (
+from pipeline.model import RoofType
+from pipeline.ruler.evaluation.faces import score_faces
+from pipeline.ruler.evaluation.matching import match_footprints
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.roof_types import (
     DEFINITIONS,
     Outcome,
     RoofTypeRow,
@@ -24,8 +25,7 @@ from pipeline.evaluation.roof_types import (
     outcome_table,
     score_roof_types,
 )
-from pipeline.evaluation.subsets import subsets
-from pipeline.model import RoofType
+from pipeline.ruler.evaluation.subsets import subsets
 
 TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0), gable("d", 60.0)]
 

@@ -12,12 +12,12 @@ import roofs_by_hand as by_hand
 import shapely
 from roofs_by_hand import flat, gable, hip, lifted, moved, reference, shrunk, with_face
 
-from pipeline.evaluation import surface
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reference import Reference
-from pipeline.evaluation.subsets import subsets
-from pipeline.evaluation.surface import DEFINITIONS, EDGES_M, lattice_over, measures, score_surface
-from pipeline.synthetic.suburb import suburb
+from pipeline.ruler.evaluation import surface
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.subsets import subsets
+from pipeline.ruler.evaluation.surface import DEFINITIONS, EDGES_M, lattice_over, measures, score_surface
+from pipeline.ruler.simulation.suburb import suburb
 
 TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0)]
 
@@ -153,7 +153,7 @@ def test_buildings_batch_by_batch_give_what_all_at_once_give(monkeypatch: pytest
     models = [gable("m", lift=0.1), shrunk(TRUTH[1], 0.3), gable("n", 100.0, slope=0.65)]
     whole = score_surface(models, truth)
     for places in (1, 3000, 7000):
-        monkeypatch.setattr("pipeline.evaluation.surface._PLACES_A_BATCH", places)
+        monkeypatch.setattr("pipeline.ruler.evaluation.surface._PLACES_A_BATCH", places)
         for row, other in zip(score_surface(models, truth), whole, strict=True):
             assert dataclasses.replace(row, histogram=other.histogram) == pytest.approx(other, nan_ok=True) or (
                 math.isnan(row.median_m) and math.isnan(other.median_m) and row.n_places == other.n_places

@@ -11,13 +11,13 @@ import pytest
 import shapely
 
 from pipeline.errors import InputError, SettingsError
-from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.files import EvaluationRequest
-from pipeline.evaluation.reading import read_models
-from pipeline.evaluation.reference_truth import read_truth_reference
-from pipeline.evaluation.survey_shift import mean_shifts
-from pipeline.synthetic.dataset import simulate
-from pipeline.synthetic.strips import ScannerSettings
+from pipeline.ruler.evaluation.evaluate import evaluate
+from pipeline.ruler.evaluation.files import EvaluationRequest
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reference_truth import read_truth_reference
+from pipeline.ruler.evaluation.survey_shift import mean_shifts
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.strips import ScannerSettings
 
 
 @pytest.fixture(scope="module")

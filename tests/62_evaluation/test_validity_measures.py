@@ -14,12 +14,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 import model_files as files
 from model_files import small
 
-from pipeline.evaluation.measure import Group
-from pipeline.evaluation.models import ModelSet, RoofModel
-from pipeline.evaluation.reading import read_models
-from pipeline.evaluation.validity import DEFINITIONS, code_counts, measures, validity
 from pipeline.model import Solid
 from pipeline.quality.validity import ValidityTolerances
+from pipeline.ruler.evaluation.measure import Group
+from pipeline.ruler.evaluation.models import ModelSet, RoofModel
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.validity import DEFINITIONS, code_counts, measures, validity
 
 
 @pytest.fixture(scope="module")

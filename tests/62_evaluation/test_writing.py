@@ -15,11 +15,11 @@ import shapely
 from damaged_suburb import DEFINITIONS, damaged_evaluation
 
 from pipeline.errors import RunError
-from pipeline.evaluation.chapters import chapters, printed
-from pipeline.evaluation.counts import breakdowns, count_tables
-from pipeline.evaluation.definitions import DEFINITIONS as ALL
-from pipeline.evaluation.measure import Group, Measure
-from pipeline.evaluation.writing import markdown, measures_table, write_tables
+from pipeline.ruler.evaluation.chapters import chapters, printed
+from pipeline.ruler.evaluation.counts import breakdowns, count_tables
+from pipeline.ruler.evaluation.definitions import DEFINITIONS as ALL
+from pipeline.ruler.evaluation.measure import Group, Measure
+from pipeline.ruler.evaluation.writing import markdown, measures_table, write_tables
 
 KINDS = ({}, {"points": False}, {"has_faces": False}, {"has_faces": False, "points": False}, {"reference": False})
 """Truth with points, truth alone, footprints with points, footprints alone, no reference."""

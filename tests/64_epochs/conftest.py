@@ -13,8 +13,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from epochs_by_hand import by_name, compared, write_epoch
 
-from pipeline.epochs.settings import DiffSettings
 from pipeline.model import BuildingResult
+from pipeline.ruler.epochs.settings import DiffSettings
 
 Compare = Callable[..., dict[str, dict[str, Any]]]
 

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from epochs_by_hand import ORIGIN, failed, house, rejected
 
-from pipeline.epochs.settings import DiffSettings
 from pipeline.model import BuildingResult
+from pipeline.ruler.epochs.settings import DiffSettings
+from pipeline.ruler.simulation.roofs import RoofShape
 from pipeline.runtime.manifest import RunStatus
-from pipeline.synthetic.roofs import RoofShape
 
 Compare = Callable[..., dict[str, dict[str, Any]]]
 GABLE_M3 = 12.0 * 9.0 * (5.0 + 4.5 * math.tan(math.radians(35.0)) / 2.0)

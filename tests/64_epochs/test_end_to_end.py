@@ -10,14 +10,14 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 
-from pipeline.epochs.diff import DiffRequest, diff
+from pipeline.ruler.epochs.diff import DiffRequest, diff
+from pipeline.ruler.simulation.als import scan
+from pipeline.ruler.simulation.suburb import suburb
+from pipeline.ruler.simulation.suites import suite_named
+from pipeline.ruler.simulation.survey_files import write_points
+from pipeline.ruler.simulation.two_epochs import TwoEpochs, Work, two_epochs
 from pipeline.runtime.manifest import read_manifest
 from pipeline.runtime.run import RunRequest, run
-from pipeline.synthetic.als import scan
-from pipeline.synthetic.suburb import suburb
-from pipeline.synthetic.suites import suite_named
-from pipeline.synthetic.survey_files import write_points
-from pipeline.synthetic.two_epochs import TwoEpochs, Work, two_epochs
 
 EXPECTED = {
     Work.BUILT: "new",

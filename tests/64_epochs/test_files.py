@@ -17,11 +17,11 @@ from epochs_by_hand import EXTENT, UTM, house, write_epoch
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.epochs.diff import DiffRequest, diff
-from pipeline.epochs.records import CHANGES, COLUMNS, DOUBTS, INCOMPARABLE, RELATIONS, Change
-from pipeline.epochs.settings import DiffSettings, read_settings
 from pipeline.errors import CrsError, RunError, SettingsError
 from pipeline.io import storage_at
+from pipeline.ruler.epochs.diff import DiffRequest, diff
+from pipeline.ruler.epochs.records import CHANGES, COLUMNS, DOUBTS, INCOMPARABLE, RELATIONS, Change
+from pipeline.ruler.epochs.settings import DiffSettings, read_settings
 from pipeline.runtime.manifest import RunStatus
 
 

@@ -10,10 +10,10 @@ import pytest
 import shapely
 from epochs_by_hand import ORIGIN, by_name, compared, failed, house, write_epoch
 
-from pipeline.epochs import comparing, matching
-from pipeline.epochs.settings import DiffSettings
 from pipeline.model import BuildingResult
-from pipeline.synthetic.roofs import RoofShape
+from pipeline.ruler.epochs import comparing, matching
+from pipeline.ruler.epochs.settings import DiffSettings
+from pipeline.ruler.simulation.roofs import RoofShape
 
 MIRRORED = {
     "new": "gone",

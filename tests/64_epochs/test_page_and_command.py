@@ -19,11 +19,11 @@ from page_reader import Reader, count
 
 from pipeline.cli import app
 from pipeline.console import ExitCode
-from pipeline.epochs.diff import DiffRequest, diff
-from pipeline.epochs.records import SCHEMA, Change
 from pipeline.report import class_map
-from pipeline.report.epochs_map import COLOURS, epochs_map, gathering
-from pipeline.report.epochs_page import page
+from pipeline.ruler.epochs.diff import DiffRequest, diff
+from pipeline.ruler.epochs.records import SCHEMA, Change
+from pipeline.ruler.report.epochs_map import COLOURS, epochs_map, gathering
+from pipeline.ruler.report.epochs_page import page
 
 
 @pytest.fixture

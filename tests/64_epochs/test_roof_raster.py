@@ -10,7 +10,7 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.epochs.roof_raster import (
+from pipeline.ruler.epochs.roof_raster import (
     ADDED_M2,
     COMMON_M2,
     DIFFERENCE_M,

@@ -19,21 +19,21 @@ import small_buildings as small
 from page_reader import Reader, count, pixels
 
 from pipeline.errors import RunError, SettingsError
-from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reading import read_models
-from pipeline.evaluation.reference import Reference
 from pipeline.io import ReadOptions, Source, SourceInfo
 from pipeline.model import BuildingResult, Reason, RoofType, Status
-from pipeline.report import comparison_page, comparison_points
-from pipeline.report.comparison import ComparedRun, PointFiles, write_comparison
-from pipeline.report.comparison_building import ComparedBuilding, Record, difference_of
-from pipeline.report.comparison_choice import CASES, DIFFERENT, Choice, chosen_buildings
-from pipeline.report.comparison_figures import seconds_text
-from pipeline.report.comparison_pictures import BLOCK_COLOUR, REACH_M, draw_building, place_of
-from pipeline.report.comparison_points import points_within
 from pipeline.report.render import ROOF_COLOURS
-from pipeline.report.section import RESIDUAL_CLASSES
+from pipeline.ruler.evaluation.evaluate import evaluate
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.report import comparison_page, comparison_points
+from pipeline.ruler.report.comparison import ComparedRun, PointFiles, write_comparison
+from pipeline.ruler.report.comparison_building import ComparedBuilding, Record, difference_of
+from pipeline.ruler.report.comparison_choice import CASES, DIFFERENT, Choice, chosen_buildings
+from pipeline.ruler.report.comparison_figures import seconds_text
+from pipeline.ruler.report.comparison_pictures import BLOCK_COLOUR, REACH_M, draw_building, place_of
+from pipeline.ruler.report.comparison_points import points_within
+from pipeline.ruler.report.section import RESIDUAL_CLASSES
 from pipeline.runtime.manifest import read_manifest, write_manifest
 
 MakeRun = Callable[..., Path]

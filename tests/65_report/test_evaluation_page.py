@@ -21,17 +21,18 @@ from page_reader import Reader, count, pixels
 from PIL import Image
 from processes import program
 
-from pipeline.evaluation.chapters import printed
-from pipeline.evaluation.definitions import DEFINITIONS as ALL
-from pipeline.evaluation.evaluate import Evaluation
-from pipeline.evaluation.models import RoofSurface
-from pipeline.evaluation.reference import ReferencePoints
-from pipeline.report.evaluation_maps import BAD, GOOD, MISSING, Map, maps
-from pipeline.report.evaluation_page import HEADLINE, page, write_page
-from pipeline.report.histograms import charts
-from pipeline.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg
+from pipeline.report.maps import BAD, GOOD, MISSING, Map
 from pipeline.report.svg_chart import rebinned
-from pipeline.report.worst_cases import MOST_NOT_FOUND, chosen_rows, worst_cases
+from pipeline.ruler.evaluation.chapters import printed
+from pipeline.ruler.evaluation.definitions import DEFINITIONS as ALL
+from pipeline.ruler.evaluation.evaluate import Evaluation
+from pipeline.ruler.evaluation.models import RoofSurface
+from pipeline.ruler.evaluation.reference import ReferencePoints
+from pipeline.ruler.report.evaluation_maps import maps
+from pipeline.ruler.report.evaluation_page import HEADLINE, page, write_page
+from pipeline.ruler.report.histograms import charts
+from pipeline.ruler.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg
+from pipeline.ruler.report.worst_cases import MOST_NOT_FOUND, chosen_rows, worst_cases
 
 KINDS: tuple[dict[str, bool], ...] = (
     {},

@@ -20,10 +20,10 @@ from pipeline.cli import app
 from pipeline.cli.batching import _end_by_signals
 from pipeline.errors import RunError
 from pipeline.io import storage_at
+from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.expected import RATES
-from pipeline.runtime.work_folder import DRIVER_LOCK, held_lock, held_work, make_work
-from pipeline.synthetic.dataset import simulate
+from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, held_lock, held_work, make_work
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from pipeline.cli.classifying import classify
 from pipeline.runtime import engine
-from pipeline.runtime.local import LocalExecutor
-from pipeline.runtime.serial import Executor, SerialExecutor
+from pipeline.runtime.cluster.local import LocalExecutor
+from pipeline.runtime.cluster.serial import Executor, SerialExecutor
 
 
 def invoke(*words: str) -> tuple[int, str, str]:
@@ -70,7 +70,7 @@ def test_this_process_or_its_children_as_the_estimate_says_give_the_same_file(
     monkeypatch.setattr("pipeline.runtime.classify.executor_for", executor_for)
     if not is_small:
         monkeypatch.setattr(engine, "ALONE_S", 0.0)
-        monkeypatch.setattr("pipeline.runtime.early._SMALL_BYTES", 0)
+        monkeypatch.setattr("pipeline.runtime.isolation.preloading._SMALL_BYTES", 0)
     code, out, _ = invoke(str(house), "--out", str(tmp_path / "auto"), "--json")
     assert code == 0
     assert [type(one) for one in engines] == [SerialExecutor if is_small else LocalExecutor]

@@ -20,7 +20,7 @@ from pipeline.errors import (
     UnreadableInputError,
 )
 from pipeline.model import Reason
-from pipeline.runtime.events import Event
+from pipeline.runtime.monitoring.events import Event
 
 
 class Clock:

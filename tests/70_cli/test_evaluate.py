@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.console import ExitCode
-from pipeline.synthetic.dataset import ScenePaths, simulate
+from pipeline.ruler.simulation.dataset import ScenePaths, simulate
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ import pytest
 from driver_bench import DEADLINE_S, Bench, Engine, until
 
 from pipeline.errors import ClusterError, UnreadableInputError
-from pipeline.runtime.events import Event
+from pipeline.runtime.monitoring.events import Event
 from service.driver import endings, process
 from service.driver.clusters import SharedCluster, answers
 from service.errors import StoreError

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import InputError, RunCancelledError, UnreadableInputError
 from pipeline.runtime.run import plan_inputs
-from pipeline.runtime.stages import Progress
+from pipeline.runtime.stages.stages import Progress
 from service import downloads
 from service.downloads import ATTEMPTS, LONGEST_PAUSE_S, PASSING, pause_s
 from service.driver.attempt import run_request

@@ -21,7 +21,7 @@ from click.testing import Result
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from pipeline.runtime.isolation import LEAST_MEMORY_BYTES
+from pipeline.runtime.isolation.isolated_items import LEAST_MEMORY_BYTES
 from service.cli import app
 from service.settings import ServiceSettings
 from service.supervisor import Supervisor, environment_of, listen, pause_s

@@ -13,10 +13,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 from batch_faults import SETTINGS, Undisturbed, buildings_of
 from processes import programs
 
+from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.run import RunRequest, run
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
 
 __all__ = ["programs"]
 

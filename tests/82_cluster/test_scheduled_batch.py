@@ -16,8 +16,8 @@ from processes import Program, Programs, program
 from pipeline.batch.schedule_state import NAME, ScheduleState
 from pipeline.batch.scheduled import RUN_LOCK
 from pipeline.io import LocalStorage
-from pipeline.runtime.work_folder import is_held, make_work
-from pipeline.synthetic.dataset import simulate
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.runtime.scratch.work_folder import is_held, make_work
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ import pytest
 from deployment import Deployment
 from processes import LONG_S, Programs, wait_for
 
-from pipeline.synthetic.dataset import simulate
+from pipeline.ruler.simulation.dataset import simulate
 from service.files import StateFolder
 from service.jobs import JobStatus
 from service.settings import ServiceSettings

@@ -15,13 +15,13 @@ from distributed import Client
 from processes import Programs, free_port, missing, program
 
 from pipeline.errors import ClusterError
-from pipeline.runtime.events import Watch
-from pipeline.runtime.executors import Cluster
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.tls import VARIABLES, TlsFiles
 from pipeline.runtime.manifest import read_manifest
+from pipeline.runtime.monitoring.events import Watch
 from pipeline.runtime.run import RunRequest, run
-from pipeline.runtime.tls import VARIABLES, TlsFiles
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "55_runtime" / "on_workers"))
 

@@ -13,10 +13,10 @@ import pytest
 from faults import asked
 from processes import Programs, free_port, program, wait_for
 
+from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.manifest import read_manifest
 from pipeline.runtime.run import RunRequest, run
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
 
 pytestmark = pytest.mark.slow
 

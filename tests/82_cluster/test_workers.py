@@ -17,12 +17,12 @@ from faults import asked
 from processes import Program, Programs, free_port, lives, program, wait_for
 
 from pipeline.errors import ClusterError, RunCancelledError, VersionMismatchError
-from pipeline.runtime.events import Event, Watch
-from pipeline.runtime.executors import Cluster
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.runtime.cluster.executors import Cluster
 from pipeline.runtime.manifest import RunStatus, read_manifest
+from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.settings import RunSettings
-from pipeline.synthetic.dataset import simulate
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "55_runtime" / "on_workers"))
 
@@ -44,7 +44,7 @@ def version(name, real=importlib.metadata.version):
 importlib.metadata.version = distributed.versions.version = version
 distributed.versions._version_cached.cache_clear()
 
-import pipeline.runtime.versions as ours
+import pipeline.runtime.monitoring.versions as ours
 
 ours._version = version
 ours.versions_here.cache_clear()

@@ -18,7 +18,7 @@ from moto.server import ThreadedMotoServer
 from processes import program
 
 from pipeline import __version__
-from pipeline.runtime.tls import DASK_VARIABLES, VARIABLES
+from pipeline.runtime.cluster.tls import DASK_VARIABLES, VARIABLES
 from service.cli import app
 from service.settings import ServiceSettings
 

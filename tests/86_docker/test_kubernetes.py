@@ -15,7 +15,7 @@ import yaml
 from container_files import Image
 
 from pipeline import __version__
-from pipeline.runtime.tls import VARIABLES
+from pipeline.runtime.cluster.tls import VARIABLES
 from service.cli import app
 from service.settings import ServiceSettings
 

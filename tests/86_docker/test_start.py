@@ -25,8 +25,8 @@ from container_files import Compose, Image, laid_over, read_compose
 from processes import LONG_S, PostgresServer, Program, Programs, free_port, missing, program, wait_for
 
 from pipeline.compiler.store import folder_of_kernels
-from pipeline.runtime.tls import why_not
-from pipeline.synthetic.dataset import simulate
+from pipeline.ruler.simulation.dataset import simulate
+from pipeline.runtime.cluster.tls import why_not
 
 pytestmark = pytest.mark.slow
 

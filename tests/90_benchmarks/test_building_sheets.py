@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "60_export"))
 from small_runs import street, write_run
 
 from benchmarks.building_sheets import COLUMNS, ROWS, main, sheet, within_share
-from pipeline.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reading import read_models
 
 
 def roof_points(run: Path, lifted_m: float) -> np.ndarray:

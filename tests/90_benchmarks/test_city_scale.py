@@ -17,8 +17,8 @@ from benchmarks.city_scale import report, stage_rows, stage_table
 from benchmarks.city_tiles import make_city, make_row, square_of
 from benchmarks.process_watch import CHILD, DRIVER, FORKING, OTHER, WORKER, Seen, Watcher, role_of
 from benchmarks.traced_run import TracingExecutor
-from pipeline.runtime.events import Watch
-from pipeline.runtime.serial import SerialExecutor
+from pipeline.runtime.cluster.serial import SerialExecutor
+from pipeline.runtime.monitoring.events import Watch
 
 
 def test_a_city_is_as_square_as_its_tiles_allow() -> None:
@@ -66,7 +66,7 @@ def test_tiles_that_are_there_are_kept(tmp_path: Path) -> None:
 
 
 def test_processes_are_told_apart_by_what_they_run() -> None:
-    assert role_of("gablework-child", ["python", "-m", "pipeline.runtime.process_server", "12"], {}, 3) == CHILD
+    assert role_of("gablework-child", ["python", "-m", "pipeline.runtime.isolation.fork_server", "12"], {}, 3) == CHILD
     assert role_of("gablework-work", ["python", "-c", "from multiprocessing.forkserver import main"], {}, 3) == WORKER
     assert role_of("gablework-fork", ["python", "-c", "from multiprocessing.forkserver import main"], {}, 3) == FORKING
     assert role_of("python", ["python", "-c", "from multiprocessing.spawn import spawn_main"], {}, 3) == WORKER

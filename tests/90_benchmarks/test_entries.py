@@ -24,8 +24,8 @@ from benchmarks.method_times import ClockedSettings
 from benchmarks.ruler import cell, methods_table
 from pipeline.methods import METHODS, Method, ReconstructSettings
 from pipeline.model import Candidate, Segmentation
+from pipeline.ruler.simulation.sweep import CELLS
 from pipeline.runtime.compare import Variant, settings_of
-from pipeline.synthetic.sweep import CELLS
 
 FUZZY = Variant(method="fuzzy-sart")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scene_speed import STAGES, Lap, laps, large_file, main, profile, speed_row
-from pipeline.synthetic.dataset import simulate
+from pipeline.ruler.simulation.dataset import simulate
 
 
 @pytest.fixture(scope="module")

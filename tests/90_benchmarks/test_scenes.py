@@ -24,10 +24,10 @@ from benchmarks.scene_suites import (
     where_surveyed,
 )
 from benchmarks.scenes import PLOT, SCENES, fill_page, main, measure_real, real_tables, scenes_named
-from pipeline.evaluation.detection import DetectedObject, Detection, DetectionBlock
-from pipeline.evaluation.models import RoofModel
-from pipeline.evaluation.reference import Reference, ReferencePoints
 from pipeline.model import RoofType
+from pipeline.ruler.evaluation.detection import DetectedObject, Detection, DetectionBlock
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
 from pipeline.scene import BUILDING_CLASS
 from pipeline.settings import RunSettings
 

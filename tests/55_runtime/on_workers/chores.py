@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from pipeline.runtime.isolation import IsolationLimits, supervise
+from pipeline.runtime.isolation.isolated_items import IsolationLimits, supervise
 
 DEADLINE_S = 120.0
 

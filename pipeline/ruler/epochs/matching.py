@@ -1,0 +1,190 @@
+"""Which buildings of two epochs belong together: by the overlap of their footprints in plan.
+
+Pairs that share enough of the smaller footprint are edges of a graph; its connected groups are what is compared. One
+building may so become several (split), several one (merged), or both. A group whose two sides cover little in common is
+no group: what stood there is gone, and something else is new.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pipeline.model import BoolArray, FloatArray, IntArray
+from pipeline.ruler.epochs.epoch import Epoch
+from pipeline.ruler.epochs.settings import DiffSettings
+
+ROWS_A_PART = 20_000
+"""Buildings of one epoch whose geometry is held at once, about."""
+_LEAST_M2 = 1e-6
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pairs:
+    """Pairs of footprints that share area, all of length p."""
+
+    old: IntArray
+    """(p,) int64, row of the earlier epoch; ascending."""
+    new: IntArray
+    """(p,) int64, row of the later one."""
+    common_m2: FloatArray
+    """(p,) float64, area that they share."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Groups:
+    """Buildings that belong together; every building is in exactly one group."""
+
+    of_old: IntArray
+    """(o,) int64, the group of each building of the earlier epoch."""
+    of_new: IntArray
+    """(n,) int64, the group of each building of the later one."""
+    count: int
+    """Number of groups; they are numbered from 0."""
+    common_m2: FloatArray
+    """(count,) float64, area that their two sides share."""
+    pairs: Pairs
+    """All pairs, also those between two groups."""
+
+
+def parts_of(xy: FloatArray, most: int = ROWS_A_PART) -> Iterator[IntArray]:
+    """Places (n, 2) in compact parts of at most so many, by halving at the median of the longer side.
+
+    Which place falls into which part depends on the places alone, not on their order. Places that coincide stay
+    together, whatever their number. Places that are nan come last.
+
+    Yields
+    ------
+    (k,) int64
+        Indices of a part, ascending.
+    """
+    known = np.isfinite(xy).all(axis=1)
+    stack = [np.flatnonzero(known)]
+    while stack:
+        part = stack.pop()
+        if len(part) == 0:
+            continue
+        span = np.ptp(xy[part], axis=0)
+        axis = int(span[1] > span[0])
+        middle = float(np.median(xy[part, axis]))
+        low = xy[part, axis] < middle
+        if not low.any():  # more than half of them lie at the low end
+            low = xy[part, axis] <= middle
+        if len(part) <= most or span[axis] == 0.0:
+            yield part
+            continue
+        stack += [part[~low], part[low]]
+    if not known.all():
+        yield np.flatnonzero(~known)
+
+
+def middles(boxes: FloatArray) -> FloatArray:
+    """Middles (n, 2) of boxes (n, 4)."""
+    return (boxes[:, :2] + boxes[:, 2:]) / 2.0
+
+
+def meeting(boxes: FloatArray, around: FloatArray) -> BoolArray:
+    """Which boxes (n, 4) meet one box (4,)."""
+    found: BoolArray = (
+        (boxes[:, 0] <= around[2])
+        & (boxes[:, 2] >= around[0])
+        & (boxes[:, 1] <= around[3])
+        & (boxes[:, 3] >= around[1])
+    )
+    return found
+
+
+def around(boxes: FloatArray) -> FloatArray:
+    """The box (4,) around boxes (n, 4), n at least 1."""
+    return np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
+
+
+def overlapping(old: Any, new: Any) -> tuple[IntArray, IntArray, FloatArray]:
+    """Indices into two arrays of valid footprints that share area, and how much; ordered by both indices."""
+    if len(old) == 0 or len(new) == 0:
+        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+    a, b = shapely.STRtree(new).query(old)
+    order = np.lexsort((b, a))
+    a, b = a[order].astype(np.int64), b[order].astype(np.int64)
+    common = shapely.area(shapely.intersection(old[a], new[b]))
+    some = common > _LEAST_M2
+    return a[some], b[some], common[some]
+
+
+def all_pairs(old: Epoch, new: Epoch) -> tuple[Pairs, FloatArray, FloatArray]:
+    """All pairs of buildings that share area, and the areas of all footprints, 0 without geometry.
+
+    Geometry is read part by part; a pair is found with the part of its earlier building.
+    """
+    old_m2, new_m2 = np.zeros(len(old)), np.zeros(len(new))
+    found: list[tuple[IntArray, IntArray, FloatArray]] = []
+    for part in parts_of(middles(old.boxes)):
+        if not np.isfinite(old.boxes[part]).all():
+            continue
+        near = np.flatnonzero(meeting(new.boxes, around(old.boxes[part])))
+        first, second = old.buildings(part, ("geometry",)), new.buildings(near, ("geometry",))
+        old_m2[first.rows] = shapely.area(first.footprints)
+        a, b, common = overlapping(first.footprints, second.footprints)
+        new_m2[second.rows] = shapely.area(second.footprints)
+        found.append((first.rows[a], second.rows[b], common))
+    unseen = np.flatnonzero((new_m2 == 0.0) & np.isfinite(new.boxes).all(axis=1))
+    for part in parts_of(middles(new.boxes[unseen])):
+        alone = new.buildings(unseen[part], ("geometry",))
+        new_m2[alone.rows] = shapely.area(alone.footprints)
+    a, b, common = (
+        (np.concatenate([one[k] for one in found]) for k in range(3))
+        if found
+        else (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
+    )
+    order = np.lexsort((b, a))
+    return Pairs(old=a[order], new=b[order], common_m2=common[order]), old_m2, new_m2
+
+
+def grouped(pairs: Pairs, old_m2: FloatArray, new_m2: FloatArray, settings: DiffSettings) -> Groups:
+    """Buildings that belong together.
+
+    Parameters
+    ----------
+    pairs : Pairs
+        All pairs that share area.
+    old_m2, new_m2 : (o,), (n,) float64
+        Areas of all footprints of the two epochs.
+    settings : DiffSettings
+        Says how much is enough.
+    """
+    smaller = np.minimum(old_m2[pairs.old], new_m2[pairs.new])
+    kept = pairs.common_m2 >= settings.min_overlap_share * smaller
+    count, labels = _components(pairs, kept, len(old_m2), len(new_m2))
+    common = _summed(labels[pairs.old[kept]], pairs.common_m2[kept], count)
+    areas = np.bincount(labels, weights=np.concatenate([old_m2, new_m2]), minlength=count)
+    iou = np.divide(common, areas - common, out=np.zeros(count), where=areas > common)
+    dissolved = (common > 0.0) & (iou < settings.min_iou)
+    if dissolved.any():
+        kept &= ~dissolved[labels[pairs.old]]
+        count, labels = _components(pairs, kept, len(old_m2), len(new_m2))
+        common = _summed(labels[pairs.old[kept]], pairs.common_m2[kept], count)
+    return Groups(
+        of_old=labels[: len(old_m2)], of_new=labels[len(old_m2) :], count=count, common_m2=common, pairs=pairs
+    )
+
+
+def _summed(index: IntArray, values: FloatArray, count: int) -> FloatArray:
+    """Sums of values (n,) by an index (n,) in 0 to count - 1: (count,)."""
+    sums: FloatArray = np.bincount(index, weights=values, minlength=count).astype(np.float64)
+    return sums
+
+
+def _components(pairs: Pairs, kept: BoolArray, n_old: int, n_new: int) -> tuple[int, IntArray]:
+    """Connected groups of the graph of the kept pairs, a number each; buildings of the later epoch come second."""
+    size = n_old + n_new
+    if size == 0:
+        return 0, np.empty(0, np.int64)
+    edges = (np.ones(int(kept.sum()), np.int8), (pairs.old[kept], n_old + pairs.new[kept]))
+    count, labels = connected_components(coo_array(edges, shape=(size, size)), directed=False)
+    return int(count), labels.astype(np.int64)

@@ -1,0 +1,201 @@
+"""One evaluation: models and a reference in, every measure out. The table of contents of the ruler."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import pyarrow as pa
+import shapely
+
+from pipeline.model import RoofType
+from pipeline.ruler.evaluation import delivery, faces, footprints, roof_types, surface, tables, validity
+from pipeline.ruler.evaluation.blocks import joined_reference
+from pipeline.ruler.evaluation.detection import detect, detection_measures
+from pipeline.ruler.evaluation.ground import FoundGround, ground_blocks, ground_measures
+from pipeline.ruler.evaluation.matching import match_footprints
+from pipeline.ruler.evaluation.measure import Measure
+from pipeline.ruler.evaluation.models import ModelSet
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.residuals import building_residuals, residual_measures
+from pipeline.ruler.evaluation.subsets import Subset, subsets
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What an evaluation found."""
+
+    models: ModelSet
+    """What was measured."""
+    reference: Reference | None
+    """Against what, with blocks joined where they were; None: the models alone."""
+    measures: tuple[Measure, ...]
+    """Every figure, in the order of the chapters."""
+    tables: Mapping[str, pa.Table]
+    """The rows behind the figures by name; see `pipeline.ruler.evaluation.tables`."""
+    notes: tuple[str, ...]
+    """What the measures had to assume or leave out."""
+
+    def measure(self, name: str, subset: str = "all") -> Measure:
+        """One figure.
+
+        Raises
+        ------
+        KeyError
+            It was not possible here.
+        """
+        for measure in self.measures:
+            if measure.name == name and measure.subset == subset:
+                return measure
+        raise KeyError(f"no measure {name!r} of subset {subset!r}")
+
+
+def needs_blocks(models: ModelSet, reference: Reference) -> bool:
+    """Whether single houses of a row cannot be asked for: models without footprints against simulated truth.
+
+    Whatever wrote them: a run and its own CityJSON are held to one reference.
+    """
+    return reference.kind == "truth" and not models.has_footprints
+
+
+def tells_types(models: ModelSet) -> bool:
+    """Whether any model says a roof type, so that types can be judged; True without models: none is found then."""
+    untold = {RoofType.UNKNOWN, RoofType.NONE}
+    return not models.models or any(model.roof_type not in untold for model in models.models)
+
+
+def evaluate(
+    models: ModelSet,
+    reference: Reference | None = None,
+    *,
+    blocks: bool | None = None,
+    ground: FoundGround | None = None,
+    on_step: Callable[[str], None] = lambda _: None,
+) -> Evaluation:
+    """Measure models.
+
+    Parameters
+    ----------
+    models : ModelSet
+        From `pipeline.ruler.evaluation.reading.read_models`.
+    reference : Reference, optional
+        From `read_truth_reference` or `read_points_reference`; without one only delivery and validity are told.
+    blocks : bool, optional
+        Join true buildings that touch; by default as `needs_blocks` says.
+    ground : callable, optional
+        What was found as ground; without it the ground measures are left out.
+    on_step : callable
+        Told the name of each step as it begins.
+
+    Returns
+    -------
+    Evaluation
+        The points of the reference are read once for the residuals, and once more each for detection against points
+        and for the ground.
+    """
+    on_step("solids")
+    solids = validity.validity(models)
+    valid = validity.measures(solids)
+    found: dict[str, pa.Table] = {"validity_codes": tables.validity_table(solids)}
+    if reference is None:
+        found["models"] = tables.model_table(models, solids, None)
+        return Evaluation(
+            models=models,
+            reference=None,
+            measures=(*delivery.record_measures(models), *valid),
+            tables=found,
+            notes=(),
+        )
+    if needs_blocks(models, reference) if blocks is None else blocks:
+        reference = joined_reference(reference)
+    groups = [group for group in subsets(reference) if group.elsewhere or group.size]
+    measures: list[Measure] = []
+    if reference.buildings or reference.extent is not None:
+        measures += _buildings(models, reference, groups, solids, found, on_step)
+    else:
+        measures += delivery.record_measures(models)
+        found["models"] = tables.model_table(models, solids, None)
+    if ground is not None and reference.has_ground:
+        on_step("ground")
+        judged = ground_blocks(reference, ground)
+        measures += ground_measures(judged, groups[0])
+        found["ground"] = tables.ground_table(judged)
+    return Evaluation(
+        models=models, reference=reference, measures=(*measures, *valid), tables=found, notes=_notes(models, reference)
+    )
+
+
+def _buildings(
+    models: ModelSet,
+    reference: Reference,
+    groups: Sequence[Subset],
+    solids: tuple[validity.ModelValidity, ...],
+    found: dict[str, pa.Table],
+    on_step: Callable[[str], None],
+) -> list[Measure]:
+    """Everything that asks for buildings; adds the tables to `found`."""
+    on_step("footprints")
+    matching = match_footprints(models.models, reference)
+    delivered = delivery.score_delivery(models.models, reference, matching)
+    outlines = footprints.score_footprints(models.models, reference, matching)
+    on_step("roof faces")
+    face_score = faces.score_faces(models.models, reference)
+    types = roof_types.score_roof_types(models.models, reference, matching, face_score) if tells_types(models) else ()
+    on_step("roof surfaces")
+    surfaces = surface.score_surface(models.models, reference)
+    on_step("points")
+    residuals = building_residuals(models.models, reference) if reference.tiles else []
+    on_step("detection")
+    detected = detect(models.models, reference)
+    on_step("intervals")
+    found["buildings"] = tables.building_table(reference, models.models, outlines, types, residuals, surfaces)
+    found["models"] = tables.model_table(models, solids, delivered)
+    if residuals:
+        found["residual_histogram"] = tables.residual_histogram(residuals)
+    if reference.has_faces:
+        found["true_faces"] = tables.true_face_table(face_score, reference)
+        found["model_faces"] = tables.model_face_table(face_score, models.models, reference)
+        found["topology"] = tables.topology_table(face_score)
+        found |= tables.outcome_tables(types, groups) if types else {}
+    measures = delivery.record_measures(models)
+    for group in groups:
+        measures += delivery.measures(delivered, group)
+        measures += residual_measures(residuals, group)
+        measures += surface.measures(surfaces, group)
+        measures += faces.measures(face_score, group)
+        measures += roof_types.measures(types, group)
+        measures += footprints.measures(outlines, group)
+        measures += detection_measures(detected, group)
+    return measures
+
+
+def _notes(models: ModelSet, reference: Reference) -> tuple[str, ...]:
+    found = []
+    codes = [crs for crs in (models.crs, reference.crs) if crs is not None and crs.startswith("EPSG:")]
+    # a name and a code may well mean the same; of a compound code the first part is the horizontal one
+    if len({code.split("+")[0] for code in codes}) > 1:
+        found.append(
+            f"The models are in {codes[0]}, the reference in {codes[1]}: coordinates were compared as they are."
+        )
+    if reference.has_faces and not tells_types(models):
+        found.append("No model tells its roof type: types, and the outcomes that ask for them, are not judged.")
+    if models.has_footprints and reference.outlines == "given":
+        found.append(
+            "The models follow given footprints, and so does the reference: where these are the same, outlines and "
+            "detection agree by themselves and say nothing of the method."
+        )
+    known = [building.footprint for building in reference.buildings]
+    if reference.extent is not None:
+        known.append(reference.extent)
+    if known and models.models:
+        place = shapely.box(*shapely.total_bounds(known))
+        away = int((~shapely.intersects(place, [model.footprint for model in models.models])).sum())
+        if away == len(models.models):
+            found.append(
+                "None of the models stands where the reference is: another place, or another reference system."
+            )
+        elif away:
+            found.append(
+                f"{away:,} of the {len(models.models):,} models stand beyond the reference and are not judged."
+            )
+    return tuple(found)

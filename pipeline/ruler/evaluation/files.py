@@ -1,0 +1,133 @@
+"""Evaluations of what lies on the disk: which reader for which argument."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+from pipeline.errors import SettingsError
+from pipeline.io import storage_at
+from pipeline.io.source import ReadOptions
+from pipeline.ruler.evaluation.evaluate import Evaluation, evaluate
+from pipeline.ruler.evaluation.ground import FoundGround, GroundOfFiles, GroundOfRun
+from pipeline.ruler.evaluation.models import ModelSet
+from pipeline.ruler.evaluation.reading import read_models
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.reference_points import read_points_reference
+from pipeline.ruler.evaluation.reference_truth import read_truth_reference
+from pipeline.runtime.manifest import NAME as MANIFEST
+from pipeline.runtime.manifest import read_manifest
+from pipeline.settings import RunSettings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvaluationRequest:
+    """What is to be measured, and against what."""
+
+    models: str
+    """A run directory, or models of other programs."""
+    truth: str | None = None
+    """The folder of simulated truth."""
+    points: tuple[str, ...] = ()
+    """Classified point files."""
+    footprints: str | None = None
+    """Outlines of buildings, with points."""
+    ground: tuple[str, ...] = ()
+    """Point files whose class 2 is the ground to be judged; without any the run's own ground stage."""
+    crs: str | None = None
+    """Of the point files, where their header has none or a wrong one."""
+    vertical_unit: str | None = None
+    """Unit of their elevations."""
+    as_surveyed: bool = False
+    """Move true buildings to where the survey saw them."""
+    blocks: bool | None = None
+    """Join true buildings that touch; None: as the models need it."""
+
+    def __post_init__(self) -> None:
+        """Hold what belongs together.
+
+        Raises
+        ------
+        SettingsError
+            If truth and points are both given, or footprints or ground without what they belong to.
+        """
+        faults = []
+        if self.truth is not None and self.points:
+            faults.append("both a truth and points are given as the reference: use one of --truth and --points")
+        if self.footprints is not None and not self.points:
+            faults.append(f"footprints are {self.footprints} without points: give the classified tile by --points")
+        if self.as_surveyed and self.truth is None:
+            faults.append("as-surveyed is asked for without a truth: only simulated strips tell their shifts")
+        if self.ground and self.truth is None and not self.points:
+            faults.append(f"ground is {', '.join(self.ground)} without a reference: give --points or --truth")
+        if faults:
+            raise SettingsError(faults)
+
+
+def read_reference(request: EvaluationRequest) -> Reference | None:
+    """What a request measures against; None where it names nothing.
+
+    Parameters
+    ----------
+    request : EvaluationRequest
+        Its models are not looked at.
+
+    Raises
+    ------
+    InputError
+        The reference cannot be read.
+    """
+    if request.truth is not None:
+        return read_truth_reference(request.truth, as_surveyed=request.as_surveyed)
+    if request.points:
+        options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit)
+        return read_points_reference(request.points, footprints=request.footprints, read_options=options)
+    return None
+
+
+def evaluate_files(
+    request: EvaluationRequest,
+    on_step: Callable[[str], None] = lambda _: None,
+    reference: Reference | None = None,
+) -> Evaluation:
+    """Read and measure.
+
+    Parameters
+    ----------
+    request : EvaluationRequest
+        What, against what.
+    on_step : callable
+        Told the name of each step as it begins.
+    reference : Reference, optional
+        From `read_reference` of the same request, where it serves several models.
+
+    Raises
+    ------
+    InputError
+        Models or reference cannot be read.
+    RunError
+        A run directory is damaged.
+    """
+    on_step("models")
+    models = read_models(request.models)
+    if reference is None and (request.truth is not None or request.points):
+        on_step("reference")
+        reference = read_reference(request)
+    options = ReadOptions(crs=request.crs, vertical_unit=request.vertical_unit)
+    ground = None if reference is None else _ground(request.ground, models, reference, options)
+    return evaluate(models, reference, blocks=request.blocks, ground=ground, on_step=on_step)
+
+
+def _ground(files: Sequence[str], models: ModelSet, reference: Reference, options: ReadOptions) -> FoundGround | None:
+    """What was found as ground: by given files, else by the stage of the run; None for models of other programs."""
+    if not reference.has_ground:
+        return None
+    if files:
+        return GroundOfFiles(files, options)
+    if models.kind != "run":
+        return None
+    if not storage_at(models.path).has(MANIFEST):  # simulated truth, or tables alone: nothing there found ground
+        return None
+    settings = read_manifest(models.path).settings
+    sections = {name: table for name, table in settings.items() if name != "general"}
+    return GroundOfRun(reference, RunSettings.from_mapping({**settings.get("general", {}), **sections}).scene)

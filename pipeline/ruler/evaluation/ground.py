@@ -1,0 +1,436 @@
+"""The ground filter against reference classes: type I, type II and total error, and kappa (Sithole, Vosselman 2003).
+
+Judged are last returns, the ones that a ground filter decides on; noise and water are left out, and where a file tells
+objects by their classes also what it leaves unclassified: nobody looked whether that is ground. What was found comes
+from a classified file that any program wrote, or from the ground stage of a run: its filter over the same points, with
+its settings and its rule for the points near the terrain (`ground_points`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.compiler import kernel
+from pipeline.errors import InconsistentInputError
+from pipeline.io import ReadOptions, open_source
+from pipeline.io.remote_file import file_at
+from pipeline.model import BoolArray, FloatArray, IntArray
+from pipeline.ruler.evaluation.bootstrap import Statistic, Sums, share
+from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
+from pipeline.ruler.evaluation.subsets import Subset, measured
+from pipeline.scene import GROUND_CLASS, SceneSettings
+from pipeline.terrain.ground import Terrain, ground_of, ground_points
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_cell
+from pipeline.terrain.outliers import OutlierSettings, dense_enough
+
+NOT_JUDGED = (7, 9, 18)
+"""Reference classes that are neither ground nor object: low noise, water, high noise."""
+UNCLASSIFIED = (0, 1)
+"""Classes that name no object. In the benchmark's samples all that is not ground has one of them."""
+BLOCK_M = 50
+"""Side of the blocks that are the units of the bootstrap."""
+MM = 1000
+WINDOW_CELLS = 512
+"""Side of the windows in which the terrain is drawn, in cells of 1 m."""
+_WHOLE_POINTS = 20_000_000
+"""More points than these are searched for outliers window by window."""
+_NO_MORE = 2**62
+
+FoundGround = Callable[[ReferencePoints], BoolArray]
+"""From the points of a tile to what was found: (n,) bool, True for ground."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GroundBlock:
+    """Judged points of one block of 50 m of one tile."""
+
+    tile: str
+    """Name of the tile."""
+    row: int
+    """Index of the block along northing, 0 at the origin of the CRS."""
+    column: int
+    """Index along easting."""
+    ground_as_ground: int
+    """Ground, found as ground."""
+    ground_as_object: int
+    """Ground, taken for an object: type I."""
+    object_as_ground: int
+    """Object, taken for ground: type II."""
+    object_as_object: int
+    """Object, found as object."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TileGround:
+    """The figures of one tile, as the samples of the benchmark are reported."""
+
+    tile: str
+    """Its name."""
+    type_1: float
+    """Share of ground taken for object; nan without ground."""
+    type_2: float
+    """Share of objects taken for ground; nan without objects."""
+    total: float
+    """Share of points on the wrong side."""
+    kappa: float
+    """Cohen's kappa."""
+    ground: int
+    """Judged ground points of the reference."""
+    object: int
+    """Judged other points of the reference."""
+
+
+# ------------------------------------------------------------------------------------------------------------ counts
+
+
+def ground_blocks(reference: Reference, found: FoundGround) -> list[GroundBlock]:
+    """Count right and wrong points of every tile, block by block; one tile in memory.
+
+    Parameters
+    ----------
+    reference : Reference
+        With ground classes.
+    found : callable
+        `GroundOfFiles` or `GroundOfRun`, or any other.
+
+    Returns
+    -------
+    list of GroundBlock
+        In the order of the tiles; empty where the reference knows no ground.
+    """
+    if not reference.has_ground:
+        return []
+    rows: list[GroundBlock] = []
+    left_out = NOT_JUDGED if reference.unclassified_is_object else (*NOT_JUDGED, *UNCLASSIFIED)
+    for points in reference.points():
+        labels = found(points)
+        judged = points.last & ~np.isin(points.classification, left_out)
+        is_ground = points.classification[judged] == GROUND_CLASS
+        outcome = np.where(is_ground, 0, 2) + np.where(labels[judged] == is_ground, 0, 1)
+        place = np.floor(points.xyz[judged, :2] / BLOCK_M).astype(np.int64)
+        west = place[:, 0].min(initial=0)
+        width = int(place[:, 0].max(initial=0) - west) + 1
+        blocks, unit = np.unique(place[:, 1] * width + (place[:, 0] - west), return_inverse=True)
+        counts = np.bincount(4 * unit + outcome, minlength=4 * len(blocks)).reshape(-1, 4)
+        rows_columns = zip((blocks // width).tolist(), (west + blocks % width).tolist(), strict=True)
+        for (row, column), (right, missed, wrong, other) in zip(
+            rows_columns, counts[:, [0, 1, 3, 2]].tolist(), strict=True
+        ):
+            rows.append(
+                GroundBlock(
+                    tile=points.name,
+                    row=row,
+                    column=column,
+                    ground_as_ground=right,
+                    ground_as_object=missed,
+                    object_as_ground=wrong,
+                    object_as_object=other,
+                )
+            )
+    return rows
+
+
+def tile_figures(rows: Sequence[GroundBlock]) -> list[TileGround]:
+    """The figures of each tile, in the order of the tiles."""
+    by_tile: dict[str, list[GroundBlock]] = defaultdict(list)
+    for row in rows:
+        by_tile[row.tile].append(row)
+    found = []
+    for tile, blocks in by_tile.items():
+        columns = _columns(blocks)
+        sums = {name: column.sum(keepdims=True) for name, column in columns.items()}
+        with np.errstate(divide="ignore", invalid="ignore"):
+            figures = {name: float(statistic(sums)[0]) for name, statistic, _ in _STATISTICS}
+        found.append(TileGround(tile=tile, **figures, ground=int(sums["ground"][0]), object=int(sums["object"][0])))
+    return found
+
+
+# ---------------------------------------------------------------------------------------------------- found in files
+
+
+class GroundOfFiles:
+    """Ground as classified files say that some program wrote for the same points.
+
+    Parameters
+    ----------
+    paths : sequence of str or Path
+        LAS, LAZ or other point files; class 2 is ground.
+    options : ReadOptions, optional
+        CRS and units as for the reference; nothing is dropped, whatever it says.
+    """
+
+    def __init__(self, paths: Sequence[str | Path], options: ReadOptions | None = None) -> None:
+        self._options = dataclasses.replace(options or ReadOptions(), keep_withheld=True, drop_classes=())
+        self._paths = [file_at(path) for path in paths]
+        self._bounds = [open_source(path, self._options).info.bounds_m for path in self._paths]
+
+    def __call__(self, points: ReferencePoints) -> BoolArray:
+        """Labels of the points of a tile, matched by coordinates in whole millimetres and return number.
+
+        Raises
+        ------
+        InconsistentInputError
+            Some points of the tile are in none of the files.
+        """
+        if len(points.xyz) == 0:
+            return np.zeros(0, np.bool_)
+        low, high = points.xyz.min(axis=0) - 0.001, points.xyz.max(axis=0) + 0.001
+        xyz, returns, ground = [np.zeros((0, 3))], [np.zeros(0, np.uint8)], [np.zeros(0, np.bool_)]
+        for path, bounds in zip(self._paths, self._bounds, strict=True):
+            if bounds[0] > high[0] or bounds[3] < low[0] or bounds[1] > high[1] or bounds[4] < low[1]:
+                continue
+            for cloud in open_source(path, self._options).chunks():
+                inside = ((cloud.xyz[:, :2] >= low[:2]) & (cloud.xyz[:, :2] <= high[:2])).all(axis=1)
+                xyz.append(cloud.xyz[inside])
+                returns.append(cloud.return_number[inside])
+                ground.append(cloud.classification[inside] == GROUND_CLASS)
+        numbers = np.concatenate(returns) if points.return_number is not None else None
+        match = matched_points(points.xyz, points.return_number, np.concatenate(xyz), numbers)
+        missing = int((match < 0).sum())
+        if missing:
+            at = points.xyz[int(np.flatnonzero(match < 0)[0])]
+            raise InconsistentInputError(
+                ", ".join(str(path) for path in self._paths) or "(no file)",
+                f"{missing} of the {len(match)} points of {points.name} are not in it, the first at"
+                f" {at[0]:.3f} {at[1]:.3f} {at[2]:.3f}",
+                "Classify the very points of the reference: the same coordinates to 1 mm and the same return numbers",
+            )
+        found: BoolArray = np.concatenate(ground)[match]
+        return found
+
+
+def matched_points(
+    wanted: FloatArray, wanted_return: np.ndarray | None, offered: FloatArray, offered_return: np.ndarray | None
+) -> IntArray:
+    """The offered point at the place of each wanted one.
+
+    Parameters
+    ----------
+    wanted, offered : (n, 3) and (m, 3) float64
+        Metres, compared on whole millimetres.
+    wanted_return, offered_return : (n,) and (m,) uint8, or None for both
+        Return numbers, which must agree too.
+
+    Returns
+    -------
+    (n,) int64
+        Index into the offered points, each given once; -1 where none is left. Equal points pair up in their order.
+    """
+    a, b = np.rint(wanted * MM).astype(np.int64), np.rint(offered * MM).astype(np.int64)
+    r = np.zeros(len(a), np.int64) if wanted_return is None else wanted_return.astype(np.int64)
+    s = np.zeros(len(b), np.int64) if offered_return is None else offered_return.astype(np.int64)
+    if len(a) == len(b) and (a == b).all() and (r == s).all():
+        return np.arange(len(a))
+    if len(a) == 0 or len(b) == 0:
+        return np.full(len(a), -1, np.int64)
+    corner = np.minimum(a.min(axis=0), b.min(axis=0))
+    keys = []
+    for mm, number in ((a - corner, r), (b - corner, s)):
+        plan, rest = mm[:, 0] << 32 | mm[:, 1], mm[:, 2] << 8 | number
+        order = np.lexsort((rest, plan))
+        keys.append((plan[order], rest[order], order))
+    return _merged(*keys[0], *keys[1])
+
+
+@kernel
+def _merged(
+    plan_a: IntArray, rest_a: IntArray, order_a: IntArray, plan_b: IntArray, rest_b: IntArray, order_b: IntArray
+) -> IntArray:
+    """Pairs of equal keys of two sorted lists."""
+    match = np.full(len(plan_a), -1, np.int64)
+    j = 0
+    for i in range(len(plan_a)):
+        while j < len(plan_b) and (plan_b[j] < plan_a[i] or (plan_b[j] == plan_a[i] and rest_b[j] < rest_a[i])):
+            j += 1
+        if j < len(plan_b) and plan_b[j] == plan_a[i] and rest_b[j] == rest_a[i]:
+            match[order_a[i]] = order_b[j]
+            j += 1
+    return match
+
+
+# ----------------------------------------------------------------------------------------------------- found by a run
+
+
+class GroundOfRun:
+    """Ground as a run's own ground stage finds it, its filter run again over the reference's points.
+
+    Made in one pass over the points: the lowest last return of each cell of 1 m, then the terrain window by window
+    with all the halo that the filter looks at, so that it does not depend on the tiles. Classes of the file are never
+    believed here, whatever the run did. Gross outliers are searched tile by tile.
+
+    Parameters
+    ----------
+    reference : Reference
+        With points.
+    settings : SceneSettings
+        The run's.
+    """
+
+    def __init__(self, reference: Reference, settings: SceneSettings) -> None:
+        self._settings = settings
+        self._lowest: dict[tuple[int, int], Elevations] = {}
+        for points in reference.points():
+            self._add(points)
+        self._terrain = {place: self._drawn(*place) for place in sorted(self._lowest)}
+
+    def __call__(self, points: ReferencePoints) -> BoolArray:
+        """Ground of a tile: near the terrain or below it; outliers are none."""
+        x, y, z = _millimetres(points.xyz)
+        found = np.zeros(len(x), np.bool_)
+        for (row, column), index in _by_window(x, y):
+            terrain = self._terrain[row, column]
+            found[index] = ground_points(x[index], y[index], z[index], terrain, self._settings.ground)
+        return found & kept_points(x, y, z, self._settings.outliers)
+
+    def _add(self, points: ReferencePoints) -> None:
+        """Lower the cells of a tile's last returns."""
+        x, y, z = _millimetres(points.xyz)
+        usable = points.last & kept_points(x, y, z, self._settings.outliers)
+        for (row, column), index in _by_window(x, y):
+            corner = column * WINDOW_CELLS, row * WINDOW_CELLS
+            lowest = lowest_per_cell(x[index], y[index], z[index], usable[index], *corner, WINDOW_CELLS, WINDOW_CELLS)
+            known = self._lowest.get((row, column))
+            self._lowest[row, column] = lowest if known is None else np.minimum(known, lowest)
+
+    def _around(self, row: int, column: int, margin: int) -> Elevations:
+        """The lowest points of a window, and of a margin of at most one window around it."""
+        side = WINDOW_CELLS
+        whole = np.full((3 * side, 3 * side), NO_DATA, np.int32)
+        for i in range(3):
+            for j in range(3):
+                known = self._lowest.get((row + i - 1, column + j - 1))
+                if known is not None:
+                    whole[i * side : (i + 1) * side, j * side : (j + 1) * side] = known
+        cut = slice(side - margin, 2 * side + margin)
+        return np.ascontiguousarray(whole[cut, cut])
+
+    def _drawn(self, row: int, column: int) -> Terrain:
+        """The terrain of a window and of one cell around it, by the run's filter over the lowest points around."""
+        settings = self._settings.ground
+        margin = math.ceil(settings.support_m) + 1
+        if margin > WINDOW_CELLS:
+            raise AssertionError(f"the ground looks {margin} m far, farther than a window of {WINDOW_CELLS} m")
+        lowest = self._around(row, column, margin)
+        corner = column * WINDOW_CELLS - margin, row * WINDOW_CELLS - margin
+        rows, columns = np.nonzero(lowest != NO_DATA)
+        middle = CELL_MM // 2
+        terrain = ground_of(
+            (columns + corner[0]) * CELL_MM + middle,
+            (rows + corner[1]) * CELL_MM + middle,
+            lowest[rows, columns].astype(np.int64),
+            np.ones(len(rows), np.bool_),
+            (*corner, lowest.shape[1], lowest.shape[0]),
+            settings,
+            trusted=False,
+        )
+        inner = slice(margin - 1, 1 - margin)
+        return Terrain(
+            elevation_mm=np.ascontiguousarray(terrain.elevation_mm[inner, inner]),
+            slope_mm=np.ascontiguousarray(terrain.slope_mm[inner, inner]),
+            measured=np.ascontiguousarray(terrain.measured[inner, inner]),
+            column0=corner[0] + margin - 1,
+            row0=corner[1] + margin - 1,
+        )
+
+
+def kept_points(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: OutlierSettings) -> BoolArray:
+    """Mask of the points that are no gross outliers; many points window by window."""
+    if len(x_mm) <= _WHOLE_POINTS:
+        return dense_enough(x_mm, y_mm, z_mm, settings)
+    kept = np.zeros(len(x_mm), np.bool_)
+    reach, side = math.ceil(settings.support_m * MM), WINDOW_CELLS * CELL_MM
+    for (row, column), index in _by_window(x_mm, y_mm):
+        near = (x_mm >= column * side - reach) & (x_mm < (column + 1) * side + reach)
+        near &= (y_mm >= row * side - reach) & (y_mm < (row + 1) * side + reach)
+        around = np.flatnonzero(near)
+        enough = dense_enough(x_mm[around], y_mm[around], z_mm[around], settings)
+        kept[index] = enough[np.searchsorted(around, index)]
+    return kept
+
+
+def _millimetres(xyz: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Coordinates as a run takes them in."""
+    x, y, z = (np.rint(xyz[:, axis] * MM).astype(np.int64) for axis in range(3))
+    return x, y, z
+
+
+def _by_window(x_mm: IntArray, y_mm: IntArray) -> Iterator[tuple[tuple[int, int], IntArray]]:
+    """Row and column of each window with points, and their indices, ascending."""
+    side = WINDOW_CELLS * CELL_MM
+    row, column = y_mm // side, x_mm // side
+    key = (row << 32) + column
+    order = np.argsort(key, kind="stable")
+    starts = np.flatnonzero(np.diff(key[order], prepend=_NO_MORE))
+    for index in np.split(order, starts[1:]) if len(starts) else ():
+        yield (int(row[index[0]]), int(column[index[0]])), index
+
+
+# ---------------------------------------------------------------------------------------------------------- measures
+
+
+def _kappa(sums: Sums) -> FloatArray:
+    """Cohen's kappa: agreement beyond what the margins of the table give by chance."""
+    n = sums["all"]
+    by_chance = (sums["ground"] * sums["found_ground"] + sums["object"] * (n - sums["found_ground"])) / (n * n)
+    agreed = 1.0 - sums["wrong"] / n
+    return (agreed - by_chance) / (1.0 - by_chance)
+
+
+_STATISTICS: tuple[tuple[str, Statistic, str], ...] = (
+    ("type_1", share("missed", "ground"), "ground"),
+    ("type_2", share("taken", "object"), "object"),
+    ("total", share("wrong", "all"), "all"),
+    ("kappa", _kappa, "all"),
+)
+
+DEFINITIONS: tuple[Definition, ...] = tuple(
+    Definition(
+        name=f"ground.{name}",
+        group=Group.GROUND,
+        label=label,
+        unit=unit,
+        better=better,
+        formula=f"{formula}; last returns without noise and water, nor what is left unclassified beside objects",
+    )
+    for name, label, unit, better, formula in (
+        ("type_1", "type I error", "share", Better.LOWER, "ground taken for object / ground"),
+        ("type_2", "type II error", "share", Better.LOWER, "object taken for ground / object"),
+        ("total", "total error", "share", Better.LOWER, "points on the wrong side / all points"),
+        ("kappa", "kappa", "share", Better.HIGHER, "(agreement - agreement by chance) / (1 - agreement by chance)"),
+    )
+)
+"""What this module measures."""
+
+
+def _columns(rows: Sequence[GroundBlock]) -> dict[str, FloatArray]:
+    counts = np.array(
+        [(r.ground_as_ground, r.ground_as_object, r.object_as_ground, r.object_as_object) for r in rows], np.float64
+    ).reshape(-1, 4)
+    right, missed, taken, other = counts.T
+    return {
+        "missed": missed,
+        "taken": taken,
+        "ground": right + missed,
+        "object": taken + other,
+        "found_ground": right + taken,
+        "wrong": missed + taken,
+        "all": counts.sum(axis=1),
+    }
+
+
+def ground_measures(rows: Sequence[GroundBlock], subset: Subset) -> list[Measure]:
+    """The figures over all tiles, blocks of 50 m as units of the bootstrap; only for the subset of all."""
+    if not rows or not subset.elsewhere:
+        return []
+    columns = _columns(rows)
+    return [
+        measured(f"ground.{name}", columns, statistic, n=columns[denominator].sum(), subset=subset)
+        for name, statistic, denominator in _STATISTICS
+    ]

@@ -1,0 +1,323 @@
+"""From polygons of any file to roof faces, a footprint and solids.
+
+1. Faces that the file does not name are told by their normals, once the part as a whole faces outward: roofs look up
+   and have no other roof above them.
+2. Roof faces that share edges and lie in one plane become one, so that a triangulated model is worth the same as the
+   polygons that it was cut from.
+3. Each gets the least-squares plane of its vertices; the footprint is the union of all of them in plan.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from itertools import chain
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.geometry import fit_plane_coefficients
+from pipeline.model import BoolArray, FaceKind, FloatArray, IntArray, Solid, SolidFace
+from pipeline.ruler.evaluation.models import RoofSurface
+from pipeline.ruler.evaluation.reading.coplanar import ANGLE_DEG, DISTANCE_M, coplanar_regions, face_vectors
+from pipeline.ruler.evaluation.reading.raw import MILLIMETRES_PER_METRE, RawPart
+
+GRID_M = 0.001
+"""Coordinates in plan are whole multiples of it."""
+LEAST_UP = 0.1
+"""A face whose unit normal has a larger z looks up, one with a smaller -z down; the rest are walls."""
+
+_LEAST_AREA_M2 = 1e-6
+_SLIVER_M = 0.004
+"""A hole in a footprint that is narrower on average is where two files' roundings met."""
+_COVERED_SHARE = 0.5
+"""A doubtful face with more of its area under other roofs is no roof."""
+
+Coefficients = tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Assembled:
+    """What the parts of a building amount to."""
+
+    surfaces: tuple[RoofSurface, ...]
+    """Roof faces; none where there is nothing that looks like a roof."""
+    footprint: Polygon | MultiPolygon
+    """Of the roof faces, else of the ground faces; empty without either."""
+    solids: tuple[Solid, ...]
+    """Of the parts that are meant to be solids."""
+    solid_origin: tuple[float, float, float]
+    """What the solids are about: whole metres."""
+
+
+class _Soup:
+    """All faces of a building as flat arrays, about an origin in whole metres."""
+
+    def __init__(self, parts: Sequence[RawPart]) -> None:
+        xyz = np.vstack([part.xyz for part in parts])
+        self.origin = np.floor(xyz.min(axis=0))
+        self.local = np.ascontiguousarray(xyz - self.origin)
+        self.millimetres = np.rint(self.local * MILLIMETRES_PER_METRE).astype(np.int64)
+        self.first_vertex = np.concatenate([[0], np.cumsum([len(part.xyz) for part in parts])])
+        self.faces = [face for part in parts for face in part.faces]
+        self.part = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
+        rings = [ring for face in self.faces for ring in face.rings]
+        self.ring_offsets = _offsets([len(ring) for ring in rings])
+        self.face_rings = _offsets([len(face.rings) for face in self.faces])
+        counts = np.diff(self.ring_offsets[self.face_rings])
+        shift = np.repeat(self.first_vertex[self.part], counts)
+        self.corners = np.fromiter(chain.from_iterable(rings), np.int64, len(shift)) + shift
+        self.vectors = face_vectors(self.local, self.corners, self.ring_offsets, self.face_rings)
+        places: dict[tuple[int, ...], int] = {}
+        first = [places.setdefault(tuple(key), k) for k, key in enumerate(self.millimetres.tolist())]
+        self.welded = np.array(first, np.int64)[self.corners]
+
+    def corners_of(self, face: int) -> IntArray:
+        """Vertices of all rings of a face, one for all in the same place."""
+        first, last = self.face_rings[face], self.face_rings[face + 1]
+        corners: IntArray = self.welded[self.ring_offsets[first] : self.ring_offsets[last]]
+        return corners
+
+    def plan(self, faces: IntArray) -> list[Polygon | MultiPolygon]:
+        """The faces in plan, metres about the origin, on the grid, valid; empty where they have no area."""
+        xy = self.millimetres[:, :2] / MILLIMETRES_PER_METRE
+        polygons = []
+        for face in faces:
+            rings = []
+            for ring in range(self.face_rings[face], self.face_rings[face + 1]):
+                corners = self.corners[self.ring_offsets[ring] : self.ring_offsets[ring + 1]]
+                if len(corners) >= 3:
+                    rings.append(xy[corners])
+            polygons.append(Polygon(rings[0], rings[1:]) if rings else Polygon())
+        for k in np.flatnonzero(~shapely.is_valid(polygons)):
+            polygons[k] = _areas_of(shapely.make_valid(polygons[k]))
+        return polygons
+
+    def subset(self, faces: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+        """Corners of some faces, one vertex for all in the same place, their ring offsets and face offsets."""
+        rings = np.concatenate([np.arange(self.face_rings[f], self.face_rings[f + 1]) for f in faces])
+        lengths = np.diff(self.ring_offsets)[rings]
+        corners = np.concatenate([self.corners_of(int(face)) for face in faces])
+        return corners, _offsets(lengths.tolist()), _offsets(np.diff(self.face_rings)[faces].tolist())
+
+
+def _offsets(lengths: Sequence[int]) -> IntArray:
+    """Where each of consecutive runs starts, and where the last ends."""
+    offsets = np.zeros(len(lengths) + 1, np.int64)
+    np.cumsum(lengths, out=offsets[1:])
+    return offsets
+
+
+def _areas_of(geometry: shapely.Geometry) -> Polygon | MultiPolygon:
+    """What of a geometry has area."""
+    if isinstance(geometry, Polygon | MultiPolygon):
+        return geometry
+    pieces = [piece for piece in shapely.get_parts(geometry) if isinstance(piece, Polygon | MultiPolygon)]
+    polygons = shapely.get_parts(pieces)
+    return polygons[0] if len(polygons) == 1 else MultiPolygon(list(polygons))
+
+
+def assemble(parts: Sequence[RawPart]) -> Assembled | None:
+    """Roof faces, footprint and solids of a building.
+
+    Parameters
+    ----------
+    parts : sequence of RawPart
+        All its geometries.
+
+    Returns
+    -------
+    Assembled or None
+        None without any face.
+    """
+    parts = [part for part in parts if part.faces and len(part.xyz)]
+    if not parts:
+        return None
+    soup = _Soup(parts)
+    kinds, polygons = _kinds(soup)
+    roofs = np.array(sorted(polygons), np.int64)
+    told = np.array([face.plane for face in soup.faces], np.int64)
+    surfaces: list[RoofSurface] = []
+    numbers = np.full(len(soup.faces), -1)
+    if len(roofs):
+        regions = _regions(soup, roofs, told[roofs])
+        for number, region in enumerate(regions):
+            plane_id = int(told[region[0]]) if told[region[0]] >= 0 else number
+            numbers[region] = plane_id
+            surfaces.extend(_surfaces(soup, region, [polygons[int(face)] for face in region], plane_id))
+    footprint = _united([surface.polygon for surface in surfaces])
+    if not surfaces:
+        ground = np.flatnonzero([kind is FaceKind.GROUND for kind in kinds])
+        footprint = _united(soup.plan(ground))
+    absolute = _moved([*(surface.polygon for surface in surfaces), footprint], soup.origin)
+    origin = (float(soup.origin[0]), float(soup.origin[1]), float(soup.origin[2]))
+    return Assembled(
+        surfaces=tuple(
+            dataclasses.replace(surface, polygon=polygon, origin=origin)
+            for surface, polygon in zip(surfaces, absolute[:-1], strict=True)
+        ),
+        footprint=absolute[-1],
+        solids=_solids(parts, soup, kinds, numbers),
+        solid_origin=origin,
+    )
+
+
+def _moved(polygons: list[Polygon | MultiPolygon], origin: FloatArray) -> list[Polygon | MultiPolygon]:
+    """Polygons in absolute coordinates, whole millimetres."""
+    return list(shapely.transform(np.array(polygons, object), lambda xy: np.round(xy + origin[:2], 3)))
+
+
+def _united(polygons: Sequence[Polygon | MultiPolygon]) -> Polygon | MultiPolygon:
+    """The union on the grid, without holes that are only slivers."""
+    if len(polygons) == 1 and isinstance(polygons[0], Polygon):
+        return polygons[0]
+    union = _areas_of(shapely.union_all(polygons, grid_size=GRID_M))
+    pieces = []
+    for piece in shapely.get_parts(union).tolist():
+        holes = [hole for hole in piece.interiors if Polygon(hole).area > _SLIVER_M * 0.5 * hole.length]
+        pieces.append(piece if len(holes) == len(piece.interiors) else Polygon(piece.exterior, holes))
+    return pieces[0] if len(pieces) == 1 else MultiPolygon(pieces)
+
+
+# ------------------------------------------------------------------------------------------------------------ kinds
+
+
+def _kinds(soup: _Soup) -> tuple[list[FaceKind], dict[int, Polygon | MultiPolygon]]:
+    """What every face is, and the plan of the roof faces that have area there, by face.
+
+    Faces that no name makes roofs, and named ones that look down, as the undersides of eaves do in some files, are
+    roofs only where no other roof is above them.
+    """
+    unnamed = [face.kind is None for face in soup.faces]
+    by_normal = _kinds_by_normal(soup) if any(unnamed) else []
+    kinds = [face.kind or by_normal[number] for number, face in enumerate(soup.faces)]
+    roofs = np.flatnonzero([kind is FaceKind.ROOF for kind in kinds])
+    plans = soup.plan(roofs)
+    areas = shapely.area(plans)
+    kept = [(int(face), plan) for face, plan, area in zip(roofs, plans, areas, strict=True) if area > _LEAST_AREA_M2]
+    doubtful = np.array([unnamed[face] or soup.vectors[face, 2] < 0.0 for face, _ in kept], np.bool_)
+    if doubtful.any():
+        covered = _covered(soup, kept, doubtful)
+        for (face, _), is_covered in zip(kept, covered, strict=True):
+            if is_covered:
+                kinds[face] = FaceKind.GROUND
+        kept = [entry for entry, is_covered in zip(kept, covered, strict=True) if not is_covered]
+    return kinds, dict(kept)
+
+
+def _kinds_by_normal(soup: _Soup) -> list[FaceKind]:
+    """What the normals say; those of a part that faces inward as a whole are turned round.
+
+    The sum of (area in plan) times (height) over the faces is the volume of a closed part, and positive too for an open
+    one whose faces look outward.
+    """
+    lengths = np.linalg.norm(soup.vectors, axis=1)
+    counts = np.diff(soup.ring_offsets[soup.face_rings])
+    owner = np.repeat(np.arange(len(soup.faces)), counts)
+    heights = np.bincount(owner, soup.local[soup.corners, 2], len(soup.faces)) / np.maximum(counts, 1)
+    low = np.full(soup.part[-1] + 1, np.inf)
+    np.minimum.at(low, soup.part[owner], soup.local[soup.corners, 2])
+    low[~np.isfinite(low)] = 0.0
+    volumes = np.bincount(soup.part, soup.vectors[:, 2] * (heights - low[soup.part]), len(low))
+    flat = np.bincount(soup.part, soup.vectors[:, 2], len(low))
+    inward = np.where(volumes == 0.0, flat, volumes) < 0.0
+    upward = np.where(inward, -1.0, 1.0)[soup.part]
+    up = np.divide(soup.vectors[:, 2] * upward, lengths, out=np.zeros(len(lengths)), where=lengths > 0.0)
+    return [FaceKind.ROOF if z > LEAST_UP else FaceKind.GROUND if z < -LEAST_UP else FaceKind.WALL for z in up]
+
+
+def _covered(soup: _Soup, roofs: list[tuple[int, Polygon | MultiPolygon]], doubtful: BoolArray) -> BoolArray:
+    """Which doubtful faces have most of their area under other roof faces."""
+    plans = np.array([plan for _, plan in roofs], object)
+    covered = np.zeros(len(roofs), np.bool_)
+    if shapely.area(plans).sum() - shapely.union_all(plans, grid_size=GRID_M).area < _LEAST_AREA_M2 * len(plans):
+        return covered
+    lower, upper = shapely.STRtree(plans).query(plans, predicate="intersects")
+    pairs = (lower != upper) & doubtful[lower]
+    lower, upper = lower[pairs], upper[pairs]
+    common = shapely.intersection(plans[lower], plans[upper])
+    met = shapely.area(common) > _LEAST_AREA_M2
+    pieces: dict[int, list[shapely.Geometry]] = {}
+    for low, high, piece in zip(lower[met].tolist(), upper[met].tolist(), common[met], strict=True):
+        x, y = shapely.get_coordinates(shapely.centroid(piece))[0]
+        if _height(soup, roofs[high][0], x, y) > _height(soup, roofs[low][0], x, y) + DISTANCE_M:
+            pieces.setdefault(low, []).append(piece)
+    for low, above in pieces.items():
+        covered[low] = shapely.union_all(above).area > _COVERED_SHARE * plans[low].area
+    return covered
+
+
+def _height(soup: _Soup, face: int, x: float, y: float) -> float:
+    """Of the plane of a face that is not vertical, at a place in plan."""
+    normal = soup.vectors[face]
+    corners = soup.local[soup.corners_of(face)].mean(axis=0)
+    return float(corners[2] - (normal[0] * (x - corners[0]) + normal[1] * (y - corners[1])) / normal[2])
+
+
+# ----------------------------------------------------------------------------------------------------------- planes
+
+
+def _regions(soup: _Soup, roofs: IntArray, told: IntArray) -> list[IntArray]:
+    """Roof faces gathered by plane, each sorted, in the order of their first faces."""
+    corners, ring_offsets, face_rings = soup.subset(roofs)
+    vectors = soup.vectors[roofs]
+    labels = coplanar_regions(soup.local, corners, ring_offsets, face_rings, vectors, told, DISTANCE_M, ANGLE_DEG)
+    regions: dict[int, list[int]] = {}
+    for face, label in zip(roofs.tolist(), labels.tolist(), strict=True):
+        regions.setdefault(label, []).append(face)
+    merged: list[list[int]] = []
+    of_plane: dict[int, int] = {}
+    for region in regions.values():
+        plane = soup.faces[region[0]].plane
+        if plane >= 0 and plane in of_plane and _in_one_plane(soup, merged[of_plane[plane]], region):
+            merged[of_plane[plane]].extend(region)
+            continue
+        of_plane.setdefault(plane, len(merged))
+        merged.append(region)
+    return [np.array(sorted(region), np.int64) for region in merged]
+
+
+def _in_one_plane(soup: _Soup, faces: Sequence[int], others: Sequence[int]) -> bool:
+    """Whether the vertices of other faces lie in the plane of some faces."""
+    a, b, c = _fitted(soup, faces)
+    xyz = soup.local[np.concatenate([soup.corners_of(face) for face in others])]
+    distance = np.abs(xyz[:, 2] - a * xyz[:, 0] - b * xyz[:, 1] - c) / np.sqrt(1.0 + a * a + b * b)
+    return bool(distance.max() <= DISTANCE_M)
+
+
+def _fitted(soup: _Soup, faces: Sequence[int] | IntArray) -> Coefficients:
+    """The least-squares plane of the vertices of some faces, each place once."""
+    corners = np.concatenate([soup.corners_of(int(face)) for face in faces])
+    a, b, c, _ = fit_plane_coefficients(soup.local, np.unique(corners).astype(np.int32))
+    return a, b, c
+
+
+def _surfaces(
+    soup: _Soup, region: IntArray, plans: Sequence[Polygon | MultiPolygon], plane_id: int
+) -> list[RoofSurface]:
+    """The roof faces of one plane: pieces that do not touch are one each. About the origin still."""
+    union = _united(plans)
+    pieces = [union] if isinstance(union, Polygon) else list(union.geoms)
+    coefficients = _fitted(soup, region)
+    return [
+        RoofSurface(polygon=piece, coefficients=coefficients, plane_id=plane_id)
+        for piece in pieces
+        if piece.area > _LEAST_AREA_M2
+    ]
+
+
+def _solids(parts: Sequence[RawPart], soup: _Soup, kinds: Sequence[FaceKind], numbers: IntArray) -> tuple[Solid, ...]:
+    """The parts that are meant to be solids, vertices in whole millimetres."""
+    solids = []
+    first = 0
+    for number, part in enumerate(parts):
+        if part.is_solid:
+            vertices = soup.millimetres[soup.first_vertex[number] : soup.first_vertex[number + 1]]
+            faces = tuple(
+                SolidFace(rings=face.rings, kind=kinds[first + k], plane=int(numbers[first + k]))
+                for k, face in enumerate(part.faces)
+            )
+            solids.append(Solid(vertices=vertices / MILLIMETRES_PER_METRE, faces=faces))
+        first += len(part.faces)
+    return tuple(solids)

@@ -1,0 +1,234 @@
+"""Classified points as a reference: class 6 is building, class 2 is ground, with given footprints or without."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.errors import InconsistentInputError, InputError, SettingsError
+from pipeline.io import ReadOptions, open_source
+from pipeline.io.crs import SpatialReference
+from pipeline.io.footprints import read_footprints
+from pipeline.io.readable import Readable
+from pipeline.io.remote_file import file_at
+from pipeline.io.source import Source
+from pipeline.model import RoofType
+from pipeline.quality.residuals import TopSurface, plan_index
+from pipeline.ruler.evaluation.building_raster import PointRaster
+from pipeline.ruler.evaluation.ground import NOT_JUDGED, UNCLASSIFIED
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
+
+MIN_BUILDING_POINTS = 11
+"""A given footprint with fewer points of class 6 is no reference building: nothing was measured of it."""
+MIN_OUTLINE_M2 = 10.0
+"""Smaller outlines of the raster are specks, not buildings: they need not be found, but their points count."""
+_SEAM_M = 1.0
+"""Gap between the bounds of adjacent tiles that is no edge of the data."""
+
+Area: TypeAlias = Polygon | MultiPolygon
+Counts: TypeAlias = npt.NDArray[np.int64]
+
+
+def read_points_reference(
+    tiles: Sequence[str | Path],
+    *,
+    footprints: str | Path | None = None,
+    crs: str | None = None,
+    vertical_unit: str | None = None,
+    read_options: ReadOptions | None = None,
+) -> Reference:
+    """Classified point files as a reference. Reads all points once, tile by tile.
+
+    Parameters
+    ----------
+    tiles : sequence of str or Path
+        Point files of one CRS; they may abut, points in two of them count twice.
+    footprints : str or Path, optional
+        Outlines of buildings. Those with at least 11 points of class 6 are the reference buildings; as the file may
+        cover a part only, nothing is known elsewhere. Without it the buildings are what hangs together on the raster
+        of class 6 (see `building_raster`).
+    crs, vertical_unit : str, optional
+        Stand above those of the files.
+    read_options : ReadOptions, optional
+        Anything else about reading.
+
+    Returns
+    -------
+    Reference
+        Of kind points; without class 6 it has no buildings and serves the ground measures only.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read, has neither class 2 nor 6, or its CRS is not that of the first.
+    """
+    if not tiles:
+        raise SettingsError(["no point files are given as a reference: name at least one"])
+    options = read_options or ReadOptions()
+    options = dataclasses.replace(options, crs=crs or options.crs, vertical_unit=vertical_unit or options.vertical_unit)
+    sources = [open_source(path, options) for path in tiles]
+    reference = _one_reference(sources)
+    bounds = tuple(_plan_bounds(source) for source in sources)
+    extent = _extent(bounds)
+    notes = list(dict.fromkeys(warning for source in sources for warning in source.info.warnings))
+    if footprints is not None:
+        given = read_footprints(footprints, reference)
+        notes += given.warnings
+        areas, names, classes = list(given.polygons), list(given.ids), np.zeros(256, np.int64)
+        index = plan_index(areas)
+        counts = np.zeros(len(areas) + 1, np.int64)
+        for source in sources:
+            for cloud in source.chunks():
+                classes += np.bincount(cloud.classification, minlength=256)
+                roof = cloud.xyz[cloud.classification == BUILDING_CLASS]
+                counts += np.bincount(index.face(roof[:, 0], roof[:, 1]) + 1, minlength=len(areas) + 1)
+        measured = np.flatnonzero(counts[1:] >= MIN_BUILDING_POINTS).tolist()
+        if len(measured) < len(areas):
+            notes.append(
+                f"{len(areas) - len(measured)} of {len(areas)} given footprints have fewer than {MIN_BUILDING_POINTS} "
+                f"points of class {BUILDING_CLASS} and are no reference buildings"
+            )
+        areas, names = [areas[k] for k in measured], [names[k] for k in measured]
+    else:
+        raster, classes = _class_raster(sources, bounds)
+        areas = list(raster.outlines())
+        names = [f"outline-{number}" for number in range(len(areas))]
+        small = sum(area.area < MIN_OUTLINE_M2 for area in areas)
+        if areas:
+            notes.append(
+                f"Reference buildings are the {len(areas)} outlines of class {BUILDING_CLASS} on the raster: houses "
+                f"that touch are one; {small} of them are smaller than {MIN_OUTLINE_M2:g} m2 and need not be found, as "
+                "those that the end of the data cuts"
+            )
+    _check_classes(sources, classes)
+    if not classes[BUILDING_CLASS]:
+        areas, names = [], []
+        notes.append(f"The points have no class {BUILDING_CLASS}: only the ground can be measured")
+    if classes[GROUND_CLASS] and _tells_objects(classes) and classes[list(UNCLASSIFIED)].any():
+        notes.append(
+            "Points that the file leaves unclassified (0, 1) are judged neither as ground nor as object, for other "
+            "classes name the objects"
+        )
+    whole = extent.buffer(-_SEAM_M, join_style="mitre")
+    buildings = tuple(
+        RoofModel(
+            building_id=name,
+            footprint=area,
+            roof_type=RoofType.UNKNOWN,
+            surfaces=(),
+            touches_data_edge=not whole.contains(area) or (footprints is None and area.area < MIN_OUTLINE_M2),
+            source_id=name if footprints is not None else None,
+            lod="",
+        )
+        for name, area in zip(names, areas, strict=True)
+    )
+    index = plan_index(areas)
+    return Reference(
+        name=", ".join(file_at(path).name for path in tiles),
+        kind="points",
+        buildings=buildings,
+        has_faces=False,
+        outlines="given" if footprints is not None else "raster",
+        tiles=tuple(functools.partial(_read_tile, file_at(path), options, index) for path in tiles),
+        bounds=bounds,
+        extent=None if footprints is not None or not buildings else extent,
+        has_ground=bool(classes[GROUND_CLASS]),
+        unclassified_is_object=not _tells_objects(classes),
+        crs=None if reference.wkt is None else (f"EPSG:{reference.epsg}" if reference.epsg else reference.name),
+        notes=tuple(notes),
+    )
+
+
+def _tells_objects(classes: Counts) -> bool:
+    """Whether any class names an object: then classes 0 and 1 hold what nobody looked at."""
+    named = classes.copy()
+    named[[GROUND_CLASS, *NOT_JUDGED, *UNCLASSIFIED]] = 0
+    return bool(named.any())
+
+
+def _one_reference(sources: Sequence[Source]) -> SpatialReference:
+    """The CRS of all files."""
+    first = sources[0].info
+    for source in sources[1:]:
+        if source.info.reference != first.reference:
+            raise InconsistentInputError(
+                source.info.path,
+                f"its CRS is {source.info.reference.name}, that of {first.path} is {first.reference.name}",
+                "Give reference points of one CRS, or --crs where the headers are wrong",
+            )
+    return first.reference
+
+
+def _plan_bounds(source: Source) -> tuple[float, float, float, float]:
+    x0, y0, _, x1, y1, _ = source.info.bounds_m
+    return x0, y0, x1, y1
+
+
+def _extent(bounds: Sequence[Sequence[float]]) -> Area:
+    """What the tiles cover together, without the seams between them."""
+    boxes = [shapely.box(*b).buffer(_SEAM_M / 2, join_style="mitre") for b in bounds]
+    extent = shapely.union_all(boxes).buffer(-_SEAM_M / 2, join_style="mitre")
+    if not isinstance(extent, Polygon | MultiPolygon):
+        raise TypeError(f"an extent became a {extent.geom_type}")
+    return extent
+
+
+def _class_raster(sources: Sequence[Source], bounds: Sequence[Sequence[float]]) -> tuple[PointRaster, Counts]:
+    """The raster of class 6, and the number of points of each class."""
+    raster, classes = PointRaster(), np.zeros(256, np.int64)
+    for number, source in enumerate(sources):
+        for cloud in source.chunks():
+            classes += np.bincount(cloud.classification, minlength=256)
+            raster.add(cloud.xyz, cloud.classification == BUILDING_CLASS)
+        raster.finish(bounds[number + 1 :])
+    return raster, classes
+
+
+def _check_classes(sources: Sequence[Source], classes: Counts) -> None:
+    if not classes[BUILDING_CLASS] and not classes[GROUND_CLASS]:
+        found = ", ".join(str(code) for code in np.flatnonzero(classes)) or "none"
+        raise InputError(
+            sources[0].info.path,
+            f"no point of class {GROUND_CLASS} (ground) or {BUILDING_CLASS} (building); its classes are {found}",
+            "Give a classified file as the reference, or simulated truth",
+        )
+
+
+def _read_tile(path: Readable, options: ReadOptions, index: TopSurface) -> ReferencePoints:
+    """The points of a tile; of class 6 those inside a footprint are roof."""
+    clouds = list(open_source(path, options).chunks())
+    if not clouds:
+        empty = np.zeros(0, np.int32)
+        return ReferencePoints(
+            name=path.name,
+            xyz=np.zeros((0, 3)),
+            classification=empty,
+            building=empty,
+            face=empty,
+            is_roof=np.zeros(0, np.bool_),
+            last=np.zeros(0, np.bool_),
+            return_number=np.zeros(0, np.uint8),
+        )
+    xyz = np.concatenate([cloud.xyz for cloud in clouds])
+    classification = np.concatenate([cloud.classification for cloud in clouds]).astype(np.int32)
+    building = index.face(xyz[:, 0], xyz[:, 1])
+    return ReferencePoints(
+        name=path.name,
+        xyz=xyz,
+        classification=classification,
+        building=building,
+        face=np.full(len(xyz), -1, np.int32),
+        is_roof=(classification == BUILDING_CLASS) & (building >= 0),
+        last=np.concatenate([cloud.return_number >= cloud.return_count for cloud in clouds]),
+        return_number=np.concatenate([cloud.return_number for cloud in clouds]),
+    )

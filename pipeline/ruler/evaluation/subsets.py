@@ -1,0 +1,161 @@
+"""Subsets of the reference buildings, and figures over them with buildings as the units of the bootstrap."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipeline.model import BoolArray, FloatArray, IntArray
+from pipeline.ruler.evaluation.bootstrap import CONFIDENCE, DRAWS, Statistic, Sums, bootstrap
+from pipeline.ruler.evaluation.matching import summed
+from pipeline.ruler.evaluation.measure import Measure
+from pipeline.ruler.evaluation.reference import Reference
+
+_SEED = 20_090_402
+_VALUES_A_BLOCK = 1_000_000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Subset:
+    """Which reference buildings a figure is over."""
+
+    name: str
+    """all, good or hard."""
+    buildings: BoolArray
+    """(buildings,) bool, True for those in it; never those that touch the data edge."""
+    elsewhere: bool
+    """True where what stands on no reference building counts too: only in `all`."""
+
+    def holds(self, building: IntArray) -> BoolArray:
+        """Whether things on these reference buildings (index, -1 for none) count; any shape."""
+        held = np.full(np.shape(building), self.elsewhere)
+        on_one = building >= 0
+        held[on_one] = self.buildings[building[on_one]]
+        return held
+
+    @property
+    def size(self) -> int:
+        """Number of its reference buildings."""
+        return int(self.buildings.sum())
+
+
+def subsets(reference: Reference) -> tuple[Subset, ...]:
+    """All reference buildings, and where conditions are known the good ones and the hard ones.
+
+    Returns
+    -------
+    tuple of Subset
+        `all` first. Buildings that touch the data edge are in none; those without conditions only in `all`.
+    """
+    whole = np.array([not building.touches_data_edge for building in reference.buildings], np.bool_)
+    everything = Subset(name="all", buildings=whole, elsewhere=True)
+    if not reference.conditions:
+        return (everything,)
+    known = [reference.conditions.get(building.building_id) for building in reference.buildings]
+    good = np.array([one is not None and one.good for one in known], np.bool_)
+    hard = np.array([one is not None and not one.good for one in known], np.bool_)
+    return (
+        everything,
+        Subset(name="good", buildings=whole & good, elsewhere=False),
+        Subset(name="hard", buildings=whole & hard, elsewhere=False),
+    )
+
+
+def summed_over_units(
+    subset: Subset, building: IntArray, model: IntArray, columns: Mapping[str, FloatArray]
+) -> dict[str, FloatArray]:
+    """Columns of things summed to the units of a bootstrap.
+
+    Parameters
+    ----------
+    subset : Subset
+        What counts.
+    building : (n,) int64
+        Reference building that each thing is on; -1 for none.
+    model : (n,) int64
+        Model that it belongs to: where it is on no building, its model is its unit. Any number >= 0 elsewhere.
+    columns : mapping of name to (n,) float64
+        What is summed.
+
+    Returns
+    -------
+    dict of name to (units,) float64
+        First the buildings of the subset, also those that nothing is on, then the models that stand on none.
+    """
+    place = np.cumsum(subset.buildings) - 1
+    held = subset.holds(building)
+    inside = held & (building >= 0)
+    unit = np.full(len(building), -1)
+    unit[inside] = place[building[inside]]
+    outside = held & (building < 0)
+    own, index = np.unique(model[outside], return_inverse=True)
+    unit[outside] = subset.size + index
+    return {name: summed(unit[held], column[held], subset.size + len(own)) for name, column in columns.items()}
+
+
+def measured(
+    name: str, columns: Mapping[str, FloatArray], statistic: Statistic, *, n: float, subset: Subset
+) -> Measure:
+    """A figure of units with its interval; of the columns only those that the statistic looks at are resampled."""
+    looked_at = _LookedAt({name: np.asarray(column)[:1] for name, column in columns.items()})
+    with np.errstate(all="ignore"):
+        statistic(looked_at)
+    estimate = bootstrap({name: columns[name] for name in sorted(looked_at.names)}, statistic)
+    return Measure(
+        name=name, value=estimate.value, low=estimate.low, high=estimate.high, n=round(n), subset=subset.name
+    )
+
+
+def measured_median(name: str, values: FloatArray, subset: Subset) -> Measure:
+    """The median over buildings with its percentile interval: a value a unit, so the units themselves are redrawn.
+
+    Parameters
+    ----------
+    name : str
+        Of the measure.
+    values : (n,) float64
+        One a building, finite; nan comes back for none, no interval for one.
+    subset : Subset
+        Which they are of.
+    """
+    count = len(values)
+    if count == 0:
+        return Measure(name=name, value=math.nan, n=0, subset=subset.name)
+    value = float(np.median(values))
+    if count == 1:
+        return Measure(name=name, value=value, n=1, subset=subset.name)
+    random = np.random.default_rng(_SEED)
+    rows = max(1, _VALUES_A_BLOCK // count)
+    drawn = np.concatenate(
+        [
+            np.median(values[random.integers(0, count, (min(rows, DRAWS - first), count))], axis=1)
+            for first in range(0, DRAWS, rows)
+        ]
+    )
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low, high = np.quantile(drawn, [tail, 1.0 - tail])
+    return Measure(name=name, value=value, low=float(low), high=float(high), n=count, subset=subset.name)
+
+
+class _LookedAt(dict[str, FloatArray]):
+    """Sums that remember which of them were asked for."""
+
+    def __init__(self, sums: Sums) -> None:
+        super().__init__(sums)
+        self.names: set[str] = set()
+
+    def __getitem__(self, name: str) -> FloatArray:
+        self.names.add(name)
+        return super().__getitem__(name)
+
+
+def total(column: str) -> Statistic:
+    """The sum of a column: counts."""
+
+    def statistic(sums: Sums) -> FloatArray:
+        return sums[column]
+
+    return statistic

@@ -1,0 +1,251 @@
+"""Roof surfaces against true roof surfaces: vertical differences on a lattice over the true roofs.
+
+The top of all models together is compared with the true top, so that neither split nor joined buildings are an excuse.
+A place of a true roof that no model covers is a miss.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.model import FloatArray, IntArray
+from pipeline.ruler.evaluation.bootstrap import quantile, ratio, root_mean, share
+from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.evaluation.residuals import top_surface_of
+from pipeline.ruler.evaluation.subsets import Subset, measured
+
+SAMPLE_M = 0.25
+"""Spacing of the lattice."""
+GOOD_M = 0.2
+"""Vertical distance that still counts as right."""
+_ROUNDING = 1e-6
+EDGES_M: FloatArray = np.concatenate(
+    (
+        [0.0],
+        [1e-6],  # what is right but for the last bits is no difference
+        np.arange(1, 200) * 0.001,
+        0.2 + np.arange(160) * 0.005,
+        1.0 + np.arange(80) * 0.05,
+        5.0 + np.arange(90) * 0.5,
+        [50.0, 1e5],
+    )
+)
+"""Borders of the bins of |difference|: 1 mm up to 0.2 m, 5 mm up to 1 m, 50 mm up to 5 m, 0.5 m up to 50 m."""
+_PLACES_A_BATCH = 2_000_000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SurfaceRow:
+    """One reference building; differences are models minus truth."""
+
+    building: int
+    """Its index."""
+    building_id: str
+    """Its name."""
+    n_places: int
+    """Places of the lattice on its true roof."""
+    n_covered: int
+    """Those that a model covers."""
+    n_within: int
+    """Those where the models are within 0.2 m."""
+    sum_m: float
+    """Sum of the differences where covered."""
+    sum_squares_m2: float
+    """Sum of their squares."""
+    median_m: float
+    """Median of the absolute differences where covered; nan where nothing is."""
+    histogram: npt.NDArray[np.int32]
+    """(bins,) int32, absolute differences where covered over `EDGES_M`."""
+
+    @property
+    def coverage(self) -> float:
+        """Share of the true roof, in plan, that models cover; nan without a roof."""
+        return self.n_covered / self.n_places if self.n_places else math.nan
+
+    @property
+    def within(self) -> float:
+        """Share of the true roof where the models are within 0.2 m; uncovered is a miss; nan without a roof."""
+        return self.n_within / self.n_places if self.n_places else math.nan
+
+    @property
+    def bias_m(self) -> float:
+        """Mean difference where covered; nan where nothing is."""
+        return self.sum_m / self.n_covered if self.n_covered else math.nan
+
+    @property
+    def rmse_m(self) -> float:
+        """Root mean square of the differences where covered; nan where nothing is."""
+        return math.sqrt(self.sum_squares_m2 / self.n_covered) if self.n_covered else math.nan
+
+
+def score_surface(
+    models: Sequence[RoofModel], reference: Reference, *, sample_m: float = SAMPLE_M
+) -> tuple[SurfaceRow, ...]:
+    """One row a reference building, in their order; none against a reference without faces.
+
+    Parameters
+    ----------
+    models : sequence of RoofModel
+        What was made.
+    reference : Reference
+        With true roof faces.
+    sample_m : float
+        Spacing of the lattice: its places are odd multiples of half of it, whatever the buildings are.
+
+    Returns
+    -------
+    tuple of SurfaceRow
+        Some buildings at a time: memory does not grow with their number but for the rows.
+    """
+    if not reference.has_faces:
+        return ()
+    truth, made = top_surface_of(reference.buildings), top_surface_of(models, near=reference.buildings)
+    owner = np.repeat(np.arange(len(reference.buildings)), [len(one.surfaces) for one in reference.buildings])
+    owner = np.append(owner, -1)  # of face -1: none
+    rows: list[SurfaceRow] = []
+    for index, x, y in _lattices(reference.buildings, sample_m):
+        true_z, face = truth.at(x, y)
+        own = owner[face] == index
+        building = index[own]
+        difference = made.elevation(x[own], y[own]) - true_z[own]
+        first, after = len(rows), int(building[-1]) + 1 if len(building) else len(rows)
+        ends = np.searchsorted(building, np.arange(first, after + 1))
+        rows += [_row(reference, k, difference[ends[k - first] : ends[k - first + 1]]) for k in range(first, after)]
+    rows += [_row(reference, k, np.zeros(0)) for k in range(len(rows), len(reference.buildings))]
+    return tuple(rows)
+
+
+def _lattices(buildings: Sequence[RoofModel], sample_m: float) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+    """Places over the bounds of some buildings at a time: index of the building, x, y."""
+    held: list[tuple[int, FloatArray, FloatArray]] = []
+    for index, building in enumerate(buildings):
+        x, y = lattice_over([surface.polygon.bounds for surface in building.surfaces], sample_m)
+        held.append((index, x, y))
+        if sum(len(places) for _, places, _ in held) >= _PLACES_A_BATCH:
+            yield _together(held)
+            held = []
+    if held:
+        yield _together(held)
+
+
+def _together(held: Sequence[tuple[int, FloatArray, FloatArray]]) -> tuple[IntArray, FloatArray, FloatArray]:
+    index = np.repeat([one for one, _, _ in held], [len(x) for _, x, _ in held])
+    return index, np.concatenate([x for _, x, _ in held]), np.concatenate([y for _, _, y in held])
+
+
+def lattice_over(bounds: Sequence[tuple[float, float, float, float]], sample_m: float) -> tuple[FloatArray, FloatArray]:
+    """Places (x, y) of a lattice of whole multiples of sample_m, shifted by half of it, over all of some bounds.
+
+    Examples
+    --------
+    >>> lattice_over([(0.1, 0.1, 0.9, 0.4)], 0.5)
+    (array([0.25, 0.75]), array([0.25, 0.25]))
+    """
+    if not bounds:
+        return np.zeros(0), np.zeros(0)
+    corners = np.array(bounds)
+    low, high = np.floor(corners[:, :2].min(axis=0) / sample_m), np.ceil(corners[:, 2:].max(axis=0) / sample_m)
+    columns, rows = (np.arange(low[axis], high[axis]) + 0.5 for axis in (0, 1))
+    x, y = np.meshgrid(columns * sample_m, rows * sample_m)
+    return x.ravel(), y.ravel()
+
+
+def _row(reference: Reference, building: int, difference: FloatArray) -> SurfaceRow:
+    covered = difference[np.isfinite(difference)]
+    sizes = np.abs(covered)
+    bins = np.clip(np.searchsorted(EDGES_M, sizes, side="right") - 1, 0, len(EDGES_M) - 2)
+    return SurfaceRow(
+        building=building,
+        building_id=reference.buildings[building].building_id,
+        n_places=len(difference),
+        n_covered=len(covered),
+        n_within=int((sizes <= GOOD_M + _ROUNDING).sum()),
+        sum_m=float(covered.sum()),
+        sum_squares_m2=float(np.square(covered).sum()),
+        median_m=float(np.median(sizes)) if len(sizes) else math.nan,
+        histogram=np.bincount(bins, minlength=len(EDGES_M) - 1).astype(np.int32),
+    )
+
+
+def measures(rows: Sequence[SurfaceRow], subset: Subset) -> list[Measure]:
+    """The figures of one subset of the buildings; none without rows."""
+    if not rows:
+        return []
+    counted = [row for row in rows if subset.buildings[row.building]]
+    columns: dict[str, FloatArray] = {
+        name: np.array([getattr(row, name) for row in counted], np.float64)
+        for name in ("n_places", "n_covered", "n_within", "sum_m", "sum_squares_m2")
+    }
+    with_roof = columns["n_places"] > 0.0
+    columns["buildings"] = with_roof.astype(np.float64)
+    columns["within"] = np.divide(columns["n_within"], columns["n_places"], out=np.zeros(len(counted)), where=with_roof)
+    histogram = np.array([row.histogram for row in counted], np.float64).reshape(-1, len(EDGES_M) - 1)
+    places, covered = float(columns["n_places"].sum()), float(columns["n_covered"].sum())
+    bins = {"bins": histogram}
+    return [
+        measured("surface.coverage", columns, share("n_covered", "n_places"), n=places, subset=subset),
+        measured("surface.within_0_2m", columns, share("n_within", "n_places"), n=places, subset=subset),
+        measured(
+            "surface.within_0_2m_mean", columns, ratio("within", "buildings"), n=float(with_roof.sum()), subset=subset
+        ),
+        measured("surface.median", bins, quantile("bins", EDGES_M, 0.5), n=covered, subset=subset),
+        measured("surface.p95", bins, quantile("bins", EDGES_M, 0.95), n=covered, subset=subset),
+        measured("surface.rmse", columns, root_mean("sum_squares_m2", "n_covered"), n=covered, subset=subset),
+        measured("surface.bias", columns, ratio("sum_m", "n_covered"), n=covered, subset=subset),
+    ]
+
+
+def _definition(name: str, label: str, formula: str, unit: str, better: Better) -> Definition:
+    return Definition(
+        name=f"surface.{name}", group=Group.SURFACE, label=label, unit=unit, better=better, formula=formula
+    )
+
+
+_PLACES = f"places of a {SAMPLE_M} m lattice on the true roofs"
+_DZ = "dz = highest face of all models - true roof"
+
+DEFINITIONS = (
+    _definition(
+        "coverage",
+        "true roof with a model over it",
+        f"share of the {_PLACES} that a model covers",
+        "share",
+        Better.HIGHER,
+    ),
+    _definition(
+        "within_0_2m",
+        "true roof within 0.2 m",
+        f"share of the {_PLACES} with abs(dz) <= 0.2 m; no model is a miss; {_DZ}",
+        "share",
+        Better.HIGHER,
+    ),
+    _definition(
+        "within_0_2m_mean",
+        "true roof within 0.2 m, mean of buildings",
+        f"mean over the reference buildings of their share with abs(dz) <= 0.2 m; {_DZ}",
+        "share",
+        Better.HIGHER,
+    ),
+    _definition(
+        "median", "vertical difference, median", f"median of abs(dz) over covered {_PLACES}; {_DZ}", "m", Better.LOWER
+    ),
+    _definition(
+        "p95",
+        "vertical difference, 95th percentile",
+        f"95th percentile of abs(dz) over covered {_PLACES}; {_DZ}",
+        "m",
+        Better.LOWER,
+    ),
+    _definition(
+        "rmse", "vertical difference, RMSE", f"sqrt(mean(dz^2)) over covered {_PLACES}; {_DZ}", "m", Better.LOWER
+    ),
+    _definition("bias", "vertical difference, mean", f"mean(dz) over covered {_PLACES}; {_DZ}", "m", Better.ZERO),
+)
+"""The measures."""

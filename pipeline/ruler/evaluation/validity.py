@@ -1,0 +1,147 @@
+"""Validity of the solids by the rules of ISO 19107, judged as `pipeline.quality.validity` judges this program's own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.quality.validity import DEFAULT_TOLERANCES, ValidityTolerances, check_solid
+from pipeline.ruler.evaluation.bootstrap import bootstrap, share
+from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
+from pipeline.ruler.evaluation.models import ModelSet
+from pipeline.ruler.evaluation.reading.raw import is_closed
+
+NO_SOLID = "no_solid"
+"""In place of a code: the model is surfaces alone."""
+
+SOLIDS_VALID = "validity.solids_valid"
+MODELS_VALID = "validity.models_valid"
+MODELS_CLOSED = "validity.models_closed"
+MODELS_NO_SOLID = "validity.models_no_solid"
+FAULTY_SOLIDS = "validity.faulty_solids"
+
+
+def _definition(name: str, label: str, unit: str, better: Better, formula: str) -> Definition:
+    return Definition(name=name, group=Group.VALIDITY, label=label, unit=unit, better=better, formula=formula)
+
+
+DEFINITIONS: tuple[Definition, ...] = (
+    _definition(
+        SOLIDS_VALID,
+        "solids valid",
+        "share",
+        Better.HIGHER,
+        "Solids without any code of ISO 19107 (val3dity's codes and default tolerances, vertices to 1 mm) / solids.",
+    ),
+    _definition(
+        MODELS_VALID,
+        "models with all solids valid",
+        "share",
+        Better.HIGHER,
+        "Models with at least one solid, all of them valid / models delivered; a model of surfaces alone is not valid.",
+    ),
+    _definition(
+        MODELS_CLOSED,
+        "models with closed solids",
+        "share",
+        Better.HIGHER,
+        "Models with at least one solid, every edge of each run both ways equally often / models delivered.",
+    ),
+    _definition(
+        MODELS_NO_SOLID,
+        "models without a solid",
+        "share",
+        Better.LOWER,
+        "Models of surfaces alone (MultiSurface, open meshes) / models delivered.",
+    ),
+    _definition(FAULTY_SOLIDS, "faulty solids", "count", Better.LOWER, "Solids with at least one code."),
+)
+"""The measures of this chapter."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelValidity:
+    """How the solids of one model keep the rules."""
+
+    building_id: str
+    """Of the model."""
+    codes: tuple[tuple[int, ...], ...]
+    """Codes of each solid, ascending; empty for a valid one."""
+    closed: tuple[bool, ...]
+    """Whether each solid is closed: every edge is run both ways equally often."""
+
+    @property
+    def n_solids(self) -> int:
+        """Its solids."""
+        return len(self.codes)
+
+    @property
+    def n_valid(self) -> int:
+        """Those without a fault."""
+        return sum(not codes for codes in self.codes)
+
+    @property
+    def is_valid(self) -> bool:
+        """True with at least one solid, all of them valid."""
+        return bool(self.codes) and self.n_valid == self.n_solids
+
+    @property
+    def is_closed(self) -> bool:
+        """True with at least one solid, all of them closed."""
+        return bool(self.closed) and all(self.closed)
+
+
+def validity(models: ModelSet, tolerances: ValidityTolerances = DEFAULT_TOLERANCES) -> tuple[ModelValidity, ...]:
+    """The faults of every model's solids, in the order of the models.
+
+    Parameters
+    ----------
+    models : ModelSet
+        Vertices of their solids are taken to the nearest millimetre.
+    tolerances : ValidityTolerances
+        Snapping and planarity.
+    """
+    return tuple(
+        ModelValidity(
+            building_id=model.building_id,
+            codes=tuple(check_solid(solid, tolerances) for solid in model.solids),
+            closed=tuple(is_closed(solid.vertices, (face.rings for face in solid.faces)) for solid in model.solids),
+        )
+        for model in models.models
+    )
+
+
+def code_counts(rows: Sequence[ModelValidity]) -> dict[str, int]:
+    """How many solids have each code, ascending, then the models without a solid under `no_solid`; none of zero."""
+    counts: dict[str, int] = {}
+    for code in sorted({code for row in rows for codes in row.codes for code in codes}):
+        counts[str(code)] = sum(code in codes for row in rows for codes in row.codes)
+    without = sum(row.n_solids == 0 for row in rows)
+    return {**counts, NO_SOLID: without} if without else counts
+
+
+def measures(rows: Sequence[ModelValidity], subset: str = "all") -> list[Measure]:
+    """The figures of `DEFINITIONS` over some models, each model a unit of the bootstrap."""
+    columns = {
+        "models": np.ones(len(rows)),
+        "solids": np.array([row.n_solids for row in rows], np.float64),
+        "solids_valid": np.array([row.n_valid for row in rows], np.float64),
+        "models_valid": np.array([row.is_valid for row in rows], np.float64),
+        "models_closed": np.array([row.is_closed for row in rows], np.float64),
+        "no_solid": np.array([row.n_solids == 0 for row in rows], np.float64),
+    }
+    n_solids = int(columns["solids"].sum())
+    shares = (
+        (SOLIDS_VALID, "solids_valid", "solids", n_solids),
+        (MODELS_VALID, "models_valid", "models", len(rows)),
+        (MODELS_CLOSED, "models_closed", "models", len(rows)),
+        (MODELS_NO_SOLID, "no_solid", "models", len(rows)),
+    )
+    found = []
+    for name, part, whole, n in shares:
+        estimate = bootstrap({key: columns[key] for key in (part, whole)}, share(part, whole))
+        found.append(Measure(name=name, value=estimate.value, low=estimate.low, high=estimate.high, n=n, subset=subset))
+    faulty = float(n_solids - columns["solids_valid"].sum())
+    return [*found, Measure(name=FAULTY_SOLIDS, value=faulty, n=n_solids, subset=subset)]

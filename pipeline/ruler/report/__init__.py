@@ -1,0 +1,1 @@
+"""Pages and pictures of evaluations, comparisons of methods, and epochs."""

@@ -1,0 +1,105 @@
+"""Which buildings are worth looking at: those on which runs differ, and typical ones beside them."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import statistics
+from collections import Counter
+from collections.abc import Sequence
+
+from pipeline.ruler.report.comparison_building import FULL_RESIDUAL_M, ComparedBuilding
+
+CASES = 12
+"""Buildings that are drawn."""
+DIFFERENT = 9
+"""So many of them are chosen for their differences, where there are as many."""
+SAME_RESIDUAL_M = 0.05
+"""Methods agree where their RMSE differ by no more."""
+KINDS = {
+    "status": "status",
+    "outcome": "outcome against the truth",
+    "roof_type": "roof type",
+    "faces": "number of roof planes",
+    "residual": "RMSE",
+}
+"""Kinds of differences in the order in which they choose, and what they are called."""
+RULE = (
+    f"Of {CASES} buildings up to {DIFFERENT} are those on which the methods differ most: in turn by "
+    f"{', '.join(KINDS.values())} (share of pairs of methods that differ; planes: largest minus smallest number over "
+    f"the largest; RMSE: largest minus smallest, {FULL_RESIDUAL_M:g} m counting in full; type, planes and RMSE among "
+    "the methods that delivered a model of their own). The others are typical ones where all agree, RMSE within "
+    f"{SAME_RESIDUAL_M:g} m: of each roof type in turn, the most frequent first, the one nearest the median footprint. "
+    "Buildings that the data's edge cuts are left out where there are others."
+)
+"""How buildings are chosen, for readers."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Choice:
+    """A building to be drawn."""
+
+    building: ComparedBuilding
+    """Which."""
+    why: str
+    """For readers."""
+
+
+def most_different_first(buildings: Sequence[ComparedBuilding]) -> list[ComparedBuilding]:
+    """Buildings by the sum of their differences, equal ones by building_id."""
+    return sorted(buildings, key=lambda building: (-building.difference.total, building.building_id))
+
+
+def chosen_buildings(buildings: Sequence[ComparedBuilding]) -> list[Choice]:
+    """The buildings to be drawn, by `RULE`; the same whatever the order of the buildings."""
+    whole = [one for one in buildings if not any(record.touches_data_edge for record in one.records)]
+    ordered = most_different_first(whole or buildings)
+    typical = _typical(ordered)
+    agreeing = {choice.building.building_id for choice in typical}
+    others = [one for one in ordered if one.building_id not in agreeing]
+    different = _different(others, CASES - min(CASES - DIFFERENT, len(typical)))
+    return [*different, *typical[: CASES - len(different)]]
+
+
+def _different(ordered: Sequence[ComparedBuilding], most: int) -> list[Choice]:
+    """Those with the largest part of each kind in turn; of equal ones the one that differs more in all."""
+    queues = {
+        kind: [
+            one
+            for one in sorted(ordered, key=lambda building: -getattr(building.difference, kind))
+            if getattr(one.difference, kind) > 0.0
+        ]
+        for kind in KINDS
+    }
+    chosen: dict[str, Choice] = {}
+    while len(chosen) < most and any(queues.values()):
+        for kind, queue in queues.items():
+            while queue and queue[0].building_id in chosen:
+                queue.pop(0)
+            if queue and len(chosen) < most:
+                one = queue.pop(0)
+                chosen[one.building_id] = Choice(building=one, why=f"differs in {KINDS[kind]}")
+    return list(chosen.values())
+
+
+def _typical(ordered: Sequence[ComparedBuilding]) -> list[Choice]:
+    """Those where all runs deliver models of one type and number of planes: of each type in turn, the middle first."""
+    agreed: dict[str, list[ComparedBuilding]] = {}
+    for one in ordered:
+        apart = one.difference
+        same = not (apart.status or apart.outcome or apart.roof_type or apart.faces)
+        if same and one.records[0].is_model and apart.residual * FULL_RESIDUAL_M <= SAME_RESIDUAL_M:
+            agreed.setdefault(one.records[0].roof_type, []).append(one)
+    counts = Counter({kind: len(found) for kind, found in agreed.items()})
+    kinds = sorted(agreed, key=lambda kind: (-counts[kind], kind))
+    for kind in kinds:
+        middle = statistics.median(_area(one) for one in agreed[kind])
+        agreed[kind].sort(key=lambda one: (abs(_area(one) - middle), one.building_id))
+    turns = itertools.zip_longest(*(agreed[kind] for kind in kinds))
+    return [Choice(building=one, why="typical: all agree") for turn in turns for one in turn if one is not None]
+
+
+def _area(building: ComparedBuilding) -> float:
+    area = building.records[0].footprint_area_m2
+    return area if math.isfinite(area) else 0.0

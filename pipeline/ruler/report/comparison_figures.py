@@ -1,0 +1,207 @@
+"""The figures of compared runs side by side: a row a figure, a column a run."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from pipeline.model import RoofType, Status
+from pipeline.ruler.evaluation.chapters import NOTHING, number_text, printed, unit_sign
+from pipeline.ruler.evaluation.counts import OUTCOMES
+from pipeline.ruler.evaluation.definitions import DEFINITIONS
+from pipeline.ruler.report.comparison_building import ComparedBuilding, ComparedRun, Record
+
+MEASURES = (
+    "delivery.lod2",
+    "faces.completeness_10m2",
+    "faces.correctness_10m2",
+    "roof_types.correct",
+    "roof_types.passable",
+    "roof_types.false",
+    "roof_types.accuracy",
+    "footprints.iou_median",
+    "surface.within_0_2m",
+    "residuals.within_0_2m_top_visible",
+    "residuals.rmse_top_visible",
+    "validity.models_valid",
+)
+"""Of an evaluation, in their order; those that no run has are left out."""
+Records = Sequence[Record]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Cell:
+    """What stands in a table."""
+
+    text: str
+    """The figure."""
+    note: str = ""
+    """What belongs to it: an interval, a denominator, reasons."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FigureTable:
+    """Figures of all runs."""
+
+    title: str
+    """What they are."""
+    first: str
+    """Header of the first column."""
+    labels: tuple[str, ...]
+    """Of the runs: headers of the others."""
+    rows: tuple[tuple[str, tuple[Cell, ...]], ...]
+    """A name and a cell a run."""
+
+
+def figure_tables(runs: Sequence[ComparedRun], buildings: Sequence[ComparedBuilding]) -> tuple[FigureTable, ...]:
+    """What the runs made, their roof types, their time, and what an evaluation found, as far as there is any."""
+    columns = [tuple(building.records[place] for building in buildings) for place in range(len(runs))]
+    tables = [_made(buildings, columns), _roof_types(columns), _seconds(columns), _measures(runs), _outcomes(runs)]
+    labels = tuple(run.label for run in runs)
+    return tuple(dataclasses.replace(table, labels=labels) for table in tables if table.rows)
+
+
+def figure(value: float, unit: str, decimals: int) -> str:
+    """A figure with its unit; a dash where it is unknown."""
+    return number_text(value, unit, decimals) + unit_sign(unit) if math.isfinite(value) else NOTHING
+
+
+def _rows(title: str, first: str, rows: Sequence[tuple[str, Sequence[Cell]]]) -> FigureTable:
+    return FigureTable(title=title, first=first, labels=(), rows=tuple((name, tuple(cells)) for name, cells in rows))
+
+
+def _made(buildings: Sequence[ComparedBuilding], columns: Sequence[Records]) -> FigureTable:
+    """Statuses with reasons, planes, residuals, coverage, validity."""
+    common = [i for i, building in enumerate(buildings) if all(record.is_model for record in building.records)]
+    names = {Status.OK: "models by the method", Status.FALLBACK: "blocks in their place", Status.FAILED: "failed"}
+    rows: list[tuple[str, list[Cell]]] = [("candidates", [Cell(text=f"{len(records):,}") for records in columns])]
+    rows += [(names[status], [_status(records, status) for records in columns]) for status in Status]
+    rows.append(("records with valid solids", [_share(sum(one.valid for one in r), len(r)) for r in columns]))
+    rows.append(("roof planes of the models", [_planes(records) for records in columns]))
+    for name, wanted in (("RMSE", "rmse_m"), ("95th percentile", "p95_m")):
+        told = f"{name} of a building, median"
+        rows.append((f"{told}, blocks counted", [_median(records, wanted, "m", 3) for records in columns]))
+        both = [_median([records[i] for i in common], wanted, "m", 3) for records in columns]
+        rows.append((f"{told}, where all have a model", both))
+    rows.append(("points with a roof, median", [_median(records, "coverage", "share", 1) for records in columns]))
+    return _rows("What the methods made", "figure", rows)
+
+
+def _status(records: Records, status: Status) -> Cell:
+    found = [record for record in records if record.status is status]
+    reasons = Counter(record.reason for record in found if record.reason is not None)
+    told = [f"{reason} {n:,}" for reason, n in sorted(reasons.items(), key=lambda item: (-item[1], item[0]))]
+    return _share(len(found), len(records), ", ".join(told))
+
+
+def _share(part: int, whole: int, note: str = "") -> Cell:
+    share = figure(part / whole, "share", 1) if whole else NOTHING
+    return Cell(text=f"{part:,} ({share})", note=note)
+
+
+def _planes(records: Records) -> Cell:
+    planes = [record.n_planes for record in records if record.is_model]
+    mean = f"{np.mean(planes):.1f} a model" if planes else ""
+    return Cell(text=f"{sum(planes):,}", note=mean)
+
+
+def _known(records: Records, name: str) -> list[float]:
+    values = [float(getattr(record, name)) for record in records if record.status is not Status.FAILED]
+    return [value for value in values if math.isfinite(value)]
+
+
+def _median(records: Records, name: str, unit: str, decimals: int) -> Cell:
+    values = _known(records, name)
+    return Cell(
+        text=figure(float(np.median(values)) if values else math.nan, unit, decimals), note=f"n = {len(values):,}"
+    )
+
+
+def _roof_types(columns: Sequence[Records]) -> FigureTable:
+    """How many buildings are said to be what; blocks and failed ones have no type of the method's."""
+    counts = [Counter(record.roof_type for record in records if record.is_model) for records in columns]
+    kinds = [kind.value for kind in RoofType if any(count[kind.value] for count in counts)]
+    rows = [(kind, [Cell(text=f"{count[kind]:,}") for count in counts]) for kind in kinds]
+    return _rows("Roof types of the models", "roof type", rows)
+
+
+def _seconds(columns: Sequence[Records]) -> FigureTable:
+    """Seconds a building, where they are known."""
+    known = [np.array([one.seconds for one in records if math.isfinite(one.seconds)]) for records in columns]
+    if not any(len(values) for values in known):
+        return _rows("", "", [])
+    kinds: tuple[tuple[str, Callable[..., float]], ...] = (
+        ("median", lambda values: float(np.median(values))),
+        ("mean", lambda values: float(np.mean(values))),
+        ("95th percentile", lambda values: float(np.quantile(values, 0.95))),
+        ("sum", lambda values: float(np.sum(values))),
+    )
+    rows = [
+        (name, [Cell(text=seconds_text(of(values)) if len(values) else NOTHING) for values in known])
+        for name, of in kinds
+    ]
+    rows.append(("buildings with a known time", [Cell(text=f"{len(values):,}") for values in known]))
+    return _rows("Time of a building", "seconds", rows)
+
+
+def seconds_text(seconds: float) -> str:
+    """Three digits, and no more than milliseconds.
+
+    Examples
+    --------
+    >>> [seconds_text(s) for s in (0.0123, 0.5, 1.234, 12.34, 1234.5)]
+    ['0.012 s', '0.500 s', '1.23 s', '12.3 s', '1,234 s']
+    """
+    if not math.isfinite(seconds):
+        return NOTHING
+    decimals = min(3, max(0, 2 - math.floor(math.log10(seconds)))) if seconds > 0.0 else 3
+    return f"{seconds:,.{decimals}f} s"
+
+
+def _measures(runs: Sequence[ComparedRun]) -> FigureTable:
+    """Headline measures with their intervals."""
+    found = [
+        {m.name: m for m in (() if run.evaluation is None else run.evaluation.measures) if m.subset == "all"}
+        for run in runs
+    ]
+    rows = []
+    for name in MEASURES:
+        if not any(name in measures for measures in found):
+            continue
+        cells = []
+        for measures in found:
+            if name not in measures:
+                cells.append(Cell(text=NOTHING))
+                continue
+            line = printed(measures[name], DEFINITIONS[name])
+            cells.append(Cell(text=line.value, note=", ".join(t for t in (line.interval, f"n = {line.n}") if t)))
+        rows.append((DEFINITIONS[name].label, cells))
+    against = next((r.evaluation.reference for r in runs if r.evaluation and r.evaluation.reference), None)
+    return _rows("By themselves" if against is None else f"Against {against.name}", "measure", rows)
+
+
+def _outcomes(runs: Sequence[ComparedRun]) -> FigureTable:
+    """Correct / passable / false by true roof type."""
+    counts: list[dict[str, list[int]]] = []
+    for run in runs:
+        table = None if run.evaluation is None else run.evaluation.tables.get("outcomes")
+        rows = [] if table is None else [row for row in table.to_pylist() if row["subset"] == "all"]
+        by_type = {row["true_type"]: [int(row[name]) for name in OUTCOMES] for row in rows}
+        by_type.pop("all", None)
+        by_type["all"] = [sum(row[i] for row in by_type.values()) for i in range(len(OUTCOMES))]
+        counts.append(by_type)
+    present = {kind for by_type in counts for kind, row in by_type.items() if sum(row)}
+    kinds = [kind.value for kind in RoofType if kind.value in present] + ["all"] * ("all" in present)
+    found = [(kind, [_outcome_cell(by_type.get(kind)) for by_type in counts]) for kind in kinds]
+    return _rows("Correct / passable / false by true roof type", "true roof type", found)
+
+
+def _outcome_cell(row: Sequence[int] | None) -> Cell:
+    if row is None or not sum(row):
+        return Cell(text=NOTHING)
+    told = f"{figure(row[0] / sum(row), 'share', 1)} correct of {sum(row):,}"
+    return Cell(text=" / ".join(f"{count:,}" for count in row), note=told)

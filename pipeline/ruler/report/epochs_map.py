@@ -1,0 +1,44 @@
+"""The map of a comparison of two epochs: what changed over what did not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pyarrow as pa
+
+from pipeline.report.class_map import ROWS, ClassMap, MapClass
+from pipeline.ruler.epochs.records import Change
+from pipeline.ruler.epochs.summary import size_of
+
+COLOURS = {
+    Change.NEW: "#1b9e77",
+    Change.GONE: "#b2182b",
+    Change.RAISED: "#e08214",
+    Change.LOWERED: "#2c7fb8",
+    Change.RESHAPED: "#8856a7",
+    Change.UNCHANGED: "#c3cad1",
+    Change.NOT_COMPARABLE: "#7d8790",
+}
+"""The colour of each class."""
+_DRAWN = (Change.NOT_COMPARABLE, Change.RESHAPED, Change.LOWERED, Change.RAISED, Change.GONE, Change.NEW)
+
+
+def epochs_map() -> ClassMap:
+    """An empty map of changes."""
+    return ClassMap("Buildings by what became of them", _class(Change.UNCHANGED), [_class(change) for change in _DRAWN])
+
+
+def gathering(drawn: ClassMap) -> Callable[[pa.Table], None]:
+    """Takes rows of changes into a map."""
+
+    def gather(table: pa.Table) -> None:
+        columns = [table["change"], table["geometry"], size_of(table), table["change_id"]]
+        drawn.add(pa.table(columns, names=ROWS.names).cast(ROWS))
+
+    return gather
+
+
+def _class(change: Change) -> MapClass:
+    is_hatched = change is Change.NOT_COMPARABLE
+    label = change.value.replace("_", " ")
+    return MapClass(name=change.value, label=label, colour=COLOURS[change], hatched=is_hatched)

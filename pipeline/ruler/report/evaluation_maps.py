@@ -1,0 +1,145 @@
+"""Maps of an evaluation: reference buildings by their outcome, roof faces found, missed and wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import shapely
+
+from pipeline.model import Status
+from pipeline.report.maps import BAD, FAIR, GOOD, MISSING, UNJUDGED, Entry, Layer, Map, draw_map
+from pipeline.ruler.evaluation.counts import floats
+from pipeline.ruler.evaluation.evaluate import Evaluation
+
+SHARES = ((0.95, "#3f86b5"), (0.9, "#8bb8d0"), (0.75, "#e3c15c"), (0.5, "#de8a3e"), (-1.0, "#c2401f"))
+"""Least share of points within 0.2 m, and colour."""
+
+
+def maps(evaluation: Evaluation) -> list[Map]:
+    """The maps that the evaluation allows, in the order of the page."""
+    buildings, faces = evaluation.tables.get("buildings"), evaluation.tables.get("true_faces")
+    made = []
+    if evaluation.reference is None or buildings is None:
+        made.append(draw_map("Models by status", _status_layers(evaluation)))
+    else:
+        footprints = {one.building_id: one.footprint for one in evaluation.reference.buildings}
+        geometries = [footprints.get(name) for name in buildings["building_id"].to_pylist()]
+        false = _false_models(evaluation)
+        if "outcome" in buildings.column_names and evaluation.reference.has_faces:
+            made.append(draw_map("Buildings by outcome", [*_outcome_layers(buildings, geometries), false]))
+        if {"n_points", "n_within"} <= set(buildings.column_names):
+            layers = [*_share_layers(buildings, geometries), false]
+            made.append(draw_map("Buildings by share of points within 0.2 m", layers))
+        if not made:
+            made.append(draw_map("Buildings found", [*_found_layers(buildings, geometries), false]))
+    if faces is not None and "geometry" in faces.column_names:
+        made.append(draw_map("Roof faces", _face_layers(faces, evaluation.tables.get("model_faces"))))
+    return [one for one in made if one is not None]
+
+
+def _layer(
+    label: str, colour: str, geometries: Sequence[Any], chosen: Any, *, filled: bool = True, hatched: bool = False
+) -> Layer:
+    """Those of the geometries that are chosen."""
+    picked = [geometry for geometry, is_so in zip(geometries, chosen, strict=True) if is_so]
+    entry = Entry(label=label, colour=colour, count=len(picked), hatched=hatched or not filled)
+    return Layer(entry=entry, geometries=picked, filled=filled)
+
+
+def _missing(buildings: pa.Table) -> list[bool]:
+    """Where no model stands for the building."""
+    return [value is None for value in buildings["model_id"].to_pylist()]
+
+
+def _cut(buildings: pa.Table) -> list[bool]:
+    """Where the building is cut by the end of the data."""
+    if "touches_data_edge" not in buildings.column_names:
+        return [False] * buildings.num_rows
+    return [bool(value) for value in buildings["touches_data_edge"].to_pylist()]
+
+
+def _outcome_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
+    """Correct, passable, false, not found, not judged."""
+    kinds = []
+    for outcome, missing, cut in zip(
+        buildings["outcome"].to_pylist(), _missing(buildings), _cut(buildings), strict=True
+    ):
+        kinds.append("unjudged" if cut or (outcome is None and not missing) else "missing" if missing else outcome)
+    named = (
+        ("unjudged", "not judged (cut by the edge of the data)", UNJUDGED),
+        ("correct", "correct", GOOD),
+        ("passable", "passable", FAIR),
+        ("false", "false", BAD),
+        ("missing", "not found", MISSING),
+    )
+    return [_layer(label, colour, geometries, [kind == name for kind in kinds]) for name, label, colour in named]
+
+
+def _share_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
+    """Classes of the share of points within 0.2 m."""
+    n_points = floats(buildings, "n_points")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.where(n_points > 0.0, floats(buildings, "n_within") / n_points, np.nan)
+    missing, cut = np.array(_missing(buildings), bool), np.array(_cut(buildings), bool)
+    unjudged = np.isnan(shares) | cut
+    layers = [_layer("not judged (no points, or cut by the edge of the data)", UNJUDGED, geometries, unjudged)]
+    judged = ~unjudged & ~missing
+    upper = math.inf
+    for least, colour in SHARES:
+        label = f"at least {100.0 * least:.0f} %" if least > 0.0 else f"less than {100.0 * upper:.0f} %"
+        layers.append(_layer(label, colour, geometries, judged & (shares >= least) & (shares < upper)))
+        upper = least
+    return [*layers, _layer("not found", MISSING, geometries, ~unjudged & missing)]
+
+
+def _found_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]:
+    missing = np.array(_missing(buildings), bool)
+    return [_layer("found", GOOD, geometries, ~missing), _layer("not found", MISSING, geometries, missing)]
+
+
+def _false_models(evaluation: Evaluation) -> Layer:
+    """Models that stand where no building is, hatched."""
+    table = evaluation.tables.get("models")
+    chosen = set()
+    if table is not None and "role" in table.column_names:
+        roles = zip(table["model_id"].to_pylist(), table["role"].to_pylist(), strict=True)
+        chosen = {name for name, role in roles if role == "false"}
+    models = evaluation.models.models
+    is_false = [model.building_id in chosen for model in models]
+    return _layer("model without a building", BAD, [m.footprint for m in models], is_false, filled=False)
+
+
+def _status_layers(evaluation: Evaluation) -> list[Layer]:
+    """The models alone: ok, fallback, failed."""
+    models, failed = evaluation.models.models, evaluation.models.failed
+    ok = [model.status is Status.OK for model in models]
+    footprints = [model.footprint for model in models]
+    return [
+        _layer("model", GOOD, footprints, ok),
+        _layer("fallback (a block)", FAIR, footprints, [not one for one in ok]),
+        _layer("no model", MISSING, [one.footprint for one in failed], [not one.footprint.is_empty for one in failed]),
+    ]
+
+
+def _face_layers(faces: pa.Table, model_faces: pa.Table | None) -> list[Layer]:
+    """Found, missed, not to be found; wrong ones of the models hatched over them."""
+    geometries = shapely.from_wkb(np.array(faces["geometry"].to_pylist(), dtype=object))
+    found = np.array([bool(value) for value in faces["found"].to_pylist()], bool)
+    wanted = np.ones(len(found), bool)
+    if "to_be_found" in faces.column_names:
+        wanted = np.array([bool(value) for value in faces["to_be_found"].to_pylist()], bool)
+    layers = [
+        _layer("too small, too sparse or cut: need not be found", UNJUDGED, geometries, ~wanted & ~found),
+        _layer("found, though it need not be", "#8bb8d0", geometries, ~wanted & found),
+        _layer("found", GOOD, geometries, wanted & found),
+        _layer("missed", FAIR, geometries, wanted & ~found),
+    ]
+    if model_faces is not None and {"wrong", "geometry"} <= set(model_faces.column_names):
+        made = shapely.from_wkb(np.array(model_faces["geometry"].to_pylist(), dtype=object))
+        wrong = [bool(value) for value in model_faces["wrong"].to_pylist()]
+        layers.append(_layer("modelled face that matches none", BAD, made, wrong, filled=False))
+    return layers

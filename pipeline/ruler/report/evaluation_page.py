@@ -1,0 +1,117 @@
+"""An evaluation as one HTML file: nothing to load, no script, light and dark, for a screen, a phone and a printer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.io.storage import LocalStorage
+from pipeline.report.page_template import page_template
+from pipeline.report.pictures import data_uri
+from pipeline.ruler.evaluation.chapters import Chapter, Line, chapters
+from pipeline.ruler.evaluation.counts import breakdowns
+from pipeline.ruler.evaluation.definitions import DEFINITIONS
+from pipeline.ruler.evaluation.evaluate import Evaluation
+from pipeline.ruler.evaluation.measure import Definition
+from pipeline.ruler.evaluation.writing import INTERVALS, all_notes, told_subject
+from pipeline.ruler.report.evaluation_maps import maps
+from pipeline.ruler.report.histograms import charts
+from pipeline.ruler.report.section import RESIDUAL_CLASSES
+from pipeline.ruler.report.worst_cases import MODEL_COLOUR, MOST_NOT_FOUND, SECTION_COLOUR, TRUTH_COLOUR, worst_cases
+
+PAGE = "report.html"
+"""The file."""
+HEADLINE = (
+    ("delivery.lod2", "delivery.records_ok"),
+    ("validity.models_valid",),
+    ("residuals.within_0_2m_top_visible",),
+    ("surface.within_0_2m",),
+    ("faces.completeness_10m2",),
+    ("faces.correctness_10m2",),
+    ("roof_types.correct",),
+    ("footprints.iou_median",),
+    ("detection.area_quality_without_ring", "detection.area_completeness_without_ring"),
+    ("residuals.rmse_top_visible",),
+    ("residuals.median_top_visible",),
+    ("delivery.records_fallback",),
+    ("delivery.records_failed",),
+)
+"""The figures that decide; of each row the first that was measured, and of all the first eight."""
+HEADLINE_FIGURES = 8
+"""How many at most."""
+
+
+def write_page(
+    evaluation: Evaluation, out_dir: str | Path, definitions: Mapping[str, Definition] = DEFINITIONS
+) -> Path:
+    """Write `report.html`.
+
+    Parameters
+    ----------
+    evaluation : Evaluation
+        What was found.
+    out_dir : str or Path
+        A folder; made where it is not there.
+    definitions : mapping of name to Definition
+        Of all measures.
+
+    Returns
+    -------
+    Path
+        The file: images and styles are in it.
+
+    Raises
+    ------
+    RunError
+        The folder cannot be made.
+    """
+    storage = LocalStorage(root=Path(out_dir))
+    storage.put(PAGE, page(evaluation, definitions).encode())
+    return storage.path(PAGE)
+
+
+def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> str:
+    """The page as text."""
+    found = chapters(evaluation, definitions)
+    measured, against = told_subject(evaluation)
+    name = evaluation.models.name
+    return page_template("evaluation.html").render(
+        title=name if evaluation.reference is None else f"{name} against {evaluation.reference.name}",
+        measured=measured,
+        against=against,
+        headline=headline(found),
+        chapters=found,
+        lost=breakdowns(evaluation.tables),
+        maps=[_with_uris(one, png="uri") for one in maps(evaluation)],
+        charts=charts(evaluation.tables),
+        cases=[_with_uris(one, plan_png="plan_uri", view_png="view_uri") for one in worst_cases(evaluation)],
+        most_not_found=MOST_NOT_FOUND,
+        residuals=RESIDUAL_CLASSES,
+        truth_colour=TRUTH_COLOUR,
+        model_colour=MODEL_COLOUR,
+        section_colour=SECTION_COLOUR,
+        notes=all_notes(evaluation),
+        intervals=INTERVALS,
+    )
+
+
+def headline(found: Sequence[Chapter]) -> list[tuple[str, Line]]:
+    """The figures over all buildings that decide, with the titles of their chapters."""
+    lines = {
+        line.definition.name: (chapter.title, line)
+        for chapter in found
+        for line in chapter.lines
+        if line.measure.subset == "all"
+    }
+    chosen = [next((lines[name] for name in names if name in lines), None) for names in HEADLINE]
+    return [pair for pair in chosen if pair is not None][:HEADLINE_FIGURES]
+
+
+def _with_uris(thing: Any, **pictures: str) -> dict[str, Any]:
+    """The fields of a dataclass and its properties, its PNG bytes as addresses that hold them."""
+    known = {name: getattr(thing, name) for name in dir(thing) if not name.startswith("_") and name not in pictures}
+    for field, name in pictures.items():
+        png = getattr(thing, field)
+        known[name] = None if png is None else data_uri(png)
+    return known

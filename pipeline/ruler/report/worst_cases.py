@@ -1,0 +1,266 @@
+"""The worst buildings of an evaluation, each in plan and in section with its points, and as a bird's-eye view."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import shapely
+from markupsafe import Markup
+from matplotlib.collections import LineCollection, PathCollection
+
+from pipeline.model import FloatArray, LabelArray
+from pipeline.report.perspective import View, draw_view
+from pipeline.report.pictures import blank, paths_of, png_of
+from pipeline.ruler.evaluation.evaluate import Evaluation
+from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.evaluation.reference import Reference
+from pipeline.ruler.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg, top_of
+from pipeline.ruler.report.viewed_models import viewed_faces
+
+CASES = 12
+"""How many are shown."""
+MOST_NOT_FOUND = 4
+"""How many of them may be buildings without a model."""
+SOUND_SHARE = 0.999
+"""A correct building of which no less is within 0.2 m is no worst case."""
+POINTS_A_CASE = 12_000
+"""More points of a building are thinned evenly."""
+SIDE_PX = 560
+"""Width and height of a picture."""
+TRUTH_COLOUR, MODEL_COLOUR, SECTION_COLOUR = "#2a9470", "#7f93a6", "#777d86"
+_MARGIN_M = 1.5
+_BADNESS = {"false": 0, "passable": 1, "correct": 2}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Case:
+    """One building with its pictures."""
+
+    building_id: str
+    """Of the reference."""
+    figures: tuple[tuple[str, str], ...]
+    """Name and text of each figure of the caption."""
+    plan_png: bytes
+    """Faces of the models with the points over them, true outlines dashed."""
+    view_png: bytes | None
+    """The model from the south; the true one where none was delivered; None where neither has faces."""
+    view_is_truth: bool
+    """Whether the view shows the truth."""
+    section: Markup | None
+    """An SVG of the profile across the building; None without any faces."""
+
+
+def worst_cases(evaluation: Evaluation) -> list[Case]:
+    """The worst buildings with their pictures; each tile of the reference is read once at most.
+
+    Returns
+    -------
+    list of Case
+        Those without a model and false ones first, then by the mean of the shares of roof and points within 0.2 m;
+        empty without a reference.
+    """
+    reference, table = evaluation.reference, evaluation.tables.get("buildings")
+    if reference is None or table is None:
+        return []
+    rows = chosen_rows(table)
+    place = {building.building_id: number for number, building in enumerate(reference.buildings)}
+    rows = [row for row in rows if row["building_id"] in place]
+    points = _points_of(reference, [place[row["building_id"]] for row in rows])
+    models = evaluation.models.models
+    tree = shapely.STRtree([model.footprint for model in models])
+    cases = []
+    for row in rows:
+        truth = reference.buildings[place[row["building_id"]]]
+        near = shapely.box(*truth.footprint.bounds).buffer(_MARGIN_M, join_style="mitre")
+        around = [models[i] for i in sorted(tree.query(near, predicate="intersects"))]
+        own = [model for model in around if shapely.intersects(model.footprint, truth.footprint)]
+        cases.append(_case(row, truth, own, around, points[place[row["building_id"]]]))
+    return cases
+
+
+def chosen_rows(table: pa.Table) -> list[dict[str, Any]]:
+    """The rows of the worst buildings, the worst first; those at the edge of the data have no say."""
+    rows = [row for row in table.to_pylist() if not row.get("touches_data_edge")]
+    judged = []
+    for row in rows:
+        within = _within(row)
+        outcome = row.get("outcome")
+        missing = row.get("model_id") is None and "model_id" in row
+        is_sound = not missing and outcome in {None, "correct"} and within >= SOUND_SHARE
+        if not is_sound:
+            badness = _BADNESS.get(outcome, 2) if outcome is not None else 2
+            judged.append((0 if missing else badness, within, row["building_id"], missing, row))
+    judged.sort(key=lambda entry: entry[:3])
+    chosen, lost = [], 0
+    for *_, missing, row in judged:
+        lost += missing
+        if not missing or lost <= MOST_NOT_FOUND:
+            chosen.append(row)
+    return chosen[:CASES]
+
+
+def _within(row: Mapping[str, Any]) -> float:
+    """Mean of the shares of the true roof and of the points within 0.2 m, as far as known; 1 where neither is.
+
+    Both count: a survey that is shifted as a whole puts good models beside the true roofs, but not beside the points.
+    """
+    known = []
+    share = row.get("surface_within")
+    if share is not None and math.isfinite(share):
+        known.append(float(share))
+    points, within = row.get("n_points"), row.get("n_within")
+    if points and within is not None:
+        known.append(float(within / points))
+    return sum(known) / len(known) if known else 1.0
+
+
+def _points_of(reference: Reference, wanted: Sequence[int]) -> dict[int, FloatArray]:
+    """Roof points of some buildings, (n, 3) each, thinned evenly; tiles without any of them are not read."""
+    kept: dict[int, list[FloatArray]] = {building: [] for building in wanted}
+    keys = np.array(sorted(wanted), np.int64)
+    areas = [reference.buildings[building].footprint for building in wanted]
+    for number, read in enumerate(reference.tiles):
+        if reference.bounds and not shapely.intersects(areas, shapely.box(*reference.bounds[number])).any():
+            continue
+        chunk = read()
+        held = np.flatnonzero(chunk.is_roof & np.isin(chunk.building, keys))
+        owner: LabelArray = chunk.building[held]
+        for building in np.unique(owner).tolist():
+            kept[building].append(chunk.xyz[held[owner == building]])
+    found = {}
+    for building, parts in kept.items():
+        xyz = np.concatenate(parts) if parts else np.zeros((0, 3))
+        found[building] = xyz[:: max(1, math.ceil(len(xyz) / POINTS_A_CASE))]
+    return found
+
+
+def _case(
+    row: Mapping[str, Any],
+    truth: RoofModel,
+    own: Sequence[RoofModel],
+    around: Sequence[RoofModel],
+    xyz: FloatArray,
+) -> Case:
+    view_is_truth = not own
+    viewed = [truth] if view_is_truth else list(own)
+    return Case(
+        building_id=truth.building_id,
+        figures=_figures(row),
+        plan_png=_plan(truth, own, around, xyz),
+        view_png=_view(viewed),
+        view_is_truth=view_is_truth,
+        section=section_svg(truth, own, xyz),
+    )
+
+
+def _figures(row: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """What the caption tells, as far as it is known."""
+
+    def known(name: str) -> bool:
+        value = row.get(name)
+        return value is not None and not (isinstance(value, float) and math.isnan(value))
+
+    told: list[tuple[str, str]] = []
+    if known("outcome"):
+        told.append(("outcome", str(row["outcome"])))
+    true_type = row.get("true_type")
+    if true_type not in {None, "none", "unknown"}:
+        model_type = row.get("model_type")
+        made = "not found" if row.get("model_id") is None else str(model_type or "?")
+        told.append(("roof type", f"{true_type}, modelled: {made}"))
+    elif "model_id" in row:
+        told.append(("model", "not found" if row["model_id"] is None else str(row.get("model_type") or "found")))
+    if known("shape"):
+        told.append(("shape", str(row["shape"])))
+    if row.get("defects"):
+        told.append(("made hard by", ", ".join(row["defects"])))
+    if known("model_status") and row["model_status"] != "ok":
+        told.append(("status", str(row["model_status"])))
+    if known("faces_to_find"):
+        told.append(
+            ("faces", f"{row['faces_found']} of {row['faces_to_find']} found, {row.get('faces_wrong') or 0} wrong")
+        )
+    if known("n_points") and row["n_points"]:
+        share = f"{100.0 * row['n_within'] / row['n_points']:.1f} % of {row['n_points']:,}"
+        told.append(("points within 0.2 m", share))
+    if known("surface_within"):
+        told.append(("roof within 0.2 m", f"{100.0 * row['surface_within']:.1f} %"))
+    if known("point_rmse_m"):
+        told.append(("point RMSE", f"{row['point_rmse_m']:.3f} m"))
+    if known("iou"):
+        told.append(("footprint IoU", f"{row['iou']:.2f}"))
+    if known("footprint_area_m2"):
+        told.append(("footprint", f"{row['footprint_area_m2']:.0f} m²"))
+    return tuple(told)
+
+
+def _square(truth: RoofModel, own: Sequence[RoofModel]) -> tuple[float, float, float]:
+    """Middle and side of what the plan shows: the building and its models, but no more than twice the building."""
+    west, south, east, north = truth.footprint.bounds
+    side = max(east - west, north - south)
+    x, y = (west + east) / 2.0, (south + north) / 2.0
+    reach = shapely.box(x - side, y - side, x + side, y + side)
+    bounds = shapely.total_bounds([truth.footprint, *(shapely.intersection(one.footprint, reach) for one in own)])
+    west, south, east, north = (float(value) for value in bounds)
+    return (west + east) / 2.0, (south + north) / 2.0, max(east - west, north - south) + 2.0 * _MARGIN_M
+
+
+def _plan(truth: RoofModel, own: Sequence[RoofModel], around: Sequence[RoofModel], xyz: FloatArray) -> bytes:
+    """Faces of the models, points by residual, true outlines dashed, and where the section lies."""
+    figure, axes = blank(SIDE_PX, SIDE_PX)
+    x, y, side = _square(truth, own)
+    faces = [surface.polygon for model in around for surface in model.surfaces]
+    axes.add_collection(
+        PathCollection(paths_of(faces), facecolors=f"{MODEL_COLOUR}38", edgecolors=MODEL_COLOUR, linewidths=1.4)
+    )
+    if len(xyz):
+        kinds = residual_class(xyz[:, 2] - top_of(around, xyz[:, 0], xyz[:, 1]))
+        size = float(np.clip(60_000.0 / len(xyz), 3.0, 40.0))
+        for place in (2, 1, 3, 0, 4):
+            at = kinds == place
+            axes.scatter(xyz[at, 0], xyz[at, 1], s=size, c=RESIDUAL_CLASSES[place].colour, linewidths=0, zorder=3)
+        bare = kinds == UNCOVERED
+        axes.scatter(
+            xyz[bare, 0],
+            xyz[bare, 1],
+            s=1.6 * size,
+            c=RESIDUAL_CLASSES[UNCOVERED].colour,
+            marker="x",
+            linewidths=1.1,
+            zorder=4,
+        )
+    outlines = [surface.polygon for surface in truth.surfaces] or [truth.footprint]
+    rings = [shapely.get_coordinates(ring)[:, :2] for ring in shapely.get_rings(outlines)]
+    axes.add_collection(LineCollection(rings, colors=TRUTH_COLOUR, linewidths=2.0, linestyles=(0, (5, 2.5)), zorder=5))
+    middle, along, half = profile_line(truth, own, xyz)
+    line = np.array([middle - (half + _MARGIN_M) * along, middle + (half + _MARGIN_M) * along])
+    axes.plot(line[:, 0], line[:, 1], color=SECTION_COLOUR, linewidth=1.3, marker="o", markersize=4.0, zorder=6)
+    axes.set_xlim(x - side / 2.0, x + side / 2.0)
+    axes.set_ylim(y - side / 2.0, y + side / 2.0)
+    return png_of(figure)
+
+
+def _view(models: Sequence[RoofModel]) -> bytes | None:
+    """Bird's-eye view; None where there is no face."""
+    viewed = [faces for model in models if (faces := viewed_faces(model))]
+    if not viewed:
+        return None
+    middle = np.mean([face.rings[0].mean(axis=0) for faces in viewed for face in faces], axis=0)
+    local = [
+        [dataclasses.replace(face, rings=tuple(ring - middle for ring in face.rings)) for face in faces]
+        for faces in viewed
+    ]
+    figure, axes = blank(SIDE_PX, SIDE_PX)
+    draw_view(axes, local, View(), shadows=False)
+    (drawn,) = axes.collections
+    corners = np.concatenate([path.vertices for path in drawn.get_paths()])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    half = 0.54 * float((high - low).max())
+    axes.set_xlim((low[0] + high[0]) / 2.0 - half, (low[0] + high[0]) / 2.0 + half)
+    axes.set_ylim((low[1] + high[1]) / 2.0 - half, (low[1] + high[1]) / 2.0 + half)
+    return png_of(figure)

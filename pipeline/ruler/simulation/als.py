@@ -1,0 +1,222 @@
+"""An airborne laser scanner over a scene: parallel strips, scan lines, beams with a footprint, several returns.
+
+Every pulse draws its random numbers from a state of its own (seed, strip, line, pulse), so what it measures depends
+neither on the order nor on the chunks in which the pulses are made.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.model import BoolArray, ByteArray, FloatArray, LabelArray, PointCloud
+from pipeline.ruler.simulation.beam import COLUMNS, MAX_RETURNS, FlightLine, scan_lines
+from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.scene_arrays import SceneArrays, scene_arrays
+from pipeline.ruler.simulation.strips import ScannerSettings, flight_lines, lines_over, reach_m
+from pipeline.ruler.simulation.survey_faults import fault_rows, move_faulty
+
+__all__ = ["ScanBlock", "ScannerSettings", "joined", "reach_m", "scan", "scan_all", "strip_count"]
+
+_PULSES_A_BLOCK = 131_072
+"""Work unit of a thread: it holds at most this many pulses in memory."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ScanBlock:
+    """Returns in the order of time, with their truth. All arrays have one length n."""
+
+    points: PointCloud
+    """CRS coordinates; classification is the true one: 1 small things, 2 ground, 5 vegetation, 6 building."""
+    intensity: npt.NDArray[np.uint16]
+    """(n,) uint16, share of the beam times the surface's reflectance."""
+    scan_angle_deg: FloatArray
+    """(n,) float64, from nadir, positive to the right of the flight."""
+    building: LabelArray
+    """(n,) int32, number of the building that was hit; -1 for none."""
+    face: LabelArray
+    """(n,) int32, number of its roof face; -1 for walls and for what is no building."""
+    mixed: BoolArray
+    """(n,) bool, True where echoes of different surfaces melted into this return."""
+
+    def __len__(self) -> int:
+        """Number of returns."""
+        return len(self.points)
+
+    @property
+    def wall(self) -> BoolArray:
+        """(n,) bool, True where a wall was hit."""
+        return (self.building >= 0) & (self.face < 0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Job:
+    """Consecutive scan lines of one strip."""
+
+    line: FlightLine
+    first: int
+    stop: int
+
+
+def strip_count(scene: Scene, settings: ScannerSettings) -> int:
+    """Number of strips that cover the scene, or the survey that it is a tile of."""
+    return len(flight_lines(scene, settings, 0))
+
+
+def scan(
+    scene: Scene, settings: ScannerSettings, seed: int, *, chunk_points: int = 1_000_000, threads: int = 2
+) -> Iterator[ScanBlock]:
+    """Scan a scene, chunk by chunk, in the order of time.
+
+    A scene with a `survey_extent` is one tile of a survey: the strips are laid over the whole, and exactly those pulses
+    are fired that aim into the tile, so that the tiles together give the returns of the whole. For that each tile holds
+    all objects and survey faults within `reach_m` of its extent, in one order everywhere.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is scanned.
+    settings : ScannerSettings
+        The survey.
+    seed : int
+        Seed of the scanner; content depends on nothing but scene, settings and seed.
+    chunk_points : int
+        At least so many returns a chunk (the last may be smaller); at most some 100,000 more.
+    threads : int
+        Threads that work ahead; memory grows with them, content does not change.
+
+    Yields
+    ------
+    ScanBlock
+        A chunk of returns. A scene without any return yields nothing.
+
+    Raises
+    ------
+    SettingsError
+        If the terrain is so steep that beams graze it.
+    """
+    margin_m = settings.beam_radius_m + settings.pulse_spacing_m
+    arrays = scene_arrays(scene, settings.max_lean, margin_m, settings.beam_radius_m)
+    pending: list[ScanBlock] = []
+    for block in _in_order(_jobs(scene, settings, seed, chunk_points), arrays, scene, settings, seed, threads):
+        if len(block):
+            pending.append(block)
+        if sum(len(one) for one in pending) >= chunk_points:
+            yield joined(pending)
+            pending = []
+    if pending:
+        yield joined(pending)
+
+
+def scan_all(scene: Scene, settings: ScannerSettings, seed: int) -> ScanBlock:
+    """The whole scan in memory: for small scenes.
+
+    Raises
+    ------
+    ValueError
+        If no pulse hit the scene's extent.
+    """
+    blocks = list(scan(scene, settings, seed))
+    if not blocks:
+        raise ValueError(f"no pulse of {settings.pulse_density_per_m2:g} per m2 hit the extent {scene.extent}")
+    return joined(blocks)
+
+
+def joined(blocks: list[ScanBlock]) -> ScanBlock:
+    """Blocks one after the other, as one."""
+    if len(blocks) == 1:
+        return blocks[0]
+    clouds = [block.points for block in blocks]
+    points = PointCloud(
+        **{f.name: np.concatenate([getattr(c, f.name) for c in clouds]) for f in dataclasses.fields(PointCloud)}
+    )
+    others = [f.name for f in dataclasses.fields(ScanBlock) if f.name != "points"]
+    return ScanBlock(points=points, **{name: np.concatenate([getattr(b, name) for b in blocks]) for name in others})
+
+
+def _jobs(scene: Scene, settings: ScannerSettings, seed: int, chunk_points: int) -> Iterator[_Job]:
+    spacing = settings.pulse_spacing_m
+    per_line = math.ceil(2 * settings.half_swath_m / spacing)
+    step = max(1, min(_PULSES_A_BLOCK, chunk_points) // per_line)
+    for line in flight_lines(scene, settings, seed):
+        needed = lines_over(line, scene, settings)
+        for first in needed[::step]:
+            yield _Job(line=line, first=first, stop=min(first + step, needed.stop))
+
+
+def _in_order(
+    jobs: Iterator[_Job], arrays: SceneArrays, scene: Scene, settings: ScannerSettings, seed: int, threads: int
+) -> Iterator[ScanBlock]:
+    """Blocks in the order of the jobs, a bounded number in flight."""
+    if threads < 2:
+        for job in jobs:
+            yield _block(job, arrays, scene, settings, seed)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        running: deque[Future[ScanBlock]] = deque()
+        for job in jobs:
+            running.append(pool.submit(_block, job, arrays, scene, settings, seed))
+            if len(running) > threads:
+                yield running.popleft().result()
+        while running:
+            yield running.popleft().result()
+
+
+def _block(job: _Job, arrays: SceneArrays, scene: Scene, settings: ScannerSettings, seed: int) -> ScanBlock:
+    """Scan some lines of a strip."""
+    spacing = settings.pulse_spacing_m
+    per_line = math.ceil(2 * settings.half_swath_m / spacing)
+    capacity = (job.stop - job.first) * per_line * MAX_RETURNS
+    floats = np.empty((capacity, 5))
+    integers = np.empty((capacity, COLUMNS), np.int32)
+    survey = np.array(
+        [
+            spacing,
+            settings.half_swath_m,
+            settings.altitude_m,
+            settings.jitter,
+            settings.range_noise_m,
+            settings.beam_radius_m,
+            settings.range_resolution_m,
+            settings.drop_out,
+            settings.speed_m_s,
+            settings.wrong_row_share,
+            settings.wrong_row_lift_m,
+        ]
+    )
+    count = scan_lines(
+        arrays, job.line, survey, np.array(scene.extent), seed, job.first, job.stop, per_line, floats, integers
+    )
+    floats, integers = floats[:count], integers[:count]
+    faults = fault_rows(scene.survey_faults, floats)
+    if len(faults):
+        move_faulty(floats, np.ascontiguousarray(integers[:, 7]), faults, seed, job.line.number)
+    return _as_block(floats, integers, scene, job.line.number)
+
+
+def _as_block(floats: FloatArray, integers: LabelArray, scene: Scene, strip: int) -> ScanBlock:
+    def byte(column: int) -> ByteArray:
+        return integers[:, column].astype(np.uint8)
+
+    points = PointCloud(
+        xyz=np.round(floats[:, :3] + np.array(scene.origin), 3),
+        return_number=byte(0),
+        return_count=byte(1),
+        classification=byte(2),
+        gps_time=floats[:, 3].copy(),
+        source_id=np.full(len(floats), strip + 1, np.uint16),
+    )
+    return ScanBlock(
+        points=points,
+        intensity=integers[:, 3].astype(np.uint16),
+        scan_angle_deg=floats[:, 4].copy(),
+        building=integers[:, 4].copy(),
+        face=integers[:, 5].copy(),
+        mixed=integers[:, 6].astype(np.bool_),
+    )

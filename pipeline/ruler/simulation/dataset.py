@@ -1,0 +1,375 @@
+"""Simulated data sets on disk: raw LAZ tiles, and the truth beside them.
+
+```
+<suite>.laz                     points without classes, as a survey delivers them
+tiles/<suite>_<key>.laz         the same of a suite that is made tile by tile (city)
+truth/scene.json                suite, seed, split, scanner, counts, list of the tiles with their points and bounds
+truth/labels.parquet            one row a point, in the order of the LAZ: class, building_id, face, mixed
+truth/labels/<key>.parquet      the same of one tile
+truth/conditions.parquet        one row a building: shape, defects, groups of its faces, slope of the terrain
+truth/buildings, planes, meshes, cityjson      the exact models, laid out and named as in a run directory
+<cell>/ and sweep.json          a suite of several surveys (sweep): such a data set a cell, and the list of the cells
+```
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import InputError, SettingsError
+from pipeline.ruler.simulation.als import ScannerSettings, scan, strip_count
+from pipeline.ruler.simulation.conditions import write_conditions
+from pipeline.ruler.simulation.scene import Scene
+from pipeline.ruler.simulation.strips import survey_extent
+from pipeline.ruler.simulation.suites import Suite, suite_named
+from pipeline.ruler.simulation.survey_files import TileFiles, last_returns, write_points
+from pipeline.ruler.simulation.sweep import Cell, chosen_cells
+from pipeline.ruler.simulation.truth_files import SceneTruth, read_truth, write_manifest, write_models
+
+__all__ = ["ScenePaths", "SceneTruth", "read_truth", "simulate"]
+
+_BUILDINGS_A_PART = 500
+_TRUTH_FILES = ("scene.json", "labels.parquet", "conditions.parquet")
+_TRUTH_FOLDERS = ("labels", "buildings", "planes", "rejected", "meshes", "cityjson")
+_TILED_CHUNK_POINTS = 250_000
+"""The scanner goes on while a chunk is compressed; small ones keep it busy."""
+
+_STEEPEST_DEG = 30.0
+"""Of the ground that a city can be put on."""
+
+OnPoints = Callable[[int], None]
+Extent = tuple[float, float, float, float]
+"""Smallest x, smallest y, largest x, largest y in the scene frame."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ScenePaths:
+    """What `simulate` wrote."""
+
+    laz: Path
+    """The tile; the folder of the tiles where there are several, the data set's folder where there are cells."""
+    truth: Path
+    """The folder of the truth: a run directory of the exact models, plus conditions, labels and scene.json. The data
+    set's folder where there are cells."""
+    labels: Path
+    """Per-point truth; the folder of it where there are several tiles, the data set's folder where there are cells."""
+    points: int
+    """Returns in all tiles."""
+    buildings: int
+    """Buildings in the scene; of all cells together where there are cells."""
+    tiles: int = 1
+    """LAZ files."""
+    cells: tuple[ScenePaths, ...] = ()
+    """What was written for every cell of a suite of several surveys."""
+
+
+def simulate(
+    suite: str,
+    out_dir: str | Path,
+    seed: int | None = None,
+    *,
+    size_m: tuple[float, float] | None = None,
+    density_per_m2: float | None = None,
+    noise_m: float | None = None,
+    scanner: ScannerSettings | None = None,
+    slope_deg: float | None = None,
+    with_classes: bool = False,
+    chunk_points: int = 1_000_000,
+    on_points: OnPoints | None = None,
+) -> ScenePaths:
+    """Make a suite's scene, scan it, write the tiles and the truth.
+
+    Parameters
+    ----------
+    suite : str
+        Name of a suite.
+    out_dir : str or Path
+        Folder, made where it does not exist; what an earlier call made there, of whatever suite, is replaced.
+    seed : int, optional
+        Of layout and scanner; the suite's own by default. The same call gives the same bytes.
+    size_m : tuple of float, optional
+        Extent east and north; the suite's own by default.
+    density_per_m2, noise_m : float, optional
+        Pulse density and range noise in place of the suite's; of a suite of several surveys, which of its cells.
+    scanner : ScannerSettings, optional
+        A whole survey in place of the suite's.
+    slope_deg : float, optional
+        Put a city on ground of this slope all over, 0 to 30 deg, in place of its plain and hillside.
+    with_classes : bool
+        Write the true classes into the LAZ too; by default all points are class 1 (unclassified).
+    chunk_points : int
+        Points held in memory at a time, about; the content does not depend on it.
+    on_points : callable, optional
+        Told the number of points written so far.
+
+    Returns
+    -------
+    ScenePaths
+        What was written, and where.
+
+    Raises
+    ------
+    SettingsError
+        Unknown suite, negative seed, or a size or survey out of range.
+    InputError
+        The survey hits nothing, or the folder cannot be written or holds somebody else's truth.
+    """
+    plan = suite_named(suite)
+    seed = plan.seed if seed is None else seed
+    faults = _faults(plan, seed, size_m)
+    if slope_deg is not None and plan.on_slope is None:
+        faults.append(f"{plan.name} has ground of its own: leave out slope_deg")
+    elif slope_deg is not None and not 0.0 <= slope_deg <= _STEEPEST_DEG:
+        faults.append(f"slope_deg is {slope_deg:g}: use 0 to {_STEEPEST_DEG:g}")
+    if "://" in str(out_dir):
+        faults.append(f"out is {out_dir}: simulate writes to a folder of this machine")
+    if faults:
+        raise SettingsError(faults)
+    if slope_deg is not None:
+        plan = _sloped(plan, slope_deg)
+    writing = _Writing(
+        plan=plan,
+        seed=seed,
+        size_m=plan.size_m if size_m is None else size_m,
+        with_classes=with_classes,
+        chunk_points=chunk_points,
+        on_points=on_points,
+    )
+    settings = scanner or plan.scanner
+    out = Path(out_dir)
+    if plan.cells:
+        return _simulate_cells(writing, settings, chosen_cells(plan.cells, density_per_m2, noise_m), out)
+    if density_per_m2 is not None:
+        settings = dataclasses.replace(settings, pulse_density_per_m2=float(density_per_m2))
+    if noise_m is not None:
+        settings = dataclasses.replace(settings, range_noise_m=float(noise_m))
+    if plan.part is not None:
+        return _simulate_tiles(writing, settings, out)
+    return _simulate_one(writing, settings, plan.make(seed, writing.size_m), out)
+
+
+def _sloped(plan: Suite, slope_deg: float) -> Suite:
+    """The suite on ground of one slope."""
+    on_slope = plan.on_slope
+    if on_slope is None:
+        raise TypeError(f"{plan.name} has ground of its own")
+    return dataclasses.replace(plan, part=lambda seed, size_m, settings: on_slope(seed, size_m, settings, slope_deg))
+
+
+def _faults(plan: Suite, seed: int, size_m: tuple[float, float] | None) -> list[str]:
+    """What is wrong with a request."""
+    faults = []
+    if size_m is not None and not plan.is_sized:
+        faults.append(f"the size of {plan.name} follows from its buildings: leave out --size")
+    elif size_m is not None:
+        faults += [f"size is {size:g} m: use 20 to 50000 m" for size in size_m if not 20.0 <= size <= 50_000.0]
+    if not 0 <= seed < 2**32:
+        faults.append(f"seed is {seed}: use 0 to {2**32 - 1}")
+    return faults
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Writing:
+    """What one call makes, and how."""
+
+    plan: Suite
+    seed: int
+    size_m: tuple[float, float]
+    with_classes: bool
+    chunk_points: int
+    on_points: OnPoints | None
+
+    def tile(self, scene: Scene, settings: ScannerSettings, laz: Path, labels: Path, before: int) -> TileFiles:
+        """Scan a scene into a LAZ file and its labels; `before` points were written by earlier tiles."""
+        blocks = scan(scene, settings, self.seed, chunk_points=self.chunk_points)
+        if self.plan.last_returns_only:
+            blocks = last_returns(blocks)
+        told = self.on_points
+        return write_points(
+            blocks, scene, laz, labels, self.with_classes, None if told is None else lambda n: told(before + n)
+        )
+
+
+def _simulate_one(writing: _Writing, settings: ScannerSettings, scene: Scene, out: Path, before: int = 0) -> ScenePaths:
+    """A data set of one tile."""
+    truth = _emptied(out, writing.plan.name)
+    laz, labels = out / f"{writing.plan.name}.laz", truth / "labels.parquet"
+    tile = writing.tile(scene, settings, laz, labels, before)
+    if tile.points == 0:
+        raise InputError(str(laz), "the survey hit nothing", "Use a larger scene or a higher density")
+    rows = []
+    for first in range(0, len(scene.buildings), _BUILDINGS_A_PART):
+        part = f"part{first // _BUILDINGS_A_PART:05d}"
+        rows += write_models(scene.buildings[first : first + _BUILDINGS_A_PART], scene, settings, truth, part)
+    write_conditions(rows, truth / "conditions.parquet")
+    write_manifest(
+        scene,
+        settings,
+        writing.seed,
+        [tile],
+        truth,
+        strips=strip_count(scene, settings),
+        buildings=len(scene.buildings),
+        trees=len(scene.trees),
+        cars=len(scene.boxes),
+    )
+    return ScenePaths(laz=laz, truth=truth, labels=labels, points=tile.points, buildings=len(scene.buildings))
+
+
+def _emptied(out: Path, suite: str) -> Path:
+    """The folder of the truth, made where it is missing, without what an earlier call left there."""
+    truth = out / "truth"
+    try:
+        truth.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            str(out), f"cannot be written ({error.strerror})", "Give --out a folder of your own"
+        ) from error
+    manifest, begun = truth / "scene.json", truth / ".scene.json"
+    held = [name for name in (*_TRUTH_FILES, *_TRUTH_FOLDERS) if (truth / name).exists()]
+    if held and not (manifest.is_file() or begun.is_file()):
+        problem = f"holds {', '.join(held)} that simulate did not write"
+        raise InputError(str(truth), problem, "Give another --out, or move them away")
+    for laz in _known_tiles(manifest):
+        laz.unlink(missing_ok=True)
+    begun.touch()  # until scene.json takes its place it tells the next call that what lies here is ours
+    for name in _TRUTH_FILES:
+        (truth / name).unlink(missing_ok=True)
+    for name in _TRUTH_FOLDERS:
+        if (truth / name).is_dir():
+            shutil.rmtree(truth / name)
+    for laz in (out / "tiles").glob(f"{suite}_x*_y*.laz"):
+        laz.unlink()
+    return truth
+
+
+def _known_tiles(manifest: Path) -> list[Path]:
+    """The LAZ files of an earlier call, of whatever suite, that lie in its folder."""
+    try:
+        names = [str(tile["laz"]) for tile in json.loads(manifest.read_text(encoding="utf-8"))["tiles"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    tiles = [(manifest.parent / name).resolve() for name in names]
+    out = manifest.parent.parent.resolve()
+    return [tile for tile in tiles if tile.suffix == ".laz" and tile.parent in {out, out / "tiles"}]
+
+
+def _simulate_cells(writing: _Writing, settings: ScannerSettings, cells: tuple[Cell, ...], out: Path) -> ScenePaths:
+    """A data set a cell: the same scene under every survey."""
+    scene = writing.plan.make(writing.seed, writing.size_m)
+    made: list[ScenePaths] = []
+    for cell in cells:
+        survey = dataclasses.replace(settings, pulse_density_per_m2=cell.density_per_m2, range_noise_m=cell.noise_m)
+        made.append(_simulate_one(writing, survey, scene, out / cell.key, sum(one.points for one in made)))
+    listed = [
+        {"cell": cell.key, "density_per_m2": cell.density_per_m2, "noise_m": cell.noise_m, "points": one.points}
+        for cell, one in zip(cells, made, strict=True)
+    ]
+    document: dict[str, Any] = {"suite": writing.plan.name, "seed": writing.seed, "cells": listed}
+    (out / "sweep.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    return ScenePaths(
+        laz=out,
+        truth=out,
+        labels=out,
+        points=sum(one.points for one in made),
+        buildings=sum(one.buildings for one in made),
+        tiles=len(made),
+        cells=tuple(made),
+    )
+
+
+def _simulate_tiles(writing: _Writing, settings: ScannerSettings, out: Path) -> ScenePaths:
+    """A data set of many tiles: the whole scene is never in memory.
+
+    While one tile is scanned and written, one thread lays out the next and writes the models of the one before.
+    """
+    size, plan = writing.size_m, writing.plan
+    if plan.part is None:
+        raise TypeError(f"{plan.name} is not made tile by tile")
+    truth = _emptied(out, plan.name)
+    tiles_dir, labels_dir = out / "tiles", truth / "labels"
+    for folder in (tiles_dir, labels_dir):
+        folder.mkdir(parents=True, exist_ok=True)
+    part_of = plan.part(writing.seed, size, settings)
+    writing = dataclasses.replace(writing, chunk_points=min(writing.chunk_points, _TILED_CHUNK_POINTS))
+    tiles: list[TileFiles] = []
+    truths: list[Future[_TileTruth]] = []
+    points = 0
+    todo = list(tile_extents(size, plan.tile_m))
+    with ThreadPoolExecutor(1) as aside:
+        ahead = aside.submit(part_of, todo[0][1])
+        for number, (key, extent) in enumerate(todo):
+            scene = ahead.result()
+            if number + 1 < len(todo):
+                ahead = aside.submit(part_of, todo[number + 1][1])
+            truths.append(aside.submit(_tile_truth, scene, settings, extent, truth, key))
+            laz, labels = tiles_dir / f"{plan.name}_{key}.laz", labels_dir / f"{key}.parquet"
+            made = writing.tile(scene, settings, laz, labels, points)
+            points += made.points
+            if made.points:
+                tiles.append(made)
+            else:
+                laz.unlink()
+                labels.unlink()
+        known = [future.result() for future in truths]
+    if points == 0:
+        raise InputError(str(tiles_dir), "the survey hit nothing", "Use a larger scene or a higher density")
+    rows = [row for one in known for row in one.rows]
+    write_conditions(rows, truth / "conditions.parquet")
+    write_manifest(
+        scene,
+        settings,
+        writing.seed,
+        tiles,
+        truth,
+        strips=strip_count(scene, settings),
+        buildings=len(rows),
+        trees=sum(one.trees for one in known),
+        cars=sum(one.cars for one in known),
+    )
+    return ScenePaths(
+        laz=tiles_dir, truth=truth, labels=labels_dir, points=points, buildings=len(rows), tiles=len(tiles)
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _TileTruth:
+    """What a tile owns."""
+
+    rows: list[dict[str, Any]]
+    trees: int
+    cars: int
+
+
+def _tile_truth(scene: Scene, settings: ScannerSettings, extent: Extent, truth: Path, key: str) -> _TileTruth:
+    """Write the models that a tile owns."""
+    whole = survey_extent(scene)
+    owned = [building for building in scene.buildings if _owns(extent, whole, building.x, building.y)]
+    middles = [box.corners.mean(axis=0) for box in scene.boxes]
+    return _TileTruth(
+        rows=write_models(owned, scene, settings, truth, key),
+        trees=sum(_owns(extent, whole, tree.x, tree.y) for tree in scene.trees),
+        cars=sum(_owns(extent, whole, float(middle[0]), float(middle[1])) for middle in middles),
+    )
+
+
+def tile_extents(size_m: tuple[float, float], tile_m: float) -> Iterator[tuple[str, Extent]]:
+    """Key and extent of the square tiles that cover a scene from its origin, row by row."""
+    for row in range(math.ceil(size_m[1] / tile_m)):
+        for column in range(math.ceil(size_m[0] / tile_m)):
+            x, y = column * tile_m, row * tile_m
+            yield f"x{column}_y{row}", (x, y, min(x + tile_m, size_m[0]), min(y + tile_m, size_m[1]))
+
+
+def _owns(extent: Extent, whole: Extent, x: float, y: float) -> bool:
+    """Half-open ownership; what has its middle outside of the whole scene belongs to the nearest tile."""
+    inside_x = min(max(x, whole[0]), math.nextafter(whole[2], -math.inf))
+    inside_y = min(max(y, whole[1]), math.nextafter(whole[3], -math.inf))
+    return extent[0] <= inside_x < extent[2] and extent[1] <= inside_y < extent[3]

@@ -1,0 +1,107 @@
+"""Plots for detached buildings: each as large as its building and the free ground around it, packed in rows."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.model import FloatArray
+from pipeline.ruler.simulation.roofs import ROOFS, RoofDimensions, RoofShape
+from pipeline.ruler.simulation.scene import turned
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plot:
+    """Where one building stands."""
+
+    x: float
+    """Easting of the middle of the building's main rectangle, scene frame."""
+    y: float
+    """Northing of it."""
+    extent: tuple[float, float, float, float]
+    """The plot: smallest x, smallest y, largest x, largest y."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlannedBuilding:
+    """A building before it has a place."""
+
+    shape: RoofShape
+    """The parametric shape."""
+    dimensions: RoofDimensions
+    """Its size."""
+    azimuth_deg: float
+    """Direction of the ridge, clockwise from north."""
+    margin_m: float
+    """Free ground around it."""
+
+    @property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest corner (2,) of the turned roof's box about the middle of the main rectangle."""
+        plan = turned(ROOFS[self.shape](self.dimensions).vertices[:, :2], 0.0, 0.0, self.azimuth_deg)
+        return plan.min(axis=0), plan.max(axis=0)
+
+
+def packed_plots(
+    buildings: Sequence[PlannedBuilding], strip_width_m: float, strips: int, gap_m: float = 0.0
+) -> tuple[list[Plot], tuple[float, float]]:
+    """Pack plots in rows across parallel strips that run north; no plot crosses the border of two strips.
+
+    Parameters
+    ----------
+    buildings : sequence of PlannedBuilding
+        In the order in which rows are filled.
+    strip_width_m : float
+        Width of a strip; wide enough for any plot.
+    strips : int
+        How many strips stand side by side.
+    gap_m : float
+        Kept free at both sides of a strip.
+
+    Returns
+    -------
+    plots : list of Plot
+        One a building, in their order.
+    size_m : tuple of float
+        Extent of all strips: east, north; whole metres.
+
+    Raises
+    ------
+    ValueError
+        If a plot is wider than a strip.
+    """
+    boxes = [building.bounds for building in buildings]
+    sizes = [high - low + 2 * building.margin_m for (low, high), building in zip(boxes, buildings, strict=True)]
+    room = strip_width_m - 2 * gap_m
+    rows: list[list[int]] = [[]]
+    filled = 0.0
+    for number, size in enumerate(sizes):
+        if size[0] > room:
+            raise ValueError(f"a plot {size[0]:.1f} m wide does not fit a strip of {room:g} m")
+        if filled + size[0] > room:
+            rows.append([])
+            filled = 0.0
+        rows[-1].append(number)
+        filled += float(size[0])
+    depths = [max((float(sizes[number][1]) for number in row), default=0.0) for row in rows]
+    length = sum(depths) / strips
+    plots: dict[int, Plot] = {}
+    strip, y, longest = 0, 0.0, 0.0
+    for row, depth in zip(rows, depths, strict=True):
+        if y + depth / 2 > length and strip < strips - 1:
+            strip, y = strip + 1, 0.0
+        spare = (room - sum(float(sizes[number][0]) for number in row)) / max(len(row), 1)
+        x = strip * strip_width_m + gap_m
+        for number in row:
+            width, (low, high) = float(sizes[number][0]) + spare, boxes[number]
+            plots[number] = Plot(
+                x=x + (width - float(low[0] + high[0])) / 2,
+                y=y + (depth - float(low[1] + high[1])) / 2,
+                extent=(x, y, x + width, y + depth),
+            )
+            x += width
+        y += depth
+        longest = max(longest, y)
+    return [plots[number] for number in range(len(buildings))], (strips * strip_width_m, float(np.ceil(longest)))

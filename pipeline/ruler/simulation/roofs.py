@@ -1,0 +1,80 @@
+"""The parametric roofs: what the records call each shape, and the function that makes its faces."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+from pipeline.model import RoofType
+from pipeline.ruler.simulation.additions import addition_parts
+from pipeline.ruler.simulation.envelope import envelope
+from pipeline.ruler.simulation.roof_dimensions import (
+    Addition,
+    AdditionKind,
+    FaceRings,
+    FlatPart,
+    RoofDimensions,
+    RoofFaces,
+    RoofShape,
+)
+from pipeline.ruler.simulation.roof_parts import PARTS
+from pipeline.ruler.simulation.simple_roofs import flat, gable, hip, l_shape, pent
+
+__all__ = [
+    "ROOFS",
+    "ROOF_TYPES",
+    "Addition",
+    "AdditionKind",
+    "FaceRings",
+    "FlatPart",
+    "RoofDimensions",
+    "RoofFaces",
+    "RoofShape",
+]
+
+ROOF_TYPES: dict[RoofShape, RoofType] = {
+    RoofShape.FLAT: RoofType.FLAT,
+    RoofShape.PENT: RoofType.PENT,
+    RoofShape.GABLE: RoofType.GABLE,
+    RoofShape.HIP: RoofType.HIP,
+    RoofShape.L_SHAPE: RoofType.COMBINATION,
+    RoofShape.HALF_HIP: RoofType.GABLE,
+    RoofShape.BENT_HIP: RoofType.HIP,
+    RoofShape.PYRAMID: RoofType.HIP,
+    RoofShape.UNEQUAL_GABLE: RoofType.GABLE,
+    RoofShape.MANSARD: RoofType.COMBINATION,
+    RoofShape.GAMBREL: RoofType.COMBINATION,
+    RoofShape.T_SHAPE: RoofType.COMBINATION,
+    RoofShape.U_SHAPE: RoofType.COMBINATION,
+    RoofShape.CROSS: RoofType.COMBINATION,
+    RoofShape.COURTYARD: RoofType.COMBINATION,
+    RoofShape.MULTI_LEVEL_FLAT: RoofType.FLAT,
+}
+"""The roof type of the records for every shape, whatever stands on it."""
+
+
+_BARE: dict[RoofShape, Callable[[RoofDimensions], RoofFaces]] = {
+    RoofShape.FLAT: flat,
+    RoofShape.PENT: pent,
+    RoofShape.GABLE: gable,
+    RoofShape.HIP: hip,
+    RoofShape.L_SHAPE: l_shape,
+}
+
+
+def _maker(shape: RoofShape) -> Callable[[RoofDimensions], RoofFaces]:
+    """The function that makes a roof of a shape, with all that stands on it."""
+    parts = PARTS[shape]
+
+    @functools.lru_cache(maxsize=256)  # a layout asks for the same roof while it draws additions and places it
+    def make(size: RoofDimensions) -> RoofFaces:
+        bare = _BARE[shape](size) if shape in _BARE else envelope(parts(size))
+        if not size.additions:
+            return bare
+        return envelope([*parts(size), *addition_parts(bare, size.additions)])
+
+    return make
+
+
+ROOFS: dict[RoofShape, Callable[[RoofDimensions], RoofFaces]] = {shape: _maker(shape) for shape in RoofShape}
+"""The function of every shape. It raises ValueError where the sizes give no such roof."""

@@ -1,0 +1,177 @@
+"""The survey: its settings, its flight lines, and which scan lines of them can touch a scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from pipeline.model import BoolArray, FloatArray
+from pipeline.parameters import Parameters, parameter
+from pipeline.ruler.simulation.beam import FlightLine
+from pipeline.ruler.simulation.scene import Scene, Terrain
+from pipeline.ruler.simulation.scene_arrays import landing_m, steepest_slope
+
+_FIRST_GPS_TIME_S = 427_536_018.0
+"""Start of the first strip: 1 April 2025, 10:00 UTC, as adjusted standard GPS time."""
+_TURN_S = 120.0
+"""From the end of a strip to the start of the next."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ScannerSettings(Parameters):
+    """The survey: instrument, flight and noise."""
+
+    pulse_density_per_m2: float = parameter(
+        8.0, "Pulses a square metre of one strip.", unit="1/m2", minimum=0.01, maximum=500.0
+    )
+    range_noise_m: float = parameter(0.03, "Standard deviation along the beam.", unit="m", minimum=0.0, maximum=2.0)
+    altitude_m: float = parameter(600.0, "Flying height over the terrain's base.", unit="m", minimum=50.0)
+    strip_spacing_m: float = parameter(120.0, "Distance of neighbouring flight lines.", unit="m", minimum=5.0)
+    strip_overlap: float = parameter(
+        0.15, "Share by which the swath is wider than the spacing.", minimum=0.0, maximum=2.0
+    )
+    flight_azimuth_deg: float = parameter(
+        0.0, "Direction of the strips, clockwise from north.", unit="deg", minimum=0.0, maximum=360.0
+    )
+    jitter: float = parameter(
+        0.5,
+        "Random shift of each pulse along and across the line, as a share of the spacing.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    beam_radius_m: float = parameter(0.12, "Radius of the beam's footprint.", unit="m", minimum=0.0, maximum=2.0)
+    range_resolution_m: float = parameter(
+        1.2, "Echoes of one beam that are closer than this melt into one return.", unit="m", minimum=0.0, maximum=10.0
+    )
+    drop_out: float = parameter(0.005, "Share of pulses that never come back.", minimum=0.0, maximum=1.0)
+    strip_shift_m: float = parameter(
+        0.0, "Standard deviation of a strip's own horizontal shift, each axis.", unit="m", minimum=0.0, maximum=5.0
+    )
+    strip_lift_m: float = parameter(
+        0.0, "Standard deviation of a strip's own vertical shift.", unit="m", minimum=0.0, maximum=5.0
+    )
+    wrong_row_share: float = parameter(
+        0.0, "Share of scan rows whose elevations are wrong, all over the survey.", minimum=0.0, maximum=1.0
+    )
+    wrong_row_lift_m: float = parameter(
+        0.0, "By how much the wrong rows are too high.", unit="m", minimum=-100.0, maximum=100.0
+    )
+    speed_m_s: float = parameter(60.0, "Speed of the aircraft.", unit="m/s", minimum=1.0, maximum=500.0)
+
+    @property
+    def half_swath_m(self) -> float:
+        """Half the width of a strip on the ground."""
+        return self.strip_spacing_m * (1.0 + self.strip_overlap) / 2.0
+
+    @property
+    def max_lean(self) -> float:
+        """Tangent of the largest scan angle."""
+        return self.half_swath_m / self.altitude_m
+
+    @property
+    def pulse_spacing_m(self) -> float:
+        """Distance of scan lines, and of pulses in a line."""
+        return 1.0 / math.sqrt(self.pulse_density_per_m2)
+
+
+def survey_extent(scene: Scene) -> tuple[float, float, float, float]:
+    """What the strips are laid over: the whole survey where the scene is one tile of it, else the scene."""
+    return scene.survey_extent or scene.extent
+
+
+def reach_m(
+    terrain: Terrain, extent: tuple[float, float, float, float], settings: ScannerSettings, height_m: float
+) -> float:
+    """How far outside of an extent the pulses that aim into it can hit things of a height.
+
+    A tile of a survey must hold all objects up to here; what stands farther out cannot change its returns.
+
+    Parameters
+    ----------
+    terrain : Terrain
+        The ground.
+    extent : tuple of float
+        The tile, scene frame.
+    settings : ScannerSettings
+        The survey.
+    height_m : float
+        Of the highest object over the lowest terrain below it.
+
+    Raises
+    ------
+    SettingsError
+        If the terrain is as steep as the flattest beam.
+    """
+    lean = settings.max_lean
+    beams = landing_m(terrain, extent, lean) + height_m * lean / (1.0 - steepest_slope(terrain) * lean)
+    return beams + 2.0 * settings.beam_radius_m + settings.pulse_spacing_m
+
+
+def flight_lines(scene: Scene, settings: ScannerSettings, seed: int) -> list[FlightLine]:
+    """The strips over the scene or over the survey that it is a tile of, every second one flown backwards."""
+    azimuth = math.radians(settings.flight_azimuth_deg)
+    along = np.array([math.sin(azimuth), math.cos(azimuth)])
+    across = np.array([along[1], -along[0]])
+    x0, y0, x1, y1 = survey_extent(scene)
+    corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+    low, high = (corners @ across).min(), (corners @ across).max()
+    start, end = (corners @ along).min() - settings.pulse_spacing_m, (corners @ along).max() + settings.pulse_spacing_m
+    count = max(1, math.ceil((high - low) / settings.strip_spacing_m))
+    first = (low + high) / 2 - (count - 1) / 2 * settings.strip_spacing_m
+    random = np.random.default_rng([seed, 0x57])
+    time, lines = _FIRST_GPS_TIME_S, []
+    for k in range(count):
+        sign = 1.0 if k % 2 == 0 else -1.0
+        shift = random.normal(0.0, 1.0, 3) * (settings.strip_shift_m, settings.strip_shift_m, settings.strip_lift_m)
+        middle = across * (first + k * settings.strip_spacing_m)
+        begin = middle + along * (start if sign > 0 else end)
+        lines.append(
+            FlightLine(
+                number=k,
+                x=float(begin[0]),
+                y=float(begin[1]),
+                along_x=float(sign * along[0]),
+                along_y=float(sign * along[1]),
+                length=float(end - start),
+                time=time,
+                shift_x=float(shift[0]),
+                shift_y=float(shift[1]),
+                shift_z=float(shift[2]),
+            )
+        )
+        time += (end - start) / settings.speed_m_s + _TURN_S
+    return lines
+
+
+def reached(places: FloatArray, scene: Scene, settings: ScannerSettings) -> BoolArray:
+    """Which places (n, 3) of the scene frame some strip can hit: n flags.
+
+    Pulses aim at the terrain's base elevation. On ground that lies higher they land nearer to the flight line, so there
+    the points end inside of the extent.
+    """
+    x0, y0, x1, y1 = survey_extent(scene)
+    x, y, z = places.T
+    found = np.zeros(len(places), np.bool_)
+    for line in flight_lines(scene, settings, 0):
+        across = (x - line.x) * line.along_y - (y - line.y) * line.along_x
+        aim = across / (1.0 - (z - scene.terrain.base_z_m) / settings.altitude_m)
+        aim_x, aim_y = x + (aim - across) * line.along_y, y - (aim - across) * line.along_x
+        in_extent = (aim_x >= x0) & (aim_y >= y0) & (aim_x <= x1) & (aim_y <= y1)
+        found |= in_extent & (np.abs(aim) <= settings.half_swath_m)
+    return found
+
+
+def lines_over(flight: FlightLine, scene: Scene, settings: ScannerSettings) -> range:
+    """The scan lines of a strip that can hold pulses which aim into the scene's extent."""
+    spacing = settings.pulse_spacing_m
+    x0, y0, x1, y1 = scene.extent
+    corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]) - (flight.x, flight.y)
+    across = corners @ (flight.along_y, -flight.along_x)
+    if across.min() > settings.half_swath_m + spacing or across.max() < -settings.half_swath_m - spacing:
+        return range(0)
+    along = corners @ (flight.along_x, flight.along_y) / spacing
+    # Jitter and the swing of the mirror move a pulse by 0.75 of a line at most.
+    first, stop = math.floor(along.min()) - 2, math.ceil(along.max()) + 2
+    return range(max(0, first), max(0, min(math.ceil(flight.length / spacing), stop)))

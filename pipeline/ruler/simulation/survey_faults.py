@@ -1,0 +1,61 @@
+"""Returns that the survey puts in the wrong place: a strip's border through a rectangle, scan rows gone wrong."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pipeline.compiler import kernel
+from pipeline.model import FloatArray, LabelArray
+from pipeline.ruler.simulation.beam import line_state, row_chance
+from pipeline.ruler.simulation.scene import FaultKind, SurveyFault
+
+_X0, _Y0, _X1, _Y1, _IS_SHIFT, _DX, _DY, _DZ, _SIN, _COS, _SHARE = range(11)
+
+
+def fault_rows(faults: tuple[SurveyFault, ...], places: FloatArray) -> FloatArray:
+    """The faults whose rectangles come near places (n, >= 2), as an array (k, 11) for `move_faulty`."""
+    rows = []
+    if faults and len(places):
+        low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
+        for fault in faults:
+            x0, y0, x1, y1 = fault.extent
+            if x0 <= high[0] and y0 <= high[1] and x1 >= low[0] and y1 >= low[1]:
+                azimuth = math.radians(fault.azimuth_deg)
+                is_shift = float(fault.kind is FaultKind.STRIP_SHIFT)
+                rows.append((*fault.extent, is_shift, *fault.shift, math.sin(azimuth), math.cos(azimuth), fault.share))
+    return np.array(rows, dtype=np.float64).reshape(-1, 11)
+
+
+@kernel
+def move_faulty(places: FloatArray, lines: LabelArray, faults: FloatArray, seed: int, strip: int) -> None:
+    """Move the returns that faults concern, in place.
+
+    Parameters
+    ----------
+    places : ndarray (n, >= 3)
+        x, y, z in the scene frame. Whether a return is concerned is judged where it stands without any fault.
+    lines : ndarray (n,) int32
+        Scan line of each return.
+    faults : ndarray (k, 11)
+        As made by `fault_rows`.
+    seed, strip : int
+        With the line they decide which rows are wrong.
+    """
+    for k in range(len(places)):
+        x, y = places[k, 0], places[k, 1]
+        for fault in range(len(faults)):
+            if x < faults[fault, _X0] or y < faults[fault, _Y0] or x >= faults[fault, _X1] or y >= faults[fault, _Y1]:
+                continue
+            if faults[fault, _IS_SHIFT] > 0.0:
+                away_x = x - 0.5 * (faults[fault, _X0] + faults[fault, _X1])
+                away_y = y - 0.5 * (faults[fault, _Y0] + faults[fault, _Y1])
+                # To the right of the border's direction (sin, cos).
+                is_wrong = away_x * faults[fault, _COS] - away_y * faults[fault, _SIN] > 0.0
+            else:
+                is_wrong = row_chance(line_state(seed, strip, lines[k]), 1) < faults[fault, _SHARE]
+            if is_wrong:
+                places[k, 0] += faults[fault, _DX]
+                places[k, 1] += faults[fault, _DY]
+                places[k, 2] += faults[fault, _DZ]

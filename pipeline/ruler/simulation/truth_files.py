@@ -1,0 +1,216 @@
+"""The truth of a simulated data set on disk: exact models, conditions, labels and the manifest `scene.json`."""
+
+from __future__ import annotations
+
+import bisect
+import dataclasses
+import json
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import shapely
+
+import pipeline
+from pipeline.errors import InputError
+from pipeline.export.facts import RecordContext
+from pipeline.export.tile import write_tile
+from pipeline.model import BoolArray, ByteArray, LabelArray
+from pipeline.ruler.simulation.conditions import condition_row
+from pipeline.ruler.simulation.scene import Building, Scene
+from pipeline.ruler.simulation.seeds import split_of
+from pipeline.ruler.simulation.solids import truth_record
+from pipeline.ruler.simulation.strips import ScannerSettings, flight_lines, reached
+from pipeline.ruler.simulation.survey_files import TileFiles, spatial_reference
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneTruth:
+    """The truth of a simulated data set, without its models: those are read as any run directory's."""
+
+    folder: Path
+    """The folder of the truth: a run directory of the exact models, plus labels and scene.json."""
+    suite: str
+    """Name of the suite."""
+    seed: int
+    """Seed of layout and scanner."""
+    crs: str | None
+    """As in `Scene.crs`."""
+    extent: tuple[float, float, float, float]
+    """CRS coordinates: smallest x, smallest y, largest x, largest y."""
+    building_ids: tuple[str, ...]
+    """All buildings that the labels know, sorted."""
+    classification: ByteArray
+    """(n,) uint8, true ASPRS class of every point in the order of the LAZ (tile after tile); 1 for small things."""
+    building: LabelArray
+    """(n,) int32, index into building_ids; -1 for none."""
+    face: LabelArray
+    """(n,) int32, roof plane of the building; -1 for walls and for what is no building."""
+    mixed: BoolArray
+    """(n,) bool, True where echoes of different surfaces melted into the return."""
+
+    @property
+    def wall(self) -> BoolArray:
+        """(n,) bool, True where a wall was hit."""
+        return (self.building >= 0) & (self.face < 0)
+
+
+def read_truth(truth_dir: str | Path) -> SceneTruth:
+    """Read the truth that `simulate` wrote, all labels in memory: 10 bytes a point.
+
+    The labels of a data set of several tiles follow one another in the order of the tiles in scene.json.
+
+    Raises
+    ------
+    InputError
+        If scene.json or the labels are missing or not readable.
+    """
+    folder = Path(truth_dir)
+    try:
+        manifest = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+        names = [tile["labels"] for tile in manifest.get("tiles", [{"labels": "labels.parquet"}])]
+        tables = [pq.read_table(folder / name) for name in names]
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(
+            str(folder), f"no readable truth ({error})", "Give the folder `truth` that `gablework simulate` wrote"
+        ) from error
+    columns = [table["building_id"].combine_chunks() for table in tables]
+    ids = sorted({str(name) for column in columns for name in column.dictionary.to_pylist()})
+    labels = pa.concat_tables([table.drop_columns("building_id") for table in tables])
+    return SceneTruth(
+        folder=folder,
+        suite=manifest["suite"],
+        seed=manifest["seed"],
+        crs=manifest["crs"],
+        extent=tuple(manifest["extent"]),
+        building_ids=tuple(ids),
+        classification=labels["class"].to_numpy(),
+        building=np.concatenate([_numbers(column, ids) for column in columns]),
+        face=labels["face"].to_numpy().astype(np.int32),
+        mixed=labels["mixed"].to_numpy(),
+    )
+
+
+def _numbers(names: pa.DictionaryArray, ids: Sequence[str]) -> LabelArray:
+    """Places of a column's names in the sorted ids; -1 for none."""
+    place = np.array([bisect.bisect_left(ids, name) for name in names.dictionary.to_pylist()], np.int32)
+    building = np.full(len(names), -1, np.int32)
+    known = names.indices.is_valid().to_numpy(zero_copy_only=False)
+    building[known] = place[names.indices.drop_null().to_numpy()]
+    return building
+
+
+def write_models(
+    buildings: Sequence[Building],
+    scene: Scene,
+    settings: ScannerSettings,
+    truth: Path,
+    part: str,
+) -> list[dict[str, Any]]:
+    """Write the exact models of some buildings as one part of a run directory.
+
+    Parameters
+    ----------
+    buildings : sequence of Building
+        What goes into the part.
+    scene : Scene
+        Their frame and terrain.
+    settings : ScannerSettings
+        The survey: with the extent it says where the data end.
+    truth : Path
+        The run directory.
+    part : str
+        The part's hive key.
+
+    Returns
+    -------
+    list of dict
+        The buildings' rows for `write_conditions`.
+    """
+    context = RecordContext(
+        reference=spatial_reference(scene), settings_hash="truth", engine_version=pipeline.__version__
+    )
+    cut = _cut_by_the_end_of_the_data(buildings, scene, settings)
+    records = [
+        truth_record(building, scene.origin, touches_data_edge=at_edge)
+        for building, at_edge in zip(buildings, cut, strict=True)
+    ]
+    write_tile(truth, part, records, [], context, meshes="tile")
+    return [
+        condition_row(building, scene.terrain, touches_data_edge=at_edge)
+        for building, at_edge in zip(buildings, cut, strict=True)
+    ]
+
+
+def _cut_by_the_end_of_the_data(buildings: Sequence[Building], scene: Scene, settings: ScannerSettings) -> list[bool]:
+    """Which buildings reach out of the extent; in a survey of tiles, on ground that may lie high, out of the strips."""
+    data = shapely.box(*(scene.survey_extent or scene.extent))
+    cut = [not data.contains(building.footprint) for building in buildings]
+    if scene.survey_extent is None or not buildings:
+        return cut
+    ends = np.cumsum([len(building.vertices) for building in buildings])[:-1]
+    seen = np.split(reached(np.concatenate([building.vertices for building in buildings]), scene, settings), ends)
+    return [outside or not bool(flags.all()) for outside, flags in zip(cut, seen, strict=True)]
+
+
+def write_manifest(
+    scene: Scene,
+    settings: ScannerSettings,
+    seed: int,
+    tiles: Iterable[TileFiles],
+    truth: Path,
+    **counts: int,
+) -> None:
+    """Write scene.json: what was made, from what, and where its tiles lie.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its name, frame and extent; of a city any part of it, with the whole as its `survey_extent`.
+    settings : ScannerSettings
+        The survey.
+    seed : int
+        Of layout and scanner.
+    tiles : iterable of TileFiles
+        In the order in which `read_truth` joins their labels.
+    truth : Path
+        The folder.
+    **counts : int
+        Numbers of strips, buildings, trees, cars.
+    """
+    x, y, _ = scene.origin
+    whole = scene.survey_extent or scene.extent
+    listed = list(tiles)
+    split = split_of(seed)
+    manifest: dict[str, Any] = {
+        "suite": scene.name,
+        "seed": seed,
+        "split": None if split is None else split.value,
+        "engine_version": pipeline.__version__,
+        "crs": scene.crs,
+        "extent": [whole[0] + x, whole[1] + y, whole[2] + x, whole[3] + y],
+        "points": sum(tile.points for tile in listed),
+        **counts,
+        "scanner": dataclasses.asdict(settings),
+        "strip_shifts_m": [
+            [round(line.shift_x, 6), round(line.shift_y, 6), round(line.shift_z, 6)]
+            for line in flight_lines(scene, settings, seed)
+        ],
+        "tiles": [
+            {
+                "laz": Path(os.path.relpath(tile.laz, truth)).as_posix(),
+                "labels": tile.labels.relative_to(truth).as_posix(),
+                "points": tile.points,
+                "bounds": [round(value, 3) for value in tile.bounds],
+            }
+            for tile in listed
+        ],
+    }
+    path = truth / "scene.json"
+    part = path.with_name(f".{path.name}")
+    part.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+    part.replace(path)

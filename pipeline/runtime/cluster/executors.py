@@ -1,0 +1,454 @@
+"""Tasks on Dask: an embedded cluster, or one elsewhere.
+
+A plan is data and tasks are plain functions of one argument; an executor maps a function over tasks
+and yields results as they come, in any order. Nothing else of the engine shows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from pipeline.errors import ClusterError, VersionMismatchError
+from pipeline.runtime.cluster import worker_setup
+from pipeline.runtime.cluster.flight import SETTLE_INTERRUPTED_S, SETTLE_S, TICK_S, Flight, Lookout
+from pipeline.runtime.cluster.needs import RESOURCE
+from pipeline.runtime.cluster.performance import PerformanceReport
+from pipeline.runtime.cluster.priorities import Traffic, priority_of
+from pipeline.runtime.cluster.tls import TlsFiles, check_address, given_tls, why_not
+from pipeline.runtime.cluster.worker_forking import forked_workers
+from pipeline.runtime.isolation.spawned_child import environment_with_this_package
+from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.measured import Measured, Result, Task, mismatch_told
+from pipeline.runtime.monitoring.versions import ENGINE, TALKING, WORKING, differences
+
+CONNECT_S = 20.0
+"""A scheduler that does not answer within so long is not there."""
+_ANSWER_S = 30.0
+_MEND_S = 5.0
+_CLOSE_S = 30.0
+_NEVER = "365 days"
+"""So long after a worker's death Dask looks whether one of its name is there, and ends its keeper if not: also where
+the worker came back long ago, died again just now, and is being started. That death would be blamed on its task.
+Keepers that gave up are told by their status (`Cluster.mend`)."""
+
+
+class _ToldOnce(logging.Filter):
+    """Leaves out what Dask's client says as its search for a lost scheduler is ended: `ClusterError` tells it."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a line is printed."""
+        return record.exc_info is None or not isinstance(record.exc_info[1], asyncio.CancelledError)
+
+
+_TOLD_ONCE = _ToldOnce()
+
+
+class Cluster:
+    """Workers for any number of runs, also several at once from several threads; a context manager.
+
+    Embedded, the scheduler lives in this process and every worker is a process of its own, restarted when it dies.
+    With the address of a scheduler nothing is started here, and each executor connects by itself: a scheduler that
+    comes back serves the next run.
+
+    Parameters
+    ----------
+    workers : int
+        Processes of the embedded cluster, one thread each; unused with `scheduler`.
+    scheduler : str or None
+        Address of a scheduler that is already there.
+    local_directory : str or None
+        Where embedded workers spill; a temporary folder by default.
+    tls : TlsFiles or None
+        Certificates for all connections, also with embedded workers; by default those of the environment
+        (`GABLEWORK_TLS_…`), and where there are none what Dask's own configuration says.
+
+    Raises
+    ------
+    SettingsError
+        Certificates of the environment cannot be used.
+    """
+
+    _starting = threading.Lock()
+
+    def __init__(
+        self,
+        *,
+        workers: int = 2,
+        scheduler: str | None = None,
+        local_directory: str | None = None,
+        tls: TlsFiles | None = None,
+    ) -> None:
+        self._workers = workers
+        self._scheduler = scheduler
+        self._local_directory = local_directory
+        self._embedded: Any = None
+        self._mended_s = 0.0
+        self._while_running = contextlib.ExitStack()
+        self.tls = tls or given_tls()
+
+    @property
+    def embedded(self) -> bool:
+        """Whether scheduler and workers belong to this process."""
+        return self._scheduler is None
+
+    @property
+    def address(self) -> str:
+        """The scheduler's address.
+
+        Raises
+        ------
+        ClusterError
+            The embedded cluster was not started.
+        """
+        if self._scheduler is not None:
+            return self._scheduler
+        if self._embedded is None:
+            raise ClusterError("the embedded cluster is not running: use it as a context manager")
+        return str(self._embedded.scheduler_address)
+
+    @property
+    def advice(self) -> str:
+        """What to do where no worker is there."""
+        if self.embedded:
+            return "Workers that die are started again by themselves; if they die again and again they lack memory"
+        return f"Start one by gablework worker --scheduler {self.address}"
+
+    @property
+    def security(self) -> Any:
+        """What Dask is told of TLS; None leaves it to Dask's own configuration."""
+        from distributed import Security
+
+        return None if self.tls is None else Security(**self.tls.security)
+
+    def mend(self, workers: int) -> None:
+        """Start embedded workers anew that their keeper gave up: one that dies as soon as it starts is not restarted.
+
+        Parameters
+        ----------
+        workers : int
+            How many are there now.
+        """
+        if self._embedded is None or workers >= self._workers or time.monotonic() - self._mended_s < _MEND_S:
+            return
+        from distributed import Status
+
+        embedded = self._embedded
+
+        def forget() -> None:
+            for name, keeper in list(embedded.workers.items()):
+                if keeper.status in (Status.closed, Status.failed):
+                    del embedded.workers[name]
+
+        self._mended_s = time.monotonic()
+        # both in the cluster's own thread, one after the other
+        embedded.loop.add_callback(forget)
+        embedded.scale(self._workers)
+
+    def executor(
+        self, priority: int = 0, *, traffic: Traffic = "interactive", performance_report: str | None = None
+    ) -> DaskExecutor:
+        """An executor for one run.
+
+        Parameters
+        ----------
+        priority : int
+            Of the runs of one kind, those with a higher one go first where workers are scarce.
+        traffic : {'interactive', 'batch'}
+            Tasks of interactive runs go before those of batch runs, whatever their priority.
+        performance_report : str, optional
+            Gets a page about the workers' time when the run is over.
+        """
+        return DaskExecutor(self, priority=priority_of(traffic, priority), performance_report=performance_report)
+
+    def __enter__(self) -> Self:
+        """Start the embedded workers; connect to nothing yet.
+
+        Raises
+        ------
+        ClusterError
+            The workers do not start.
+        """
+        if self._scheduler is not None:
+            return self
+        import dask
+        from distributed import LocalCluster
+
+        each_bytes = _share_bytes(self._workers)
+        settings = {
+            "distributed.admin.log-format": "%(message)s",
+            "distributed.logging.distributed": "critical",
+            # a suspect is tried alone before it is blamed, so it need not take many workers with it
+            "distributed.scheduler.allowed-failures": 1,
+            **worker_setup.LEAN_LOOP,
+        }
+        starting = contextlib.ExitStack()
+        try:
+            # the configuration is the process's own, not the thread's, and workers copy it as they start
+            with self._starting, dask.config.set(settings), starting:
+                # also those that are started again later
+                starting.enter_context(dask.config.set(starting.enter_context(forked_workers())))
+                self._embedded = LocalCluster(
+                    n_workers=self._workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address="127.0.0.1:0",
+                    local_directory=self._local_directory,
+                    silence_logs="CRITICAL",
+                    preload=[worker_setup.__name__],
+                    security=self.security,
+                    resources={RESOURCE: each_bytes},
+                    # the server that they are forked from may have begun with another one
+                    env=environment_with_this_package(),
+                )
+                self._while_running = starting.pop_all()
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise ClusterError(f"the {self._workers} workers of this machine do not start: {error}") from error
+        self._while_running.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": _NEVER}))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the embedded workers."""
+        if self._embedded is not None:
+            embedded, self._embedded = self._embedded, None
+            self._while_running.close()
+            # what does not end in time ends with this process
+            with contextlib.suppress(TimeoutError):
+                embedded.close(timeout=_CLOSE_S)
+
+
+class DaskExecutor:
+    """One run's connection to a cluster.
+
+    Parameters
+    ----------
+    cluster : Cluster
+        Where tasks go.
+    priority : int
+        Tasks of a higher one go first where workers are scarce; `priority_of` knows which.
+    owned : bool
+        Whether the cluster lives and ends with this executor.
+    performance_report : str, optional
+        Gets a page about the workers' time, also of a run that breaks off: docs/how_to/watch_a_run.md.
+    """
+
+    def __init__(
+        self, cluster: Cluster, *, priority: int = 0, owned: bool = False, performance_report: str | None = None
+    ) -> None:
+        self._cluster = cluster
+        self._priority = priority
+        self._owned = owned
+        self._stack = contextlib.ExitStack()
+        self._client: Any = None
+        self._lookout: Lookout | None = None
+        self._report = None if performance_report is None else PerformanceReport(performance_report)
+
+    def __enter__(self) -> Self:
+        """Connect, and start the cluster if it is owned.
+
+        Raises
+        ------
+        ClusterError
+            The scheduler does not answer, or certificates and address do not go together.
+        """
+        import dask
+        from distributed import Client
+
+        logging.getLogger("distributed.client").addFilter(_TOLD_ONCE)
+        # what was entered before a fault is left again
+        with contextlib.ExitStack() as stack:
+            if self._owned:
+                stack.enter_context(self._cluster)
+            address, tls = self._cluster.address, self._cluster.tls
+            configured = bool(dask.config.get("distributed.comm.tls.ca-file", None))
+            check_address(address, tls, configured=configured)
+            security = self._cluster.security
+            given = {} if security is None else {"security": security}
+            try:
+                client = Client(address, timeout=CONNECT_S, set_as_default=False, **given)
+            except (OSError, TimeoutError, ValueError, TypeError, RuntimeError) as error:
+                told = why_not(address, tls)
+                if not told and isinstance(error, TypeError | RuntimeError):
+                    raise
+                raise ClusterError(
+                    f"the scheduler {address} cannot be used: {told}"
+                    if told
+                    else f"the scheduler {address} does not answer: {error}. Check the address, or use --workers"
+                ) from error
+            self._client = stack.enter_context(client)
+            if self._report is not None:
+                stack.enter_context(self._report)
+            self._lookout = Lookout(client, address, self._cluster.mend, self._cluster.advice)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Disconnect, and end the cluster if it is owned."""
+        self._stack.__exit__(kind, error, trace)
+
+    @property
+    def memory_limit_bytes(self) -> int | None:
+        """The smallest worker's limit; None where none has one, or where no worker is there.
+
+        Raises
+        ------
+        ClusterError
+            The scheduler is lost.
+        """
+        found = self._ask(self._client.scheduler.identity, n_workers=-1)
+        limits = [worker["memory_limit"] for worker in found["workers"].values()]
+        return min((limit for limit in limits if limit), default=None)
+
+    @property
+    def worker_count(self) -> int:
+        """Workers that are there now.
+
+        Raises
+        ------
+        ClusterError
+            The scheduler is lost.
+        """
+        return len(self._ask(self._client.scheduler.identity, n_workers=-1)["workers"])
+
+    def prepare(self, stage: str, watch: Watch) -> None:
+        """Wait for a worker, tell the waiting, and compare the versions of all processes.
+
+        Raises
+        ------
+        ClusterError
+            The scheduler is lost.
+        VersionMismatchError
+            Some process runs other versions than this one.
+        RunCancelledError
+            The watch called the run off.
+        """
+        lookout = self._started()
+        while not lookout.threads:
+            watch.check_cancelled()
+            lookout.look(stage, watch)
+            if not lookout.threads:
+                time.sleep(TICK_S)
+        if not self._cluster.embedded:
+            self._check_versions()
+
+    def map(
+        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
+    ) -> Generator[Measured[Result], None, None]:
+        """Results as they come; `Flight` tells what happens to tasks whose workers die.
+
+        Raises
+        ------
+        RunCancelledError
+            The watch called the run off.
+        ClusterError
+            The scheduler was lost.
+        VersionMismatchError
+            A worker that came late runs other versions than this process.
+        RunError
+            Workers died again and again on one task.
+        """
+        flight = Flight(
+            client=self._client,
+            lookout=self._started(),
+            stage=stage,
+            function=function,
+            tasks=tasks,
+            watch=watch,
+            priority=self._priority,
+            # workers that end with the run need not be waited for
+            settle_s=SETTLE_INTERRUPTED_S if self._owned and self._cluster.embedded else SETTLE_S,
+        )
+        if self._report is None:
+            yield from flight.results()
+            return
+        for measured in flight.results():
+            self._report.add(stage, measured)
+            yield measured
+
+    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
+        """The step's result, worked out here: what a driver holds of a city should not travel."""
+        return function(task)
+
+    def _started(self) -> Lookout:
+        if self._lookout is None:
+            raise ClusterError("the executor is not connected: use it as a context manager")
+        return self._lookout
+
+    def _ask(self, what: Callable[..., Any], **options: Any) -> Any:
+        """An answer of the scheduler.
+
+        Raises
+        ------
+        ClusterError
+            There is none.
+        """
+        try:
+            return self._client.sync(what, callback_timeout=_ANSWER_S, **options)
+        except (OSError, TimeoutError) as error:
+            raise self._started().lost(f"it did not answer ({type(error).__name__}: {error})") from error
+
+    def _check_versions(self) -> None:
+        """Compare this process with the scheduler and all workers.
+
+        Raises
+        ------
+        VersionMismatchError
+            They differ.
+        ClusterError
+            The scheduler is lost.
+        """
+        from distributed.versions import get_versions
+
+        packages = [ENGINE, *WORKING]
+        ours = _plain(get_versions(packages))
+        talking = {name: ours[name] for name in ("python", ENGINE, *TALKING) if name in ours}
+        message = {"op": "versions", "packages": packages}
+        scheduler = self._ask(self._client.scheduler.versions, packages=[ENGINE])
+        workers = self._ask(self._client.scheduler.broadcast, msg=message, on_error="ignore")
+        told = {f"scheduler {self._cluster.address}": differences(talking, _plain(scheduler))}
+        for address, theirs in sorted(workers.items()):
+            told[f"worker {address}"] = differences(ours, _plain(theirs))
+        faults = [f"{process}: {', '.join(what)}" for process, what in told.items() if what]
+        if faults:
+            raise VersionMismatchError(mismatch_told(faults))
+
+
+def memory_of_workers(*, workers: int, scheduler: str | None, tls: TlsFiles | None = None) -> tuple[int, int | None]:
+    """How many workers a run would have now, and the memory limit of the smallest; nothing is started.
+
+    Raises
+    ------
+    ClusterError
+        The scheduler does not answer.
+    """
+    if scheduler is None:
+        if workers == 0:
+            return 1, None
+        return workers, _share_bytes(workers)
+    with DaskExecutor(Cluster(scheduler=scheduler, tls=tls)) as executor:
+        return executor.worker_count, executor.memory_limit_bytes
+
+
+def _plain(found: Mapping[str, Any]) -> dict[str, str]:
+    """What a Dask process tells of its versions, by name; what it has not is left out."""
+    told = {name: str(version) for name, version in found["packages"].items() if version is not None}
+    major_minor = told["python"].split(".")[:2]
+    wanted = (ENGINE, *TALKING, *WORKING)
+    return {"python": ".".join(major_minor), **{name: told[name] for name in wanted if name in told}}
+
+
+def _share_bytes(workers: int) -> int:
+    """Memory of one of several workers that share this machine, as Dask reckons it."""
+    from distributed.system import MEMORY_LIMIT
+
+    return int(MEMORY_LIMIT / max(1, workers))

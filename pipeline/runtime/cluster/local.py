@@ -1,0 +1,278 @@
+"""Small jobs without a cluster: tasks in supervised child processes of this one, as many at once as there are cores.
+
+This process plans, brings results together and writes the manifest. Its children do all else, and stay from stage to
+stage; the join of surfaces and the digest are a task of one child each (`apart`), since they need kernels and libraries
+that this process does not load. What may happen to a child, and what comes of it, is as on a cluster
+(`pipeline.runtime.cluster.flight`):
+
+| event | outcome |
+| --- | --- |
+| a child dies of a building | that building is lost: its task supervises each of them (`isolation.isolated_items`) |
+| a child dies of another task | the task waits until the others are through and is tried alone, in a fresh child |
+| it dies of it alone, too | `RunError` that names the task |
+| the run is called off | the tasks that run are told, waited for with a bound, and killed |
+| tasks need more memory than there is | they run one after the other |
+"""
+
+from __future__ import annotations
+
+import contextlib
+import contextvars
+import math
+import queue
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from types import TracebackType
+from typing import Any, Generic, Self
+
+from pipeline.errors import RunCancelledError, RunError
+from pipeline.runtime.cluster.flight import SETTLE_INTERRUPTED_S, TICK_S, blame
+from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, lent_child, start_fault
+from pipeline.runtime.isolation.supervision import End
+from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.logs import LOG, facts_of_task
+from pipeline.runtime.monitoring.machine import cores, memory_bytes
+from pipeline.runtime.monitoring.measured import Measured, Result, Task, measure, measure_in_child
+from pipeline.runtime.monitoring.tallies import TALLIES
+
+_WORN_BYTES = 2**30
+"""A child that keeps more than this between tasks is not used again: buildings have their own limits."""
+
+_SAID: set[str] = set()
+
+
+class LocalExecutor:
+    """Tasks in child processes of this one.
+
+    Parameters
+    ----------
+    children : int, optional
+        Tasks at once; by default one per core.
+    memory_limit_bytes : int, optional
+        What all of them may take together; by default the machine's memory.
+    """
+
+    def __init__(self, children: int | None = None, memory_limit_bytes: int | None = None) -> None:
+        self._children = children or cores()
+        self._memory_bytes = memory_limit_bytes or memory_bytes()
+
+    def prepare(self, stage: str, watch: Watch) -> None:
+        """Nothing to wait for: children start with the first task."""
+
+    def map(
+        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
+    ) -> Generator[Measured[Result], None, None]:
+        """Results as they come.
+
+        Raises
+        ------
+        RunCancelledError
+            The watch called the run off.
+        RunError
+            Children died of one task, also when it ran alone.
+        """
+        return _Stage(stage, function, tasks, watch, self._memory_bytes).results(self._children)
+
+    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
+        """The step's result, worked out in a child: this process has no kernels.
+
+        Raises
+        ------
+        RunCancelledError, RunError
+            As `map`.
+        """
+        with contextlib.closing(self.map(stage, function, [task], watch)) as found:
+            return next(found).result
+
+    @property
+    def memory_limit_bytes(self) -> int | None:
+        """The machine's: one task may take all of it while no other runs."""
+        return self._memory_bytes
+
+    def __enter__(self) -> Self:
+        """Nothing to start."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Children stay, for the next run of this process; they end with it."""
+
+
+class _Stage(Generic[Task, Result]):
+    """The tasks of one stage: handed out to threads, each of which has one child at a time."""
+
+    def __init__(
+        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch, memory: int
+    ) -> None:
+        self._stage = stage
+        self._function = function
+        self._tasks = tasks
+        self._watch = watch
+        self._memory_bytes = memory
+        self._changed = threading.Condition()
+        self._waiting = deque(range(len(tasks)))
+        self._suspects: deque[int] = deque()
+        self._running: dict[int, int] = {}
+        self._alone = False
+        self._over = False
+        self._killed = threading.Event()
+        self._landed: queue.SimpleQueue[Measured[Result] | BaseException] = queue.SimpleQueue()
+
+    def results(self, children: int) -> Generator[Measured[Result], None, None]:
+        """Results as they come."""
+        threads = [
+            threading.Thread(
+                target=contextvars.copy_context().run, args=(self._work,), name=f"{self._stage}-{k}", daemon=True
+            )
+            for k in range(min(children, len(self._tasks)))
+        ]
+        try:
+            for thread in threads:
+                thread.start()
+            for _ in self._tasks:
+                yield self._next()
+        finally:
+            self._settle()
+            for thread in threads:
+                if thread.ident is not None:
+                    thread.join()
+
+    def _next(self) -> Measured[Result]:
+        """The next result, waited for."""
+        while True:
+            self._watch.check_cancelled()
+            try:
+                landed = self._landed.get(timeout=TICK_S)
+            except queue.Empty:
+                continue
+            if isinstance(landed, BaseException):
+                raise landed
+            return landed
+
+    def _settle(self) -> None:
+        """Let no task begin, tell those that run to end, and kill those that do not."""
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+            if not self._running:
+                return
+        self._watch.stop()
+        deadline = time.monotonic() + SETTLE_INTERRUPTED_S
+        with self._changed:
+            while self._running and time.monotonic() < deadline:
+                self._changed.wait(TICK_S)
+        self._killed.set()
+
+    # --- in the threads ----------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        """Take tasks until there are none."""
+        while (number := self._taken()) is not None:
+            landed: Measured[Result] | BaseException | None = None
+            try:
+                outcome = self._done(number)
+                if isinstance(outcome, Measured):
+                    landed = outcome
+                elif self._alone:
+                    landed = RunError(blame(self._stage, self._tasks[number], here=True))
+                else:
+                    facts = {"stage": self._stage, **facts_of_task(self._tasks[number])}
+                    LOG.warning("a process died of the task (%s): it is tried alone", outcome.told, extra=facts)
+            except BaseException as error:  # noqa: BLE001 - raised where the results are waited for
+                landed = error
+            with self._changed:
+                del self._running[number]
+                self._alone = False
+                if landed is None:
+                    self._suspects.append(number)
+                self._changed.notify_all()
+            # only now: with the last result the stage is over, and what still runs then is called off
+            if landed is not None:
+                self._landed.put(landed)
+
+    def _taken(self) -> int | None:
+        """The next task, once it may run; None where nothing is left to do."""
+        with self._changed:
+            while not self._over:
+                if self._suspects:
+                    if not self._running:
+                        self._alone = True
+                        return self._begun(self._suspects.popleft())
+                elif self._waiting:
+                    if not self._alone and self._fits(self._waiting[0]):
+                        return self._begun(self._waiting.popleft())
+                elif not self._running:
+                    break
+                self._changed.wait()
+            return None
+
+    def _begun(self, number: int) -> int:
+        self._running[number] = self._need_bytes(number)
+        return number
+
+    def _need_bytes(self, number: int) -> int:
+        return int(getattr(self._tasks[number], "memory_bytes", 0))
+
+    def _fits(self, number: int) -> bool:
+        """Whether there is memory for a task beside those that run; alone it may run in any case."""
+        return not self._running or sum(self._running.values()) + self._need_bytes(number) <= self._memory_bytes
+
+    def _done(self, number: int) -> Measured[Result] | End:
+        """What a task found, or how its child ended."""
+        task = self._tasks[number]
+        if getattr(task, "supervises", False):
+            return measure(self._function, task, self._stage)
+        TALLIES.begin()
+        began, outcome = time.perf_counter(), "failed"
+        try:
+            found = self._in_child(task)
+        except RunCancelledError:
+            outcome = "called off"
+            raise
+        else:
+            outcome = "done" if isinstance(found, Measured) else "failed"
+            return found
+        finally:
+            TALLIES.end(self._stage, outcome, time.perf_counter() - began)
+
+    def _in_child(self, task: Task) -> Measured[Result] | End:
+        """A task in a child, which has all the memory and all the time that it wants.
+
+        Raises
+        ------
+        RunError
+            Children die before they begin.
+        """
+        for _ in range(FRUITLESS_STARTS):
+            with lent_child(self._killed.is_set, fresh=self._alone, loads=()) as child:
+                found: Any = None
+                for said in child.work(
+                    measure_in_child,
+                    [(0, (self._function, task, self._stage))],
+                    timeout_s=math.inf,
+                    memory_bytes=self._memory_bytes,
+                    cancelled=self._killed.is_set,
+                    one="task",
+                ):
+                    found = said
+                if not isinstance(found, End):
+                    self._pass_on(child.new_words())
+                if isinstance(found, End) or child.memory_bytes > _WORN_BYTES:
+                    child.end()
+            if not isinstance(found, End):
+                measured: Measured[Result] = found.result
+                return measured
+            if found.index is not None:
+                return found
+        raise RunError(start_fault(found.told, found.stderr, f"does the tasks of the stage {self._stage}"))
+
+    @staticmethod
+    def _pass_on(words: str) -> None:
+        """Say what a child said, warnings and log lines; the same words of several children once."""
+        if words and words not in _SAID:
+            _SAID.add(words)
+            sys.stderr.write(words)

@@ -1,0 +1,80 @@
+"""What a run needs of an engine, and the simplest one: one task after the other, in this process.
+
+A plan is data and tasks are plain functions of one argument; an executor maps a function over tasks
+and yields results as they come, in any order. Nothing else of the engine shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from types import TracebackType
+from typing import Protocol, Self
+
+from pipeline.runtime.monitoring.events import Watch
+from pipeline.runtime.monitoring.measured import Measured, Result, Task, measure
+
+
+class Executor(Protocol):
+    """What a run needs of an engine. One executor serves one run at a time."""
+
+    def prepare(self, stage: str, watch: Watch) -> None:
+        """Wait until tasks can run, and see that all processes run the same versions."""
+
+    def map(
+        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
+    ) -> Generator[Measured[Result], None, None]:
+        """Results of all tasks, in the order in which they finish."""
+
+    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
+        """The result of one step of the driver: worked out here, or where the libraries are that it needs."""
+
+    @property
+    def memory_limit_bytes(self) -> int | None:
+        """Memory of one worker; None where there is no limit."""
+
+    def __enter__(self) -> Self:
+        """Start."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Stop."""
+
+
+class SerialExecutor:
+    """One task after the other, in this process."""
+
+    def prepare(self, stage: str, watch: Watch) -> None:
+        """Nothing to wait for."""
+
+    def map(
+        self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
+    ) -> Generator[Measured[Result], None, None]:
+        """Results in the order of the tasks.
+
+        Raises
+        ------
+        RunCancelledError
+            The watch called the run off.
+        """
+        for task in tasks:
+            watch.check_cancelled()
+            yield measure(function, task, stage)
+
+    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
+        """The step's result, worked out here."""
+        return function(task)
+
+    @property
+    def memory_limit_bytes(self) -> int | None:
+        """No limit of its own."""
+        return None
+
+    def __enter__(self) -> Self:
+        """Nothing to start."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing to stop."""

@@ -1,0 +1,254 @@
+"""A Dask worker under a nanny that drains when it is told to end: the command `gablework worker`.
+
+`dask worker` closes on SIGTERM with its task half done, and the task runs again elsewhere. This one takes no new task,
+finishes what runs, hands its results over, and leaves then. Where the scheduler goes away it waits for it to come back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+import signal
+import time
+from collections.abc import Callable
+from typing import Any
+
+import dask
+from distributed import Nanny, Security, Worker
+from distributed.core import Status
+from distributed.worker_memory import parse_memory_limit
+
+from pipeline.errors import ClusterError, SettingsError
+from pipeline.runtime.cluster import worker_setup
+from pipeline.runtime.cluster.needs import RESOURCE
+from pipeline.runtime.cluster.tls import TlsFiles, check_address, why_not
+from pipeline.runtime.cluster.worker_forking import forked_workers
+from pipeline.runtime.monitoring import logs
+
+_POLL_S = 0.1
+_HAND_OVER_S = 30.0
+"""Clients fetch results at once; longer than this they are not waited for."""
+_RETRY_S = 2.0
+_STOPPING = (signal.SIGTERM, signal.SIGINT)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorkerOptions:
+    """How a worker runs."""
+
+    scheduler: str
+    """Address of the scheduler."""
+    threads: int = 1
+    """Tasks at once. With one, a task that ends its process takes no other with it."""
+    memory_limit: str = "auto"
+    """Bytes or a text such as `4GiB`; `auto` takes the machine's share, 0 sets none."""
+    local_directory: str | None = None
+    """Where the worker keeps its files; a temporary folder by default."""
+    name: str | None = None
+    """Name in the scheduler's lists; its address by default. Two workers cannot share one."""
+    host: str | None = None
+    """Address to listen on; by default the one that leads to the scheduler."""
+    drain_timeout_s: float | None = None
+    """Longest time that a running task is waited for when told to end; None waits for its end."""
+    give_up_after_s: float | None = None
+    """End when the scheduler was away for so long; None keeps trying."""
+    tls: TlsFiles | None = None
+    """Certificates; without, Dask's own configuration is asked."""
+    log_json: bool = False
+    """Whether the lines of nanny and worker are JSON objects."""
+    metrics_port: int | None = None
+    """Where the worker shows its figures to Prometheus; None shows none."""
+    metrics_host: str = "127.0.0.1"
+    """On which address."""
+
+    @property
+    def memory_bytes(self) -> int | None:
+        """The memory limit, of which tasks declare their share; None where there is none.
+
+        Raises
+        ------
+        SettingsError
+            It is no number of bytes.
+        """
+        try:
+            limit = parse_memory_limit(self.memory_limit, self.threads, logger=logging.getLogger("distributed.worker"))
+        except (ValueError, TypeError, AssertionError) as error:
+            raise SettingsError(
+                [f"memory limit is {self.memory_limit!r}: use bytes such as 4GiB, a share such as 0.5, auto, or 0"]
+            ) from error
+        return None if limit is None else int(limit)
+
+
+class DrainingWorker(Worker):
+    """A worker that its nanny can drain."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.handlers["drain"] = self.drain
+
+    async def drain(self) -> int:
+        """Take no new task, finish what runs, hand the results over; how many tasks were waited for."""
+        self.status = Status.closing_gracefully
+        running = len(self.state.executing)
+        while self.state.executing:
+            await asyncio.sleep(_POLL_S)
+        deadline = time.monotonic() + _HAND_OVER_S
+        while self.data and time.monotonic() < deadline:
+            await asyncio.sleep(_POLL_S)
+        # results that nobody fetched are copied to others, tasks that only queued here go there without suspicion
+        await self.scheduler.retire_workers(workers=[self.address], close_workers=False, remove=True)
+        return running
+
+
+def serve_worker(options: WorkerOptions, say: Callable[[str], None]) -> None:
+    """Run a worker until SIGTERM or SIGINT drains it; a second signal ends it at once.
+
+    Parameters
+    ----------
+    options : WorkerOptions
+        How it runs.
+    say : callable
+        Gets one line for people at every turn.
+
+    Raises
+    ------
+    ClusterError
+        The scheduler was away for longer than the options allow, the worker cannot start, or address and certificates
+        do not go together.
+    SettingsError
+        The memory limit is none.
+    """
+    configured = bool(dask.config.get("distributed.comm.tls.ca-file", None))
+    check_address(options.scheduler, options.tls, configured=configured)
+    logs.configure(as_json=options.log_json)
+    quiet = {
+        "distributed.admin.log-format": "%(asctime)s %(name)s %(levelname)s %(message)s",
+        "distributed.worker.daemon": True,
+        **worker_setup.LEAN_LOOP,
+    }
+    with dask.config.set(quiet), forked_workers() as forked, dask.config.set(forked):
+        if options.log_json:
+            logs.configure(as_json=True, also=("distributed",))
+        asyncio.run(_serve(options, say))
+
+
+async def _serve(options: WorkerOptions, say: Callable[[str], None]) -> None:
+    """Keep a worker at the scheduler until told to stop."""
+    stop, hurry = asyncio.Event(), asyncio.Event()
+
+    def on_signal() -> None:
+        (hurry if stop.is_set() else stop).set()
+
+    for number in _STOPPING:
+        asyncio.get_running_loop().add_signal_handler(number, on_signal)
+    away_since_s = time.monotonic()
+    told = ""
+    say(f"looking for the scheduler {options.scheduler}")
+    while not stop.is_set():
+        nanny = _nanny(options)
+        try:
+            if await _first(_start(nanny, options), stop):
+                say(f"worker {nanny.worker_address} is at the scheduler {options.scheduler}")
+                if not await _first(nanny.finished(), stop):
+                    await _drain(nanny, options, hurry, say)
+                    return
+                say(f"the scheduler {options.scheduler} is gone: looking for it again")
+                away_since_s = time.monotonic()
+        except OSError as error:
+            away_s = time.monotonic() - away_since_s
+            why = await asyncio.to_thread(why_not, options.scheduler, options.tls)
+            if why and why != told:
+                told = why
+                say(f"the scheduler {options.scheduler} cannot be used: {why}")
+            if options.give_up_after_s is not None and away_s > options.give_up_after_s:
+                raise ClusterError(
+                    f"the scheduler {options.scheduler} was away for {away_s:.0f} s: {why or error}. Check the address"
+                ) from error
+        finally:
+            await nanny.close()
+        await _first(asyncio.sleep(_RETRY_S), stop)
+
+
+def _nanny(options: WorkerOptions) -> Any:
+    """A nanny that is not started yet."""
+    memory_bytes = options.memory_bytes
+    environment = {
+        worker_setup.METRICS_PORT: "" if options.metrics_port is None else str(options.metrics_port),
+        worker_setup.METRICS_HOST: options.metrics_host,
+        worker_setup.LOG: "json" if options.log_json else "plain",
+    }
+    return Nanny(
+        options.scheduler,
+        nthreads=options.threads,
+        memory_limit=options.memory_limit,
+        local_directory=options.local_directory,
+        name=options.name,
+        host=options.host,
+        worker_class=DrainingWorker,
+        preload=[worker_setup.__name__],
+        dashboard=False,
+        security=None if options.tls is None else Security(**options.tls.security),
+        resources=None if memory_bytes is None else {RESOURCE: memory_bytes},
+        env=environment,
+    )
+
+
+async def _start(nanny: Any, options: WorkerOptions) -> None:
+    """Start the worker's process and bring it to the scheduler.
+
+    Raises
+    ------
+    OSError
+        The scheduler is not there.
+    ClusterError
+        The process does not start.
+    """
+    try:
+        await nanny
+    except OSError:
+        raise
+    except (RuntimeError, ValueError, TypeError) as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, OSError):
+            raise cause from error
+        # what TLS says of a scheduler that speaks first comes in many kinds
+        why = await asyncio.to_thread(why_not, options.scheduler, options.tls)
+        if why:
+            raise ConnectionError(why) from error
+        raise ClusterError(f"the worker for {options.scheduler} does not start: {cause}") from error
+
+
+async def _drain(nanny: Any, options: WorkerOptions, hurry: asyncio.Event, say: Callable[[str], None]) -> None:
+    """Let the worker finish what runs, then close it."""
+    say("told to end: no new tasks, what runs is finished (once more to end at once)")
+    # a worker that dies now is not started again
+    nanny.close_gracefully(reason="drain")
+
+    async def drained() -> None:
+        async with nanny.rpc(nanny.worker_address) as worker:
+            count = await asyncio.wait_for(worker.drain(), options.drain_timeout_s)
+        say(f"drained, tasks waited for: {count}")
+
+    try:
+        if not await _first(drained(), hurry):
+            say("ended at once: what ran will run again elsewhere")
+    except TimeoutError:
+        say(f"not drained within {options.drain_timeout_s:g} s: what ran will run again elsewhere")
+    except OSError as error:
+        say(f"not drained ({error}): what ran will run again elsewhere")
+
+
+async def _first(work: Any, stop: asyncio.Event) -> bool:
+    """Wait for some work or a stop: True where the work ended first. Work that is stopped is cancelled."""
+    doing, stopping = asyncio.ensure_future(work), asyncio.ensure_future(stop.wait())
+    try:
+        await asyncio.wait({doing, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        if doing.done():
+            await doing
+            return True
+        return False
+    finally:
+        for task in (doing, stopping):
+            task.cancel()
+        await asyncio.gather(doing, stopping, return_exceptions=True)

@@ -1,0 +1,102 @@
+"""Dask's workers on this machine come from a preloaded server, too: Python's own forkserver, which Dask can use."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import multiprocessing
+import os
+import select
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from multiprocessing import forkserver
+from typing import Any
+
+from pipeline.runtime.isolation.forked_child import can_fork, read_at_start
+from pipeline.runtime.isolation.spawned_child import environment_with_this_package, in_starter_thread
+from pipeline.runtime.isolation.start_up import WITHOUT_THREADS
+
+_PRELOADED = ("distributed.nanny", "pipeline.runtime.cluster.worker_birth")
+_SETTINGS = {"distributed.worker.multiprocessing-method": "forkserver"}
+_SAFE_PATH = {"PYTHONSAFEPATH": "1"}
+"""Nothing is imported from the working directory."""
+_END_S = 2.0
+_changing = threading.Lock()
+_users = 0
+_environment: Mapping[str, str] | None = None
+
+
+@contextlib.contextmanager
+def forked_workers() -> Iterator[Mapping[str, Any]]:
+    """Dask's settings under which workers are forked from a server, which starts and loads at once; a context manager.
+
+    For processes that have imported Dask.
+
+    There is one server a process. It outlives its users, so that the next cluster's workers start fast, too, but not a
+    change of the environment between them. Where this system cannot fork there are no settings, and workers start the
+    long way.
+    """
+    global _users  # noqa: PLW0603 - one server a process
+    if not can_fork():
+        yield {}
+        return
+    with _changing:
+        in_starter_thread(_start)
+        _users += 1
+    try:
+        yield _SETTINGS
+    finally:
+        with _changing:
+            _users -= 1
+
+
+def _start() -> None:
+    """Start the server where it is not there, or has another environment and no workers."""
+    global _environment  # noqa: PLW0603 - as above
+    now = read_at_start(os.environ)
+    if now != _environment and not _users:
+        _stop()
+        _environment = now
+    multiprocessing.set_forkserver_preload(list(_PRELOADED))
+    # Dask would import all that it can use, here and there, and have that loaded in place of ours
+    vars(sys.modules["distributed.utils"])["_forkserver_preload_set"] = True
+    before = dict(os.environ)
+    special = {"PYTHONPATH": environment_with_this_package()["PYTHONPATH"], **WITHOUT_THREADS, **_SAFE_PATH}
+    # the server takes the environment of this process: there is no other way to give it one
+    os.environ.update(special)
+    try:
+        forkserver.ensure_running()
+    finally:
+        for name in special:
+            if name in before:
+                os.environ[name] = before[name]
+            else:
+                del os.environ[name]
+
+
+def _stop() -> None:
+    """End the server, if there is one: by itself where all workers are gone, whose processor time it hands up.
+
+    Python has no public way.
+    """
+    server: Any = forkserver._forkserver  # noqa: SLF001
+    pid = server._forkserver_pid  # noqa: SLF001
+    if pid is None:
+        return
+    os.close(server._forkserver_alive_fd)  # noqa: SLF001
+    server._forkserver_alive_fd = server._forkserver_address = server._forkserver_pid = None  # noqa: SLF001
+    lives = os.pidfd_open(pid)
+    try:
+        if not select.select([lives], [], [], _END_S)[0]:
+            os.kill(pid, signal.SIGKILL)
+    finally:
+        os.close(lives)
+    os.waitpid(pid, 0)
+
+
+@atexit.register
+def _close() -> None:
+    with _changing:
+        _stop()

@@ -1,0 +1,305 @@
+"""Processes that are forked from a preloaded server, on the side of the one who asks for them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import IO
+
+from pipeline.runtime.isolation.fork_server import THREADED, kill_with_group, serve_forked
+from pipeline.runtime.isolation.messages import NUMBER, Order, frame
+from pipeline.runtime.isolation.spawned_child import environment_with_this_package, in_starter_thread
+from pipeline.runtime.isolation.start_up import WITHOUT_THREADS
+
+_READ_AT_START = (
+    *("PYTHON", "LD_", "LC_", "LANG", "TZ"),
+    *("NUMBA_", "GABLEWORK_", "ARROW_", "GDAL_", "PROJ_"),
+)
+"""Beginnings of variables that the interpreter or a library reads once: with others a server is no use any more."""
+_READ_LATER = (
+    *("GABLEWORK_WORKER_", "PYTHONSAFEPATH", "PYTHONHASHSEED"),
+    *("GDAL_CURL_CA_BUNDLE", "PROJ_CURL_CA_BUNDLE"),
+)
+"""Beginnings of variables that look like those, but matter to no child: Dask sets one, and pyogrio the last two as it
+is loaded."""
+
+
+_SAID_BYTES = 2000
+_END_S = 1.0
+
+
+def can_fork() -> bool:
+    """Whether this system has what a server needs: Linux, in a sandbox that forbids none of it."""
+    if sys.platform != "linux" or not hasattr(os, "pidfd_open"):
+        return False
+    try:
+        os.close(os.pidfd_open(os.getpid()))
+    except OSError:
+        return False
+    return True
+
+
+class Forked:
+    """A process that a server forks for this one, as soon as it has loaded; see `isolation.spawned_child.Started`."""
+
+    def __init__(self, control: socket.socket, stdin: int, stdout: int) -> None:
+        self.stdin, self.stdout = stdin, stdout
+        self._control = control
+        self._lock = threading.Lock()
+        self._told = bytearray()
+        self._pid: int | None = None
+        self._code: int | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Its number; None as long as it is not there."""
+        if self._pid is None and self._code is None:
+            self._hear(0.0)
+        return self._pid
+
+    def poll(self) -> int | None:
+        """Its return code; None as long as it lives, or is to come."""
+        if self._code is None:
+            self._hear(0.0)
+        return self._code
+
+    def wait(self, timeout_s: float | None = None) -> int | None:
+        """Wait for its end; its return code, or None after the time."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while self.poll() is None:
+            left_s = None if deadline is None else deadline - time.monotonic()
+            if left_s is not None and left_s <= 0.0:
+                break
+            self._hear(left_s)
+        return self._code
+
+    def kill(self) -> None:
+        """Kill it and all that it started; harmless where it is gone."""
+        if self.poll() is not None:
+            return
+        if self._pid is not None:
+            kill_with_group(self._pid)
+            return
+        with contextlib.suppress(OSError):
+            self._control.shutdown(socket.SHUT_RDWR)
+        self._code = -signal.SIGKILL
+
+    def close(self) -> None:
+        """Let go of one that ended."""
+        self._control.close()
+        os.close(self.stdin)
+        os.close(self.stdout)
+
+    def _hear(self, timeout_s: float | None) -> None:
+        """What the server says of it within some time."""
+        poll = select.poll()
+        poll.register(self._control, select.POLLIN)
+        if not poll.poll(None if timeout_s is None else 1e3 * timeout_s):
+            return
+        with self._lock:
+            try:
+                received = self._control.recv(2 * NUMBER.size, socket.MSG_DONTWAIT)
+            except BlockingIOError:  # another thread heard it
+                return
+            except ConnectionResetError:
+                received = b""
+            if not received:
+                # the server is gone, and takes its children with it
+                self._code = -signal.SIGKILL if self._code is None else self._code
+                return
+            self._told += received
+            numbers = [number for (number,) in NUMBER.iter_unpack(self._told[: len(self._told) // 8 * 8])]
+            self._pid = numbers[0] if numbers else None
+            if len(numbers) > 1:
+                self._code = numbers[1]
+
+
+class Own:
+    """A process that this one forked, asked as `subprocess.Popen` is."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._code: int | None = None
+
+    def poll(self) -> int | None:
+        """Its return code; None as long as it lives."""
+        return self._waited(os.WNOHANG)
+
+    def wait(self, timeout: float | None = None) -> int | None:
+        """Wait for its end; its return code.
+
+        Raises
+        ------
+        TimeoutError
+            It lives still.
+        """
+        if timeout is not None and self._code is None:
+            lives = os.pidfd_open(self._pid)
+            try:
+                if not select.select([lives], [], [], timeout)[0]:
+                    raise TimeoutError
+            finally:
+                os.close(lives)
+        return self._waited(0)
+
+    def kill(self) -> None:
+        """Kill it."""
+        if self.poll() is None:
+            os.kill(self._pid, signal.SIGKILL)
+
+    def _waited(self, options: int) -> int | None:
+        if self._code is None:
+            pid, status = os.waitpid(self._pid, options)
+            if pid:
+                self._code = os.waitstatus_to_exitcode(status)
+        return self._code
+
+
+def executed_server(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes]) -> subprocess.Popen[bytes]:
+    """Start a server that loads things, as `pipeline.runtime.isolation.child_main` takes them."""
+    command = [sys.executable, "-P", "-m", "pipeline.runtime.isolation.fork_server", str(os.getpid())]
+    return in_starter_thread(
+        subprocess.Popen,
+        [*command, str(orders.fileno()), *loads],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=stderr,
+        pass_fds=[orders.fileno()],
+        start_new_session=True,
+        env=environment_with_this_package() | WITHOUT_THREADS,
+    )
+
+
+def forked_server(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes]) -> Own:
+    """Fork a server with all that this process has loaded, to load more; for one that has a single thread."""
+    owner = os.getpid()
+    pid = os.fork()
+    if not pid:
+        os.environ.update(WITHOUT_THREADS)
+        serve_forked(owner, orders, stderr.fileno(), loads)
+    return Own(pid)
+
+
+def has_one_thread() -> bool:
+    """Whether nothing in this process could hold a lock while it is forked; also no thread of a library."""
+    return sum(1 for _ in Path("/proc/self/task").iterdir()) == 1
+
+
+class ProcessServer:
+    """A server, started and asked for processes.
+
+    Parameters
+    ----------
+    start : callable
+        Starts it, with a socket for its orders and a file for what it has to say: `executed_server`, `forked_server`.
+    """
+
+    def __init__(self, start: Callable[[socket.socket, IO[bytes]], subprocess.Popen[bytes] | Own]) -> None:
+        self._environment = read_at_start(os.environ)
+        self._stderr = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - lives as long as this object
+        self._socket, there = socket.socketpair()
+        with there:
+            self._process = start(there, self._stderr)
+        self._asked = False
+
+    @property
+    def alive(self) -> bool:
+        """Whether it is there."""
+        return self._process.poll() is None
+
+    @property
+    def fault(self) -> str:
+        """Why it is gone; empty where it is there."""
+        code = self._process.poll()
+        if code is None:
+            return ""
+        if code == THREADED:
+            return "what it loaded has started threads"
+        size = os.fstat(self._stderr.fileno()).st_size
+        said = os.pread(self._stderr.fileno(), _SAID_BYTES, max(0, size - _SAID_BYTES))
+        return f"return code {code}. It said: {said.decode(errors='replace').strip()}"
+
+    @property
+    def was_killed(self) -> bool:
+        """Whether somebody killed it, or the system for lack of memory."""
+        return self._process.poll() == -signal.SIGKILL
+
+    @property
+    def serves(self) -> bool:
+        """Whether it is there, and its children would be as those that are started now."""
+        return self.alive and self._environment == read_at_start(os.environ)
+
+    def forked(self, loads: Sequence[str], stderr: int) -> Forked:
+        """A process that runs `pipeline.runtime.isolation.child_main`; forked when the server has loaded.
+
+        Raises
+        ------
+        OSError
+            The server is gone.
+        """
+        self._asked = True
+        order = Order(environment=environment_with_this_package(), folder=_folder(), loads=tuple(loads))
+        theirs: list[int] = []
+        control, there = socket.socketpair()
+        try:
+            stdin, ours = os.pipe()
+            theirs.append(stdin)
+            result, stdout = os.pipe()
+            theirs.append(stdout)
+            process = Forked(control, ours, result)
+            try:
+                socket.send_fds(self._socket, [b"."], [there.fileno(), stdin, stdout, stderr])
+                control.sendall(frame(order))
+            except OSError:
+                process.close()
+                raise
+        finally:
+            there.close()
+            for descriptor in theirs:
+                os.close(descriptor)
+        return process
+
+    def retire(self) -> None:
+        """Ask it for nothing more; it ends after its last child."""
+        self._socket.close()
+
+    def end(self) -> None:
+        """End it: by itself where its children are gone, whose processor time it then hands up, else with them."""
+        self.retire()
+        if self._asked:
+            with contextlib.suppress(TimeoutError, subprocess.TimeoutExpired):
+                self._process.wait(_END_S)
+        self._process.kill()
+        self._process.wait()
+
+
+def _folder() -> str:
+    """The working directory; empty where it is gone."""
+    try:
+        return str(Path.cwd())
+    except FileNotFoundError:
+        return ""
+
+
+def read_by_children(environment: Mapping[str, str]) -> dict[str, str]:
+    """The variables that may matter to a child: keys of an object store, say, which it reads when it works."""
+    return {name: value for name, value in environment.items() if not name.startswith(_READ_LATER)}
+
+
+def read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
+    """The variables that count once only, when a process starts."""
+    return {
+        name: value
+        for name, value in environment.items()
+        if name.startswith(_READ_AT_START) and not name.startswith(_READ_LATER)
+    }

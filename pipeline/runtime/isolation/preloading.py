@@ -1,0 +1,68 @@
+"""What a command starts before it does anything else: the server that the children of a small job are forked from.
+
+The server loads what they need while the command itself reads its options, imports and plans. Cheap to import.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+Job = Literal["reconstruct", "classify"]
+
+_METHOD = "arrangement"
+"""The default method; a child loads another one by itself."""
+_STAGES = ("numpy.ma", "pipeline.runtime.stages.ingest", "pipeline.runtime.stages.split")
+_LOADS = {
+    "reconstruct": ("pipeline.runtime.stages.publish", "pipeline.export.tile", "pipeline.runtime.digest"),
+    "classify": ("pipeline.runtime.stages.label", "pipeline.runtime.stages.write_classified"),
+}
+_SCENE = "pipeline.runtime.stages.rehearsal:rehearse_scene"
+
+
+_SMALL_BYTES = 500_000
+"""About 120 thousand points as LAZ, which one process classifies in half a second (`engine.ALONE_S`)."""
+
+
+def surely_small(inputs: Sequence[str]) -> bool:
+    """Whether inputs without buildings to model are files of this machine so small that no children will be needed."""
+    paths = [Path(name) for name in inputs]
+    return all(path.is_file() for path in paths) and sum(path.stat().st_size for path in paths) < _SMALL_BYTES
+
+
+def loads_of(job: Job, *, footprints: bool, method: str | None = None) -> list[str]:
+    """What the children of a job need, as `isolation.child_main` takes it; `footprints` and `method` as below."""
+    loads = [*_STAGES, *_LOADS[job], f"{_SCENE}:given" if footprints else _SCENE]
+    if job == "reconstruct":
+        loads.append(f"pipeline.runtime.stages.reconstruct:load_once:{method or _METHOD}")
+    return loads
+
+
+def start_early(job: Job, *, workers: int | None, scheduler: str | None, footprints: bool, method: str | None) -> None:
+    """Start the server of a job that may be small; nothing where it was told to run elsewhere, or was started before.
+
+    Parameters
+    ----------
+    job : {'reconstruct', 'classify'}
+        Whose stages it is to load.
+    workers, scheduler
+        As asked for.
+    footprints : bool
+        Whether outlines are given: then no surfaces are looked for.
+    method : str or None
+        Name of the method; None for the default one.
+    """
+    if workers is not None or scheduler is not None:
+        return
+    # what this process needs, too, is loaded before the server is forked from it: nearly every job reads LAS
+    import pipeline.io.las  # noqa: F401
+    from pipeline.methods import METHODS
+    from pipeline.runtime.isolation.child_pool import preload
+
+    if job == "reconstruct":
+        METHODS.get(method or _METHOD)
+        if footprints:
+            import pyarrow as pa  # noqa: F401 - what reads footprints loads both
+
+    preload(loads_of(job, footprints=footprints, method=method))

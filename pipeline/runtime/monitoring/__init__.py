@@ -1,0 +1,1 @@
+"""What a run reports about itself: events, log lines, timings, memory, versions."""

@@ -1,0 +1,139 @@
+"""A task run and measured, in whichever process."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pickle
+import resource
+import socket
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from pipeline.errors import GableworkError, RunCancelledError, VersionMismatchError
+from pipeline.runtime.monitoring.logs import LOG, about, configure_once, facts_of_task
+from pipeline.runtime.monitoring.tallies import TALLIES
+from pipeline.runtime.monitoring.versions import differences, fingerprint, versions_here, versions_of
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Measured(Generic[Result]):
+    """A result and what it took."""
+
+    result: Result
+    seconds: float
+    cpu_s: float
+    """CPU seconds of the task's own thread, and of the child processes that worked for it."""
+    began_s: float
+    """When it began, in seconds since 1970 by this machine's clock."""
+    process: str
+    """host:pid."""
+    peak_bytes: int
+    """Largest resident size of the process so far."""
+
+
+class _Account(threading.local):
+    """What child processes spent for the task that runs in this thread."""
+
+    cpu_s: float = 0.0
+
+
+_spent_by_children = _Account()
+
+
+def charge(cpu_s: float) -> None:
+    """Charge the task that runs in this thread with CPU seconds of a child process that worked for it."""
+    _spent_by_children.cpu_s += cpu_s
+
+
+def peak_of_process() -> tuple[str, int]:
+    """The process as host:pid, and its largest resident size so far in bytes."""
+    return f"{socket.gethostname()}:{os.getpid()}", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> Measured[Result]:
+    """Run one task, count and measure it; what is logged meanwhile names it."""
+    _spent_by_children.cpu_s = 0.0
+    began_s, started, cpu_s = time.time(), time.perf_counter(), time.thread_time()
+    outcome = "failed"
+    TALLIES.begin()
+    try:
+        with about(stage=stage, **facts_of_task(task)):
+            try:
+                result = function(task)
+            except RunCancelledError:
+                outcome = "called off"
+                raise
+            except GableworkError as error:
+                LOG.error("the task failed: %s", error)
+                raise
+            except Exception:
+                LOG.exception("the task failed")
+                raise
+        outcome = "done"
+        cpu_s = time.thread_time() - cpu_s + _spent_by_children.cpu_s
+    finally:
+        seconds = time.perf_counter() - started
+        TALLIES.end(stage, outcome, seconds)
+    process, peak_bytes = peak_of_process()
+    return Measured(
+        result=result, seconds=seconds, cpu_s=cpu_s, began_s=began_s, process=process, peak_bytes=peak_bytes
+    )
+
+
+def measure_in_child(work: tuple[Callable[[Task], Result], Task, str]) -> Measured[Result]:
+    """Run one task in a child process of whoever waits for it; a fault of ours tells where it happened.
+
+    Parameters
+    ----------
+    work : tuple
+        Function, task and stage.
+    """
+    try:
+        return measure(*work)
+    except GableworkError:
+        raise
+    except Exception as error:
+        # a traceback does not survive the pipe, a note does
+        error.add_note(traceback.format_exc())
+        raise
+
+
+def packed(function: Callable[[Task], Result], task: Task) -> bytes:
+    """A task on its way to another process, opaque to whoever passes it on.
+
+    A Dask scheduler unpacks what it passes on; from bytes it needs not import what only workers need.
+    """
+    return pickle.dumps((function, task), protocol=pickle.HIGHEST_PROTOCOL)
+
+
+def measure_packed(client_fingerprint: str, task: bytes, stage: str = "") -> Measured[Any]:
+    """Run a packed task of a client and measure it, if this process runs what the client runs.
+
+    Raises
+    ------
+    VersionMismatchError
+        It does not: a worker that came late must not mix other versions into a result. Told before the task is
+        unpacked, which may fail in strange ways then.
+    """
+    configure_once()
+    if client_fingerprint != fingerprint():
+        process, _ = peak_of_process()
+        told = differences(versions_of(client_fingerprint), versions_here())
+        raise VersionMismatchError(mismatch_told([f"worker {process}: {', '.join(told)}"]))
+    function, unpacked = pickle.loads(task)  # noqa: S301 - from the client, whose code the worker runs anyway
+    return measure(function, unpacked, stage)
+
+
+def mismatch_told(faults: list[str]) -> str:
+    """The message of a version mismatch, from what is wrong in each process."""
+    return (
+        f"the processes do not run the same versions: {'; '.join(faults)}. "
+        "Install the same gablework with the same locks everywhere (one image), then start again"
+    )

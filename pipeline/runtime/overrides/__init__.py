@@ -1,0 +1,1 @@
+"""Overrides: manual corrections of single buildings."""

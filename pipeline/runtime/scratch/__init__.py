@@ -1,0 +1,1 @@
+"""Scratch: intermediate results, the keys that they are stored under, and when they expire."""

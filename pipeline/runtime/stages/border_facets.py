@@ -1,0 +1,132 @@
+"""Facets that several tiles see: by them the fragments of one surface find each other across the borders.
+
+A facet is the same in all tiles that see it, so its vertices name it. The name that travels is a hash of 128 bits. Two
+of n facets get one name by chance with a probability below n^2 / 2^129: 10^-22 for the 10^8 facets of ten million
+buildings.
+
+Of most facets no name needs to travel. Along a border, far from a third tile, both tiles are sure to see the facets
+that reach into a strip around it, and what is connected there is connected for both: one facet of each connected piece
+tells as much as all of them. Both tiles take the one of the smallest name.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.compiler import kernel
+from pipeline.kernels.union_find import united
+from pipeline.model import BoolArray, IntArray, KindArray
+from pipeline.runtime.stages.tile_content import mixed
+from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.surfaces import SurfaceSettings
+from pipeline.tiling import Tile, TileGrid
+
+_SLACK_MM = 2
+"""Circumradii are compared as floats; a facet may be wider than twice the largest by less than this."""
+_OTHER = np.uint64(0xD1B54A32D192ED03)
+"""Where the second word begins: any number but 0, where the first does."""
+
+
+@kernel
+def facet_names(keys: IntArray) -> npt.NDArray[np.uint64]:
+    """Names (j, 2) uint64 of facets, from their keys (j, 6) as of `facet_keys`."""
+    names = np.empty((keys.shape[0], 2), np.uint64)
+    for i in range(keys.shape[0]):
+        first, second = np.uint64(0), _OTHER
+        for k in range(6):
+            word = np.uint64(keys[i, k])
+            first = mixed(first, word)
+            second = mixed(second, word)
+        names[i, 0], names[i, 1] = first, second
+    return names
+
+
+def united_by_name(count: int, names: npt.NDArray[np.uint64], holders: IntArray) -> IntArray:
+    """Smallest member (count,) int64 of the set of each of `count` elements, where those with one name are one set.
+
+    Parameters
+    ----------
+    count : int
+        How many elements there are.
+    names : (j, 2) uint64
+        Names.
+    holders : (j,) int
+        The element that holds each.
+    """
+    order = np.lexsort((names[:, 1], names[:, 0]))
+    same = np.flatnonzero((names[order[1:]] == names[order[:-1]]).all(axis=1))
+    return united(count, holders[order[same]], holders[order[same + 1]])
+
+
+def telling_facets(
+    keys: IntArray,
+    names: npt.NDArray[np.uint64],
+    kinds: KindArray,
+    tile: Tile,
+    grid: TileGrid,
+    settings: SurfaceSettings,
+) -> tuple[BoolArray, BoolArray]:
+    """Which facets another tile may see, and which of them need to be told for the same sets of fragments.
+
+    Parameters
+    ----------
+    keys : (j, 6) int64
+        All facets of some kinds that the tile sees and another may see, as of `facet_keys`.
+    names : (j, 2) uint64
+        Their names.
+    kinds : (j,) int8
+        Their FacetKind: only what is of one kind is connected.
+    tile, grid : Tile, TileGrid
+        The tile and its lattice.
+    settings : SurfaceSettings
+        Those that the facets were made with.
+
+    Returns
+    -------
+    (j,) bool
+        May be seen by another tile.
+    (j,) bool
+        Has to be told: all of the former, but of those that are connected in a strip that two tiles are sure to see,
+        and no third may, only the one of the smallest name.
+    """
+    x, y = keys[:, 0::2], keys[:, 1::2]
+    # a tile sees a facet if a vertex is near its core, or in another facet that reaches into the core
+    reach_mm = max(settings.far_mm, round(2000 * settings.max_circumradius_m) + _SLACK_MM)
+    west, south = grid.columns_rows(x.min(axis=1) - reach_mm, y.min(axis=1) - reach_mm)
+    east, north = grid.columns_rows(x.max(axis=1) + reach_mm, y.max(axis=1) + reach_mm)
+    seen = (west < tile.column) | (east > tile.column) | (south < tile.row) | (north > tile.row)
+    # 0: the strip to the west or east, 1: to the south or north; where four tiles may see, there is no strip
+    sure = np.full(len(keys), -1, np.int64)
+    for axis, (values, low, high, across_low, across_high, origin) in enumerate(
+        ((x, west, east, south, north, grid.origin_x_mm), (y, south, north, west, east, grid.origin_y_mm))
+    ):
+        border = origin + high * grid.size_mm
+        two = (high == low + 1) & (across_low == across_high)
+        both = (values.min(axis=1) < border + settings.far_mm) & (values.max(axis=1) >= border - settings.far_mm)
+        # both borders of a tile along one axis: two strips
+        sure[two & both] = 2 * axis + (high == (tile.column, tile.row)[axis])[two & both]
+    told = seen.copy()
+    strip = np.flatnonzero(seen & (sure >= 0))
+    piece = _connected(keys[strip], sure[strip] * len(FacetKind) + kinds[strip])
+    order = np.lexsort((names[strip, 1], names[strip, 0], piece))
+    told[strip] = False
+    _, first = np.unique(piece[order], return_index=True)
+    told[strip[order[first]]] = True
+    return seen, told
+
+
+def _connected(keys: IntArray, layer: IntArray) -> IntArray:
+    """Smallest member (j,) of the set of each facet, where those of one layer that share an edge are one set."""
+    if len(keys) == 0:
+        return np.empty(0, np.int64)
+    x, y = keys[:, 0::2].ravel(), keys[:, 1::2].ravel()
+    # vertices are few and near each other: both coordinates fit one integer, and so do the numbers of two of them
+    _, vertex = np.unique(((x - x.min()) << 32) | (y - y.min()), return_inverse=True)
+    a = vertex.reshape(-1, 3).astype(np.int64)
+    b = np.roll(a, -1, axis=1)
+    count = int(a.max()) + 1
+    edge = ((layer[:, None] * count + np.minimum(a, b)) * count + np.maximum(a, b)).ravel()
+    order = np.argsort(edge, kind="stable")
+    same = np.flatnonzero(edge[order[1:]] == edge[order[:-1]])
+    return united(len(keys), order[same] // 3, order[same + 1] // 3)

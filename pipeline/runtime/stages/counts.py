@@ -1,0 +1,91 @@
+"""What a run counts: of its models, and over all stages."""
+
+from __future__ import annotations
+
+import dataclasses
+import heapq
+from collections import Counter
+from collections.abc import Sequence
+
+from pipeline.runtime.manifest import SLOWEST, SlowBuilding
+from pipeline.runtime.plan import Plan
+from pipeline.runtime.stages.ingest import Ingested
+from pipeline.runtime.stages.join import Joined
+from pipeline.runtime.stages.stages import Models, Splits
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Counted:
+    """What a run counts of its models."""
+
+    statuses: Counter[str]
+    """Candidates by status."""
+    reasons: Counter[str]
+    """Those that are not ok, by reason."""
+    roof_types: Counter[str]
+    """Candidates by roof type."""
+    faces: int
+    """Roof faces of all models."""
+    made: int
+    """Candidates that this run modelled itself."""
+    slowest: tuple[SlowBuilding, ...]
+    """Those that took longest."""
+    seconds: dict[str, float]
+    """Wall-clock seconds of each building by its id; empty where nobody asked for each."""
+
+    @classmethod
+    def of(cls, models: Models, *, each_told: bool) -> Counted:
+        """Count the models; `each_told` keeps the seconds of every one."""
+        statuses, reasons, roof_types = Counter[str](), Counter[str](), Counter[str]()
+        seconds: dict[str, float] = {}
+        slowest: list[tuple[float, str]] = []
+        faces = 0
+        for model in models.each():
+            statuses[model.status] += 1
+            if model.reason is not None:
+                reasons[model.reason] += 1
+            roof_types[model.roof_type] += 1
+            faces += model.faces
+            if each_told:
+                seconds[model.building_id] = model.seconds
+            slowest.append((round(model.seconds, 3), model.building_id))
+            if len(slowest) >= 2 * SLOWEST:
+                slowest = heapq.nlargest(SLOWEST, slowest)
+        return cls(
+            statuses=statuses,
+            reasons=reasons,
+            roof_types=roof_types,
+            faces=faces,
+            made=models.made,
+            slowest=tuple(SlowBuilding(building_id=i, seconds=s) for s, i in heapq.nlargest(SLOWEST, slowest)),
+            seconds=seconds,
+        )
+
+
+def told_counts(
+    plan: Plan, ingested: Sequence[Ingested], splits: Splits, joined: Joined, found: Counted
+) -> dict[str, int]:
+    """The counts of run.json."""
+    by_status = found.statuses
+    dropped: Counter[str] = Counter()
+    for entry in ingested:
+        dropped.update(entry.dropped)
+    return {
+        "points_promised": plan.points,
+        "points": sum(s.points for s in splits.told),
+        **{f"dropped_{cause}": count for cause, count in sorted(dropped.items())},
+        "duplicates": sum(s.duplicates for s in splits.told),
+        "outliers": sum(s.outliers for s in splits.told),
+        "tiles": len(splits.told),
+        "candidates": sum(by_status.values()),
+        "ok": by_status["ok"],
+        "fallback": by_status["fallback"],
+        "failed": by_status["failed"],
+        "rejected": len(joined.rejected),
+        "reused": sum(by_status.values()) - found.made,
+        "small_surfaces": joined.small_fragments,
+        "roof_faces": found.faces,
+        "class_6_in_candidates": sum(s.audit[0] for s in splits.told),
+        "other_classes_in_candidates": sum(s.audit[1] for s in splits.told),
+        "class_6_elsewhere": sum(s.audit[2] for s in splits.told),
+    }

@@ -1,0 +1,266 @@
+"""Gather: the points and the terrain of one candidate, from all tiles that hold some of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+import hashlib
+import math
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+from shapely import MultiPolygon, Polygon
+
+from pipeline.export.facts import CandidateFacts
+from pipeline.io.gps_time import GpsTimeKind, utc_of
+from pipeline.model import BoolArray, Candidate, IntArray
+from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.stages.join import CandidateSite
+from pipeline.runtime.stages.split import bucket_paths
+from pipeline.terrain.lattice import CELL_MM, NO_DATA
+from pipeline.tiling import MM, TileGrid, Window
+
+Area = TypeVar("Area", Polygon, MultiPolygon, Polygon | MultiPolygon)
+
+_GROUND_MARGIN_M = 4
+_VIEW_MARGIN_M = 14
+_OUTLINE_CELLS = 2
+_EMPTY_CELLS = 4
+_EDGE_CELLS = 5
+_BESIDE_CELLS = 2
+_HEIGHT_WITHOUT_TERRAIN_MM = 2500
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Surroundings:
+    """Terrain around a candidate, on the 1 m lattice."""
+
+    column0: int
+    row0: int
+    elevation_mm: npt.NDArray[np.int32]
+    """(rows, columns), NO_DATA where unknown."""
+    occupied: BoolArray
+    """(rows, columns), some point lies in the cell."""
+
+
+def surroundings_of(scratch: Scratch, grid: TileGrid, view: Window) -> Surroundings:
+    """Mosaic of the tiles' terrain over a view."""
+    column0, row0 = view.x0_mm // CELL_MM, view.y0_mm // CELL_MM
+    columns, rows = -(-view.x1_mm // CELL_MM) - column0, -(-view.y1_mm // CELL_MM) - row0
+    elevation = np.full((rows, columns), NO_DATA, np.int32)
+    occupied = np.zeros((rows, columns), np.bool_)
+    # a cell belongs to the tile of its centre, so the neighbours of the view's own tiles may hold its border cells
+    for tile in grid.tiles_over(view.grown(CELL_MM)):
+        name = f"tiles/{tile.key}"
+        if not scratch.has(name):
+            continue
+        corner = scratch.array(name, "corner")
+        part = scratch.array(name, "terrain", mapped=True)
+        c0, r0 = int(corner[0]) - column0, int(corner[1]) - row0
+        left, right = max(c0, 0), min(c0 + part.shape[1], columns)
+        low, high = max(r0, 0), min(r0 + part.shape[0], rows)
+        if left < right and low < high:
+            theirs = (slice(low - r0, high - r0), slice(left - c0, right - c0))
+            ours = (slice(low, high), slice(left, right))
+            elevation[ours] = part[theirs]
+            occupied[ours] = scratch.array(name, "occupied", mapped=True)[theirs]
+    return Surroundings(column0=column0, row0=row0, elevation_mm=elevation, occupied=occupied)
+
+
+def _grown(mask: BoolArray, cells: int) -> BoolArray:
+    """Dilation by a square of 2 cells + 1: where the box around a cell holds any True (integral image)."""
+    rows, columns = mask.shape
+    side = 2 * cells + 1
+    sums = np.zeros((rows + side, columns + side), np.int32)
+    sums[cells + 1 : cells + 1 + rows, cells + 1 : cells + 1 + columns] = mask
+    np.cumsum(sums, axis=0, out=sums)
+    np.cumsum(sums, axis=1, out=sums)
+    inside = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
+    grown: BoolArray = inside > 0
+    return grown
+
+
+def _touches_data_edge(roof: BoolArray, empty_around: BoolArray) -> bool:
+    """Whether a square of 9 m without any point, by the mask of their middles, begins within 5 m of the roof."""
+    return bool(empty_around.any()) and bool((empty_around & _grown(roof, _EDGE_CELLS + _EMPTY_CELLS)).any())
+
+
+def points_of(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
+    """A candidate's points in canonical order: X, Y, Z, return, GPS time, source."""
+    points = stored_points(scratch, site)
+    sorted_points: npt.NDArray[np.void] = np.take(points, canonical_order(points))
+    return sorted_points
+
+
+def stored_points(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]:
+    """A candidate's points, range after range."""
+    pieces = []
+    for part in site.ranges:
+        first, last = part.start * POINT.itemsize, part.stop * POINT.itemsize
+        pieces.append(scratch.rows(f"{part.folder}/{part.tile.key}", "points", first, last).view(POINT))
+    return np.concatenate(pieces) if pieces else np.empty(0, POINT)
+
+
+def canonical_order(points: npt.NDArray[np.void]) -> IntArray:
+    """The order of points that does not depend on files and tiles: X, Y, Z, return, GPS time, source; (n,) int64."""
+    x, y = (np.ascontiguousarray(points[name]) for name in "xy")
+    steps = np.diff(x), np.diff(y)
+    # one tile's points come from the split by x and y: a stable sort would leave them as they are
+    if bool(((steps[0] > 0) | ((steps[0] == 0) & (steps[1] >= 0))).all()):
+        order = np.arange(len(points))
+    else:
+        order = np.lexsort((y, x))
+        steps = np.diff(x[order]), np.diff(y[order])
+    tied = np.flatnonzero((steps[0] == 0) & (steps[1] == 0))
+    if len(tied):
+        rows = np.unique(np.concatenate((tied, tied + 1)))
+        among = np.sort(order[rows])
+        few = points[among]
+        order[rows] = among[
+            np.lexsort((few["source"], few["gps_time"], few["return_number"], few["z"], few["y"], few["x"]))
+        ]
+    return order
+
+
+def gather(
+    scratch: Scratch,
+    grid: TileGrid,
+    site: CandidateSite,
+    gps_kind: GpsTimeKind,
+    *,
+    beside: bool = False,
+) -> tuple[Candidate, CandidateFacts]:
+    """One candidate with the terrain around it.
+
+    Parameters
+    ----------
+    scratch, grid : Scratch, TileGrid
+        Where the tiles' points and terrain are.
+    site : CandidateSite
+        Which points.
+    gps_kind : GpsTimeKind
+        Whether GPS times tell dates.
+    beside : bool
+        Whether the points around and beneath are wanted too; a candidate whose outline is known has none.
+    """
+    points = points_of(scratch, site)
+    footprint = site.footprint
+    columns_mm = [points[name].astype(np.int64) for name in "xyz"]
+    xyz = np.column_stack(columns_mm)
+    if len(xyz):
+        # of columns: numpy takes many times longer along the first axis of three
+        low, high = (np.array([extreme(column) for column in columns_mm]) for extreme in (np.min, np.max))
+    else:
+        x0, y0, x1, y1 = footprint.bounds if footprint is not None else (0.0, 0.0, 0.0, 0.0)
+        low = np.array([round(x0 * MM), round(y0 * MM), 0], np.int64)
+        high = np.array([round(x1 * MM), round(y1 * MM), 0], np.int64)
+    origin_mm = low // MM * MM
+    margin = _VIEW_MARGIN_M * MM
+    view = Window(x0_mm=int(low[0]), y0_mm=int(low[1]), x1_mm=int(high[0]) + 1, y1_mm=int(high[1]) + 1).grown(margin)
+    around = surroundings_of(scratch, grid, view)
+    roof = np.zeros(around.occupied.shape, np.bool_)
+    roof[columns_mm[1] // CELL_MM - around.row0, columns_mm[0] // CELL_MM - around.column0] = True
+    # terrain far from all points may lie in a tile that nobody made
+    points_near = _grown(around.occupied, _EMPTY_CELLS)
+    known = (around.elevation_mm != NO_DATA) & points_near
+    outline = _grown(roof, _OUTLINE_CELLS) & ~roof & known
+    sampled = known & _grown(roof, _GROUND_MARGIN_M)
+    if not roof.any():
+        sampled = known
+    rows, columns = np.nonzero(sampled)
+    ground_mm = np.column_stack(
+        (
+            (columns + around.column0) * CELL_MM + CELL_MM // 2,
+            (rows + around.row0) * CELL_MM + CELL_MM // 2,
+            around.elevation_mm[rows, columns].astype(np.int64),
+        )
+    )
+    ground_z: int | None
+    if outline.any():
+        ground_z = int(around.elevation_mm[outline].min())
+    elif len(ground_mm):
+        ground_z = int(ground_mm[:, 2].min())
+    elif len(xyz):
+        ground_z = int(low[2]) - _HEIGHT_WITHOUT_TERRAIN_MM
+    else:
+        ground_z = None
+    digest = hashlib.sha256(points.tobytes())
+    digest.update(np.ascontiguousarray(ground_mm).tobytes())
+    beside_mm = later_mm = np.empty((0, 3), np.int64)
+    if beside and footprint is None and site.outline is None:
+        beside_mm, later_mm = _beside(scratch, grid, xyz, _grown(roof, _BESIDE_CELLS), around)
+        digest.update(beside_mm.tobytes())
+        digest.update(later_mm.tobytes())
+    if site.outline is not None:
+        digest.update(np.rint(shapely.get_coordinates(site.outline) * MM).astype(np.int64).tobytes())
+    candidate = Candidate(
+        building_id=site.building_id,
+        origin=(float(origin_mm[0] // MM), float(origin_mm[1] // MM), float(origin_mm[2] // MM)),
+        points=(xyz - origin_mm) / MM,
+        ground=(ground_mm - origin_mm) / MM,
+        split_returns=(xyz[(points["return_number"] == 1) & (points["return_count"] > 1)] - origin_mm) / MM,
+        ground_z_m=math.nan if ground_z is None else (ground_z - int(origin_mm[2])) / MM,
+        footprint=None if footprint is None else _moved(footprint, origin_mm),
+        source_id=site.source_id,
+        outline=None if site.outline is None else _moved(site.outline, origin_mm),
+        beside=(beside_mm - origin_mm) / MM,
+        beside_later=(later_mm - origin_mm) / MM,
+        touches_data_edge=_touches_data_edge(roof, ~points_near),
+    )
+    first, last = _acquired(points, gps_kind)
+    return candidate, CandidateFacts(input_hash=digest.hexdigest(), acquired_from=first, acquired_to=last)
+
+
+def _beside(
+    scratch: Scratch, grid: TileGrid, own_mm: IntArray, cells: BoolArray, around: Surroundings
+) -> tuple[IntArray, IntArray]:
+    """Points in some cells of the surroundings that are none of a candidate's: each (n, 3) int64, sorted.
+
+    The first are of pulses with one return, the second the last of several.
+    """
+    rows, columns = np.nonzero(cells)
+    single, later = [own_mm], [own_mm]
+    if len(rows):
+        view = Window(
+            x0_mm=(around.column0 + int(columns.min())) * CELL_MM,
+            y0_mm=(around.row0 + int(rows.min())) * CELL_MM,
+            x1_mm=(around.column0 + int(columns.max()) + 1) * CELL_MM,
+            y1_mm=(around.row0 + int(rows.max()) + 1) * CELL_MM,
+        )
+        for path in (path for tile in grid.tiles_over(view) for path in bucket_paths(scratch, tile)):
+            if path.stat().st_size == 0:
+                continue
+            stored = np.memmap(path, POINT, mode="r")
+            near = np.array(stored[view.contains(stored["x"], stored["y"])])
+            near = near[cells[near["y"] // CELL_MM - around.row0, near["x"] // CELL_MM - around.column0]]
+            xyz = np.column_stack((near["x"], near["y"], near["z"].astype(np.int64)))
+            single.append(xyz[near["return_count"] <= 1])
+            later.append(xyz[(near["return_count"] > 1) & (near["return_number"] >= near["return_count"])])
+    return _others(single, len(own_mm)), _others(later, len(own_mm))
+
+
+def _others(pieces: Sequence[IntArray], own: int) -> IntArray:
+    """Places of the pieces, one of each, without those of the first `own` rows: (n, 3) int64, sorted."""
+    places, index = np.unique(np.concatenate(pieces), axis=0, return_index=True)
+    others: IntArray = places[index >= own]
+    return others
+
+
+def _moved(area: Area, origin_mm: IntArray) -> Area:
+    """An area in metres, from the CRS into a local frame."""
+    if area.is_empty:
+        return area
+    xyz = shapely.get_coordinates(area, include_z=bool(area.has_z))
+    xyz[:, :2] -= origin_mm[:2] // MM
+    moved: Area = shapely.transform(area, lambda _: xyz, include_z=bool(area.has_z))
+    return moved
+
+
+def _acquired(points: npt.NDArray[np.void], kind: GpsTimeKind) -> tuple[dt.datetime | None, dt.datetime | None]:
+    """First and last time of the points where GPS times tell dates."""
+    if kind is not GpsTimeKind.ADJUSTED or len(points) == 0:
+        return None, None
+    return utc_of(float(points["gps_time"].min())), utc_of(float(points["gps_time"].max()))

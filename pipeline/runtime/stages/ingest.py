@@ -1,0 +1,258 @@
+"""Ingest: one streamed read of an input file, its points bucketed on the lattice of tiles.
+
+LAZ has no spatial index: reading windows of it would decode the file again for every tile.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import shutil
+from collections import Counter
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import InconsistentInputError, InputError
+from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
+from pipeline.io.remote_file import RemoteFile
+from pipeline.io.storage import sha256_of
+from pipeline.model import IntArray, PointCloud
+from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums
+from pipeline.tiling import MM, Tile, TileGrid
+
+_CHUNK_POINTS = 250_000
+"""Points that are read at once: few enough that their arrays stay in memory that is used again and again."""
+_MAX_MM = 2**31 - 2
+_TWO_BYTES = 2**16
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class IngestTask:
+    """One input file."""
+
+    part: str
+    """Names the file's parts in scratch; no two inputs share one."""
+    path: str
+    """The file, or its URL with its query."""
+    options: ReadOptions
+    """CRS, units, area of interest, dropped classes."""
+    grid: TileGrid
+    """The lattice."""
+    scratch: Scratch
+    """Where the buckets go."""
+    known: SourceInfo | None = None
+    """What the plan found in the file."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ingested:
+    """What one input file held."""
+
+    path: str
+    """The file."""
+    points_by_tile: dict[Tile, int]
+    """Points in each tile's bucket."""
+    content: dict[Tile, bytes]
+    """What points they are: the bytes of the tile's `ZoneSums`."""
+    classes: dict[int, int]
+    """Points by ASPRS class, of those kept."""
+    dropped: dict[str, int]
+    """Points left out, by cause."""
+    warnings: tuple[str, ...]
+    """What is odd but usable."""
+    bounds_mm: tuple[int, int, int, int, int, int] | None
+    """x, y, z minimum, then maximum, of the kept points; None where there are none."""
+    moments: tuple[float, ...]
+    """n, Sx, Sy, Sxx, Sxy, Syy in metres about the first kept point: tells whether all lie on one line."""
+    first_mm: tuple[int, int]
+    """That first point."""
+    multiple_returns: bool
+    """Whether any kept pulse has more than one return."""
+    sha256: str
+    """Digest of the file."""
+
+
+def part_of(path: str) -> str:
+    """Names the parts of an input file in scratch: whatever other inputs there are.
+
+    >>> part_of("/data/37EN1.LAZ")
+    '406afe307fa1d623'
+    """
+    return hashlib.sha256(path.encode()).hexdigest()[:16]
+
+
+def to_records(cloud: PointCloud, path: str) -> npt.NDArray[np.void]:
+    """Points in whole millimetres.
+
+    Raises
+    ------
+    InconsistentInputError
+        An elevation is beyond what whole millimetres of 32 bits hold (2,147 km).
+    """
+    if np.abs(cloud.xyz[:, 2]).max(initial=0.0) * MM > _MAX_MM:
+        worst = float(cloud.xyz[np.abs(cloud.xyz[:, 2]).argmax(), 2])
+        raise InconsistentInputError(path, f"a point has elevation {worst:g} m", "Check the vertical unit and scale")
+    records = np.empty(len(cloud), POINT)
+    rounded = np.rint(cloud.xyz * MM)
+    records["x"] = rounded[:, 0]
+    records["y"] = rounded[:, 1]
+    records["z"] = rounded[:, 2]
+    records["source"] = cloud.source_id
+    records["return_number"] = cloud.return_number
+    records["return_count"] = cloud.return_count
+    records["gps_time"] = cloud.gps_time
+    records["classification"] = cloud.classification
+    return records
+
+
+def ingest(task: IngestTask) -> Ingested:
+    """Read one file and bucket its points by tile; one behind a URL is fetched into scratch for as long as it takes.
+
+    Returns
+    -------
+    Ingested
+        Counts and facts; the points are in scratch under `points/<tile>/<part>.bin`.
+
+    Raises
+    ------
+    InputError
+        The file cannot be used.
+    RunCancelledError
+        The run was called off.
+    """
+    task.scratch.check_cancelled()
+    if not is_url(task.path):
+        return _ingested(task)
+    file = RemoteFile(task.path)
+    copy = task.scratch.path("fetched", uuid4().hex, f"points{file.suffix}")
+    try:
+        known = task.known if task.known is not None and task.known.is_of(file) else None
+        file.fetch(copy, task.scratch.check_cancelled)
+        if known is not None:
+            now = copy.stat()
+            same = (now.st_size, file.stat().st_mtime_ns) == (known.file_size, known.modified_ns)
+            known = dataclasses.replace(known, modified_ns=now.st_mtime_ns) if same else None
+        found = _ingested(dataclasses.replace(task, path=str(copy), known=known))
+        return dataclasses.replace(found, path=shown(task.path))
+    except InputError as fault:
+        raise fault.of(shown(task.path), str(copy)) from None
+    finally:
+        shutil.rmtree(copy.parent, ignore_errors=True)
+
+
+def _ingested(task: IngestTask) -> Ingested:
+    """The same of a file of this machine."""
+    source = open_source(task.path, task.options, task.known)
+    suffix = f".{uuid4().hex}.part"
+    counts: Counter[Tile] = Counter()
+    content: dict[Tile, ZoneSums] = {}
+    classes: Counter[int] = Counter()
+    low = np.full(3, 2**62)
+    high = np.full(3, -(2**62))
+    moments = np.zeros(6)
+    first: tuple[int, int] | None = None
+    multiple = False
+    for cloud in source.chunks(_CHUNK_POINTS):
+        task.scratch.check_cancelled()
+        records = to_records(cloud, task.path)
+        x, y, z = (np.ascontiguousarray(records[name]) for name in "xyz")
+        for axis, values in enumerate((x, y, z)):
+            low[axis] = min(low[axis], int(values.min()))
+            high[axis] = max(high[axis], int(values.max()))
+        if first is None:
+            first = int(x[0]), int(y[0])
+        dx, dy = (x - first[0]) / MM, (y - first[1]) / MM
+        moments += (len(records), dx.sum(), dy.sum(), (dx * dx).sum(), (dx * dy).sum(), (dy * dy).sum())
+        histogram = np.bincount(records["classification"])
+        classes.update({int(c): int(histogram[c]) for c in np.flatnonzero(histogram)})
+        multiple = multiple or bool((records["return_count"] > 1).any())
+        counts.update(_append_by_tile(records, x, y, task, suffix, content))
+    for tile in counts:
+        part = task.scratch.path("points", tile.key, f"{task.part}{suffix}")
+        task.scratch.check_cancelled()
+        part.replace(task.scratch.path("points", tile.key, f"{task.part}.bin"))
+    return Ingested(
+        path=task.path,
+        points_by_tile=dict(counts),
+        content={tile: sums.tobytes() for tile, sums in content.items()},
+        classes=dict(classes),
+        dropped=source.dropped,
+        warnings=source.warnings,
+        bounds_mm=None if first is None else (*(int(v) for v in low), *(int(v) for v in high)),  # type: ignore[arg-type]
+        moments=tuple(float(v) for v in moments),
+        first_mm=first or (0, 0),
+        multiple_returns=multiple,
+        sha256=sha256_of(Path(task.path)),
+    )
+
+
+def _append_by_tile(
+    records: npt.NDArray[np.void],
+    x_mm: IntArray,
+    y_mm: IntArray,
+    task: IngestTask,
+    suffix: str,
+    content: dict[Tile, ZoneSums],
+) -> Counter[Tile]:
+    """Append a chunk to the parts of its tiles; points of each tile. Their content is added to that of the file."""
+    columns, rows = task.grid.columns_rows(x_mm, y_mm)
+    west, south = int(columns.min()), int(rows.min())
+    height = int(rows.max()) - south + 1
+    number = (columns - west) * height + (rows - south)
+    n_tiles = (int(columns.max()) - west + 1) * height
+    # a stable sort of two bytes is a radix sort
+    order = np.argsort(number.astype(np.uint16) if n_tiles <= _TWO_BYTES else number, kind="stable")
+    ordered, number = np.take(records, order), number[order]
+    starts = np.flatnonzero(np.diff(number, prepend=-1))
+    counts: Counter[Tile] = Counter()
+    for start, stop in zip(starts, [*starts[1:], len(ordered)], strict=True):
+        column, row = divmod(int(number[start]), height)
+        tile = Tile(west + column, south + row)
+        with task.scratch.path("points", tile.key, f"{task.part}{suffix}").open("ab") as part:
+            ordered[start:stop].tofile(part)
+        core = task.grid.core(tile)
+        points = ordered[start:stop]
+        bits = np.ascontiguousarray(points["gps_time"]).view(np.uint64)
+        sums = zone_sums(points, bits, core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm, task.grid.halo_mm)
+        content[tile] = content[tile] + sums if tile in content else sums
+        counts[tile] += int(stop - start)
+    return counts
+
+
+def spread_m(results: list[Ingested]) -> float:
+    """Standard deviation across the line that fits all points best: 0 where they lie on one line.
+
+    Parameters
+    ----------
+    results : list of Ingested
+        All inputs.
+    """
+    total = np.zeros(6)
+    anchor: tuple[int, int] | None = None
+    for result in results:
+        n, sx, sy, sxx, sxy, syy = result.moments
+        if n == 0:
+            continue
+        if anchor is None:
+            anchor = result.first_mm
+        # move the moments to the first file's first point
+        dx, dy = (result.first_mm[0] - anchor[0]) / MM, (result.first_mm[1] - anchor[1]) / MM
+        total += (
+            n,
+            sx + n * dx,
+            sy + n * dy,
+            sxx + 2 * dx * sx + n * dx * dx,
+            sxy + dx * sy + dy * sx + n * dx * dy,
+            syy + 2 * dy * sy + n * dy * dy,
+        )
+    n, sx, sy, sxx, sxy, syy = total
+    if n == 0:
+        return 0.0
+    xx, xy, yy = sxx / n - (sx / n) ** 2, sxy / n - sx * sy / n**2, syy / n - (sy / n) ** 2
+    smallest = (xx + yy) / 2 - math.hypot((xx - yy) / 2, xy)
+    return math.sqrt(max(0.0, smallest))

@@ -1,0 +1,184 @@
+"""Labelling: the class of every point of a tile, in the order in which ingest bucketed each input's points.
+
+A bucket holds the points of one input that lie in one tile, in the order of the file. Whoever reads the file again
+meets each tile's points in that order, so that a class a point is all that has to be stored: no index, no sorting.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.model import BoolArray, ByteArray
+from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.stages.gather import Surroundings, surroundings_of
+from pipeline.runtime.stages.join import PointRange
+from pipeline.runtime.stages.split import bucket_paths, load_window
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse, SceneSettings, WindowPoints
+from pipeline.terrain.ground import Terrain, ground_points, slopes_of
+from pipeline.terrain.lattice import NO_DATA, height_above
+from pipeline.terrain.outliers import dense_enough
+from pipeline.terrain.point_classes import PointClass, PointEvidence, classes_of, index_of_each, support_m
+from pipeline.tiling import MM, Tile, TileGrid, Window
+
+FOLDER = "classes"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LabelTask:
+    """One tile."""
+
+    tile: Tile
+    """The tile."""
+    grid: TileGrid
+    """The lattice."""
+    settings: SceneSettings
+    """Outliers, ground and vegetation."""
+    classes: ClassesInUse
+    """Which of the file's classes are believed."""
+    scratch: Scratch
+    """Points and terrain in, classes out."""
+    buildings: tuple[PointRange, ...]
+    """Points of the candidates in all tiles that the tile's neighbourhood meets."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Labelled:
+    """What a tile held."""
+
+    tile: Tile
+    """The tile."""
+    points: dict[int, int]
+    """Points by class, duplicates included."""
+
+
+def label_halo_m(settings: SceneSettings) -> float:
+    """How far the classes of a tile look beyond its core."""
+    return support_m(settings.vegetation) + settings.outliers.support_m
+
+
+def neighbourhood(tile: Tile, grid: TileGrid, settings: SceneSettings) -> Window:
+    """What the labelling of a tile sees."""
+    return grid.core(tile).grown(math.ceil(label_halo_m(settings) * MM))
+
+
+def label(task: LabelTask) -> Labelled:
+    """Classify the points of a tile.
+
+    Returns
+    -------
+    Labelled
+        Counts; the classes are in scratch under `classes/<tile>/<input>.bin`, a byte a point of the bucket.
+
+    Raises
+    ------
+    RunCancelledError
+        The run was called off.
+    """
+    task.scratch.check_cancelled()
+    window = neighbourhood(task.tile, task.grid, task.settings)
+    halo_mm = task.grid.core(task.tile).x0_mm - window.x0_mm
+    loaded = load_window(task.scratch, dataclasses.replace(task.grid, halo_mm=halo_mm), task.tile)
+    points, core = loaded.points, len(loaded.core)
+    task.scratch.check_cancelled()
+    wanted = np.zeros(len(points), np.bool_)
+    wanted[:core] = True
+    found = classes_of(
+        evidence_of(task, points, window),
+        wanted,
+        task.settings.vegetation,
+    )[:core]
+    counts: Counter[int] = Counter()
+    # points of one place and return number differ at most in their count of returns: the lowest decides for all
+    first = np.argsort(points.return_count[:core], kind="stable")
+    places = points.x_mm[first], points.y_mm[first], points.z_mm[first], points.return_number[first]
+    for path in bucket_paths(task.scratch, task.tile):
+        records = np.fromfile(path, POINT)
+        at = first[index_of_each(*_places(records), *places)]
+        labels = _believed(found[at], records["classification"], task.classes)
+        histogram = np.bincount(labels)
+        counts.update({int(code): int(histogram[code]) for code in np.flatnonzero(histogram)})
+        target = class_path(task.scratch, task.tile, path.name)
+        temporary = target.with_name(f".{target.name}.{uuid4().hex}.part")
+        labels.tofile(temporary)
+        temporary.replace(target)
+    return Labelled(tile=task.tile, points=dict(counts))
+
+
+def class_path(scratch: Scratch, tile: Tile, bucket: str) -> Path:
+    """Where the classes of a bucket are."""
+    return scratch.path(FOLDER, tile.key, bucket)
+
+
+def evidence_of(task: LabelTask, points: WindowPoints, window: Window) -> PointEvidence:
+    """What is known of the points of a tile's neighbourhood."""
+    around = surroundings_of(task.scratch, task.grid, window.grown(2 * MM))
+    terrain = terrain_around(around)
+    x, y, z = points.x_mm, points.y_mm, points.z_mm
+    if task.classes.ground:
+        ground = points.classification == GROUND_CLASS
+    else:
+        ground = ground_points(x, y, z, terrain, task.settings.ground)
+    return PointEvidence(
+        x_mm=x,
+        y_mm=y,
+        z_mm=z,
+        height_mm=height_above(x, y, z, around.elevation_mm, around.column0, around.row0),
+        rise_mm=-height_above(x, y, np.zeros_like(z), terrain.slope_mm, around.column0, around.row0),
+        ground=ground,
+        building=_in_buildings(task, points, window),
+        outlier=~dense_enough(x, y, z, task.settings.outliers),
+        echoes=points.return_count > 1,
+    )
+
+
+def terrain_around(around: Surroundings) -> Terrain:
+    """The mosaic of the tiles' terrain as one."""
+    return Terrain(
+        elevation_mm=around.elevation_mm,
+        slope_mm=slopes_of(around.elevation_mm),
+        measured=around.elevation_mm != NO_DATA,
+        column0=around.column0,
+        row0=around.row0,
+    )
+
+
+def _in_buildings(task: LabelTask, points: WindowPoints, window: Window) -> BoolArray:
+    """Mask of the points that a candidate holds."""
+    pieces = []
+    for part in task.buildings:
+        stored = task.scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
+        records = np.array(stored[part.start : part.stop])
+        pieces.append(records[window.contains(records["x"], records["y"])])
+    records = np.concatenate(pieces) if pieces else np.empty(0, POINT)
+    at = index_of_each(points.x_mm, points.y_mm, points.z_mm, points.return_number, *_places(records))
+    inside: BoolArray = at >= 0
+    return inside
+
+
+def _places(
+    records: npt.NDArray[np.void],
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64], ByteArray]:
+    """Coordinates and return numbers of records, each in one piece."""
+    return (
+        np.ascontiguousarray(records["x"]),
+        np.ascontiguousarray(records["y"]),
+        records["z"].astype(np.int64),
+        np.ascontiguousarray(records["return_number"]),
+    )
+
+
+def _believed(found: ByteArray, own: ByteArray, classes: ClassesInUse) -> ByteArray:
+    """The classes, those of the file where they are believed."""
+    labels = found.copy()
+    if classes.ground:
+        labels[own == GROUND_CLASS] = PointClass.GROUND
+    if classes.building:
+        labels[own == BUILDING_CLASS] = PointClass.BUILDING
+    return labels

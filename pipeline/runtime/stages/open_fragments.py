@@ -1,0 +1,187 @@
+"""What of a tile's fragments a join over tiles can need; the rest is finished where it is found.
+
+A fragment without a facet that another tile may see is a whole surface: closed. It is judged in its tile. Levels unite
+along steps, so what belongs together is connected by facets of neighbouring tiles and by steps beside roofs. Of a set
+that is connected in its tile and has nothing open, candidates and rejected objects are known at once. Open fragments,
+and the closed ones that steps connect with them, are handed on:
+
+- no ground, which is neither judged nor listed nor united;
+- of steps their identity only: which surfaces lie along one;
+- no closed surface that is no candidate and may not join one: it leads nothing and follows nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.kernels.union_find import united
+from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
+from pipeline.runtime.stages.border_facets import facet_names, telling_facets
+from pipeline.runtime.stages.finished_surfaces import Finished, finished
+from pipeline.terrain.candidates import SOLID, CandidateSettings, Fault, Surfaces, judge_surfaces, may_join
+from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.surfaces import Fragments, SurfaceSettings
+from pipeline.tiling import Tile, TileGrid
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BorderFacets:
+    """Facets by which the fragments of several tiles find each other."""
+
+    names: npt.NDArray[np.uint64]
+    """(j, 2) uint64, as of `facet_names`."""
+    holders: LabelArray
+    """(j,) int32, the fragment or step that holds each."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TileSurfaces:
+    """The surfaces of one tile, by columns: those that are finished, and k fragments that wait for other tiles."""
+
+    done: Finished
+    """Of what no other tile can change; its tiles are numbered 0."""
+    kind: KindArray
+    """(k,) int8, FacetKind: OBJECT, BUILDING or CROWN."""
+    sums: IntArray
+    """(k, N_SUMS) int64, columns as in Sum."""
+    boxes_mm: IntArray
+    """(k, 4) int64, xmin, ymin, xmax, ymax; xmin > xmax where no facet is owned."""
+    lowest_point_mm: IntArray
+    """(k, 3) int64, smallest assigned point; NOWHERE where there is none."""
+    ranges: IntArray
+    """(k, 2) int64, start and stop of each one's points in the tile's sorted points; equal where there are none."""
+    facets: BorderFacets
+    """Of the fragments."""
+    steps: int
+    """How many steps lie along them or cross the tile's border."""
+    step_facets: BorderFacets
+    """Of the steps."""
+    along_steps: LabelArray
+    """(s, 2) int32, fragment and step; one row a pair."""
+
+
+def open_fragments(
+    fragments: Fragments,
+    keys: IntArray,
+    starts: IntArray,
+    tile: Tile,
+    grid: TileGrid,
+    cut: SurfaceSettings,
+    settings: CandidateSettings,
+) -> TileSurfaces:
+    """Finish what a tile can, and keep of its other fragments what a join needs.
+
+    Parameters
+    ----------
+    fragments : Fragments
+        All fragments of the tile.
+    keys : (n,) int64
+        Fragments with points, ascending.
+    starts : (n + 1,) int64
+        Where the points of each start in the tile's sorted points.
+    tile, grid : Tile, TileGrid
+        The tile and its lattice.
+    cut : SurfaceSettings
+        Those that the fragments were made with.
+    settings : CandidateSettings
+        What makes a surface a candidate.
+    """
+    kind, count = fragments.kind, len(fragments.kind)
+    opened, holders, names = _told_facets(fragments, tile, grid, cut)
+    is_open = np.zeros(count, np.bool_)
+    is_open[opened] = True
+    solid, step = np.isin(kind, SOLID), kind == FacetKind.STEP
+    pairs = _linking_pairs(fragments, is_open, settings)
+    piece = united(count, pairs[:, 0], pairs[:, 1])
+    waits = np.zeros(count, np.bool_)
+    waits[piece[is_open]] = True
+    waits = waits[piece]
+    linked = np.zeros(count, np.bool_)
+    linked[pairs.ravel()] = True
+    # a step that nothing lies along here matters only where it holds several facets together, for other tiles
+    facets_of = np.bincount(holders, minlength=count)
+    kept_steps = step & waits & (linked | (facets_of > 1))
+    kept = solid & waits
+    ranges = np.zeros((count, 2), np.int64)
+    ranges[keys, 0], ranges[keys, 1] = starts[:-1], starts[1:]
+    pair_waits = waits[pairs[:, 0]]
+    chosen = np.flatnonzero(kept)
+    return TileSurfaces(
+        done=_finished(fragments, solid & ~waits, pairs[~pair_waits], ranges, settings),
+        kind=kind[chosen],
+        sums=fragments.sums[chosen],
+        boxes_mm=fragments.boxes_mm[chosen],
+        lowest_point_mm=fragments.lowest_point_mm[chosen],
+        ranges=ranges[chosen],
+        facets=_held_by(kept, holders, names),
+        steps=int(kept_steps.sum()),
+        step_facets=_held_by(kept_steps, holders, names),
+        along_steps=np.column_stack(
+            (_numbers(kept)[pairs[pair_waits, 0]], _numbers(kept_steps)[pairs[pair_waits, 1]])
+        ).astype(np.int32),
+    )
+
+
+def _numbers(mask: BoolArray) -> IntArray:
+    """The place of each set element among those that are set."""
+    return np.cumsum(mask, dtype=np.int64) - 1
+
+
+def _held_by(kept: BoolArray, holders: IntArray, names: npt.NDArray[np.uint64]) -> BorderFacets:
+    """The facets of the fragments that are kept, with these numbered anew."""
+    held = kept[holders]
+    return BorderFacets(names=names[held], holders=_numbers(kept)[holders[held]].astype(np.int32))
+
+
+def _told_facets(
+    fragments: Fragments, tile: Tile, grid: TileGrid, cut: SurfaceSettings
+) -> tuple[IntArray, IntArray, npt.NDArray[np.uint64]]:
+    """Fragments that another tile may see; and of the facets that have to be told their fragments and names."""
+    kinds = fragments.kind[fragments.crossing_fragment]
+    above = np.flatnonzero(kinds != FacetKind.GROUND)
+    keys = fragments.crossing_keys[above]
+    holders = fragments.crossing_fragment[above].astype(np.int64)
+    names = facet_names(keys)
+    seen, told = telling_facets(keys, names, kinds[above], tile, grid, cut)
+    return np.unique(holders[seen]), holders[told], names[told]
+
+
+def _linking_pairs(fragments: Fragments, is_open: BoolArray, settings: CandidateSettings) -> IntArray:
+    """Pairs (s, 2) of a surface that may lead or join along a step, as far as the tile can know, and the step."""
+    count = len(fragments.kind)
+    may_link = is_open & np.isin(fragments.kind, (FacetKind.OBJECT, FacetKind.BUILDING))
+    beside = np.zeros(count, np.bool_)
+    beside[fragments.along_steps[:, 0]] = True
+    closed = np.flatnonzero(beside & ~is_open)
+    surfaces = _surfaces(fragments, closed, np.empty((0, 2), np.int64))
+    faults = judge_surfaces(surfaces, settings)
+    may_link[closed] = (faults == Fault.NONE) | may_join(surfaces.kind, surfaces.sums, faults, settings)
+    rows = fragments.along_steps[may_link[fragments.along_steps[:, 0]], :2]
+    pairs = np.unique(rows[:, 0] * count + rows[:, 1])
+    return np.column_stack((pairs // max(1, count), pairs % max(1, count)))
+
+
+def _surfaces(fragments: Fragments, chosen: IntArray, pairs: IntArray) -> Surfaces:
+    """Some fragments as whole surfaces; `pairs` by their place among those chosen."""
+    return Surfaces(
+        kind=fragments.kind[chosen],
+        sums=fragments.sums[chosen],
+        boxes_mm=fragments.boxes_mm[chosen],
+        lowest_point_mm=fragments.lowest_point_mm[chosen],
+        along_steps=pairs,
+    )
+
+
+def _finished(
+    fragments: Fragments, closed: BoolArray, pairs: IntArray, ranges: IntArray, settings: CandidateSettings
+) -> Finished:
+    """Candidates and rejected objects of closed surfaces; `pairs` of these and steps."""
+    chosen = np.flatnonzero(closed)
+    number = _numbers(closed)
+    held = np.flatnonzero(closed & (ranges[:, 1] > ranges[:, 0]))
+    own = np.column_stack((number[held], np.zeros(len(held), np.int64), ranges[held]))
+    along = np.column_stack((number[pairs[:, 0]], pairs[:, 1]))
+    return finished(_surfaces(fragments, chosen, along), own, settings)

@@ -1,0 +1,103 @@
+"""Units: a candidate in which several buildings touch becomes one candidate a unit, as the end of the join.
+
+A task sees all points of its candidates, whichever tiles they lie in, so the outcome does not depend on the tiles. The
+points of a divided candidate are stored again, sorted by unit, tile by tile: a range still lies in the tile it names.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.stages.grouping import in_groups
+from pipeline.runtime.stages.join import CandidateSite, PointRange, object_id
+from pipeline.terrain.units import UnitSettings, smallest_points, units_of
+from pipeline.tiling import Tile, TileGrid
+
+_POINTS_PER_TASK = 50_000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class UnitTask:
+    """Some candidates for one task."""
+
+    sites: tuple[CandidateSite, ...]
+    """The candidates."""
+    settings: UnitSettings
+    """What separates units."""
+    grid: TileGrid
+    """The lattice, for the owners."""
+    scratch: Scratch
+    """Where the points are, and where those of units go."""
+    crs_name: str
+    """Goes into the ids."""
+
+
+def unit_tasks(
+    sites: Sequence[CandidateSite], settings: UnitSettings, grid: TileGrid, scratch: Scratch, crs_name: str
+) -> list[UnitTask]:
+    """Group candidates to tasks of some tenths of a second each."""
+    groups = in_groups(((site, site.points) for site in sites), _POINTS_PER_TASK)
+    return [
+        UnitTask(sites=tuple(group), settings=settings, grid=grid, scratch=scratch, crs_name=crs_name)
+        for group in groups
+    ]
+
+
+def divide(task: UnitTask) -> tuple[CandidateSite, ...]:
+    """The units of some candidates; those that are one unit stay as they are.
+
+    Raises
+    ------
+    RunCancelledError
+        The run was called off.
+    """
+    found: list[CandidateSite] = []
+    for site in task.sites:
+        task.scratch.check_cancelled()
+        found.extend(_units_of_site(site, task))
+    return tuple(found)
+
+
+def _units_of_site(site: CandidateSite, task: UnitTask) -> list[CandidateSite]:
+    by_tile: dict[Tile, list[npt.NDArray[np.void]]] = {}
+    for part in site.ranges:
+        stored = task.scratch.array(f"{part.folder}/{part.tile.key}", "points", mapped=True).view(POINT)
+        by_tile.setdefault(part.tile, []).append(np.array(stored[part.start : part.stop]))
+    tiles = sorted(by_tile)
+    pieces = [np.concatenate(by_tile[tile]) for tile in tiles]
+    if not pieces:
+        return [site]
+    points = np.concatenate(pieces)
+    x, y, z = points["x"].astype(np.int64), points["y"].astype(np.int64), points["z"].astype(np.int64)
+    unit = units_of(x, y, z, task.settings)
+    count = int(unit.max(initial=0)) + 1
+    if count == 1:
+        return [site]
+    firsts = smallest_points(x, y, z, unit)
+    ranges: list[list[PointRange]] = [[] for _ in range(count)]
+    folder = f"units/{site.building_id}"
+    start = 0
+    for tile, piece in zip(tiles, pieces, strict=True):
+        own = unit[start : start + len(piece)]
+        start += len(piece)
+        by_unit = np.argsort(own, kind="stable")
+        task.scratch.put_arrays(f"{folder}/{tile.key}", {"points": piece[by_unit].view(np.uint8)})
+        borders = np.searchsorted(own[by_unit], np.arange(count + 1)).tolist()
+        for k in range(count):
+            if borders[k] < borders[k + 1]:
+                ranges[k].append(PointRange(tile=tile, start=borders[k], stop=borders[k + 1], folder=folder))
+    return [
+        CandidateSite(
+            building_id=object_id(task.crs_name, (int(x[first]), int(y[first]), int(z[first]))),
+            owner=task.grid.tile_of(int(x[first]), int(y[first])),
+            ranges=tuple(ranges[k]),
+            points=sum(part.stop - part.start for part in ranges[k]),
+            block=site.building_id,
+        )
+        for k, first in enumerate(firsts.tolist())
+    ]

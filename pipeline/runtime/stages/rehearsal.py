@@ -1,0 +1,64 @@
+"""Loading what the stages need by running them once, over some made-up houses: libraries and compiled kernels.
+
+For a process from which others are forked: what is loaded there is loaded once for all of them.
+"""
+
+from __future__ import annotations
+
+import tempfile
+
+import numpy as np
+import shapely
+
+from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.stages.join import join
+from pipeline.runtime.stages.reconstruct_tasks import divide, unit_tasks
+from pipeline.runtime.stages.split import SplitTask, split
+from pipeline.runtime.stages.tile_content import zone_sums
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse, SceneSettings
+from pipeline.tiling import MM, Tile, TileGrid
+
+_SIDE_M = 24
+_HOUSES = ((4, 10), (14, 20))
+"""From where to where they stand, in both directions, metres."""
+
+
+def rehearse_scene(outlines: str = "") -> None:
+    """Split, join and divide a tile with houses, its classes known.
+
+    Parameters
+    ----------
+    outlines : str
+        `given` where footprints tell where the houses are: then the tile is split alone.
+    """
+    footprints = tuple(shapely.box(low, low, high, high) for low, high in _HOUSES) if outlines else None
+    steps = np.arange(500, _SIDE_M * MM, 1000)
+    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
+    points = np.zeros(len(x), POINT)
+    points["x"], points["y"], points["classification"] = x, y, GROUND_CLASS
+    points["return_number"] = points["return_count"] = 1
+    for low, high in _HOUSES:
+        inside = (x > low * MM) & (x < high * MM) & (y > low * MM) & (y < high * MM)
+        points["z"][inside], points["classification"][inside] = 6 * MM, BUILDING_CLASS
+    settings, tile = SceneSettings(), Tile(0, 0)
+    grid = TileGrid(size_mm=_SIDE_M * MM, halo_mm=MM, origin_x_mm=0, origin_y_mm=0)
+    core = grid.core(tile)
+    bits = np.ascontiguousarray(points["gps_time"]).view(np.uint64)
+    zone_sums(points, bits, core.x0_mm, core.y0_mm, core.x1_mm, core.y1_mm, grid.halo_mm)
+    with tempfile.TemporaryDirectory(prefix="gablework-rehearsal-") as folder:
+        scratch = Scratch(folder)
+        points.tofile(scratch.path("points", tile.key, "made-up.bin"))
+        task = SplitTask(
+            tile=tile,
+            grid=grid,
+            settings=settings,
+            classes=ClassesInUse(ground=True, building=True),
+            scratch=scratch,
+            footprints=footprints,
+        )
+        found = split(task)
+        if footprints is not None:
+            return
+        joined = join([found], grid, settings.candidates, "")
+        for units in unit_tasks(joined.candidates, settings.units, grid, scratch, ""):
+            divide(units)
