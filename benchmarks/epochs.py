@@ -48,7 +48,7 @@ EXPECTED: Mapping[Work | None, Change] = {
 """What is to be told of a building, by what was done to it."""
 MISSED = "missed"
 """Of a building over which no row lies."""
-_LEAST_SHARE = 0.5
+_MIN_SHARE = 0.5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,7 +128,7 @@ def judged(epochs: TwoEpochs, changes: Path) -> Found:
         footprint = shapely.transform(building.footprint, lambda xy: xy + origin)
         near = tree.query(footprint, predicate="intersects")
         common = shapely.area(shapely.intersection(geometries[near], footprint))
-        over = near[common >= _LEAST_SHARE * np.minimum(areas[near], footprint.area)].tolist()
+        over = near[common >= _MIN_SHARE * np.minimum(areas[near], footprint.area)].tolist()
         work = epochs.works.get(name)
         for place in over:
             true_of[place].add(EXPECTED[work])

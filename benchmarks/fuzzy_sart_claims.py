@@ -140,7 +140,7 @@ def right(roof: SyntheticRoof, found: Segmentation) -> bool:
 def with_absorption(settings: FuzzySartSettings, absorption: str) -> FuzzySartSettings:
     """Settings that keep absorbed points in their facet (bucket), insert them there (insert), or absorb none."""
     if absorption == "none":
-        return dataclasses.replace(settings, absorption="bucket", absorption_min_m=0.0, absorption_max_m=0.0)
+        return dataclasses.replace(settings, absorption="bucket", min_absorption_m=0.0, max_absorption_m=0.0)
     return dataclasses.replace(settings, absorption=absorption)
 
 
@@ -273,13 +273,13 @@ def scaling(sample: Sample) -> list[Table]:
         for density in (DENSITIES_PER_M2[0], DENSITIES_PER_M2[-1]):
             rows: Rows = []
             for name, (vectors, lowest) in SCALES.items():
-                chosen = dataclasses.replace(settings, vectors="spherical_scaled", vigilance=0.7, scaled_minimum=lowest)
+                chosen = dataclasses.replace(settings, vectors="spherical_scaled", vigilance=0.7, scaled_min=lowest)
                 rows.append([name, *vector_row(sample, HOUSES, density, chosen, vectors=vectors)])
             caption = f"TIN and refinement of {preset}; {density:g} points a m2, {NOISE_M:g} m of noise."
             tables.append(Table(caption=caption, header=["r, theta, phi", *VECTOR_HEADER], rows=rows))
     rows = []
     for name, (vectors, lowest) in SCALES.items():
-        chosen = dataclasses.replace(PRESETS["faithful"], scaled_minimum=lowest)
+        chosen = dataclasses.replace(PRESETS["faithful"], scaled_min=lowest)
         rows.append([name, *weights(sample, HOUSES, DENSITIES_PER_M2[0], chosen, vectors)])
     caption = (
         f"What decides: rank correlation of 1 - VDM with the difference in a dimension; {DENSITIES_PER_M2[0]:g} a m2."

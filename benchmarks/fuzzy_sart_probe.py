@@ -329,10 +329,10 @@ def unscaled_spherical(angle_unit: float) -> Vectors:
     """In place of `facet_vectors`: (r, theta, phi) as they are, metres and multiples of an angle in radians."""
 
     def vectors(
-        kind: str, normals: FloatArray, centroids: FloatArray, centre: FloatArray, *, scaled_minimum: float = 0.0
+        kind: str, normals: FloatArray, centroids: FloatArray, centre: FloatArray, *, scaled_min: float = 0.0
     ) -> FloatArray:
         with mock.patch.object(clustering, "_to_one_range", lambda values, _: values):
-            spherical = facet_vectors(kind, normals, centroids, centre, scaled_minimum=scaled_minimum)
+            spherical = facet_vectors(kind, normals, centroids, centre, scaled_min=scaled_min)
         return spherical * (1.0, 1.0 / angle_unit, 1.0 / angle_unit)
 
     return vectors

@@ -33,8 +33,8 @@ FIRST_SEED = {"dev": 1_000, "test": 90_000}
 REQUIRED = {0.03: 0.98, 0.05: 0.98, 0.10: 0.90}
 NORMAL_LIMIT_DEG = 5.0
 OFFSET_LIMIT_M = 0.3
-LEAST_AREA_M2 = 10.0
-LEAST_POINTS = 11
+MIN_AREA_M2 = 10.0
+MIN_POINTS = 11
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -124,7 +124,7 @@ def all_planes_right(roof: SyntheticRoof, found: Segmentation) -> tuple[bool, bo
             if _agree(truth, np.array(plane.coefficients), roof.candidate.points[roof.labels == t]):
                 matched_true.add(t)
                 matched_found.add(f)
-    least = max(LEAST_POINTS, LEAST_AREA_M2 * roof.density_per_m2)
+    least = max(MIN_POINTS, MIN_AREA_M2 * roof.density_per_m2)
     right = all(t in matched_true for t in range(len(roof.planes)) if true_size[t] >= least)
     right &= all(f in matched_found for f in range(count) if found_size[f] >= least)
     return right, len(matched_true) == len(matched_found) == count == len(roof.planes)

@@ -57,7 +57,7 @@ CITY_DENSITIES = (1.0, 4.0, 12.0)
 CITY_SIZE_M = (200.0, 200.0)
 
 _TOUCH_M = 0.3
-_LEAST_WALL_M = 5.0
+_MIN_WALL_M = 5.0
 _STEP_M = 0.5
 _REACH_M = 1.2
 _END_M = 0.7
@@ -172,7 +172,7 @@ def walls_of(
             corners = shapely.get_coordinates(ring)
             for start, end in itertools.pairwise(corners):
                 length = math.dist(start, end)
-                if length < _LEAST_WALL_M:
+                if length < _MIN_WALL_M:
                     continue
                 asked += length
                 wall = _wall(start, end, length, border, pulses)

@@ -310,7 +310,7 @@ def _alone_s(trace: Mapping[str, Any], stage: str) -> float:
 
 
 def _driver_costs(
-    trace: Mapping[str, Any], costs: Mapping[str, Any], least_s: float, scheduler_s: float
+    trace: Mapping[str, Any], costs: Mapping[str, Any], min_s: float, scheduler_s: float
 ) -> dict[str, float]:
     """What a task of each stage costs the driver, from its CPU time in that stage.
 
@@ -320,7 +320,7 @@ def _driver_costs(
     tasks = own_times(trace, "cpu_s")
     lines = [line for line in trace["diary"] if is_mark(line)]
     idle = costs["tasks"][0]["scheduler_idle_share"]
-    found = dict.fromkeys(STAGES, least_s)
+    found = dict.fromkeys(STAGES, min_s)
     # what comes behind the last result is the digest's
     last = {line["stage"]: line for line in trace["diary"] if line["kind"] == "progress"}
     for line, after in itertools.pairwise(lines):
@@ -330,7 +330,7 @@ def _driver_costs(
             own_s = after["cpu_s"] - line["cpu_s"] - idle * (after["at_s"] - line["at_s"])
             if line["stage"] == "join":
                 own_s -= _alone_s(trace, "join")
-            found[line["stage"]] = max(least_s, own_s / count - scheduler_s)
+            found[line["stage"]] = max(min_s, own_s / count - scheduler_s)
     return found
 
 
@@ -452,7 +452,7 @@ def curves(engine: Engine, wanted: argparse.Namespace) -> dict[tuple[int, str], 
     return found
 
 
-def most_workers(run_with: Callable[[int], Outcome], least: float, limit: int) -> int:
+def max_workers(run_with: Callable[[int], Outcome], least: float, limit: int) -> int:
     """The largest number of workers, up to a limit, at which the efficiency is still as large as wanted; by halves."""
     low, high = 0, limit
     while high - low > max(1, low // 20):
@@ -476,7 +476,7 @@ def changes_table(engine: Engine, buildings: int, workers: int, storage_bytes_s:
         def run_with(count: int, change: Change = change) -> Outcome:
             return city_run(engine, buildings, max(count, change.drivers), change, storage_bytes_s)
 
-        most = str(most_workers(run_with, REQUIRED, 1000))
+        most = str(max_workers(run_with, REQUIRED, 1000))
         rows.append([label, *outcome_cells(found), most])
     return markdown_table(
         ["change", "wall, min", "efficiency", "driver at work", "scheduler at work", "workers at which it is 0.8"],

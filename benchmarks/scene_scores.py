@@ -56,7 +56,7 @@ def candidate_outline(candidate: Candidate, settings: RoofSettings) -> Polygon |
         return None
     x, y, _ = candidate.origin
     parts = [shapely.transform(part, lambda xy: xy / 1e3 + (x, y)) for part in polygons_of(outline_mm)]
-    large = [part for part in parts if part.area >= settings.minimum_part_area_m2]
+    large = [part for part in parts if part.area >= settings.min_part_area_m2]
     kept = large or sorted(parts, key=lambda part: -part.area)[:1]
     if not kept:
         return None
@@ -113,15 +113,15 @@ class DetectionScore:
     """Those models."""
 
 
-def detection_score(found: Detection, least_m2: float = OBJECT_M2) -> DetectionScore:
+def detection_score(found: Detection, min_m2: float = OBJECT_M2) -> DetectionScore:
     """The figures of a detection."""
     totals = {
         name: sum(getattr(block, name) for block in found.blocks)
         for layer in ("", "_without_ring")
         for name in (f"both{layer}", f"reference{layer}", f"found{layer}")
     }
-    all_wanted = [row for row in found.buildings if row.area_m2 >= least_m2]
-    all_made = [row for row in found.models if row.area_m2 >= least_m2]
+    all_wanted = [row for row in found.buildings if row.area_m2 >= min_m2]
+    all_made = [row for row in found.models if row.area_m2 >= min_m2]
     wanted, made = [row for row in all_wanted if row.counts], [row for row in all_made if row.counts]
     return DetectionScore(
         completeness=_ratio(totals["both"], totals["reference"]),

@@ -69,7 +69,7 @@ def steps_of(candidate: Candidate) -> Steps:
     described = describe_planes(top.points, planes, labels)
     ground_z_m = candidate.ground_z_m - float(shift[2])
     fit = fit_gable(
-        top.points, labels, (described[0], described[1]), ground_z_m, least_side_share=settings.least_side_share
+        top.points, labels, (described[0], described[1]), ground_z_m, min_side_share=settings.min_side_share
     )
     return Steps(candidate=candidate, shift=shift, top=top, labels=labels, planes=described, fit=fit)
 
@@ -81,13 +81,13 @@ def picked(candidates: Iterator[Candidate], arguments: argparse.Namespace) -> tu
         robust = reconstruct_building(candidate, "kmeans", ReconstructSettings())
         if robust.roof_type is not RoofType.GABLE or robust.status is not Status.OK or robust.footprint is None:
             continue
-        if not arguments.least_area <= robust.footprint.area <= arguments.most_area:
+        if not arguments.min_area <= robust.footprint.area <= arguments.most_area:
             continue
         faithful = ReconstructSettings(method=METHODS["kmeans"].preset("faithful"))
         result = reconstruct_building(candidate, "kmeans", faithful)
         if result.status is not Status.OK or result.roof_type is not RoofType.GABLE:
             continue
-        if min(plane.slope_deg for plane in result.planes) < arguments.least_slope:
+        if min(plane.slope_deg for plane in result.planes) < arguments.min_slope:
             continue
         sides = steps_of(candidate).fit.symmetric
         if sides[0].length_m > arguments.most_elongated * 2.0 * sides[0].width_m:

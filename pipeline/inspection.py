@@ -19,9 +19,9 @@ RAISED_M = 2.5
 """Cells this far above the lowest surroundings count as raised."""
 SURROUNDINGS_M = 40.0
 """Side of the square in which the lowest surroundings are sought: wider than most buildings."""
-LEAST_AREA_M2 = 10.0
+MIN_AREA_M2 = 10.0
 """Smaller groups of raised cells are not counted."""
-MOST_CELLS = 4_000_000
+MAX_CELLS = 4_000_000
 """Bounds the raster's memory: a larger tile gets coarser cells."""
 _CORES = 2
 """For which the time is estimated."""
@@ -158,7 +158,7 @@ class _Raster:
     def __init__(self, info: SourceInfo) -> None:
         x0, y0, _, x1, y1, _ = info.bounds_m
         area = max((x1 - x0) * (y1 - y0), 1.0)
-        self.cell_m = max(1.0, math.sqrt(area / MOST_CELLS))
+        self.cell_m = max(1.0, math.sqrt(area / MAX_CELLS))
         self._x0, self._y0 = x0, y0
         self._columns = int((x1 - x0) / self.cell_m) + 1
         self._rows = int((y1 - y0) / self.cell_m) + 1
@@ -195,4 +195,4 @@ class _Raster:
         if n == 0:
             return 0
         areas = np.bincount(labels.ravel())[1:] * self.cell_m**2
-        return int(np.count_nonzero(areas >= LEAST_AREA_M2))
+        return int(np.count_nonzero(areas >= MIN_AREA_M2))

@@ -51,7 +51,7 @@ class Reason(StrEnum):
 
 
 REASONS: Mapping[Reason, str] = {
-    Reason.TOO_FEW_POINTS: "fewer points than a plane needs; or fewer than `minimum_points`, of which the model "
+    Reason.TOO_FEW_POINTS: "fewer points than a plane needs; or fewer than `min_points`, of which the model "
     "explains less than three quarters",
     Reason.NO_PLANE: "no plane passed the refinement",
     Reason.NO_PARTITION: "the planes could not be turned into roof faces",

@@ -50,7 +50,7 @@ from pipeline.roof.primitives import primitive_partition
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.solid import SolidPart, solid_parts
-from pipeline.roof.templates import MOST_POINTS, RankedFaces, Templates, fit_templates, margin_of_templates
+from pipeline.roof.templates import MAX_POINTS, RankedFaces, Templates, fit_templates, margin_of_templates
 from pipeline.roof.voids import without_voids
 
 __all__ = ["ReconstructSettings", "failed_building", "reconstruct_building"]
@@ -119,7 +119,7 @@ def _reconstruct(
         roof = dataclasses.replace(bare, labels=segmentation.labels[bare.index])
         forms: Iterable[_Form]
         if lack is not None:
-            if not is_arranged or len(roof.points) > MOST_POINTS:
+            if not is_arranged or len(roof.points) > MAX_POINTS:
                 raise lack
             forms = _template_forms(roof, lack, settings.roof)
         elif segmentation.faces is not None:
@@ -134,14 +134,14 @@ def _reconstruct(
             is_primitive=segmentation.faces is not None,
         )  # fmt: skip
         if parts:
-            few = len(roof.points) < settings.roof.minimum_points
+            few = len(roof.points) < settings.roof.min_points
             unlikely = few or (lack is not None and roof.spacing_m < settings.roof.templates_spacing_m)
             share = _explained_share(roof, parts, planes, settings.plan.residual_cap_m) if unlikely else 1.0
             if share < _FEW_EXPLAINED:
                 if lack is not None and not few:
                     raise lack
                 told = f"{share:.0%} of {len(roof.points)} roof points lie on a roof, less than {_FEW_EXPLAINED:.0%}"
-                fewest = f"where there are fewer than minimum_points = {settings.roof.minimum_points}"
+                fewest = f"where there are fewer than min_points = {settings.roof.min_points}"
                 return failed_building(candidate, method, Reason.TOO_FEW_POINTS, f"{told}, {fewest}")
             deliver = partial(_result, candidate, method, settings, roof=roof, status=Status.OK, bic_margin=margin)
             own_type = segmentation.roof_type
@@ -227,7 +227,7 @@ def _best_forms(
 ) -> tuple[tuple[_Form, ...], tuple[_Form, ...]]:
     """The arrangement within an outline, and where points are few the templates: what goes first, what last."""
     arranged = partial(arranged_faces, roof, planes, outline_mm, settings.plan)
-    if roof.spacing_m < settings.roof.templates_spacing_m or len(roof.points) > MOST_POINTS:
+    if roof.spacing_m < settings.roof.templates_spacing_m or len(roof.points) > MAX_POINTS:
         return (arranged,), ()
     return _ranked_forms(roof, planes, outline_mm, arranged)
 
@@ -321,7 +321,7 @@ def _own_solids(
                 level, own_planes = level_unsupported_faces(drawn, labelled, own_planes, candidate.ground_z_m, settings)
                 is_levelled = _is_much_changed(drawn, level)
                 drawn = level
-            parts = large_parts(solid_parts(drawn, own_planes, candidate.ground_z_m), settings.minimum_part_area_m2)
+            parts = large_parts(solid_parts(drawn, own_planes, candidate.ground_z_m), settings.min_part_area_m2)
             if is_primitive:
                 parts = [unite_flush_walls(part) for part in parts]
         except (BuildingError, shapely.errors.GEOSException):
@@ -360,9 +360,9 @@ def _stays_near(parts: Sequence[SolidPart], roof: RoofPoints) -> bool:
     return True
 
 
-def large_parts(parts: list[SolidPart], minimum_area_m2: float) -> list[SolidPart]:
+def large_parts(parts: list[SolidPart], min_area_m2: float) -> list[SolidPart]:
     """The parts that are large enough, or the largest one."""
-    large = [part for part in parts if part.footprint.area >= minimum_area_m2]
+    large = [part for part in parts if part.footprint.area >= min_area_m2]
     return large or sorted(parts, key=lambda part: -part.footprint.area)[:1]
 
 
@@ -385,7 +385,7 @@ def _block(
     if hull is not None:
         outlines.append(MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))]))
     for footprint in outlines:
-        for form in block_forms(footprint, plane, candidate.ground_z_m, tolerance, settings.minimum_part_area_m2):
+        for form in block_forms(footprint, plane, candidate.ground_z_m, tolerance, settings.min_part_area_m2):
             try:
                 parts = form()
             except (BuildingError, shapely.errors.GEOSException):

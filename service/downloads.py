@@ -31,7 +31,7 @@ LONGEST_PAUSE_S = 60.0
 PASSING = frozenset({408, 425, 429, 500, 502, 503, 504})
 """Status codes after which another try may help."""
 REDIRECTS = frozenset({301, 302, 303, 307, 308})
-MOST_REDIRECTS = 3
+MAX_REDIRECTS = 3
 CONNECT_S = 10.0
 READ_S = 30.0
 """Seconds without a byte after which a server is taken for silent."""
@@ -159,7 +159,7 @@ def _check_cancelled(cancelled: Cancel) -> None:
 def _try(client: httpx.Client, url: httpx.URL, path: Path, settings: ServiceSettings, cancelled: Cancel) -> str:
     """One try: follow redirects within the list, stream the body to the file; its SHA-256."""
     try:
-        for _ in range(MOST_REDIRECTS + 1):
+        for _ in range(MAX_REDIRECTS + 1):
             _check_cancelled(cancelled)
             with client.stream("GET", url, headers={"Accept-Encoding": "identity"}) as response:
                 if response.status_code not in REDIRECTS:
@@ -171,7 +171,7 @@ def _try(client: httpx.Client, url: httpx.URL, path: Path, settings: ServiceSett
         raise _PassingError(f"the server does not answer ({type(fault).__name__})", None) from fault
     except (httpx.HTTPError, httpx.InvalidURL) as fault:
         raise UnreadableInputError(shown(url), f"cannot be fetched ({fault})", "Check the URL") from fault
-    raise UnreadableInputError(shown(url), f"redirects more than {MOST_REDIRECTS} times", "Give the last URL")
+    raise UnreadableInputError(shown(url), f"redirects more than {MAX_REDIRECTS} times", "Give the last URL")
 
 
 def _check_answer(url: httpx.URL, response: httpx.Response) -> None:

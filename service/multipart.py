@@ -40,21 +40,21 @@ class Part:
             else:
                 yield data
 
-    async def text(self, most_bytes: int) -> str:
+    async def text(self, max_bytes: int) -> str:
         """The content as text.
 
         Raises
         ------
         TooLargeError
-            It is longer than `most_bytes`.
+            It is longer than `max_bytes`.
         RequestError
             It is no UTF-8.
         """
         held = bytearray()
         async for chunk in self.chunks():
             held += chunk
-            if len(held) > most_bytes:
-                raise TooLargeError(f"the field {self.name[:80]!r} has more than {most_bytes} bytes")
+            if len(held) > max_bytes:
+                raise TooLargeError(f"the field {self.name[:80]!r} has more than {max_bytes} bytes")
         try:
             return held.decode("utf-8")
         except UnicodeDecodeError:
@@ -70,7 +70,7 @@ class Form:
         The request's body.
     content_type : str
         The request's header; names the boundary.
-    most_parts : int
+    max_parts : int
         More are refused.
 
     Raises
@@ -79,14 +79,14 @@ class Form:
         The header is none of a form.
     """
 
-    def __init__(self, stream: AsyncIterator[bytes], content_type: str, *, most_parts: int) -> None:
+    def __init__(self, stream: AsyncIterator[bytes], content_type: str, *, max_parts: int) -> None:
         kind, options = parse_options_header(content_type)
         boundary = options.get(b"boundary", b"")
         if kind != b"multipart/form-data" or not boundary:
             told = f"is {content_type[:80]!r}" if content_type else "is missing"
             raise RequestError([f"the content type {told}: send multipart/form-data with a boundary"])
         self._stream = stream
-        self._most_parts = most_parts
+        self._max_parts = max_parts
         self._field = self._value = b""
         self._headers: dict[bytes, bytes] = {}
         # headers begin a part, bytes are data of it, None ends it
@@ -121,8 +121,8 @@ class Form:
         # every part takes its own end: another one is that of the form
         while isinstance(seen := await self.following(), dict):
             count += 1
-            if count > self._most_parts:
-                raise RequestError([f"the form has more than {self._most_parts} parts"])
+            if count > self._max_parts:
+                raise RequestError([f"the form has more than {self._max_parts} parts"])
             part = Part(self, seen)
             yield part
             async for _ in part.chunks():

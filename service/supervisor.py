@@ -24,7 +24,7 @@ from service.errors import StartUpError
 from service.settings import ServiceSettings
 from service.store import JobStore
 
-LEAST_PAUSE_S = 0.5
+MIN_PAUSE_S = 0.5
 """Seconds before a driver that died is started again, the first time."""
 
 LONGEST_PAUSE_S = 30.0
@@ -51,7 +51,7 @@ def pause_s(deaths: int) -> float:
     >>> [pause_s(n) for n in (1, 2, 3, 10)]
     [0.5, 1.0, 2.0, 30.0]
     """
-    return min(LONGEST_PAUSE_S, LEAST_PAUSE_S * 2.0 ** min(deaths - 1, 10))
+    return min(LONGEST_PAUSE_S, MIN_PAUSE_S * 2.0 ** min(deaths - 1, 10))
 
 
 def environment_of(settings: ServiceSettings, inherited: Mapping[str, str]) -> dict[str, str]:

@@ -75,11 +75,11 @@ def slowly_judged(kind: int, sums: IntArray, settings: CandidateSettings) -> Ver
     sure = sure and f["canopy_share"] <= settings.max_canopy_share
     slender = f["height_m"] > settings.max_slenderness * f["width_m"]
     sure = sure and (f["area_m2"] >= settings.doubtful_area_m2 or not slender)
-    least_m2 = settings.min_area_m2
+    min_m2 = settings.min_area_m2
     if kind != FacetKind.BUILDING and not sure:
-        least_m2 = max(least_m2, settings.doubtful_area_m2)
-    if f["area_m2"] < least_m2:
-        return Verdict(reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {least_m2:g}")
+        min_m2 = max(min_m2, settings.doubtful_area_m2)
+    if f["area_m2"] < min_m2:
+        return Verdict(reason=Reason.TOO_SMALL, detail=f"area {f['area_m2']:.1f} m2, at least {min_m2:g}")
     if kind == FacetKind.BUILDING:
         return None
     if f["top_m"] < settings.min_height_m:

@@ -16,7 +16,7 @@ VerticalUnit = Annotated[
 ]
 AUTO = "auto"
 """The word for as many workers as the machine or the job wants."""
-_MOST_WORKERS = 1024
+_MAX_WORKERS = 1024
 
 
 def count_or_auto(text: str, *, least: int) -> str:
@@ -41,9 +41,9 @@ def count_or_auto(text: str, *, least: int) -> str:
     """
     if text == AUTO:
         return AUTO
-    if text.isdecimal() and least <= int(text) <= _MOST_WORKERS:
+    if text.isdecimal() and least <= int(text) <= _MAX_WORKERS:
         return str(int(text))
-    raise typer.BadParameter(f"{text!r}: use {AUTO}, or a whole number from {least} to {_MOST_WORKERS}")
+    raise typer.BadParameter(f"{text!r}: use {AUTO}, or a whole number from {least} to {_MAX_WORKERS}")
 
 
 def worker_count(text: str) -> int | None:

@@ -17,7 +17,7 @@ FLAT_BELOW_DEG = 7.0
 EAVE_WITHIN_DEG = 45.0
 """An outer edge is an eave where it faces the plane's aspect within this angle; else it is a rake or a high edge."""
 _FLAT, _FACING = math.tan(math.radians(FLAT_BELOW_DEG)), math.cos(math.radians(EAVE_WITHIN_DEG))
-_MOST_AT_ONCE = 2_000
+_MAX_AT_ONCE = 2_000
 """Levels times triangles up to which the areas below all levels at once take less time than a bisection."""
 
 
@@ -212,7 +212,7 @@ def roof_percentiles(solids: Sequence[Solid], shares: Sequence[float]) -> tuple[
     if len(area) == 0:
         return tuple(math.nan for _ in shares)
     levels = np.unique(corner_z)
-    if len(levels) * len(area) <= _MOST_AT_ONCE:
+    if len(levels) * len(area) <= _MAX_AT_ONCE:
         below = _area_below(levels, corner_z, area).tolist().__getitem__
     else:
         # a block has thousands of levels and of triangles, and their product is not needed

@@ -27,7 +27,7 @@ BLOCK_BYTES = 1 << 18
 """Read at least, and kept together."""
 BLOCKS_KEPT = 64
 """Of one file, 16 MiB."""
-MOST_AHEAD = 32
+MAX_AHEAD = 32
 """Blocks that are read at once where a file is read on and on: 8 MiB."""
 PIECE_BYTES = 1 << 24
 """Fetched by one request: what a cut connection costs at most."""
@@ -137,7 +137,7 @@ class RemoteFile:
     def _block(self, number: int) -> bytes:
         """One block, from memory or, with those that will be wanted next, from the server."""
         if number not in self._blocks:
-            self._ahead = min(2 * self._ahead, MOST_AHEAD) if number == self._next_block else 1
+            self._ahead = min(2 * self._ahead, MAX_AHEAD) if number == self._next_block else 1
             ahead = next((k for k in range(1, self._ahead) if number + k in self._blocks), self._ahead)
             begin = number * BLOCK_BYTES
             content = self._range(begin, min(begin + ahead * BLOCK_BYTES, self.stat().st_size))

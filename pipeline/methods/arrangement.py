@@ -43,10 +43,10 @@ def segment(candidate: Candidate, settings: AdaptivePlaneSettings) -> Segmentati
     points, shift = local_metres(candidate.points)
     visible = np.flatnonzero(top_visible(points))
     roof = points[visible]
-    if len(roof) < settings.least_points:
+    if len(roof) < settings.min_points:
         raise BuildingError(
             Reason.TOO_FEW_POINTS,
-            f"{len(roof)} of {len(points)} points are visible from above, least_points is {settings.least_points}",
+            f"{len(roof)} of {len(points)} points are visible from above, min_points is {settings.min_points}",
         )
     found = detect_planes(roof, point_spacing_m(roof), settings)
     labels = np.full(len(points), -1, np.int32)

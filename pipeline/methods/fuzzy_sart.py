@@ -48,11 +48,11 @@ class FuzzySartSettings(RoofFaceSettings, FuzzySartClusteringSettings, Refinemen
         "Absorbed points are kept in their facet, or inserted at its elevation (the paper's way, slower).",
         choices=("bucket", "insert"),
     )
-    absorption_min_m: float = parameter(
+    min_absorption_m: float = parameter(
         0.10, "Least distance up to which a facet absorbs points (Eq. 1).", unit="m", minimum=0.0, maximum=10.0
     )
-    absorption_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
-    absorption_max_slope_deg: float = parameter(
+    max_absorption_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
+    max_absorption_slope_deg: float = parameter(
         60.0, "Facets that are steeper absorb nothing (Eq. 2) and are no roof.", unit="deg", minimum=1.0, maximum=89.0
     )
     ground_gap_spacings: float = parameter(
@@ -61,7 +61,7 @@ class FuzzySartSettings(RoofFaceSettings, FuzzySartClusteringSettings, Refinemen
         minimum=0.0,
         maximum=100.0,
     )
-    ground_gap_min_m: float = parameter(
+    min_ground_gap_m: float = parameter(
         1.0, "Terrain samples nearer to a roof point than this count so too.", unit="m", minimum=0.01, maximum=100.0
     )
     height_rule: str = parameter(
@@ -83,10 +83,10 @@ class FuzzySartSettings(RoofFaceSettings, FuzzySartClusteringSettings, Refinemen
             vectors="spherical_scaled",
             vigilance=0.7,
             absorption="insert",
-            absorption_min_m=0.2,
-            absorption_max_m=0.2,
-            plane_distance_min_m=0.2,
-            plane_distance_max_m=0.2,
+            min_absorption_m=0.2,
+            max_absorption_m=0.2,
+            min_plane_distance_m=0.2,
+            max_plane_distance_m=0.2,
             height_rule="scene",
             split_by_connectivity=False,
             assignment="all_planes",
@@ -101,14 +101,14 @@ class FuzzySartSettings(RoofFaceSettings, FuzzySartClusteringSettings, Refinemen
 
     def absorption_distance_m(self, sigma_m: float) -> float:
         """Distance of Eq. 1 for a noise."""
-        return min(max(self.noise_factor * sigma_m, self.absorption_min_m), self.absorption_max_m)
+        return min(max(self.noise_factor * sigma_m, self.min_absorption_m), self.max_absorption_m)
 
     def insertion(self, sigma_m: float) -> GreedyInsertionSettings:
         """Settings of the TIN for a noise."""
         return GreedyInsertionSettings(
             absorption=self.absorption,
             absorption_distance_m=self.absorption_distance_m(sigma_m),
-            absorption_slope_deg=self.absorption_max_slope_deg,
+            absorption_slope_deg=self.max_absorption_slope_deg,
         )
 
 
@@ -138,10 +138,10 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     points, shift = local_metres(candidate.points)
     visible = np.flatnonzero(top_visible(points))
     roof = points[visible]
-    if len(roof) < settings.least_points:
+    if len(roof) < settings.min_points:
         raise BuildingError(
             Reason.TOO_FEW_POINTS,
-            f"{len(roof)} of {len(points)} points are visible from above, least_points is {settings.least_points}",
+            f"{len(roof)} of {len(points)} points are visible from above, min_points is {settings.min_points}",
         )
     spacing_m = point_spacing_m(roof)
     sigma_m = noise_sigma_m(roof)
@@ -149,7 +149,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     distance_m = settings.plane_distance_m(sigma_m)
 
     # 3.1: the TIN of the building with its ground; points near a facet are absorbed by it.
-    gap_m = max(settings.ground_gap_spacings * spacing_m, settings.ground_gap_min_m)
+    gap_m = max(settings.ground_gap_spacings * spacing_m, settings.min_ground_gap_m)
     ground = ground_around(candidate.ground, shift, roof, gap_m)
     building_with_ground = np.concatenate([roof, ground])
     check_extent(building_with_ground)
@@ -166,7 +166,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
         normals[can_be_roof],
         facet_centroids(greedy.vertices, facets[can_be_roof]),
         centre,
-        scaled_minimum=settings.scaled_minimum,
+        scaled_min=settings.scaled_min,
     )
     clusters = np.full(len(facets), -1, np.int32)
     clusters[can_be_roof] = cluster(vectors, areas_m2[can_be_roof], settings).labels
@@ -193,7 +193,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
 def _roof_facets(greedy: GreedyTin, normals: FloatArray, n_roof: int, settings: FuzzySartSettings) -> BoolArray:
     """Facets that may be roof: not too steep, and by the height rule."""
     facets = greedy.tin.facets
-    gentle = normals[:, 2] > np.cos(np.radians(settings.absorption_max_slope_deg))
+    gentle = normals[:, 2] > np.cos(np.radians(settings.max_absorption_slope_deg))
     if settings.height_rule == "scene":
         z_m = greedy.vertices[:, 2]
         return np.asarray(gentle & facets_above_z_avg(z_m, facets, wall_height_m=settings.wall_height_m))

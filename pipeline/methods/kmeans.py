@@ -46,7 +46,7 @@ from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
 from pipeline.segmentation.surrounding_ground import far_from
 from pipeline.tin.delaunay import triangulate, unique_xy
 
-_LEAST_FACETS = 3
+_MIN_FACETS = 3
 """Fewer facets are no two groups."""
 
 
@@ -82,7 +82,7 @@ class KMeansSettings(RoofFaceSettings, NormalClusteringSettings, RefinementSetti
         minimum=0.0,
         maximum=45.0,
     )
-    least_plane_share: float = parameter(
+    min_plane_share: float = parameter(
         0.1,
         "An unrefined cluster with a smaller share of the points is no roof plane.",
         minimum=0.0,
@@ -101,7 +101,7 @@ class KMeansSettings(RoofFaceSettings, NormalClusteringSettings, RefinementSetti
         "Whether a given footprint is kept, its roof drawn from the labels, or the model's rectangle is the outline.",
         choices=("footprint", "rectangle"),
     )
-    least_side_share: float = parameter(
+    min_side_share: float = parameter(
         0.5,
         "Share of a plane's points that must lie on its side of the line in which the two planes meet.",
         minimum=0.0,
@@ -226,7 +226,7 @@ def building_top(points: FloatArray, settings: KMeansSettings) -> BuildingTop:
     points : (n, 3) float64
         From `local_metres`.
     settings : KMeansSettings
-        `least_points`, and the distance that follows the noise.
+        `min_points`, and the distance that follows the noise.
 
     Returns
     -------
@@ -242,10 +242,10 @@ def building_top(points: FloatArray, settings: KMeansSettings) -> BuildingTop:
     kept, _ = unique_xy(grid[:, :2], grid[:, 2])
     index = index[kept]
     top = points[index]
-    if len(top) < settings.least_points:
+    if len(top) < settings.min_points:
         raise BuildingError(
             Reason.TOO_FEW_POINTS,
-            f"{len(top)} of {len(points)} points are visible from above, least_points is {settings.least_points}",
+            f"{len(top)} of {len(points)} points are visible from above, min_points is {settings.min_points}",
         )
     check_extent(top)
     sigma_m = noise_sigma_m(top)
@@ -278,13 +278,13 @@ def cluster_facets(top: BuildingTop, settings: KMeansSettings) -> tuple[LabelArr
     normals, areas_m2 = facet_normals(top.points, facets), facet_areas_m2(top.points, facets)
     gentle = normals[:, 2] > math.cos(math.radians(settings.max_slope_deg))
     usable = gentle & (_longest_edges_m(top) <= settings.longest_edge_spacings * top.spacing_m)
-    if settings.longest_edge_spacings == 0.0 or usable.sum() < _LEAST_FACETS:
+    if settings.longest_edge_spacings == 0.0 or usable.sum() < _MIN_FACETS:
         usable = gentle
-    if usable.sum() < _LEAST_FACETS:
+    if usable.sum() < _MIN_FACETS:
         raise BuildingError(
             Reason.NO_PLANE,
             f"{int(usable.sum())} of {len(facets)} facets are not steeper than max_slope_deg, "
-            f"{settings.max_slope_deg:g}; clusters need {_LEAST_FACETS}",
+            f"{settings.max_slope_deg:g}; clusters need {_MIN_FACETS}",
         )
     passes = passes_for_noise(top.sigma_m, top.spacing_m, settings.normal_noise_deg, settings.smoothing_passes)
     normals = smoothed_normals(normals, areas_m2, top.tin.neighbours, usable, passes)
@@ -323,7 +323,7 @@ def planes_of(top: BuildingTop, settings: KMeansSettings) -> tuple[FloatArray, L
         return _refined_planes(top, clusters, settings)
     labels = labels_around(top.points, top.tin.facets, clusters)
     shares = np.bincount(labels[labels >= 0], minlength=int(labels.max()) + 1) / len(labels)
-    labels = np.where((labels >= 0) & (shares[labels] < settings.least_plane_share), -1, labels).astype(np.int32)
+    labels = np.where((labels >= 0) & (shares[labels] < settings.min_plane_share), -1, labels).astype(np.int32)
     planes, labels = _best_fit_planes(top.points, labels)
     if len(planes) == 2 and _angle_deg(planes[0], planes[1]) < settings.one_plane_deg:
         # one plane on which the clusters told only noise apart
@@ -390,7 +390,7 @@ def _box_or_gable(
         labels,
         (planes[0], planes[1]),
         ground_z_m,
-        least_side_share=settings.least_side_share,
+        min_side_share=settings.min_side_share,
         margin_m=margin_m,
     )
     if fit.is_valley:

@@ -30,7 +30,7 @@ from pipeline.segmentation.roof_trees import RoofTreeSettings, classify_2d, clas
 from pipeline.segmentation.single_linkage import SingleLinkageSettings, cluster_by_linkage
 from pipeline.tin.delaunay import triangulate, unique_xy
 
-_LEAST_POINTS = 4
+_MIN_POINTS = 4
 """Below this there is neither a spacing nor a noise to speak of."""
 _VOTING_PASSES = 4
 """Repetitions of the choice between regions; it ends when nothing changes."""
@@ -75,10 +75,10 @@ class ParameterSpaceSettings(RoofFaceSettings, RegionGrowingSettings, RoofTreeSe
         minimum=0.0,
         maximum=1.0,
     )
-    least_area_m2: float = parameter(
+    min_area_m2: float = parameter(
         3.0, "A region has at least as many points as this area holds in plan.", unit="m2", minimum=0.0, maximum=1000.0
     )
-    least_points: int = parameter(
+    min_points: int = parameter(
         5, "Fewest points of a roof face, however sparse the cloud.", unit="points", minimum=3, maximum=10_000
     )
     type_from: str = parameter(
@@ -92,10 +92,10 @@ class ParameterSpaceSettings(RoofFaceSettings, RegionGrowingSettings, RoofTreeSe
 class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
     """Settings of the method in slope and orientation."""
 
-    least_slope_deg: float = parameter(
+    min_slope_deg: float = parameter(
         0.0, "Clusters with less mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
     )
-    most_slope_deg: float = parameter(
+    max_slope_deg: float = parameter(
         75.0, "Clusters with more mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
     )
 
@@ -105,8 +105,8 @@ class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
         return cls(
             tin_spacing_m=0.0,
             ground_clusters="keep",
-            least_slope_deg=7.0,
-            least_members=11,
+            min_slope_deg=7.0,
+            min_members=11,
             point_groups="membership",
             type_from="tree",
             faces="traced",
@@ -124,7 +124,7 @@ class ParameterSpace3dSettings(ParameterSpaceSettings, ParameterBoxSettings, Clu
             tin_spacing_m=0.0,
             ground_clusters="keep",
             dense_box_facets=5,
-            least_members=11,
+            min_members=11,
             point_groups="membership",
             type_from="tree",
             faces="traced",
@@ -227,7 +227,7 @@ def roof_clusters_2d(facets: BuildingFacets, settings: ParameterSpace2dSettings)
     centres = cluster_means(facets.parameters, labels, int(labels.max(initial=-1)) + 1)
 
     # 3.3: clusters with a plausible slope are faces.
-    kept = plausible_slopes(centres, settings.least_slope_deg, settings.most_slope_deg)
+    kept = plausible_slopes(centres, settings.min_slope_deg, settings.max_slope_deg)
     return _kept_clusters(labels, centres, kept & _not_terrain(facets, labels, len(centres), settings))
 
 
@@ -258,10 +258,10 @@ def facets_of(candidate: Candidate, settings: ParameterSpaceSettings) -> Buildin
     points, shift = local_metres(candidate.points)
     visible = np.flatnonzero(top_visible(points)).astype(np.int32)
     roof = points[visible]
-    if len(roof) < _LEAST_POINTS:
+    if len(roof) < _MIN_POINTS:
         raise BuildingError(
             Reason.TOO_FEW_POINTS,
-            f"{len(roof)} of {len(points)} points are visible from above, at least {_LEAST_POINTS} are needed",
+            f"{len(roof)} of {len(points)} points are visible from above, at least {_MIN_POINTS} are needed",
         )
     spacing_m = max(point_spacing_m(roof), 1e-3)
     gap_m = max(settings.ground_gap_spacings * spacing_m, 1e-3)
@@ -347,7 +347,7 @@ def _primitive(
     if settings.point_groups == "region_growing":
         planes, groups = _grown(facets, groups, centres, settings)
     else:
-        planes, groups = _interpolated(facets.roof, groups, len(centres), settings.least_points)
+        planes, groups = _interpolated(facets.roof, groups, len(centres), settings.min_points)
     all_labels = np.full(len(candidate.points), -1, np.int32)
     all_labels[facets.visible] = groups
     described = describe_planes(facets.roof, planes, groups)
@@ -359,12 +359,12 @@ def _primitive(
 
 
 def _interpolated(
-    roof: FloatArray, groups: LabelArray, n_groups: int, least_points: int
+    roof: FloatArray, groups: LabelArray, n_groups: int, min_points: int
 ) -> tuple[FloatArray, LabelArray]:
     """Least-squares planes of groups of points; groups that hold no plane are none any more."""
     sums = cluster_sums(roof, groups, n_groups)
     fits = [best_fit_plane(row) for row in sums]
-    kept = np.array([fit[3] and row[0] >= least_points for fit, row in zip(fits, sums, strict=True)], np.bool_)
+    kept = np.array([fit[3] and row[0] >= min_points for fit, row in zip(fits, sums, strict=True)], np.bool_)
     planes = np.array([fit[:3] for fit in fits]).reshape(-1, 3)
     groups, planes = _kept_clusters(groups, planes, kept)
     return planes, groups
@@ -378,7 +378,7 @@ def _grown(
     sigma_m = noise_sigma_m(roof)
     distance_m = settings.growing_distance_m(sigma_m)
     neighbours = nearest_neighbours(roof, settings.growing_neighbours)
-    fewest = max(settings.least_points, min(int(settings.least_area_m2 / facets.spacing_m**2), 10_000))
+    fewest = max(settings.min_points, min(int(settings.min_area_m2 / facets.spacing_m**2), 10_000))
     tangent, turn = np.tan(np.radians(np.minimum(centres[:, 0], 89.0))), np.radians(centres[:, 1])
     gradients = np.column_stack([-tangent * np.sin(turn), -tangent * np.cos(turn)])
     planes, labels = grow_regions(
@@ -394,4 +394,4 @@ def _grown(
         settings.growing_vote,
         _VOTING_PASSES,
     )
-    return _interpolated(roof, labels, len(planes), settings.least_points)
+    return _interpolated(roof, labels, len(planes), settings.min_points)

@@ -16,7 +16,7 @@ from pipeline.segmentation.leftover_planes import cluster_leftovers
 from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, refine_planes
 from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
 
-_LEAST_DISTANCE_M = 1e-3
+_MIN_DISTANCE_M = 1e-3
 """The grid of the points: no distance to a plane is less, also where settings and noise are 0."""
 
 
@@ -24,10 +24,10 @@ _LEAST_DISTANCE_M = 1e-3
 class RefinementSettings(PlaneRefinementSettings):
     """Settings of the common end; those of its stages are among them."""
 
-    plane_distance_min_m: float = parameter(
+    min_plane_distance_m: float = parameter(
         0.15, "Least distance up to which a point belongs to a plane.", unit="m", minimum=0.0, maximum=10.0
     )
-    plane_distance_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
+    max_plane_distance_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
     noise_factor: float = parameter(
         3.0,
         "Distances that follow the noise are this many standard deviations of it, within their bounds.",
@@ -54,13 +54,13 @@ class RefinementSettings(PlaneRefinementSettings):
 
     def range_faults(self, name: str) -> list[str]:
         """What is wrong with a pair of bounds, `name` without its ending."""
-        low, high = getattr(self, f"{name}_min_m"), getattr(self, f"{name}_max_m")
-        return [f"{name}_min_m is {low:g}: use at most {name}_max_m, {high:g}"] if low > high else []
+        low, high = getattr(self, f"min_{name}_m"), getattr(self, f"max_{name}_m")
+        return [f"min_{name}_m is {low:g}: use at most max_{name}_m, {high:g}"] if low > high else []
 
     def plane_distance_m(self, sigma_m: float) -> float:
         """Distance of a point from its plane for a noise; 1 mm, the grid of the points, is the least."""
-        bounded = min(max(self.noise_factor * sigma_m, self.plane_distance_min_m), self.plane_distance_max_m)
-        return max(bounded, _LEAST_DISTANCE_M)
+        bounded = min(max(self.noise_factor * sigma_m, self.min_plane_distance_m), self.max_plane_distance_m)
+        return max(bounded, _MIN_DISTANCE_M)
 
 
 def planes_of_clusters(

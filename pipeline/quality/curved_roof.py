@@ -11,15 +11,15 @@ from pipeline.roof.roof_type import folds
 Normal = tuple[float, float, float]
 """A unit vector that points up."""
 
-LEAST_TURN_DEG = 3.0
-MOST_TURN_DEG = 26.0
+MIN_TURN_DEG = 3.0
+MAX_TURN_DEG = 26.0
 """Planes that meet in a ridge of this angle go on one another in a curve; hips of 18 deg and gables of 13 deg turn by
 more."""
-_LEAST_TURN_COSINE = math.cos(math.radians(LEAST_TURN_DEG))
-_MOST_TURN_COSINE = math.cos(math.radians(MOST_TURN_DEG))
-LEAST_NORMALS = 5
+_MIN_TURN_COSINE = math.cos(math.radians(MIN_TURN_DEG))
+_MAX_TURN_COSINE = math.cos(math.radians(MAX_TURN_DEG))
+MIN_NORMALS = 5
 """Directions of a curve. Hip roofs, also those on an L, have four; a mansard's break is a larger turn."""
-LEAST_SHARE = 0.5
+MIN_SHARE = 0.5
 """Of the roof's plan area."""
 SLIVER_HEIGHT_M = 0.5
 """Planes meet across a wall that is nowhere higher, as for the roof types."""
@@ -39,15 +39,15 @@ def is_curved_roof(planes: Sequence[Plane], faces: Sequence[RoofFace], solids: S
     Returns
     -------
     bool
-        False for fewer planes than `LEAST_NORMALS`.
+        False for fewer planes than `MIN_NORMALS`.
     """
     normals = [plane.normal for plane in planes]
-    if len(planes) < LEAST_NORMALS or not _has_directions(normals):
+    if len(planes) < MIN_NORMALS or not _has_directions(normals):
         return False
     ridges, _ = folds(planes, solids, SLIVER_HEIGHT_M)
     surface = list(range(len(planes)))
     for p, q in sorted(ridges):
-        if p < q and _MOST_TURN_COSINE <= _cosine(normals[p], normals[q]) <= _LEAST_TURN_COSINE:
+        if p < q and _MAX_TURN_COSINE <= _cosine(normals[p], normals[q]) <= _MIN_TURN_COSINE:
             one, other = surface[p], surface[q]
             surface = [one if number == other else number for number in surface]
     areas = [0.0] * len(planes)
@@ -56,7 +56,7 @@ def is_curved_roof(planes: Sequence[Plane], faces: Sequence[RoofFace], solids: S
     for number in sorted(set(surface)):
         members = [p for p in range(len(planes)) if surface[p] == number]
         share = math.fsum(areas[p] for p in members)
-        if share >= LEAST_SHARE * math.fsum(areas) and _has_directions([normals[p] for p in members]):
+        if share >= MIN_SHARE * math.fsum(areas) and _has_directions([normals[p] for p in members]):
             return True
     return False
 
@@ -73,8 +73,8 @@ def _has_directions(normals: Sequence[Normal]) -> bool:
     """
     kept: list[Normal] = []
     for normal in normals:
-        if all(_cosine(normal, other) <= _LEAST_TURN_COSINE for other in kept):
+        if all(_cosine(normal, other) <= _MIN_TURN_COSINE for other in kept):
             kept.append(normal)
-            if len(kept) == LEAST_NORMALS:
+            if len(kept) == MIN_NORMALS:
                 return True
     return False

@@ -24,9 +24,9 @@ DRAWN_OUTLINE_SPACINGS = 0.2
 """Standard deviation in plan of a drawn outline: pent roofs of the simulated suites, whose ridge is their outline."""
 _MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over the median of its absolute values."""
-_LEAST_CELL_M = 0.25
+_MIN_CELL_M = 0.25
 """Places on the roof are looked at on a raster of one point spacing, or of this where points are denser."""
-_MOST_CELLS = 20_000
+_MAX_CELLS = 20_000
 """Halls of more cells are looked at more coarsely."""
 
 
@@ -103,7 +103,7 @@ def _seen(
     if np.isnan(residuals).all() or not spacing_m > 0.0:
         return math.nan, math.nan
     low_x, low_y, high_x, high_y = surface.bounds
-    cell = max(_LEAST_CELL_M, spacing_m, math.sqrt((high_x - low_x) * (high_y - low_y) / _MOST_CELLS))
+    cell = max(_MIN_CELL_M, spacing_m, math.sqrt((high_x - low_x) * (high_y - low_y) / _MAX_CELLS))
     raster = (low_x, low_y, cell, math.floor((high_x - low_x) / cell) + 1, math.floor((high_y - low_y) / cell) + 1)
     places, unseen, square = surface.seen(points, residuals, raster, TOLERANCE_M, GAP_SPACINGS * spacing_m)
     if places == 0:

@@ -98,9 +98,7 @@ def fitted_plane(corners: IntArray) -> tuple[float, float, FloatArray]:
 
 
 @kernel
-def bends_where_it_is_straight(
-    corners: IntArray, ring_offsets: IntArray, axes: FloatArray, least_cosine: float
-) -> bool:
+def bends_where_it_is_straight(corners: IntArray, ring_offsets: IntArray, axes: FloatArray, min_cosine: float) -> bool:
     """Whether three consecutive corners of a ring span a triangle that is tilted against the face.
 
     Corners that lie nearly on one line do, by the rounding of their coordinates to millimetres.
@@ -111,7 +109,7 @@ def bends_where_it_is_straight(
             before = i - 1 if i > start else stop - 1
             after = i + 1 if i + 1 < stop else start
             x, y, z = _unit_normal(corners, before, i, after)
-            if abs(x * axes[0, 0] + y * axes[1, 0] + z * axes[2, 0]) < least_cosine:
+            if abs(x * axes[0, 0] + y * axes[1, 0] + z * axes[2, 0]) < min_cosine:
                 return True
     return False
 
@@ -152,7 +150,7 @@ def _unit_normal(corners: IntArray, a: int, b: int, c: int) -> tuple[float, floa
 
 
 @kernel
-def least_cosine_of_normals(corners: IntArray, triangles: IntArray, enough: float) -> float:
+def min_cosine_of_normals(corners: IntArray, triangles: IntArray, enough: float) -> float:
     """Cosine of the largest angle between the normals of any two triangles of a face.
 
     Parameters

@@ -21,7 +21,7 @@ from pipeline.model import FaceKind, FloatArray, IntArray, LabelArray, Plane, So
 
 SAME_TOP_M = 0.05
 """Roof faces that end within this of the highest point meet there."""
-LEAST_SIGMA_M = 0.004
+MIN_SIGMA_M = 0.004
 """What no number of points undoes: beams average over an edge, and survey and model are in whole millimetres."""
 _BLOCKS = 4
 """A plane's points are gathered in so many blocks each way, of equal size over their extent."""
@@ -71,7 +71,7 @@ def ridge_height_sigma_m(
         return math.nan
     weights, gradient = _weights([(planes[number].a, planes[number].b) for number in numbers])
     terms = [weight * weight * variance for weight, variance in zip(weights, variances, strict=True)]
-    return math.sqrt(math.fsum(terms) + (gradient * outline_sigma_m) ** 2 + LEAST_SIGMA_M**2)
+    return math.sqrt(math.fsum(terms) + (gradient * outline_sigma_m) ** 2 + MIN_SIGMA_M**2)
 
 
 def _top(solids: Sequence[Solid]) -> tuple[float, float, list[int]] | None:

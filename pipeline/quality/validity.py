@@ -51,7 +51,7 @@ from pipeline.quality.planarity import (
     bends_where_it_is_straight,
     fitted_plane,
     in_fitted_plane,
-    least_cosine_of_normals,
+    min_cosine_of_normals,
 )
 from pipeline.quality.rings import RING_SELF_INTERSECTION, polygon_code
 from pipeline.quality.self_intersection import shell_intersects_itself
@@ -69,7 +69,7 @@ SHELL_SELF_INTERSECTION = 306
 WRONG_ORIENTATION_SHELL = 405
 
 _CODE_LIMIT = 406
-_LEAST_SLENDERNESS = 1.2e-4
+_MIN_SLENDERNESS = 1.2e-4
 """Narrower faces, such as a wall of 2 mm under a ridge of 40 m, are lines to a validator that fits planes in floating
 point: of 600 slabs val3dity 2.6 finds half of those below 9e-5 faulty, a tenth at 1e-4, none above 1.2e-4."""
 
@@ -114,9 +114,9 @@ def check_solid(solid: Solid, tolerances: ValidityTolerances = DEFAULT_TOLERANCE
     ring_offsets = _offsets([len(ring) for ring in rings])
     face_offsets = _offsets([len(face.rings) for face in solid.faces])
     planarity_mm = tolerances.planarity_m * MILLIMETRES_PER_METRE
-    least_cosine = math.cos(math.radians(tolerances.normals_deg))
+    min_cosine = math.cos(math.radians(tolerances.normals_deg))
     snap_mm = tolerances.snap_m * MILLIMETRES_PER_METRE
-    found = _faults(vertices, ring_vertices, ring_offsets, face_offsets, snap_mm, planarity_mm, least_cosine)
+    found = _faults(vertices, ring_vertices, ring_offsets, face_offsets, snap_mm, planarity_mm, min_cosine)
     return tuple(int(code) for code in np.flatnonzero(found))
 
 
@@ -142,14 +142,14 @@ def _faults(
     face_offsets: IntArray,
     snap_mm: float,
     planarity_mm: float,
-    least_cosine: float,
+    min_cosine: float,
 ) -> BoolArray:
     """(406,) bool, True at the codes of the faults of a solid, by either verdict on pairs at the snapping tolerance."""
     joined, apart, differ = _snap(vertices, ring_vertices, snap_mm)
     found = np.zeros(_CODE_LIMIT, np.bool_)
     for verdict in range(2 if differ else 1):
         ids = joined if verdict == 0 else apart
-        _find_faults(vertices, ids, ring_offsets, face_offsets, planarity_mm, least_cosine, found)
+        _find_faults(vertices, ids, ring_offsets, face_offsets, planarity_mm, min_cosine, found)
     return found
 
 
@@ -214,26 +214,26 @@ def _face_code(corners: IntArray, ids: IntArray, rings: IntArray, planarity_mm: 
     distance_mm, slenderness, _ = fitted_plane(corners)
     if distance_mm > planarity_mm:
         return NON_PLANAR_DISTANCE
-    if slenderness < _LEAST_SLENDERNESS:
+    if slenderness < _MIN_SLENDERNESS:
         return RING_SELF_INTERSECTION
     flat, has_area = project_along_dominant_axis(corners, rings[1])
     return int(polygon_code(flat, ids, rings)) if has_area else RING_SELF_INTERSECTION
 
 
 @kernel
-def _is_folded(corners: IntArray, rings: IntArray, cut: IntArray, least_cosine: float) -> bool:
+def _is_folded(corners: IntArray, rings: IntArray, cut: IntArray, min_cosine: float) -> bool:
     """Whether two triangles of a face have normals too far apart: of its triangulation, or of that in its fitted plane.
 
     val3dity triangulates in the fitted plane. Where corners lie on one line but for the rounding to millimetres, it
     depends on the projection which of them bulge outwards, and with it whether a sliver of any normal is cut off there.
     """
-    if least_cosine_of_normals(corners, cut, least_cosine) < least_cosine:
+    if min_cosine_of_normals(corners, cut, min_cosine) < min_cosine:
         return True
     _, _, axes = fitted_plane(corners)
-    if not bends_where_it_is_straight(corners, rings, axes, least_cosine):
+    if not bends_where_it_is_straight(corners, rings, axes, min_cosine):
         return False
     in_plane, status = triangulate_rings(in_fitted_plane(corners, axes), rings)
-    return status != DONE or least_cosine_of_normals(corners, in_plane, least_cosine) < least_cosine
+    return status != DONE or min_cosine_of_normals(corners, in_plane, min_cosine) < min_cosine
 
 
 @kernel
@@ -243,7 +243,7 @@ def _find_faults(
     ring_offsets: IntArray,
     face_offsets: IntArray,
     planarity_mm: float,
-    least_cosine: float,
+    min_cosine: float,
     found: BoolArray,
 ) -> None:
     """Set found[code] for the faults of a solid whose corners `ids` are snapped vertices."""
@@ -277,7 +277,7 @@ def _find_faults(
             found[NOT_VALID_2_MANIFOLD] = True
             sound = False
             continue
-        if len(cut) > 1 and _is_folded(corners[start:stop], rings - start, cut, least_cosine):
+        if len(cut) > 1 and _is_folded(corners[start:stop], rings - start, cut, min_cosine):
             found[NON_PLANAR_NORMALS] = True
             sound = False
         for t in range(len(cut)):

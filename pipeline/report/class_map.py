@@ -18,7 +18,7 @@ import shapely
 from pipeline.model import FloatArray
 from pipeline.report.maps import Entry, Layer, Map, draw_map
 
-MOST_DRAWN, MOST_ORDINARY = 30_000, 20_000
+MAX_DRAWN, MAX_ORDINARY = 30_000, 20_000
 """Footprints that are drawn. Of more that are not ordinary the largest are; where more are ordinary, the cells that
 hold some of them are drawn in their place."""
 CELLS_ACROSS = 300
@@ -74,7 +74,7 @@ class ClassMap:
         self._count.update(drawn["class"].to_pylist())
         self._drawn.append(drawn)
         self._n_drawn += len(drawn)
-        if self._n_drawn > 2 * MOST_DRAWN:
+        if self._n_drawn > 2 * MAX_DRAWN:
             self._drawn = [self._largest()]
             self._n_drawn = len(self._drawn[0])
         found = shapely.from_wkb(np.array(rows.filter(is_ordinary)["geometry"].to_pylist(), dtype=object))
@@ -83,15 +83,15 @@ class ClassMap:
         self._middles.append((bounds[:, :2] + bounds[:, 2:]) / 2.0)
         self._beneath.append(found)
         self.ordinary += len(found)
-        if self.ordinary > MOST_ORDINARY:
+        if self.ordinary > MAX_ORDINARY:
             self._beneath = []
 
     def _largest(self) -> pa.Table:
         """The largest rows; of equal ones those that come first by name."""
         table = pa.concat_tables(self._drawn)
         order = pc.sort_indices(table, sort_keys=[("size", "descending"), ("id", "ascending")])
-        self.left_out += max(0, len(table) - MOST_DRAWN)
-        return table.take(order[:MOST_DRAWN])
+        self.left_out += max(0, len(table) - MAX_DRAWN)
+        return table.take(order[:MAX_DRAWN])
 
     def map(self, unit_m: float) -> Map | None:
         """The map; None where nothing has geometry.
@@ -115,7 +115,7 @@ class ClassMap:
 
     def _cells_or_footprints(self) -> Any:
         """The ordinary footprints, or the cells that hold some."""
-        if self.ordinary <= MOST_ORDINARY:
+        if self.ordinary <= MAX_ORDINARY:
             return np.concatenate(self._beneath)
         middles = np.concatenate(self._middles)
         low = middles.min(axis=0)

@@ -23,7 +23,7 @@ WIDTH_PX = 1500
 """Of a map that takes the width of a page; the height follows the extent."""
 HALF_WIDTH_PX = 1000
 """Of a map of few buildings."""
-_LEAST_HEIGHT, _MOST_HEIGHT = 0.35, 1.25
+_MIN_HEIGHT, _MAX_HEIGHT = 0.35, 1.25
 _MARGIN = 0.02
 _SMALL_PX = 14.0
 _HALF_SHARE = 0.04
@@ -138,7 +138,7 @@ def _extent(bounds: FloatArray) -> tuple[float, float, float, float]:
     west, south, east, north = (float(value) for value in bounds)
     margin = _MARGIN * max(east - west, north - south, 1.0)
     width, height = east - west + 2.0 * margin, north - south + 2.0 * margin
-    width, height = max(width, height / _MOST_HEIGHT), max(height, width * _LEAST_HEIGHT)
+    width, height = max(width, height / _MAX_HEIGHT), max(height, width * _MIN_HEIGHT)
     x, y = (west + east) / 2.0, (south + north) / 2.0
     return x - width / 2.0, y - height / 2.0, x + width / 2.0, y + height / 2.0
 

@@ -17,7 +17,7 @@ from pipeline.errors import RunError
 from pipeline.export.geoparquet import table_dataset
 from pipeline.io import arrow_at, storage_at
 from pipeline.model import REASONS, Reason, Status
-from pipeline.report.class_map import MOST_DRAWN, ROWS, ClassMap, MapClass
+from pipeline.report.class_map import MAX_DRAWN, ROWS, ClassMap, MapClass
 from pipeline.report.maps import BAD, FAIR, GOOD, MISSING, NO_FIGURE
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
@@ -102,7 +102,7 @@ def run_page(run_dir: str) -> str:
         cards=_cards(manifest, statistics),
         map=None if drawn is None else {"uri": data_uri(drawn.png), "it": drawn},
         left_out=seen.map.left_out,
-        most_drawn=MOST_DRAWN,
+        max_drawn=MAX_DRAWN,
         without_outline=seen.without_outline,
         reasons=_reasons(statistics, seen),
         listed=seen.listed(),

@@ -17,7 +17,7 @@ from pipeline.roof.footprint import polygons_of, without_repeated
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart, solid_parts
 
-_MINIMUM_HEIGHT_M = 0.1
+_MIN_HEIGHT_M = 0.1
 _DRAWN_BACK_MM = (2.0, 20.0, 100.0)
 _SHARES_OF_TOLERANCE = (0.0, 0.5, 1.0)
 
@@ -41,13 +41,13 @@ def block_plane(points: FloatArray, ground_z_m: float, percentile: float) -> Pla
     """
     z = np.sort(points[:, 2])
     height = float(z[min(len(z) - 1, math.floor(percentile / 100.0 * len(z)))])
-    height = round(max(height, ground_z_m + _MINIMUM_HEIGHT_M), 3)
+    height = round(max(height, ground_z_m + _MIN_HEIGHT_M), 3)
     squares = math.fsum(((z - height) ** 2).tolist())
     return Plane(a=0.0, b=0.0, c=height, n_points=len(z), rmse_m=math.sqrt(squares / len(z)))
 
 
 def block_forms(
-    footprint_mm: MultiPolygon, plane: Plane, ground_z_m: float, tolerance_m: float, minimum_area_m2: float
+    footprint_mm: MultiPolygon, plane: Plane, ground_z_m: float, tolerance_m: float, min_area_m2: float
 ) -> Iterator[Callable[[], list[SolidPart]]]:
     """Ways to draw one block for every part of a footprint, the nearest to it first.
 
@@ -64,7 +64,7 @@ def block_forms(
         Elevation of the floor.
     tolerance_m : float
         Largest simplification of the outline (0 for none).
-    minimum_area_m2 : float
+    min_area_m2 : float
         Smaller parts are left out unless there is no larger one.
 
     Yields
@@ -73,7 +73,7 @@ def block_forms(
         Draws the blocks, at least one and not yet judged. Raises `BuildingError` where they cannot be drawn:
         `no_footprint` where no part has an area, `no_partition` where parts overlap or touch; or what GEOS raises.
     """
-    build = partial(_blocks, plane=plane, ground_z_m=ground_z_m, minimum_area_m2=minimum_area_m2)
+    build = partial(_blocks, plane=plane, ground_z_m=ground_z_m, min_area_m2=min_area_m2)
     yield partial(build, footprint_mm)
     for share in _SHARES_OF_TOLERANCE if tolerance_m > 0.0 else (0.0,):
         for back_mm in _DRAWN_BACK_MM:
@@ -94,23 +94,23 @@ def _drawn_back(
 
 
 def _blocks(
-    shape: BaseGeometry, *, plane: Plane, ground_z_m: float, minimum_area_m2: float, tolerance_mm: float = 0.0
+    shape: BaseGeometry, *, plane: Plane, ground_z_m: float, min_area_m2: float, tolerance_mm: float = 0.0
 ) -> list[SolidPart]:
     """Extrude the large parts of a shape, simplified."""
-    polygons = _clean_parts(shape, tolerance_mm, minimum_area_m2)
+    polygons = _clean_parts(shape, tolerance_mm, min_area_m2)
     if not polygons:
         raise BuildingError(Reason.NO_FOOTPRINT, f"the outline has an area of {shape.area * 1e-6:g} m2")
     partition = RoofPartition(polygons=tuple(polygons), labels=np.zeros(len(polygons), np.int32))
     return solid_parts(partition, [plane], ground_z_m)
 
 
-def _clean_parts(shape: BaseGeometry, tolerance_mm: float, minimum_area_m2: float) -> list[Polygon]:
+def _clean_parts(shape: BaseGeometry, tolerance_mm: float, min_area_m2: float) -> list[Polygon]:
     """Simplified polygons on whole millimetres: those large enough, else the largest; none of an empty shape."""
     if tolerance_mm > 0.0:
         shape = shapely.simplify(shape, tolerance_mm, preserve_topology=True)
     snapped = polygons_of(shapely.set_precision(shape, 1.0))
     polygons = [thinned for polygon in snapped for thinned in without_repeated(polygon, 5.0)]
-    large = [p for p in polygons if p.area >= minimum_area_m2 * 1e6] or sorted(polygons, key=lambda p: -p.area)[:1]
+    large = [p for p in polygons if p.area >= min_area_m2 * 1e6] or sorted(polygons, key=lambda p: -p.area)[:1]
     if not shapely.is_valid(large).all():  # left out it would be missing, and another form may have it
         raise BuildingError(Reason.NO_PARTITION, "the outline of a block crosses itself")
     return large

@@ -24,7 +24,7 @@ from pipeline.roof.settings import RoofSettings
 _ROUNDS = 4
 _MERGE = 1.3
 """Runs are one while a single line passes within this many tolerances of all their vertices."""
-_LEAST_SLOPE = 0.05
+_MIN_SLOPE = 0.05
 """Planes whose slopes differ by less cross nowhere exactly."""
 
 
@@ -143,7 +143,7 @@ def _fit(arc: _Arc, left: Plane, right: Plane, tolerance: float) -> None:
     runs = split(border, tolerance, closed=arc.closed)
     da, db, dc = left.a - right.a, left.b - right.b, (left.c - right.c) * 1e3
     slope = math.hypot(da, db)
-    if slope > _LEAST_SLOPE:
+    if slope > _MIN_SLOPE:
         for run in runs:
             piece = border[np.arange(run.first, run.last + 1) % len(border)]
             off = float(np.median(np.abs(piece[:, 0] * da + piece[:, 1] * db + dc))) / slope

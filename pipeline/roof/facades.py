@@ -26,7 +26,7 @@ from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Run, corners
 
-_LEAST_LENGTH_M = 2.0
+_MIN_LENGTH_M = 2.0
 """A shorter line takes the mean overhang."""
 _STRIP_M = 1.0
 """Length of the strips along a line in which the eave's height is taken."""
@@ -62,7 +62,7 @@ _OPEN_SHARE = 0.5
 """Least share of the strips with such points."""
 _CORNER_REACH_M = 2.0
 """Lines that meet farther than this from their corner at the eaves are joined by a step there."""
-_MOST_MOVED = 1.5
+_MAX_MOVED = 1.5
 """Most area between eaves and walls: so many times what the lines sweep."""
 _ROUNDING_MM2 = 1e4
 
@@ -157,7 +157,7 @@ def eave_of(start: FloatArray, end: FloatArray, points: FacadePoints, reach_m: f
         Its overhang is slightly negative where the outline was drawn a little inside the wall.
     """
     length = math.dist(start, end)
-    if length < _LEAST_LENGTH_M:
+    if length < _MIN_LENGTH_M:
         return Eave(length_m=length, is_open=True, overhang_m=None)
     (x0, y0), (ux, uy) = start.tolist(), ((end - start) / length).tolist()
     out = np.array([uy, -ux])
@@ -285,7 +285,7 @@ def _moved(ring: FloatArray, ways_m: Sequence[float]) -> FloatArray:
         return ring
     largest = Polygon(max(parts, key=lambda part: part.area).exterior)
     swept = math.fsum(run.length * 1e3 * abs(way_m) for run, way_m in zip(runs, ways_m, strict=True))
-    if shapely.symmetric_difference(largest, Polygon(ring)).area > _MOST_MOVED * swept + _ROUNDING_MM2:
+    if shapely.symmetric_difference(largest, Polygon(ring)).area > _MAX_MOVED * swept + _ROUNDING_MM2:
         return ring
     drawn: FloatArray = shapely.get_coordinates(largest.exterior)[:-1]
     return drawn

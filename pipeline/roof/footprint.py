@@ -159,7 +159,7 @@ def polygons_of(geometry: shapely.Geometry) -> list[Polygon]:
     return [p for p in parts.tolist() if isinstance(p, Polygon) and p.area > 0.0]
 
 
-def clip_partition(partition: RoofPartition, footprint_mm: MultiPolygon, minimum_area_m2: float) -> RoofPartition:
+def clip_partition(partition: RoofPartition, footprint_mm: MultiPolygon, min_area_m2: float) -> RoofPartition:
     """The part of a partition inside a footprint.
 
     Parameters
@@ -168,7 +168,7 @@ def clip_partition(partition: RoofPartition, footprint_mm: MultiPolygon, minimum
         A coverage that reaches beyond the footprint wherever there is roof.
     footprint_mm : MultiPolygon
         Integer millimetres.
-    minimum_area_m2 : float
+    min_area_m2 : float
         Smaller pieces join the neighbour with the longest border, or go where they have none.
 
     Returns
@@ -190,21 +190,21 @@ def clip_partition(partition: RoofPartition, footprint_mm: MultiPolygon, minimum
         for piece in [polygon] if whole else polygons_of(shapely.intersection(polygon, footprint_mm, grid_size=1.0)):
             pieces.append(piece)
             labels.append(label)
-    pieces, labels = _absorb_small(pieces, labels, minimum_area_m2 * 1e6)
+    pieces, labels = _absorb_small(pieces, labels, min_area_m2 * 1e6)
     if not pieces:
         raise BuildingError(Reason.NO_PARTITION, "no roof face lies inside the footprint")
     return RoofPartition(polygons=tuple(pieces), labels=np.array(labels, np.int32))
 
 
-def _absorb_small(pieces: list[Polygon], labels: list[int], minimum_area_mm2: float) -> tuple[list[Polygon], list[int]]:
+def _absorb_small(pieces: list[Polygon], labels: list[int], min_area_mm2: float) -> tuple[list[Polygon], list[int]]:
     """Unite pieces that are too small with a neighbour, smallest first."""
     alive = [True] * len(pieces)
-    small = [k for k in range(len(pieces)) if pieces[k].area < minimum_area_mm2]
+    small = [k for k in range(len(pieces)) if pieces[k].area < min_area_mm2]
     if not small:
         return pieces, labels
     tree = shapely.STRtree(pieces)
     for k in sorted(small, key=lambda k: (pieces[k].area, k)):
-        if pieces[k].area >= minimum_area_mm2:
+        if pieces[k].area >= min_area_mm2:
             continue
         longest, into = 0.0, -1
         for j in sorted(tree.query(pieces[k]).tolist()):

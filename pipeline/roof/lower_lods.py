@@ -26,7 +26,7 @@ from pipeline.roof.solid import SolidPart, solid_parts
 
 XY = tuple[int, int]
 
-_MOST_FORMS = 8
+_MAX_FORMS = 8
 """Of a part's levels; what is not sound then is one level."""
 
 
@@ -144,7 +144,7 @@ def level_forms(
 
     Roof faces whose common border has a mean step below `level_step_m` belong to one level part, however far this goes
     on; then neighbouring parts whose heights differ by less, those that differ least first. So neighbours differ by
-    that step at least. Parts without points, and those smaller than `minimum_part_area_m2`, join the neighbour that
+    that step at least. Parts without points, and those smaller than `min_part_area_m2`, join the neighbour that
     differs least. Behind that wanted form come those in which ever more neighbours are joined, up to one level.
 
     Parameters
@@ -158,7 +158,7 @@ def level_forms(
     ground_z_m : float
         Elevation of the floor, local metres.
     settings : RoofSettings
-        `level_step_m`, `block_height_percentile`, `minimum_part_area_m2`.
+        `level_step_m`, `block_height_percentile`, `min_part_area_m2`.
     """
     polygons = [_polygon_mm(face) for face in part.faces]
     borders = _borders(part.faces)
@@ -168,14 +168,14 @@ def level_forms(
         return
     regions = _Regions(polygons, heights, borders, settings.block_height_percentile)
     regions.unite_without_step(settings.level_step_m)
-    while regions.unite_closest(settings.level_step_m, settings.minimum_part_area_m2):
+    while regions.unite_closest(settings.level_step_m, settings.min_part_area_m2):
         pass
     for form in itertools.count(1):
         planes = [block_plane(z, ground_z_m, settings.block_height_percentile) for z in regions.points()]
         yield from _drawn(regions.polygons(), planes, ground_z_m)
         if not regions.unite_closest(math.inf, 0.0):
             return
-        while form >= _MOST_FORMS and regions.unite_closest(math.inf, 0.0):
+        while form >= _MAX_FORMS and regions.unite_closest(math.inf, 0.0):
             pass
 
 
@@ -261,12 +261,12 @@ class _Regions:
                 for face in self._members[into]:
                     region[face] = into
 
-    def unite_closest(self, step_m: float, minimum_area_m2: float) -> bool:
+    def unite_closest(self, step_m: float, min_area_m2: float) -> bool:
         """Unite the two neighbours that ask for it most; False where none does."""
         best: tuple[bool, float, int, int] | None = None
         for a, b in self._pairs:
             difference = abs(self._level[a] - self._level[b])
-            is_poor = min(self._area_m2[a], self._area_m2[b]) < minimum_area_m2
+            is_poor = min(self._area_m2[a], self._area_m2[b]) < min_area_m2
             if math.isnan(difference):
                 difference, is_poor = 0.0, True
             if is_poor or difference < step_m:

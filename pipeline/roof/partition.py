@@ -82,8 +82,8 @@ def absorb_small_regions(
     labels: LabelArray,
     counted: LabelArray,
     planes: FloatArray,
-    minimum_area_m2: float,
-    minimum_void_m2: float,
+    min_area_m2: float,
+    min_void_m2: float,
 ) -> LabelArray:
     """Labels in which no region is smaller than it may be: small ones join a neighbour, smallest first.
 
@@ -112,9 +112,9 @@ def absorb_small_regions(
         changed = False
         for r in ascending_order(areas):
             label = labels[members[first[r]]]
-            if areas[r] >= max(minimum_area_m2, minimum_void_m2):
+            if areas[r] >= max(min_area_m2, min_void_m2):
                 break
-            if areas[r] >= (minimum_void_m2 if label < 0 else minimum_area_m2) or r == regions[n - 1]:
+            if areas[r] >= (min_void_m2 if label < 0 else min_area_m2) or r == regions[n - 1]:
                 continue
             if touched[r] != 0:
                 continue  # it grew since its area was taken: the next round judges it

@@ -71,7 +71,7 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
     candidate : Candidate
         Its points.
     settings : RoofSettings
-        `minimum_roof_height_m`, `minimum_points`, `minimum_points_in_footprint`.
+        `min_roof_height_m`, `min_points`, `min_points_in_footprint`.
 
     Returns
     -------
@@ -88,20 +88,18 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
     points = candidate.points
     if not np.isfinite(points).all():
         raise ValueError("a point of the candidate has a coordinate that is not finite")
-    if len(points) > settings.maximum_points:
-        raise BuildingError(
-            Reason.TOO_COMPLEX, f"{len(points)} points, more than maximum_points = {settings.maximum_points}"
-        )
+    if len(points) > settings.max_points:
+        raise BuildingError(Reason.TOO_COMPLEX, f"{len(points)} points, more than max_points = {settings.max_points}")
     chosen = top_visible(points, SHADING_RADIUS_M, SHADING_HEIGHT_M) & (
-        points[:, 2] >= candidate.ground_z_m + settings.minimum_roof_height_m
+        points[:, 2] >= candidate.ground_z_m + settings.min_roof_height_m
     )
     index = np.flatnonzero(chosen)
     grid = np.rint(points[index] * 1e3).astype(np.int64)
     kept, _ = unique_xy(grid[:, :2], grid[:, 2])
     index = index[kept]
-    name, fewest = "minimum_points", settings.minimum_points
-    if candidate.footprint is not None and settings.minimum_points_in_footprint < fewest:
-        name, fewest = "minimum_points_in_footprint", settings.minimum_points_in_footprint
+    name, fewest = "min_points", settings.min_points
+    if candidate.footprint is not None and settings.min_points_in_footprint < fewest:
+        name, fewest = "min_points_in_footprint", settings.min_points_in_footprint
     if len(index) < fewest:
         raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than {name} = {fewest}")
     footprint = None if candidate.footprint is None else footprint_in_mm(candidate.footprint)
@@ -201,10 +199,10 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     z = np.zeros(len(xy_mm))
     z[:n] = roof.points[:, 2]
     x, y = np.ascontiguousarray(xy_mm[:, 0]), np.ascontiguousarray(xy_mm[:, 1])
-    area = minimum_face_area(roof, settings)
+    area = min_face_area(roof, settings)
     step_offset_m = settings.step_offset_spacings * roof.spacing_m
     labels = continue_crossings(x, y, tin.facets, labels, known, coefficients)
-    labels = absorb_small_regions(x, y, z, tin.facets, labels, counted, coefficients, area, settings.minimum_void_m2)
+    labels = absorb_small_regions(x, y, z, tin.facets, labels, counted, coefficients, area, settings.min_void_m2)
     partition = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     if given is not None:
         return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=given, raw=None)
@@ -343,16 +341,16 @@ def draw_clipped(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings, form:
     if form.shrink_mm > 0.0:
         drawn_back = shapely.set_precision(shapely.buffer(outline_mm, -form.shrink_mm, join_style="mitre"), 1.0)
         outline_mm = MultiPolygon(polygons_of(drawn_back))
-    partition = clip_partition(plan.faces, outline_mm, minimum_face_area(roof, settings))
+    partition = clip_partition(plan.faces, outline_mm, min_face_area(roof, settings))
     if form.straight and settings.straight_borders:
         partition = straighten_borders(partition, plan.planes, roof.spacing_m, settings)
     tolerance = form.simplification * settings.simplification_spacings * roof.spacing_m
     return unite_close_vertices(simplify_partition(partition, tolerance, outline_too=False), form.unite_mm)
 
 
-def minimum_face_area(roof: RoofPoints, settings: RoofSettings) -> float:
+def min_face_area(roof: RoofPoints, settings: RoofSettings) -> float:
     """Area in m2 under which a roof face joins a neighbour."""
-    return max(settings.minimum_face_area_m2, settings.minimum_face_spacings2 * roof.spacing_m**2)
+    return max(settings.min_face_area_m2, settings.min_face_spacings2 * roof.spacing_m**2)
 
 
 def _frame(low: IntArray, high: IntArray, margin: int) -> IntArray:
@@ -393,7 +391,7 @@ def level_unsupported_faces(
     ground_z_m : float
         The floor.
     settings : RoofSettings
-        `minimum_clearance_m`, `maximum_overshoot_m`.
+        `min_clearance_m`, `max_overshoot_m`.
 
     Returns
     -------
@@ -404,7 +402,7 @@ def level_unsupported_faces(
     """
     labels = partition.labels.copy()
     extended = list(planes)
-    floor = ground_z_m + settings.minimum_clearance_m
+    floor = ground_z_m + settings.min_clearance_m
     known = roof.labels >= 0
     lowest, highest = np.full(len(planes), np.inf), np.full(len(planes), -np.inf)
     np.minimum.at(lowest, roof.labels[known], roof.points[known, 2])
@@ -417,7 +415,7 @@ def level_unsupported_faces(
     z = a * (xy[:, 0] * 1e-3) + b * (xy[:, 1] * 1e-3) + c
     starts = np.searchsorted(face, np.arange(len(labels)))
     bottoms, tops = np.minimum.reduceat(z, starts), np.maximum.reduceat(z, starts)
-    tolerance = settings.maximum_overshoot_m
+    tolerance = settings.max_overshoot_m
     fits = (bottoms >= np.maximum(floor, lowest[labels] - tolerance)) & (tops <= highest[labels] + tolerance)
     for k in np.flatnonzero(~fits).tolist():
         polygon, label = partition.polygons[k], int(labels[k])

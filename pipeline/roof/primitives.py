@@ -138,7 +138,7 @@ def fit_gable(
     planes: tuple[Plane, Plane],
     ground_z_m: float,
     *,
-    least_side_share: float,
+    min_side_share: float,
     margin_m: float = 0.0,
 ) -> GableFit:
     """The gable of two planes: rectangles on their line of intersection, both made equal by the larger one.
@@ -153,7 +153,7 @@ def fit_gable(
         Their best-fit planes.
     ground_z_m : float
         Elevation of the floor.
-    least_side_share : float
+    min_side_share : float
         At least this share of either plane's points must lie on one side of the line, the other's on the other.
     margin_m : float
         By how much the rectangles go beyond the hulls.
@@ -179,11 +179,11 @@ def fit_gable(
         # the other way round, so that the first plane's side is again to the right
         line = PlanLine(origin=line.origin, direction=(0.0 - line.direction[0], 0.0 - line.direction[1]))
         shares = float(np.mean(left[members[0]] >= 0.0)), float(np.mean(left[members[1]] <= 0.0))
-    if min(shares) < least_side_share:
+    if min(shares) < min_side_share:
         raise BuildingError(
             Reason.NO_PARTITION,
             f"{min(shares):.2f} of the points of a plane lie on its side of the line in which the two planes meet, "
-            f"least_side_share is {least_side_share:g}",
+            f"min_side_share is {min_side_share:g}",
         )
     grid = np.rint(points[:, :2] * 1e3).astype(np.int64)
     hulls = convex_hull(grid[members[0]]), convex_hull(grid[members[1]])

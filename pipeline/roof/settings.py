@@ -11,12 +11,12 @@ from pipeline.parameters import Parameters, parameter
 class RoofSettings(Parameters):
     """How roof planes become roof faces and closed solids."""
 
-    minimum_points: int = parameter(10, "A candidate with fewer roof points is not modelled.", minimum=3, maximum=1000)
-    minimum_points_in_footprint: int = parameter(
+    min_points: int = parameter(10, "A candidate with fewer roof points is not modelled.", minimum=3, maximum=1000)
+    min_points_in_footprint: int = parameter(
         4, "The same where the footprint is given: few points then tell a simple roof.", minimum=3, maximum=1000
     )
-    maximum_points: int = parameter(4_000_000, "A candidate with more points is refused as too complex.", minimum=1000)
-    minimum_roof_height_m: float = parameter(
+    max_points: int = parameter(4_000_000, "A candidate with more points is refused as too complex.", minimum=1000)
+    min_roof_height_m: float = parameter(
         1.5, "Points lower than this above the floor are no roof points.", unit="m", minimum=0.2, maximum=10.0
     )
     gap_spacings: float = parameter(
@@ -90,20 +90,18 @@ class RoofSettings(Parameters):
         minimum=0.5,
         maximum=100.0,
     )
-    minimum_face_area_m2: float = parameter(
+    min_face_area_m2: float = parameter(
         0.6, "A smaller roof face joins a neighbour.", unit="m2", minimum=0.05, maximum=100.0
     )
-    minimum_face_spacings2: float = parameter(
+    min_face_spacings2: float = parameter(
         2.0,
         "A roof face smaller than this many squared point spacings joins a neighbour.",
         unit="squared point spacings",
         minimum=0.0,
         maximum=100.0,
     )
-    minimum_void_m2: float = parameter(
-        6.0, "A smaller gap in a roof is closed.", unit="m2", minimum=0.0, maximum=1000.0
-    )
-    minimum_part_area_m2: float = parameter(
+    min_void_m2: float = parameter(6.0, "A smaller gap in a roof is closed.", unit="m2", minimum=0.0, maximum=1000.0)
+    min_part_area_m2: float = parameter(
         4.0, "A smaller separate part of a building is left out.", unit="m2", minimum=0.0, maximum=100.0
     )
     simplification_spacings: float = parameter(
@@ -113,14 +111,14 @@ class RoofSettings(Parameters):
         minimum=0.0,
         maximum=3.0,
     )
-    minimum_clearance_m: float = parameter(
+    min_clearance_m: float = parameter(
         0.4,
         "A roof face that comes nearer to the floor than this becomes horizontal.",
         unit="m",
         minimum=0.05,
         maximum=5.0,
     )
-    maximum_overshoot_m: float = parameter(
+    max_overshoot_m: float = parameter(
         2.0,
         "A roof face that goes farther than this above or below the points of its plane becomes horizontal.",
         unit="m",

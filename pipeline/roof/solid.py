@@ -24,7 +24,7 @@ from pipeline.roof.partition import RoofPartition
 SAME_HEIGHT_MM = 2
 """Levels of one plan vertex that are closer than this are one."""
 
-MINIMUM_SPAN_MM = 5
+MIN_SPAN_MM = 5
 """A crossing of two planes nearer than this to the end of its edge is moved to that end."""
 
 Ring = list[int]
@@ -136,7 +136,7 @@ def _insert_crossings(mesh: _Mesh, planes: Sequence[Plane]) -> dict[tuple[int, i
             continue
         (xa, ya), (xb, yb) = mesh.xy[a], mesh.xy[b]
         fraction = at_a / (at_a - at_b)
-        if min(fraction, 1.0 - fraction) * math.hypot(xb - xa, yb - ya) < MINIMUM_SPAN_MM:
+        if min(fraction, 1.0 - fraction) * math.hypot(xb - xa, yb - ya) < MIN_SPAN_MM:
             continue
         inserted[a, b] = inserted[b, a] = len(mesh.xy)
         mesh.xy.append((round(xa + fraction * (xb - xa)), round(ya + fraction * (yb - ya))))

@@ -118,7 +118,7 @@ def without_voids(
     spacing_m : float
         Typical distance of neighbouring points in plan.
     settings : RoofSettings
-        `void_distance_m`, `minimum_void_m2`, `gap_spacings`, `minimum_part_area_m2`.
+        `void_distance_m`, `min_void_m2`, `gap_spacings`, `min_part_area_m2`.
 
     Returns
     -------
@@ -155,12 +155,12 @@ def without_voids(
     drawn = [
         shapely.transform(piece, lambda xy: np.rint(_turned(xy, cos, sin) * 1e3))
         for piece in polygons_of(shapely.union_all(voids))
-        if piece.area >= settings.minimum_void_m2
+        if piece.area >= settings.min_void_m2
     ]
     if not drawn:
         return outline_mm
     left = polygons_of(shapely.difference(outline_mm, shapely.union_all(drawn), grid_size=1.0))
-    large = [piece for piece in left if piece.area * 1e-6 >= settings.minimum_part_area_m2]
+    large = [piece for piece in left if piece.area * 1e-6 >= settings.min_part_area_m2]
     return MultiPolygon(large) if large else outline_mm
 
 

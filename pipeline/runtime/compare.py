@@ -219,7 +219,7 @@ def own_tables(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 
     Examples
     --------
-    >>> own_tables({"classes": "trust", "roof": {"minimum_points": 9}, "kmeans": {"clusters": 3}})
+    >>> own_tables({"classes": "trust", "roof": {"min_points": 9}, "kmeans": {"clusters": 3}})
     {'kmeans': {'clusters': 3}}
     """
     named = [name for name in ("method", "preset") if name in table]

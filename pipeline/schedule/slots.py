@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from pipeline.schedule.cron import Cron
 
-MOST_COUNTED = 10_000
+MAX_COUNTED = 10_000
 """Slots that are counted one by one: a week of every minute. Of a longer stretch only its ends are known."""
 
 _WINDOW = dt.timedelta(hours=1)
@@ -56,7 +56,7 @@ def passed_slots(cron: Cron, decided_until: dt.datetime, now: dt.datetime) -> Pa
     found: list[dt.datetime] = []
     for at in _up_to(now, cron.times(decided_until)):
         found.append(at)
-        if len(found) > MOST_COUNTED:
+        if len(found) > MAX_COUNTED:
             return _ends_of_many(cron, found[0], now)
     if not found:
         return None
@@ -72,7 +72,7 @@ def _ends_of_many(cron: Cron, first: dt.datetime, now: dt.datetime) -> PassedSlo
         near = list(_up_to(now, cron.times(now.astimezone(dt.UTC) - back)))
         if len(near) >= 2:
             return PassedSlots(
-                latest=near[-1], earlier=MOST_COUNTED, first=first, before_latest=near[-2], is_counted=False
+                latest=near[-1], earlier=MAX_COUNTED, first=first, before_latest=near[-2], is_counted=False
             )
         back *= 4
 

@@ -48,7 +48,7 @@ _PLANE_COST = 5.0
 _ROUNDS = 2
 """Rounds of regression, merging and assignment: labels hardly change later."""
 _MAD_TO_SIGMA = 1.4826
-_LEAST_POINTS = 5
+_MIN_POINTS = 5
 """Fewest points of any plane: with three free parameters, four fit by chance too often."""
 
 
@@ -62,21 +62,21 @@ class AdaptivePlaneSettings(Parameters):
         minimum=0.5,
         maximum=20.0,
     )
-    distance_min_m: float = parameter(
+    min_distance_m: float = parameter(
         0.15,
         "Least such distance: tiles, gutters and sag keep a roof from being plane to less.",
         unit="m",
         minimum=0.001,
         maximum=10.0,
     )
-    distance_max_m: float = parameter(0.35, "Largest such distance.", unit="m", minimum=0.001, maximum=10.0)
-    least_area_m2: float = parameter(
+    max_distance_m: float = parameter(0.35, "Largest such distance.", unit="m", minimum=0.001, maximum=10.0)
+    min_area_m2: float = parameter(
         1.3, "Least area of a plane in plan where points are dense.", unit="m2", minimum=0.0, maximum=1e4
     )
-    least_area_sparse_m2: float = parameter(
+    min_area_sparse_m2: float = parameter(
         10.0, "Least area that is asked for however sparse the points.", unit="m2", minimum=0.0, maximum=1e4
     )
-    least_points: int = parameter(
+    min_points: int = parameter(
         6, "Fewest points of a plane where the larger area holds as many.", unit="points", minimum=5, maximum=10_000
     )
     max_slope_deg: float = parameter(
@@ -93,7 +93,7 @@ class AdaptivePlaneSettings(Parameters):
     def cross_faults(self) -> list[str]:
         """Bounds must be ranges."""
         faults = super().cross_faults()
-        for low, high in (("distance_min_m", "distance_max_m"), ("least_area_m2", "least_area_sparse_m2")):
+        for low, high in (("min_distance_m", "max_distance_m"), ("min_area_m2", "min_area_sparse_m2")):
             if getattr(self, low) > getattr(self, high):
                 faults.append(f"{low} is {getattr(self, low):g}: use at most {high}, {getattr(self, high):g}")
         return faults
@@ -107,8 +107,8 @@ class AdaptivePlaneSettings(Parameters):
         [21, 6, 6, 5]
         """
         cell_m2 = spacing_m * spacing_m
-        asked = max(self.least_area_m2 / cell_m2, min(self.least_points, self.least_area_sparse_m2 / cell_m2))
-        return max(_LEAST_POINTS, math.ceil(asked))
+        asked = max(self.min_area_m2 / cell_m2, min(self.min_points, self.min_area_sparse_m2 / cell_m2))
+        return max(_MIN_POINTS, math.ceil(asked))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -141,12 +141,12 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
         Without planes where points are too few, or flat nowhere; a spacing of nan or 0 counts as too few.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
-    if len(points) < _LEAST_POINTS or not spacing_m > 0.0:
+    if len(points) < _MIN_POINTS or not spacing_m > 0.0:
         return DetectedPlanes(
             coefficients=np.zeros((0, 3)), labels=np.full(len(points), -1, np.int32), sigma_m=math.nan
         )
     if spacing_m < _DENSE_SPACING_M:
-        nodes, node_of = mean_nodes(points, _NODE_CELL_M, settings.distance_max_m)
+        nodes, node_of = mean_nodes(points, _NODE_CELL_M, settings.max_distance_m)
         spacing_m = _NODE_CELL_M
     else:
         nodes, node_of = points, np.arange(len(points), dtype=np.int32)
@@ -157,8 +157,8 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
         nearest_neighbours(nodes, _NEIGHBOURS),
         spacing_m,
         settings.noises,
-        settings.distance_min_m,
-        settings.distance_max_m,
+        settings.min_distance_m,
+        settings.max_distance_m,
         settings.fewest_points(spacing_m),
         math.cos(math.radians(settings.max_slope_deg)),
         math.cos(math.radians(settings.normal_angle_deg)),
@@ -426,8 +426,8 @@ def _detect(
     neighbours: LabelArray,
     spacing_m: float,
     noises: float,
-    distance_min_m: float,
-    distance_max_m: float,
+    min_distance_m: float,
+    max_distance_m: float,
     fewest_points: int,
     min_cosine: float,
     normal_cosine: float,
@@ -436,7 +436,7 @@ def _detect(
     local, variances = local_planes(nodes, neighbours)
     order = ascending_order(variances)
     sigma_m = noise_of_local_planes(variances, order)
-    distance_m = min(max(noises * sigma_m, distance_min_m), distance_max_m)
+    distance_m = min(max(noises * sigma_m, min_distance_m), max_distance_m)
     # of a plane through m points spread evenly over a disc the slope has the error 2 sigma sqrt(pi) / (spacing m)
     slope_error = 2.0 * math.sqrt(math.pi) * sigma_m / (spacing_m * (FITTED_NEIGHBOURS + 1.0))
     tells = slope_error < _SLOPE_ERROR and spacing_m < _NORMALS_SPACING_M
@@ -459,7 +459,7 @@ def _detect(
             labels[i] = -1
     if len(nodes) < len(points):
         sigma_m = _noise_about(points, labels[node_of], planes)
-        distance_m = min(max(noises * sigma_m, distance_min_m), distance_max_m)
+        distance_m = min(max(noises * sigma_m, min_distance_m), max_distance_m)
         labels = _labels_of_points(points, node_of, neighbours, labels, planes, distance_m)
     planes = _numbered(points, labels, planes, min_cosine)
     return planes, labels, _noise_about(points, labels, planes)

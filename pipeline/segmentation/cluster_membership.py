@@ -47,7 +47,7 @@ class ClusterMembershipSettings(Parameters):
         minimum=0.01,
         maximum=100.0,
     )
-    least_members: int = parameter(4, "Fewest facets of a cluster.", unit="facets", minimum=1, maximum=100_000)
+    min_members: int = parameter(4, "Fewest facets of a cluster.", unit="facets", minimum=1, maximum=100_000)
     max_o_deviation_m: float = parameter(
         1.3,
         "Clusters whose O-distance has this standard deviation or more are no roof.",
@@ -153,7 +153,7 @@ def refine_clusters(
         scales[:, 2] += float(deviations.mean()) / settings.member_spreads
     labels = _nearest_centre(parameters, centres, scales, settings.member_spreads)
     counts = np.bincount(labels[labels >= 0], minlength=len(coarse))
-    kept = counts >= settings.least_members
+    kept = counts >= settings.min_members
     for k in np.flatnonzero(kept).tolist():
         kept[k] = parameters[labels == k, 2].std() < settings.max_o_deviation_m
     number = np.full(len(coarse) + 1, -1, np.int32)

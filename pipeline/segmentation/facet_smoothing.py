@@ -17,7 +17,7 @@ _NORMAL_NOISE = 1.5
 """Standard deviation of the slope of a Delaunay facet, in vertical noise over point spacing (measured: 1.3 to 1.8)."""
 
 
-def passes_for_noise(sigma_m: float, spacing_m: float, wanted_deg: float, most_passes: int) -> int:
+def passes_for_noise(sigma_m: float, spacing_m: float, wanted_deg: float, max_passes: int) -> int:
     """How often the normals are averaged until the noise turns them by no more than a wanted angle.
 
     Parameters
@@ -28,7 +28,7 @@ def passes_for_noise(sigma_m: float, spacing_m: float, wanted_deg: float, most_p
         Mean point spacing in plan, above 0; nan for unknown.
     wanted_deg : float
         Standard deviation of the slope that is good enough, above 0.
-    most_passes : int
+    max_passes : int
         Never more than these.
 
     Returns
@@ -40,7 +40,7 @@ def passes_for_noise(sigma_m: float, spacing_m: float, wanted_deg: float, most_p
         return 0
     # a patch is wider by about one spacing a pass
     widths = _NORMAL_NOISE * sigma_m / (spacing_m * math.tan(math.radians(wanted_deg)))
-    return min(max(0, math.ceil(widths - 1.0)), most_passes)
+    return min(max(0, math.ceil(widths - 1.0)), max_passes)
 
 
 @kernel

@@ -57,7 +57,7 @@ class FuzzySartClusteringSettings(Parameters):
     neighbourhood_end: float = parameter(
         0.01, "The same for a winner of age tau: practically none but the winner learns.", minimum=1e-6, maximum=100.0
     )
-    scaled_minimum: float = parameter(
+    scaled_min: float = parameter(
         0.0, "Lower end of the one range, up to 1, of spherical_scaled vectors.", minimum=0.0, maximum=1.0
     )
     clustering_work_limit: int = parameter(
@@ -135,7 +135,7 @@ def centre_of_building(points: FloatArray) -> FloatArray:
 
 
 def facet_vectors(
-    kind: str, normals: FloatArray, centroids: FloatArray, centre: FloatArray, *, scaled_minimum: float = 0.0
+    kind: str, normals: FloatArray, centroids: FloatArray, centre: FloatArray, *, scaled_min: float = 0.0
 ) -> FloatArray:
     """What is clustered: one vector a facet.
 
@@ -144,14 +144,14 @@ def facet_vectors(
     kind : {"unit_normal", "footpoint", "spherical_scaled"}
         ``unit_normal`` is the normal; ``footpoint`` the foot of the perpendicular from the centre to the facet's
         plane (the reading under which Figs. 6 and 7 of the paper make sense); ``spherical_scaled`` that foot as
-        (r, theta, phi), each scaled to [scaled_minimum, 1] (the paper's literal words).
+        (r, theta, phi), each scaled to [scaled_min, 1] (the paper's literal words).
     normals : (m, 3) float64
         Unit normals.
     centroids : (m, 3) float64
         Centres of the facets, metres.
     centre : (3,) float64
         As `centre_of_building` gives it.
-    scaled_minimum : float
+    scaled_min : float
         Lower end of the range of ``spherical_scaled``.
 
     Returns
@@ -165,7 +165,7 @@ def facet_vectors(
     footpoints = normals * offset_m[:, None]
     if kind == "footpoint":
         return footpoints
-    return _scaled_spherical(footpoints, scaled_minimum)
+    return _scaled_spherical(footpoints, scaled_min)
 
 
 def _row_dot(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -173,8 +173,8 @@ def _row_dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2], dtype=np.float64)
 
 
-def _scaled_spherical(footpoints: FloatArray, scaled_minimum: float) -> FloatArray:
-    """(r, theta, phi) of every vector, each dimension scaled to [scaled_minimum, 1]."""
+def _scaled_spherical(footpoints: FloatArray, scaled_min: float) -> FloatArray:
+    """(r, theta, phi) of every vector, each dimension scaled to [scaled_min, 1]."""
     if len(footpoints) == 0:
         return footpoints.copy()
     r = np.sqrt(_row_dot(footpoints, footpoints))
@@ -184,15 +184,15 @@ def _scaled_spherical(footpoints: FloatArray, scaled_minimum: float) -> FloatArr
     ordered = np.sort(phi)
     gaps = np.diff(np.append(ordered, ordered[0] + 2.0 * math.pi))
     phi = (phi - ordered[(int(gaps.argmax()) + 1) % len(ordered)]) % (2.0 * math.pi)
-    return np.column_stack([_to_one_range(values, scaled_minimum) for values in (r, theta, phi)])
+    return np.column_stack([_to_one_range(values, scaled_min) for values in (r, theta, phi)])
 
 
-def _to_one_range(values: FloatArray, scaled_minimum: float) -> FloatArray:
-    """Values scaled to [scaled_minimum, 1]; all 1 where they have no range."""
+def _to_one_range(values: FloatArray, scaled_min: float) -> FloatArray:
+    """Values scaled to [scaled_min, 1]; all 1 where they have no range."""
     low, high = float(values.min()), float(values.max())
     if high - low < _FLAT_RANGE:
         return np.ones_like(values)
-    return np.asarray(scaled_minimum + (1.0 - scaled_minimum) * (values - low) / (high - low), dtype=np.float64)
+    return np.asarray(scaled_min + (1.0 - scaled_min) * (values - low) / (high - low), dtype=np.float64)
 
 
 def cluster(vectors: FloatArray, areas_m2: FloatArray, settings: FuzzySartClusteringSettings) -> Clustering:
@@ -268,7 +268,7 @@ def _learn(
     ranked = np.zeros(capacity, np.int64)
     degree = np.zeros(capacity)
     # An angle beyond pi (1 - V) cannot reach the vigilance: its arc cosine need not be taken.
-    least_cosine = math.cos(math.pi * (1.0 - vigilance)) - 1e-12
+    min_cosine = math.cos(math.pi * (1.0 - vigilance)) - 1e-12
     count = 0
     work = 0
     epochs = 0
@@ -283,7 +283,7 @@ def _learn(
             work += count + 1
             matches = 0
             for k in range(count):
-                match = _degree(template, template_module, k, vectors, module, i, least_cosine, vigilance)
+                match = _degree(template, template_module, k, vectors, module, i, min_cosine, vigilance)
                 if match >= vigilance:
                     at = matches
                     while at > 0 and degree[at - 1] < match:
@@ -354,7 +354,7 @@ def _learn(
             continue
         best = vigilance
         for k in range(count):
-            match = _degree(template, template_module, k, vectors, module, i, least_cosine, vigilance)
+            match = _degree(template, template_module, k, vectors, module, i, min_cosine, vigilance)
             if match > best or (match == best and labels[i] < 0):
                 best = match
                 labels[i] = k
@@ -369,7 +369,7 @@ def _degree(
     vectors: FloatArray,
     module: FloatArray,
     i: int,
-    least_cosine: float,
+    min_cosine: float,
     vigilance: float,
 ) -> float:
     """VDM of neuron k and vector i (Eq. 3), or -1 where it is certain to stay below the vigilance."""
@@ -380,6 +380,6 @@ def _degree(
         return -1.0
     dot = template[k, 0] * vectors[i, 0] + template[k, 1] * vectors[i, 1] + template[k, 2] * vectors[i, 2]
     modules = t_module * x_module
-    if dot < least_cosine * modules:
+    if dot < min_cosine * modules:
         return -1.0
     return float(_module_degree(t_module, x_module) * _angle_degree(dot / modules))

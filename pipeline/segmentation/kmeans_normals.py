@@ -37,7 +37,7 @@ class NormalClusteringSettings(Parameters):
         minimum=0,
         maximum=32,
     )
-    most_clusters: int = parameter(6, "Largest k that is tried where k is chosen.", minimum=1, maximum=32)
+    max_clusters: int = parameter(6, "Largest k that is tried where k is chosen.", minimum=1, maximum=32)
     residual_weight: float = parameter(
         2.0,
         "The k is chosen by the silhouette plus this many times the share of points that lie on their planes.",
@@ -122,8 +122,8 @@ def cluster_normals(
     products = 0
     for first in range(starts):
         allowed = (settings.kmeans_work_limit - products) // (len(normals) * k)
-        most_rounds = min(settings.kmeans_rounds, allowed)
-        found = kmeans(normals, weights, farthest[first : first + k], most_rounds) if most_rounds > 0 else None
+        max_rounds = min(settings.kmeans_rounds, allowed)
+        found = kmeans(normals, weights, farthest[first : first + k], max_rounds) if max_rounds > 0 else None
         if found is None or found[3] == allowed < settings.kmeans_rounds:
             raise BuildingError(
                 Reason.TOO_COMPLEX,
@@ -177,7 +177,7 @@ def choose_clusters(
     if settings.clusters > 0:
         return cluster_normals(normals, weights, settings.clusters, settings)
     best, highest = cluster_normals(normals, weights, 1, settings), -math.inf
-    for k in range(1, min(settings.most_clusters, len(normals)) + 1):
+    for k in range(1, min(settings.max_clusters, len(normals)) + 1):
         clusters = cluster_normals(normals, weights, k, settings)
         if len(clusters.centres) < k:
             break
@@ -235,7 +235,7 @@ def farthest_point_start(normals: FloatArray, weights: FloatArray, k: int) -> Fl
 
 @kernel
 def kmeans(
-    normals: FloatArray, weights: FloatArray, start: FloatArray, most_rounds: int
+    normals: FloatArray, weights: FloatArray, start: FloatArray, max_rounds: int
 ) -> tuple[LabelArray, FloatArray, float, int]:
     """Rounds of assignment to the most similar centre and of new centres, until no facet changes.
 
@@ -247,7 +247,7 @@ def kmeans(
         Above 0.
     start : (k, 3) float64
         Unit vectors.
-    most_rounds : int
+    max_rounds : int
         At least 1.
 
     Returns
@@ -267,7 +267,7 @@ def kmeans(
     sums = np.empty((k, 3))
     inertia = 0.0
     rounds = 0
-    for _ in range(most_rounds):
+    for _ in range(max_rounds):
         rounds += 1
         changed = False
         inertia = 0.0

@@ -19,7 +19,7 @@ from pipeline.segmentation.plane_regression import (
     mean_square_residual,
 )
 
-_LEAST_SEED_POINTS = 4
+_MIN_SEED_POINTS = 4
 """A plane has three free parameters: four points are the fewest that can contradict one another."""
 
 
@@ -57,7 +57,7 @@ def cluster_leftovers(
         if labels[i] < 0:
             sums = _sums_of_neighbourhood(points, neighbours, grown, i)
             a, b, c, fitted = best_fit_plane(sums)
-            if fitted and sums[0] >= _LEAST_SEED_POINTS:
+            if fitted and sums[0] >= _MIN_SEED_POINTS:
                 flatness[i] = mean_square_residual(sums, a, b, c) * cosine_of_slope(a, b) ** 2
     queue = np.empty(n, np.int32)
     asked = np.full(n, -1, np.int32)
@@ -68,14 +68,14 @@ def cluster_leftovers(
             continue
         sums = _sums_of_neighbourhood(points, neighbours, grown, seed)
         a, b, c, fitted = best_fit_plane(sums)
-        if not fitted or sums[0] < _LEAST_SEED_POINTS:
+        if not fitted or sums[0] < _MIN_SEED_POINTS:
             continue
         sums = np.zeros(N_SUMS)
         queue[0] = seed
         asked[seed] = seed
         held = 1
         at = 0
-        refit = 2 * _LEAST_SEED_POINTS
+        refit = 2 * _MIN_SEED_POINTS
         while at < held:
             i = queue[at]
             at += 1

@@ -40,7 +40,7 @@ class ParameterBoxSettings(Parameters):
     double_share: float = parameter(
         0.5, "Two coarse clusters that share more than this of the smaller one are one.", minimum=0.0, maximum=1.0
     )
-    most_coarse_clusters: int = parameter(
+    max_coarse_clusters: int = parameter(
         2000, "Coarse clusters beyond which a building is too complex.", minimum=1, maximum=10**6
     )
 
@@ -64,18 +64,18 @@ def coarse_clusters(parameters: FloatArray, settings: ParameterBoxSettings) -> t
     Raises
     ------
     BuildingError
-        Reason ``too_complex`` beyond ``most_coarse_clusters``.
+        Reason ``too_complex`` beyond ``max_coarse_clusters``.
     """
     if len(parameters) == 0:
         return ()
     first = _dense_groups(parameters, 0.0, settings)
     second = _dense_groups(parameters, 0.5, settings)
     n_first, n_second = int(first.max()) + 1, int(second.max()) + 1
-    if n_first + n_second > settings.most_coarse_clusters:
+    if n_first + n_second > settings.max_coarse_clusters:
         raise BuildingError(
             Reason.TOO_COMPLEX,
             f"{n_first + n_second} coarse clusters of {len(parameters)} facets, "
-            f"most_coarse_clusters is {settings.most_coarse_clusters}",
+            f"max_coarse_clusters is {settings.max_coarse_clusters}",
         )
     cluster_of_group = _merge_doubles(first, second, n_first, n_second, settings.double_share)
     n_clusters = int(cluster_of_group.max(initial=-1)) + 1

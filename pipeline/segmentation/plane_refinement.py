@@ -22,7 +22,7 @@ from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums,
 from pipeline.segmentation.point_assignment import distance_to_plane, nearest_plane, vote_among_neighbours
 from pipeline.segmentation.redundant_planes import dissolve_redundant
 
-_LEAST_SEED_POINTS = 4
+_MIN_SEED_POINTS = 4
 """In the first round a cluster may still be small: its points have not been assigned by planes yet."""
 
 
@@ -40,15 +40,15 @@ class PlaneRefinementSettings(Parameters):
         "Which planes a point chooses among: those of its neighbours, or all planes of the building (the nearest).",
         choices=("neighbours", "all_planes"),
     )
-    least_area_m2: float = parameter(
+    min_area_m2: float = parameter(
         1.5,
         "A plane has at least as many points as this area holds in plan, within the two bounds below.",
         unit="m2",
         minimum=0.0,
         maximum=1000.0,
     )
-    least_points: int = parameter(6, "Fewest points of a plane, however sparse the cloud.", minimum=3, maximum=10_000)
-    most_least_points: int = parameter(
+    min_points: int = parameter(6, "Fewest points of a plane, however sparse the cloud.", minimum=3, maximum=10_000)
+    max_min_points: int = parameter(
         25, "Points that make a plane, however dense the cloud.", minimum=3, maximum=100_000
     )
     max_slope_deg: float = parameter(
@@ -101,18 +101,16 @@ class PlaneRefinementSettings(Parameters):
 
     def fewest_points(self, spacing_m: float) -> int:
         """Fewest points of a plane at a mean spacing in plan."""
-        if spacing_m * spacing_m * self.most_least_points <= self.least_area_m2:
-            return self.most_least_points
-        points = self.least_area_m2 / (spacing_m * spacing_m)
-        return int(min(max(points, self.least_points), self.most_least_points))
+        if spacing_m * spacing_m * self.max_min_points <= self.min_area_m2:
+            return self.max_min_points
+        points = self.min_area_m2 / (spacing_m * spacing_m)
+        return int(min(max(points, self.min_points), self.max_min_points))
 
     def cross_faults(self) -> list[str]:
         """The fewest points must be a range."""
         faults = super().cross_faults()
-        if self.least_points > self.most_least_points:
-            faults.append(
-                f"least_points is {self.least_points}: use at most most_least_points, {self.most_least_points}"
-            )
+        if self.min_points > self.max_min_points:
+            faults.append(f"min_points is {self.min_points}: use at most max_min_points, {self.max_min_points}")
         return faults
 
 
@@ -249,12 +247,12 @@ def _refine(
     parallel_cosine = math.cos(math.radians(rules.merge_angle_deg))
     work = 0
     for round_ in range(rules.rounds):
-        fewest = rules.fewest_points if round_ > 0 else min(rules.fewest_points, _LEAST_SEED_POINTS)
+        fewest = rules.fewest_points if round_ > 0 else min(rules.fewest_points, _MIN_SEED_POINTS)
         sums = cluster_sums(points, labels, n_clusters)
         _fit_all(sums, planes, usable, fewest, rules.min_cosine)
         _drop_outliers(points, labels, planes, usable, rules.outlier_factor * rules.distance_m)
         sums = cluster_sums(points, labels, n_clusters)
-        _fit_all(sums, planes, usable, min(fewest, _LEAST_SEED_POINTS), rules.min_cosine)
+        _fit_all(sums, planes, usable, min(fewest, _MIN_SEED_POINTS), rules.min_cosine)
         pairs = touching_pairs(neighbours, labels, usable)
         if rules.merge_reach_m > 0.0:
             settled = usable & (sums[:, 0] >= rules.fewest_points)

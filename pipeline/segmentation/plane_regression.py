@@ -17,9 +17,9 @@ from pipeline.model import FloatArray, LabelArray
 
 N_SUMS = 10
 """n, x, y, z, xx, xy, yy, xz, yz, zz."""
-_LEAST_WIDTH_RATIO = 1e-3
+_MIN_WIDTH_RATIO = 1e-3
 """A cluster narrower than this share of its length is a line: it holds no plane."""
-_LEAST_VARIANCE_M2 = 1e-9
+_MIN_VARIANCE_M2 = 1e-9
 """Below this the points coincide in plan."""
 
 
@@ -71,7 +71,7 @@ def best_fit_plane(sums: FloatArray) -> tuple[float, float, float, bool]:
     yy = sums[6] / n - y * y
     determinant = xx * yy - xy * xy
     spread = xx + yy
-    if n < 3.0 or spread < _LEAST_VARIANCE_M2 or determinant < (_LEAST_WIDTH_RATIO * spread) ** 2:
+    if n < 3.0 or spread < _MIN_VARIANCE_M2 or determinant < (_MIN_WIDTH_RATIO * spread) ** 2:
         return 0.0, 0.0, z, False
     xz = sums[7] / n - x * z
     yz = sums[8] / n - y * z

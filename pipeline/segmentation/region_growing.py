@@ -35,8 +35,8 @@ class RegionGrowingSettings(Parameters):
         minimum=0.1,
         maximum=100.0,
     )
-    growing_min_m: float = parameter(0.15, "Least such distance.", unit="m", minimum=0.001, maximum=10.0)
-    growing_max_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.001, maximum=10.0)
+    min_growing_m: float = parameter(0.15, "Least such distance.", unit="m", minimum=0.001, maximum=10.0)
+    max_growing_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.001, maximum=10.0)
     agreeing_share: float = parameter(
         0.4,
         "A point joins where at least this share of its neighbours lies as near to the plane.",
@@ -51,13 +51,13 @@ class RegionGrowingSettings(Parameters):
     def cross_faults(self) -> list[str]:
         """The distances must be a range."""
         faults = super().cross_faults()
-        if self.growing_min_m > self.growing_max_m:
-            faults.append(f"growing_min_m is {self.growing_min_m:g}: use at most growing_max_m, {self.growing_max_m:g}")
+        if self.min_growing_m > self.max_growing_m:
+            faults.append(f"min_growing_m is {self.min_growing_m:g}: use at most max_growing_m, {self.max_growing_m:g}")
         return faults
 
     def growing_distance_m(self, sigma_m: float) -> float:
         """Distance of a point from its plane for a noise."""
-        return min(max(self.growing_noises * sigma_m, self.growing_min_m), self.growing_max_m)
+        return min(max(self.growing_noises * sigma_m, self.min_growing_m), self.max_growing_m)
 
 
 def grow_regions(

@@ -16,11 +16,11 @@ from pipeline.compiler import kernel
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.segmentation.point_assignment import distance_to_plane
 
-_LEAST_GRADIENT = 0.02
+_MIN_GRADIENT = 0.02
 """Rise a metre by which two planes must part: about 1 degree; below it their intersection is anywhere."""
-_LEAST_BORDER_POINTS = 3
+_MIN_BORDER_POINTS = 3
 """Points beside the other plane that make a border."""
-_LEAST_AGREEMENT = 0.7
+_MIN_AGREEMENT = 0.7
 """Share of the points along a border that must lie on their plane's own side."""
 
 
@@ -295,7 +295,7 @@ def _segment(
     gradient_x = planes[low, 0] - planes[high, 0]
     gradient_y = planes[low, 1] - planes[high, 1]
     steepness = math.hypot(gradient_x, gradient_y)
-    if steepness < _LEAST_GRADIENT:
+    if steepness < _MIN_GRADIENT:
         return False
     offset = (planes[low, 2] - planes[high, 2]) / (steepness * steepness)
     count = 0
@@ -318,7 +318,7 @@ def _segment(
         first = min(first, position)
         last = max(last, position)
     agreeing = max(valley_votes, count - valley_votes)
-    if count < _LEAST_BORDER_POINTS or count_low in {0, count} or agreeing < _LEAST_AGREEMENT * count:
+    if count < _MIN_BORDER_POINTS or count_low in {0, count} or agreeing < _MIN_AGREEMENT * count:
         return False
     row[0] = low
     row[1] = high

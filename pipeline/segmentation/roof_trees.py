@@ -45,9 +45,9 @@ class TreeVerdict:
     """Clusters that make a gable with one another, best pair first."""
 
 
-def plausible_slopes(centres: FloatArray, least_deg: float, most_deg: float) -> BoolArray:
+def plausible_slopes(centres: FloatArray, min_deg: float, max_deg: float) -> BoolArray:
     """Clusters whose mean slope may be a roof's (section 3.3): (k,) bool."""
-    return np.asarray((centres[:, 0] >= least_deg) & (centres[:, 0] <= most_deg))
+    return np.asarray((centres[:, 0] >= min_deg) & (centres[:, 0] <= max_deg))
 
 
 def classify_2d(centres: FloatArray, settings: RoofTreeSettings) -> TreeVerdict:

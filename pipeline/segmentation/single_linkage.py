@@ -26,14 +26,14 @@ class SingleLinkageSettings(Parameters):
     linkage_start_deg: float = parameter(
         10.0, "Distance up to which two facets are linked, at first.", unit="deg", minimum=0.1, maximum=90.0
     )
-    linkage_least_deg: float = parameter(4.0, "Least reasonable such distance.", unit="deg", minimum=0.1, maximum=90.0)
+    min_linkage_deg: float = parameter(4.0, "Least reasonable such distance.", unit="deg", minimum=0.1, maximum=90.0)
     linkage_factor: float = parameter(
         0.9, "The distance is multiplied by this while a cluster is too large.", minimum=0.1, maximum=0.99
     )
     largest_cluster_share: float = parameter(
         0.8, "A cluster that holds more of all facets than this is too large.", minimum=0.1, maximum=1.0
     )
-    least_members: int = parameter(6, "Fewest facets of a cluster.", unit="facets", minimum=1, maximum=100_000)
+    min_members: int = parameter(6, "Fewest facets of a cluster.", unit="facets", minimum=1, maximum=100_000)
     linkage_work_limit: int = parameter(
         200_000_000, "Comparisons of facets after which a building is too complex.", minimum=1, maximum=10**15
     )
@@ -41,9 +41,9 @@ class SingleLinkageSettings(Parameters):
     def cross_faults(self) -> list[str]:
         """The distances must be a range."""
         faults = super().cross_faults()
-        if self.linkage_least_deg > self.linkage_start_deg:
+        if self.min_linkage_deg > self.linkage_start_deg:
             faults.append(
-                f"linkage_least_deg is {self.linkage_least_deg:g}: use at most linkage_start_deg, "
+                f"min_linkage_deg is {self.min_linkage_deg:g}: use at most linkage_start_deg, "
                 f"{self.linkage_start_deg:g}"
             )
         return faults
@@ -94,11 +94,11 @@ def cluster_by_linkage(
             )
         counts = np.bincount(labels, minlength=1)
         smaller = distance * settings.linkage_factor
-        if counts.max() <= settings.largest_cluster_share * len(labels) or distance <= settings.linkage_least_deg:
+        if counts.max() <= settings.largest_cluster_share * len(labels) or distance <= settings.min_linkage_deg:
             break
-        distance = max(smaller, settings.linkage_least_deg)
+        distance = max(smaller, settings.min_linkage_deg)
     number = np.full(len(counts), -1, np.int32)
-    large = counts >= settings.least_members
+    large = counts >= settings.min_members
     number[large] = np.arange(int(large.sum()), dtype=np.int32)
     return LinkedClusters(labels=number[labels], distance_deg=distance)
 

@@ -192,17 +192,17 @@ def _limits(
     slender = f["height_m"] > settings.max_slenderness * f["width_m"]
     sure &= (f["area_m2"] >= settings.doubtful_area_m2) | ~slender
     doubtful = (kind != FacetKind.BUILDING) & ~sure
-    least_m2 = np.where(doubtful, max(settings.min_area_m2, settings.doubtful_area_m2), settings.min_area_m2)
-    return sure, least_m2, settings.min_width_m * np.where(sure, 0.5, 1.0)
+    min_m2 = np.where(doubtful, max(settings.min_area_m2, settings.doubtful_area_m2), settings.min_area_m2)
+    return sure, min_m2, settings.min_width_m * np.where(sure, 0.5, 1.0)
 
 
 def _faults(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> KindArray:
     """The first fault of each of some surfaces, by their kind and sums alone."""
     f = _figures(sums)
-    sure, least_m2, width_m = _limits(kind, f, settings)
+    sure, min_m2, width_m = _limits(kind, f, settings)
     # the first rule that holds decides
     rules = [
-        (f["area_m2"] < least_m2, Fault.TOO_SMALL),
+        (f["area_m2"] < min_m2, Fault.TOO_SMALL),
         (kind == FacetKind.BUILDING, Fault.NONE),
         (f["top_m"] < settings.min_height_m, Fault.TOO_LOW),
         (kind == FacetKind.CROWN, Fault.CROWN),
@@ -260,8 +260,8 @@ def verdicts(kind: KindArray, sums: IntArray, settings: CandidateSettings) -> It
     for start in range(0, len(kind), _BLOCK):
         own = slice(start, start + _BLOCK)
         faults, figures = _faults(kind[own], sums[own], settings), _figures(sums[own])
-        _, least_m2, width_m = _limits(kind[own], figures, settings)
-        figures |= {"least_m2": least_m2, "least_width_m": width_m}
+        _, min_m2, width_m = _limits(kind[own], figures, settings)
+        figures |= {"min_m2": min_m2, "least_width_m": width_m}
         walls = np.maximum(1, sums[own, Sum.WALLS])
         figures |= {"z_avg": sums[own, Sum.WALLS_Z_MX] / walls / 1000.0}
         figures |= {"own": sums[own, Sum.WALLS_OWN_Z] / walls / 1000.0}
@@ -276,7 +276,7 @@ def _told(fault: Fault, f: Mapping[str, float], settings: CandidateSettings) -> 
         case Fault.NONE:
             return None
         case Fault.TOO_SMALL:
-            detail = f"area {f['area_m2']:.1f} m2, at least {f['least_m2']:g}"
+            detail = f"area {f['area_m2']:.1f} m2, at least {f['min_m2']:g}"
         case Fault.TOO_LOW:
             detail = f"top {f['top_m']:.2f} m above the terrain, at least {settings.min_height_m:g}"
         case Fault.CROWN:

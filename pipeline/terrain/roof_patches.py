@@ -363,7 +363,7 @@ def patches_of(
     roughness_m: float,
     distance_m: float,
     max_angle_deg: float,
-    least_step_m: float,
+    min_step_m: float,
 ) -> tuple[Patches, Borders, LabelArray, LabelArray]:
     """Planar patches of a roof, the borders between them, and which vertices are neighbours (compressed rows).
 
@@ -384,7 +384,7 @@ def patches_of(
         Largest orthogonal distance of a vertex to its patch's plane.
     max_angle_deg : float
         Largest angle between a patch and the surroundings of its vertices.
-    least_step_m : float
+    min_step_m : float
         Planes closer than this in elevation meet.
     """
     radii = circumradii(x, y, tin.facets)
@@ -408,7 +408,7 @@ def patches_of(
     centres /= np.maximum(np.bincount(label, minlength=count), 1)[:, None]
     across = np.flatnonzero(~is_sound).astype(np.int32)
     gaps, sights, _, _ = border_pieces(x, y, tin.facets, tin.neighbours, across, label, count)
-    borders = _borders(pairs, ends, planes, least_step_m, _longest_first(gaps, sights, count))
+    borders = _borders(pairs, ends, planes, min_step_m, _longest_first(gaps, sights, count))
     outlines = outline / 1000.0
     np.add.at(outlines, borders.first, borders.length_m)
     np.add.at(outlines, borders.second, borders.length_m)
@@ -446,7 +446,7 @@ def _longest_first(pairs: LabelArray, ends: FloatArray, count: int) -> IntArray:
 
 
 def _borders(
-    pairs: LabelArray, ends: FloatArray, planes: FloatArray, least_step_m: float, gap_pairs: IntArray
+    pairs: LabelArray, ends: FloatArray, planes: FloatArray, min_step_m: float, gap_pairs: IntArray
 ) -> Borders:
     """Sum up the pieces of each pair."""
     count = len(planes)
@@ -454,7 +454,7 @@ def _borders(
     length = np.hypot(ends[:, 2] - ends[:, 0], ends[:, 3] - ends[:, 1])
     difference = planes[pairs[:, 0]] - planes[pairs[:, 1]]
     step = np.abs(difference[:, 0] * middle[:, 0] + difference[:, 1] * middle[:, 1] + difference[:, 2])
-    level = np.where(step < least_step_m * 1000.0, length, 0.0)
+    level = np.where(step < min_step_m * 1000.0, length, 0.0)
     across = np.hypot(difference[:, 0], difference[:, 1])
     beside = np.where(step < MAX_BESIDE_MM * across, length, 0.0)
     keys, row = np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1], return_inverse=True)

@@ -37,9 +37,7 @@ class UnitSettings(Parameters):
         "What separates units within a candidate: nothing, steps, or steps and valleys between parallel ridges.",
         choices=("nothing", "steps", "ridges"),
     )
-    least_step_m: float = parameter(
-        0.3, "Least step between the roofs of two units.", unit="m", minimum=0.1, maximum=5.0
-    )
+    min_step_m: float = parameter(0.3, "Least step between the roofs of two units.", unit="m", minimum=0.1, maximum=5.0)
     min_area_m2: float = parameter(
         25.0, "Least plan area of a unit; what is smaller joins its neighbour.", unit="m2", minimum=1.0, maximum=1000.0
     )
@@ -345,7 +343,7 @@ def units_of(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: UnitSetti
         roughness_m=_ROUGHNESS_M,
         distance_m=_DISTANCE_M,
         max_angle_deg=_MAX_ANGLE_DEG,
-        least_step_m=settings.least_step_m,
+        min_step_m=settings.min_step_m,
     )
     unit_of_patch = units_of_patches(patches, borders, settings)
     if (unit_of_patch == unit_of_patch[0]).all():

@@ -21,7 +21,7 @@ LOG = logging.getLogger("gablework.driver")
 
 _FLUSH_S = 0.5
 """Progress is written at most so often."""
-_MOST_PENDING = 500
+_MAX_PENDING = 500
 """Events that wait while the database is away; the oldest go first."""
 
 
@@ -141,7 +141,7 @@ class HeldJob:
                 return
             if told.kind == "progress":
                 self._pending = [e for e in self._pending if (e.kind, e.stage) != ("progress", told.stage)]
-            self._pending = [*self._pending, told][-_MOST_PENDING:]
+            self._pending = [*self._pending, told][-_MAX_PENDING:]
 
     def write(self) -> None:
         """Write down what waits.
@@ -162,7 +162,7 @@ class HeldJob:
                 self._store.record(self.job, pending)
             except StoreError:
                 with self._lock:
-                    self._pending = [*pending, *self._pending][-_MOST_PENDING:]
+                    self._pending = [*pending, *self._pending][-_MAX_PENDING:]
                 raise
             self._written_s = time.monotonic()
 

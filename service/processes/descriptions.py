@@ -17,7 +17,7 @@ MESHES = ("building", "tile", "glb", "none")
 PRIORITY = 10
 """Largest priority; its negative is the least."""
 
-MOST_METHODS = 8
+MAX_METHODS = 8
 """Most methods of one comparison."""
 
 
@@ -79,7 +79,7 @@ def compare_inputs(settings: ServiceSettings) -> dict[str, dict[str, Any]]:
         "type": "array",
         "items": {"type": "string", "enum": list(known.variants())},
         "minItems": 2,
-        "maxItems": MOST_METHODS,
+        "maxItems": MAX_METHODS,
         "uniqueItems": True,
     }
     told = "What is run on the same candidates, each METHOD or METHOD:PRESET; without a preset robust is meant."

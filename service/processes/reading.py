@@ -11,8 +11,8 @@ from service.drafts import Draft, Inputs, shortened
 from service.errors import RequestError
 from service.outputs import COMPARISON_OUTPUTS, OUTPUTS, OutputKind
 from service.processes.descriptions import (
+    MAX_METHODS,
     MESHES,
-    MOST_METHODS,
     PRIORITY,
     compare_inputs,
     reconstruct_inputs,
@@ -80,7 +80,7 @@ def _methods(inputs: Inputs, known: catalogue.Catalogue) -> tuple[str, ...]:
     if isinstance(value, Mapping) and "value" in value:
         value = value["value"]
     if value in (None, []):
-        inputs.faults.append(f"methods is missing: give 2 to {MOST_METHODS} of {', '.join(known.variants())}")
+        inputs.faults.append(f"methods is missing: give 2 to {MAX_METHODS} of {', '.join(known.variants())}")
         return ()
     words: list[Any] = value if isinstance(value, list) else [value]
     unknown = [word for word in words if word not in known.variants()]
@@ -92,8 +92,8 @@ def _methods(inputs: Inputs, known: catalogue.Catalogue) -> tuple[str, ...]:
     twice = sorted({word for word in found if found.count(word) > 1})
     if twice:
         inputs.faults.append(f"methods holds {', '.join(twice)} twice: give each once")
-    elif not 2 <= len(found) <= MOST_METHODS:
-        inputs.faults.append(f"methods holds {len(found)}: give 2 to {MOST_METHODS}")
+    elif not 2 <= len(found) <= MAX_METHODS:
+        inputs.faults.append(f"methods holds {len(found)}: give 2 to {MAX_METHODS}")
     return found
 
 

@@ -100,7 +100,7 @@ async def _read(
         It is no form, or holds what cannot be read.
     """
     content_type = request.headers.get("content-type", "")
-    form = Form(aiter(request.stream()), content_type, most_parts=settings.max_inputs + OTHER_PARTS)
+    form = Form(aiter(request.stream()), content_type, max_parts=settings.max_inputs + OTHER_PARTS)
     inputs: dict[str, Any] = {}
     outputs: list[str] | None = None
     faults: list[str] = []

@@ -31,7 +31,7 @@ UPLOAD_ID = "0123456789abcdef0123456789abcdef"
 """The upload of the examples."""
 FILE_FIELD = "file"
 """Field of a form that holds the file."""
-MOST_PARTS = 20
+MAX_PARTS = 20
 FORM_SLACK_BYTES = 65_536
 """What a form may have beside the file."""
 DIGEST = re.compile(r"(?:^|,)\s*sha-256\s*=\s*:([A-Za-z0-9+/=]*):", re.IGNORECASE)
@@ -137,7 +137,7 @@ async def send(
     if is_form:
         if digest is not None:
             raise RequestError(["the digest is that of a whole form: send the file as the body itself"])
-        form = Form(aiter(request.stream()), request.headers["content-type"], most_parts=MOST_PARTS)
+        form = Form(aiter(request.stream()), request.headers["content-type"], max_parts=MAX_PARTS)
         upload = await _from_form(form, keep, store, folder)
     else:
         named = filename or _disposition_name(content_disposition) or unquote(x_filename or "")

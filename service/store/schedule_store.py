@@ -13,7 +13,7 @@ from service.store.database import LOCK_SUBMISSIONS, Database
 from service.store.schedules import ScheduleFilter
 from service.store.ticks import LineLimits
 
-MOST_A_TICK = 200
+MAX_A_TICK = 200
 """Schedules that one tick decides; the next tick goes on."""
 
 
@@ -170,7 +170,7 @@ class ScheduleStore:
                 return []
         limits = self._limits(max_queued, max_queued_per_key)
         told: list[ScheduleRun] = []
-        for _ in range(MOST_A_TICK):
+        for _ in range(MAX_A_TICK):
             with self._database.write() as connection:
                 found = ticks.decide_first(connection, now=at, limits=limits)
             if found is None:

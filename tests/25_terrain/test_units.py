@@ -255,8 +255,8 @@ def test_gutters_part_only_where_ridges_count() -> None:
 
 def test_steps_below_the_least_step_do_not_part() -> None:
     cloud = cloud_of(_row((6.0, 6.6)))
-    assert cloud.units(UnitSettings(least_step_m=0.5)).max() == 1
-    assert cloud.units(UnitSettings(least_step_m=0.8)).max() == 0
+    assert cloud.units(UnitSettings(min_step_m=0.5)).max() == 1
+    assert cloud.units(UnitSettings(min_step_m=0.8)).max() == 0
 
 
 def test_a_unit_below_the_least_area_joins_its_neighbour() -> None:

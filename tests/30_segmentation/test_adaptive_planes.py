@@ -128,7 +128,7 @@ def test_a_superstructure_is_found_where_points_are_dense() -> None:
 def test_what_is_smaller_than_the_least_area_is_no_plane() -> None:
     points = gable(10.0, 0.02, seed=4)
     points, inside = with_box(points, 10.0, 3.0, 2.4, 2.0)
-    found = detected(points, AdaptivePlaneSettings(least_area_m2=8.0))
+    found = detected(points, AdaptivePlaneSettings(min_area_m2=8.0))
     assert len(found.coefficients) == 2
     assert (found.labels[inside] == -1).mean() > 0.9
 
@@ -330,6 +330,6 @@ def test_the_region_with_the_greatest_gain_is_taken_first() -> None:
 
 def test_bounds_that_are_no_range_are_refused_together() -> None:
     with pytest.raises(SettingsError) as caught:
-        AdaptivePlaneSettings(distance_min_m=0.5, least_area_m2=12.0)
-    assert "use at most distance_max_m, 0.35" in str(caught.value)
-    assert "use at most least_area_sparse_m2, 10" in str(caught.value)
+        AdaptivePlaneSettings(min_distance_m=0.5, min_area_m2=12.0)
+    assert "use at most max_distance_m, 0.35" in str(caught.value)
+    assert "use at most min_area_sparse_m2, 10" in str(caught.value)

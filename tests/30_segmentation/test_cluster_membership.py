@@ -19,7 +19,7 @@ from pipeline.segmentation.cluster_membership import (
 from pipeline.segmentation.facet_parameters import about_barycentre, facet_parameters
 from pipeline.tin.delaunay import triangulate
 
-PAPER = ClusterMembershipSettings(least_members=11)
+PAPER = ClusterMembershipSettings(min_members=11)
 
 
 def face(slope: float, orientation: float, distance: float, n: int, seed: int) -> FloatArray:
@@ -79,7 +79,7 @@ def test_clusters_with_few_members_or_much_spread_in_distance_are_none() -> None
     parameters = np.concatenate([wide, few])
     generous = dataclasses.replace(PAPER, typical_o_range_m=20.0)
     assert refine_clusters(parameters, coarse, 1.2, generous).centres.shape == (0, 3)
-    lenient = dataclasses.replace(generous, max_o_deviation_m=9.0, least_members=5)
+    lenient = dataclasses.replace(generous, max_o_deviation_m=9.0, min_members=5)
     assert refine_clusters(parameters, coarse, 1.2, lenient).centres.shape == (2, 3)
 
 

@@ -218,7 +218,7 @@ def test_footpoints_of_opposite_roof_sides_are_mirrored_about_the_centre() -> No
 @pytest.mark.parametrize("low", [0.0, 1.0])
 def test_scaled_spherical_vectors_fill_their_range(low: float) -> None:
     normals, _ = noisy_normals(5, count=30)
-    vectors = facet_vectors("spherical_scaled", normals, normals * 7, np.array([1.0, 0, 0]), scaled_minimum=low)
+    vectors = facet_vectors("spherical_scaled", normals, normals * 7, np.array([1.0, 0, 0]), scaled_min=low)
     np.testing.assert_allclose(vectors.min(axis=0), low, atol=1e-12)
     np.testing.assert_allclose(vectors.max(axis=0), 1.0, atol=1e-12)
 

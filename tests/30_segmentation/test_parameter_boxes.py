@@ -98,6 +98,6 @@ def test_without_facets_there_is_no_cluster() -> None:
 def test_more_clusters_than_the_limit_are_too_complex() -> None:
     centres = np.random.default_rng(0).uniform([0, 0, -9], [89, 359, 9], (120, 3))
     parameters = np.repeat(centres, [8, 1] * 60, axis=0)
-    with pytest.raises(BuildingError, match="most_coarse_clusters is 10") as caught:
-        coarse_clusters(parameters, ParameterBoxSettings(most_coarse_clusters=10))
+    with pytest.raises(BuildingError, match="max_coarse_clusters is 10") as caught:
+        coarse_clusters(parameters, ParameterBoxSettings(max_coarse_clusters=10))
     assert caught.value.reason is Reason.TOO_COMPLEX

@@ -176,5 +176,5 @@ def test_the_fewest_points_follow_the_density_within_their_bounds() -> None:
 
 
 def test_contradicting_bounds_are_refused() -> None:
-    with pytest.raises(SettingsError, match="least_points is 30: use at most most_least_points, 25"):
-        PlaneRefinementSettings(least_points=30)
+    with pytest.raises(SettingsError, match="min_points is 30: use at most max_min_points, 25"):
+        PlaneRefinementSettings(min_points=30)

@@ -114,5 +114,5 @@ def test_points_on_a_line_are_grown_over_from_every_seed_until_the_work_is_too_m
 
 
 def test_bounds_that_are_no_range_are_refused() -> None:
-    with pytest.raises(SettingsError, match=r"use at most growing_max_m, 0\.3"):
-        RegionGrowingSettings(growing_min_m=0.5)
+    with pytest.raises(SettingsError, match=r"use at most max_growing_m, 0\.3"):
+        RegionGrowingSettings(min_growing_m=0.5)

@@ -61,7 +61,7 @@ def test_two_roof_faces_are_two_clusters_and_strays_none() -> None:
     (a, b), (c, d) = blob(30, 90, 60, 1), blob(30, 270, 60, 2)
     strays = np.array([70.0, 65, 80]), np.array([10.0, 180, 350])
     found = cluster_by_linkage(
-        np.concatenate([a, c, strays[0]]), np.concatenate([b, d, strays[1]]), SingleLinkageSettings(least_members=11)
+        np.concatenate([a, c, strays[0]]), np.concatenate([b, d, strays[1]]), SingleLinkageSettings(min_members=11)
     )
     assert found.distance_deg == 10.0
     assert found.labels.tolist() == [0] * 60 + [1] * 60 + [-1] * 3
@@ -71,10 +71,10 @@ def test_while_a_cluster_holds_most_facets_the_distance_shrinks_to_the_least() -
     (a, b), (c, d) = blob(30, 90, 60, 1), blob(30, 104, 60, 2)
     slopes, orientations = np.concatenate([a, c]), np.concatenate([b, d])
     assert link(slopes, orientations, 10.0)[0].max() == 0
-    found = cluster_by_linkage(slopes, orientations, SingleLinkageSettings(least_members=11))
+    found = cluster_by_linkage(slopes, orientations, SingleLinkageSettings(min_members=11))
     assert 4.0 <= found.distance_deg < 10.0
     assert set(found.labels.tolist()) - {-1} == {0, 1}
-    single = cluster_by_linkage(a, b, SingleLinkageSettings(least_members=11))
+    single = cluster_by_linkage(a, b, SingleLinkageSettings(min_members=11))
     assert single.distance_deg == 4.0
     assert set(single.labels.tolist()) - {-1} == {0}
 
@@ -82,7 +82,7 @@ def test_while_a_cluster_holds_most_facets_the_distance_shrinks_to_the_least() -
 @pytest.mark.parametrize("members", [10, 11])
 def test_a_cluster_needs_its_fewest_members(members: int) -> None:
     (a, b), (c, d) = blob(30, 90, members, 1), blob(50, 270, 100, 2)
-    settings = SingleLinkageSettings(least_members=11, largest_cluster_share=1.0)
+    settings = SingleLinkageSettings(min_members=11, largest_cluster_share=1.0)
     labels = cluster_by_linkage(np.concatenate([a, c]), np.concatenate([b, d]), settings).labels
     assert (labels[:members] >= 0).all() == (members == 11)
     assert (labels[members:] >= 0).all()
@@ -115,4 +115,4 @@ def test_two_dense_directions_that_do_not_link_end_at_the_limit_and_not_after_al
 
 def test_a_least_distance_above_the_first_is_refused() -> None:
     with pytest.raises(SettingsError, match="use at most linkage_start_deg, 10"):
-        SingleLinkageSettings(linkage_least_deg=12.0)
+        SingleLinkageSettings(min_linkage_deg=12.0)

@@ -275,7 +275,7 @@ def test_every_plane_has_points_and_every_label_a_plane(seed: int) -> None:
 
 
 def test_too_few_visible_points_are_told_with_their_number() -> None:
-    with pytest.raises(BuildingError, match="5 of 5 points are visible from above, least_points is 6") as caught:
+    with pytest.raises(BuildingError, match="5 of 5 points are visible from above, min_points is 6") as caught:
         segment(candidate_of(np.array([[0.0, 0, 5], [1, 0, 5], [0, 1, 5], [1, 1, 5], [2, 2, 5]])), FuzzySartSettings())
     assert caught.value.reason is Reason.TOO_FEW_POINTS
 
@@ -313,12 +313,12 @@ def test_thresholds_follow_the_noise_within_their_bounds() -> None:
     assert [chosen.plane_distance_m(s) for s in (0.01, 0.06, 0.5)] == pytest.approx([0.15, 0.18, 0.30])
     literal = FuzzySartSettings.faithful()
     assert {literal.absorption_distance_m(s) for s in (0.0, 0.1, 9.0)} == {0.2}
-    assert (literal.vectors, literal.vigilance, literal.absorption_max_slope_deg) == ("spherical_scaled", 0.7, 60.0)
+    assert (literal.vectors, literal.vigilance, literal.max_absorption_slope_deg) == ("spherical_scaled", 0.7, 60.0)
 
 
 def test_contradicting_settings_of_all_stages_are_named_at_once() -> None:
     with pytest.raises(SettingsError) as caught:
-        FuzzySartSettings(absorption_min_m=0.5, plane_distance_min_m=0.4, least_points=100, vigilance=2.0)
+        FuzzySartSettings(min_absorption_m=0.5, min_plane_distance_m=0.4, min_points=100, vigilance=2.0)
     assert len(caught.value.faults) == 4
 
 

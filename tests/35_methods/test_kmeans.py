@@ -186,7 +186,7 @@ def test_nearly_parallel_planes_that_meet_beside_the_building_are_a_labelled_blo
     xy = random.uniform(-7, 7, (600, 2))
     z = np.where(xy[:, 0] < 0, 9.0, 6.0 - 0.15 * xy[:, 0]) + random.normal(0, 0.01, 600)
     candidate = candidate_of(np.column_stack([xy, z]))
-    with pytest.raises(BuildingError, match=r"least_side_share is 0\.5") as error:
+    with pytest.raises(BuildingError, match=r"min_side_share is 0\.5") as error:
         segment(candidate, FAITHFUL)
     assert error.value.reason is Reason.NO_PARTITION
     result = reconstruct_building(candidate, "kmeans", ReconstructSettings(method=FAITHFUL))
@@ -269,7 +269,7 @@ def test_points_below_others_and_far_from_the_model_have_no_label() -> None:
 
 @PRESETS
 def test_too_few_points_are_refused_with_their_number(settings: KMeansSettings) -> None:
-    with pytest.raises(BuildingError, match="4 of 4 points are visible from above, least_points is 6") as error:
+    with pytest.raises(BuildingError, match="4 of 4 points are visible from above, min_points is 6") as error:
         segment(candidate_of(np.array([(0, 0, 5.0), (4, 0, 5), (0, 4, 5), (4, 4, 5)])), settings)
     assert error.value.reason is Reason.TOO_FEW_POINTS
 
@@ -299,7 +299,7 @@ def test_the_presets_are_those_of_the_method() -> None:
 
 
 def test_without_noise_or_a_least_distance_a_building_is_modelled_all_the_same() -> None:
-    settings = KMeansSettings(plane_distance_min_m=0.0, noise_factor=0.0)
+    settings = KMeansSettings(min_plane_distance_m=0.0, noise_factor=0.0)
     found = segment(exact_gable(0.0), settings)
     assert len(found.planes) == 2
     assert (found.labels >= 0).all()
@@ -323,8 +323,8 @@ def test_a_rectangle_that_the_points_cannot_fill_is_refused_before_it_is_sampled
 
 
 def test_a_distance_that_is_no_range_is_refused() -> None:
-    with pytest.raises(SettingsError, match=r"plane_distance_min_m is 0\.5: use at most plane_distance_max_m, 0\.3"):
-        KMeansSettings(plane_distance_min_m=0.5)
+    with pytest.raises(SettingsError, match=r"min_plane_distance_m is 0\.5: use at most max_plane_distance_m, 0\.3"):
+        KMeansSettings(min_plane_distance_m=0.5)
 
 
 def test_the_page_tells_every_setting_and_the_faithful_ones_exactly() -> None:

@@ -289,8 +289,8 @@ def test_beyond_the_limits_of_work_a_building_is_too_complex() -> None:
 
 def test_the_faithful_settings_hold_the_papers_figures() -> None:
     flat, deep = ParameterSpace2dSettings.faithful(), ParameterSpace3dSettings.faithful()
-    assert (flat.least_members, flat.linkage_least_deg, flat.largest_cluster_share) == (11, 4.0, 0.8)
-    assert (flat.least_slope_deg, flat.most_slope_deg) == (7.0, 75.0)
+    assert (flat.min_members, flat.min_linkage_deg, flat.largest_cluster_share) == (11, 4.0, 0.8)
+    assert (flat.min_slope_deg, flat.max_slope_deg) == (7.0, 75.0)
     assert (deep.box_slope_deg, deep.box_orientation_deg, deep.box_o_distance_m) == (7.0, 10.0, 2.0)
     assert (deep.max_o_deviation_m, deep.ground_below_deg, deep.wall_above_deg) == (1.3, 4.0, 76.0)
     for settings in (flat, deep):
@@ -301,7 +301,7 @@ def test_the_faithful_settings_hold_the_papers_figures() -> None:
 
 def test_contradicting_settings_of_all_stages_are_named_at_once() -> None:
     with pytest.raises(SettingsError) as caught:
-        ParameterSpace2dSettings(linkage_least_deg=12.0, growing_min_m=0.5, point_groups="chance", least_members=0)
+        ParameterSpace2dSettings(min_linkage_deg=12.0, min_growing_m=0.5, point_groups="chance", min_members=0)
     assert len(caught.value.faults) == 4
 
 

@@ -56,7 +56,7 @@ def test_the_robust_preset_arranges_and_the_faithful_one_traces(name: str) -> No
 def test_the_arrangement_has_no_such_choice() -> None:
     assert ReconstructSettings().arranges(method_named("arrangement"))
     for table in ("arrangement", "roof"):
-        with pytest.raises(SettingsError, match=rf"\[{table}\] faces is no setting"):
+        with pytest.raises(SettingsError, match=rf"\[{table}\] faces is not a setting"):
             RunSettings.from_mapping({table: {"faces": "traced"}})
 
 

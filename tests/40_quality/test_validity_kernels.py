@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.model import IntArray, Solid
-from pipeline.quality.planarity import fitted_plane, in_fitted_plane, least_cosine_of_normals
+from pipeline.quality.planarity import fitted_plane, in_fitted_plane, min_cosine_of_normals
 from pipeline.quality.rings import polygon_code, ring_is_simple
 from pipeline.quality.self_intersection import side_of_plane, triangles_intersect
 from pipeline.quality.shell import is_sound_shell, six_volumes
@@ -192,7 +192,7 @@ def test_normals_of_a_fold_differ_by_its_angle() -> None:
     triangles = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int64)
     normals = [np.cross(corners[t[1]] - corners[t[0]], corners[t[2]] - corners[t[0]]) for t in triangles]
     expected = normals[0] @ normals[1] / np.linalg.norm(normals[0]) / np.linalg.norm(normals[1])
-    assert least_cosine_of_normals(corners, triangles, -1.0) == pytest.approx(expected)
+    assert min_cosine_of_normals(corners, triangles, -1.0) == pytest.approx(expected)
 
 
 def test_volumes_add_up_and_turn_their_sign() -> None:

@@ -79,9 +79,9 @@ def test_a_block_reaches_the_percentile_of_the_points_and_never_the_floor() -> N
 
 
 def first_sound_blocks(
-    footprint_mm: shapely.MultiPolygon, plane: Plane, tolerance_m: float, minimum_area_m2: float
+    footprint_mm: shapely.MultiPolygon, plane: Plane, tolerance_m: float, min_area_m2: float
 ) -> list[SolidPart]:
-    for form in block_forms(footprint_mm, plane, 0.0, tolerance_m, minimum_area_m2):
+    for form in block_forms(footprint_mm, plane, 0.0, tolerance_m, min_area_m2):
         with contextlib.suppress(BuildingError):
             parts = form()
             if not any(check_solid(part.solid) for part in parts):

@@ -103,7 +103,7 @@ def test_a_small_tower_joins_the_roof_around_it() -> None:
     planes = [plane(6.0), plane(12.0)]
     (levels,) = lower(built(polygons, planes), sampled(polygons, planes), ["1.3"])
     assert heights(levels) == [6.0]
-    (levels,) = lower(built(polygons, planes), sampled(polygons, planes), ["1.3"], minimum_part_area_m2=2.0)
+    (levels,) = lower(built(polygons, planes), sampled(polygons, planes), ["1.3"], min_part_area_m2=2.0)
     assert heights(levels) == [6.0, 12.0]
 
 

@@ -60,16 +60,16 @@ def outlines(density: float, beam_radius_m: float, *, tell_returns: bool = True)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("density", "beam_radius_m", "least_iou"),
+    ("density", "beam_radius_m", "min_iou"),
     [(0.7, 0.12, 0.9), (2.0, 0.05, 0.95), (2.0, 0.3, 0.95), (6.0, 0.12, 0.98)],
 )
 def test_outlines_have_the_true_area_whatever_density_and_beam(
-    density: float, beam_radius_m: float, least_iou: float
+    density: float, beam_radius_m: float, min_iou: float
 ) -> None:
     rows = outlines(density, beam_radius_m)
     assert abs(rows[:, 1].sum() / rows[:, 2].sum() - 1.0) < 0.02
     assert abs(np.median(rows[:, 1] / rows[:, 2]) - 1.0) < 0.02
-    assert np.median(rows[:, 0]) > least_iou
+    assert np.median(rows[:, 0]) > min_iou
 
 
 @pytest.mark.slow

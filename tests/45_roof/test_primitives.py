@@ -47,7 +47,7 @@ def gable_points(
 
 def fit(degrees: float, **shape: Any) -> Any:
     points, labels, planes = gable_points(degrees, **shape)
-    return fit_gable(points, labels, planes, 0.25, least_side_share=0.5)
+    return fit_gable(points, labels, planes, 0.25, min_side_share=0.5)
 
 
 def solids(model: BuildingPrimitive) -> list[Any]:
@@ -111,7 +111,7 @@ def test_both_sides_are_made_equal_by_the_larger_one() -> None:
 def test_the_longer_side_decides_the_length() -> None:
     points, labels, planes = gable_points(0.0)
     shorter = (labels == 1) | (points[:, 0] < 25.0)
-    steps = fit_gable(points[shorter], labels[shorter], planes, 0.0, least_side_share=0.5)
+    steps = fit_gable(points[shorter], labels[shorter], planes, 0.0, min_side_share=0.5)
     assert steps.rectangles[0].length_m < 12.2
     assert steps.rectangles[1].length_m == pytest.approx(14.0)
     assert steps.symmetric[0].length_m == steps.symmetric[1].length_m == pytest.approx(14.0)
@@ -125,7 +125,7 @@ def test_unequal_pitches_give_the_mean_of_the_two_eaves() -> None:
 
 def test_a_margin_goes_beyond_the_points_on_all_sides() -> None:
     points, labels, planes = gable_points(15.0)
-    model = fit_gable(points, labels, planes, 0.0, least_side_share=0.5, margin_m=0.4).model
+    model = fit_gable(points, labels, planes, 0.0, min_side_share=0.5, margin_m=0.4).model
     outline = shapely.Polygon(model.corners[2:])
     assert outline.area == pytest.approx(14.8 * 8.8, rel=1e-3)
     assert model.eave_z_m == pytest.approx(8 - 0.7 * 4.4, abs=3e-3)
@@ -134,7 +134,7 @@ def test_a_margin_goes_beyond_the_points_on_all_sides() -> None:
 def test_planes_that_rise_from_their_line_are_called_a_valley() -> None:
     points, labels, _ = gable_points(15.0, rises=(-0.4, -0.4))
     planes = fit_plane(points[labels == 0]), fit_plane(points[labels == 1])
-    steps = fit_gable(points, labels, planes, 0.0, least_side_share=0.5)
+    steps = fit_gable(points, labels, planes, 0.0, min_side_share=0.5)
     assert steps.is_valley
     assert steps.model.eave_z_m > steps.model.top_z_m
     assert not fit(15.0).is_valley
@@ -143,7 +143,7 @@ def test_planes_that_rise_from_their_line_are_called_a_valley() -> None:
 def test_the_first_plane_lies_to_the_right_of_the_line_and_under_the_first_face() -> None:
     for degrees in (0.0, 100.0, 200.0, 300.0):
         points, labels, planes = gable_points(degrees)
-        steps = fit_gable(points, labels, planes, 0.0, least_side_share=0.5)
+        steps = fit_gable(points, labels, planes, 0.0, min_side_share=0.5)
         assert (steps.line.frame(points[labels == 0, :2])[:, 1] <= 1e-3).all()
         for k in (0, 1):
             face = steps.model.faces[k]
@@ -158,7 +158,7 @@ def test_planes_that_meet_beside_the_building_make_no_gable() -> None:
     stepped = np.column_stack([points[:, :2], z])
     planes = fit_plane(stepped[labels == 0]), fit_plane(stepped[labels == 1])
     with pytest.raises(BuildingError, match=r"0\.00 of the points of a plane lie on its side") as error:
-        fit_gable(stepped, labels, planes, 0.0, least_side_share=0.5)
+        fit_gable(stepped, labels, planes, 0.0, min_side_share=0.5)
     assert error.value.reason is Reason.NO_PARTITION
 
 
@@ -166,7 +166,7 @@ def test_parallel_planes_make_no_gable() -> None:
     points, labels, planes = gable_points(0.0)
     above = Plane(a=planes[0].a, b=planes[0].b, c=planes[0].c + 2, n_points=9, rmse_m=0.0)
     with pytest.raises(BuildingError, match="parallel"):
-        fit_gable(points, labels, (planes[0], above), 0.0, least_side_share=0.5)
+        fit_gable(points, labels, (planes[0], above), 0.0, min_side_share=0.5)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 31.0, 122.0])

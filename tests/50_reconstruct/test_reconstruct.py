@@ -105,17 +105,17 @@ def test_too_few_points_are_told(n: int) -> None:
     points = np.column_stack((np.arange(n), np.arange(n) ** 2, np.full(n, 5.0)))
     result = reconstruct_building(candidate(points), "fuzzy-sart", DEFAULTS)
     assert (result.status, result.reason, result.lod) == (Status.FAILED, Reason.TOO_FEW_POINTS, "")
-    assert f"{n} roof points, fewer than minimum_points = 10" in result.reason_detail
+    assert f"{n} roof points, fewer than min_points = 10" in result.reason_detail
     assert (result.solids, result.roof_type, result.coverage) == ((), RoofType.NONE, 0.0)
     assert math.isnan(result.rmse_m)
     assert (result.footprint is None) == (n < 3)
 
 
 def test_too_many_points_are_too_complex() -> None:
-    settings = ReconstructSettings(roof=RoofSettings(maximum_points=1000))
+    settings = ReconstructSettings(roof=RoofSettings(max_points=1000))
     result = reconstruct_building(gable(n=1500), "fuzzy-sart", settings)
     assert (result.status, result.reason) == (Status.FAILED, Reason.TOO_COMPLEX)
-    assert "1500 points, more than maximum_points = 1000" in result.reason_detail
+    assert "1500 points, more than max_points = 1000" in result.reason_detail
 
 
 def test_a_candidate_of_kilometres_is_too_complex() -> None:

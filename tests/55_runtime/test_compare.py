@@ -203,7 +203,7 @@ def test_variants_that_make_no_sense_are_told(texts: list[str], told: str) -> No
 
 
 def test_a_methods_own_table_counts_for_all_its_variants() -> None:
-    table = {"fuzzy-sart": {"vigilance": 0.8}, "roof": {"minimum_points": 12}}
+    table = {"fuzzy-sart": {"vigilance": 0.8}, "roof": {"min_points": 12}}
     own = RunSettings.from_mapping(table)
     for variant in BOTH:
         chosen = settings_of(own, variant, own_tables(table))

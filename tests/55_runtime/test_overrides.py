@@ -306,7 +306,7 @@ def test_given_footprints_are_overridden_by_their_own_id(plain: Any, overridden:
             "[[building]]\nbuilding_id = 'a'\nsettings.kmeans.k = 2",
             r"\[kmeans\] cannot .* use roof, plan, roof-type, arrangement",
         ),
-        ("[[building]]\nbuilding_id = 'a'\nsettings.roof.colour = 1", r"\[roof\] colour is no setting"),
+        ("[[building]]\nbuilding_id = 'a'\nsettings.roof.colour = 1", r"\[roof\] colour is not a setting"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGO ((0 0))'", "is no WKT"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POINT (0 0)'", "is no polygon: use POLYGON"),
         ("[[building]]\nbuilding_id = 'a'\nfootprint = 'POLYGON ((0 0, 1 1, 1 0, 0 1, 0 0))'", "Self-intersection"),

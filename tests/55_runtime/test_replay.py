@@ -63,7 +63,7 @@ def bundle() -> Bundle:
         method="fuzzy-sart",
         settings=ReconstructSettings(
             method=FuzzySartSettings(vigilance=0.9),
-            roof=RoofSettings(minimum_roof_height_m=1.0),
+            roof=RoofSettings(min_roof_height_m=1.0),
             plan=ArrangementSettings(line_reach_m=0.7),
             lods=("1.2", "2.2"),
         ),

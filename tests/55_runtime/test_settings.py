@@ -9,7 +9,8 @@ import pytest
 
 from pipeline.errors import SettingsError
 from pipeline.methods import METHODS
-from pipeline.settings import RunSettings
+from pipeline.parameters import RENAMED
+from pipeline.settings import SECTIONS, RunSettings
 
 
 def test_all_faults_are_told_at_once() -> None:
@@ -28,7 +29,7 @@ def test_all_faults_are_told_at_once() -> None:
         "method is 'magic': use one of arrangement",
         "tile_size_m is -5",
         "[ground] max_slope is 9",
-        "[ground] windows is no setting",
+        "[ground] windows is not a setting",
         "[roofs] is no table of settings",
         "[fuzzy-sart] vigilance is 'high'",
     ):
@@ -46,7 +47,7 @@ OF_PAPERS = [name for name, entry in METHODS.items() if entry.faithful is not No
 
 def test_a_method_of_our_own_has_no_preset_that_keeps_to_a_paper() -> None:
     told = "preset is 'faithful', and arrangement follows no paper: use robust"
-    for table in ({}, {"arrangement": {"least_points": 9}}):
+    for table in ({}, {"arrangement": {"min_points": 9}}):
         with pytest.raises(SettingsError, match=told):
             RunSettings.from_mapping({"method": "arrangement", "preset": "faithful", **table})
 
@@ -112,3 +113,13 @@ def test_a_settings_file_that_is_no_toml_is_named(tmp_path: Path) -> None:
     path.write_text("classes = trust")
     with pytest.raises(SettingsError, match=r"run.toml is no TOML"):
         RunSettings.from_toml(str(path), {})
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
+def test_an_old_name_of_a_setting_is_rejected_with_the_new_one(old: str, new: str) -> None:
+    kinds = {**SECTIONS, **{name: entry.settings_type for name, entry in METHODS.items()}}
+    tables = [name for name, kind in kinds.items() if new in {field.name for field in dataclasses.fields(kind)}]
+    assert tables
+    for table in tables:
+        with pytest.raises(SettingsError, match=rf"\[{table}\] {old} is not a setting: it is called {new} now"):
+            RunSettings.from_mapping({table: {old: 1}})

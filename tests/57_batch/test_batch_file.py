@@ -116,7 +116,7 @@ def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
     for words in (
         "[inputs] paths is missing",
         "[inputs] bbox is [1, 2]",
-        "[inputs] path is no setting",
+        "[inputs] path is not a setting",
         "meshes is 'stl': use one of building",
         "workers is -1: use 'auto' or a whole number from 0 to 1024",
         "scheduler is 8786: use a text in quotes",

@@ -122,7 +122,7 @@ def test_only_the_figures_of_a_reason_count(run_dir: Path, tmp_path: Path) -> No
 
         return run_digest(str(rewritten(run_dir, tmp_path / str(len(text)), "buildings", change)))
 
-    first = detail("12 points, fewer than least_points 24.5")
+    first = detail("12 points, fewer than min_points 24.5")
     assert detail("min_points is 24.5, and the candidate has 12 points") == first
     assert detail("12 points, fewer than 24.6") != first
 

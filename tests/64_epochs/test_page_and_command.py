@@ -138,8 +138,8 @@ def test_text_of_the_users_is_no_markup(pair: tuple[Path, Path], tmp_path: Path)
 
 @pytest.mark.slow
 def test_a_map_of_very_many_buildings_keeps_its_bounds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(class_map, "MOST_ORDINARY", 20)
-    monkeypatch.setattr(class_map, "MOST_DRAWN", 10)
+    monkeypatch.setattr(class_map, "MAX_ORDINARY", 20)
+    monkeypatch.setattr(class_map, "MAX_DRAWN", 10)
     houses = [house(f"h{k}_1", 30.0 * (k % 10), 30.0 * (k // 10)) for k in range(40)]
     added = [house(f"n{k}_2", 30.0 * (k % 10), 300.0 + 30.0 * (k // 10), length=10.0 + k / 10.0) for k in range(25)]
     rows = epochs_map()

@@ -52,7 +52,7 @@ def figures(
     *,
     guests: tuple[list[Face], list[Face]] = ([], []),
     width_m: float = WIDTH_M,
-    least_m: float = 0.5,
+    min_m: float = 0.5,
     shift_m: float = 0.0,
     rough_new: bool = False,
 ) -> np.ndarray:
@@ -67,7 +67,7 @@ def figures(
         is_own=np.array([mine for _, _, mine in entries]),
         boxes=shapely.total_bounds(own)[None, :],
         width_m=np.array([width_m]),
-        height_m=np.array([least_m]),
+        height_m=np.array([min_m]),
         ground_m=np.zeros((1, 2)),
     )
     faces = faces_of([face for face, _, _ in entries], [new and rough_new for _, new, _ in entries])

@@ -494,7 +494,7 @@ def test_names_from_outside_are_text_and_never_markup(runs: list[ComparedRun], t
 def test_the_table_of_the_page_is_bounded_and_says_so(
     runs: list[ComparedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(comparison_page, "MOST_ROWS", 2)
+    monkeypatch.setattr(comparison_page, "MAX_ROWS", 2)
     path, _, page = write_comparison(tmp_path / "out", runs)
     text = page.read_text()
     rows = re.findall(r'<tr><th scope="row"><code>(\w+)</code>', text)

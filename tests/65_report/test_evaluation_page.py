@@ -32,7 +32,7 @@ from pipeline.ruler.report.evaluation_maps import maps
 from pipeline.ruler.report.evaluation_page import HEADLINE, page, write_page
 from pipeline.ruler.report.histograms import charts
 from pipeline.ruler.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg
-from pipeline.ruler.report.worst_cases import MOST_NOT_FOUND, chosen_rows, worst_cases
+from pipeline.ruler.report.worst_cases import MAX_NOT_FOUND, chosen_rows, worst_cases
 
 KINDS: tuple[dict[str, bool], ...] = (
     {},
@@ -220,7 +220,7 @@ def test_worst_cases_are_false_ones_first_and_only_some_that_were_not_found() ->
     passable = [("passable1", "m", "passable", 0.5), ("passable0", "m", "passable", 0.05)]
     sound = [("sound", "m", "correct", 1.0), ("poor", "m", "correct", 0.9), ("edge", "m", "false", 0.0)]
     names = [row["building_id"] for row in chosen_rows(case_rows([*sound, *passable, *reversed(false), *lost]))]
-    assert sum(name.startswith("lost") for name in names) == MOST_NOT_FOUND
+    assert sum(name.startswith("lost") for name in names) == MAX_NOT_FOUND
     assert [name for name in names if not name.startswith("lost")] == [
         *(f"false{k}" for k in range(5)),
         "passable0",

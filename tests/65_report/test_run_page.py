@@ -135,7 +135,7 @@ def test_what_is_listed_is_bounded_those_without_a_model_first(
     make_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_page, "LISTED", 3)
-    monkeypatch.setattr(class_map, "MOST_ORDINARY", 2)
+    monkeypatch.setattr(class_map, "MAX_ORDINARY", 2)
     blocks = [dataclasses.replace(small.courtyard(), building_id=f"b{k}") for k in range(9)]
     assert blocks[0].status in {Status.FALLBACK, Status.OK}
     blocks = [dataclasses.replace(b, status=Status.FALLBACK, reason=Reason.INVALID_SOLID) for b in blocks]

@@ -21,7 +21,7 @@ from click.testing import Result
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
-from pipeline.runtime.isolation.isolated_items import LEAST_MEMORY_BYTES
+from pipeline.runtime.isolation.isolated_items import MIN_MEMORY_BYTES
 from service.cli import app
 from service.settings import ServiceSettings
 from service.supervisor import Supervisor, environment_of, listen, pause_s
@@ -330,10 +330,10 @@ def test_a_signal_before_the_server_listens_to_any_is_not_lost(tmp_path: Path) -
 
 
 def test_limits_that_no_run_takes_are_refused_at_the_start_and_not_by_every_job() -> None:
-    assert ServiceSettings(building_memory_bytes=LEAST_MEMORY_BYTES).building_memory_bytes == LEAST_MEMORY_BYTES
+    assert ServiceSettings(building_memory_bytes=MIN_MEMORY_BYTES).building_memory_bytes == MIN_MEMORY_BYTES
     with pytest.raises(ValidationError) as caught:
         ServiceSettings(
-            building_memory_bytes=LEAST_MEMORY_BYTES - 1,
+            building_memory_bytes=MIN_MEMORY_BYTES - 1,
             building_timeout_s=math.inf,
             lease_s=math.inf,
             poll_s=math.inf,

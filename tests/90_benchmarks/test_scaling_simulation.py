@@ -18,7 +18,7 @@ from benchmarks.scaling_simulation import (
     _driver_costs,
     city_run,
     city_stages,
-    most_workers,
+    max_workers,
     replayed,
     run_stage,
     simulate,
@@ -150,7 +150,7 @@ def test_the_largest_number_of_workers_is_found_by_halves() -> None:
     def run_with(workers: int) -> object:
         return dataclasses.replace(outcome, workers=workers, wall_s=1.0, busy_s=workers * (1.0 - workers / 1000))
 
-    assert most_workers(run_with, 0.8, 1000) == pytest.approx(200, rel=0.06)
+    assert max_workers(run_with, 0.8, 1000) == pytest.approx(200, rel=0.06)
 
 
 def test_a_trace_is_given_again() -> None:

@@ -17,7 +17,7 @@ from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import vertical_distance_m
 
-_LEAST_SLOPE = 0.08
+_MIN_SLOPE = 0.08
 """Planes whose slopes differ by less cross nowhere exactly."""
 _NEAR_CROSSING_CELLS = 1.2
 _NEAR_CROSSING_M = 0.1
@@ -26,11 +26,11 @@ _BAND_CELLS = 1.1
 """Width of the band in which the places of one step lie."""
 _CROSSING_BONUS = 1.5
 """A crossing comes before a step with as many places: its position is exact."""
-_LEAST_EDGE_M = 1.0
+_MIN_EDGE_M = 1.0
 _SAME_DIRECTION_RAD = math.radians(3.0)
 _SEARCH_M = 1.0
 """How far from a step the points are that decide its position."""
-_LEAST_POINTS = 4
+_MIN_POINTS = 4
 _MAX_DIRECTIONS = 24
 
 
@@ -43,7 +43,7 @@ def _outline_directions(edges: FloatArray) -> FloatArray:
     found = np.empty(_MAX_DIRECTIONS)
     n = 0
     for e in ascending_order(shortness):
-        if -shortness[e] < _LEAST_EDGE_M or n + 2 > _MAX_DIRECTIONS:
+        if -shortness[e] < _MIN_EDGE_M or n + 2 > _MAX_DIRECTIONS:
             break
         for quarter in range(2):
             angle = math.atan2(edges[e, 3] - edges[e, 1], edges[e, 2] - edges[e, 0]) + quarter * math.pi / 2
@@ -161,7 +161,7 @@ def _parting_shift(
         offsets[m] = off
         gains[m] = (min(to_a, cap_m) - min(to_b, cap_m)) / cap_m
         m += 1
-    if m < _LEAST_POINTS:
+    if m < _MIN_POINTS:
         return math.nan
     order = ascending_order(offsets[:m])
     total = 0.0
@@ -192,7 +192,7 @@ def candidate_lines(
     edges: FloatArray,
     cell_m: float,
     cap_m: float,
-    least_length_m: float,
+    min_length_m: float,
 ) -> tuple[FloatArray, FloatArray, LabelArray, LabelArray]:
     """Lines along the borders of coarse labels.
 
@@ -210,7 +210,7 @@ def candidate_lines(
         Cell of the labels.
     cap_m : float
         Residual from which a point is unexplained.
-    least_length_m : float
+    min_length_m : float
         Shorter borders give no line.
 
     Returns
@@ -226,7 +226,7 @@ def candidate_lines(
     """
     k = len(planes)
     m = len(places)
-    least = max(2, math.ceil(least_length_m / cell_m))
+    least = max(2, math.ceil(min_length_m / cell_m))
     lines = np.empty((m + 1, 3))
     scores = np.empty(m + 1)
     crossing = np.zeros(m + 1, np.int32)
@@ -243,7 +243,7 @@ def candidate_lines(
         free = last - first
         da, db, dc = planes[a, 0] - planes[b, 0], planes[a, 1] - planes[b, 1], planes[a, 2] - planes[b, 2]
         turn = math.hypot(da, db)
-        if turn > _LEAST_SLOPE:
+        if turn > _MIN_SLOPE:
             # where the planes differ by less than the cap the points cannot tell on which side they are
             near_m = max(_NEAR_CROSSING_CELLS * cell_m + _NEAR_CROSSING_M, min(cap_m / turn, 4.0 * cell_m))
             on_line = 0
@@ -263,7 +263,7 @@ def candidate_lines(
         for q in range(n):
             directions[q] = outline[q]
         for plane in (a, b):
-            if math.hypot(planes[plane, 0], planes[plane, 1]) > _LEAST_SLOPE:
+            if math.hypot(planes[plane, 0], planes[plane, 1]) > _MIN_SLOPE:
                 fall = math.atan2(planes[plane, 1], planes[plane, 0])
                 n = _with_direction(directions, n, fall % math.pi)
                 n = _with_direction(directions, n, (fall + math.pi / 2) % math.pi)
@@ -286,7 +286,7 @@ def candidate_lines(
             shift = _parting_shift(points, planes, a, b, line, low - half, high + half, cap_m, reach_m)
             if not math.isnan(shift):
                 line[2] -= shift
-            elif turn > _LEAST_SLOPE:
+            elif turn > _MIN_SLOPE:
                 # a border in a gap of the points lies anywhere: the planes themselves tell where they meet
                 line[0], line[1], line[2] = da / turn, db / turn, dc / turn
                 crossing[n_lines] = 1

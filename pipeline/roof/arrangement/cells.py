@@ -21,7 +21,7 @@ from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, FACE, ORIGIN, Subdivision, between_vertices
 
-_LEAST_BEYOND = 3.0
+_MIN_BEYOND = 3.0
 """Points that a cell counts for at least where a plane leaves the heights of its own: splinters hold none."""
 _ROW_MM = 500.0
 _TOLERANCE = 0.5
@@ -157,8 +157,8 @@ def cell_costs(
         for label in range(k):
             if beyond[cell, label] != 0:
                 share = beyond[cell, label] / corners[cell]
-                costs[cell, label] += int(COST_SCALE * max(share * expected[cell], _LEAST_BEYOND))
-                misfits[cell, label] += int(COST_SCALE * max(share * lacking[cell], _LEAST_BEYOND))
+                costs[cell, label] += int(COST_SCALE * max(share * expected[cell], _MIN_BEYOND))
+                misfits[cell, label] += int(COST_SCALE * max(share * lacking[cell], _MIN_BEYOND))
     return costs, misfits
 
 

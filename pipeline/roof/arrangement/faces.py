@@ -31,10 +31,10 @@ from pipeline.roof.arrangement.subdivision import (
 
 _CORNER_MM = 120.0
 """Size of the corner that goes to a neighbour."""
-_LEAST_CORNER_MM = 20.0
+_MIN_CORNER_MM = 20.0
 _STRAIGHT_MM = 2.0
 """A vertex that was put on a line and bends it by less goes again."""
-_MOST_BORDERS = 32
+_MAX_BORDERS = 32
 _LARGE_COST = 100.0
 """Metres: more than heights differ by."""
 
@@ -86,7 +86,7 @@ def _give_corner(plan: Subdivision, labels: LabelArray, first: int, last: int, l
         dx, dy = float(xy[w, 0] - xy[v, 0]), float(xy[w, 1] - xy[v, 1])
         length = math.hypot(dx, dy)
         size = min(corner_mm, 0.4 * length)
-        if size < _LEAST_CORNER_MM or counts[VERTICES] >= len(xy) or counts[EDGES] + 4 > len(graph):
+        if size < _MIN_CORNER_MM or counts[VERTICES] >= len(xy) or counts[EDGES] + 4 > len(graph):
             return False
         x, y = int(np.rint(xy[v, 0] + size / length * dx)), int(np.rint(xy[v, 1] + size / length * dy))
         if not insert_vertex(plan, g, x, y):
@@ -165,11 +165,11 @@ def part_crossings(
     """
     xy, graph, counts = plan.xy, plan.graph, plan.counts
     corner_mm = clearance * _CORNER_MM
-    borders = np.empty(_MOST_BORDERS, np.int64)
-    around = np.empty(_MOST_BORDERS, np.int64)
-    plane_of = np.empty(_MOST_BORDERS, np.int64)
-    refused = np.empty(2 * _MOST_BORDERS, np.bool_)
-    heights = np.empty(_MOST_BORDERS)
+    borders = np.empty(_MAX_BORDERS, np.int64)
+    around = np.empty(_MAX_BORDERS, np.int64)
+    plane_of = np.empty(_MAX_BORDERS, np.int64)
+    refused = np.empty(2 * _MAX_BORDERS, np.bool_)
+    heights = np.empty(_MAX_BORDERS)
     pairs, _ = cell_borders(plan, 0.0)
     faces, n_faces = connected_faces(labels[: counts[CELLS]], pairs)
     leaving = np.full(len(xy), -1, np.int64)

@@ -69,11 +69,11 @@ _FAR_SIDES = 3.0
 _STEEPEST = 1.0
 """Planes that are steeper go on no farther beyond their points than one of this slope."""
 _COST_PER_M = 20.0
-_MOST_COST = 40.0
+_MAX_COST = 40.0
 """Points that a plane costs by the metre, and at most: more than a face, less than what a large cell holds."""
 _STEP_MM = 250.0
 """A third of the raster's cells: its heights say no more."""
-_MOST_LEVEL = 8
+_MAX_LEVEL = 8
 """Horizontal planes that are added at a time: more places where nothing fits are no roof that planes can tell."""
 
 
@@ -194,7 +194,7 @@ def add_costs_of_far_planes(
         least = max(least, far_m)
         for k in range(len(planes)):
             if farthest[cell, k] > least:
-                cost = int(COST_SCALE * min(_COST_PER_M * (farthest[cell, k] - least), _MOST_COST))
+                cost = int(COST_SCALE * min(_COST_PER_M * (farthest[cell, k] - least), _MAX_COST))
                 costs[cell, k] += cost
                 misfits[cell, k] += cost
 
@@ -217,7 +217,7 @@ def with_level_planes(
     (k + l, 3) float64
         The given ones first.
     """
-    extended = np.empty((len(planes) + _MOST_LEVEL, 3))
+    extended = np.empty((len(planes) + _MAX_LEVEL, 3))
     k = len(planes)
     for q in range(k):
         for axis in range(3):

@@ -14,7 +14,7 @@ from pipeline.roof.arrangement.raster_labels import vertical_distance_m
 _ROUNDS = 3
 _FEWEST_POINTS = 6
 """Planes with fewer points keep their coefficients."""
-_LEAST_WIDTH_M = 0.2
+_MIN_WIDTH_M = 0.2
 """Standard deviation across the longest direction of the points, below which they tell no slope across it."""
 
 
@@ -47,7 +47,7 @@ def _fit(points: FloatArray, chosen: LabelArray, plane: FloatArray, cap_m: float
         return False
     found = moments_of(points, near[:n])
     # the smaller eigenvalue of the scatter is at least determinant / trace
-    if found.xx * found.yy - found.xy * found.xy < n * _LEAST_WIDTH_M**2 * (found.xx + found.yy):
+    if found.xx * found.yy - found.xy * found.xy < n * _MIN_WIDTH_M**2 * (found.xx + found.yy):
         return False
     a, b = solve_plane_moments(found.xx, found.xy, found.yy, found.xz, found.yz)
     fitted[0], fitted[1], fitted[2] = a, b, found.z - a * found.x - b * found.y

@@ -7,7 +7,7 @@ import dataclasses
 from pipeline.parameters import Parameters, parameter
 
 _CELL_SPACINGS = 1.2
-_LEAST_CELL_M = 0.25
+_MIN_CELL_M = 0.25
 """A superstructure of a metre has four such cells a side."""
 
 
@@ -74,7 +74,7 @@ class ArrangementSettings(Parameters):
         >>> [ArrangementSettings().raster_cell_of(spacing_m) for spacing_m in (0.1, 0.25, 0.3, 0.5)]
         [0.25, 0.3, 0.35, 0.5]
         """
-        return max(min(self.raster_cell_m, max(_CELL_SPACINGS * spacing_m, _LEAST_CELL_M)), spacing_m)
+        return max(min(self.raster_cell_m, max(_CELL_SPACINGS * spacing_m, _MIN_CELL_M)), spacing_m)
 
     def costs_of_face(self, points_per_m2: float) -> tuple[float, float]:
         """Misfitting points that a face must save that explains all its own points, and one that explains half.

@@ -45,7 +45,7 @@ _CLEARANCE_MM = 25.0
 """Chords keep this far from vertices."""
 _APART_MM = 10.0
 """New vertices keep this far from edges."""
-_LEAST_SUPPORT_MM = 10.0
+_MIN_SUPPORT_MM = 10.0
 
 
 @kernel
@@ -356,7 +356,7 @@ def cut_by_line(plan: Subdivision, line: FloatArray, number: int, snap_mm: float
             continue
         supported = False
         for s in range(len(spans)):
-            supported = supported or min(high, spans[s, 1]) - max(low, spans[s, 0]) > _LEAST_SUPPORT_MM
+            supported = supported or min(high, spans[s, 1]) - max(low, spans[s, 0]) > _MIN_SUPPORT_MM
         if not supported or counts[VERTICES] + 2 > len(xy) or counts[EDGES] + 6 > len(graph):
             continue
         middle = 0.5 * (low + high)

@@ -14,12 +14,12 @@ from pipeline.model import FloatArray, LabelArray, Reason
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.simplification import unite_close_vertices
-from pipeline.roof.templates.shapes import MOST_PLANES, height
+from pipeline.roof.templates.shapes import MAX_PLANES, height
 
 _MARGIN_M = 1.0
 """By how much parts go beyond the outline before it cuts them."""
 _UNITE_MM = 10.0
-_MOST_PAIRED = 500
+_MAX_PAIRED = 500
 """Vertices; of more not all pairs are looked at, which takes memory."""
 
 
@@ -68,7 +68,7 @@ def draw_parts(
     planes: FloatArray,
     direction: float,
     origin_m: FloatArray,
-    least_face_m2: float,
+    min_face_m2: float,
 ) -> RoofPartition:
     """The outline cut into the roof faces of its parts.
 
@@ -82,13 +82,13 @@ def draw_parts(
         Of the frame's axis u, radians.
     origin_m : (2,) float64
         Of the frame.
-    least_face_m2 : float
+    min_face_m2 : float
         A smaller face joins the neighbour with which it has the longest border.
 
     Returns
     -------
     RoofPartition
-        A coverage of the outline; label `MOST_PLANES` p + k is plane k of part p.
+        A coverage of the outline; label `MAX_PLANES` p + k is plane k of part p.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def draw_parts(
                 continue
             u, v = corners[:, 0], corners[:, 1]
             rings.append(np.rint(np.column_stack((u * cos - v * sin + x0, u * sin + v * cos + y0)) * 1e3))
-            labels.append(MOST_PLANES * p + k)
+            labels.append(MAX_PLANES * p + k)
     if len(rings) == 1:
         polygons = polygons_of(outline_mm)
         return RoofPartition(polygons=tuple(polygons), labels=np.full(len(polygons), labels[0], np.int32))
@@ -133,16 +133,16 @@ def draw_parts(
         ],
         np.int32,
     )
-    partition = _united(cells, own, least_face_m2)
+    partition = _united(cells, own, min_face_m2)
     vertices = np.unique(shapely.get_coordinates(partition.polygons), axis=0)
-    if len(vertices) > _MOST_PAIRED or _least_distance_mm(vertices) <= _UNITE_MM:
+    if len(vertices) > _MAX_PAIRED or _min_distance_mm(vertices) <= _UNITE_MM:
         partition = unite_close_vertices(partition, _UNITE_MM)
     if not shapely.is_valid(partition.polygons).all() or not shapely.coverage_is_valid(partition.polygons):
         raise BuildingError(Reason.NO_PARTITION, "the faces of the templates make no coverage")
     return partition
 
 
-def _least_distance_mm(vertices: FloatArray) -> float:
+def _min_distance_mm(vertices: FloatArray) -> float:
     """Between any two of the places, (n, 2), along x or y, whichever is more; infinite for fewer than two."""
     apart = np.abs(vertices[:, None] - vertices[None]).max(axis=2) + np.diag(np.full(len(vertices), np.inf))
     return float(apart.min())
@@ -153,14 +153,14 @@ def _label_at(u: float, v: float, regions: FloatArray, counts: LabelArray, plane
     """Part and plane over a place."""
     for p in range(len(regions)):
         if regions[p, 0] <= u < regions[p, 1] and regions[p, 2] <= v < regions[p, 3]:
-            return MOST_PLANES * p + height(planes[p], counts[p], u, v)[1]
+            return MAX_PLANES * p + height(planes[p], counts[p], u, v)[1]
     return 0
 
 
-def _united(cells: np.ndarray[tuple[int], np.dtype[np.object_]], labels: LabelArray, least_m2: float) -> RoofPartition:
+def _united(cells: np.ndarray[tuple[int], np.dtype[np.object_]], labels: LabelArray, min_m2: float) -> RoofPartition:
     """Cells of one label that touch are one face; small faces take the label along their longest border."""
     labels = labels.copy()
-    if len(np.unique(labels)) == len(labels) and shapely.area(cells).min() >= least_m2 * 1e6:
+    if len(np.unique(labels)) == len(labels) and shapely.area(cells).min() >= min_m2 * 1e6:
         return RoofPartition(polygons=tuple(cells.tolist()), labels=labels)
     while True:
         faces: list[Polygon] = []
@@ -171,7 +171,7 @@ def _united(cells: np.ndarray[tuple[int], np.dtype[np.object_]], labels: LabelAr
                 own.append(label)
         areas = shapely.area(faces)
         for k in np.argsort(areas, kind="stable").tolist():
-            if areas[k] >= least_m2 * 1e6:
+            if areas[k] >= min_m2 * 1e6:
                 return RoofPartition(polygons=tuple(faces), labels=np.array(own, np.int32))
             shared = shapely.length(shapely.intersection(shapely.boundary(faces[k]), shapely.boundary(faces)))
             shared[np.array(own) == own[k]] = 0.0

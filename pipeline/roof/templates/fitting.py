@@ -17,22 +17,22 @@ from pipeline.model import FloatArray, LabelArray, Plane, Reason
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.templates.drawing import draw_parts
 from pipeline.roof.templates.parts import fit_parts, main_direction
-from pipeline.roof.templates.shapes import CAP_SIGMAS, MOST_PLANES
+from pipeline.roof.templates.shapes import CAP_SIGMAS, MAX_PLANES
 
 SIGMA_M = 0.1
 """Standard deviation of points about the faces of a simple model: noise, and what is too small for the density."""
 _REACH_M = CAP_SIGMAS * SIGMA_M
 """A point farther from a template is not explained by it."""
-LEAST_POINTS = 4
+MIN_POINTS = 4
 """Of an outline: a level takes one parameter, and some points that bear it out."""
-MOST_POINTS = 500
+MAX_POINTS = 500
 """More are not few: the arrangement has all it needs, and the cuts that are tried take time."""
 _POINTS_OF_PART = 3
-_LEAST_EXPLAINED = 0.5
+_MIN_EXPLAINED = 0.5
 """Share of the points within three standard deviations without which no template is a model of them."""
 _SPARE_POINTS = 2
 """By how many the explained points must outnumber the parameters: many small shapes meet any points."""
-_LEAST_FACE_M2 = 1.0
+_MIN_FACE_M2 = 1.0
 _STEP_M = 0.3
 """Faces that part by more along a border meet in a step."""
 _PARAMETERS_OF_PLANE = 3
@@ -85,10 +85,10 @@ class Templates:
             `no_partition` where they break on the millimetre grid.
         """
         drawn = draw_parts(
-            self.outline_mm, self.regions, self.counts, self.planes, self.direction, self.origin_m, _LEAST_FACE_M2
+            self.outline_mm, self.regions, self.counts, self.planes, self.direction, self.origin_m, _MIN_FACE_M2
         )
         used = np.unique(drawn.labels)
-        number = np.full(MOST_PLANES * len(self.regions), -1, np.int32)
+        number = np.full(MAX_PLANES * len(self.regions), -1, np.int32)
         number[used] = np.arange(len(used))
         labels = number[self.plane_of_point]
         labels[np.abs(self.residuals_m) > _REACH_M] = -1
@@ -98,7 +98,7 @@ class Templates:
 
     def _plane(self, number: int, residuals_m: FloatArray) -> Plane:
         """A plane in local metres, with what its points say about it."""
-        a, b, c = self.planes[number // MOST_PLANES, number % MOST_PLANES].tolist()
+        a, b, c = self.planes[number // MAX_PLANES, number % MAX_PLANES].tolist()
         cos, sin = math.cos(self.direction), math.sin(self.direction)
         x_slope, y_slope = a * cos - b * sin, a * sin + b * cos
         squares = math.fsum((residuals_m**2).tolist())
@@ -132,8 +132,8 @@ def fit_templates(points: FloatArray, outline_mm: MultiPolygon) -> Templates:
         `too_few_points` below four points, `no_plane` where the best templates explain less than half of them, or
         too few for their parameters.
     """
-    if len(points) < LEAST_POINTS:
-        raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(points)} roof points, templates take {LEAST_POINTS}")
+    if len(points) < MIN_POINTS:
+        raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(points)} roof points, templates take {MIN_POINTS}")
     rings = [ring for polygon in outline_mm.geoms for ring in (polygon.exterior, *polygon.interiors)]
     around = [shapely.get_coordinates(ring) * 1e-3 for ring in rings]
     origin = np.array(outline_mm.bounds[:2]) * 1e-3
@@ -141,7 +141,7 @@ def fit_templates(points: FloatArray, outline_mm: MultiPolygon) -> Templates:
     direction, fitted = _fit_in_frame(np.ascontiguousarray(points), edges, origin, SIGMA_M, _POINTS_OF_PART)
     parameters, parts, regions, counts, planes, residuals, plane_of = fitted
     explained = int((np.abs(residuals) <= _REACH_M).sum())
-    if explained < max(_LEAST_EXPLAINED * len(points), parameters + _SPARE_POINTS):
+    if explained < max(_MIN_EXPLAINED * len(points), parameters + _SPARE_POINTS):
         found = f"{explained} of {len(points)} roof points with {parameters:g} parameters"
         raise BuildingError(Reason.NO_PLANE, f"templates explain only {found}")
     return Templates(

@@ -13,15 +13,15 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.model import FloatArray, LabelArray
-from pipeline.roof.templates.shapes import CAP_SIGMAS, MOST_PLANES, best_shape, copy_planes, height
+from pipeline.roof.templates.shapes import CAP_SIGMAS, MAX_PLANES, best_shape, copy_planes, height
 
-MOST_PARTS = 6
+MAX_PARTS = 6
 _EVERYWHERE_M = 1e6
 _CUT_PARAMETERS = 3.0
 """Direction and place of a cut between points."""
 _CORNER_CUT_PARAMETERS = 2.0
 """Of a cut at a corner of the outline: which one."""
-_LEAST_SIDE_M = 1.0
+_MIN_SIDE_M = 1.0
 """Width of a part."""
 _PLACES = 12
 """Cuts between points that are tried in each direction."""
@@ -123,7 +123,7 @@ def _cuts(points: FloatArray, edges: FloatArray, box: FloatArray) -> tuple[Float
         for i in range(e):
             corners_along[i] = edges[i, axis]
         own, corners = in_order(along), in_order(corners_along)
-        low, high = box[2 * axis] + _LEAST_SIDE_M, box[2 * axis + 1] - _LEAST_SIDE_M
+        low, high = box[2 * axis] + _MIN_SIDE_M, box[2 * axis + 1] - _MIN_SIDE_M
         last = -math.inf
         for i in range(e):
             if low <= corners[i] <= high and corners[i] > last + _CORNERS_APART_M:
@@ -191,7 +191,7 @@ def _settled_place(
     while rank < m and own[rank] < place:
         rank += 1
     step = max(1, m // _PLACES)
-    low, high = box[2 * axis] + _LEAST_SIDE_M, box[2 * axis + 1] - _LEAST_SIDE_M
+    low, high = box[2 * axis] + _MIN_SIDE_M, box[2 * axis + 1] - _MIN_SIDE_M
     least, settled = math.inf, place
     for i in range(m):
         if i >= fewest and m - i >= fewest and abs(i - rank) < step and own[i] > own[i - 1]:
@@ -220,7 +220,7 @@ def _best_cut(
     finalists = np.zeros((_FINALISTS, 3))
     least = np.full(_FINALISTS, math.inf)
     best, chosen = math.inf, 0
-    planes, best_planes = np.zeros((2, MOST_PLANES, 3)), np.zeros((2, MOST_PLANES, 3))
+    planes, best_planes = np.zeros((2, MAX_PLANES, 3)), np.zeros((2, MAX_PLANES, 3))
     counts, best_counts = np.zeros(2, np.int32), np.zeros(2, np.int32)
     for trial in range(count + _FINALISTS):
         thorough = trial >= count
@@ -296,17 +296,17 @@ def fit_parts(
     residuals : (n,) float64
         Height of every point above its roof, metres.
     plane_of : (n,) int32
-        `MOST_PLANES` p + k for a point over plane k of part p.
+        `MAX_PLANES` p + k for a point over plane k of part p.
     """
     n = len(points)
     cost_of_parameter = math.log(n)
     part_of = np.zeros(n, np.int32)
-    regions = np.empty((MOST_PARTS, 4))
+    regions = np.empty((MAX_PARTS, 4))
     for q in range(4):
         regions[0, q] = _EVERYWHERE_M if q % 2 else -_EVERYWHERE_M
-    counts = np.zeros(MOST_PARTS, np.int32)
-    planes = np.zeros((MOST_PARTS, MOST_PLANES, 3))
-    of_parts = np.zeros(MOST_PARTS)
+    counts = np.zeros(MAX_PARTS, np.int32)
+    planes = np.zeros((MAX_PARTS, MAX_PLANES, 3))
+    of_parts = np.zeros(MAX_PARTS)
     of_cuts = 0.0
     parts = 1
     part = 0
@@ -324,7 +324,7 @@ def fit_parts(
         of_parts[part], counts[part] = parameters, count
         copy_planes(shape, planes[part])
         # two levels cannot cost less
-        if parts == MOST_PARTS or m < 2 * fewest or cost <= (_CORNER_CUT_PARAMETERS + 2.0) * cost_of_parameter:
+        if parts == MAX_PARTS or m < 2 * fewest or cost <= (_CORNER_CUT_PARAMETERS + 2.0) * cost_of_parameter:
             part += 1
             continue
         cost_of_sides, axis, place, of_cut = _best_cut(own, edges, regions[part], sigma_m, cost_of_parameter, fewest)
@@ -345,7 +345,7 @@ def fit_parts(
         part = part_of[i]
         z, k = height(planes[part], counts[part], points[i, 0], points[i, 1])
         residuals[i] = points[i, 2] - z
-        part_of[i] = MOST_PLANES * part + k
+        part_of[i] = MAX_PLANES * part + k
     parameters_of_all = of_cuts
     for part in range(parts):
         parameters_of_all += of_parts[part]

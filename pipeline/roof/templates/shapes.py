@@ -14,21 +14,21 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.model import FloatArray
 
-MOST_PLANES = 4
+MAX_PLANES = 4
 """Of a shape: those of a hip."""
 CAP_SIGMAS = 3.0
 """A point farther than this from a shape is not explained by it."""
 _STEPS = 5
 """Refits of a line: what counts as far halves each time."""
-_LEAST_SLOPE = math.tan(math.radians(7.0))
-_MOST_SLOPE = math.tan(math.radians(70.0))
+_MIN_SLOPE = math.tan(math.radians(7.0))
+_MAX_SLOPE = math.tan(math.radians(70.0))
 _RIDGE_PLACES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
 """Where a ridge may lie, as shares of the part's width; the first in the middle."""
 _BOTH_ENDS = 3
 """Bits of the ends of a ridge with hips."""
 _RIDGES = _BOTH_ENDS + len(_RIDGE_PLACES)
 """Ridges that are tried in each direction: without hips, with them at either end, at both, and off the middle."""
-_LEAST_PENT = 0.02
+_MIN_PENT = 0.02
 """A pent roof of less slope is flat."""
 _BEYOND_M = 0.3
 """By how much a shape may leave the heights of its points within the part, beside what it falls over one spacing."""
@@ -105,7 +105,7 @@ def _stays_near(planes: FloatArray, count: int, points: FloatArray, box: FloatAr
     steepest = 0.0
     for k in range(count):
         steepest = max(steepest, abs(planes[k, 0]) + abs(planes[k, 1]))
-    if steepest > _MOST_SLOPE:
+    if steepest > _MAX_SLOPE:
         return False
     # ridges and eaves lie up to a spacing beyond points
     beyond_m = _BEYOND_M + steepest * math.sqrt((box[1] - box[0]) * (box[3] - box[2]) / len(points))
@@ -260,16 +260,16 @@ def best_shape(
     m = len(points)
     best = math.inf
     best_count, best_parameters = 0, 0
-    best_planes = np.zeros((MOST_PLANES, 3))
+    best_planes = np.zeros((MAX_PLANES, 3))
     ridged = math.inf
     start_count = 0
-    start = np.zeros((MOST_PLANES, 3))
-    planes = np.zeros((MOST_PLANES, 3))
+    start = np.zeros((MAX_PLANES, 3))
+    planes = np.zeros((MAX_PLANES, 3))
     z, t = np.empty(m), np.empty(m)
     for i in range(m):
         z[i] = points[i, 2]
     ridges = 3 + 2 * _RIDGES
-    for trial in range(ridges + MOST_PLANES - 1 if thorough else ridges):
+    for trial in range(ridges + MAX_PLANES - 1 if thorough else ridges):
         axis, place, ends, count = trial - 1, 0, 0, 1
         parameters = 1 if trial == 0 else 2
         if trial >= 3:
@@ -283,7 +283,7 @@ def best_shape(
         if trial >= ridges:
             count = trial - ridges + 2
             parameters = 2 * count
-            if count > start_count or (start_count == MOST_PLANES and count == 3):
+            if count > start_count or (start_count == MAX_PLANES and count == 3):
                 continue
         if m < parameters + (1 if trial < 3 else 2) or best <= parameters * cost_of_parameter:
             continue
@@ -302,14 +302,14 @@ def best_shape(
                     t[i] = points[i, max(axis, 0)]
             c, s = robust_line(t, z, reach_m, trial == 0)
             if trial >= 3:
-                if -s < _LEAST_SLOPE:
+                if -s < _MIN_SLOPE:
                     continue
                 count = _ridged(planes, axis, ridge, box, ends, c, -s)
             else:
                 planes[0, 0], planes[0, 1], planes[0, 2] = 0.0, 0.0, c
                 if trial > 0:
                     planes[0, axis] = s
-                    if abs(s) < _LEAST_PENT:
+                    if abs(s) < _MIN_PENT:
                         continue
         if trial > 0 and not _stays_near(planes, count, points, box):
             continue

@@ -146,9 +146,9 @@ def diff(
         if request.geojson != "none":
             warnings.append(f"no {GEOJSON}: GeoJSON is in WGS 84 (RFC 7946), and the CRS of the runs is unknown")
     level = summary.level
-    least_m = request.settings.min_height_change_m
+    min_m = request.settings.min_height_change_m
     shift_m = request.settings.vertical_shift_m
-    if level.median_m is not None and abs(level.median_m) > _LEVEL_SHARE * least_m:
+    if level.median_m is not None and abs(level.median_m) > _LEVEL_SHARE * min_m:
         warnings.append(
             f"unchanged roofs of NEW lie {level.median_m:+.3f} m off those of OLD (median of {level.count}): if the "
             f"surveys are that far apart, set vertical_shift_m to {shift_m + level.median_m:.3f}"

@@ -22,7 +22,7 @@ from pipeline.ruler.epochs.settings import DiffSettings
 
 ROWS_A_PART = 20_000
 """Buildings of one epoch whose geometry is held at once, about."""
-_LEAST_M2 = 1e-6
+_MIN_M2 = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -113,7 +113,7 @@ def overlapping(old: Any, new: Any) -> tuple[IntArray, IntArray, FloatArray]:
     order = np.lexsort((b, a))
     a, b = a[order].astype(np.int64), b[order].astype(np.int64)
     common = shapely.area(shapely.intersection(old[a], new[b]))
-    some = common > _LEAST_M2
+    some = common > _MIN_M2
     return a[some], b[some], common[some]
 
 

@@ -19,7 +19,7 @@ from pipeline.model import BoolArray, FloatArray, IntArray
 
 CELLS_A_WIDTH = 5
 """Cells across the narrowest part that counts: the disc is 5 x 5 cells without its corners."""
-MOST_CELLS = 4_000_000
+MAX_CELLS = 4_000_000
 """Of one group; a larger one gets larger cells, so that no hall of a kilometre takes all the memory."""
 
 COMMON_M2, MEDIAN_M, UNIFORM_M, SHIFT_M, DIFFERENCE_M = 0, 1, 2, 3, 4
@@ -106,7 +106,7 @@ def _compare_all(faces: RoofFaces, groups: RoofGroups, share: float, shift: floa
         cell = groups.width_m[group] / CELLS_A_WIDTH
         columns = math.ceil((boxes[group, 2] - west) / cell) + 1
         rows = math.ceil((boxes[group, 3] - south) / cell) + 1
-        while columns * rows > MOST_CELLS:
+        while columns * rows > MAX_CELLS:
             cell *= 2.0
             columns, rows = columns // 2 + 1, rows // 2 + 1
         before, after = np.full((rows, columns), _NOTHING), np.full((rows, columns), _NOTHING)
@@ -185,7 +185,7 @@ def _figures_of(
     own: BoolArray,
     rough: BoolArray,
     cell: float,
-    least_m: float,
+    min_m: float,
     ground_m: FloatArray,
     share: float,
     shift: float,
@@ -221,12 +221,12 @@ def _figures_of(
         rank = math.floor((1.0 - share) * (count - 1))
         lowest, highest = ordered[rank], ordered[count - 1 - rank]
         uniform = lowest if lowest > 0.0 else min(highest, 0.0)
-        moved = uniform if abs(uniform) >= least_m else 0.0
+        moved = uniform if abs(uniform) >= min_m else 0.0
         figures[COMMON_M2] = count * area
         figures[MEDIAN_M], figures[UNIFORM_M], figures[SHIFT_M] = median, uniform, moved
         figures[DIFFERENCE_M] = total / count
-    raised, lowered = common & (difference >= least_m), common & (difference <= -least_m)
-    higher, lower = common & (difference - moved >= least_m), common & (difference - moved <= -least_m)
+    raised, lowered = common & (difference >= min_m), common & (difference <= -min_m)
+    higher, lower = common & (difference - moved >= min_m), common & (difference - moved <= -min_m)
     for mask in (added, removed, raised, lowered, higher, lower):
         _open(mask)
     for row in range(rows):

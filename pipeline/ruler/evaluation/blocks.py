@@ -22,7 +22,7 @@ BLOCK_SHAPE = "block"
 """Shape of a block of several buildings, in their conditions."""
 _TOUCH_M = 0.02
 """What is closer than this is in touch, and in one plane."""
-_LEAST_BORDER_M = 0.5
+_MIN_BORDER_M = 0.5
 
 
 def joined_reference(reference: Reference) -> Reference:
@@ -107,7 +107,7 @@ def _one_plane(one: RoofSurface, other: RoofSurface) -> bool:
 
 def _touch(one: shapely.Polygon, other: shapely.Polygon) -> bool:
     """Whether two polygons have a piece of border in common, not a corner alone."""
-    return bool(shapely.length(shapely.intersection(one.buffer(_TOUCH_M), other.exterior)) > _LEAST_BORDER_M)
+    return bool(shapely.length(shapely.intersection(one.buffer(_TOUCH_M), other.exterior)) > _MIN_BORDER_M)
 
 
 def _block(parts: Sequence[RoofModel], surfaces: Sequence[RoofSurface]) -> RoofModel:

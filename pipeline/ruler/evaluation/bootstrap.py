@@ -23,8 +23,8 @@ CONFIDENCE = 0.95
 """Share of the resamples inside the interval."""
 _SEED = 20_030_117
 _ROWS_A_BLOCK = 64
-_LEAST_UNITS = 2
-_MOST_KEPT_UNITS = 50_000
+_MIN_UNITS = 2
+_MAX_KEPT_UNITS = 50_000
 """50 MB of resamples."""
 
 Sums = Mapping[str, FloatArray]
@@ -95,7 +95,7 @@ def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws:
     count = units.pop()
     whole = {name: column.sum(axis=0, keepdims=True) for name, column in arrays.items()}
     value = float(_figures(statistic, whole)[0])
-    if count < _LEAST_UNITS:
+    if count < _MIN_UNITS:
         return Estimate(value=value, low=math.nan, high=math.nan)
     figures = []
     for counts in _resamples(count, draws):
@@ -114,7 +114,7 @@ def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws:
 
 def _resamples(units: int, draws: int) -> Iterator[npt.NDArray[np.uint8]]:
     """How often each unit is drawn, (rows, units), some rows at a time; the same for the same numbers."""
-    if units <= _MOST_KEPT_UNITS:
+    if units <= _MAX_KEPT_UNITS:
         yield from _kept_resamples(units, draws)
         return
     yield from _drawn_resamples(units, draws)

@@ -287,8 +287,8 @@ def _definitions() -> tuple[Definition, ...]:
     )
 
 
-def _suffix(least_m2: float) -> str:
-    return f"_{least_m2:g}m2" if least_m2 else ""
+def _suffix(min_m2: float) -> str:
+    return f"_{min_m2:g}m2" if min_m2 else ""
 
 
 DEFINITIONS: tuple[Definition, ...] = _definitions()

@@ -24,7 +24,7 @@ MIN_SHARE = 0.5
 """Share of a footprint or face from which on it counts as lying on another."""
 EDGE_M = 5.0
 """Farther inside the extent of a reference no model is cut by the edge of the data, whatever it says of itself."""
-_LEAST_M2 = 1e-6
+_MIN_M2 = 1e-6
 _ROUNDING = 1e-9
 _PAIRS_A_BLOCK = 65_536
 
@@ -123,9 +123,9 @@ def overlapping(first: Geometries, second: Geometries) -> Overlaps:
         block = slice(start, start + _PAIRS_A_BLOCK)
         shared = shapely.intersection(first[a[block]], second[b[block]])
         common[block] = shapely.area(shared)
-        real = np.flatnonzero(common[block] > _LEAST_M2)
+        real = np.flatnonzero(common[block] > _MIN_M2)
         middle[start + real] = shapely.get_coordinates(shapely.centroid(shared[real]))
-    some = common > _LEAST_M2
+    some = common > _MIN_M2
     return Overlaps(first=a[some], second=b[some], common_m2=common[some], middle=middle[some])
 
 

@@ -31,7 +31,7 @@ from pipeline.ruler.report.section import RESIDUAL_CLASSES
 from pipeline.ruler.report.worst_cases import TRUTH_COLOUR
 from pipeline.runtime.manifest import RunManifest, RunStatus
 
-MOST_ROWS = 500
+MAX_ROWS = 500
 """Buildings in the page's table."""
 _SETTINGS_DIGITS = 12
 
@@ -82,7 +82,7 @@ class Comparison:
 
 def page(comparison: Comparison) -> str:
     """The page as text: styles, pictures and the one script, which sorts a table, are in it."""
-    ordered = most_different_first(comparison.buildings)[:MOST_ROWS]
+    ordered = most_different_first(comparison.buildings)[:MAX_ROWS]
     has_outcomes = any(record.outcome is not None for one in comparison.buildings for record in one.records)
     kinds = {
         record.roof_type for case in comparison.cases for record in case.choice.building.records if record.is_model

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from pipeline.io.storage import LocalStorage
-from pipeline.report.class_map import MOST_DRAWN, ClassMap
+from pipeline.report.class_map import MAX_DRAWN, ClassMap
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
 from pipeline.report.svg_chart import Axis, Ordinate, histogram_svg
@@ -72,7 +72,7 @@ def page(diff: Diff, rows: ClassMap) -> str:
         level=told["level"],
         map=None if drawn is None else {"uri": data_uri(drawn.png), "it": drawn},
         left_out=rows.left_out,
-        most_drawn=MOST_DRAWN,
+        max_drawn=MAX_DRAWN,
         chart=_chart(diff),
         reasons=[(INCOMPARABLE[Incomparable(name)], count) for name, count in told["reasons"].items()],
         doubts=[(DOUBTS[Doubt(name)], count) for name, count in told["doubts"].items()],

@@ -18,7 +18,7 @@ from pipeline.ruler.evaluation.writing import INTERVALS, all_notes, told_subject
 from pipeline.ruler.report.evaluation_maps import maps
 from pipeline.ruler.report.histograms import charts
 from pipeline.ruler.report.section import RESIDUAL_CLASSES
-from pipeline.ruler.report.worst_cases import MODEL_COLOUR, MOST_NOT_FOUND, SECTION_COLOUR, TRUTH_COLOUR, worst_cases
+from pipeline.ruler.report.worst_cases import MAX_NOT_FOUND, MODEL_COLOUR, SECTION_COLOUR, TRUTH_COLOUR, worst_cases
 
 PAGE = "report.html"
 """The file."""
@@ -86,7 +86,7 @@ def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINIT
         maps=[_with_uris(one, png="uri") for one in maps(evaluation)],
         charts=charts(evaluation.tables),
         cases=[_with_uris(one, plan_png="plan_uri", view_png="view_uri") for one in worst_cases(evaluation)],
-        most_not_found=MOST_NOT_FOUND,
+        max_not_found=MAX_NOT_FOUND,
         residuals=RESIDUAL_CLASSES,
         truth_colour=TRUTH_COLOUR,
         model_colour=MODEL_COLOUR,

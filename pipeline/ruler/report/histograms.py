@@ -17,9 +17,9 @@ from pipeline.ruler.evaluation.counts import floats
 
 GOOD_M = 0.2
 """Where the line stands in charts of distances: METHODS counts points within it."""
-_LEAST_SHARE = 1e-5
+_MIN_SHARE = 1e-5
 _FACE_AREAS_M2 = (0.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, math.inf)
-_LEAST_FACE_M2 = 10.0
+_MIN_FACE_M2 = 10.0
 _SLOPES_DEG = (0.0, 7.0, 20.0, 30.0, 40.0, 50.0, 90.0)
 
 
@@ -82,7 +82,7 @@ def _residuals(table: pa.Table) -> Chart | None:
             all_points,
             x=Axis(name="distance, m", text=lambda value: f"{value:g}"),
             y=Axis(name="share of points (log)", text=_percent),
-            ordinate=Ordinate(low=_LEAST_SHARE, high=1.0, log=True),
+            ordinate=Ordinate(low=_MIN_SHARE, high=1.0, log=True),
             description=f"Histogram of the vertical distances of {counts.sum():,.0f} points, "
             f"{100.0 * within:.1f} % of them within {GOOD_M:g} m.",
             steps=steps,
@@ -207,10 +207,10 @@ def _of_faces(table: pa.Table) -> list[Chart | None]:
             shown = edges[edges >= -1e-12] if unsigned else edges
             made.append(_plain(values, shown, title=title, x_name=x_name, what="found faces", marks=marks))
     areas = floats(table, "area_m2")
-    counted = areas >= _LEAST_FACE_M2
+    counted = areas >= _MIN_FACE_M2
     if "to_be_found" in names:
         counted = np.array([bool(value) for value in table["to_be_found"].to_pylist()], bool)
-    classed = counted | (areas < _LEAST_FACE_M2)
+    classed = counted | (areas < _MIN_FACE_M2)
     title, x_name = "Faces found, by area", "area of the true face, m²"
     made.append(_completeness(areas[classed], found[classed], _FACE_AREAS_M2, title, x_name, True))
     if "slope_deg" in names:
@@ -232,7 +232,7 @@ def _completeness(
         names.append(f"{low:g}-{high:g}" if math.isfinite(high) else f"> {low:g}")
         counts.append(int(chosen.sum()))
         shares.append(float(found[chosen].mean()) if chosen.any() else math.nan)
-        pale.append(by_area and high <= _LEAST_FACE_M2)
+        pale.append(by_area and high <= _MIN_FACE_M2)
     classes = "; ".join(
         f"{name}: {100.0 * share:.0f} % of {count:,}"
         for name, share, count in zip(names, shares, counts, strict=True)

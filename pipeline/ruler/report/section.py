@@ -39,7 +39,7 @@ RESIDUAL_CLASSES = (
 UNCOVERED = len(RESIDUAL_CLASSES) - 1
 """The class of points without a roof."""
 _WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 380.0, 40.0, 8.0, 10.0, 38.0
-_LEAST_HEIGHT, _MOST_HEIGHT = 130.0, 330.0
+_MIN_HEIGHT, _MAX_HEIGHT = 130.0, 330.0
 _MARGIN_M = 2.0
 _BELOW_M = 1.5
 _STEPS = 400
@@ -123,11 +123,11 @@ class _Frame:
     @property
     def scale(self) -> float:
         wide = (_WIDTH - _LEFT - _RIGHT) / (self.right_m - self.left_m)
-        return min(wide, (_MOST_HEIGHT - _TOP - _BOTTOM) / (self.high_m + 0.5 - self.floor_m))
+        return min(wide, (_MAX_HEIGHT - _TOP - _BOTTOM) / (self.high_m + 0.5 - self.floor_m))
 
     @property
     def height(self) -> float:
-        return max(_LEAST_HEIGHT, _TOP + _BOTTOM + self.scale * (self.high_m + 0.5 - self.floor_m))
+        return max(_MIN_HEIGHT, _TOP + _BOTTOM + self.scale * (self.high_m + 0.5 - self.floor_m))
 
     def across(self, place_m: float) -> float:
         middle = (_LEFT + _WIDTH - _RIGHT) / 2.0

@@ -24,7 +24,7 @@ from pipeline.ruler.report.viewed_models import viewed_faces
 
 CASES = 12
 """How many are shown."""
-MOST_NOT_FOUND = 4
+MAX_NOT_FOUND = 4
 """How many of them may be buildings without a model."""
 SOUND_SHARE = 0.999
 """A correct building of which no less is within 0.2 m is no worst case."""
@@ -99,7 +99,7 @@ def chosen_rows(table: pa.Table) -> list[dict[str, Any]]:
     chosen, lost = [], 0
     for *_, missing, row in judged:
         lost += missing
-        if not missing or lost <= MOST_NOT_FOUND:
+        if not missing or lost <= MAX_NOT_FOUND:
             chosen.append(row)
     return chosen[:CASES]
 

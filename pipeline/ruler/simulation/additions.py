@@ -23,7 +23,7 @@ from pipeline.ruler.simulation.roof_parts import PARTS, rectangle
 _TOLERANCE_M = 1e-6
 _EDGE_M = 0.3
 _APART_M = 0.5
-_LEAST_CLEARANCE_M = 0.05
+_MIN_CLEARANCE_M = 0.05
 _ALONG_M = 1e-3
 _TRIES = 40
 _ON_FLAT_ROOFS = (1.5, 1.5, 0.8), (4.5, 4.0, 3.2)
@@ -280,10 +280,10 @@ def random_superstructures(
         own = shapely.Polygon(plan_rectangle(one))
         if not free.contains(own) or any(shapely.dwithin(own, other, _APART_M) for other in taken):
             continue
-        if shapely.intersection(own.exterior, edges).length > _LEAST_CLEARANCE_M:
+        if shapely.intersection(own.exterior, edges).length > _MIN_CLEARANCE_M:
             continue  # a side along a ridge would leave a wall without height on it
         both = envelope([*parts, *addition_parts(bare, [one])])
-        if min(shapely.minimum_clearance(_polygon(both, face)) for face in both.faces) < _LEAST_CLEARANCE_M:
+        if min(shapely.minimum_clearance(_polygon(both, face)) for face in both.faces) < _MIN_CLEARANCE_M:
             continue
         found.append(one)
         taken.append(own)

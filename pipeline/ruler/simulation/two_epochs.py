@@ -30,7 +30,7 @@ class Work(StrEnum):
 
 STOREY_M = 2.8
 """By how much walls are raised or lowered."""
-LEAST_EAVE_M = 2.2
+MIN_EAVE_M = 2.2
 """No walls are made lower than this."""
 EXTENSION_M = 4.0
 """By how much a building grows along its ridge."""
@@ -116,7 +116,7 @@ def _worked_on(building: Building, kind: Work, terrain: Terrain) -> Building | N
         return _placed(building, building.shape, size, eave_m + STOREY_M, terrain)
     if kind is Work.LOWERED:
         lower_m = eave_m - STOREY_M
-        return None if lower_m < LEAST_EAVE_M else _placed(building, building.shape, size, lower_m, terrain)
+        return None if lower_m < MIN_EAVE_M else _placed(building, building.shape, size, lower_m, terrain)
     if kind is Work.NEW_ROOF:
         if building.shape not in _OTHER_ROOF:
             return None

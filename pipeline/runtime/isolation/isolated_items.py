@@ -23,7 +23,7 @@ from pipeline.runtime.monitoring.events import never
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-LEAST_MEMORY_BYTES = 2**29
+MIN_MEMORY_BYTES = 2**29
 """A child has a quarter of this in use before it begins."""
 
 _WORN_SHARE = 0.5
@@ -50,8 +50,8 @@ class IsolationLimits:
         faults = []
         if not (math.isfinite(self.timeout_s) and self.timeout_s > 0.0):
             faults.append(f"the time-out of a building is {self.timeout_s:g} s: use more than 0")
-        if self.memory_bytes < LEAST_MEMORY_BYTES:
-            least = LEAST_MEMORY_BYTES / 2**30
+        if self.memory_bytes < MIN_MEMORY_BYTES:
+            least = MIN_MEMORY_BYTES / 2**30
             faults.append(f"the memory of a building is {self.memory_bytes / 2**30:g} GiB: use at least {least:g} GiB")
         if faults:
             raise SettingsError(faults)

@@ -24,7 +24,7 @@ KIND_OF_SURFACE: Mapping[str, FaceKind | None] = {
 
 SURFACES = ("MultiSurface", "CompositeSurface")
 SOLIDS = ("Solid", "MultiSolid", "CompositeSolid")
-_LEAST_MODEL_LOD = 1.0
+_MIN_MODEL_LOD = 1.0
 
 Object = Mapping[str, Any]
 
@@ -92,11 +92,11 @@ def chosen(own: Sequence[Object], parts: Sequence[Sequence[Object]], places: Pla
     if level(lod_own) >= level(lod_parts):
         taken.extend(best_own)
     if level(lod_parts) >= level(lod_own):
-        modelled = level(lod_parts) >= _LEAST_MODEL_LOD
+        modelled = level(lod_parts) >= _MIN_MODEL_LOD
         taken.extend(
             geometry
             for geometries, lod in of_parts
-            if not modelled or level(lod) >= _LEAST_MODEL_LOD
+            if not modelled or level(lod) >= _MIN_MODEL_LOD
             for geometry in geometries
         )
     return taken, max(lod_own, lod_parts, key=level)
@@ -124,7 +124,7 @@ def parts_of(geometry: Object, places: Places) -> Iterator[RawPart]:
         raise TypeError(f"semantics is a {type(semantics).__name__}, not an object")
     surfaces = [_told(surface) for surface in semantics.get("surfaces", ())]
     values = semantics.get("values")
-    is_model = level(template.get("lod", "")) >= _LEAST_MODEL_LOD
+    is_model = level(template.get("lod", "")) >= _MIN_MODEL_LOD
     if kind in SURFACES:
         yield raw_part(vertices, _faces(boundaries, values, surfaces, is_model), is_solid=False)
         return

@@ -17,7 +17,7 @@ DISTANCE_M = 0.01
 ANGLE_DEG = 0.1
 """Normals up to this far apart are the same; more where so much is within `DISTANCE_M` over the width of the face."""
 
-_LEAST_UP = 1e-9
+_MIN_UP = 1e-9
 
 
 @kernel
@@ -96,7 +96,7 @@ def _neighbours(
 
 
 @kernel
-def _least_cosine(xyz: FloatArray, corners: IntArray, area: float, distance_m: float, angle_deg: float) -> float:
+def _min_cosine(xyz: FloatArray, corners: IntArray, area: float, distance_m: float, angle_deg: float) -> float:
     """Cosine of the largest angle that a face may have to a plane that it lies in: what a small error explains."""
     extent = 0.0
     for axis in range(3):
@@ -161,7 +161,7 @@ def coplanar_regions(
         n, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
         sxx, sxy, syy, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0
         joining = seed
-        while normals[seed, 2] > _LEAST_UP:
+        while normals[seed, 2] > _MIN_UP:
             if joining >= 0:
                 for k in range(ring_offsets[face_rings[joining]], ring_offsets[face_rings[joining + 1]]):
                     x, y, z = xyz[corners[k], 0], xyz[corners[k], 1], xyz[corners[k], 2]
@@ -183,7 +183,7 @@ def coplanar_regions(
             up = 1.0 / math.sqrt(1.0 + a * a + b * b)
             for q in range(offsets[face], offsets[face + 1]):
                 other = others[q]
-                if labels[other] >= 0 or told[other] != told[seed] or normals[other, 2] <= _LEAST_UP:
+                if labels[other] >= 0 or told[other] != told[seed] or normals[other, 2] <= _MIN_UP:
                     continue
                 first, last = ring_offsets[face_rings[other]], ring_offsets[face_rings[other + 1]]
                 fits = True
@@ -193,7 +193,7 @@ def coplanar_regions(
                         fits = False
                         break
                 cosine = (normals[other, 2] - a * normals[other, 0] - b * normals[other, 1]) * up
-                if fits and cosine >= _least_cosine(xyz, corners[first:last], areas[other], distance_m, angle_deg):
+                if fits and cosine >= _min_cosine(xyz, corners[first:last], areas[other], distance_m, angle_deg):
                     labels[other] = count
                     queue[written] = other
                     written += 1

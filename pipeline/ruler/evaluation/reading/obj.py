@@ -33,7 +33,7 @@ _OWN_HEADER = re.compile(
 _OWN_MATERIAL = re.compile(r"^roof_(\d+)$")
 _COARSER_STEM = re.compile(r"^(.+)-lod\d+$")
 """Name of a file of this program that holds a coarser level of detail than the file of the name before it."""
-_LEAST_SOLID_FACES = 4
+_MIN_SOLID_FACES = 4
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -110,7 +110,7 @@ def _buildings(mesh: _Mesh, path: Path, into: Collected, *, alone: bool) -> dict
             buildings.setdefault(building, []).extend(parts)
         return buildings
     groups = {name: faces for name, faces in mesh.groups.items() if faces}
-    if len(groups) > 1 and all(name and len(faces) >= _LEAST_SOLID_FACES for name, faces in groups.items()):
+    if len(groups) > 1 and all(name and len(faces) >= _MIN_SOLID_FACES for name, faces in groups.items()):
         into.note("an OBJ without `o`: each of its groups is taken as a building")
         return {name: _parts(vertices, faces) for name, faces in groups.items()}
     parts = _parts(vertices, objects[""])

@@ -25,10 +25,10 @@ from pipeline.ruler.evaluation.reading.raw import MILLIMETRES_PER_METRE, RawPart
 
 GRID_M = 0.001
 """Coordinates in plan are whole multiples of it."""
-LEAST_UP = 0.1
+MIN_UP = 0.1
 """A face whose unit normal has a larger z looks up, one with a smaller -z down; the rest are walls."""
 
-_LEAST_AREA_M2 = 1e-6
+_MIN_AREA_M2 = 1e-6
 _SLIVER_M = 0.004
 """A hole in a footprint that is narrower on average is where two files' roundings met."""
 _COVERED_SHARE = 0.5
@@ -195,7 +195,7 @@ def _kinds(soup: _Soup) -> tuple[list[FaceKind], dict[int, Polygon | MultiPolygo
     roofs = np.flatnonzero([kind is FaceKind.ROOF for kind in kinds])
     plans = soup.plan(roofs)
     areas = shapely.area(plans)
-    kept = [(int(face), plan) for face, plan, area in zip(roofs, plans, areas, strict=True) if area > _LEAST_AREA_M2]
+    kept = [(int(face), plan) for face, plan, area in zip(roofs, plans, areas, strict=True) if area > _MIN_AREA_M2]
     doubtful = np.array([unnamed[face] or soup.vectors[face, 2] < 0.0 for face, _ in kept], np.bool_)
     if doubtful.any():
         covered = _covered(soup, kept, doubtful)
@@ -224,20 +224,20 @@ def _kinds_by_normal(soup: _Soup) -> list[FaceKind]:
     inward = np.where(volumes == 0.0, flat, volumes) < 0.0
     upward = np.where(inward, -1.0, 1.0)[soup.part]
     up = np.divide(soup.vectors[:, 2] * upward, lengths, out=np.zeros(len(lengths)), where=lengths > 0.0)
-    return [FaceKind.ROOF if z > LEAST_UP else FaceKind.GROUND if z < -LEAST_UP else FaceKind.WALL for z in up]
+    return [FaceKind.ROOF if z > MIN_UP else FaceKind.GROUND if z < -MIN_UP else FaceKind.WALL for z in up]
 
 
 def _covered(soup: _Soup, roofs: list[tuple[int, Polygon | MultiPolygon]], doubtful: BoolArray) -> BoolArray:
     """Which doubtful faces have most of their area under other roof faces."""
     plans = np.array([plan for _, plan in roofs], object)
     covered = np.zeros(len(roofs), np.bool_)
-    if shapely.area(plans).sum() - shapely.union_all(plans, grid_size=GRID_M).area < _LEAST_AREA_M2 * len(plans):
+    if shapely.area(plans).sum() - shapely.union_all(plans, grid_size=GRID_M).area < _MIN_AREA_M2 * len(plans):
         return covered
     lower, upper = shapely.STRtree(plans).query(plans, predicate="intersects")
     pairs = (lower != upper) & doubtful[lower]
     lower, upper = lower[pairs], upper[pairs]
     common = shapely.intersection(plans[lower], plans[upper])
-    met = shapely.area(common) > _LEAST_AREA_M2
+    met = shapely.area(common) > _MIN_AREA_M2
     pieces: dict[int, list[shapely.Geometry]] = {}
     for low, high, piece in zip(lower[met].tolist(), upper[met].tolist(), common[met], strict=True):
         x, y = shapely.get_coordinates(shapely.centroid(piece))[0]
@@ -303,7 +303,7 @@ def _surfaces(
     return [
         RoofSurface(polygon=piece, coefficients=coefficients, plane_id=plane_id)
         for piece in pieces
-        if piece.area > _LEAST_AREA_M2
+        if piece.area > _MIN_AREA_M2
     ]
 
 
