@@ -137,7 +137,7 @@ class Console:
                 self._tell_error(error, ExitCode.USAGE)
                 raise typer.Exit(ExitCode.USAGE) from error
             if self._log_json:
-                self._logs.callback(logs.let_all_speak_json())
+                self._logs.callback(logs.log_everything_as_json())
         return self
 
     def __exit__(

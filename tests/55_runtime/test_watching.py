@@ -129,7 +129,7 @@ def lines() -> Iterator[io.StringIO]:
     """What the loggers of gablework write, as JSON."""
     stream = io.StringIO()
     handler = logging.StreamHandler(stream)
-    handler.setFormatter(logs.JsonLines())
+    handler.setFormatter(logs.formatter(as_json=True))
     logger = logging.getLogger("gablework")
     before, level = list(logger.handlers), logger.level
     logger.handlers = [handler]
@@ -223,7 +223,7 @@ def test_all_that_a_process_of_ours_says_is_json_also_what_libraries_say_and_wha
     odd, broke, ours, thread, lost = (json.loads(line) for line in ended.stderr.splitlines())
     assert (odd["logger"], broke["logger"], ours["logger"]) == ("py.warnings", "distributed.client", "gablework.run")
     assert broke["message"] == "the connection broke"
-    assert "adder ended by a fault: division by zero" in thread["message"]
+    assert "adder ended with an exception: division by zero" in thread["message"]
     assert "ZeroDivisionError" in thread["exception"]
     assert "KeyError: 'lost'" in lost["exception"]
 

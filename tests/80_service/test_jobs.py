@@ -24,8 +24,8 @@ from pipeline.errors import (
     UnreadableInputError,
     VersionMismatchError,
 )
+from pipeline.runtime.monitoring.logs import formatter
 from service.driver.faults import failure_of, pause_s, tried_again
-from service.driver.logs import JsonLines, PlainLines
 from service.driver.progress import WEIGHTS, WORDS, percent
 from service.driver.wording import Scrubber, outcome
 from service.errors import (
@@ -250,9 +250,9 @@ def test_pauses_grow_and_stay_bounded() -> None:
 def test_lines_of_the_log_name_the_job_and_the_attempt() -> None:
     facts = {"job": "ab", "attempt": 2}
     record = logging.makeLogRecord({"name": "x", "levelname": "INFO", "msg": "runs %d", "args": (3,), **facts})
-    told = json.loads(JsonLines().format(record))
-    assert (told["message"], told["job"], told["attempt"], told["level"]) == ("runs 3", "ab", 2, "info")
-    assert PlainLines().format(record).endswith("runs 3 [job ab, attempt 2]")
+    line = json.loads(formatter(as_json=True).format(record))
+    assert (line["message"], line["job"], line["attempt"], line["level"]) == ("runs 3", "ab", 2, "info")
+    assert formatter(as_json=False).format(record).endswith("runs 3 [job ab, attempt 2]")
 
 
 # --- the page about jobs

@@ -54,7 +54,7 @@ def dask_setup(worker: object) -> None:
     if os.environ.get(LOG):
         as_json = os.environ[LOG] == "json"
         if as_json:
-            logs.let_all_speak_json()
+            logs.log_everything_as_json()
         logs.configure(as_json=as_json, also=("distributed",) if as_json else ())
     else:
         logs.configure_once()

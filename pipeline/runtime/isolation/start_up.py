@@ -73,7 +73,7 @@ def start_own_process() -> None:
         # a value that is neither yes nor no is told by the command itself
         with contextlib.suppress(SettingsError):
             if logs.wants_json():
-                logs.let_all_speak_json()
+                logs.log_everything_as_json()
 
 
 def _keep_freed_memory() -> None:

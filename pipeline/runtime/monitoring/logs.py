@@ -1,8 +1,8 @@
-"""Log lines with ids: plain for people, or one JSON object a line; of the driver of a run, of workers, of the service.
+"""Log lines with ids, plain or JSON, from the driver of a run, from workers and from the service.
 
-All of gablework's lines go to loggers below `gablework`. As a library it prints none of them; a process that is ours
-calls `configure`. Facts stand beside the message: those that the line itself has (`extra=`), and those of what is under
-way (`about`): a worker thus names run, stage and tile of the task at hand, also where the line comes from deep inside.
+All lines of gablework go to loggers below `gablework`. As a library it prints none of them; a process of gablework
+calls `configure`. A line has facts beside its message: its own (`extra=`), and those of the current work (`about`). A
+worker thus names run, stage and tile of the current task in every line.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import datetime as dt
 import functools
-import json
 import logging
 import os
 import sys
@@ -27,98 +26,106 @@ FACTS = (
     *("schedule", "run", "stage", "tile", "batch", "building", "reason"),
     *("seconds", "memory_bytes", "done", "total", "failed"),
 )
-"""What a line may tell beside its message, in this order."""
+"""Facts that a line may have beside its message, in this order."""
 VARIABLE = "GABLEWORK_LOG_JSON"
 """Environment variable that makes workers and commands log JSON; the service's setting has the same name."""
 
 _NAME = "gablework"
 _CHATTY = ("alembic", "distributed")
-"""Libraries of whose lines a process of ours shows warnings and errors only; Dask sets its own levels as it loads, so
-that a level set before would not last."""
-_UNDER_WAY: ContextVar[Mapping[str, object]] = ContextVar("gablework facts", default=MappingProxyType({}))
+"""Libraries that log only warnings and errors in a process of gablework. Dask sets its own levels when it is loaded, so
+a level set earlier would not last."""
+_CURRENT: ContextVar[Mapping[str, object]] = ContextVar("gablework facts", default=MappingProxyType({}))
+_KEY_DIGITS = 12
+"""Logged digits of a batch's key: enough to find it in scratch."""
 
 LOG = logging.getLogger(f"{_NAME}.run")
-"""Of runs and their tasks."""
+"""Logger of runs and their tasks."""
 logging.getLogger(_NAME).addHandler(logging.NullHandler())
-
-
-_KEY_TOLD = 12
-"""Digits of a batch's key that are told: enough to find it in scratch."""
 
 
 @contextlib.contextmanager
 def about(**facts: object) -> Iterator[None]:
-    """Let all lines of this thread tell some facts, until the end of the block; None and "" are left out."""
+    """Add facts to all lines of this thread until the end of the block; None and "" are left out."""
     known = {name: value for name, value in facts.items() if value not in (None, "")}
-    token = _UNDER_WAY.set({**_UNDER_WAY.get(), **known})
+    token = _CURRENT.set({**_CURRENT.get(), **known})
     try:
         yield
     finally:
-        _UNDER_WAY.reset(token)
+        _CURRENT.reset(token)
 
 
 def facts_of_task(task: object) -> dict[str, object]:
-    """The ids that a task of a run carries: the run by the name of its scratch folder, its tile, its batch."""
+    """The ids of a run's task: the name of the run's scratch folder, the tile, the batch."""
     place, task = getattr(task, "place", None), getattr(task, "task", task)
     run = getattr(getattr(task, "scratch", None), "name", None)
     tile = getattr(getattr(task, "tile", None), "key", None)
     batch = None
     if place is not None and hasattr(task, "sites"):
-        tile, batch = place.unit, place.key[:_KEY_TOLD]
+        tile, batch = place.unit, place.key[:_KEY_DIGITS]
     return {"run": run, "tile": tile, "batch": batch}
 
 
 def facts_of(record: logging.LogRecord) -> dict[str, Any]:
-    """The facts of a line: its own before those of what is under way."""
-    under_way = _UNDER_WAY.get()
-    found = {name: getattr(record, name, under_way.get(name)) for name in FACTS}
+    """The facts of a line: its own facts override those of the current work."""
+    current = _CURRENT.get()
+    found = {name: getattr(record, name, current.get(name)) for name in FACTS}
     return {name: value for name, value in found.items() if value is not None}
 
 
-class JsonLines(logging.Formatter):
-    """One JSON object a line."""
+def formatter(*, as_json: bool) -> logging.Formatter:
+    """The format of lines with their facts: one JSON object per line, or plain."""
+    return _json_lines() if as_json else PlainLines()
 
-    def format(self, record: logging.LogRecord) -> str:
-        """The record with its facts; an exception with its traceback."""
-        told = {
-            "at": dt.datetime.fromtimestamp(record.created, dt.UTC).isoformat(timespec="milliseconds"),
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "message": record.getMessage(),
-        }
-        told |= facts_of(record)
-        if record.exc_info:
-            told["exception"] = self.formatException(record.exc_info)
-        return json.dumps(told, default=str)
+
+@functools.cache
+def _json_lines() -> logging.Formatter:
+    from pythonjsonlogger.json import JsonFormatter  # here, as most processes log plain lines or none
+
+    class JsonLines(JsonFormatter):
+        """One JSON object per line; of the facts of libraries only those of `FACTS`."""
+
+        def add_fields(self, log_data: dict[str, Any], record: logging.LogRecord, message_dict: dict[str, Any]) -> None:
+            at = dt.datetime.fromtimestamp(record.created, dt.UTC).isoformat(timespec="milliseconds")
+            log_data |= {
+                "at": at,
+                "level": record.levelname.lower(),
+                "logger": record.name,
+                "message": record.getMessage(),
+            }
+            log_data |= facts_of(record)
+            if record.exc_info:
+                log_data["exception"] = message_dict["exc_info"]
+
+    return JsonLines(json_default=str)
 
 
 class PlainLines(logging.Formatter):
-    """One line for people; an exception below it."""
+    """A plain line, with an exception below it."""
 
     def __init__(self) -> None:
-        super().__init__("%(asctime)s %(levelname)s %(message)s%(told)s")
+        super().__init__("%(asctime)s %(levelname)s %(message)s%(facts)s")
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record with its facts in brackets."""
+        """Format the record, its facts in brackets."""
         facts = [f"{name} {value}" for name, value in facts_of(record).items()]
-        record.told = f" [{', '.join(facts)}]" if facts else ""
+        record.facts = f" [{', '.join(facts)}]" if facts else ""
         return super().format(record)
 
 
 def configure(*, as_json: bool, name: str = _NAME, also: tuple[str, ...] = ()) -> None:
-    """Let the lines of a logger go to standard error with their facts, whatever the program does with others.
+    """Send the lines of a logger to standard error with their facts, whatever the program does with other loggers.
 
     Parameters
     ----------
     as_json : bool
-        One JSON object a line in place of plain lines.
+        One JSON object per line instead of plain lines.
     name : str
         The logger; all of gablework's by default.
     also : tuple of str
-        Loggers of libraries that speak in the same way; their levels stay.
+        Loggers of libraries to format in the same way; their levels stay.
     """
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonLines() if as_json else PlainLines())
+    handler.setFormatter(formatter(as_json=as_json))
     for one in (name, *also):
         logger = logging.getLogger(one)
         logger.handlers = [handler]
@@ -126,28 +133,28 @@ def configure(*, as_json: bool, name: str = _NAME, also: tuple[str, ...] = ()) -
     logging.getLogger(name).setLevel(logging.INFO)
 
 
-class _NoChatter(logging.Filter):
-    """Lets pass what is ours, and what libraries say that is of interest."""
+class _QuietLibraries(logging.Filter):
+    """Drops the informative lines of chatty libraries."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether the line is shown."""
         return record.levelno >= logging.WARNING or record.name.partition(".")[0] not in _CHATTY
 
 
-def let_all_speak_json() -> Callable[[], None]:
-    """Make all lines of this process JSON on standard error, whoever writes them.
+def log_everything_as_json() -> Callable[[], None]:
+    """Write all lines of this process as JSON to standard error.
 
-    Those of libraries, also of such as are loaded later; Python's warnings; and faults that nobody catches, of any
-    thread. For processes that are ours, never for one that imports this program as a library.
+    This includes lines of libraries, also of those loaded later, Python's warnings, and uncaught exceptions of any
+    thread. It is for processes of gablework, never for one that imports it as a library.
 
     Returns
     -------
     callable
-        Undoes it.
+        Restores what was there before.
     """
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonLines())
-    handler.addFilter(_NoChatter())
+    handler.setFormatter(formatter(as_json=True))
+    handler.addFilter(_QuietLibraries())
     root = logging.getLogger()
     loggers = (root, *map(logging.getLogger, (_NAME, "distributed", "py.warnings")))
     before = [(logger, logger.handlers, logger.propagate, logger.level) for logger in loggers]
@@ -171,7 +178,7 @@ def let_all_speak_json() -> Callable[[], None]:
 
 
 def _log_fault(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    LOG.critical("a fault that nobody caught: %s", error or kind.__name__, exc_info=(kind, error, trace))
+    LOG.critical("an uncaught exception: %s", error or kind.__name__, exc_info=(kind, error, trace))
 
 
 def _log_fault_of_thread(fault: threading.ExceptHookArgs) -> None:
@@ -180,7 +187,7 @@ def _log_fault_of_thread(fault: threading.ExceptHookArgs) -> None:
     name = "a thread" if fault.thread is None else f"the thread {fault.thread.name}"
     error = fault.exc_type() if fault.exc_value is None else fault.exc_value
     LOG.critical(
-        "%s ended by a fault: %s",
+        "%s ended with an exception: %s",
         name,
         error or fault.exc_type.__name__,
         exc_info=(fault.exc_type, error, fault.exc_traceback),
@@ -205,6 +212,6 @@ def wants_json() -> bool:
 
 @functools.cache
 def configure_once() -> None:
-    """Configure a worker that the environment tells to log JSON, whatever program started it."""
+    """Log JSON in a worker if the environment asks for it, whatever program started it."""
     if wants_json():
         configure(as_json=True, also=("distributed",))
