@@ -26,7 +26,7 @@ def test_the_console_script_imports_nothing_heavy() -> None:
 
 
 def test_a_serial_run_imports_no_engine_and_nothing_for_child_processes() -> None:
-    unused = {"dask", "distributed", "matplotlib", "psutil"}
+    unused = {"dask", "distributed", "matplotlib", "psutil", "pythonjsonlogger"}
     assert modules_after("import pipeline.runtime.run") & unused == set()
 
 
