@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.io import ReadOptions
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import Candidate
-from pipeline.runtime.cluster.serial import SerialExecutor
+from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.monitoring.events import ignore
 from pipeline.runtime.plan import make_plan
 from pipeline.runtime.scratch.folder import Scratch

@@ -35,7 +35,7 @@ from benchmarks.city_scale import free_port, wait_for_listener
 from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions
 from pipeline.model import IntArray
-from pipeline.runtime.cluster.executors import Cluster, DaskExecutor
+from pipeline.runtime.cluster.dask_executor import Cluster, DaskExecutor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.monitoring.events import Watch, ignore
 from pipeline.runtime.plan import Plan, make_plan

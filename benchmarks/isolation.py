@@ -20,8 +20,8 @@ from pathlib import Path
 
 import psutil
 
-from pipeline.runtime.cluster.executors import Cluster
-from pipeline.runtime.cluster.serial import Executor, SerialExecutor
+from pipeline.runtime.cluster.dask_executor import Cluster
+from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.run import RunRequest, run
 
 STAGES = ("split", "reconstruct", "total")

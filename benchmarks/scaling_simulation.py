@@ -32,7 +32,7 @@ import numpy as np
 from benchmarks.city_scale import is_mark
 from benchmarks.entries import markdown_table
 from pipeline.model import FloatArray
-from pipeline.runtime.cluster.flight import TASKS_A_THREAD
+from pipeline.runtime.cluster.dispatch import TASKS_PER_THREAD
 from pipeline.runtime.scratch.folder import POINT
 
 _SEED = 20
@@ -77,7 +77,7 @@ class Machine:
     """Between two tasks of one worker."""
     storage_bytes_s: float = math.inf
     """Bandwidth of the storage that all share."""
-    tasks_a_thread: int = TASKS_A_THREAD
+    tasks_a_thread: int = TASKS_PER_THREAD
     """The window of tasks in flight."""
 
 
@@ -348,7 +348,7 @@ class Change:
     """So many tasks become one, but those of whole tiles: input files, units, outlines, batches of buildings."""
     drivers: int = 1
     """Runs side by side, each with a scheduler and a share of the workers."""
-    tasks_a_thread: int = TASKS_A_THREAD
+    tasks_a_thread: int = TASKS_PER_THREAD
     """Window of tasks in flight."""
 
 
@@ -423,7 +423,7 @@ ALL = dataclasses.replace(REGIONS, digest_in_driver=0.02, plan_in_driver=0.05, t
 PLAIN, CHANGED = "as it is", "with all changes"
 CHANGES: Mapping[str, Change] = {
     "as it is": Change(),
-    "window twice as large": Change(tasks_a_thread=2 * TASKS_A_THREAD),
+    "window twice as large": Change(tasks_a_thread=2 * TASKS_PER_THREAD),
     "tasks four times larger": Change(tasks_a_batch=4.0),
     "join by regions, in tasks": REGIONS,
     "digest by tile": Change(digest_in_driver=0.02),

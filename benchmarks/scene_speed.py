@@ -35,7 +35,7 @@ from benchmarks.entries import markdown_table
 from pipeline.io import ReadOptions
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.seeds import seed_of
-from pipeline.runtime.cluster.serial import Executor, SerialExecutor
+from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.monitoring.events import ignore
 from pipeline.runtime.plan import Plan, make_plan

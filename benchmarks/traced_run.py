@@ -23,10 +23,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.monitoring.events import Event, Watch
-from pipeline.runtime.monitoring.measured import Measured, Result, Task
+from pipeline.runtime.monitoring.measurement import Measured, Result, Task
 from pipeline.runtime.run import RunRequest, run
 from pipeline.settings import RunSettings
 

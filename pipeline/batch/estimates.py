@@ -21,8 +21,8 @@ from pipeline.errors import EmptyInputError, InputError, RunError
 from pipeline.inspection import inspect
 from pipeline.io import shown
 from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
-from pipeline.runtime.cluster.executors import memory_of_workers
-from pipeline.runtime.cluster.performance import PerformanceReport
+from pipeline.runtime.cluster.dask_executor import memory_of_workers
+from pipeline.runtime.cluster.performance_report import PerformanceReport
 from pipeline.runtime.engine import engine_of
 from pipeline.runtime.expected import RATES, expected
 from pipeline.runtime.monitoring.events import ignore

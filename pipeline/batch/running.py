@@ -14,7 +14,7 @@ from pipeline.batch.wording import as_keys, said_in_keys
 from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.report.run_page import write_run_page
 from pipeline.runtime.cluster.run_metrics import RunMetrics, both, serve_metrics
-from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.events import Event, Listener, ignore, never
 from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, held_lock, make_work, refuse_held

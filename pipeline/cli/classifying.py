@@ -22,7 +22,7 @@ from pipeline.cli.options import (
     Workers,
 )
 from pipeline.console import Console
-from pipeline.runtime.isolation.preloading import start_early, surely_small
+from pipeline.runtime.isolation.preloading import is_surely_small, start_early
 
 if TYPE_CHECKING:
     from pipeline.runtime.classify import ClassifySummary
@@ -61,7 +61,7 @@ def classify(
         from pipeline.runtime.cluster.tls import given_tls
         from pipeline.settings import RunSettings
 
-        if not surely_small(tiles):
+        if not is_surely_small(tiles):
             start_early(
                 "classify", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None
             )

@@ -342,10 +342,10 @@ def _statistics_of(run_dir: str) -> dict[str, Any]:
     from pipeline.runtime.isolation.child_pool import has_idle_child
 
     if has_idle_child():
-        from pipeline.runtime.cluster.local import LocalExecutor
+        from pipeline.runtime.cluster.local_executor import LocalExecutor
         from pipeline.runtime.monitoring.events import Watch
 
-        return LocalExecutor(1).apart("report", _read_statistics, run_dir, Watch())
+        return LocalExecutor(1).run_step("report", _read_statistics, run_dir, Watch())
     return _read_statistics(run_dir)
 
 

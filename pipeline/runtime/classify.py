@@ -12,13 +12,13 @@ from uuid import uuid4
 from pipeline.errors import InputError, RunError, SettingsError
 from pipeline.export.raster import RasterLattice
 from pipeline.io import SpatialReference, is_url, shown
-from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.cluster.tls import TlsFiles
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.monitoring.events import Listener, Watch, ignore, never
-from pipeline.runtime.monitoring.measured import peak_of_process
+from pipeline.runtime.monitoring.measurement import peak_of_process
 from pipeline.runtime.plan import check_memory
 from pipeline.runtime.run import RunRequest, calling_off, plan_inputs
 from pipeline.runtime.scratch.folder import Scratch

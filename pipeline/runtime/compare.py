@@ -12,7 +12,7 @@ from typing import Any
 from pipeline.errors import RunError, SettingsError
 from pipeline.methods import METHODS, PRESETS, method_named
 from pipeline.parameters import build
-from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.manifest import NAME as MANIFEST
 from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.run import RunRequest, RunSummary, RunVariant, run_variants

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pipeline.errors import SettingsError
 from pipeline.runtime.cluster.priorities import Traffic, priority_of
-from pipeline.runtime.cluster.serial import Executor, SerialExecutor
+from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.cluster.tls import TlsFiles
 from pipeline.runtime.expected import RATES, Expected
 from pipeline.runtime.isolation.child_pool import kill_children, preload
@@ -133,14 +133,14 @@ def executor_for(
             raise SettingsError(["a performance report tells the time of workers, and there are none: use --workers 1"])
         return SerialExecutor()
     if engine == "local":
-        from pipeline.runtime.cluster.local import LocalExecutor
+        from pipeline.runtime.cluster.local_executor import LocalExecutor
 
         if loads:
             preload(loads)
         return LocalExecutor(processes)
     if scheduler is None:
         kill_children()  # the server that was started early, in case the job was small
-    from pipeline.runtime.cluster.executors import Cluster, DaskExecutor
+    from pipeline.runtime.cluster.dask_executor import Cluster, DaskExecutor
 
     cluster = Cluster(workers=processes, scheduler=scheduler, local_directory=local_directory, tls=tls)
     return DaskExecutor(

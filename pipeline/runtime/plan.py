@@ -11,7 +11,7 @@ import shapely
 
 from pipeline.errors import CrsError, EmptyInputError, InputError, all_at_fault
 from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
-from pipeline.runtime.cluster.needs import WINDOW_BASE_BYTES
+from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
 from pipeline.scene import ClassesInUse
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile, TileGrid

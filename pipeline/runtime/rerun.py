@@ -25,7 +25,7 @@ from pipeline.errors import RunError
 from pipeline.export.tile_update import updated_tile
 from pipeline.io import LocalStorage
 from pipeline.model import Reason
-from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.cluster.tls import TlsFiles
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.earlier import (

@@ -30,9 +30,9 @@ from pipeline.io import (
 from pipeline.io.footprints import read_area
 from pipeline.io.remote_file import on_this_machine
 from pipeline.io.tile_index import TileIndex
-from pipeline.runtime.cluster.flight import TICK_S
+from pipeline.runtime.cluster.dispatch import TICK_S
 from pipeline.runtime.cluster.priorities import Traffic
-from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.cluster.tls import TlsFiles
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.expected import expected
@@ -49,7 +49,7 @@ from pipeline.runtime.manifest import (
 )
 from pipeline.runtime.monitoring.events import Listener, Watch, ignore, never
 from pipeline.runtime.monitoring.logs import about
-from pipeline.runtime.monitoring.measured import peak_of_process
+from pipeline.runtime.monitoring.measurement import peak_of_process
 from pipeline.runtime.overrides.overrides_file import read_overrides
 from pipeline.runtime.plan import Plan, check_memory, make_plan, without_far_files
 from pipeline.runtime.scratch.folder import Scratch
@@ -387,7 +387,7 @@ def run_variants(
         finishing = time.perf_counter()
         content = (run_dir, _with_tables(run_dir, joined, modelled[k], published[k]))
         # the run can be called off no more
-        digest = engine.apart("digest", _digest_of, content, Watch())
+        digest = engine.run_step("digest", _digest_of, content, Watch())
         own.timings["digest"] = time.perf_counter() - finishing
         # of several variants each is told with what it took alone: the shared stages and its own
         alone = len(variants) == 1

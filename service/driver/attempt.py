@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from pipeline import __version__
 from pipeline.errors import RunCancelledError
-from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.monitoring.events import Event, Listener
 from pipeline.runtime.run import RunRequest, RunSummary, run

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from urllib.parse import urlsplit
 
 from pipeline.errors import ClusterError, RunCancelledError
-from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.tls import given_tls
 from pipeline.runtime.engine import workers_that_fit
 from pipeline.runtime.monitoring.events import Event

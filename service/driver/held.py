@@ -9,7 +9,7 @@ from enum import IntEnum
 from types import TracebackType
 from typing import Protocol, Self
 
-from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.events import Event
 from service.driver.progress import WORDS, percent
 from service.driver.wording import Scrubber
@@ -26,7 +26,7 @@ _MAX_PENDING = 500
 
 
 class Engine(Protocol):
-    """`pipeline.runtime.cluster.executors.Cluster`."""
+    """`pipeline.runtime.cluster.dask_executor.Cluster`."""
 
     def executor(self, priority: int = 0) -> Executor:
         """An executor for one run."""

@@ -15,8 +15,8 @@ from pipeline.methods import ReconstructSettings
 from pipeline.model import BuildingResult, Candidate
 from pipeline.reconstruct import reconstruct_building
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.cluster.serial import SerialExecutor
-from pipeline.runtime.monitoring.measured import Measured, measure
+from pipeline.runtime.cluster.serial_executor import SerialExecutor
+from pipeline.runtime.monitoring.measurement import Measured, measure
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.settings import RunSettings
 

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from pipeline.errors import RunCancelledError
-from pipeline.runtime.cluster.serial import SerialExecutor
+from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.manifest import RunStatus, read_manifest
 from pipeline.runtime.monitoring.events import Event
-from pipeline.runtime.monitoring.measured import Measured, measure
+from pipeline.runtime.monitoring.measurement import Measured, measure
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import keep

@@ -8,8 +8,8 @@ import pytest
 
 from pipeline.errors import SettingsError
 from pipeline.io import ReadOptions
-from pipeline.runtime.cluster.local import LocalExecutor
-from pipeline.runtime.cluster.serial import SerialExecutor
+from pipeline.runtime.cluster.local_executor import LocalExecutor
+from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.engine import ALONE_S, SMALL_S, engine_of, executor_for
 from pipeline.runtime.expected import RATES, Expected, expected
 from pipeline.runtime.isolation import preloading
@@ -73,8 +73,8 @@ def test_only_the_smallest_jobs_without_buildings_need_no_children(
 
 def test_a_large_job_has_no_more_workers_than_there_is_memory_for(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
-    monkeypatch.setattr("pipeline.runtime.cluster.executors.Cluster", lambda **given: made.append(given["workers"]))
-    monkeypatch.setattr("pipeline.runtime.cluster.executors.DaskExecutor", lambda *_, **__: None)
+    monkeypatch.setattr("pipeline.runtime.cluster.dask_executor.Cluster", lambda **given: made.append(given["workers"]))
+    monkeypatch.setattr("pipeline.runtime.cluster.dask_executor.DaskExecutor", lambda *_, **__: None)
     monkeypatch.setattr("pipeline.runtime.engine.cores", lambda: 8)
     monkeypatch.setattr("pipeline.runtime.engine.memory_bytes", lambda: 16 * 2**30)
     large = Expected(points_by_file={"a": 10**9}, tiles=99, seen_points=2e9, buildings=10**6, task_bytes=3 * 2**30)
@@ -99,13 +99,13 @@ def test_inputs_are_surely_small_where_all_are_files_of_this_machine_and_small_t
 
     most = preloading._SMALL_BYTES
     half, rest, more = file("half.laz", most // 2), file("rest.laz", most - most // 2 - 1), file("more.laz", most)
-    assert preloading.surely_small([half])
-    assert preloading.surely_small([half, rest])
-    assert not preloading.surely_small([half, half])
-    assert not preloading.surely_small([more])
-    assert not preloading.surely_small([half, str(tmp_path)])
-    assert not preloading.surely_small([half, str(tmp_path / "none.laz")])
-    assert not preloading.surely_small(["s3://bucket/half.laz"])
+    assert preloading.is_surely_small([half])
+    assert preloading.is_surely_small([half, rest])
+    assert not preloading.is_surely_small([half, half])
+    assert not preloading.is_surely_small([more])
+    assert not preloading.is_surely_small([half, str(tmp_path)])
+    assert not preloading.is_surely_small([half, str(tmp_path / "none.laz")])
+    assert not preloading.is_surely_small(["s3://bucket/half.laz"])
 
 
 def test_more_points_buildings_and_halos_cost_more() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from distributed import Client
 
-from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.priorities import PRIORITIES, Traffic, priority_of
 from pipeline.runtime.monitoring.events import Watch
 

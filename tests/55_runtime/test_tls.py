@@ -19,8 +19,8 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from pipeline.errors import ClusterError, SettingsError
-from pipeline.runtime.cluster.executors import Cluster
-from pipeline.runtime.cluster.tls import VARIABLES, TlsFiles, check_address, given_tls, why_not
+from pipeline.runtime.cluster.dask_executor import Cluster
+from pipeline.runtime.cluster.tls import VARIABLES, TlsFiles, check_address, explain_failure, given_tls
 from pipeline.runtime.cluster.worker import WorkerOptions, _start
 
 
@@ -187,15 +187,15 @@ def test_a_look_at_the_port_tells_why_a_connection_failed(
     ours, theirs = authority.files(), Authority(tmp_path, "theirs").files()
     doors += [Door(ours), Door(None)]
     secure, plain = (f"127.0.0.1:{door.port}" for door in doors)
-    assert f"it speaks TLS: write tls://{secure} and give --tls-ca" in why_not(f"tcp://{secure}", None)
-    assert f"does not speak TLS: write tcp://{plain}" in why_not(f"tls://{plain}", ours)
-    assert "its certificate is not accepted" in why_not(f"tls://{secure}", theirs)
+    assert f"it speaks TLS: write tls://{secure} and give --tls-ca" in explain_failure(f"tcp://{secure}", None)
+    assert f"does not speak TLS: write tcp://{plain}" in explain_failure(f"tls://{plain}", ours)
+    assert "its certificate is not accepted" in explain_failure(f"tls://{secure}", theirs)
     mixed = TlsFiles(ca=ours.ca, cert=theirs.cert, key=theirs.key)
-    assert "it does not accept our certificate" in why_not(f"tls://{secure}", mixed)
-    assert "it wants a certificate of ours" in why_not(f"tls://{secure}", None)
+    assert "it does not accept our certificate" in explain_failure(f"tls://{secure}", mixed)
+    assert "it wants a certificate of ours" in explain_failure(f"tls://{secure}", None)
     # nothing to tell: it is as it should be, or nobody is there
-    assert why_not(f"tls://{secure}", ours) == why_not(f"tcp://{plain}", None) == ""
-    assert why_not("tls://127.0.0.1:9", ours) == why_not("inproc://somewhere", None) == ""
+    assert explain_failure(f"tls://{secure}", ours) == explain_failure(f"tcp://{plain}", None) == ""
+    assert explain_failure("tls://127.0.0.1:9", ours) == explain_failure("inproc://somewhere", None) == ""
 
 
 class Unwilling:

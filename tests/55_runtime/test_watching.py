@@ -21,13 +21,13 @@ from prometheus_client import CollectorRegistry, generate_latest
 
 from pipeline.console import Console
 from pipeline.errors import RunCancelledError, RunError, SettingsError
-from pipeline.runtime.cluster.executors import Cluster
-from pipeline.runtime.cluster.performance import BINS, ROWS, PerformanceReport
+from pipeline.runtime.cluster.dask_executor import Cluster
+from pipeline.runtime.cluster.performance_report import BINS, ROWS, PerformanceReport
 from pipeline.runtime.cluster.run_metrics import RunMetrics, TallyMetrics, both, serve_metrics
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.monitoring import logs
 from pipeline.runtime.monitoring.events import Event, Watch
-from pipeline.runtime.monitoring.measured import Measured, measure
+from pipeline.runtime.monitoring.measurement import Measured, measure
 from pipeline.runtime.monitoring.tallies import TALLIES, Tallies
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.tiling import Tile

@@ -18,9 +18,9 @@ import pytest
 
 from pipeline.errors import RunError
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.cluster.serial import SerialExecutor
+from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.monitoring.events import Event
-from pipeline.runtime.monitoring.measured import Measured
+from pipeline.runtime.monitoring.measurement import Measured
 from pipeline.runtime.run import RunRequest, RunSummary, run
 from pipeline.runtime.scratch.work_folder import held_work, is_at_work
 from pipeline.settings import RunSettings

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from pipeline.cli.classifying import classify
 from pipeline.runtime import engine
-from pipeline.runtime.cluster.local import LocalExecutor
-from pipeline.runtime.cluster.serial import Executor, SerialExecutor
+from pipeline.runtime.cluster.local_executor import LocalExecutor
+from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 
 
 def invoke(*words: str) -> tuple[int, str, str]:

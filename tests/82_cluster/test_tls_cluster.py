@@ -16,7 +16,7 @@ from processes import Programs, free_port, missing, program
 
 from pipeline.errors import ClusterError
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.tls import VARIABLES, TlsFiles
 from pipeline.runtime.manifest import read_manifest
 from pipeline.runtime.monitoring.events import Watch

@@ -18,7 +18,7 @@ from processes import Program, Programs, free_port, lives, program, wait_for
 
 from pipeline.errors import ClusterError, RunCancelledError, VersionMismatchError
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.cluster.executors import Cluster
+from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.manifest import RunStatus, read_manifest
 from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.run import RunRequest, RunSummary, run

@@ -26,7 +26,7 @@ from processes import LONG_S, PostgresServer, Program, Programs, free_port, miss
 
 from pipeline.compiler.store import folder_of_kernels
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.cluster.tls import why_not
+from pipeline.runtime.cluster.tls import explain_failure
 
 pytestmark = pytest.mark.slow
 
@@ -275,9 +275,9 @@ def test_the_same_services_work_over_tls(composed_tls: Composed, root: Path, tmp
     running["worker"].wait_for_text(f"is at the scheduler tls://127.0.0.1:{port}")
     for name in ("api", "scheduler"):
         running[name].wait_for(lambda name=name: composed_tls.healthy(name, f"{name}-tls"), "good health")
-    told = why_not(f"tcp://127.0.0.1:{port}", None)
+    told = explain_failure(f"tcp://127.0.0.1:{port}", None)
     assert "it speaks TLS" in told
-    assert "it wants a certificate of ours" in why_not(f"tls://127.0.0.1:{port}", None)
+    assert "it wants a certificate of ours" in explain_failure(f"tls://127.0.0.1:{port}", None)
 
     tile = simulate("gable", tmp_path / "scene").laz
     statuses = send(f"http://{composed_tls.host.here('0.0.0.0:8000')}", key, tile, running["driver"])

@@ -17,7 +17,7 @@ from benchmarks.city_scale import report, stage_rows, stage_table
 from benchmarks.city_tiles import make_city, make_row, square_of
 from benchmarks.process_watch import CHILD, DRIVER, FORKING, OTHER, WORKER, Seen, Watcher, role_of
 from benchmarks.traced_run import TracingExecutor
-from pipeline.runtime.cluster.serial import SerialExecutor
+from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.monitoring.events import Watch
 
 

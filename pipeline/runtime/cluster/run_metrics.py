@@ -20,7 +20,7 @@ from prometheus_client.registry import Collector
 
 from pipeline.errors import SettingsError
 from pipeline.runtime.monitoring.events import Event, Listener
-from pipeline.runtime.monitoring.measured import peak_of_process
+from pipeline.runtime.monitoring.measurement import peak_of_process
 from pipeline.runtime.monitoring.tallies import TALLIES, Tallies
 
 UNITS = {

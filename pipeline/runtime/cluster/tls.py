@@ -174,7 +174,7 @@ def check_address(address: str, tls: TlsFiles | None, *, configured: bool) -> No
         )
 
 
-def why_not(address: str, tls: TlsFiles | None) -> str:
+def explain_failure(address: str, tls: TlsFiles | None) -> str:
     """What a look at the scheduler's port says after a connection failed; empty where it explains nothing.
 
     Parameters

@@ -21,9 +21,9 @@ from distributed.worker_memory import parse_memory_limit
 
 from pipeline.errors import ClusterError, SettingsError
 from pipeline.runtime.cluster import worker_setup
-from pipeline.runtime.cluster.needs import RESOURCE
-from pipeline.runtime.cluster.tls import TlsFiles, check_address, why_not
-from pipeline.runtime.cluster.worker_forking import forked_workers
+from pipeline.runtime.cluster.memory_needs import RESOURCE
+from pipeline.runtime.cluster.tls import TlsFiles, check_address, explain_failure
+from pipeline.runtime.cluster.worker_fork_server import forked_workers
 from pipeline.runtime.monitoring import logs
 
 _POLL_S = 0.1
@@ -157,7 +157,7 @@ async def _serve(options: WorkerOptions, say: Callable[[str], None]) -> None:
                 away_since_s = time.monotonic()
         except OSError as error:
             away_s = time.monotonic() - away_since_s
-            why = await asyncio.to_thread(why_not, options.scheduler, options.tls)
+            why = await asyncio.to_thread(explain_failure, options.scheduler, options.tls)
             if why and why != told:
                 told = why
                 say(f"the scheduler {options.scheduler} cannot be used: {why}")
@@ -213,7 +213,7 @@ async def _start(nanny: Any, options: WorkerOptions) -> None:
         if isinstance(cause, OSError):
             raise cause from error
         # what TLS says of a scheduler that speaks first comes in many kinds
-        why = await asyncio.to_thread(why_not, options.scheduler, options.tls)
+        why = await asyncio.to_thread(explain_failure, options.scheduler, options.tls)
         if why:
             raise ConnectionError(why) from error
         raise ClusterError(f"the worker for {options.scheduler} does not start: {cause}") from error

@@ -58,7 +58,7 @@ def serve_parent(parent: int, loads: Sequence[str]) -> None:
     """
     incoming, outgoing = _private_pipes()
     end_with_parent(parent)
-    be_named(NAME)
+    name_process(NAME)
     _be_the_first_victim()
     faulthandler.enable(all_threads=False)
     faulthandler.register(signal.SIGUSR1, all_threads=True)
@@ -103,7 +103,7 @@ def end_with_parent(parent: int) -> None:
         os._exit(0)
 
 
-def be_named(name: str) -> None:
+def name_process(name: str) -> None:
     """Tell those who look at processes what this one is: a forked one has the command line of its server."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)

@@ -11,17 +11,17 @@ from collections.abc import Callable, Iterator, Sequence
 
 from pipeline.errors import RunError
 from pipeline.runtime.isolation.forked_child import (
-    ProcessServer,
+    ForkServer,
     can_fork,
-    executed_server,
-    forked_server,
+    fork_server_here,
     has_one_thread,
     read_by_children,
+    spawn_server,
 )
-from pipeline.runtime.isolation.spawned_child import Executed
+from pipeline.runtime.isolation.spawned_child import SpawnedChild
 from pipeline.runtime.isolation.supervision import SupervisedChild
 from pipeline.runtime.monitoring.logs import LOG
-from pipeline.runtime.monitoring.measured import charge
+from pipeline.runtime.monitoring.measurement import charge
 
 FRUITLESS_STARTS = 3
 """Children that die in a row before they begin anything: then it is nobody's building that is at fault."""
@@ -31,7 +31,7 @@ _START_TIMEOUT_S = 900.0
 """With compiled kernels a child takes two seconds; without, it compiles them."""
 
 
-def start_fault(told: str, stderr: str, work: str = "models buildings") -> str:
+def start_failure(told: str, stderr: str, work: str = "models buildings") -> str:
     """The message where children that do some work do not last."""
     said = f". It said: {stderr}" if stderr else ""
     return f"the process that {work} does not last, {FRUITLESS_STARTS} times in a row: {told}{said}"
@@ -44,8 +44,8 @@ class _Children:
         self._lock = threading.Lock()
         self._idle: list[SupervisedChild] = []
         self._all: set[SupervisedChild] = set()
-        self._server: ProcessServer | None = None
-        self._retired: list[ProcessServer] = []
+        self._server: ForkServer | None = None
+        self._retired: list[ForkServer] = []
         self._can_fork = can_fork()
         self._closed = False
 
@@ -108,7 +108,7 @@ class _Children:
                 server.end()
             self._retired.clear()
 
-    def take(self, server: ProcessServer) -> None:
+    def take(self, server: ForkServer) -> None:
         """Have children forked from a server."""
         with self._lock:
             self._retire()
@@ -127,7 +127,7 @@ class _Children:
                 raise
             if problem is None:
                 return child
-            fault = start_fault(problem, child.last_words)
+            fault = start_failure(problem, child.last_words)
             self._end(child)
         raise RunError(fault)
 
@@ -156,9 +156,9 @@ class _Children:
             except OSError as error:
                 LOG.warning("no process can be forked: %s", error)
                 self._retire()
-        return SupervisedChild(lambda stderr: Executed(loads, stderr))
+        return SupervisedChild(lambda stderr: SpawnedChild(loads, stderr))
 
-    def _serving(self, loads: Sequence[str]) -> ProcessServer | None:
+    def _serving(self, loads: Sequence[str]) -> ForkServer | None:
         """The server, started where none is there that can serve; None where children have to be executed."""
         if self._server is not None and not self._server.serves:
             if fault := self._server.fault:
@@ -168,8 +168,8 @@ class _Children:
             self._retire()
         self._retired = [server for server in self._retired if server.alive]
         if self._server is None and self._can_fork:
-            start = forked_server if has_one_thread() else executed_server
-            self._server = ProcessServer(functools.partial(start, loads))
+            start = fork_server_here if has_one_thread() else spawn_server
+            self._server = ForkServer(functools.partial(start, loads))
         return self._server
 
     def _retire(self) -> None:
@@ -187,7 +187,7 @@ class _Children:
 _children = _Children()
 
 
-def lent_child(
+def borrowed_child(
     cancelled: Callable[[], bool], *, fresh: bool, loads: Sequence[str] | None = None
 ) -> contextlib.AbstractContextManager[SupervisedChild]:
     """A ready child of this process, for the time of a `with` block.
@@ -226,7 +226,7 @@ def preload(loads: Sequence[str]) -> None:
 
 def fork_server() -> None:
     """Have this process forked to be the server of its children, with all that it has loaded; it has one thread."""
-    _children.take(ProcessServer(functools.partial(forked_server, ())))
+    _children.take(ForkServer(functools.partial(fork_server_here, ())))
 
 
 def has_idle_child() -> bool:

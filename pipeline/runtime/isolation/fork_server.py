@@ -121,7 +121,7 @@ def serve_forked(owner: int, orders: socket.socket, stderr: int, loads: Sequence
 
 def serve(owner: socket.socket) -> NoReturn:
     """Fork children for an owner; for a process with one thread, which ends here."""
-    child_main.be_named(NAME)
+    child_main.name_process(NAME)
     # the stop of a service goes to all its processes: this one ends with its owner, not before
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.freeze()  # a collection in a child would write to all objects, and so copy the memory that is shared

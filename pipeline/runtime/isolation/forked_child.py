@@ -18,7 +18,7 @@ from typing import IO
 
 from pipeline.runtime.isolation.fork_server import THREADED, kill_with_group, serve_forked
 from pipeline.runtime.isolation.messages import NUMBER, Order, frame
-from pipeline.runtime.isolation.spawned_child import environment_with_this_package, in_starter_thread
+from pipeline.runtime.isolation.spawned_child import environment_with_this_package, run_in_starter_thread
 from pipeline.runtime.isolation.start_up import WITHOUT_THREADS
 
 _READ_AT_START = (
@@ -49,7 +49,7 @@ def can_fork() -> bool:
     return True
 
 
-class Forked:
+class ForkedChild:
     """A process that a server forks for this one, as soon as it has loaded; see `isolation.spawned_child.Started`."""
 
     def __init__(self, control: socket.socket, stdin: int, stdout: int) -> None:
@@ -124,7 +124,7 @@ class Forked:
                 self._code = numbers[1]
 
 
-class Own:
+class ForkedServer:
     """A process that this one forked, asked as `subprocess.Popen` is."""
 
     def __init__(self, pid: int) -> None:
@@ -165,10 +165,10 @@ class Own:
         return self._code
 
 
-def executed_server(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes]) -> subprocess.Popen[bytes]:
+def spawn_server(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes]) -> subprocess.Popen[bytes]:
     """Start a server that loads things, as `pipeline.runtime.isolation.child_main` takes them."""
     command = [sys.executable, "-P", "-m", "pipeline.runtime.isolation.fork_server", str(os.getpid())]
-    return in_starter_thread(
+    return run_in_starter_thread(
         subprocess.Popen,
         [*command, str(orders.fileno()), *loads],
         stdin=subprocess.DEVNULL,
@@ -180,14 +180,14 @@ def executed_server(loads: Sequence[str], orders: socket.socket, stderr: IO[byte
     )
 
 
-def forked_server(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes]) -> Own:
+def fork_server_here(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes]) -> ForkedServer:
     """Fork a server with all that this process has loaded, to load more; for one that has a single thread."""
     owner = os.getpid()
     pid = os.fork()
     if not pid:
         os.environ.update(WITHOUT_THREADS)
         serve_forked(owner, orders, stderr.fileno(), loads)
-    return Own(pid)
+    return ForkedServer(pid)
 
 
 def has_one_thread() -> bool:
@@ -195,16 +195,16 @@ def has_one_thread() -> bool:
     return sum(1 for _ in Path("/proc/self/task").iterdir()) == 1
 
 
-class ProcessServer:
+class ForkServer:
     """A server, started and asked for processes.
 
     Parameters
     ----------
     start : callable
-        Starts it, with a socket for its orders and a file for what it has to say: `executed_server`, `forked_server`.
+        Starts it, with a socket for its orders and a file for what it has to say: `spawn_server`, `fork_server_here`.
     """
 
-    def __init__(self, start: Callable[[socket.socket, IO[bytes]], subprocess.Popen[bytes] | Own]) -> None:
+    def __init__(self, start: Callable[[socket.socket, IO[bytes]], subprocess.Popen[bytes] | ForkedServer]) -> None:
         self._environment = read_at_start(os.environ)
         self._stderr = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - lives as long as this object
         self._socket, there = socket.socketpair()
@@ -239,7 +239,7 @@ class ProcessServer:
         """Whether it is there, and its children would be as those that are started now."""
         return self.alive and self._environment == read_at_start(os.environ)
 
-    def forked(self, loads: Sequence[str], stderr: int) -> Forked:
+    def forked(self, loads: Sequence[str], stderr: int) -> ForkedChild:
         """A process that runs `pipeline.runtime.isolation.child_main`; forked when the server has loaded.
 
         Raises
@@ -256,7 +256,7 @@ class ProcessServer:
             theirs.append(stdin)
             result, stdout = os.pipe()
             theirs.append(stdout)
-            process = Forked(control, ours, result)
+            process = ForkedChild(control, ours, result)
             try:
                 socket.send_fds(self._socket, [b"."], [there.fileno(), stdin, stdout, stderr])
                 control.sendall(frame(order))

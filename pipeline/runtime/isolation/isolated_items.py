@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from pipeline.errors import RunError, SettingsError
 from pipeline.model import Reason
-from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, lent_child, start_fault
+from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, borrowed_child, start_failure
 from pipeline.runtime.isolation.supervision import Cause, End
 from pipeline.runtime.monitoring.events import never
 
@@ -121,7 +121,7 @@ def supervise(
     while lots:
         lot, alone = lots.popleft()
         end: End | None = None
-        with lent_child(cancelled, fresh=alone, loads=loads) as child:
+        with borrowed_child(cancelled, fresh=alone, loads=loads) as child:
             for said in child.work(
                 function, lot, timeout_s=limits.timeout_s, memory_bytes=limits.memory_bytes, cancelled=cancelled
             ):
@@ -138,7 +138,7 @@ def supervise(
         if end.index is None:
             fruitless += 1
             if fruitless == FRUITLESS_STARTS:
-                raise RunError(start_fault(end.told, end.stderr))
+                raise RunError(start_failure(end.told, end.stderr))
             lots.appendleft((lot, alone))
             continue
         guilty = tuple(entry for entry in lot if entry[0] == end.index)

@@ -25,7 +25,7 @@ _SMALL_BYTES = 500_000
 """About 120 thousand points as LAZ, which one process classifies in half a second (`engine.ALONE_S`)."""
 
 
-def surely_small(inputs: Sequence[str]) -> bool:
+def is_surely_small(inputs: Sequence[str]) -> bool:
     """Whether inputs without buildings to model are files of this machine so small that no children will be needed."""
     paths = [Path(name) for name in inputs]
     return all(path.is_file() for path in paths) and sum(path.stat().st_size for path in paths) < _SMALL_BYTES

@@ -39,11 +39,11 @@ class Started(Protocol):
         """Let go of one that ended."""
 
 
-class Executed:
+class SpawnedChild:
     """A process that runs `pipeline.runtime.isolation.child_main` in an interpreter of its own; see `Started`."""
 
     def __init__(self, loads: Sequence[str], stderr: int) -> None:
-        self._process = in_starter_thread(
+        self._process = run_in_starter_thread(
             subprocess.Popen,
             [sys.executable, "-P", "-m", "pipeline.runtime.isolation.child_main", str(os.getpid()), *loads],
             stdin=subprocess.PIPE,
@@ -92,7 +92,7 @@ def environment_with_this_package() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
-def in_starter_thread(
+def run_in_starter_thread(
     start: Callable[Arguments, Value], *arguments: Arguments.args, **options: Arguments.kwargs
 ) -> Value:
     """What a function gives in the one thread that lives as long as this process.

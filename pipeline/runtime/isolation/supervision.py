@@ -63,7 +63,7 @@ class SupervisedChild:
     Parameters
     ----------
     start : callable
-        Starts it, with its standard error at a descriptor: `Executed`, or `ProcessServer.forked`.
+        Starts it, with its standard error at a descriptor: `SpawnedChild`, or `ForkServer.forked`.
     """
 
     def __init__(self, start: Callable[[int], Started]) -> None:

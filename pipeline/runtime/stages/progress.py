@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
-from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.events import Event, EventKind, Listener, Watch
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.scratch.outcomes import Keeping, Place, keep, told_of

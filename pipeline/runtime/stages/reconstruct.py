@@ -18,7 +18,7 @@ from pipeline.io.crs import SpatialReference
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.model import BuildingResult, Candidate, Reason, RoofType, Status
-from pipeline.runtime.cluster.needs import building_bytes
+from pipeline.runtime.cluster.memory_needs import building_bytes
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
 from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, write_bundle
 from pipeline.runtime.monitoring.logs import LOG

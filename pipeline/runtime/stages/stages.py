@@ -22,7 +22,7 @@ from pipeline.io import SpatialReference, shown, storage_at
 from pipeline.io.footprints import read_footprints
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import Status
-from pipeline.runtime.cluster.serial import Executor
+from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.isolation.isolated_items import IsolationLimits
 from pipeline.runtime.overrides.overrides_file import Override, own_modelling
 from pipeline.runtime.plan import Plan, check_windows, split_grid, window_bytes
@@ -408,7 +408,7 @@ class Stages:
                 settings=self.settings.scene.candidates,
                 crs_name=crs_name,
             )
-            joined = self.executor.apart("join", joined_of, task, self.progress.watch)
+            joined = self.executor.run_step("join", joined_of, task, self.progress.watch)
             joined = self._divided(dataclasses.replace(joined, keys=splits.keys), crs_name)
         else:
             joined = join_footprints(

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 from distributed import Client, LocalCluster, Nanny
 
-from pipeline.runtime.cluster.executors import Cluster
-from pipeline.runtime.cluster.needs import (
+from pipeline.runtime.cluster.dask_executor import Cluster
+from pipeline.runtime.cluster.memory_needs import (
     BUILDING_BASE_BYTES,
     BUILDING_BYTES_PER_POINT,
     DECLARED_FROM_BYTES,
@@ -147,7 +147,7 @@ def test_a_need_that_no_worker_has_runs_where_most_is_and_it_is_told(bench: Benc
 def test_a_giant_does_not_wait_for_ever_for_a_worker_that_has_left(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.runtime.cluster.flight.Lookout.memory_s", 0.5)
+    monkeypatch.setattr("pipeline.runtime.cluster.dispatch.ClusterMonitor.memory_s", 0.5)
     add_worker(bench, 8 * GIB)
     with ThreadPoolExecutor(1) as thread:
         running = thread.submit(bench.run, [bench.task(f"giant{k}", 6 * GIB) for k in range(2)])

@@ -126,12 +126,12 @@ def measure_packed(client_fingerprint: str, task: bytes, stage: str = "") -> Mea
     if client_fingerprint != fingerprint():
         process, _ = peak_of_process()
         told = differences(versions_of(client_fingerprint), versions_here())
-        raise VersionMismatchError(mismatch_told([f"worker {process}: {', '.join(told)}"]))
+        raise VersionMismatchError(mismatch_message([f"worker {process}: {', '.join(told)}"]))
     function, unpacked = pickle.loads(task)  # noqa: S301 - from the client, whose code the worker runs anyway
     return measure(function, unpacked, stage)
 
 
-def mismatch_told(faults: list[str]) -> str:
+def mismatch_message(faults: list[str]) -> str:
     """The message of a version mismatch, from what is wrong in each process."""
     return (
         f"the processes do not run the same versions: {'; '.join(faults)}. "

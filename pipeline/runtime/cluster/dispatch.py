@@ -24,16 +24,16 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Any, Generic
 
 from pipeline.errors import ClusterError, GableworkError, RunCancelledError, RunError
-from pipeline.runtime.cluster.needs import RESOURCE, announced_bytes, declared_bytes
+from pipeline.runtime.cluster.memory_needs import RESOURCE, announced_bytes, declared_bytes
 from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.logs import LOG, facts_of_task
-from pipeline.runtime.monitoring.measured import Measured, Result, Task, measure_packed, packed
+from pipeline.runtime.monitoring.measurement import Measured, Result, Task, measure_packed, packed
 from pipeline.runtime.monitoring.tallies import TALLIES
 from pipeline.runtime.monitoring.versions import fingerprint
 
 TICK_S = 0.2
 """Seconds between two looks at what no result tells."""
-TASKS_A_THREAD = 3
+TASKS_PER_THREAD = 3
 """Tasks in flight for each thread of the cluster: one runs, the others are on their way."""
 SETTLE_S = 30.0
 """Longest time that tasks in flight are waited for after the run was called off."""
@@ -61,7 +61,7 @@ def blame(stage: str, task: object, *, here: bool = False) -> str:
     )
 
 
-class Lookout:
+class ClusterMonitor:
     """Looks after the cluster while nothing comes: whether workers are there, whether the scheduler answers.
 
     Parameters
@@ -186,11 +186,11 @@ class Lookout:
 
 
 @dataclasses.dataclass
-class Flight(Generic[Task, Result]):
+class Dispatch(Generic[Task, Result]):
     """The tasks of one stage, on their way through the cluster."""
 
     client: Any
-    lookout: Lookout
+    monitor: ClusterMonitor
     stage: str
     function: Callable[[Task], Result]
     tasks: Sequence[Task]
@@ -227,7 +227,7 @@ class Flight(Generic[Task, Result]):
         try:
             while self._large or self._waiting or self._suspects or self._flying:
                 self.watch.check_cancelled()
-                self.lookout.look(self.stage, self.watch)
+                self.monitor.look(self.stage, self.watch)
                 self._reconsider()
                 self._submit()
                 self._wake.wait(TICK_S)
@@ -242,7 +242,7 @@ class Flight(Generic[Task, Result]):
         except Exception as error:
             # what a client says that has just lost its scheduler comes in many kinds
             if self.client.status != "running":
-                raise self.lookout.lost(f"{type(error).__name__}: {error}") from error
+                raise self.monitor.lost(f"{type(error).__name__}: {error}") from error
             raise
         finally:
             self._settle()
@@ -252,13 +252,13 @@ class Flight(Generic[Task, Result]):
         if self._suspects:
             if not self._flying and self._take_turn():
                 number = self._suspects.popleft()
-                largest = max(self.lookout.announced() or (), default=0)
+                largest = max(self.monitor.announced() or (), default=0)
                 self._send(number, min(self._needs.get(number, 0), largest))
             return
         if self._alone is not None:
             # the last suspect still flies: nothing may be blamed in its place
             return
-        window = TASKS_A_THREAD * max(2, self.lookout.threads)
+        window = TASKS_PER_THREAD * max(2, self.monitor.threads)
         self._submit_large(window)
         # those that wait for memory do not keep the others from going
         while self._waiting and len(self._flying) - len(self._reserved) < window:
@@ -268,7 +268,7 @@ class Flight(Generic[Task, Result]):
         """Send off tasks that need much memory: as many as the workers can take, and as many again on their way."""
         if not self._large:
             return
-        announced = self.lookout.announced()
+        announced = self.monitor.announced()
         if announced is None:
             return
         if not announced:
@@ -296,7 +296,7 @@ class Flight(Generic[Task, Result]):
         """Take back tasks that wait for memory which no worker has any more; they are sent anew."""
         if not self._reserved:
             return
-        announced = self.lookout.announced()
+        announced = self.monitor.announced()
         if announced is None:
             return
         largest = max(announced, default=0)
@@ -353,15 +353,15 @@ class Flight(Generic[Task, Result]):
         from distributed.scheduler import KilledWorker
 
         if future.status == "cancelled":
-            self.lookout.check()
-            raise self.lookout.lost("it no longer knows the tasks of this run")
+            self.monitor.check()
+            raise self.monitor.lost("it no longer knows the tasks of this run")
         number = self._flying[future]
         if future.status == "error":
             try:
                 error = future.exception(timeout=_RESULT_S)
             except TimeoutError:
                 # a busy cluster: it is looked at again
-                self.lookout.check()
+                self.monitor.check()
                 return
             if isinstance(error, RunCancelledError) and not self.watch.cancelled():
                 raise RunError(_NOT_SHARED) from error
@@ -377,7 +377,7 @@ class Flight(Generic[Task, Result]):
             measured = future.result(timeout=_RESULT_S)
         except (TimeoutError, OSError):
             # its worker died with the result: it is made again, and looked at again
-            self.lookout.check()
+            self.monitor.check()
             return
         self._drop(future, "done")
         self._end_turn()

@@ -15,10 +15,10 @@ from multiprocessing import forkserver
 from typing import Any
 
 from pipeline.runtime.isolation.forked_child import can_fork, read_at_start
-from pipeline.runtime.isolation.spawned_child import environment_with_this_package, in_starter_thread
+from pipeline.runtime.isolation.spawned_child import environment_with_this_package, run_in_starter_thread
 from pipeline.runtime.isolation.start_up import WITHOUT_THREADS
 
-_PRELOADED = ("distributed.nanny", "pipeline.runtime.cluster.worker_birth")
+_PRELOADED = ("distributed.nanny", "pipeline.runtime.cluster.worker_preload")
 _SETTINGS = {"distributed.worker.multiprocessing-method": "forkserver"}
 _SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """Nothing is imported from the working directory."""
@@ -43,7 +43,7 @@ def forked_workers() -> Iterator[Mapping[str, Any]]:
         yield {}
         return
     with _changing:
-        in_starter_thread(_start)
+        run_in_starter_thread(_start)
         _users += 1
     try:
         yield _SETTINGS

@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from pipeline.errors import RunError
-from pipeline.runtime.monitoring.measured import Measured
+from pipeline.runtime.monitoring.measurement import Measured
 
 BINS = 480
 """Most bins of time; where a run lasts longer, two become one."""

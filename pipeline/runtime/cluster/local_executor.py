@@ -1,16 +1,15 @@
 """Small jobs without a cluster: tasks in supervised child processes of this one, as many at once as there are cores.
 
-This process plans, brings results together and writes the manifest. Its children do all else, and stay from stage to
-stage; the join of surfaces and the digest are a task of one child each (`apart`), since they need kernels and libraries
-that this process does not load. What may happen to a child, and what comes of it, is as on a cluster
-(`pipeline.runtime.cluster.flight`):
+This process plans, merges results and writes the manifest. Its children do everything else and stay from stage to
+stage. The join of surfaces and the digest each run in one child (`run_step`), as they need kernels and libraries that
+this process does not load. Deaths of children are handled as deaths of workers are (`runtime.cluster.dispatch`):
 
 | event | outcome |
 | --- | --- |
-| a child dies of a building | that building is lost: its task supervises each of them (`isolation.isolated_items`) |
-| a child dies of another task | the task waits until the others are through and is tried alone, in a fresh child |
-| it dies of it alone, too | `RunError` that names the task |
-| the run is called off | the tasks that run are told, waited for with a bound, and killed |
+| a building kills a child | only that building is lost: its task supervises each (`isolation.isolated_items`) |
+| another task kills a child | the task waits until the others are done, then runs alone in a fresh child |
+| it kills that child, too | `RunError` with the task's name |
+| the run is cancelled | running tasks are asked to end, get a limited time, and are then killed |
 | tasks need more memory than there is | they run one after the other |
 """
 
@@ -29,13 +28,13 @@ from types import TracebackType
 from typing import Any, Generic, Self
 
 from pipeline.errors import RunCancelledError, RunError
-from pipeline.runtime.cluster.flight import SETTLE_INTERRUPTED_S, TICK_S, blame
-from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, lent_child, start_fault
+from pipeline.runtime.cluster.dispatch import SETTLE_INTERRUPTED_S, TICK_S, blame
+from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, borrowed_child, start_failure
 from pipeline.runtime.isolation.supervision import End
 from pipeline.runtime.monitoring.events import Watch
 from pipeline.runtime.monitoring.logs import LOG, facts_of_task
 from pipeline.runtime.monitoring.machine import cores, memory_bytes
-from pipeline.runtime.monitoring.measured import Measured, Result, Task, measure, measure_in_child
+from pipeline.runtime.monitoring.measurement import Measured, Result, Task, measure, measure_in_child
 from pipeline.runtime.monitoring.tallies import TALLIES
 
 _WORN_BYTES = 2**30
@@ -76,7 +75,7 @@ class LocalExecutor:
         """
         return _Stage(stage, function, tasks, watch, self._memory_bytes).results(self._children)
 
-    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
+    def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
         """The step's result, worked out in a child: this process has no kernels.
 
         Raises
@@ -248,7 +247,7 @@ class _Stage(Generic[Task, Result]):
             Children die before they begin.
         """
         for _ in range(FRUITLESS_STARTS):
-            with lent_child(self._killed.is_set, fresh=self._alone, loads=()) as child:
+            with borrowed_child(self._killed.is_set, fresh=self._alone, loads=()) as child:
                 found: Any = None
                 for said in child.work(
                     measure_in_child,
@@ -268,7 +267,7 @@ class _Stage(Generic[Task, Result]):
                 return measured
             if found.index is not None:
                 return found
-        raise RunError(start_fault(found.told, found.stderr, f"does the tasks of the stage {self._stage}"))
+        raise RunError(start_failure(found.told, found.stderr, f"does the tasks of the stage {self._stage}"))
 
     @staticmethod
     def _pass_on(words: str) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, supervise
-from pipeline.runtime.monitoring.measured import charge, measure
+from pipeline.runtime.monitoring.measurement import charge, measure
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
 SPUN_S = 0.5

@@ -20,7 +20,7 @@ _METHOD = "arrangement"
 
 def _prepare() -> None:
     """Load, and be born again in every worker."""
-    child_main.be_named(fork_server.NAME)
+    child_main.name_process(fork_server.NAME)
     # the stop of a service goes to all its processes: workers, which finish their tasks, must not lose this one
     signal.signal(signal.SIGTERM, _left_to_the_nanny)
     loads = list(STAGES)
@@ -32,7 +32,7 @@ def _prepare() -> None:
 
     def born() -> None:
         if os.getppid() == server:
-            child_main.be_named(NAME)
+            child_main.name_process(NAME)
             child_pool.fork_server()
 
     os.register_at_fork(after_in_child=born)

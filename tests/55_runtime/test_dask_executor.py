@@ -18,14 +18,14 @@ from distributed import Client, Status
 
 from pipeline.errors import ClusterError, RunCancelledError, RunError, VersionMismatchError
 from pipeline.runtime.cluster import worker_setup
-from pipeline.runtime.cluster.executors import Cluster
-from pipeline.runtime.cluster.flight import Lookout
-from pipeline.runtime.cluster.local import LocalExecutor
-from pipeline.runtime.cluster.serial import SerialExecutor
+from pipeline.runtime.cluster.dask_executor import Cluster
+from pipeline.runtime.cluster.dispatch import ClusterMonitor
+from pipeline.runtime.cluster.local_executor import LocalExecutor
+from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.isolation.forked_child import can_fork
 from pipeline.runtime.monitoring.events import Event, Watch
-from pipeline.runtime.monitoring.measured import Measured, measure_packed, packed
+from pipeline.runtime.monitoring.measurement import Measured, measure_packed, packed
 from pipeline.runtime.monitoring.versions import ENGINE, differences, fingerprint, versions_here, versions_of
 
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
@@ -239,7 +239,7 @@ def test_serial_tasks_are_called_off_between_two() -> None:
 
 
 class FakeScheduler:
-    """What a lookout asks: how many threads there are, or nothing where it does not answer."""
+    """What a monitor asks: how many threads there are, or nothing where it does not answer."""
 
     def __init__(self) -> None:
         self.threads: dict[str, int] | None = {}
@@ -259,20 +259,22 @@ class FakeScheduler:
 
 
 class Lookouts:
-    """A lookout over a fake scheduler, with a clock of its own."""
+    """A monitor over a fake scheduler, with a clock of its own."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
         self.client = FakeScheduler()
         self.events: list[Event] = []
         self.counts: list[int] = []
-        self.lookout = Lookout(self.client, "tcp://s:8786", self.counts.append, "Start one", clock=lambda: self.now_s)
+        self.monitor = ClusterMonitor(
+            self.client, "tcp://s:8786", self.counts.append, "Start one", clock=lambda: self.now_s
+        )
 
     def pass_time(self, seconds: float) -> None:
         """Look once a second for a while."""
         for _ in range(round(seconds)):
             self.now_s += 1.0
-            self.lookout.look("split", Watch(listener=self.events.append))
+            self.monitor.look("split", Watch(listener=self.events.append))
 
 
 def test_waiting_for_workers_is_told_with_the_time_and_the_fix_and_so_is_their_return() -> None:
@@ -286,7 +288,7 @@ def test_waiting_for_workers_is_told_with_the_time_and_the_fix_and_so_is_their_r
     world.pass_time(5)
     assert [event.kind for event in world.events[3:]] == ["run"]
     assert "workers are there after 70 s" in world.events[3].message
-    assert world.lookout.threads == 2
+    assert world.monitor.threads == 2
     assert world.counts == [0] * 70 + [1] * 5
 
 
@@ -318,7 +320,7 @@ def test_a_broken_connection_to_the_scheduler_is_told_at_once() -> None:
 
 
 def test_a_scheduler_that_is_not_there_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.runtime.cluster.executors.CONNECT_S", 1.0)
+    monkeypatch.setattr("pipeline.runtime.cluster.dask_executor.CONNECT_S", 1.0)
     executor = executor_for(workers=2, scheduler="tcp://127.0.0.1:9", local_directory="")
     with pytest.raises(ClusterError, match=r"tcp://127.0.0.1:9 does not answer.*Check the address"), executor:
         pytest.fail("it connected")

@@ -17,15 +17,15 @@ from typing import Any, Self
 
 from pipeline.errors import ClusterError, VersionMismatchError
 from pipeline.runtime.cluster import worker_setup
-from pipeline.runtime.cluster.flight import SETTLE_INTERRUPTED_S, SETTLE_S, TICK_S, Flight, Lookout
-from pipeline.runtime.cluster.needs import RESOURCE
-from pipeline.runtime.cluster.performance import PerformanceReport
+from pipeline.runtime.cluster.dispatch import SETTLE_INTERRUPTED_S, SETTLE_S, TICK_S, ClusterMonitor, Dispatch
+from pipeline.runtime.cluster.memory_needs import RESOURCE
+from pipeline.runtime.cluster.performance_report import PerformanceReport
 from pipeline.runtime.cluster.priorities import Traffic, priority_of
-from pipeline.runtime.cluster.tls import TlsFiles, check_address, given_tls, why_not
-from pipeline.runtime.cluster.worker_forking import forked_workers
+from pipeline.runtime.cluster.tls import TlsFiles, check_address, explain_failure, given_tls
+from pipeline.runtime.cluster.worker_fork_server import forked_workers
 from pipeline.runtime.isolation.spawned_child import environment_with_this_package
 from pipeline.runtime.monitoring.events import Watch
-from pipeline.runtime.monitoring.measured import Measured, Result, Task, mismatch_told
+from pipeline.runtime.monitoring.measurement import Measured, Result, Task, mismatch_message
 from pipeline.runtime.monitoring.versions import ENGINE, TALKING, WORKING, differences
 
 CONNECT_S = 20.0
@@ -248,7 +248,7 @@ class DaskExecutor:
         self._owned = owned
         self._stack = contextlib.ExitStack()
         self._client: Any = None
-        self._lookout: Lookout | None = None
+        self._monitor: ClusterMonitor | None = None
         self._report = None if performance_report is None else PerformanceReport(performance_report)
 
     def __enter__(self) -> Self:
@@ -275,7 +275,7 @@ class DaskExecutor:
             try:
                 client = Client(address, timeout=CONNECT_S, set_as_default=False, **given)
             except (OSError, TimeoutError, ValueError, TypeError, RuntimeError) as error:
-                told = why_not(address, tls)
+                told = explain_failure(address, tls)
                 if not told and isinstance(error, TypeError | RuntimeError):
                     raise
                 raise ClusterError(
@@ -286,7 +286,7 @@ class DaskExecutor:
             self._client = stack.enter_context(client)
             if self._report is not None:
                 stack.enter_context(self._report)
-            self._lookout = Lookout(client, address, self._cluster.mend, self._cluster.advice)
+            self._monitor = ClusterMonitor(client, address, self._cluster.mend, self._cluster.advice)
             self._stack = stack.pop_all()
         return self
 
@@ -332,11 +332,11 @@ class DaskExecutor:
         RunCancelledError
             The watch called the run off.
         """
-        lookout = self._started()
-        while not lookout.threads:
+        monitor = self._started()
+        while not monitor.threads:
             watch.check_cancelled()
-            lookout.look(stage, watch)
-            if not lookout.threads:
+            monitor.look(stage, watch)
+            if not monitor.threads:
                 time.sleep(TICK_S)
         if not self._cluster.embedded:
             self._check_versions()
@@ -344,7 +344,7 @@ class DaskExecutor:
     def map(
         self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
     ) -> Generator[Measured[Result], None, None]:
-        """Results as they come; `Flight` tells what happens to tasks whose workers die.
+        """Results as they come; `Dispatch` tells what happens to tasks whose workers die.
 
         Raises
         ------
@@ -357,9 +357,9 @@ class DaskExecutor:
         RunError
             Workers died again and again on one task.
         """
-        flight = Flight(
+        dispatch = Dispatch(
             client=self._client,
-            lookout=self._started(),
+            monitor=self._started(),
             stage=stage,
             function=function,
             tasks=tasks,
@@ -369,20 +369,20 @@ class DaskExecutor:
             settle_s=SETTLE_INTERRUPTED_S if self._owned and self._cluster.embedded else SETTLE_S,
         )
         if self._report is None:
-            yield from flight.results()
+            yield from dispatch.results()
             return
-        for measured in flight.results():
+        for measured in dispatch.results():
             self._report.add(stage, measured)
             yield measured
 
-    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
+    def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
         """The step's result, worked out here: what a driver holds of a city should not travel."""
         return function(task)
 
-    def _started(self) -> Lookout:
-        if self._lookout is None:
+    def _started(self) -> ClusterMonitor:
+        if self._monitor is None:
             raise ClusterError("the executor is not connected: use it as a context manager")
-        return self._lookout
+        return self._monitor
 
     def _ask(self, what: Callable[..., Any], **options: Any) -> Any:
         """An answer of the scheduler.
@@ -420,7 +420,7 @@ class DaskExecutor:
             told[f"worker {address}"] = differences(ours, _plain(theirs))
         faults = [f"{process}: {', '.join(what)}" for process, what in told.items() if what]
         if faults:
-            raise VersionMismatchError(mismatch_told(faults))
+            raise VersionMismatchError(mismatch_message(faults))
 
 
 def memory_of_workers(*, workers: int, scheduler: str | None, tls: TlsFiles | None = None) -> tuple[int, int | None]:

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from pipeline.runtime.monitoring.events import Watch
-from pipeline.runtime.monitoring.measured import Measured, Result, Task, measure
+from pipeline.runtime.monitoring.measurement import Measured, Result, Task, measure
 
 
 class Executor(Protocol):
@@ -25,7 +25,7 @@ class Executor(Protocol):
     ) -> Generator[Measured[Result], None, None]:
         """Results of all tasks, in the order in which they finish."""
 
-    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
+    def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
         """The result of one step of the driver: worked out here, or where the libraries are that it needs."""
 
     @property
@@ -61,7 +61,7 @@ class SerialExecutor:
             watch.check_cancelled()
             yield measure(function, task, stage)
 
-    def apart(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
+    def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
         """The step's result, worked out here."""
         return function(task)
 

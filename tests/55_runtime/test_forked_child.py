@@ -62,7 +62,7 @@ def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     def asked(expression: str, loads: str = "loaded_by_a_test:load") -> Any:
         for child in tuple(child_pool._children._idle):
             child.begun = 1
-        with child_pool.lent_child(lambda: False, fresh=True, loads=(loads,)) as child:
+        with child_pool.borrowed_child(lambda: False, fresh=True, loads=(loads,)) as child:
             child.begun = 1
         ((_, found),) = supervise(loaded_by_a_test.ask, [expression], LIMITS, loads=(loads,))
         return found
@@ -191,7 +191,7 @@ def test_a_child_that_is_called_off_before_its_server_has_loaded_never_begins(
     os.mkfifo(fifo)  # who opens it waits for somebody who writes
     with (
         pytest.raises(RunCancelledError),
-        child_pool.lent_child(lambda: True, fresh=False, loads=(f"loaded_by_a_test:read:{fifo}",)),
+        child_pool.borrowed_child(lambda: True, fresh=False, loads=(f"loaded_by_a_test:read:{fifo}",)),
     ):
         pytest.fail("it is not ready")
     assert child_pool._children._all == set()
