@@ -50,7 +50,7 @@ from pipeline.roof.primitives import primitive_partition
 from pipeline.roof.roof_type import roof_type
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.solid import SolidPart, solid_parts
-from pipeline.roof.templates import MAX_POINTS, RankedFaces, Templates, fit_templates, margin_of_templates
+from pipeline.roof.templates.fitting import MAX_POINTS, RankedFaces, Templates, fit_templates, margin_of_templates
 from pipeline.roof.voids import without_voids
 
 __all__ = ["ReconstructSettings", "failed_building", "reconstruct_building"]

@@ -14,9 +14,7 @@ from typing import Any
 from pipeline.errors import SettingsError
 from pipeline.methods import LODS, METHODS, PRESETS, ReconstructSettings, method_named
 from pipeline.parameters import Parameters, build, parameter
-from pipeline.roof.arrangement import ArrangementSettings
-from pipeline.roof.roof_type import RoofTypeSettings
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.settings import ArrangementSettings, RoofSettings, RoofTypeSettings
 from pipeline.scene import SceneSettings
 from pipeline.terrain.candidates import CandidateSettings
 from pipeline.terrain.class_codes import ClassCodeSettings

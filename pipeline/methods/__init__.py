@@ -11,9 +11,7 @@ from pipeline.errors import SettingsError
 from pipeline.methods.roof_faces import RoofFaceSettings
 from pipeline.model import Candidate, Segmentation
 from pipeline.parameters import Parameters
-from pipeline.roof.arrangement import ArrangementSettings
-from pipeline.roof.roof_type import RoofTypeSettings
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.settings import ArrangementSettings, RoofSettings, RoofTypeSettings
 
 LODS = ("1.2", "1.3", "2.2")
 """Levels of detail (Biljecki, Ledoux and Stoter 2016): one block, level parts, the roof faces themselves."""

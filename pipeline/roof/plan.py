@@ -14,7 +14,7 @@ from shapely import MultiPolygon
 from pipeline.errors import BuildingError
 from pipeline.geometry import spacing_over_area_m, top_visible
 from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
-from pipeline.roof.arrangement import ArrangementSettings, arrange
+from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
@@ -29,7 +29,7 @@ from pipeline.roof.partition import (
     absorb_small_regions,
     march,
 )
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.settings import ArrangementSettings, RoofSettings
 from pipeline.roof.simplification import simplify_partition, unite_close_vertices
 from pipeline.tin.delaunay import triangulate, unique_xy
 

@@ -16,42 +16,7 @@ import numpy as np
 import shapely
 
 from pipeline.model import FaceKind, Plane, RoofFace, RoofType, Solid, SolidFace
-from pipeline.parameters import Parameters, parameter
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RoofTypeSettings(Parameters):
-    """Thresholds of the roof types; they change no geometry."""
-
-    flat_below_deg: float = parameter(
-        7.0, "A roof plane with less slope is flat.", unit="deg", minimum=0.5, maximum=20.0
-    )
-    aspect_tolerance_deg: float = parameter(
-        20.0,
-        "Sides are opposite where their aspects are 180 degrees apart within this.",
-        unit="deg",
-        minimum=1.0,
-        maximum=45.0,
-    )
-    slope_tolerance_deg: float = parameter(
-        10.0, "Faces of one direction with slopes within this are one side.", unit="deg", minimum=1.0, maximum=45.0
-    )
-    sliver_height_m: float = parameter(
-        0.5,
-        "Roof planes meet across a wall that is nowhere higher: fitted planes seldom meet in one line.",
-        unit="m",
-        minimum=0.0,
-        maximum=5.0,
-    )
-    minor_share: float = parameter(
-        0.12, "Directions with a smaller share of the roof's area do not decide the type.", minimum=0.0, maximum=0.4
-    )
-    minor_share_together: float = parameter(
-        0.20,
-        "Where all that does not decide has this share of the roof's area the roof is a combination.",
-        minimum=0.0,
-        maximum=1.0,
-    )
+from pipeline.roof.settings import RoofTypeSettings
 
 
 @dataclasses.dataclass

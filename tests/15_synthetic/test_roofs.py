@@ -11,7 +11,8 @@ import pytest
 import shapely
 
 from pipeline.model import FloatArray
-from pipeline.roof.roof_type import RoofTypeSettings, roof_type
+from pipeline.roof.roof_type import roof_type
+from pipeline.roof.settings import RoofTypeSettings
 from pipeline.ruler.simulation.additions import (
     can_have_dormers,
     plan_rectangle,

@@ -18,9 +18,10 @@ from pipeline.errors import BuildingError
 from pipeline.geometry import point_spacing_m
 from pipeline.model import FloatArray, Plane, Reason, Solid
 from pipeline.quality.validity import check_solid
-from pipeline.roof.arrangement import ArrangementSettings, arrange
+from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.footprint import footprint_in_mm
 from pipeline.roof.partition import RoofPartition
+from pipeline.roof.settings import ArrangementSettings
 from pipeline.roof.solid import solid_parts
 
 ExactRoofs = Callable[..., Any]

@@ -17,8 +17,8 @@ from pipeline.roof.arrangement.far_corners import (
     heights_raster,
     with_level_planes,
 )
-from pipeline.roof.arrangement.settings import ArrangementSettings
 from pipeline.roof.arrangement.subdivision import FACE, insert_chord, insert_vertex, subdivision_of
+from pipeline.roof.settings import ArrangementSettings
 
 RISING = (0.5, 0.0, 3.0)
 """A plane that explains the west of a hall, up to x = 8 m."""

@@ -20,9 +20,8 @@ from pipeline.quality.validity import check_solid
 from pipeline.roof.footprint import footprint_in_mm
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import solid_parts
-from pipeline.roof.templates import fit_templates, margin_of_templates
 from pipeline.roof.templates.drawing import lower_piece
-from pipeline.roof.templates.fitting import parameters_of
+from pipeline.roof.templates.fitting import fit_templates, margin_of_templates, parameters_of
 from pipeline.roof.templates.parts import main_direction
 from pipeline.roof.templates.shapes import best_shape, height, misfit, robust_line
 

@@ -28,8 +28,7 @@ from pipeline.methods import ReconstructSettings
 from pipeline.methods.fuzzy_sart import FuzzySartSettings
 from pipeline.model import Candidate, Status
 from pipeline.reconstruct import reconstruct_building
-from pipeline.roof.arrangement import ArrangementSettings
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.settings import ArrangementSettings, RoofSettings
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, read_bundle, write_bundle
 from pipeline.runtime.replay import replay

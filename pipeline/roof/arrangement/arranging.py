@@ -25,9 +25,9 @@ from pipeline.roof.arrangement.far_corners import (
 from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, raster_labels
-from pipeline.roof.arrangement.settings import ArrangementSettings
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, VERTICES, Subdivision, subdivide, subdivision_of
 from pipeline.roof.partition import RoofPartition
+from pipeline.roof.settings import ArrangementSettings
 
 _EDGES_PER_LINE = 24
 _SPARE_EDGES = 256
