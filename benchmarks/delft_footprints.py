@@ -24,7 +24,7 @@ import shapely
 
 from pipeline.geometry import top_visible
 from pipeline.methods import ReconstructSettings
-from pipeline.methods.fuzzy_sart import FuzzySartSettings
+from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, Status
 from pipeline.quality.residuals import vertical_residuals
 from pipeline.quality.validity import check_solid

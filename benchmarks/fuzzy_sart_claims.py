@@ -39,7 +39,8 @@ from benchmarks.fuzzy_sart_probe import (
 from benchmarks.fuzzy_sart_product import large_and_small
 from benchmarks.fuzzy_sart_roofs import SyntheticRoof, all_planes_right
 from pipeline.geometry import point_spacing_m
-from pipeline.methods.fuzzy_sart import FuzzySartSettings, segment
+from pipeline.methods.fuzzy_sart import segment
+from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import FloatArray, Segmentation
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
 from pipeline.ruler.simulation.seeds import seed_of

@@ -20,7 +20,7 @@ from benchmarks.fuzzy_sart_probe import Observed, observe, strewn
 from benchmarks.fuzzy_sart_roofs import SyntheticRoof
 from pipeline.geometry import facet_normals
 from pipeline.methods import ReconstructSettings
-from pipeline.methods.fuzzy_sart import FuzzySartSettings
+from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import FaceKind, FloatArray, LabelArray, Solid
 from pipeline.reconstruct import reconstruct_building
 from pipeline.report.perspective import View, ViewedFace, draw_view

@@ -20,7 +20,7 @@ import shapely
 from benchmarks.fuzzy_sart_roofs import SyntheticRoof
 from pipeline.geometry import facet_areas_m2, facet_normals
 from pipeline.methods import fuzzy_sart
-from pipeline.methods.fuzzy_sart import FuzzySartSettings
+from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Segmentation
 from pipeline.ruler.simulation.additions import random_dormers
 from pipeline.ruler.simulation.random_dimensions import random_dimensions

@@ -22,7 +22,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pipeline.methods.fuzzy_sart import FuzzySartSettings, segment
+from pipeline.methods.fuzzy_sart import segment
+from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, Segmentation
 
 KINDS = ("gable", "hip", "flat", "L")

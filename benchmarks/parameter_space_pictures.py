@@ -21,7 +21,8 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from benchmarks.fuzzy_sart_roofs import FIRST_SEED, simulate_roof
 from pipeline.methods import ReconstructSettings
-from pipeline.methods.parameter_space import ParameterSpace3dSettings, facets_of, roof_clusters_3d
+from pipeline.methods.parameter_space import facets_of, roof_clusters_3d
+from pipeline.methods.settings import ParameterSpace3dSettings
 from pipeline.model import Candidate, FaceKind, FloatArray, LabelArray
 from pipeline.reconstruct import reconstruct_building
 

@@ -27,8 +27,9 @@ from matplotlib.figure import Figure
 from benchmarks.candidates import candidates_of
 from pipeline.geometry import vertical_residuals_m
 from pipeline.methods import METHODS, ReconstructSettings
-from pipeline.methods.kmeans import BuildingTop, KMeansSettings, building_top, planes_of, sides_of
+from pipeline.methods.kmeans import BuildingTop, building_top, planes_of, sides_of
 from pipeline.methods.local_frame import local_metres
+from pipeline.methods.settings import KMeansSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, LabelArray, Plane, RoofType, Status
 from pipeline.reconstruct import reconstruct_building
 from pipeline.report.perspective import VIEW_SUN, View, ViewedFace, draw_view, projected

@@ -155,6 +155,11 @@ class Parameters:
         """Faults that concern more than one field; overridden where there are any."""
         return []
 
+    def range_faults(self, low: str, high: str) -> list[str]:
+        """The fault of two fields that bound a range, or none."""
+        low_value, high_value = getattr(self, low), getattr(self, high)
+        return [f"{low} is {low_value:g}: use at most {high}, {high_value:g}"] if low_value > high_value else []
+
 
 def build(
     kind: type[Parameters],

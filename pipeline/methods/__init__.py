@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pipeline.errors import SettingsError
-from pipeline.methods.roof_faces import RoofFaceSettings
+from pipeline.methods.settings import (
+    FuzzySartSettings,
+    KMeansSettings,
+    ParameterSpace2dSettings,
+    ParameterSpace3dSettings,
+    RoofFaceSettings,
+)
 from pipeline.model import Candidate, Segmentation
 from pipeline.parameters import Parameters
 from pipeline.roof.settings import ArrangementSettings, RoofSettings, RoofTypeSettings
+from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 
 LODS = ("1.2", "1.3", "2.2")
 """Levels of detail (Biljecki, Ledoux and Stoter 2016): one block, level parts, the roof faces themselves."""
@@ -19,7 +25,7 @@ PRESETS = ("robust", "faithful")
 """Named settings: those that measured better, the default, which every method has, and those that keep to its paper."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class Method:
     """A segmentation method."""
 
@@ -60,90 +66,51 @@ class Method:
         return self.faithful
 
 
-def _arrangement() -> Method:
+def _arrangement(candidate: Candidate, settings: AdaptivePlaneSettings) -> Segmentation:
     from pipeline.methods import arrangement
-    from pipeline.segmentation.adaptive_planes import AdaptivePlaneSettings
 
-    return Method(
-        name="arrangement",
-        settings_type=AdaptivePlaneSettings,
-        segment=arrangement.segment,
-    )
+    return arrangement.segment(candidate, settings)
 
 
-def _fuzzy_sart() -> Method:
+def _fuzzy_sart(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     from pipeline.methods import fuzzy_sart
 
-    return Method(
-        name="fuzzy-sart",
-        settings_type=fuzzy_sart.FuzzySartSettings,
-        segment=fuzzy_sart.segment,
-        faithful=fuzzy_sart.FuzzySartSettings.faithful(),
-    )
+    return fuzzy_sart.segment(candidate, settings)
 
 
-def _parameter_space_2d() -> Method:
+def _parameter_space_2d(candidate: Candidate, settings: ParameterSpace2dSettings) -> Segmentation:
     from pipeline.methods import parameter_space
 
-    return Method(
-        name="parameter-space-2d",
-        settings_type=parameter_space.ParameterSpace2dSettings,
-        segment=parameter_space.segment_2d,
-        faithful=parameter_space.ParameterSpace2dSettings.faithful(),
-    )
+    return parameter_space.segment_2d(candidate, settings)
 
 
-def _parameter_space_3d() -> Method:
+def _parameter_space_3d(candidate: Candidate, settings: ParameterSpace3dSettings) -> Segmentation:
     from pipeline.methods import parameter_space
 
-    return Method(
-        name="parameter-space-3d",
-        settings_type=parameter_space.ParameterSpace3dSettings,
-        segment=parameter_space.segment_3d,
-        faithful=parameter_space.ParameterSpace3dSettings.faithful(),
-    )
+    return parameter_space.segment_3d(candidate, settings)
 
 
-def _kmeans() -> Method:
+def _kmeans(candidate: Candidate, settings: KMeansSettings) -> Segmentation:
     from pipeline.methods import kmeans
 
-    return Method(
-        name="kmeans",
-        settings_type=kmeans.KMeansSettings,
-        segment=kmeans.segment,
-        faithful=kmeans.KMeansSettings.faithful(),
+    return kmeans.segment(candidate, settings)
+
+
+METHODS: Mapping[str, Method] = {
+    method.name: method
+    for method in (
+        Method("arrangement", AdaptivePlaneSettings, _arrangement),
+        Method("fuzzy-sart", FuzzySartSettings, _fuzzy_sart, FuzzySartSettings.faithful()),
+        Method(
+            "parameter-space-2d", ParameterSpace2dSettings, _parameter_space_2d, ParameterSpace2dSettings.faithful()
+        ),
+        Method(
+            "parameter-space-3d", ParameterSpace3dSettings, _parameter_space_3d, ParameterSpace3dSettings.faithful()
+        ),
+        Method("kmeans", KMeansSettings, _kmeans, KMeansSettings.faithful()),
     )
-
-
-class _Table(Mapping[str, Method]):
-    """Methods by name, each imported when it is first asked for: a run needs one, and start-up counts."""
-
-    def __init__(self, entries: Mapping[str, Callable[[], Method]]) -> None:
-        self._entries = {name: functools.cache(entry) for name, entry in entries.items()}
-
-    def __getitem__(self, name: str) -> Method:
-        return self._entries[name]()
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._entries
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
-
-    def __len__(self) -> int:
-        return len(self._entries)
-
-
-METHODS: Mapping[str, Method] = _Table(
-    {
-        "arrangement": _arrangement,
-        "fuzzy-sart": _fuzzy_sart,
-        "parameter-space-2d": _parameter_space_2d,
-        "parameter-space-3d": _parameter_space_3d,
-        "kmeans": _kmeans,
-    }
-)
-"""All methods by name."""
+}
+"""All methods by name. A recipe and its kernels load when a building is first segmented by it."""
 
 
 def method_named(name: str) -> Method:
@@ -203,7 +170,7 @@ class ReconstructSettings:
     def arranges(self, method: Method) -> bool:
         """Whether the plan is cut into roof faces along the lines in which planes meet.
 
-        It is for every method but those that are told to trace them from the labels (`RoofFaceSettings.faces`).
+        True unless the settings say to trace them from the labels (`RoofFaceSettings.faces`).
 
         Raises
         ------

@@ -13,8 +13,9 @@ from pipeline.errors import BuildingError
 from pipeline.geometry import point_spacing_m, top_visible
 from pipeline.methods.local_frame import local_metres, plane_over_origin
 from pipeline.model import Candidate, Reason, Segmentation
-from pipeline.segmentation.adaptive_planes import AdaptivePlaneSettings, detect_planes
+from pipeline.segmentation.adaptive_planes import detect_planes
 from pipeline.segmentation.plane_refinement import describe_planes
+from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 
 
 def segment(candidate: Candidate, settings: AdaptivePlaneSettings) -> Segmentation:

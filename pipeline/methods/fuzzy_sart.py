@@ -8,8 +8,6 @@ measured better (unit normals, thresholds that follow the noise, clusters split 
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from pipeline.errors import BuildingError
@@ -23,13 +21,11 @@ from pipeline.geometry import (
     top_visible,
 )
 from pipeline.methods.local_frame import check_extent, ground_around, local_metres, plane_over_origin
-from pipeline.methods.refinement import RefinementSettings, planes_of_clusters
-from pipeline.methods.roof_faces import RoofFaceSettings
+from pipeline.methods.refinement import planes_of_clusters
+from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import BoolArray, Candidate, FloatArray, Reason, Segmentation
-from pipeline.parameters import parameter
 from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
 from pipeline.segmentation.fuzzy_sart import (
-    FuzzySartClusteringSettings,
     centre_of_building,
     cluster,
     facet_vectors,
@@ -37,79 +33,6 @@ from pipeline.segmentation.fuzzy_sart import (
 from pipeline.segmentation.plane_refinement import describe_planes
 from pipeline.terrain.height_rule import facets_above_z_avg
 from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FuzzySartSettings(RoofFaceSettings, FuzzySartClusteringSettings, RefinementSettings):
-    """Settings of the recipe; those of the clustering, of the refinement and of the roof faces are among them."""
-
-    absorption: str = parameter(
-        "bucket",
-        "Absorbed points are kept in their facet, or inserted at its elevation (the paper's way, slower).",
-        choices=("bucket", "insert"),
-    )
-    min_absorption_m: float = parameter(
-        0.10, "Least distance up to which a facet absorbs points (Eq. 1).", unit="m", minimum=0.0, maximum=10.0
-    )
-    max_absorption_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
-    max_absorption_slope_deg: float = parameter(
-        60.0, "Facets that are steeper absorb nothing (Eq. 2) and are no roof.", unit="deg", minimum=1.0, maximum=89.0
-    )
-    ground_gap_spacings: float = parameter(
-        1.3,
-        "Terrain samples nearer to a roof point than this many mean point spacings count as beneath the roof.",
-        minimum=0.0,
-        maximum=100.0,
-    )
-    min_ground_gap_m: float = parameter(
-        1.0, "Terrain samples nearer to a roof point than this count so too.", unit="m", minimum=0.01, maximum=100.0
-    )
-    height_rule: str = parameter(
-        "separated",
-        "Which facets can be roof: those that touch no terrain, or those above the Z_avg of the scene.",
-        choices=("separated", "scene"),
-    )
-    wall_height_m: float = parameter(
-        2.0, "Elevation difference from which a facet is a wall, for Z_avg.", unit="m", minimum=0.0, maximum=100.0
-    )
-    split_by_connectivity: bool = parameter(
-        True, "Whether a cluster is cut into the parts that hang together in the TIN."
-    )
-
-    @classmethod
-    def faithful(cls) -> FuzzySartSettings:
-        """The paper's words: scaled spherical vectors, V = 0.7, 0.2 m and 60 degrees, Z_avg, fixed thresholds."""
-        return cls(
-            vectors="spherical_scaled",
-            vigilance=0.7,
-            absorption="insert",
-            min_absorption_m=0.2,
-            max_absorption_m=0.2,
-            min_plane_distance_m=0.2,
-            max_plane_distance_m=0.2,
-            height_rule="scene",
-            split_by_connectivity=False,
-            assignment="all_planes",
-            rounds=1,
-            leftover_rounds=0,
-            faces="traced",
-        )
-
-    def cross_faults(self) -> list[str]:
-        """Bounds must be ranges."""
-        return [*super().cross_faults(), *self.range_faults("absorption")]
-
-    def absorption_distance_m(self, sigma_m: float) -> float:
-        """Distance of Eq. 1 for a noise."""
-        return min(max(self.noise_factor * sigma_m, self.min_absorption_m), self.max_absorption_m)
-
-    def insertion(self, sigma_m: float) -> GreedyInsertionSettings:
-        """Settings of the TIN for a noise."""
-        return GreedyInsertionSettings(
-            absorption=self.absorption,
-            absorption_distance_m=self.absorption_distance_m(sigma_m),
-            absorption_slope_deg=self.max_absorption_slope_deg,
-        )
 
 
 def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
@@ -153,7 +76,12 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     ground = ground_around(candidate.ground, shift, roof, gap_m)
     building_with_ground = np.concatenate([roof, ground])
     check_extent(building_with_ground)
-    greedy = insert_greedily(building_with_ground, settings.insertion(sigma_m), candidate.ground_z_m - float(shift[2]))
+    insertion = GreedyInsertionSettings(
+        absorption=settings.absorption,
+        absorption_distance_m=settings.absorption_distance_m(sigma_m),
+        absorption_slope_deg=settings.max_absorption_slope_deg,
+    )
+    greedy = insert_greedily(building_with_ground, insertion, candidate.ground_z_m - float(shift[2]))
     facets = greedy.tin.facets
     normals = facet_normals(greedy.vertices, facets)
     areas_m2 = facet_areas_m2(greedy.vertices, facets)

@@ -28,16 +28,14 @@ from pipeline.geometry import (
     vertical_residuals_m,
 )
 from pipeline.methods.local_frame import check_extent, local_metres, plane_over_origin
-from pipeline.methods.refinement import RefinementSettings, planes_of_clusters
-from pipeline.methods.roof_faces import RoofFaceSettings
+from pipeline.methods.refinement import planes_of_clusters
+from pipeline.methods.settings import KMeansSettings
 from pipeline.model import Candidate, FloatArray, IntArray, LabelArray, Plane, PlanFace, Reason, Segmentation, Tin
-from pipeline.parameters import parameter
 from pipeline.roof.primitives import BuildingPrimitive, fit_box, fit_gable
 from pipeline.segmentation.facet_clusters import connected_parts
 from pipeline.segmentation.facet_smoothing import passes_for_noise, smoothed_normals
 from pipeline.segmentation.kmeans_normals import (
     FacetClusters,
-    NormalClusteringSettings,
     choose_clusters,
     labels_around,
 )
@@ -48,107 +46,6 @@ from pipeline.tin.delaunay import triangulate, unique_xy
 
 _MIN_FACETS = 3
 """Fewer facets are no two groups."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class KMeansSettings(RoofFaceSettings, NormalClusteringSettings, RefinementSettings):
-    """Settings of the recipe; those of the clustering, of the refinement and of the roof faces are among them."""
-
-    longest_edge_spacings: float = parameter(
-        4.0,
-        "Facets with a longer edge in plan, in mean point spacings, bridge gaps and are left out; 0 keeps all.",
-        minimum=0.0,
-        maximum=1000.0,
-    )
-    normal_noise_deg: float = parameter(
-        6.0,
-        "Normals are averaged over the facets around until the noise turns them by about this angle.",
-        unit="deg",
-        minimum=0.1,
-        maximum=45.0,
-    )
-    smoothing_passes: int = parameter(
-        6, "Most passes of that, by one ring of facets each; 0 for none (as the paper).", minimum=0, maximum=100
-    )
-    refine: bool = parameter(
-        True,
-        "Whether clusters are split where they do not hang together, merged where they are one plane, and their points "
-        "assigned anew; without it there is one least-squares fit a cluster (as the paper).",
-    )
-    one_plane_deg: float = parameter(
-        6.0,
-        "Two planes of unrefined clusters with a smaller angle between them are one plane.",
-        unit="deg",
-        minimum=0.0,
-        maximum=45.0,
-    )
-    min_plane_share: float = parameter(
-        0.1,
-        "An unrefined cluster with a smaller share of the points is no roof plane.",
-        minimum=0.0,
-        maximum=0.5,
-    )
-    flat_below_deg: float = parameter(
-        3.0, "The model of one plane is level below this slope, pent above.", unit="deg", minimum=0.0, maximum=45.0
-    )
-    model: str = parameter(
-        "fitting",
-        "When one or two planes become the paper's model: where it explains the building, always, or never.",
-        choices=("fitting", "always", "never"),
-    )
-    outline: str = parameter(
-        "footprint",
-        "Whether a given footprint is kept, its roof drawn from the labels, or the model's rectangle is the outline.",
-        choices=("footprint", "rectangle"),
-    )
-    min_side_share: float = parameter(
-        0.5,
-        "Share of a plane's points that must lie on its side of the line in which the two planes meet.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    margin_spacings: float = parameter(
-        0.13,
-        "By how much the rectangles go beyond the outermost points, in mean point spacings.",
-        minimum=0.0,
-        maximum=2.0,
-    )
-    model_distance_m: float = parameter(
-        0.5,
-        "Points farther than this above or below the model are not explained by it.",
-        unit="m",
-        minimum=0.0,
-        maximum=100.0,
-    )
-    fitting_share: float = parameter(
-        0.9,
-        "The model explains a building where this share of its roof points lies within the distance of a plane.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    fitting_fill: float = parameter(
-        0.9,
-        "The model explains a building where this share of its rectangle has roof points near.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    fill_gap_spacings: float = parameter(1.2, "What near means, in mean point spacings.", minimum=0.1, maximum=10.0)
-
-    @classmethod
-    def faithful(cls) -> KMeansSettings:
-        """The paper's words: k = 2, equal facets, one fit a cluster, the model always, its own outline."""
-        return cls(
-            clusters=2,
-            facet_weights="equal",
-            longest_edge_spacings=0.0,
-            smoothing_passes=0,
-            refine=False,
-            leftover_rounds=0,
-            model="always",
-            outline="rectangle",
-            margin_spacings=0.0,
-            faces="traced",
-        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -299,7 +196,8 @@ def cluster_facets(top: BuildingTop, settings: KMeansSettings) -> tuple[LabelArr
     def explained(labels: LabelArray) -> float:
         return _share_explained(top, connected_parts(on_all_facets(labels), top.tin.neighbours), fewest_points)
 
-    clusters = choose_clusters(normals[index], settings.weights(areas_m2[index]), explained, settings)
+    weights = areas_m2[index] if settings.facet_weights == "area" else np.ones(len(index))
+    clusters = choose_clusters(normals[index], weights, explained, settings)
     return on_all_facets(clusters.labels), clusters
 
 

@@ -15,120 +15,24 @@ import numpy as np
 from pipeline.errors import BuildingError
 from pipeline.geometry import facet_areas_m2, nearest_neighbours, noise_sigma_m, point_spacing_m, top_visible
 from pipeline.methods.local_frame import check_extent, ground_around, local_metres, plane_over_origin
-from pipeline.methods.roof_faces import RoofFaceSettings
+from pipeline.methods.settings import ParameterSpace2dSettings, ParameterSpace3dSettings, ParameterSpaceSettings
 from pipeline.model import BoolArray, Candidate, FloatArray, LabelArray, Reason, RoofType, Segmentation, Tin
-from pipeline.parameters import parameter
-from pipeline.segmentation.cluster_membership import ClusterMembershipSettings, may_be_roof, refine_clusters
+from pipeline.segmentation.cluster_membership import may_be_roof, refine_clusters
 from pipeline.segmentation.facet_clusters import labels_of_points
 from pipeline.segmentation.facet_parameters import about_barycentre, cluster_means, facet_parameters
-from pipeline.segmentation.parameter_boxes import ParameterBoxSettings, coarse_clusters
+from pipeline.segmentation.parameter_boxes import coarse_clusters
 from pipeline.segmentation.plane_refinement import describe_planes
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
 from pipeline.segmentation.point_assignment import vote_among_neighbours
-from pipeline.segmentation.region_growing import RegionGrowingSettings, grow_regions
-from pipeline.segmentation.roof_trees import RoofTreeSettings, classify_2d, classify_3d, plausible_slopes
-from pipeline.segmentation.single_linkage import SingleLinkageSettings, cluster_by_linkage
+from pipeline.segmentation.region_growing import grow_regions
+from pipeline.segmentation.roof_trees import classify_2d, classify_3d, plausible_slopes
+from pipeline.segmentation.single_linkage import cluster_by_linkage
 from pipeline.tin.delaunay import triangulate, unique_xy
 
 _MIN_POINTS = 4
 """Below this there is neither a spacing nor a noise to speak of."""
 _VOTING_PASSES = 4
 """Repetitions of the choice between regions; it ends when nothing changes."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ParameterSpaceSettings(RoofFaceSettings, RegionGrowingSettings, RoofTreeSettings):
-    """What both methods share."""
-
-    tin_spacing_m: float = parameter(
-        0.7,
-        "The TIN takes one roof point a square of this size, since noise tilts the facets of a dense cloud most; "
-        "0 takes all.",
-        unit="m",
-        minimum=0.0,
-        maximum=10.0,
-    )
-    surroundings_m: float = parameter(
-        5.0, "Terrain takes part up to this distance from the roof's points.", unit="m", minimum=0.0, maximum=1000.0
-    )
-    ground_gap_spacings: float = parameter(
-        0.7,
-        "Terrain samples nearer to a roof point than this many mean point spacings count as beneath the roof.",
-        minimum=0.01,
-        maximum=100.0,
-    )
-    ground_clusters: str = parameter(
-        "leave_out",
-        "Clusters of terrain and walls: all kept but those that the paper eliminates; dropped where fewer than half of "
-        "their facets touch roof points alone; or facets that touch terrain not clustered at all.",
-        choices=("keep", "drop", "leave_out"),
-    )
-    point_groups: str = parameter(
-        "region_growing",
-        "Points of a roof face: those of the facets that are members of a cluster, or a region grown from its mean.",
-        choices=("membership", "region_growing"),
-    )
-    growing_vote: float = parameter(
-        0.04,
-        "Between regions a point takes the nearer plane; share of the largest squared distance that one neighbour's "
-        "vote outweighs.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    min_area_m2: float = parameter(
-        3.0, "A region has at least as many points as this area holds in plan.", unit="m2", minimum=0.0, maximum=1000.0
-    )
-    min_points: int = parameter(
-        5, "Fewest points of a roof face, however sparse the cloud.", unit="points", minimum=3, maximum=10_000
-    )
-    type_from: str = parameter(
-        "faces",
-        "What names the roof type: the paper's decision tree, or the rule over the delivered faces.",
-        choices=("tree", "faces"),
-    )
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
-    """Settings of the method in slope and orientation."""
-
-    min_slope_deg: float = parameter(
-        0.0, "Clusters with less mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
-    )
-    max_slope_deg: float = parameter(
-        75.0, "Clusters with more mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
-    )
-
-    @classmethod
-    def faithful(cls) -> ParameterSpace2dSettings:
-        """The paper's words: terrain is clustered too, at least 11 facets, points by membership, its own tree."""
-        return cls(
-            tin_spacing_m=0.0,
-            ground_clusters="keep",
-            min_slope_deg=7.0,
-            min_members=11,
-            point_groups="membership",
-            type_from="tree",
-            faces="traced",
-        )
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ParameterSpace3dSettings(ParameterSpaceSettings, ParameterBoxSettings, ClusterMembershipSettings):
-    """Settings of the method in slope, orientation and O-distance."""
-
-    @classmethod
-    def faithful(cls) -> ParameterSpace3dSettings:
-        """The paper's words: terrain is clustered too, at least 11 facets, points by membership, its own tree."""
-        return cls(
-            tin_spacing_m=0.0,
-            ground_clusters="keep",
-            dense_box_facets=5,
-            min_members=11,
-            point_groups="membership",
-            type_from="tree",
-            faces="traced",
-        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

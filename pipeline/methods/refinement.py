@@ -11,56 +11,10 @@ import dataclasses
 import numpy as np
 
 from pipeline.model import FloatArray, LabelArray
-from pipeline.parameters import parameter
 from pipeline.segmentation.leftover_planes import cluster_leftovers
-from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, refine_planes
+from pipeline.segmentation.plane_refinement import refine_planes
+from pipeline.segmentation.plane_settings import PlaneRefinementSettings
 from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
-
-_MIN_DISTANCE_M = 1e-3
-"""The grid of the points: no distance to a plane is less, also where settings and noise are 0."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RefinementSettings(PlaneRefinementSettings):
-    """Settings of the common end; those of its stages are among them."""
-
-    min_plane_distance_m: float = parameter(
-        0.15, "Least distance up to which a point belongs to a plane.", unit="m", minimum=0.0, maximum=10.0
-    )
-    max_plane_distance_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
-    noise_factor: float = parameter(
-        3.0,
-        "Distances that follow the noise are this many standard deviations of it, within their bounds.",
-        minimum=0.0,
-        maximum=100.0,
-    )
-    neighbours: int = parameter(
-        9, "Nearest points whose planes a point chooses among.", unit="points", minimum=3, maximum=64
-    )
-    leftover_rounds: int = parameter(
-        2,
-        "Rounds of refinement with clusters that grow among the points no plane explains; 0 for none (as the papers).",
-        unit="rounds",
-        minimum=0,
-        maximum=50,
-    )
-    ridge_reach_spacings: float = parameter(
-        1.5, "Distance in plan up to which points are near a ridge, in mean point spacings.", minimum=0.0, maximum=10.0
-    )
-
-    def cross_faults(self) -> list[str]:
-        """The distance must be a range."""
-        return [*super().cross_faults(), *self.range_faults("plane_distance")]
-
-    def range_faults(self, name: str) -> list[str]:
-        """What is wrong with a pair of bounds, `name` without its ending."""
-        low, high = getattr(self, f"min_{name}_m"), getattr(self, f"max_{name}_m")
-        return [f"min_{name}_m is {low:g}: use at most max_{name}_m, {high:g}"] if low > high else []
-
-    def plane_distance_m(self, sigma_m: float) -> float:
-        """Distance of a point from its plane for a noise; 1 mm, the grid of the points, is the least."""
-        bounded = min(max(self.noise_factor * sigma_m, self.min_plane_distance_m), self.max_plane_distance_m)
-        return max(bounded, _MIN_DISTANCE_M)
 
 
 def planes_of_clusters(
@@ -70,7 +24,7 @@ def planes_of_clusters(
     *,
     spacing_m: float,
     distance_m: float,
-    settings: RefinementSettings,
+    settings: PlaneRefinementSettings,
 ) -> tuple[FloatArray, LabelArray]:
     """Roof planes of rough clusters, and the plane of every point.
 
@@ -86,7 +40,7 @@ def planes_of_clusters(
         Mean point spacing in plan.
     distance_m : float
         Up to which a point belongs to a plane: `settings.plane_distance_m` of the noise.
-    settings : RefinementSettings
+    settings : PlaneRefinementSettings
         All else.
 
     Returns

@@ -17,9 +17,9 @@ from pipeline.compiler import kernel
 from pipeline.geometry import nearest_neighbours
 from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.parameters import Parameters, parameter
 from pipeline.segmentation.plane_merge import touching_pairs
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
+from pipeline.segmentation.plane_settings import MIN_PLANE_POINTS, AdaptivePlaneSettings
 from pipeline.segmentation.point_assignment import distance_to_plane, vote_among_neighbours
 from pipeline.segmentation.redundant_planes import dissolve_redundant
 from pipeline.segmentation.trial_regions import FITTED_NEIGHBOURS, local_planes, noise_of_local_planes, take_regions
@@ -48,67 +48,6 @@ _PLANE_COST = 5.0
 _ROUNDS = 2
 """Rounds of regression, merging and assignment: labels hardly change later."""
 _MAD_TO_SIGMA = 1.4826
-_MIN_POINTS = 5
-"""Fewest points of any plane: with three free parameters, four fit by chance too often."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class AdaptivePlaneSettings(Parameters):
-    """Settings of the detection."""
-
-    noises: float = parameter(
-        3.0,
-        "Distance up to which a point belongs to a plane, in standard deviations of the noise.",
-        minimum=0.5,
-        maximum=20.0,
-    )
-    min_distance_m: float = parameter(
-        0.15,
-        "Least such distance: tiles, gutters and sag keep a roof from being plane to less.",
-        unit="m",
-        minimum=0.001,
-        maximum=10.0,
-    )
-    max_distance_m: float = parameter(0.35, "Largest such distance.", unit="m", minimum=0.001, maximum=10.0)
-    min_area_m2: float = parameter(
-        1.3, "Least area of a plane in plan where points are dense.", unit="m2", minimum=0.0, maximum=1e4
-    )
-    min_area_sparse_m2: float = parameter(
-        10.0, "Least area that is asked for however sparse the points.", unit="m2", minimum=0.0, maximum=1e4
-    )
-    min_points: int = parameter(
-        6, "Fewest points of a plane where the larger area holds as many.", unit="points", minimum=5, maximum=10_000
-    )
-    max_slope_deg: float = parameter(
-        75.0, "Planes steeper than this are no roof.", unit="deg", minimum=1.0, maximum=89.0
-    )
-    normal_angle_deg: float = parameter(
-        30.0,
-        "Largest angle between a plane and the plane of a point's neighbours, where points are dense and clean enough.",
-        unit="deg",
-        minimum=1.0,
-        maximum=89.0,
-    )
-
-    def cross_faults(self) -> list[str]:
-        """Bounds must be ranges."""
-        faults = super().cross_faults()
-        for low, high in (("min_distance_m", "max_distance_m"), ("min_area_m2", "min_area_sparse_m2")):
-            if getattr(self, low) > getattr(self, high):
-                faults.append(f"{low} is {getattr(self, low):g}: use at most {high}, {getattr(self, high):g}")
-        return faults
-
-    def fewest_points(self, spacing_m: float) -> int:
-        """Fewest points of a plane for a spacing.
-
-        Examples
-        --------
-        >>> [AdaptivePlaneSettings().fewest_points(spacing_m) for spacing_m in (0.25, 0.7, 1.0, 1.6)]
-        [21, 6, 6, 5]
-        """
-        cell_m2 = spacing_m * spacing_m
-        asked = max(self.min_area_m2 / cell_m2, min(self.min_points, self.min_area_sparse_m2 / cell_m2))
-        return max(_MIN_POINTS, math.ceil(asked))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -141,7 +80,7 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
         Without planes where points are too few, or flat nowhere; a spacing of nan or 0 counts as too few.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
-    if len(points) < _MIN_POINTS or not spacing_m > 0.0:
+    if len(points) < MIN_PLANE_POINTS or not spacing_m > 0.0:
         return DetectedPlanes(
             coefficients=np.zeros((0, 3)), labels=np.full(len(points), -1, np.int32), sigma_m=math.nan
         )

@@ -16,58 +16,7 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, LabelArray, Reason
-from pipeline.parameters import Parameters, parameter
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ClusterMembershipSettings(Parameters):
-    """Settings of the refinement of coarse clusters."""
-
-    height_noise_m: float = parameter(
-        0.08,
-        "Standard deviation of heights within one building, from which the spread of slope and orientation follows.",
-        unit="m",
-        minimum=0.001,
-        maximum=1.0,
-    )
-    close_spreads: float = parameter(
-        1.0,
-        "Facets within this many standard deviations of slope and orientation are close.",
-        minimum=0.01,
-        maximum=100.0,
-    )
-    member_spreads: float = parameter(
-        2.5, "Farthest that a member lies from its centre, in standard deviations.", minimum=0.01, maximum=100.0
-    )
-    typical_o_range_m: float = parameter(
-        2.0,
-        "Range of the O-distance of a typical roof face: a quarter of it counts as a standard deviation, to which that "
-        "of the mean cluster is added.",
-        unit="m",
-        minimum=0.01,
-        maximum=100.0,
-    )
-    min_members: int = parameter(4, "Fewest facets of a cluster.", unit="facets", minimum=1, maximum=100_000)
-    max_o_deviation_m: float = parameter(
-        1.3,
-        "Clusters whose O-distance has this standard deviation or more are no roof.",
-        unit="m",
-        minimum=0.01,
-        maximum=100.0,
-    )
-    ground_below_deg: float = parameter(
-        4.0, "Clusters with less slope and a negative O-distance are no roof.", unit="deg", minimum=0.0, maximum=90.0
-    )
-    wall_above_deg: float = parameter(
-        76.0, "Clusters with more slope are walls.", unit="deg", minimum=1.0, maximum=90.0
-    )
-    weight_sample: int = parameter(
-        500, "Most facets of a cluster that weights are counted against.", unit="facets", minimum=10, maximum=100_000
-    )
-    membership_work_limit: int = parameter(
-        500_000_000, "Comparisons of facets with facets and centres after which a building is too complex.",
-        minimum=1, maximum=10**15,
-    )  # fmt: skip
+from pipeline.segmentation.clustering_settings import ClusterMembershipSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

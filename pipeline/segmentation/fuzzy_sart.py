@@ -17,9 +17,7 @@ import numpy.typing as npt
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.parameters import Parameters, parameter
-
-VECTOR_KINDS = ("unit_normal", "footpoint", "spherical_scaled")
+from pipeline.segmentation.clustering_settings import FuzzySartClusteringSettings
 
 _FLAT_RANGE = 1e-6
 """Ranges below this (metres or radians) count as none: scaling them would only blow up rounding."""
@@ -27,45 +25,6 @@ _ZERO_MODULE = 1e-9
 """A vector shorter than this has no direction: an outlier."""
 _NEGLIGIBLE_RANK = 12.0
 """exp(-12) is 6e-6: a neuron that far down the ranking is not moved."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FuzzySartClusteringSettings(Parameters):
-    """Settings of the clustering; the paper publishes the vigilance alone."""
-
-    vectors: str = parameter(
-        "unit_normal",
-        "What of a facet is clustered: its unit normal, the foot of the perpendicular from the building's centre, "
-        "or that foot in spherical coordinates scaled to one range.",
-        choices=VECTOR_KINDS,
-    )
-    vigilance: float = parameter(
-        0.95, "Vector degree of match below which an input starts a cluster of its own.", minimum=0.0, maximum=1.0
-    )
-    tau_epochs: int = parameter(5, "Epochs in which a neuron learns.", unit="epochs", minimum=1, maximum=100)
-    epochs_per_tau: int = parameter(
-        4, "The clustering ends after this many times tau epochs at the latest.", minimum=1, maximum=100
-    )
-    learning_rate_start: float = parameter(0.5, "Learning rate of a new neuron.", minimum=1e-6, maximum=1.0)
-    learning_rate_end: float = parameter(0.005, "Learning rate of a neuron of age tau.", minimum=1e-6, maximum=1.0)
-    neighbourhood_start: float = parameter(
-        1.0,
-        "Ranks over which the learning fades when a new winner wins.",
-        minimum=1e-6,
-        maximum=100.0,
-    )
-    neighbourhood_end: float = parameter(
-        0.01, "The same for a winner of age tau: practically none but the winner learns.", minimum=1e-6, maximum=100.0
-    )
-    scaled_min: float = parameter(
-        0.0, "Lower end of the one range, up to 1, of spherical_scaled vectors.", minimum=0.0, maximum=1.0
-    )
-    clustering_work_limit: int = parameter(
-        1_500_000_000,
-        "Comparisons of a vector with a neuron after which a building is given up as too complex.",
-        minimum=1,
-        maximum=10**15,
-    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

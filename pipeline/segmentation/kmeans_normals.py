@@ -21,55 +21,10 @@ from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.parameters import Parameters, parameter
+from pipeline.segmentation.clustering_settings import NormalClusteringSettings
 
 _EQUAL_INERTIA = 1e-9
 """Starts whose inertia differs by less than this share of it ended in the same clusters."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class NormalClusteringSettings(Parameters):
-    """Settings of the clustering of facets; the paper has k = 2 and publishes no others."""
-
-    clusters: int = parameter(
-        0,
-        "The k of k-means: how many directions of roof planes there are (the paper: 2); 0 chooses it (k: auto).",
-        minimum=0,
-        maximum=32,
-    )
-    max_clusters: int = parameter(6, "Largest k that is tried where k is chosen.", minimum=1, maximum=32)
-    residual_weight: float = parameter(
-        2.0,
-        "The k is chosen by the silhouette plus this many times the share of points that lie on their planes.",
-        minimum=0.0,
-        maximum=100.0,
-    )
-    one_cluster_silhouette: float = parameter(
-        0.6, "What counts as the silhouette of a single cluster, which has none.", minimum=-1.0, maximum=1.0
-    )
-    facet_weights: str = parameter(
-        "area", "Whether large facets count more in the centres of clusters.", choices=("area", "equal")
-    )
-    starts: int = parameter(
-        8,
-        "Starts of k-means, of which the one with the least inertia counts: each leaves out one more of the farthest "
-        "normals, which may be alone.",
-        minimum=1,
-        maximum=1000,
-    )
-    kmeans_rounds: int = parameter(
-        100, "Most rounds of k-means; it ends when no facet changes.", unit="rounds", minimum=1, maximum=10_000
-    )
-    kmeans_work_limit: int = parameter(
-        2_000_000_000,
-        "Products of facets with centres, for each number of clusters tried, after which a building is too complex.",
-        minimum=1,
-        maximum=10**15,
-    )
-
-    def weights(self, areas_m2: FloatArray) -> FloatArray:
-        """Weight of every facet, (m,) float64."""
-        return areas_m2 if self.facet_weights == "area" else np.ones(len(areas_m2))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -7,42 +7,15 @@ between two layers; what both grids find is merged.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Reason
-from pipeline.parameters import Parameters, parameter
+from pipeline.segmentation.clustering_settings import ParameterBoxSettings
 
 _ROWS = 1 << 12
 """More than there can be rows of slope or columns of orientation."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ParameterBoxSettings(Parameters):
-    """Settings of the coarse clustering in three dimensions."""
-
-    box_slope_deg: float = parameter(7.0, "Edge of a box in slope.", unit="deg", minimum=0.1, maximum=90.0)
-    box_orientation_deg: float = parameter(
-        10.0, "Edge of a box in orientation; rounded so that the circle is a whole number of them.", unit="deg",
-        minimum=0.1, maximum=120.0,
-    )  # fmt: skip
-    box_o_distance_m: float = parameter(2.0, "Edge of a box in O-distance.", unit="m", minimum=0.01, maximum=1000.0)
-    dense_box_facets: int = parameter(
-        2,
-        "A box is dense where it holds more facets than this, and more than the mean of the filled boxes.",
-        unit="facets",
-        minimum=0,
-        maximum=100_000,
-    )
-    double_share: float = parameter(
-        0.5, "Two coarse clusters that share more than this of the smaller one are one.", minimum=0.0, maximum=1.0
-    )
-    max_coarse_clusters: int = parameter(
-        2000, "Coarse clusters beyond which a building is too complex.", minimum=1, maximum=10**6
-    )
 
 
 def coarse_clusters(parameters: FloatArray, settings: ParameterBoxSettings) -> tuple[LabelArray, ...]:

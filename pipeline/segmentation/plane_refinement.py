@@ -7,7 +7,6 @@ settings here.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import NamedTuple
 
@@ -16,102 +15,14 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import BoolArray, FloatArray, LabelArray, Plane, Reason
-from pipeline.parameters import Parameters, parameter
 from pipeline.segmentation.plane_merge import merge_planes, parallel_pairs_in_reach, touching_pairs
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums, cosine_of_slope, mean_square_residual
+from pipeline.segmentation.plane_settings import PlaneRefinementSettings
 from pipeline.segmentation.point_assignment import distance_to_plane, nearest_plane, vote_among_neighbours
 from pipeline.segmentation.redundant_planes import dissolve_redundant
 
 _MIN_SEED_POINTS = 4
 """In the first round a cluster may still be small: its points have not been assigned by planes yet."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PlaneRefinementSettings(Parameters):
-    """Settings of the refinement; the paper publishes none of them."""
-
-    rounds: int = parameter(5, "Rounds of regression, merging and assignment.", unit="rounds", minimum=1, maximum=50)
-    voting_passes: int = parameter(4, "Passes of assignment a round.", unit="passes", minimum=1, maximum=50)
-    vote_weight: float = parameter(
-        0.04, "Share of the largest squared distance that one vote of a neighbour outweighs.", minimum=0.0, maximum=1.0
-    )
-    assignment: str = parameter(
-        "neighbours",
-        "Which planes a point chooses among: those of its neighbours, or all planes of the building (the nearest).",
-        choices=("neighbours", "all_planes"),
-    )
-    min_area_m2: float = parameter(
-        1.5,
-        "A plane has at least as many points as this area holds in plan, within the two bounds below.",
-        unit="m2",
-        minimum=0.0,
-        maximum=1000.0,
-    )
-    min_points: int = parameter(6, "Fewest points of a plane, however sparse the cloud.", minimum=3, maximum=10_000)
-    max_min_points: int = parameter(
-        25, "Points that make a plane, however dense the cloud.", minimum=3, maximum=100_000
-    )
-    max_slope_deg: float = parameter(
-        70.0, "Planes steeper than this are no roof.", unit="deg", minimum=1.0, maximum=89.0
-    )
-    outlier_factor: float = parameter(
-        2.0,
-        "Points beyond this many times the threshold leave their cluster before it is fitted again.",
-        minimum=1.0,
-        maximum=100.0,
-    )
-    merge_residual_m: float = parameter(
-        0.10,
-        "Two clusters are one plane where it adds less systematic residual than this to both.",
-        unit="m",
-        minimum=0.0,
-        maximum=10.0,
-    )
-    merge_angle_deg: float = parameter(
-        12.0,
-        "Largest angle between two planes that merge; twice as much for small clusters.",
-        unit="deg",
-        minimum=0.0,
-        maximum=45.0,
-    )
-    small_cluster_points: int = parameter(
-        15, "Clusters with fewer points have a poorly known plane.", minimum=3, maximum=10_000
-    )
-    merge_reach_m: float = parameter(
-        10.0,
-        "Parts of one plane that do not touch merge up to this distance of their boxes in plan.",
-        unit="m",
-        minimum=0.0,
-        maximum=1e6,
-    )
-    plane_cost: float = parameter(
-        6.0,
-        "A plane stays if without it this many points more would be unexplained; a point that another plane explains "
-        "badly counts in part.",
-        unit="points",
-        minimum=0.0,
-        maximum=1e6,
-    )
-    refinement_work_limit: int = parameter(
-        200_000_000,
-        "Comparisons of planes with planes, and of points with all planes, after which a building is too complex.",
-        minimum=1,
-        maximum=10**15,
-    )
-
-    def fewest_points(self, spacing_m: float) -> int:
-        """Fewest points of a plane at a mean spacing in plan."""
-        if spacing_m * spacing_m * self.max_min_points <= self.min_area_m2:
-            return self.max_min_points
-        points = self.min_area_m2 / (spacing_m * spacing_m)
-        return int(min(max(points, self.min_points), self.max_min_points))
-
-    def cross_faults(self) -> list[str]:
-        """The fewest points must be a range."""
-        faults = super().cross_faults()
-        if self.min_points > self.max_min_points:
-            faults.append(f"min_points is {self.min_points}: use at most max_min_points, {self.max_min_points}")
-        return faults
 
 
 def refine_planes(

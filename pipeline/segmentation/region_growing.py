@@ -7,57 +7,17 @@ parallel faces of two roofs, becomes several regions.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.parameters import Parameters, parameter
 from pipeline.segmentation.plane_regression import N_SUMS, add_point, best_fit_plane, cosine_of_slope
+from pipeline.segmentation.plane_settings import RegionGrowingSettings
 
 WORK_LIMIT = 1_000_000_000
 """Looks at neighbours after which a building is too complex: points that hold no region are grown over once a seed."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RegionGrowingSettings(Parameters):
-    """Settings of region growing."""
-
-    growing_neighbours: int = parameter(
-        9, "Nearest points over which a region grows.", unit="points", minimum=3, maximum=64
-    )
-    growing_noises: float = parameter(
-        3.0,
-        "Distance up to which a region takes points, in standard deviations of the noise.",
-        minimum=0.1,
-        maximum=100.0,
-    )
-    min_growing_m: float = parameter(0.15, "Least such distance.", unit="m", minimum=0.001, maximum=10.0)
-    max_growing_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.001, maximum=10.0)
-    agreeing_share: float = parameter(
-        0.4,
-        "A point joins where at least this share of its neighbours lies as near to the plane.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    free_plane_points: int = parameter(
-        8, "Points from which on a region has a plane of its own, and no more its cluster's direction.", unit="points",
-        minimum=4, maximum=10_000,
-    )  # fmt: skip
-
-    def cross_faults(self) -> list[str]:
-        """The distances must be a range."""
-        faults = super().cross_faults()
-        if self.min_growing_m > self.max_growing_m:
-            faults.append(f"min_growing_m is {self.min_growing_m:g}: use at most max_growing_m, {self.max_growing_m:g}")
-        return faults
-
-    def growing_distance_m(self, sigma_m: float) -> float:
-        """Distance of a point from its plane for a noise."""
-        return min(max(self.growing_noises * sigma_m, self.min_growing_m), self.max_growing_m)
 
 
 def grow_regions(

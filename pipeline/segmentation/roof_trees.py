@@ -7,32 +7,7 @@ import dataclasses
 import numpy as np
 
 from pipeline.model import BoolArray, FloatArray, RoofType
-from pipeline.parameters import Parameters, parameter
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RoofTreeSettings(Parameters):
-    """Settings of both trees."""
-
-    flat_below_deg: float = parameter(
-        7.0,
-        "A single roof plane with less slope is flat, with more a pent roof.",
-        unit="deg",
-        minimum=0.0,
-        maximum=45.0,
-    )
-    opposite_tolerance_deg: float = parameter(
-        20.0, "Orientations about 180 degrees apart are so within this.", unit="deg", minimum=0.0, maximum=90.0
-    )
-    similar_slope_deg: float = parameter(
-        10.0, "Slopes of a pair among several clusters are similar within this.", unit="deg", minimum=0.0, maximum=90.0
-    )
-    pent_beside: str = parameter(
-        "below_origin",
-        "In three dimensions, a pent roof is the one cluster above the origin, whatever is left below it, or the one "
-        "cluster that is left at all.",
-        choices=("below_origin", "nothing"),
-    )
+from pipeline.segmentation.clustering_settings import RoofTreeSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -16,37 +16,7 @@ from pipeline.errors import BuildingError
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.union_find import numbered_sets, root_of, unite
 from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.parameters import Parameters, parameter
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SingleLinkageSettings(Parameters):
-    """Settings of the clustering in two dimensions."""
-
-    linkage_start_deg: float = parameter(
-        10.0, "Distance up to which two facets are linked, at first.", unit="deg", minimum=0.1, maximum=90.0
-    )
-    min_linkage_deg: float = parameter(4.0, "Least reasonable such distance.", unit="deg", minimum=0.1, maximum=90.0)
-    linkage_factor: float = parameter(
-        0.9, "The distance is multiplied by this while a cluster is too large.", minimum=0.1, maximum=0.99
-    )
-    largest_cluster_share: float = parameter(
-        0.8, "A cluster that holds more of all facets than this is too large.", minimum=0.1, maximum=1.0
-    )
-    min_members: int = parameter(6, "Fewest facets of a cluster.", unit="facets", minimum=1, maximum=100_000)
-    linkage_work_limit: int = parameter(
-        200_000_000, "Comparisons of facets after which a building is too complex.", minimum=1, maximum=10**15
-    )
-
-    def cross_faults(self) -> list[str]:
-        """The distances must be a range."""
-        faults = super().cross_faults()
-        if self.min_linkage_deg > self.linkage_start_deg:
-            faults.append(
-                f"min_linkage_deg is {self.min_linkage_deg:g}: use at most linkage_start_deg, "
-                f"{self.linkage_start_deg:g}"
-            )
-        return faults
+from pipeline.segmentation.clustering_settings import SingleLinkageSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

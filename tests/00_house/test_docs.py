@@ -15,7 +15,7 @@ import pytest
 from pipeline.batch.batch_file import read_batch
 from pipeline.export.records import SCHEMAS
 from pipeline.io import SpatialReference
-from pipeline.methods.fuzzy_sart import FuzzySartSettings
+from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import REASONS, Reason, RoofType, Status
 from pipeline.roof.roof_type import RoofTypeSettings
 from pipeline.roof.settings import RoofSettings

@@ -13,14 +13,9 @@ from hypothesis import strategies as st
 from pipeline.errors import SettingsError
 from pipeline.geometry import nearest_neighbours, point_spacing_m
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.segmentation.adaptive_planes import (
-    AdaptivePlaneSettings,
-    DetectedPlanes,
-    detect_planes,
-    mean_nodes,
-    merge_by_f_test,
-)
+from pipeline.segmentation.adaptive_planes import DetectedPlanes, detect_planes, mean_nodes, merge_by_f_test
 from pipeline.segmentation.plane_regression import cluster_sums
+from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 from pipeline.segmentation.trial_regions import local_planes, noise_of_local_planes, take_regions
 
 LENGTH_M, WIDTH_M = 20.0, 12.0

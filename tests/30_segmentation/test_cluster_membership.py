@@ -10,12 +10,8 @@ import pytest
 
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, Reason
-from pipeline.segmentation.cluster_membership import (
-    ClusterMembershipSettings,
-    may_be_roof,
-    refine_clusters,
-    spreads,
-)
+from pipeline.segmentation.cluster_membership import may_be_roof, refine_clusters, spreads
+from pipeline.segmentation.clustering_settings import ClusterMembershipSettings
 from pipeline.segmentation.facet_parameters import about_barycentre, facet_parameters
 from pipeline.tin.delaunay import triangulate
 

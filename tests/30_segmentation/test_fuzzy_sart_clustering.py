@@ -14,13 +14,8 @@ from hypothesis import strategies as st
 
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.model import FloatArray, Reason
-from pipeline.segmentation.fuzzy_sart import (
-    FuzzySartClusteringSettings,
-    centre_of_building,
-    cluster,
-    facet_vectors,
-    vector_degree_of_match,
-)
+from pipeline.segmentation.clustering_settings import FuzzySartClusteringSettings
+from pipeline.segmentation.fuzzy_sart import centre_of_building, cluster, facet_vectors, vector_degree_of_match
 
 coordinate = st.floats(-100, 100, allow_nan=False).filter(lambda value: abs(value) > 1e-3)
 vector = st.tuples(coordinate, coordinate, coordinate)

@@ -12,9 +12,9 @@ from sklearn.metrics import silhouette_score
 
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, LabelArray, Reason
+from pipeline.segmentation.clustering_settings import NormalClusteringSettings
 from pipeline.segmentation.facet_smoothing import passes_for_noise, smoothed_normals
 from pipeline.segmentation.kmeans_normals import (
-    NormalClusteringSettings,
     choose_clusters,
     cluster_normals,
     farthest_point_start,

@@ -9,7 +9,8 @@ import pytest
 
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, Reason
-from pipeline.segmentation.parameter_boxes import ParameterBoxSettings, coarse_clusters
+from pipeline.segmentation.clustering_settings import ParameterBoxSettings
+from pipeline.segmentation.parameter_boxes import coarse_clusters
 
 PAPER = ParameterBoxSettings(dense_box_facets=5)
 

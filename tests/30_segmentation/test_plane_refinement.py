@@ -11,7 +11,8 @@ import pytest
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.segmentation.plane_refinement import PlaneRefinementSettings, describe_planes, refine_planes
+from pipeline.segmentation.plane_refinement import describe_planes, refine_planes
+from pipeline.segmentation.plane_settings import PlaneRefinementSettings
 
 
 def gable(seed: int = 0, count: int = 400, noise: float = 0.03, rise: float = 0.5) -> tuple[FloatArray, LabelArray]:

@@ -8,7 +8,8 @@ from scipy.cluster.hierarchy import fcluster, linkage
 
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.segmentation.single_linkage import SingleLinkageSettings, cluster_by_linkage, link
+from pipeline.segmentation.clustering_settings import SingleLinkageSettings
+from pipeline.segmentation.single_linkage import cluster_by_linkage, link
 
 
 def same_partition(a: LabelArray, b: LabelArray) -> bool:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BuildingError, SettingsError
-from pipeline.methods.fuzzy_sart import FuzzySartSettings, segment
+from pipeline.methods.fuzzy_sart import segment
+from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import Candidate, FloatArray, LabelArray, Reason
 
 

@@ -16,8 +16,9 @@ import shapely
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.geometry import vertical_residuals_m
 from pipeline.methods import METHODS, ReconstructSettings
-from pipeline.methods.kmeans import KMeansSettings, building_top, cluster_facets, segment
+from pipeline.methods.kmeans import building_top, cluster_facets, segment
 from pipeline.methods.local_frame import local_metres
+from pipeline.methods.settings import KMeansSettings
 from pipeline.model import Candidate, FloatArray, Reason, RoofType, Segmentation, Status
 from pipeline.quality.validity import check_solid
 from pipeline.reconstruct import reconstruct_building

@@ -15,12 +15,8 @@ import pytest
 
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.methods import METHODS
-from pipeline.methods.parameter_space import (
-    ParameterSpace2dSettings,
-    ParameterSpace3dSettings,
-    segment_2d,
-    segment_3d,
-)
+from pipeline.methods.parameter_space import segment_2d, segment_3d
+from pipeline.methods.settings import ParameterSpace2dSettings, ParameterSpace3dSettings
 from pipeline.model import Candidate, FloatArray, Reason, RoofType, Segmentation
 from pipeline.settings import RunSettings
 

@@ -10,7 +10,7 @@ import shapely
 
 from pipeline.errors import SettingsError
 from pipeline.methods import METHODS, ReconstructSettings, method_named
-from pipeline.methods.roof_faces import RoofFaceSettings
+from pipeline.methods.settings import RoofFaceSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, RoofType, Status
 from pipeline.reconstruct import reconstruct_building
 from pipeline.settings import RunSettings

@@ -25,7 +25,7 @@ from pipeline.cli import app
 from pipeline.errors import SettingsError, UnreadableInputError
 from pipeline.io.crs import SpatialReference
 from pipeline.methods import ReconstructSettings
-from pipeline.methods.fuzzy_sart import FuzzySartSettings
+from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import Candidate, Status
 from pipeline.reconstruct import reconstruct_building
 from pipeline.roof.settings import ArrangementSettings, RoofSettings

@@ -57,12 +57,9 @@ def start_early(job: Job, *, workers: int | None, scheduler: str | None, footpri
         return
     # what this process needs, too, is loaded before the server is forked from it: nearly every job reads LAS
     import pipeline.io.las  # noqa: F401
-    from pipeline.methods import METHODS
     from pipeline.runtime.isolation.child_pool import preload
 
-    if job == "reconstruct":
-        METHODS.get(method or _METHOD)
-        if footprints:
-            import pyarrow as pa  # noqa: F401 - what reads footprints loads both
+    if job == "reconstruct" and footprints:
+        import pyarrow as pa  # noqa: F401 - what reads footprints loads both
 
     preload(loads_of(job, footprints=footprints, method=method))
