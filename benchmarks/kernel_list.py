@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from pipeline.compiler.signatures import written
+from pipeline.compiler.signatures import to_json
 from pipeline.compiler.store import ENDING, Stored
 from pipeline.compiler.warm_up import LIST, Listed, write_list
 
@@ -57,13 +57,13 @@ def compiled(folder: Path) -> dict[str, Listed]:
     found = {}
     for path in folder.glob(f"*{ENDING}"):
         content = path.read_bytes()
-        stored = Stored.unpacked(content, Stored.fingerprint_of(content))
+        stored = Stored.from_bytes(content, Stored.fingerprint_of(content))
         if stored is None or not stored.machine_code:
             continue
         function, _, signature, *_ = pickle.loads(stored.facts)
         found[path.name] = Listed(
             kernel=f"{function.modname}:{function.qualname}",
-            arguments=[written(kind) for kind in signature.args],
+            arguments=[to_json(kind) for kind in signature.args],
             weight=-(-len(content) // 1000),
         )
     return found

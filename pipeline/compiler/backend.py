@@ -1,13 +1,12 @@
-"""How numba compiles our kernels: the one module that knows numba's inside.
+"""How numba compiles our kernels: the only module that uses numba's internals.
 
 A kernel that only other kernels call needs no machine code of its own: its callers link its code and optimise it
-together with theirs. numba makes machine code and wrappers for each all the same, and optimises each by itself; so it
-does for its own helpers (`np.argsort` and the like). Here code is optimised and generated only for what is called from
-Python. What is compiled is kept in files of ours (`pipeline.compiler.store`) under fingerprints that cover callees.
+together with theirs. numba nevertheless makes machine code and wrappers for each kernel, and for its own helpers
+(`np.argsort` and the like). Here code is optimised and generated only for kernels that Python calls. Compiled kernels
+are stored in our own files (`pipeline.compiler.store`) under fingerprints that cover their callees.
 
-It is written against the versions in `KNOWN`. With any other numba, or with `GABLEWORK_PLAIN_NUMBA` set, kernels are
-`numba.njit(cache=True)`, whose files are stamped with the same fingerprints, and nothing more: slower to compile, equal
-in what they compute.
+The module is written for the versions in `KNOWN`. With any other numba, or with `GABLEWORK_PLAIN_NUMBA` set, kernels
+are plain `numba.njit(cache=True)`, whose files carry the same fingerprints: slower to compile, with equal results.
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ from pipeline.compiler.store import Stored
 
 types: Any = numba.types
 KNOWN = ("0.68.",)
-"""Versions of numba whose inside is known."""
+"""Versions of numba whose internals this module knows."""
 COMMON_OPTIONS = {"nopython": True, "nogil": True}
-"""Of all kernels."""
-# before numba makes its code generator, which asks for them once
+"""Options of all kernels."""
+# set before numba makes its code generator, which reads them once
 config.CPU_NAME = processor()
 if config.CPU_NAME == GENERIC:
     config.CPU_FEATURES = ""
@@ -50,16 +49,16 @@ _PLAIN = "GABLEWORK_PLAIN_NUMBA"
 
 
 def is_known() -> bool:
-    """Whether kernels are compiled in our way."""
+    """Whether this module compiles kernels, not plain numba."""
     return numba.__version__.startswith(KNOWN) and not os.environ.get(_PLAIN)
 
 
 @functools.cache
-def _say_unknown() -> None:
+def _warn_unknown() -> None:
     """Warn once that everything is slower to compile."""
     warnings.warn(
-        f"numba {numba.__version__} is not one of those that gablework knows ({', '.join(KNOWN)}x): it compiles all "
-        "kernels in its own way, which takes three times as long, and loads none that were compiled ahead",
+        f"gablework does not know numba {numba.__version__} (it knows {', '.join(KNOWN)}x): kernels are compiled in "
+        "numba's own way, which takes three times as long, and none that were compiled ahead are loaded",
         RuntimeWarning,
         stacklevel=3,
     )
@@ -68,7 +67,7 @@ def _say_unknown() -> None:
 def dispatcher_of(
     function: Callable[..., Any], options: Mapping[str, Any], prefix: str, fingerprint: Callable[[], bytes]
 ) -> Any:
-    """Numba's object for a kernel; the function itself where numba is switched off (`NUMBA_DISABLE_JIT`).
+    """Numba's object for a kernel; the function itself if numba is switched off (`NUMBA_DISABLE_JIT`).
 
     Parameters
     ----------
@@ -77,17 +76,17 @@ def dispatcher_of(
     options : mapping
         Options beyond the common ones.
     prefix : str
-        With which the names of the kernel's files begin.
+        Start of the names of the kernel's files.
     fingerprint : callable
-        Tells the kernel's fingerprint; asked when a file is looked for.
+        Returns the kernel's fingerprint; called when a file is looked up.
     """
     if config.DISABLE_JIT:
         return function
     if not is_known():
         if not os.environ.get(_PLAIN):
-            _say_unknown()
+            _warn_unknown()
         made = numba.njit(cache=True, nogil=True, **options)(function)
-        # in place of a stamp of the kernel's own file: an edited callee counts, too
+        # instead of a stamp of the kernel's own file: an edited callee counts, too
         made._cache._cache_file._source_stamp = fingerprint().hex()
         return made
     _prepare()
@@ -98,7 +97,7 @@ def dispatcher_of(
 
 
 def _prepare() -> None:
-    """Set numba up before its first kernel: code for every processor of this kind, and our libraries."""
+    """Set numba up before its first kernel: code for every processor of this kind, and our code libraries."""
     context = registry.cpu_target.target_context
     if getattr(context, "gablework", False):
         return
@@ -107,7 +106,7 @@ def _prepare() -> None:
     make_executable = context.get_executable
 
     def get_executable(library: Any, fndesc: Any, environment: Any) -> Any:
-        """A C function; for what has no wrapper nothing that could be called."""
+        """The C function of a kernel; `_no_code` for one without a wrapper."""
         flags = ConfigStack.top_or_none()
         if flags is not None and flags.no_cpython_wrapper:
             return _no_code()
@@ -118,7 +117,7 @@ def _prepare() -> None:
     dynamic_address = context.add_dynamic_addr
 
     def add_dynamic_addr(builder: Any, address: int, info: str) -> Any:
-        """An address of this process in the code, which cannot be kept then; none for a kernel that is only called."""
+        """Put an address of this process into the code, which then cannot be stored; null for a called kernel."""
         if info == "Kernel":
             return cgutils.voidptr_t(None)
         return dynamic_address(builder, address, info)
@@ -126,7 +125,7 @@ def _prepare() -> None:
     build = templates._OverloadFunctionTemplate._get_impl
 
     def get_implementation(template: Any, args: Any, kws: Any) -> Any:
-        """Find a helper of numba: the same for callers with a wrapper and without one, which numba tells apart."""
+        """Find a helper of numba: the same one for callers with and without a wrapper."""
         flags = ConfigStack.top_or_none()
         if flags is None or flags.no_cpython_wrapper:
             return build(template, args, kws)
@@ -144,26 +143,26 @@ def _prepare() -> None:
 
 
 def _no_wrapper(*of_function: Any) -> None:
-    """Make no wrapper for callers in C; there are none."""
+    """Make no wrapper for C, which calls no kernel."""
 
 
 _NOTHING = Environment({})
-"""Stands for all environments that hold nothing."""
+"""Used for every empty environment."""
 
 
 def _no_code() -> Any:
-    """What stands where numba wants a C function, and each time another: numba knows compiled functions by them.
+    """A placeholder where numba wants a C function, new each time, since numba identifies functions by it.
 
-    It takes no arguments and there is nothing to pop, so a call would raise in any case.
+    Calling it raises: it takes no arguments and the dictionary is empty.
     """
     return {}.popitem
 
 
 def _environments(library: Any) -> tuple[tuple[Any, ...], tuple[str, ...]]:
-    """The environments that a library's code refers to: those that hold constants, and the names of the others.
+    """The environments that a library's code refers to: those with constants, and the names of the others.
 
-    An environment knows its module, so to load one imports that; numba's own modules take a tenth of a second. Most
-    hold nothing, and any other empty one does as well.
+    An environment refers to its module, which loading imports; numba's own modules take a tenth of a second. Most
+    environments are empty, and one empty environment serves for all.
     """
     names = [v.name for v in library._final_module.global_variables if v.name.startswith(_ENVIRONMENTS)]
     found = {name: compiler.lookup_environment(name) for name in names}
@@ -172,10 +171,10 @@ def _environments(library: Any) -> tuple[tuple[Any, ...], tuple[str, ...]]:
 
 
 def _set_environments(library: Any, full: Iterable[Any], empty: Iterable[str]) -> None:
-    """Have a library's code, which is loaded, find its environments.
+    """Point a library's loaded code to its environments.
 
-    All code of a process shares one pointer per name. A kernel that kernels call has no constants; made callable from
-    Python it has some, under the same name: what is set already stays.
+    All code of a process shares one pointer per name. A kernel called by kernels has no constants; made callable from
+    Python it has some under the same name, so an empty environment never replaces another one.
     """
     for one in full:
         library.codegen.set_env(one.env_name, one)
@@ -186,14 +185,14 @@ def _set_environments(library: Any, full: Iterable[Any], empty: Iterable[str]) -
 
 
 class _Library(codegen.JITCodeLibrary):
-    """Code that is only linked until its address is asked for."""
+    """Code that is only linked until its address is needed."""
 
     _has_code = False
     _shared_module: Any
     _bitcode: bytes | None = None
 
     def finalize(self) -> None:
-        """Link what it calls, and no more."""
+        """Link the code that it calls, without optimising it."""
         self._raise_if_finalized()
         seen = set()
         for library in self._linking_libraries:
@@ -205,22 +204,22 @@ class _Library(codegen.JITCodeLibrary):
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """The address of a function; its code is generated now if it was not."""
+        """The address of a function; generates its code if necessary."""
         self._ensure_finalized()
         if not self._has_code:
             self._has_code = True
             self._optimize_final_module()
             self._final_module.verify()
-            # asked again: what nothing uses is gone now
+            # collected again, without what the optimisation removed
             self._dynamic_globals.clear()
             self._finalize_final_module()
         address: int = super().get_pointer_to_function(name)
         return address
 
-    def load(self, stored: Stored, defined: tuple[str, ...]) -> None:
-        """Take the code of a file."""
+    def load(self, stored: Stored, defined: tuple[str, ...], *, runnable: bool) -> None:
+        """Take the code of a file; the machine code only if it is to run."""
         self._bitcode = stored.bitcode
-        if stored.machine_code:
+        if runnable:
             self._has_code = True
             self.enable_object_caching()
             self._set_compiled_object(stored.machine_code)
@@ -240,7 +239,7 @@ class _Library(codegen.JITCodeLibrary):
 
 
 class _Depth(threading.local):
-    """How many kernels this thread is compiling inside one another."""
+    """Nesting depth of the kernels that this thread is compiling."""
 
     value = 0
 
@@ -249,19 +248,19 @@ _DEPTH = _Depth()
 
 
 def _without_wrappers(flags: Any) -> Any:
-    """Numba's flags for a kernel: only what Python calls gets a wrapper, and nothing one for C."""
+    """Numba's flags for a kernel: only one that Python calls gets a wrapper."""
     flags.no_cpython_wrapper = _DEPTH.value > 1
     return flags
 
 
 def _common(kind: Any) -> Any:
-    """The type that stands for all of its kind: int64 for signed integers, no literals."""
+    """The common type of similar ones: int64 for signed integers, no literals."""
     kind = types.unliteral(kind)
     return types.int64 if isinstance(kind, types.Integer) and kind.signed else kind
 
 
 def _fields_in(kinds: Iterable[Any]) -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """The named tuples among types: numba tells them by the types of their fields alone."""
+    """The named tuples among types, which numba identifies only by the types of their fields."""
     for kind in kinds:
         if isinstance(kind, types.BaseNamedTuple):
             one = kind.instance_class
@@ -271,7 +270,7 @@ def _fields_in(kinds: Iterable[Any]) -> Iterator[tuple[str, str, tuple[str, ...]
 
 
 class KernelDispatcher(registry.CPUDispatcher):
-    """numba's dispatcher with files of ours."""
+    """numba's dispatcher with our files."""
 
     def __init__(
         self, function: Callable[..., Any], options: Mapping[str, Any], prefix: str, fingerprint: Callable[[], bytes]
@@ -283,14 +282,14 @@ class KernelDispatcher(registry.CPUDispatcher):
         self._callable: set[tuple[Any, ...]] = set()
 
     def _compilation_chain_init_hook(self) -> None:
-        """Look for no extensions of numba; there are none that we know."""
+        """Look for no extensions of numba; we use none."""
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """How another kernel calls this one: numbers as one type each, so that it is compiled once."""
+        """How another kernel calls this one: with one type per kind of number, so it is compiled once."""
         return super().get_call_template(tuple(map(_common, args)), {name: _common(kind) for name, kind in kws.items()})
 
     def compile(self, sig: Any) -> Any:
-        """Load or compile the kernel for a signature; its C function where Python asks."""
+        """Load or compile the kernel for a signature; returns its C function if Python calls it."""
         arguments, _ = sigutils.normalize_signature(sig)
         with global_compiler_lock, self._compiling_counter:
             for_python = _DEPTH.value == 0
@@ -299,33 +298,35 @@ class KernelDispatcher(registry.CPUDispatcher):
             name = self._prefix + self._suffix(arguments)
             if not self._load(name, arguments, for_python=for_python):
                 with store.claimed(name):
-                    # another process may have compiled it meanwhile
+                    # another process may have compiled it in the meantime
                     if not self._load(name, arguments, for_python=for_python):
                         self._compile(name, arguments, for_python=for_python)
             return self.overloads[arguments].entry_point
 
     @staticmethod
     def _suffix(arguments: tuple[Any, ...]) -> str:
-        """Tells files of one kernel apart: by signature and processor."""
+        """Distinguishes the files of one kernel, by signature and processor."""
         processor = registry.cpu_target.target_context.codegen().magic_tuple()
-        told = repr((str(arguments), [*_fields_in(arguments)], processor))
-        return hashlib.sha256(told.encode()).hexdigest()[:16]
+        facts = repr((str(arguments), [*_fields_in(arguments)], processor))
+        return hashlib.sha256(facts.encode()).hexdigest()[:16]
 
     def _load(self, name: str, arguments: tuple[Any, ...], *, for_python: bool) -> bool:
-        """Load the kernel if there is a file of it that serves."""
+        """Load the kernel if a suitable file of it exists.
+
+        For another kernel only its bitcode: while that one is compiled, numba makes no function that Python can call.
+        """
         stored = store.load(name, self._fingerprint(), runnable=for_python)
         if stored is None:
             return False
         fndesc, environment, signature, reload_init, environments, defined = pickle.loads(stored.facts)  # noqa: S301
-        for again in reload_init:
-            again()
+        for initialise in reload_init:
+            initialise()
         if not for_python:
             self.targetctx.refresh()
         library = self.targetctx.codegen().create_library(fndesc.qualname)
-        library.load(stored, defined)
-        runnable = bool(stored.machine_code)
-        entry = self.targetctx.get_executable(library, fndesc, environment) if runnable else _no_code()
-        if runnable:
+        library.load(stored, defined, runnable=for_python)
+        entry = self.targetctx.get_executable(library, fndesc, environment) if for_python else _no_code()
+        if for_python:
             _set_environments(library, *environments)
         self._take(
             arguments,
@@ -342,18 +343,18 @@ class KernelDispatcher(registry.CPUDispatcher):
                 reload_init=reload_init,
                 referenced_envs=environments[0],
             ),
-            runnable=runnable,
+            runnable=for_python,
         )
         self.targetctx.insert_user_function(entry, fndesc, [library])
         return True
 
     def _compile(self, name: str, arguments: tuple[Any, ...], *, for_python: bool) -> None:
-        """Compile the kernel, and keep it."""
+        """Compile the kernel and store it."""
         known = self.overloads.get(arguments)
         if known is not None:
             result = self._with_wrapper(known)
         else:
-            store.say_what_does_not_fit(self._prefix)
+            store.warn_of_misfits(self._prefix)
             compiling = functools.partial(self._compiled, arguments)
             result = compiling() if _DEPTH.value else with_room_for_frames(compiling)
         self._take(arguments, result, runnable=for_python)
@@ -376,7 +377,7 @@ class KernelDispatcher(registry.CPUDispatcher):
         store.save(name, self._fingerprint(), Stored(facts=serialize.dumps(facts), machine_code=code, bitcode=bitcode))
 
     def _compiled(self, arguments: tuple[Any, ...]) -> Any:
-        """What numba makes of the kernel, and of what it calls on the way."""
+        """Numba's result for the kernel; compiles its callees, too."""
         _DEPTH.value += 1
         try:
             details = {"dispatcher": self, "args": arguments, "return_type": None}
@@ -386,14 +387,14 @@ class KernelDispatcher(registry.CPUDispatcher):
             _DEPTH.value -= 1
 
     def _with_wrapper(self, known: Any) -> Any:
-        """A kernel that kernels called so far, made callable from Python."""
+        """Make a kernel that only kernels called so far callable from Python."""
         context = self.targetctx.subtarget(environment=known.environment, fndesc=known.fndesc, enable_nrt=True)
         library = context.codegen().create_library(known.fndesc.qualname)
         library.enable_object_caching()
         context.create_cpython_wrapper(library, known.fndesc, known.environment, None, release_gil=True)
         library.add_linking_library(known.library)
         entry = context.get_executable(library, known.fndesc, known.environment)
-        # numba finds a compiled function by its C function, which is another one now
+        # numba finds a compiled function by its C function, which has changed
         self.targetctx.insert_user_function(entry, known.fndesc, [library])
         return known._replace(library=library, entry_point=entry)
 

@@ -1,8 +1,8 @@
-"""The fingerprint of a kernel: a hash of all that its machine code depends on.
+"""The fingerprint of a kernel: a hash of everything that its machine code depends on.
 
-It covers the kernel's own bytecode and constants, the values of the globals that it names, and the same of every
-kernel that it calls, directly or not. Comments, docstrings, blank lines and edits elsewhere in a file leave it as it
-was; an edit of a callee in another file changes it. numba itself looks at the kernel's own file alone.
+It covers the kernel's bytecode and constants, the values of the globals that it names, and the same of every kernel
+that it calls, directly or not. Comments, docstrings, blank lines and edits elsewhere in a file do not change it; an
+edit of a callee in another file does. numba itself looks only at the kernel's own file.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ def fingerprint(function: Callable[..., Any], options: Mapping[str, Any], source
     function : callable
         The plain function of the kernel.
     options : mapping
-        With which it is compiled.
+        Options of its compilation.
     source_of : callable
-        Function and options of a value that is a kernel; None of any other value.
+        Returns function and options of a kernel; None for any other value.
 
     Returns
     -------
     bytes
-        Equal for equal code on every machine; it depends on the minor version of Python, whose bytecode it hashes.
+        Equal for equal code on every machine with the same minor version of Python, whose bytecode it hashes.
     """
     found: dict[str, bytes] = {}
     waiting: list[Kerneled] = [(function, options)]
@@ -60,7 +60,7 @@ SourceOf = Callable[[Any], Kerneled | None]
 
 
 _KNOWN: dict[Callable[..., Any], tuple[bytes, tuple[Kerneled, ...]]] = {}
-"""Hashes of kernels' own code, and what they call, by function: many kernels call the same."""
+"""Hash of the own code and callees of each function: many kernels share callees."""
 
 
 class _Own:
@@ -79,7 +79,7 @@ class _Own:
         return self._hash.digest()
 
     def value(self, value: Any) -> str:
-        """A text that changes whenever the value may compile to other code."""
+        """A text that changes whenever the value may compile to different code."""
         kernel = self._source_of(value)
         if kernel is not None:
             self.calls.append(kernel)
@@ -113,7 +113,7 @@ class _Own:
 
 
 def _of_function(function: Callable[..., Any], own: _Own) -> Iterator[str]:
-    """What is to be hashed of a function: code, defaults, closure and the globals that it names."""
+    """The texts to hash for a function: code, defaults, closure and the globals that it names."""
     code = function.__code__
     names: set[str] = set()
     yield from _of_code(code, own, names, documented=function.__doc__)
@@ -128,7 +128,7 @@ def _of_function(function: Callable[..., Any], own: _Own) -> Iterator[str]:
 
 
 def _of_code(code: types.CodeType, own: _Own, names: set[str], documented: str | None = None) -> Iterator[str]:
-    """What is to be hashed of compiled Python, without its place in the file and without its docstring."""
+    """The texts to hash for compiled Python: neither its place in the file nor its docstring."""
     names.update(code.co_names)
     yield f"{code.co_code.hex()} {code.co_flags} {code.co_argcount}"
     yield repr((code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars))
@@ -140,5 +140,5 @@ def _of_code(code: types.CodeType, own: _Own, names: set[str], documented: str |
 
 
 def _file_hash(value: Any) -> str:
-    """The hash of the file that defines a value's class, for values that nobody foresaw."""
+    """The hash of the file that defines a value's class, for values of any other kind."""
     return hashlib.sha256(Path(inspect.getfile(type(value))).read_bytes()).hexdigest()

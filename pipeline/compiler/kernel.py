@@ -25,7 +25,7 @@ class Kernel:
     Parameters
     ----------
     function : callable
-        What is to be compiled.
+        The function to compile.
     options : mapping
         Options of `numba.njit` beyond the common ones.
     """
@@ -37,60 +37,60 @@ class Kernel:
 
     @functools.cached_property
     def fingerprint(self) -> bytes:
-        """A hash of all that the machine code depends on but for signature and processor, 32 bytes."""
+        """A hash of everything that the machine code depends on except signature and processor, 32 bytes."""
         return hashlib.sha256(_versions() + fingerprint(self.py_func, self.options, _source_of)).digest()
 
     @property
     def prefix(self) -> str:
-        """With which the names of its files begin."""
+        """Start of the names of its files."""
         place = f"{sys.implementation.cache_tag}-{os.uname().machine}-{processor()}"
         return f"{self.py_func.__module__}.{self.py_func.__qualname__}.{place}-"
 
     @property
     def is_compiled(self) -> bool:
-        """Whether there is a file of it, of whatever signature; numba is not asked."""
-        return is_off() or store.is_kept(self.prefix, self.fingerprint)
+        """Whether a file of it exists, for any signature; does not import numba."""
+        return is_off() or store.is_stored(self.prefix, self.fingerprint)
 
     @functools.cached_property
     def dispatcher(self) -> Any:
-        """Numba's own object; the function itself where numba is switched off."""
+        """Numba's own object; the function itself if numba is switched off."""
         from pipeline.compiler.backend import dispatcher_of
 
         return dispatcher_of(self.py_func, self.options, self.prefix, lambda: self.fingerprint)
 
-    # numba's object is called without a frame of Python between: buildings call kernels by the hundred
+    # calls numba's object without a Python frame in between: a building makes hundreds of calls
     __call__ = property(operator.attrgetter("dispatcher"))
 
     @property
     def targetoptions(self) -> Mapping[str, Any]:
-        """Where numba looks for `inline`."""
+        """Options that numba reads for `inline`."""
         return self.options
 
     @property
     def _numba_type_(self) -> Any:
-        """What numba takes for the type of this kernel in another one."""
+        """The type that numba gives this kernel inside another one."""
         return self.dispatcher._numba_type_
 
     def __reduce__(self) -> str:
-        """Kernels travel by name."""
+        """Pickle a kernel by name."""
         return self.py_func.__qualname__
 
 
 def is_off() -> bool:
-    """Whether nothing is to be compiled, as numba reads `NUMBA_DISABLE_JIT`."""
+    """Whether compilation is switched off, as numba reads `NUMBA_DISABLE_JIT`."""
     return os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 
 
 @functools.cache
 def _versions() -> bytes:
-    """What tells versions of numba and llvmlite apart, without importing them."""
-    told = b""
+    """The version files of numba and llvmlite, read without importing the packages."""
+    content = b""
     for name in ("numba", "llvmlite"):
         found = importlib.util.find_spec(name)
         assert found is not None
         assert found.origin is not None
-        told += Path(found.origin).with_name("_version.py").read_bytes()
-    return told
+        content += Path(found.origin).with_name("_version.py").read_bytes()
+    return content
 
 
 def _source_of(value: Any) -> Kerneled | None:
@@ -113,17 +113,17 @@ def kernel(*, inline: Literal["always"]) -> Callable[[Function], Function]: ...
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Have numba compile a function; used bare, or with one option.
+    """Let numba compile a function; used bare, or with one option.
 
     Parameters
     ----------
     function : callable
-        It calls nothing but other kernels and what numba knows.
+        Calls only other kernels and functions that numba knows.
     fastmath : set of str
         Liberties with floating point that LLVM may take.
     inline : {'always'}
-        Its lines become lines of the kernels that call it, and it is not compiled itself: for a few lines with one or
-        two callers. LLVM makes the same of either, but a kernel costs a tenth of a second to compile.
+        Copies its lines into the kernels that call it; it is not compiled itself. For a few lines with one or two
+        callers. LLVM makes the same code either way, but a kernel costs a tenth of a second to compile.
     """
     if function is None:
         return lambda decorated: Kernel(decorated, options)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 
 GENERIC = "generic"
-"""Any of this machine's architecture. Such code is as fast as that for the very processor, gives the same last bits on
-all of them, and its files can be carried from machine to machine."""
+"""Any processor of this architecture. Such code is as fast as code for the exact processor, gives the same last bits on
+all of them, and its files can be copied from machine to machine."""
 
 
 def processor() -> str:
-    """LLVM's name of the processor, `GENERIC` unless `NUMBA_CPU_NAME` says otherwise."""
+    """LLVM's name of the processor: `NUMBA_CPU_NAME`, or `GENERIC`."""
     return os.environ.get("NUMBA_CPU_NAME") or GENERIC

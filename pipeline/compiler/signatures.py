@@ -1,9 +1,9 @@
-"""Signatures of kernels as JSON, so that kernels can be compiled before anything calls them.
+"""Signatures of kernels as JSON, used to compile kernels before anything calls them.
 
-| type | written |
+| type | JSON |
 | --- | --- |
 | number, boolean, none | its name: `"float64"` |
-| array | `["float64", 2, "C"]`: items, dimensions, layout; and `"readonly"` where it is |
+| array | `["float64", 2, "C"]`: items, dimensions, layout; then `"readonly"` if it is |
 | record, the item of an array | `{"record": [["x", "<i8"], ...]}`: numpy's description of it |
 | tuple | `{"tuple": [...]}` |
 | named tuple | `{"class": "module:Name", "fields": [...]}` |
@@ -24,8 +24,8 @@ from pipeline.compiler.kernel import Kernel
 types: Any = numba.types
 
 
-def written(kind: Any) -> Any:
-    """A type of numba's as JSON.
+def to_json(kind: Any) -> Any:
+    """A numba type as JSON.
 
     Raises
     ------
@@ -33,41 +33,41 @@ def written(kind: Any) -> Any:
         No kernel takes such an argument yet: add it here.
     """
     if isinstance(kind, types.Array):
-        return [written(kind.dtype), kind.ndim, kind.layout, *(() if kind.mutable else ("readonly",))]
+        return [to_json(kind.dtype), kind.ndim, kind.layout, *(() if kind.mutable else ("readonly",))]
     if isinstance(kind, types.BaseNamedTuple):
         named = kind.instance_class
-        return {"class": f"{named.__module__}:{named.__qualname__}", "fields": [written(one) for one in kind]}
+        return {"class": f"{named.__module__}:{named.__qualname__}", "fields": [to_json(one) for one in kind]}
     if isinstance(kind, types.BaseTuple):
-        return {"tuple": [written(one) for one in kind]}
+        return {"tuple": [to_json(one) for one in kind]}
     if isinstance(kind, types.Record):
         return {"record": np.lib.format.dtype_to_descr(as_dtype(kind))}
     if isinstance(kind, types.Omitted):
         return {"default": kind.value}
     if isinstance(kind, types.Number | types.Boolean | types.NoneType):
         return str(kind)
-    raise TypeError(f"{kind} is written in no way yet")
+    raise TypeError(f"{kind} has no JSON form yet")
 
 
-def read(told: Any) -> Any:
-    """The type of numba's that `written` wrote.
+def from_json(document: Any) -> Any:
+    """The numba type that `to_json` wrote.
 
-    >>> print(read(["float64", 2, "C", "readonly"]), read({"tuple": ["int64", "boolean"]}))
+    >>> print(from_json(["float64", 2, "C", "readonly"]), from_json({"tuple": ["int64", "boolean"]}))
     readonly array(float64, 2d, C) Tuple(int64, bool)
     """
-    if isinstance(told, str):
-        return getattr(types, {"bool": "boolean"}.get(told, told))
-    if isinstance(told, list):
-        items, dimensions, layout, *readonly = told
-        return types.Array(read(items), dimensions, layout, readonly=bool(readonly))
-    if "record" in told:
-        return numba.from_dtype(np.lib.format.descr_to_dtype([tuple(field) for field in told["record"]]))
-    if "default" in told:
-        return types.Omitted(told["default"])
-    if "tuple" in told:
-        return types.BaseTuple.from_types([read(one) for one in told["tuple"]])
-    module, name = told["class"].split(":")
+    if isinstance(document, str):
+        return getattr(types, {"bool": "boolean"}.get(document, document))
+    if isinstance(document, list):
+        items, dimensions, layout, *readonly = document
+        return types.Array(from_json(items), dimensions, layout, readonly=bool(readonly))
+    if "record" in document:
+        return numba.from_dtype(np.lib.format.descr_to_dtype([tuple(field) for field in document["record"]]))
+    if "default" in document:
+        return types.Omitted(document["default"])
+    if "tuple" in document:
+        return types.BaseTuple.from_types([from_json(one) for one in document["tuple"]])
+    module, name = document["class"].split(":")
     return types.BaseTuple.from_types(
-        [read(one) for one in told["fields"]], getattr(importlib.import_module(module), name)
+        [from_json(one) for one in document["fields"]], getattr(importlib.import_module(module), name)
     )
 
 
@@ -77,7 +77,7 @@ def kernel_named(name: str) -> Kernel:
     Raises
     ------
     AttributeError, ModuleNotFoundError
-        There is none of this name any more.
+        No kernel has this name.
     """
     module, function = name.split(":")
     found: Kernel = getattr(importlib.import_module(module), function)

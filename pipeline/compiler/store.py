@@ -1,9 +1,8 @@
-"""The files of compiled kernels: where they are, what they hold, and which may be loaded.
+"""The files of compiled kernels: their place, their content, and which ones may be loaded.
 
-One file holds one kernel for one signature. It begins with the kernel's fingerprint: a file of another fingerprint is
-overwritten, never used. Its name says kernel, signature, Python, numba and processor, so that these do not overwrite
-each other. Machine code is code: a file that came with an installed package is loaded only if the package's list names
-its hash.
+One file holds one kernel for one signature. It begins with the kernel's fingerprint: a file with another fingerprint is
+overwritten, never used. Its name contains kernel, signature, Python, numba and processor. As machine code can do
+anything, a file of an installed package is loaded only if the package's list contains its hash.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from pathlib import Path
 ENDING = ".kernel"
 _PACKAGE = Path(__file__).resolve().parents[1]
 LIST = "kernels.json"
-"""Beside kernels that came with a package or an image: the sha256 of each, by file name."""
+"""File beside the kernels of a package or an image: the sha256 of each, by file name."""
 _HEADER = struct.Struct("<8s32sQQQ")
 _MAGIC = b"gwkern02"
 _LOCKS = "locks"
@@ -35,28 +34,28 @@ _LOCK_RANGE = 2**30
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Stored:
-    """What the file of a kernel holds."""
+    """Content of the file of a kernel."""
 
     facts: bytes
-    """Pickled: what numba must know of the compiled function."""
+    """Numba's description of the compiled function, pickled."""
     machine_code: bytes
-    """An object file; empty where only kernels call this one."""
+    """An object file; empty if only kernels call this one."""
     bitcode: bytes
-    """LLVM's own form, which is linked into kernels that call this one."""
+    """LLVM bitcode, linked into the kernels that call this one."""
 
-    def packed(self, fingerprint: bytes) -> bytes:
-        """The content of the file."""
+    def to_bytes(self, fingerprint: bytes) -> bytes:
+        """The bytes of the file."""
         lengths = (len(self.facts), len(self.machine_code), len(self.bitcode))
         return _HEADER.pack(_MAGIC, fingerprint, *lengths) + self.facts + self.machine_code + self.bitcode
 
     @staticmethod
     def fingerprint_of(content: bytes) -> bytes:
-        """The fingerprint in a file's head."""
+        """The fingerprint in a file's header."""
         return content[len(_MAGIC) : len(_MAGIC) + 32]
 
     @classmethod
-    def unpacked(cls, content: bytes, fingerprint: bytes) -> Stored | None:
-        """What a file holds; None where it is cut off, or of another fingerprint."""
+    def from_bytes(cls, content: bytes, fingerprint: bytes) -> Stored | None:
+        """Content of a file; None if it is truncated or has another fingerprint."""
         if len(content) < _HEADER.size:
             return None
         magic, stamp, facts, code, bitcode = _HEADER.unpack_from(content)
@@ -71,16 +70,16 @@ class Stored:
 
 
 def load(name: str, fingerprint: bytes, *, runnable: bool) -> Stored | None:
-    """A compiled kernel; None where there is none of this fingerprint.
+    """A compiled kernel; None if none has this fingerprint.
 
     Parameters
     ----------
     name : str
-        Of the file, without its ending.
+        File name without its ending.
     fingerprint : bytes
-        Of the kernel, 32 bytes.
+        Fingerprint of the kernel, 32 bytes.
     runnable : bool
-        Whether it must have machine code: what came with a package may have none where only kernels called it.
+        Whether it must have machine code, which a kernel lacks if only kernels have called it.
     """
     file_name = name + ENDING
     listed = _shipped_hashes().get(file_name)
@@ -90,49 +89,49 @@ def load(name: str, fingerprint: bytes, *, runnable: bool) -> Stored | None:
         except OSError:
             continue
         if folder == shipped_folder() and hashlib.sha256(content).hexdigest() != listed:
-            _warn(f"{folder / file_name} is not the file that {LIST} names: this kernel is compiled anew")
+            _warn(f"{folder / file_name} is not the file that {LIST} lists: this kernel is compiled again")
             continue
-        stored = Stored.unpacked(content, fingerprint)
+        stored = Stored.from_bytes(content, fingerprint)
         if stored is not None and (stored.machine_code or not runnable):
             return stored
     return None
 
 
-def say_what_does_not_fit(name: str) -> None:
-    """Warn once where kernels came with the package and the one that is about to be compiled is not among them."""
+def warn_of_misfits(name: str) -> None:
+    """Warn once if the package has compiled kernels and this one has to be compiled nevertheless."""
     if _shipped_hashes():
         _warn(
             f"kernels are compiled, {name} first: those in {shipped_folder()} were made for another Python, numba or "
             "processor, or are called in a new way",
-            once="what came does not fit",
+            once="misfit",
         )
 
 
 def save(name: str, fingerprint: bytes, stored: Stored) -> None:
-    """Keep a compiled kernel for processes to come. Where nothing can be written, warn once and go on."""
+    """Store a compiled kernel for later processes; if nothing can be written, warn once and continue."""
     folder = folder_of_kernels()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         part = folder / f".{name}.{os.getpid()}.part"
         try:
-            part.write_bytes(stored.packed(fingerprint))
+            part.write_bytes(stored.to_bytes(fingerprint))
             part.replace(folder / (name + ENDING))
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
-        told = f"compiled kernels cannot be kept in {folder}: {error.strerror}. Name a folder by NUMBA_CACHE_DIR"
-        _warn(told, once="cannot be kept")
+        fault = f"compiled kernels cannot be stored in {folder}: {error.strerror}. Set NUMBA_CACHE_DIR to a folder"
+        _warn(fault, once="cannot be stored")
 
 
-def is_kept(prefix: str, fingerprint: bytes) -> bool:
-    """Whether there is a file of a kernel, for whatever signature and processor; reads its first bytes.
+def is_stored(prefix: str, fingerprint: bytes) -> bool:
+    """Whether a file of a kernel exists, for any signature and processor; reads its first bytes.
 
     Parameters
     ----------
     prefix : str
-        With which the names of the kernel's files begin.
+        Start of the names of the kernel's files.
     fingerprint : bytes
-        Of the kernel.
+        Fingerprint of the kernel.
     """
     for folder in (shipped_folder(), folder_of_kernels()):
         for path in folder.glob(f"{glob.escape(prefix)}*{ENDING}"):
@@ -145,16 +144,16 @@ def is_kept(prefix: str, fingerprint: bytes) -> bool:
 
 @contextlib.contextmanager
 def claimed(name: str) -> Iterator[None]:
-    """Hold a kernel while it is compiled: another process that wants it waits, and finds it compiled then.
+    """Lock a kernel while it is compiled: another process that needs it waits and then finds it compiled.
 
-    Where files cannot be locked, both compile it, which costs time and harms nothing.
+    If files cannot be locked, both compile it, which costs time and does no harm.
     """
     file = _lock_file()
     if file is None:
         yield
         return
     at = zlib.crc32(name.encode()) % _LOCK_RANGE
-    # some file systems have no locks; two kernels may share a byte, so that two processes would wait for each other
+    # some file systems have no locks; and if two kernels share a byte, the system reports the deadlock of two processes
     with contextlib.suppress(OSError):
         fcntl.lockf(file, fcntl.LOCK_EX, 1, at)
     try:
@@ -165,14 +164,14 @@ def claimed(name: str) -> Iterator[None]:
 
 
 def ship(folder: Path, is_current: Callable[[str, bytes], bool]) -> int:
-    """Copy what is compiled to a folder with a list of hashes, so that a package can take it along; how many files.
+    """Copy the compiled kernels to a folder for a package, with a list of their hashes; returns the number of files.
 
     Parameters
     ----------
     folder : Path
         New or empty.
     is_current : callable
-        Whether a kernel, `module.function`, has a fingerprint: what is left of earlier versions stays here.
+        Whether a kernel, `module.function`, has a fingerprint; files of earlier versions are left out.
     """
     folder.mkdir(parents=True, exist_ok=True)
     hashes = {}
@@ -187,14 +186,14 @@ def ship(folder: Path, is_current: Callable[[str, bytes], bool]) -> int:
 
 @functools.cache
 def shipped_folder() -> Path:
-    """The folder of kernels that came with the package, or that the environment names; never written."""
+    """The folder of the package's kernels, or the one that `GABLEWORK_KERNELS` names; never written."""
     named = os.environ.get("GABLEWORK_KERNELS")
     return Path(named) if named else _PACKAGE / "compiled"
 
 
 @functools.cache
 def folder_of_kernels() -> Path:
-    """The folder that new files go to: of the environment, beside the sources, or the user's own."""
+    """The folder for new files: `NUMBA_CACHE_DIR`, beside the sources, or the user's cache."""
     named = os.environ.get("NUMBA_CACHE_DIR")
     if named:
         return Path(named)
@@ -207,7 +206,7 @@ def folder_of_kernels() -> Path:
 
 @functools.cache
 def _shipped_hashes() -> dict[str, str]:
-    """The hashes of the files that came with the package, by name."""
+    """The hashes of the package's files, by name."""
     try:
         hashes: dict[str, str] = json.loads((shipped_folder() / LIST).read_text(encoding="ascii"))
     except FileNotFoundError:
@@ -217,7 +216,7 @@ def _shipped_hashes() -> dict[str, str]:
 
 @functools.cache
 def _lock_file() -> int | None:
-    """The file whose bytes are locked, opened once: closing any descriptor of it would drop all locks."""
+    """The file whose bytes are locked, opened once: closing any descriptor of it would release all locks."""
     try:
         folder_of_kernels().mkdir(parents=True, exist_ok=True)
         return os.open(folder_of_kernels() / _LOCKS, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
@@ -225,14 +224,14 @@ def _lock_file() -> int | None:
         return None
 
 
-# locks belong to a process: a forked one opens the file for itself, as its copy of the descriptor may be closed
+# locks belong to a process: a forked one opens the file itself, as its copy of the descriptor may be closed
 os.register_at_fork(after_in_child=_lock_file.cache_clear)
 
-_said: set[str] = set()
+_warned: set[str] = set()
 
 
 def _warn(text: str, *, once: str = "") -> None:
-    """Warn once of each thing."""
-    if (once or text) not in _said:
-        _said.add(once or text)
+    """Warn once about each thing."""
+    if (once or text) not in _warned:
+        _warned.add(once or text)
         warnings.warn(text, RuntimeWarning, stacklevel=3)

@@ -1,8 +1,8 @@
-"""Kernels compiled ahead of their first call, in as many processes as there are cores.
+"""Kernels compiled ahead of their first call, in several processes.
 
-`kernels.json` lists what Python calls, with the signatures that it calls it with, by what needs it; what these call
-is compiled with them. Processes leave a kernel that another one is at work on to it and wait for its code
-(`store.claimed`), so none is compiled twice. What the list lacks is compiled when it is first called.
+`kernels.json` lists the kernels and signatures that Python calls, grouped by command; their callees are compiled with
+them. A process waits for a kernel that another one is compiling (`store.claimed`), so none is compiled twice. A kernel
+that the list lacks is compiled at its first call.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ class Listed:
     arguments: list[Any]
     """Types of its arguments, as `pipeline.compiler.signatures` writes them."""
     weight: int
-    """Kilobytes of its code: about how long it takes to compile."""
+    """Size of its code in kilobytes, a measure of its compile time."""
 
 
 def groups() -> list[str]:
-    """What kernels are listed for."""
+    """Keys of the list of kernels."""
     return list(json.loads(LIST.read_text(encoding="utf-8")))
 
 
@@ -52,7 +52,7 @@ def listed(groups: Iterable[str] | None = None) -> list[Listed]:
     Raises
     ------
     KeyError
-        There is no such group.
+        No group has this name.
     """
     found = json.loads(LIST.read_text(encoding="utf-8"))
     kernels = [Listed(kernel=k, arguments=a, weight=w) for name in groups or found for k, a, w in found[name]]
@@ -71,14 +71,14 @@ def compile_kernels(
     kernels : iterable of Listed
         Those of `listed`.
     processes : int
-        How many compile at once.
+        Number of processes.
     on_progress : callable, optional
-        Gets how many are done, of how many, and the seconds that the rest may take.
+        Gets the numbers of finished and of all kernels, and an estimate of the seconds left.
 
     Returns
     -------
     int
-        How many were compiled or loaded.
+        Number of kernels that were compiled or loaded.
     """
     waiting = list(kernels)
     whole = sum(one.weight for one in waiting) or 1
@@ -95,22 +95,22 @@ def compile_kernels(
 
 
 def _compile(one: Listed) -> int:
-    """Compile or load a kernel in this process; its weight."""
-    from pipeline.compiler.signatures import kernel_named, read
+    """Compile or load a kernel in this process; returns its weight."""
+    from pipeline.compiler.signatures import from_json, kernel_named
 
     kernel = kernel_named(one.kernel)
     if not is_off():
-        kernel.dispatcher.compile(tuple(read(kind) for kind in one.arguments))
+        kernel.dispatcher.compile(tuple(from_json(kind) for kind in one.arguments))
     return one.weight
 
 
 def ship(folder: Path) -> int:
-    """Copy all compiled kernels of this version to a folder that a package takes along; how many files.
+    """Copy all compiled kernels of this version to a folder for a package; returns the number of files.
 
     Raises
     ------
     RunError
-        There are none: another numba, or none at all, compiled what was called.
+        No kernel is compiled: numba is unknown or switched off.
     """
     from pipeline.compiler.signatures import kernel_named
 
@@ -124,16 +124,16 @@ def ship(folder: Path) -> int:
     shipped = store.ship(folder, is_current)
     if not shipped:
         raise RunError(
-            f"no compiled kernel lies in {store.folder_of_kernels()}: with the numba of the locks, and without "
-            "GABLEWORK_PLAIN_NUMBA and NUMBA_DISABLE_JIT, the warm-up leaves them there"
+            f"{store.folder_of_kernels()} has no compiled kernel: warm up with the numba of the locks and without "
+            "GABLEWORK_PLAIN_NUMBA and NUMBA_DISABLE_JIT"
         )
     return shipped
 
 
 def write_list(groups: dict[str, list[Listed]], path: Path = LIST) -> None:
-    """Write the list, one kernel a line so that changes are easy to see."""
-    told = []
+    """Write the list, one kernel per line to make changes easy to see."""
+    parts = []
     for name, kernels in groups.items():
         rows = sorted((one.kernel, one.arguments, one.weight) for one in kernels)
-        told.append(f"{json.dumps(name)}: [\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]")
-    path.write_text("{\n" + ",\n".join(told) + "\n}\n", encoding="utf-8")
+        parts.append(f"{json.dumps(name)}: [\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]")
+    path.write_text("{\n" + ",\n".join(parts) + "\n}\n", encoding="utf-8")

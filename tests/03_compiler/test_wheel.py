@@ -1,4 +1,4 @@
-"""Kernels compiled ahead, also in the wheel that `make wheel` builds: they serve all commands, nothing is compiled."""
+"""After kernels were compiled ahead, or come with a wheel, no command compiles anything."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ import os
 from numba.core import event
 
 class Counting(event.Listener):
-    def on_start(self, told):
-        line = f"{os.getpid()} {told.data['dispatcher'].py_func.__qualname__}\\n"
+    def on_start(self, started):
+        line = f"{os.getpid()} {started.data['dispatcher'].py_func.__qualname__}\\n"
         with open(os.environ["COMPILED"], "a") as file:
             file.write(line)
 
-    def on_end(self, told):
+    def on_end(self, ended):
         pass
 
 event.register("numba:compile", Counting())
@@ -47,7 +47,7 @@ COMMANDS = (
     "compare scene/suburb.laz --methods kmeans,fuzzy-sart:faithful --workers 0 --out compared-serially",
     "batch diff arrangement kmeans --out changes",
 )
-"""What docs/how_to/plan_a_run.md promises to compile nothing after `warm-up all`.
+"""Commands that compile nothing after `warm-up all`, by docs/how_to/plan_a_run.md.
 
 The suite hofmann310 is left out: `simulate` calls `pipeline.ruler.simulation.survey_faults.move_faulty` for it, which
 `kernels.json` lacks.
@@ -55,7 +55,7 @@ The suite hofmann310 is left out: `simulate` calls `pipeline.ruler.simulation.su
 
 
 def done(command: list[str], folder: Path, **environment: str) -> str:
-    """What a command prints in a folder; it must succeed."""
+    """Run a command in a folder; returns what it prints. It must succeed."""
     ended = subprocess.run(
         command, cwd=folder, env={**os.environ, **environment}, capture_output=True, text=True, check=False
     )
@@ -65,7 +65,7 @@ def done(command: list[str], folder: Path, **environment: str) -> str:
 
 @pytest.fixture(scope="module")
 def ahead(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the kernels that `warm-up all` compiles, and no other."""
+    """A folder with exactly the kernels that `warm-up all` compiles."""
     folder = tmp_path_factory.mktemp("ahead") / "kernels"
     done([*PROGRAM, "warm-up", "all", "--quiet"], ROOT, NUMBA_CACHE_DIR=str(folder))
     return folder
@@ -73,7 +73,7 @@ def ahead(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def counted(tmp_path: Path) -> Path:
-    """A folder that, on PYTHONPATH, has every Python process note what it compiles in the file `COMPILED`."""
+    """A folder for PYTHONPATH: every Python process then writes the kernels it compiles to the file `COMPILED`."""
     folder = tmp_path / "counted"
     folder.mkdir()
     (folder / "sitecustomize.py").write_text(COUNTING)
@@ -81,7 +81,7 @@ def counted(tmp_path: Path) -> Path:
 
 
 def noted(path: Path) -> list[str]:
-    """Names of what was compiled, in all processes."""
+    """Names of the kernels compiled by any process."""
     return [line.split()[1] for line in path.read_text().splitlines()] if path.exists() else []
 
 
@@ -105,7 +105,7 @@ def test_no_command_compiles_anything_after_warm_up_all(ahead: Path, counted: Pa
         assert manifest["counts"]["candidates"] > 0
         assert manifest["settings"]["general"]["method"] == method
 
-    # what the children of a command compile is seen, too
+    # children of a command are counted, too
     (lost,) = kernels.glob("pipeline.roof.arrangement.arranging._arranged.*")
     lost.unlink()
     done([*PROGRAM, *COMMANDS[1].split(), "--overwrite", "--quiet"], tmp_path, **environment)
