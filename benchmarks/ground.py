@@ -24,9 +24,10 @@ import numpy.typing as npt
 from benchmarks.ground_scenes import KINDS
 from pipeline.io import open_source
 from pipeline.scene import GROUND_CLASS
-from pipeline.terrain.ground import GroundSettings, ground_of, ground_points
+from pipeline.terrain.ground import ground_of, ground_points
 from pipeline.terrain.lattice import CELL_MM
-from pipeline.terrain.outliers import OutlierSettings, dense_enough
+from pipeline.terrain.outliers import dense_enough
+from pipeline.terrain.settings import GroundSettings, OutlierSettings
 
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]

@@ -1,4 +1,4 @@
-"""All settings of a run: the small settings classes that live beside each stage, composed and hashed."""
+"""All settings of a run: the settings classes of the chapters, composed and hashed; nothing here imports a kernel."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from pipeline.errors import SettingsError
 from pipeline.methods import LODS, METHODS, PRESETS, ReconstructSettings, method_named
 from pipeline.parameters import Parameters, build, parameter
 from pipeline.roof.settings import ArrangementSettings, RoofSettings, RoofTypeSettings
-from pipeline.scene import SceneSettings
-from pipeline.terrain.candidates import CandidateSettings
 from pipeline.terrain.class_codes import ClassCodeSettings
-from pipeline.terrain.ground import GroundSettings
-from pipeline.terrain.outliers import OutlierSettings
-from pipeline.terrain.surfaces import SurfaceSettings
-from pipeline.terrain.units import UnitSettings
-from pipeline.terrain.vegetation import VegetationSettings
+from pipeline.terrain.scene_settings import SceneSettings
+from pipeline.terrain.settings import (
+    CandidateSettings,
+    GroundSettings,
+    OutlierSettings,
+    SurfaceSettings,
+    UnitSettings,
+    VegetationSettings,
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

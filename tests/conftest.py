@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from object_store import FaultyProxy
 
     from pipeline.model import BoolArray
+    from pipeline.terrain.filter_settings import MorphologicalFilterSettings
     from pipeline.terrain.lattice import Elevations
-    from pipeline.terrain.morphological import MorphologicalFilterSettings
 
 # The same examples in every run: a change fails by what it changed, not by the draw. To search for new ones:
 # HYPOTHESIS_PROFILE=search make unit

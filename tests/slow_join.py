@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from pipeline.model import IntArray, Reason
 from pipeline.runtime.stages.join import CandidateSite, Joined, PointRange, RejectedSite, object_id
-from pipeline.terrain.candidates import NOWHERE, CandidateSettings, Surfaces, Verdict
+from pipeline.terrain.candidates import NOWHERE, Surfaces, Verdict
 from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.settings import CandidateSettings
 from pipeline.terrain.surfaces import N_SUMS, Fragments, Sum
 from pipeline.tiling import Tile, TileGrid
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SettingsError
 from pipeline.methods.settings import (
@@ -14,10 +14,12 @@ from pipeline.methods.settings import (
     ParameterSpace3dSettings,
     RoofFaceSettings,
 )
-from pipeline.model import Candidate, Segmentation
 from pipeline.parameters import Parameters
 from pipeline.roof.settings import ArrangementSettings, RoofSettings, RoofTypeSettings
 from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
+
+if TYPE_CHECKING:
+    from pipeline.model import Candidate, Segmentation
 
 LODS = ("1.2", "1.3", "2.2")
 """Levels of detail (Biljecki, Ledoux and Stoter 2016): one block, level parts, the roof faces themselves."""

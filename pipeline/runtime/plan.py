@@ -12,8 +12,8 @@ import shapely
 from pipeline.errors import CrsError, EmptyInputError, InputError, all_at_fault
 from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
 from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
-from pipeline.scene import ClassesInUse
 from pipeline.settings import RunSettings
+from pipeline.terrain.scene_settings import ClassesInUse
 from pipeline.tiling import MM, Tile, TileGrid
 
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)

@@ -16,15 +16,13 @@ import numpy.typing as npt
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations
+from pipeline.terrain.support import ALONG_CELLS
 
 _DIRECTIONS = np.array([(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)])
 """Rows and columns of a stride: every 18 to 27 degrees, so that one of them is nearly square to any edge."""
 
 _STEEPEST = 1.0
 """Rise over run that is no drop: by as much more must a drop fall as the points on its two sides lie apart."""
-
-_ALONG_CELLS = 6
-"""The edges are compared with those of the cells so far along them, to one side or the other."""
 
 _SAME_EDGE_M = 2.0
 """An edge is the same where it lies no farther off than that, and _TURN more for each metre along it."""
@@ -108,7 +106,7 @@ def _mark(out: BoolArray, lowest: Elevations, ahead: Distances, behind: Distance
                 continue
             for side in (-1, 1):
                 seen, same = 0, 0
-                for t in range(1, _ALONG_CELLS + 1):
+                for t in range(1, ALONG_CELLS + 1):
                     a, b = r + round(side * t * along[0]), c + round(side * t * along[1])
                     if a < 0 or a >= rows or b < 0 or b >= columns or lowest[a, b] == NO_DATA:
                         continue
@@ -145,8 +143,3 @@ def between_walls(lowest: Elevations, widest: int, drop_mm: float, rise_mm: floa
         ahead, behind = _widths(lowest, (down, across, length), float(widest), drop_mm, rise_mm)
         _mark(out, lowest, ahead, behind, (-across / length, down / length))
     return out
-
-
-def between_walls_support_m(widest: int) -> float:
-    """How far it looks: the edges of the cells along the edges."""
-    return float(widest + _ALONG_CELLS)

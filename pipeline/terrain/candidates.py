@@ -17,8 +17,8 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, Reason
-from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.settings import CandidateSettings
 from pipeline.terrain.surfaces import Sum
 
 NOWHERE = 2**62
@@ -27,73 +27,6 @@ SOLID = (FacetKind.OBJECT, FacetKind.BUILDING, FacetKind.CROWN)
 """Kinds of the surfaces that are judged."""
 _BLOCK = 65_536
 """Surfaces that are judged at once: what that takes on the way stays below 20 MB, however many there are."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CandidateSettings(Parameters):
-    """What a surface must be to become a candidate."""
-
-    min_object_area_m2: float = parameter(
-        4.0,
-        "Smaller surfaces are no objects: crowns fall apart into thousands of them; they are counted, not listed.",
-        unit="m2",
-        minimum=0.5,
-        maximum=100.0,
-    )
-    min_area_m2: float = parameter(
-        5.0, "Least plan area of a surface that is surely a roof.", unit="m2", minimum=1.0, maximum=1000.0
-    )
-    sure_planar_share: float = parameter(
-        0.75,
-        "Share of vertices with planar surroundings from which a surface is surely a roof.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    max_slenderness: float = parameter(
-        3.0,
-        "Largest height over mean width of a small surface that is surely a roof.",
-        minimum=0.5,
-        maximum=100.0,
-    )
-    doubtful_area_m2: float = parameter(
-        20.0, "Least plan area of a building's surface that is not.", unit="m2", minimum=1.0, maximum=1000.0
-    )
-    min_height_m: float = parameter(
-        2.0,
-        "Least height above the terrain, of a pitched roof that of its ridge, as the spread of its heights tells.",
-        unit="m",
-        minimum=0.5,
-        maximum=20.0,
-    )
-    min_width_m: float = parameter(
-        2.0,
-        "Least mean width, twice the area over the outline; half of it for what is surely a roof.",
-        unit="m",
-        minimum=0.0,
-        maximum=20.0,
-    )
-    min_planar_share: float = parameter(
-        0.5, "Least share of vertices with planar surroundings.", minimum=0.0, maximum=1.0
-    )
-    max_canopy_share: float = parameter(
-        0.35, "Largest share of earlier returns above the surface.", minimum=0.0, maximum=1.0
-    )
-    min_wall_share: float = parameter(0.15, "Least share of the outline that touches walls.", minimum=0.0, maximum=1.0)
-    min_top_share: float = parameter(
-        0.3,
-        "Least share of the touching walls at whose top the surface lies (the Z_avg rule by surface).",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    unite_share: float = parameter(
-        0.5,
-        "A surface with at least this share of its outline along steps joins the largest roof beside them.",
-        minimum=0.1,
-        maximum=1.0,
-    )
-    unite_reach_m: float = parameter(
-        3.0, "Farthest that this roof may be, between the boxes around both.", unit="m", minimum=0.0, maximum=50.0
-    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -14,102 +14,11 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
-from pipeline.parameters import parameter
-from pipeline.terrain.hierarchical_filter import HierarchicalFilterSettings, hierarchical_ground
+from pipeline.terrain.hierarchical_filter import hierarchical_ground
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_cell, without_pits
-from pipeline.terrain.morphological import MorphologicalFilterSettings, morphological_ground
+from pipeline.terrain.morphological import morphological_ground
 from pipeline.terrain.planar_fitting import MIN_CELLS, plane_around, plane_sums
-
-_MAX_SUPPORT_M = 500
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
-    """How ground is told from objects."""
-
-    filter: str = parameter(
-        "morphological",
-        "What tells ground from objects: openings of growing size, or TIN densification with planar fitting.",
-        choices=("morphological", "hierarchical"),
-    )
-
-    pit_depth_m: float = parameter(
-        1.0,
-        "A cell that lies deeper than this below all but two of its 24 neighbours is a low outlier.",
-        unit="m",
-        minimum=0.2,
-        maximum=20.0,
-    )
-    bridge_m: int = parameter(
-        24,
-        "Farthest that the terrain is drawn under objects, where the filter asks for no more.",
-        unit="m",
-        minimum=4,
-        maximum=80,
-    )
-    max_slope: float = parameter(
-        1.0,
-        "Steepest that the terrain is drawn from the middle of the ground around a place to that place, rise over run.",
-        minimum=0.01,
-        maximum=2.0,
-    )
-    tolerance_m: float = parameter(
-        0.5, "Points closer than this to level terrain are ground.", unit="m", minimum=0.05, maximum=3.0
-    )
-    tolerance_slope: float = parameter(
-        1.0,
-        "What that distance grows by, in metres, where the terrain rises by 45 degrees, and in proportion elsewhere; "
-        "0 with the hierarchical filter.",
-        minimum=0.0,
-        maximum=3.0,
-    )
-
-    def cross_faults(self) -> list[str]:
-        """A hierarchy of so many passes, or openings so large, that its tiles would be all halo."""
-        if self.filter == "hierarchical":
-            counts = [self.seed_cell_m, self.level_ratio, self.passes, self.min_reach_m, self.clump_m]
-            told = (
-                f"seed_cell_m {self.seed_cell_m}, level_ratio {self.level_ratio}, passes {self.passes}",
-                "use fewer passes or smaller cells",
-            )
-        else:
-            counts = [self.max_window_m, self.trend_m, self.widest_m, self.regrowth_m]
-            counts += [self.regrowth_passes, self.terrace_passes]
-            told = (
-                (
-                    f"max_window_m {self.max_window_m}, trend_m {self.trend_m}, widest_m {self.widest_m}, regrowth_m"
-                    f" {self.regrowth_m} in {self.regrowth_passes} and {self.terrace_passes} passes,"
-                    f" bridge_m {self.bridge_m}"
-                ),
-                "use smaller ones",
-            )
-        whole = all(isinstance(n, int) for n in (*counts, self.bridge_m))
-        if not whole or self.level_ratio < 2 or self.support_m <= _MAX_SUPPORT_M:
-            return []
-        return [f"filter looks {self.support_m:g} m far, by {told[0]}: {told[1]}, for at most {_MAX_SUPPORT_M} m"]
-
-    @property
-    def reach_m(self) -> int:
-        """Farthest that the terrain is drawn under objects: at least to the middle of the widest that are cut off."""
-        if self.filter == "hierarchical":
-            return max(self.bridge_m, 2 * self.seed_cell_m // 3)
-        return max(self.bridge_m, self.max_window_m + 1, self.widest_m // 2 + 1 if self.looks_for_wide else 0)
-
-    @property
-    def support_m(self) -> float:
-        """How far a terrain elevation looks: the pit tests, the filter, the local planes, cell sizes, slopes."""
-        if self.filter == "hierarchical":
-            return self.hierarchical_support_m + self.reach_m + 4
-        return self.morphological_support_m + self.reach_m + 4
-
-    @property
-    def trusted_support_m(self) -> float:
-        """How far a terrain elevation looks where the ground is known by its class: no filter, and no pit test.
-
-        A plane is drawn through the ground cells of a square that never reaches farther than `reach_m`, however wide
-        the gap: where there is no ground in it there is no terrain. The rest is as in `support_m`.
-        """
-        return float(self.reach_m + 4)
+from pipeline.terrain.settings import GroundSettings
 
 
 @kernel

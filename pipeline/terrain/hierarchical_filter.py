@@ -8,17 +8,16 @@ through it where no facet decides. Every pass looks one reach far, so the whole 
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray
-from pipeline.parameters import Parameters, parameter
-from pipeline.terrain.lattice import CELL_MM, NO_DATA, PIT_CELLS, Elevations, without_pits
+from pipeline.terrain.filter_settings import HierarchicalFilterSettings
+from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, without_pits
 from pipeline.terrain.planar_fitting import join_planes
+from pipeline.terrain.support import PIT_CELLS
 from pipeline.terrain.tin_densification import join_facets
 
 _CLUMP_MATES = 3
@@ -32,93 +31,6 @@ _WALL_CELLS = 2
 
 _CUT_SLOPE = 0.2
 """Rise over run from the foot of a wall that is still no wall."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Level:
-    """One pass of the densification; lengths in cells of the terrain lattice, which are metres."""
-
-    cell: int
-    """Side of the cells whose lowest points may join."""
-    reach: int
-    """How far the decision on a point looks."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class HierarchicalFilterSettings(Parameters):
-    """The hierarchy of cells and the tests of a joining point; read only where the filter is hierarchical."""
-
-    seed_cell_m: int = parameter(
-        48,
-        "Side of the coarsest cells, whose lowest points are ground: wider than most buildings.",
-        unit="m",
-        minimum=8,
-        maximum=120,
-    )
-    level_ratio: int = parameter(
-        4, "Each level's cells are as many times smaller than those before; the last are of 1 m.", minimum=2, maximum=8
-    )
-    passes: int = parameter(
-        4,
-        "How often each level after the first is gone through, each time on the TIN of the last.",
-        minimum=1,
-        maximum=8,
-    )
-    min_reach_m: int = parameter(
-        8,
-        "Least distance that a decision looks; coarse levels look one cell of their TIN far.",
-        unit="m",
-        minimum=3,
-        maximum=40,
-    )
-    max_angle_deg: float = parameter(
-        10.0,
-        "Largest angle between a facet and the lines from a joining point to its vertices.",
-        unit="deg",
-        minimum=1.0,
-        maximum=60.0,
-    )
-    max_distance_m: float = parameter(
-        0.6,
-        "Farthest that a joining point lies above its facet or plane, perpendicularly.",
-        unit="m",
-        minimum=0.05,
-        maximum=5.0,
-    )
-    distance_rise: float = parameter(
-        0.1, "How much more that distance may be for each metre of the level's cells.", minimum=0.0, maximum=1.0
-    )
-    noise_m: float = parameter(
-        0.5, "Points this close to their facet join it at any angle.", unit="m", minimum=0.0, maximum=3.0
-    )
-    lone_slope: float = parameter(
-        0.1,
-        "Steepest rise over run to a point from the mean of the ground within reach, where that carries no plane.",
-        minimum=0.0,
-        maximum=2.0,
-    )
-    clump_m: int = parameter(
-        3,
-        "Side of the cells in which pits are searched a second time, so that clumps of low outliers go too.",
-        unit="m",
-        minimum=1,
-        maximum=12,
-    )
-
-    def levels(self) -> Iterator[Level]:
-        """The passes, coarse to fine."""
-        before, first = self.seed_cell_m, True
-        while before > 1:
-            cell = max(1, before // self.level_ratio)
-            for _ in range(1 if first else self.passes):
-                yield Level(cell, max(before, self.min_reach_m))
-            before, first = cell, False
-
-    @property
-    def hierarchical_support_m(self) -> float:
-        """How far the filter looks: both pit tests, a cell of seeds, and the reaches of all passes."""
-        pits = PIT_CELLS + (PIT_CELLS + 1) * self.clump_m - 1
-        return float(pits + self.seed_cell_m - 1 + sum(level.reach for level in self.levels()))
 
 
 @kernel

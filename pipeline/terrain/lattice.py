@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
+from pipeline.terrain.support import PIT_CELLS
 
 CELL_MM = 1000
 """Side of a cell of the terrain lattice."""
@@ -15,9 +16,6 @@ NO_DATA = np.int32(2**31 - 1)
 """Elevation of a cell without one."""
 
 Elevations = npt.NDArray[np.int32]
-
-PIT_CELLS = 2
-"""How many cells far the pit test looks."""
 
 PIT_MATES = 2
 """At most as many neighbours of a pit lie as deep."""

@@ -10,27 +10,20 @@ beside it on the same level.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray
-from pipeline.parameters import Parameters, parameter
-from pipeline.terrain.between_walls import between_walls, between_walls_support_m
-from pipeline.terrain.lattice import NO_DATA, PIT_CELLS, Elevations
+from pipeline.terrain.between_walls import between_walls
+from pipeline.terrain.filter_settings import MorphologicalFilterSettings
+from pipeline.terrain.lattice import NO_DATA, Elevations
 from pipeline.terrain.openings import cut_off
 from pipeline.terrain.planar_fitting import leaning_planes
-from pipeline.terrain.wide_objects import wide_objects, wide_support_m, with_corners
-
-_GAP_CELLS = 4
-"""Gaps between points are closed from their rims so far, and as many rounds of relaxation smooth the fill."""
+from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS
+from pipeline.terrain.wide_objects import wide_objects, with_corners
 
 _STEEPEST = 1.5
 """Rise over run from which on the trend's slope allows the second openings no more."""
-
-_CLUMP_CELLS = 6
-"""Half side of the square in which a clump of low outliers must be rare."""
 
 _CLUMP_SHARE = 0.1
 """A clump holds at most this share of the cells around it, or four."""
@@ -40,111 +33,6 @@ _CLUMP_BAND_MM = 750
 
 _FEWEST_BESIDE = 2
 """Ground cells on its level that a cell needs beside it to come back."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MorphologicalFilterSettings(Parameters):
-    """Sizes of the openings and what they may take; read only where the filter is morphological."""
-
-    max_window_m: int = parameter(
-        20,
-        "Largest radius of the openings on the terrain lattice; wider objects are looked for on a coarse one.",
-        unit="m",
-        minimum=2,
-        maximum=60,
-    )
-    window_slope: float = parameter(
-        0.15,
-        "What a step of the first openings may take, for each metre of their radius.",
-        minimum=0.01,
-        maximum=2.0,
-    )
-    residual_slope: float = parameter(
-        0.1,
-        "The same of the second openings, which work on heights above the trend of the first ground.",
-        minimum=0.01,
-        maximum=2.0,
-    )
-    residual_step_m: float = parameter(
-        0.15, "What a step of the second openings may always take.", unit="m", minimum=0.0, maximum=3.0
-    )
-    residual_steepness_m: float = parameter(
-        0.3,
-        "What it may take more where the trend rises by 45 degrees, in proportion elsewhere: steep ground is rough.",
-        unit="m",
-        minimum=0.0,
-        maximum=3.0,
-    )
-    trend_m: int = parameter(
-        10,
-        "Half side of the squares of the trend's planes; twice as much where they hold little ground.",
-        unit="m",
-        minimum=4,
-        maximum=40,
-    )
-    clump_depth_m: float = parameter(
-        4.0,
-        "Few cells that lie deeper below the trend are a clump of low outliers.",
-        unit="m",
-        minimum=0.5,
-        maximum=50.0,
-    )
-    widest_m: int = parameter(
-        102,
-        "Objects up to this width are cut off on a coarse lattice, where they are high enough for wide_slope.",
-        unit="m",
-        minimum=0,
-        maximum=240,
-    )
-    wide_slope: float = parameter(
-        0.12,
-        "What a step of these openings may take, for each metre of their radius: so high are wide objects at least.",
-        minimum=0.01,
-        maximum=2.0,
-    )
-    wall_drop_m: float = parameter(
-        1.0,
-        "Decks and roofs between two parallel drops are no ground where both are deeper than this, and than wide_slope "
-        "times half the width between them; up to widest_m wide.",
-        unit="m",
-        minimum=0.2,
-        maximum=20.0,
-    )
-    regrowth_passes: int = parameter(
-        3, "How often what lies level with the ground beside it joins the ground.", minimum=0, maximum=10
-    )
-    regrowth_m: int = parameter(3, "Half side of the square that is beside.", unit="m", minimum=1, maximum=10)
-    regrowth_step_m: float = parameter(
-        0.2, "Highest that a cell may lie above ground beside it.", unit="m", minimum=0.0, maximum=3.0
-    )
-    regrowth_share: float = parameter(
-        0.3, "Least share of the ground beside it above which it lies no higher.", minimum=0.0, maximum=1.0
-    )
-    terrace_passes: int = parameter(
-        2, "How often wide objects join the ground after that, which are terraces then.", minimum=0, maximum=10
-    )
-    terrace_share: float = parameter(
-        0.7, "The share of the ground beside it that this asks for.", minimum=0.0, maximum=1.0
-    )
-
-    @property
-    def morphological_support_m(self) -> float:
-        """How far the filter looks: the sum of its chain, or the wide objects beside it."""
-        chain = 4 * _GAP_CELLS + 4 * self.max_window_m + 2 * self.trend_m + _CLUMP_CELLS
-        wide = wide_support_m(self.widest_m // 2) if self.looks_for_wide else 0.0
-        walls = between_walls_support_m(self.deck_m)
-        grown = (self.regrowth_passes + self.terrace_passes) * self.regrowth_m
-        return PIT_CELLS + max(float(chain), wide, walls) + grown
-
-    @property
-    def looks_for_wide(self) -> bool:
-        """Whether there are objects to cut off that max_window_m leaves."""
-        return self.widest_m > 2 * self.max_window_m
-
-    @property
-    def deck_m(self) -> int:
-        """Widest that a deck between two walls may be."""
-        return max(self.widest_m, 2 * self.max_window_m)
 
 
 @kernel
@@ -199,8 +87,8 @@ def without_clumps(lowest: Elevations, level: Elevations, slope_mm: Elevations, 
             if height >= -deep_mm - slope_mm[r, c]:
                 continue
             cells, low = 0, 0
-            for a in range(max(r - _CLUMP_CELLS, 0), min(r + _CLUMP_CELLS + 1, rows)):
-                for b in range(max(c - _CLUMP_CELLS, 0), min(c + _CLUMP_CELLS + 1, columns)):
+            for a in range(max(r - CLUMP_CELLS, 0), min(r + CLUMP_CELLS + 1, rows)):
+                for b in range(max(c - CLUMP_CELLS, 0), min(c + CLUMP_CELLS + 1, columns)):
                     if lowest[a, b] != NO_DATA and level[a, b] != NO_DATA:
                         cells += 1
                         if lowest[a, b] - level[a, b] <= height + _CLUMP_BAND_MM:
@@ -290,7 +178,7 @@ def morphological_ground(
         Ground; none where there is no data.
     """
     radius = settings.max_window_m
-    elevation = closed_gaps(lowest, _GAP_CELLS)
+    elevation = closed_gaps(lowest, GAP_CELLS)
     nothing = np.zeros(lowest.shape, np.int32)
     first = cut_off(elevation, nothing, settings.window_slope * 1000.0, radius)
     is_first = (lowest != NO_DATA) & (first == 0)
@@ -304,7 +192,7 @@ def morphological_ground(
     lowest = without_clumps(lowest, level, slope_mm, round(settings.clump_depth_m * 1000))
     limits = (round(settings.residual_step_m * 1000), settings.residual_steepness_m * 1000.0)
     height, base = _heights(lowest, level, slope_mm, limits)
-    second = cut_off(closed_gaps(height, _GAP_CELLS), base, settings.residual_slope * 1000.0, radius)
+    second = cut_off(closed_gaps(height, GAP_CELLS), base, settings.residual_slope * 1000.0, radius)
     ground = (lowest != NO_DATA) & (second == 0) & ~wide & ~decks
     step_mm = round(settings.regrowth_step_m * 1000)
     beside = (settings.regrowth_m, step_mm, settings.regrowth_share)

@@ -7,37 +7,18 @@ further, so that tiles agree on it.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray
-from pipeline.parameters import Parameters, parameter
 from pipeline.spatial_hash import slot_of_key
+from pipeline.terrain.settings import OutlierSettings
 
 # 21 bits a coordinate pack a cube into one key: 2^21 cubes are wider than any tile with its halo.
 _BITS = 21
 _EMPTY = -1
 _CUBES_A_POINT = 4.0
 """As many cubes as that for each point are held in an array; more, where strays lie far off, are looked up."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class OutlierSettings(Parameters):
-    """When a point counts as a gross outlier."""
-
-    cube_m: float = parameter(
-        5.0, "Side of the cubes in which neighbours are counted.", unit="m", minimum=1.0, maximum=50.0
-    )
-    min_neighbours: int = parameter(
-        4, "Fewest other points in the 27 cubes around a point that is kept.", minimum=0, maximum=100
-    )
-
-    @property
-    def support_m(self) -> float:
-        """How far the decision looks."""
-        return 2.0 * self.cube_m
 
 
 @kernel

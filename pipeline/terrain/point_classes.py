@@ -16,8 +16,9 @@ from pipeline.model import BoolArray, ByteArray, IntArray, KindArray
 from pipeline.spatial_hash import slot_of_key
 from pipeline.terrain.binning import points_by_cell
 from pipeline.terrain.lattice import NO_DATA, PIT_MATES
+from pipeline.terrain.settings import VegetationSettings
 from pipeline.terrain.thinning import highest_per_cell
-from pipeline.terrain.vegetation import VegetationSettings, planarity
+from pipeline.terrain.vegetation import planarity
 
 
 class PointClass(IntEnum):

@@ -16,7 +16,6 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray, Tin
-from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.facets import (
     classify_facets,
     facet_keys,
@@ -26,6 +25,7 @@ from pipeline.terrain.facets import (
     with_vertex,
 )
 from pipeline.terrain.point_assignment import AssignmentLimits, CorePoints, LabelledTin, assign_points
+from pipeline.terrain.settings import SurfaceSettings
 
 
 class Sum(IntEnum):
@@ -63,45 +63,6 @@ class Sum(IntEnum):
 
 
 N_SUMS = len(Sum)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SurfaceSettings(Parameters):
-    """How the TIN is thinned and cut."""
-
-    thinning_m: float = parameter(
-        0.5, "Side of the cells of which one point each enters the scene's TIN.", unit="m", minimum=0.1, maximum=5.0
-    )
-    max_circumradius_m: float = parameter(
-        6.0, "Facets with a wider circumcircle bridge a gap in the data.", unit="m", minimum=1.0, maximum=30.0
-    )
-    wall_m: float = parameter(2.0, "MX_zdiff from which a facet is a wall.", unit="m", minimum=0.5, maximum=10.0)
-    steep_deg: float = parameter(
-        70.0, "Facets steeper than this cut too, from steep_m on.", unit="deg", minimum=45.0, maximum=90.0
-    )
-    steep_m: float = parameter(
-        1.0, "Least elevation difference of a facet that cuts by its slope.", unit="m", minimum=0.2, maximum=10.0
-    )
-    step_height_m: float = parameter(
-        2.0, "A wall whose foot stands this high above the terrain is a step.", unit="m", minimum=0.5, maximum=20.0
-    )
-    reach_m: float = parameter(
-        1.0,
-        "Points closer than this in elevation to a surface belong to it.",
-        unit="m",
-        minimum=0.1,
-        maximum=5.0,
-    )
-
-    @property
-    def support_m(self) -> float:
-        """How far a fragment's facets look: two facets and their circumcircles."""
-        return 4.0 * self.max_circumradius_m + 2.0 * self.thinning_m
-
-    @property
-    def far_mm(self) -> int:
-        """How far the vertices are that a point may refer to: a tile looks at all facets with one so near its core."""
-        return round(2 * self.thinning_m * 1000)
 
 
 @kernel

@@ -22,38 +22,10 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.union_find import root_of, unite, united
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.roof_patches import Borders, Patches, patches_of
+from pipeline.terrain.settings import UnitSettings
 from pipeline.terrain.thinning import highest_per_cell
 from pipeline.tin.delaunay import MAX_WINDOW_MM, triangulate
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class UnitSettings(Parameters):
-    """How touching buildings are told apart."""
-
-    split: str = parameter(
-        "ridges",
-        "What separates units within a candidate: nothing, steps, or steps and valleys between parallel ridges.",
-        choices=("nothing", "steps", "ridges"),
-    )
-    min_step_m: float = parameter(0.3, "Least step between the roofs of two units.", unit="m", minimum=0.1, maximum=5.0)
-    min_area_m2: float = parameter(
-        25.0, "Least plan area of a unit; what is smaller joins its neighbour.", unit="m2", minimum=1.0, maximum=1000.0
-    )
-    enclosed_share: float = parameter(
-        0.5,
-        "A unit with at least this share of its outline against one other joins it, as towers do.",
-        minimum=0.1,
-        maximum=1.0,
-    )
-    annex_share: float = parameter(
-        0.5,
-        "A unit below this share of the area of its only neighbour joins it if its top lies below that one's middle.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-
 
 THINNING_M = 0.5
 """Side of the cells of which one point each enters the TIN, as in the split of a scene."""

@@ -6,71 +6,18 @@ distance and use integer sums, so they are the same in every tile.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, KindArray, LabelArray
-from pipeline.parameters import Parameters, parameter
 from pipeline.terrain.binning import points_by_cell
+from pipeline.terrain.settings import VegetationSettings
+from pipeline.terrain.support import PLANARITY_SCALES
 
-_SCALES = 3
 _COUNT = 2**20 - 1
 """Three counts of up to a million share one whole number."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class VegetationSettings(Parameters):
-    """How local planarity is measured."""
-
-    radius_m: float = parameter(
-        1.0,
-        "Radius of the windows that judge planarity; doubled up to twice where they hold too few points.",
-        unit="m",
-        minimum=0.3,
-        maximum=5.0,
-    )
-    min_neighbours: int = parameter(6, "Fewest points in a window for a judgement.", minimum=4, maximum=50)
-    roughness_m: float = parameter(
-        0.1,
-        "Largest orthogonal standard deviation of a planar window; half as much again at each doubling.",
-        unit="m",
-        minimum=0.02,
-        maximum=1.0,
-    )
-    level_m: float = parameter(
-        2.0,
-        "Points this far above or below a vertex lie across a wall and do not judge it.",
-        unit="m",
-        minimum=0.5,
-        maximum=20.0,
-    )
-    company_m: float = parameter(
-        2.0,
-        "Radius of the sphere around a vertex whose verdicts say together whether it is roof or crown.",
-        unit="m",
-        minimum=0.5,
-        maximum=5.0,
-    )
-    crown_share: float = parameter(
-        0.5, "Share of rough vertices in that sphere above which a vertex belongs to a crown.", minimum=0.1, maximum=1.0
-    )
-    pierced_share: float = parameter(
-        0.1,
-        "Share of vertices from pulses of several returns in that sphere, above which it may be a crown's.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    canopy_m: float = parameter(
-        1.0, "Earlier returns this far above the surface of last returns are canopy.", unit="m", minimum=0.3, maximum=5
-    )
-
-    @property
-    def support_m(self) -> float:
-        """How far the judgement looks: the shifted windows of the widest scale, around the vertices of a sphere."""
-        return 2.0 * self.radius_m * 2.0 ** (_SCALES - 1) + self.company_m
 
 
 @kernel
@@ -266,7 +213,7 @@ def planarity(
         1 planar, 0 rough, -1 where it was not wanted or there are too few neighbours to tell.
     """
     verdict = np.full(len(x_mm), -1, np.int8)
-    for scale in range(_SCALES):
+    for scale in range(PLANARITY_SCALES):
         _planar(
             x_mm,
             y_mm,

@@ -12,18 +12,7 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, ByteArray
 from pipeline.terrain.lattice import NO_DATA, Elevations
 from pipeline.terrain.openings import dilate_back, erode_once, framed
-
-COARSE = 2
-"""Side of a coarse cell in cells of the terrain lattice, which are metres."""
-
-_FILL = 2
-"""Coarse cells by which the gaps between sparse points are closed."""
-
-_NARROW = 2
-"""Half the width, in coarse cells, of the courtyards, trenches and clumps of low outliers that are filled first."""
-
-_RIM_CELLS = 3
-"""So near to a wide object lie the corners that belong to it, in cells of the terrain lattice."""
+from pipeline.terrain.support import COARSE, FILL, NARROW, RIM_CELLS
 
 _RIM_STEP_MM = 200
 """A corner lies no deeper than this below the wide cells beside it."""
@@ -127,10 +116,10 @@ def wide_objects(lowest: Elevations, corner: tuple[int, int], narrower: int, rad
         Objects; none where there is no data.
     """
     surface = _coarse(lowest, *corner)
-    for _ in range(_FILL):  # the higher side wins: an outlier must not grow
+    for _ in range(FILL):  # the higher side wins: an outlier must not grow
         surface = _extreme_of_nine(surface, False, True)
     for want_low in (False, True):
-        for _ in range(_NARROW):
+        for _ in range(NARROW):
             surface = _extreme_of_nine(surface, want_low, False)
     floors = _floors(surface, narrower // COARSE, -(-radius // COARSE), rise_mm * COARSE)
     return _on_fine(lowest, floors, *corner, round(rise_mm * narrower / 2))
@@ -159,16 +148,11 @@ def with_corners(lowest: Elevations, wide: BoolArray, first: ByteArray) -> BoolA
             if wide[r, c] or first[r, c] == 0 or lowest[r, c] == NO_DATA:
                 continue
             beside, level = 0, 0
-            for a in range(max(r - _RIM_CELLS, 0), min(r + _RIM_CELLS + 1, rows)):
-                for b in range(max(c - _RIM_CELLS, 0), min(c + _RIM_CELLS + 1, columns)):
+            for a in range(max(r - RIM_CELLS, 0), min(r + RIM_CELLS + 1, rows)):
+                for b in range(max(c - RIM_CELLS, 0), min(c + RIM_CELLS + 1, columns)):
                     if wide[a, b]:
                         beside += 1
                         if lowest[a, b] - lowest[r, c] <= _RIM_STEP_MM:
                             level += 1
             out[r, c] = level >= 2 and level >= _RIM_SHARE * beside
     return out
-
-
-def wide_support_m(radius: int) -> float:
-    """How far it looks: alignment of the coarse cells, gaps, closing, erosion and dilation, the neighbours, corners."""
-    return float(COARSE * (_FILL + 2 * _NARROW + 2 * -(-radius // COARSE) + 1) + COARSE - 1 + _RIM_CELLS)

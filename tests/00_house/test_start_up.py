@@ -25,6 +25,11 @@ def test_the_console_script_imports_nothing_heavy() -> None:
     assert modules_after("import service.cli") & {*HEAVY, "numpy", "numba", "scipy", "shapely"} == set()
 
 
+def test_settings_import_no_kernel_and_no_library() -> None:
+    heavy = {*HEAVY, "numpy", "numba", "scipy", "shapely"}
+    assert modules_after("import pipeline.settings") & heavy == set()
+
+
 def test_a_serial_run_imports_no_engine_and_nothing_for_child_processes() -> None:
     unused = {"dask", "distributed", "matplotlib", "psutil", "pythonjsonlogger"}
     assert modules_after("import pipeline.runtime.run") & unused == set()

@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from pipeline.terrain.between_walls import between_walls, between_walls_support_m
-from pipeline.terrain.ground import GroundSettings
+from pipeline.terrain.between_walls import between_walls
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.morphological import morphological_ground
+from pipeline.terrain.settings import GroundSettings
+from pipeline.terrain.support import between_walls_support_m
 
 Grid = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]

@@ -14,7 +14,6 @@ from pipeline.model import IntArray, Reason
 from pipeline.terrain.candidates import (
     NOWHERE,
     REASONS,
-    CandidateSettings,
     Fault,
     Surfaces,
     Verdict,
@@ -24,6 +23,7 @@ from pipeline.terrain.candidates import (
     unite_levels,
 )
 from pipeline.terrain.facets import FacetKind
+from pipeline.terrain.settings import CandidateSettings
 from pipeline.terrain.surfaces import N_SUMS, Sum
 
 SETTINGS = CandidateSettings()

@@ -13,8 +13,9 @@ from hypothesis.extra.numpy import arrays
 from scipy.ndimage import map_coordinates
 
 from pipeline.terrain import ground
-from pipeline.terrain.ground import GroundSettings, Terrain, ground_of, ground_points, slopes_of
+from pipeline.terrain.ground import Terrain, ground_of, ground_points, slopes_of
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, height_above, lowest_per_cell, without_pits
+from pipeline.terrain.settings import GroundSettings
 
 Grid = npt.NDArray[np.int32]
 Points = npt.NDArray[np.int64]

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.ndimage import binary_dilation, generate_binary_structure, grey_dilation, grey_erosion
 
-from pipeline.terrain.ground import GroundSettings
 from pipeline.terrain.lattice import NO_DATA
 from pipeline.terrain.morphological import closed_gaps, morphological_ground, regrown, without_clumps
 from pipeline.terrain.openings import cut_off, dilate_back, erode_once, framed
 from pipeline.terrain.planar_fitting import leaning_planes
+from pipeline.terrain.settings import GroundSettings
 from pipeline.terrain.wide_objects import wide_objects, with_corners
 
 Grid = npt.NDArray[np.int32]

@@ -13,7 +13,8 @@ from scipy.ndimage import convolve
 from pipeline.errors import SettingsError
 from pipeline.model import BoolArray
 from pipeline.terrain import outliers as outliers_module
-from pipeline.terrain.outliers import OutlierSettings, dense_enough
+from pipeline.terrain.outliers import dense_enough
+from pipeline.terrain.settings import OutlierSettings
 
 Points = npt.NDArray[np.int64]
 

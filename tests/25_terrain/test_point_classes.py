@@ -23,7 +23,7 @@ from pipeline.terrain.point_classes import (
     sums_around,
     tops_nearby,
 )
-from pipeline.terrain.vegetation import VegetationSettings
+from pipeline.terrain.settings import VegetationSettings
 
 
 @pytest.fixture

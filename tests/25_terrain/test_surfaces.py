@@ -16,7 +16,8 @@ from scipy.sparse.csgraph import connected_components
 
 from pipeline.model import FloatArray, IntArray, KindArray, LabelArray, Tin
 from pipeline.terrain.facets import FacetKind, VertexKind, classify_facets, facet_keys, label_fragments, label_vertices
-from pipeline.terrain.surfaces import N_SUMS, Fragments, ScenePoints, SceneVertices, Sum, SurfaceSettings, fragments_of
+from pipeline.terrain.settings import SurfaceSettings
+from pipeline.terrain.surfaces import N_SUMS, Fragments, ScenePoints, SceneVertices, Sum, fragments_of
 from pipeline.tin.delaunay import triangulate
 
 Height = Callable[[FloatArray, FloatArray], FloatArray]

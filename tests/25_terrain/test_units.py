@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
-from pipeline.terrain.units import UnitSettings, units_of
+from pipeline.terrain.settings import UnitSettings
+from pipeline.terrain.units import units_of
 
 SETTINGS = UnitSettings()
 STEEP = math.tan(math.radians(40.0))

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.model import KindArray
-from pipeline.terrain.vegetation import VegetationSettings, crowns, planarity, smallest_eigenvalue
+from pipeline.terrain.settings import VegetationSettings
+from pipeline.terrain.vegetation import crowns, planarity, smallest_eigenvalue
 
 Points = npt.NDArray[np.int64]
 

@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.scene import ClassesInUse, SceneSettings, WindowPoints, lattice_of, split_tile, terrain_of
+from pipeline.scene import WindowPoints, lattice_of, split_tile, terrain_of
 from pipeline.settings import RunSettings
-from pipeline.terrain.ground import GroundSettings
 from pipeline.terrain.lattice import NO_DATA, height_above
-from pipeline.terrain.outliers import OutlierSettings
-from pipeline.terrain.surfaces import SurfaceSettings
-from pipeline.terrain.vegetation import VegetationSettings
+from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import GroundSettings, OutlierSettings, SurfaceSettings, VegetationSettings
 from pipeline.tiling import Tile, TileGrid, Window
 
 GROUND = 2

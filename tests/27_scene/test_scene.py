@@ -15,14 +15,19 @@ from hypothesis import strategies as st
 from slow_join import WholeSplit, whole_surfaces
 
 from pipeline.model import IntArray
-from pipeline.scene import ClassesInUse, SceneSettings, SplitTile, WindowPoints, lattice_of, split_tile
-from pipeline.terrain.candidates import CandidateSettings, Surfaces, judge_surfaces, unite_levels
+from pipeline.scene import SplitTile, WindowPoints, lattice_of, split_tile
+from pipeline.terrain.candidates import Surfaces, judge_surfaces, unite_levels
 from pipeline.terrain.facets import FacetKind
-from pipeline.terrain.ground import GroundSettings
 from pipeline.terrain.lattice import NO_DATA
-from pipeline.terrain.outliers import OutlierSettings
-from pipeline.terrain.surfaces import Fragments, Sum, SurfaceSettings
-from pipeline.terrain.vegetation import VegetationSettings
+from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import (
+    CandidateSettings,
+    GroundSettings,
+    OutlierSettings,
+    SurfaceSettings,
+    VegetationSettings,
+)
+from pipeline.terrain.surfaces import Fragments, Sum
 from pipeline.tiling import Tile, TileGrid, Window
 
 GROUND, TREE, BUILDING = 2, 5, 6

@@ -25,10 +25,12 @@ from pipeline.runtime.stages.border_facets import facet_names, telling_facets, u
 from pipeline.runtime.stages.join import Joined, join
 from pipeline.runtime.stages.open_fragments import open_fragments
 from pipeline.runtime.stages.split import Split
-from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse, SceneSettings, WindowPoints, split_tile
-from pipeline.terrain.candidates import NOWHERE, CandidateSettings
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints, split_tile
+from pipeline.terrain.candidates import NOWHERE
 from pipeline.terrain.facets import FacetKind, VertexKind
-from pipeline.terrain.surfaces import N_SUMS, Fragments, ScenePoints, SceneVertices, Sum, SurfaceSettings, fragments_of
+from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import CandidateSettings, SurfaceSettings
+from pipeline.terrain.surfaces import N_SUMS, Fragments, ScenePoints, SceneVertices, Sum, fragments_of
 from pipeline.tiling import Tile, TileGrid
 from pipeline.tin.delaunay import triangulate
 

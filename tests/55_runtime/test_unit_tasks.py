@@ -27,7 +27,7 @@ from pipeline.runtime.stages.join import CandidateSite, PointRange, object_id
 from pipeline.runtime.stages.outline import draw_outlines, outline_tasks
 from pipeline.runtime.stages.reconstruct_tasks import divide, unit_tasks
 from pipeline.terrain.lattice import CELL_MM
-from pipeline.terrain.units import UnitSettings
+from pipeline.terrain.settings import UnitSettings
 from pipeline.tiling import TileGrid
 
 CRS = "EPSG:28992"

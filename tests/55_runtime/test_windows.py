@@ -17,9 +17,9 @@ from pipeline.io import ReadOptions
 from pipeline.runtime.plan import Plan, check_windows, make_plan, split_grid
 from pipeline.runtime.stages import stages
 from pipeline.runtime.stages.split import Split, SplitTask, split
-from pipeline.scene import ClassesInUse, SceneSettings
 from pipeline.settings import RunSettings
-from pipeline.terrain.ground import GroundSettings
+from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
+from pipeline.terrain.settings import GroundSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 TRUSTED = ClassesInUse(ground=True, building=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.ground import drawn_scenes, figures_of, labels_of, main, product_filter, samples
-from pipeline.terrain.ground import GroundSettings
+from pipeline.terrain.settings import GroundSettings
 
 
 def test_scenes_are_drawn_alike_each_time_and_know_their_ground() -> None:

@@ -25,10 +25,12 @@ from pipeline.ruler.evaluation.bootstrap import Statistic, Sums, share
 from pipeline.ruler.evaluation.measure import Better, Definition, Group, Measure
 from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
 from pipeline.ruler.evaluation.subsets import Subset, measured
-from pipeline.scene import GROUND_CLASS, SceneSettings
+from pipeline.scene import GROUND_CLASS
 from pipeline.terrain.ground import Terrain, ground_of, ground_points
 from pipeline.terrain.lattice import CELL_MM, NO_DATA, Elevations, lowest_per_cell
-from pipeline.terrain.outliers import OutlierSettings, dense_enough
+from pipeline.terrain.outliers import dense_enough
+from pipeline.terrain.scene_settings import SceneSettings
+from pipeline.terrain.settings import OutlierSettings
 
 NOT_JUDGED = (7, 9, 18)
 """Reference classes that are neither ground nor object: low noise, water, high noise."""

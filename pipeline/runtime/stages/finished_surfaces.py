@@ -12,15 +12,8 @@ import dataclasses
 import numpy as np
 
 from pipeline.model import IntArray, KindArray
-from pipeline.terrain.candidates import (
-    NOWHERE,
-    SOLID,
-    CandidateSettings,
-    Surfaces,
-    are_objects,
-    judge_surfaces,
-    unite_levels,
-)
+from pipeline.terrain.candidates import NOWHERE, SOLID, Surfaces, are_objects, judge_surfaces, unite_levels
+from pipeline.terrain.settings import CandidateSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,8 @@ from pipeline.runtime.stages.border_facets import united_by_name
 from pipeline.runtime.stages.finished_surfaces import Finished, finished
 from pipeline.runtime.stages.open_fragments import TileSurfaces
 from pipeline.runtime.stages.split import Split
-from pipeline.terrain.candidates import NOWHERE, CandidateSettings, Surfaces, Verdict, verdicts
+from pipeline.terrain.candidates import NOWHERE, Surfaces, Verdict, verdicts
+from pipeline.terrain.settings import CandidateSettings
 from pipeline.terrain.surfaces import N_SUMS, Sum
 from pipeline.tiling import MM, Tile, TileGrid
 

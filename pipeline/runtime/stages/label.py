@@ -20,11 +20,12 @@ from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.gather import Surroundings, surroundings_of
 from pipeline.runtime.stages.join import PointRange
 from pipeline.runtime.stages.split import bucket_paths, load_window
-from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse, SceneSettings, WindowPoints
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints
 from pipeline.terrain.ground import Terrain, ground_points, slopes_of
 from pipeline.terrain.lattice import NO_DATA, height_above
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.point_classes import PointClass, PointEvidence, classes_of, index_of_each, support_m
+from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 FOLDER = "classes"

@@ -21,9 +21,10 @@ from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
 from pipeline.runtime.stages.border_facets import facet_names, telling_facets
 from pipeline.runtime.stages.finished_surfaces import Finished, finished
-from pipeline.terrain.candidates import SOLID, CandidateSettings, Fault, Surfaces, judge_surfaces, may_join
+from pipeline.terrain.candidates import SOLID, Fault, Surfaces, judge_surfaces, may_join
 from pipeline.terrain.facets import FacetKind
-from pipeline.terrain.surfaces import Fragments, SurfaceSettings
+from pipeline.terrain.settings import CandidateSettings, SurfaceSettings
+from pipeline.terrain.surfaces import Fragments
 from pipeline.tiling import Tile, TileGrid
 
 

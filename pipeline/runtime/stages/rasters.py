@@ -18,12 +18,13 @@ from pipeline.model import BoolArray
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import Surroundings, surroundings_of
 from pipeline.runtime.stages.split import load_window
-from pipeline.scene import SceneSettings, WindowPoints
+from pipeline.scene import WindowPoints
 from pipeline.terrain.elevation_rasters import FILL_M, closed, columns_of, filled, highest_in_cells, terrain_at
 from pipeline.terrain.ground import slopes_of
 from pipeline.terrain.lattice import CELL_MM, height_above
 from pipeline.terrain.outliers import dense_enough
 from pipeline.terrain.point_classes import PIT_REACH_MM, noise_of
+from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 FOLDER = "rasters"

@@ -15,7 +15,8 @@ import numpy.typing as npt
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.grouping import in_groups
 from pipeline.runtime.stages.join import CandidateSite, PointRange, object_id
-from pipeline.terrain.units import UnitSettings, smallest_points, units_of
+from pipeline.terrain.settings import UnitSettings
+from pipeline.terrain.units import smallest_points, units_of
 from pipeline.tiling import Tile, TileGrid
 
 _POINTS_PER_TASK = 50_000

@@ -15,7 +15,8 @@ from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.reconstruct_tasks import divide, unit_tasks
 from pipeline.runtime.stages.split import SplitTask, split
 from pipeline.runtime.stages.tile_content import zone_sums
-from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse, SceneSettings
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
+from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 _SIDE_M = 24

@@ -18,20 +18,10 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, ByteArray, FloatArray, IntArray
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.open_fragments import TileSurfaces, open_fragments
-from pipeline.scene import (
-    APRON_M,
-    BUILDING_CLASS,
-    GROUND_CLASS,
-    ClassesInUse,
-    SceneSettings,
-    SplitTile,
-    WindowPoints,
-    lattice_of,
-    split_tile,
-    terrain_of,
-)
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, SplitTile, WindowPoints, lattice_of, split_tile, terrain_of
 from pipeline.spatial_hash import first_of_each
 from pipeline.terrain.ground import Terrain, ground_points
+from pipeline.terrain.scene_settings import APRON_M, ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 if TYPE_CHECKING:

@@ -47,9 +47,10 @@ from pipeline.runtime.stages.reconstruct import (
 from pipeline.runtime.stages.reconstruct_tasks import divide, unit_tasks
 from pipeline.runtime.stages.split import Split, SplitTask, SplitTold, split, told_of_split
 from pipeline.runtime.stages.tile_content import ZoneSums, content_of_window, zone_sums_of
-from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, ClassesInUse
+from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
 from pipeline.settings import RunSettings
-from pipeline.terrain.candidates import CandidateSettings
+from pipeline.terrain.scene_settings import ClassesInUse
+from pipeline.terrain.settings import CandidateSettings
 from pipeline.tiling import MM, Tile, TileGrid, Window
 
 Task = TypeVar("Task")

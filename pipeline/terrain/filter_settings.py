@@ -1,0 +1,201 @@
+"""Settings of the two ground filters, and how far each of them looks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+from pipeline.parameters import Parameters, parameter
+from pipeline.terrain.support import CLUMP_CELLS, GAP_CELLS, PIT_CELLS, between_walls_support_m, wide_support_m
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MorphologicalFilterSettings(Parameters):
+    """Sizes of the openings and what they may take; read only where the filter is morphological."""
+
+    max_window_m: int = parameter(
+        20,
+        "Largest radius of the openings on the terrain lattice; wider objects are looked for on a coarse one.",
+        unit="m",
+        minimum=2,
+        maximum=60,
+    )
+    window_slope: float = parameter(
+        0.15,
+        "What a step of the first openings may take, for each metre of their radius.",
+        minimum=0.01,
+        maximum=2.0,
+    )
+    residual_slope: float = parameter(
+        0.1,
+        "The same of the second openings, which work on heights above the trend of the first ground.",
+        minimum=0.01,
+        maximum=2.0,
+    )
+    residual_step_m: float = parameter(
+        0.15, "What a step of the second openings may always take.", unit="m", minimum=0.0, maximum=3.0
+    )
+    residual_steepness_m: float = parameter(
+        0.3,
+        "What it may take more where the trend rises by 45 degrees, in proportion elsewhere: steep ground is rough.",
+        unit="m",
+        minimum=0.0,
+        maximum=3.0,
+    )
+    trend_m: int = parameter(
+        10,
+        "Half side of the squares of the trend's planes; twice as much where they hold little ground.",
+        unit="m",
+        minimum=4,
+        maximum=40,
+    )
+    clump_depth_m: float = parameter(
+        4.0,
+        "Few cells that lie deeper below the trend are a clump of low outliers.",
+        unit="m",
+        minimum=0.5,
+        maximum=50.0,
+    )
+    widest_m: int = parameter(
+        102,
+        "Objects up to this width are cut off on a coarse lattice, where they are high enough for wide_slope.",
+        unit="m",
+        minimum=0,
+        maximum=240,
+    )
+    wide_slope: float = parameter(
+        0.12,
+        "What a step of these openings may take, for each metre of their radius: so high are wide objects at least.",
+        minimum=0.01,
+        maximum=2.0,
+    )
+    wall_drop_m: float = parameter(
+        1.0,
+        "Decks and roofs between two parallel drops are no ground where both are deeper than this, and than wide_slope "
+        "times half the width between them; up to widest_m wide.",
+        unit="m",
+        minimum=0.2,
+        maximum=20.0,
+    )
+    regrowth_passes: int = parameter(
+        3, "How often what lies level with the ground beside it joins the ground.", minimum=0, maximum=10
+    )
+    regrowth_m: int = parameter(3, "Half side of the square that is beside.", unit="m", minimum=1, maximum=10)
+    regrowth_step_m: float = parameter(
+        0.2, "Highest that a cell may lie above ground beside it.", unit="m", minimum=0.0, maximum=3.0
+    )
+    regrowth_share: float = parameter(
+        0.3, "Least share of the ground beside it above which it lies no higher.", minimum=0.0, maximum=1.0
+    )
+    terrace_passes: int = parameter(
+        2, "How often wide objects join the ground after that, which are terraces then.", minimum=0, maximum=10
+    )
+    terrace_share: float = parameter(
+        0.7, "The share of the ground beside it that this asks for.", minimum=0.0, maximum=1.0
+    )
+
+    @property
+    def morphological_support_m(self) -> float:
+        """How far the filter looks: the sum of its chain, or the wide objects beside it."""
+        chain = 4 * GAP_CELLS + 4 * self.max_window_m + 2 * self.trend_m + CLUMP_CELLS
+        wide = wide_support_m(self.widest_m // 2) if self.looks_for_wide else 0.0
+        walls = between_walls_support_m(self.deck_m)
+        grown = (self.regrowth_passes + self.terrace_passes) * self.regrowth_m
+        return PIT_CELLS + max(float(chain), wide, walls) + grown
+
+    @property
+    def looks_for_wide(self) -> bool:
+        """Whether there are objects to cut off that max_window_m leaves."""
+        return self.widest_m > 2 * self.max_window_m
+
+    @property
+    def deck_m(self) -> int:
+        """Widest that a deck between two walls may be."""
+        return max(self.widest_m, 2 * self.max_window_m)
+
+
+@dataclasses.dataclass(frozen=True)
+class Level:
+    """One pass of the densification; lengths in cells of the terrain lattice, which are metres."""
+
+    cell: int
+    """Side of the cells whose lowest points may join."""
+    reach: int
+    """How far the decision on a point looks."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HierarchicalFilterSettings(Parameters):
+    """The hierarchy of cells and the tests of a joining point; read only where the filter is hierarchical."""
+
+    seed_cell_m: int = parameter(
+        48,
+        "Side of the coarsest cells, whose lowest points are ground: wider than most buildings.",
+        unit="m",
+        minimum=8,
+        maximum=120,
+    )
+    level_ratio: int = parameter(
+        4, "Each level's cells are as many times smaller than those before; the last are of 1 m.", minimum=2, maximum=8
+    )
+    passes: int = parameter(
+        4,
+        "How often each level after the first is gone through, each time on the TIN of the last.",
+        minimum=1,
+        maximum=8,
+    )
+    min_reach_m: int = parameter(
+        8,
+        "Least distance that a decision looks; coarse levels look one cell of their TIN far.",
+        unit="m",
+        minimum=3,
+        maximum=40,
+    )
+    max_angle_deg: float = parameter(
+        10.0,
+        "Largest angle between a facet and the lines from a joining point to its vertices.",
+        unit="deg",
+        minimum=1.0,
+        maximum=60.0,
+    )
+    max_distance_m: float = parameter(
+        0.6,
+        "Farthest that a joining point lies above its facet or plane, perpendicularly.",
+        unit="m",
+        minimum=0.05,
+        maximum=5.0,
+    )
+    distance_rise: float = parameter(
+        0.1, "How much more that distance may be for each metre of the level's cells.", minimum=0.0, maximum=1.0
+    )
+    noise_m: float = parameter(
+        0.5, "Points this close to their facet join it at any angle.", unit="m", minimum=0.0, maximum=3.0
+    )
+    lone_slope: float = parameter(
+        0.1,
+        "Steepest rise over run to a point from the mean of the ground within reach, where that carries no plane.",
+        minimum=0.0,
+        maximum=2.0,
+    )
+    clump_m: int = parameter(
+        3,
+        "Side of the cells in which pits are searched a second time, so that clumps of low outliers go too.",
+        unit="m",
+        minimum=1,
+        maximum=12,
+    )
+
+    def levels(self) -> Iterator[Level]:
+        """The passes, coarse to fine."""
+        before, first = self.seed_cell_m, True
+        while before > 1:
+            cell = max(1, before // self.level_ratio)
+            for _ in range(1 if first else self.passes):
+                yield Level(cell, max(before, self.min_reach_m))
+            before, first = cell, False
+
+    @property
+    def hierarchical_support_m(self) -> float:
+        """How far the filter looks: both pit tests, a cell of seeds, and the reaches of all passes."""
+        pits = PIT_CELLS + (PIT_CELLS + 1) * self.clump_m - 1
+        return float(pits + self.seed_cell_m - 1 + sum(level.reach for level in self.levels()))

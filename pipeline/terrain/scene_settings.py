@@ -1,0 +1,79 @@
+"""All settings between a tile's points and its candidates, and the halo that they need."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from pipeline.terrain.settings import (
+    CandidateSettings,
+    GroundSettings,
+    OutlierSettings,
+    SurfaceSettings,
+    UnitSettings,
+    VegetationSettings,
+)
+
+APRON_M = 6
+"""Width of the terrain that a tile stores beyond its core."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ClassesInUse:
+    """Which of the file's classes are believed, decided once for a run."""
+
+    ground: bool = False
+    """Class 2 is the ground; no filter runs."""
+    building: bool = False
+    """Class 6 is building, classes that exclude buildings are believed, the rest is judged by its own evidence."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneSettings:
+    """The settings of the stages between a tile's points and its candidates."""
+
+    outliers: OutlierSettings = dataclasses.field(default_factory=OutlierSettings)
+    ground: GroundSettings = dataclasses.field(default_factory=GroundSettings)
+    vegetation: VegetationSettings = dataclasses.field(default_factory=VegetationSettings)
+    surfaces: SurfaceSettings = dataclasses.field(default_factory=SurfaceSettings)
+    candidates: CandidateSettings = dataclasses.field(default_factory=CandidateSettings)
+    units: UnitSettings = dataclasses.field(default_factory=UnitSettings)
+
+    @property
+    def support_m(self) -> float:
+        """How far a tile looks beyond its core at most: to find fragments among points whose classes tell nothing."""
+        return self.support_with(ClassesInUse(), footprints=False)
+
+    def support_with(self, classes: ClassesInUse, *, footprints: bool) -> float:
+        """How far a tile looks beyond its core, by what is known beforehand.
+
+        Three lengths add up: how far off the terrain is wanted, how far a terrain elevation looks from there, and how
+        far it takes to tell whether a point that it looks at is an outlier.
+
+        - Terrain is stored for the core and its apron (`APRON_M`). Fragments want it at all points of the core and of
+          the facets and vertices around it. The points in given footprints are the core's own: no TIN is made for
+          them, no surroundings are judged, and each is asked only whether it lies in a footprint and above the ground.
+        - A terrain elevation looks as far as the filter that finds the ground; where class 2 is the ground none runs,
+          and `GroundSettings.trusted_support_m` is left.
+        - Class 6 narrows nothing: its points are judged one by one.
+
+        Parameters
+        ----------
+        classes : ClassesInUse
+            Which classes of the file are believed.
+        footprints : bool
+            Whether the footprints are given.
+
+        Returns
+        -------
+        float
+            Metres; never more than `support_m`.
+        """
+        ground_m = self.ground.trusted_support_m if classes.ground else self.ground.support_m
+        return self.outliers.support_m + ground_m + self.terrain_m(footprints=footprints)
+
+    def terrain_m(self, *, footprints: bool) -> float:
+        """How far beyond a tile's core terrain is wanted, in metres; for the points in given footprints, or for all."""
+        if footprints:
+            return float(APRON_M)
+        around_m = max(self.surfaces.support_m, self.vegetation.support_m) + self.vegetation.support_m
+        return max(float(APRON_M), around_m)

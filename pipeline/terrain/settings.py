@@ -1,0 +1,302 @@
+"""Settings of the stages from a tile's points to candidates; no kernel is imported here."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from pipeline.parameters import Parameters, parameter
+from pipeline.terrain.filter_settings import HierarchicalFilterSettings, MorphologicalFilterSettings
+from pipeline.terrain.support import PLANARITY_SCALES
+
+_MAX_SUPPORT_M = 500
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OutlierSettings(Parameters):
+    """When a point counts as a gross outlier."""
+
+    cube_m: float = parameter(
+        5.0, "Side of the cubes in which neighbours are counted.", unit="m", minimum=1.0, maximum=50.0
+    )
+    min_neighbours: int = parameter(
+        4, "Fewest other points in the 27 cubes around a point that is kept.", minimum=0, maximum=100
+    )
+
+    @property
+    def support_m(self) -> float:
+        """How far the decision looks."""
+        return 2.0 * self.cube_m
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GroundSettings(MorphologicalFilterSettings, HierarchicalFilterSettings):
+    """How ground is told from objects."""
+
+    filter: str = parameter(
+        "morphological",
+        "What tells ground from objects: openings of growing size, or TIN densification with planar fitting.",
+        choices=("morphological", "hierarchical"),
+    )
+
+    pit_depth_m: float = parameter(
+        1.0,
+        "A cell that lies deeper than this below all but two of its 24 neighbours is a low outlier.",
+        unit="m",
+        minimum=0.2,
+        maximum=20.0,
+    )
+    bridge_m: int = parameter(
+        24,
+        "Farthest that the terrain is drawn under objects, where the filter asks for no more.",
+        unit="m",
+        minimum=4,
+        maximum=80,
+    )
+    max_slope: float = parameter(
+        1.0,
+        "Steepest that the terrain is drawn from the middle of the ground around a place to that place, rise over run.",
+        minimum=0.01,
+        maximum=2.0,
+    )
+    tolerance_m: float = parameter(
+        0.5, "Points closer than this to level terrain are ground.", unit="m", minimum=0.05, maximum=3.0
+    )
+    tolerance_slope: float = parameter(
+        1.0,
+        "What that distance grows by, in metres, where the terrain rises by 45 degrees, and in proportion elsewhere; "
+        "0 with the hierarchical filter.",
+        minimum=0.0,
+        maximum=3.0,
+    )
+
+    def cross_faults(self) -> list[str]:
+        """A hierarchy of so many passes, or openings so large, that its tiles would be all halo."""
+        if self.filter == "hierarchical":
+            counts = [self.seed_cell_m, self.level_ratio, self.passes, self.min_reach_m, self.clump_m]
+            told = (
+                f"seed_cell_m {self.seed_cell_m}, level_ratio {self.level_ratio}, passes {self.passes}",
+                "use fewer passes or smaller cells",
+            )
+        else:
+            counts = [self.max_window_m, self.trend_m, self.widest_m, self.regrowth_m]
+            counts += [self.regrowth_passes, self.terrace_passes]
+            told = (
+                (
+                    f"max_window_m {self.max_window_m}, trend_m {self.trend_m}, widest_m {self.widest_m}, regrowth_m"
+                    f" {self.regrowth_m} in {self.regrowth_passes} and {self.terrace_passes} passes,"
+                    f" bridge_m {self.bridge_m}"
+                ),
+                "use smaller ones",
+            )
+        whole = all(isinstance(n, int) for n in (*counts, self.bridge_m))
+        if not whole or self.level_ratio < 2 or self.support_m <= _MAX_SUPPORT_M:
+            return []
+        return [f"filter looks {self.support_m:g} m far, by {told[0]}: {told[1]}, for at most {_MAX_SUPPORT_M} m"]
+
+    @property
+    def reach_m(self) -> int:
+        """Farthest that the terrain is drawn under objects: at least to the middle of the widest that are cut off."""
+        if self.filter == "hierarchical":
+            return max(self.bridge_m, 2 * self.seed_cell_m // 3)
+        return max(self.bridge_m, self.max_window_m + 1, self.widest_m // 2 + 1 if self.looks_for_wide else 0)
+
+    @property
+    def support_m(self) -> float:
+        """How far a terrain elevation looks: the pit tests, the filter, the local planes, cell sizes, slopes."""
+        if self.filter == "hierarchical":
+            return self.hierarchical_support_m + self.reach_m + 4
+        return self.morphological_support_m + self.reach_m + 4
+
+    @property
+    def trusted_support_m(self) -> float:
+        """How far a terrain elevation looks where the ground is known by its class: no filter, and no pit test.
+
+        A plane is drawn through the ground cells of a square that never reaches farther than `reach_m`, however wide
+        the gap: where there is no ground in it there is no terrain. The rest is as in `support_m`.
+        """
+        return float(self.reach_m + 4)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VegetationSettings(Parameters):
+    """How local planarity is measured."""
+
+    radius_m: float = parameter(
+        1.0,
+        "Radius of the windows that judge planarity; doubled up to twice where they hold too few points.",
+        unit="m",
+        minimum=0.3,
+        maximum=5.0,
+    )
+    min_neighbours: int = parameter(6, "Fewest points in a window for a judgement.", minimum=4, maximum=50)
+    roughness_m: float = parameter(
+        0.1,
+        "Largest orthogonal standard deviation of a planar window; half as much again at each doubling.",
+        unit="m",
+        minimum=0.02,
+        maximum=1.0,
+    )
+    level_m: float = parameter(
+        2.0,
+        "Points this far above or below a vertex lie across a wall and do not judge it.",
+        unit="m",
+        minimum=0.5,
+        maximum=20.0,
+    )
+    company_m: float = parameter(
+        2.0,
+        "Radius of the sphere around a vertex whose verdicts say together whether it is roof or crown.",
+        unit="m",
+        minimum=0.5,
+        maximum=5.0,
+    )
+    crown_share: float = parameter(
+        0.5, "Share of rough vertices in that sphere above which a vertex belongs to a crown.", minimum=0.1, maximum=1.0
+    )
+    pierced_share: float = parameter(
+        0.1,
+        "Share of vertices from pulses of several returns in that sphere, above which it may be a crown's.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    canopy_m: float = parameter(
+        1.0, "Earlier returns this far above the surface of last returns are canopy.", unit="m", minimum=0.3, maximum=5
+    )
+
+    @property
+    def support_m(self) -> float:
+        """How far the judgement looks: the shifted windows of the widest scale, around the vertices of a sphere."""
+        return 2.0 * self.radius_m * 2.0 ** (PLANARITY_SCALES - 1) + self.company_m
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SurfaceSettings(Parameters):
+    """How the TIN is thinned and cut."""
+
+    thinning_m: float = parameter(
+        0.5, "Side of the cells of which one point each enters the scene's TIN.", unit="m", minimum=0.1, maximum=5.0
+    )
+    max_circumradius_m: float = parameter(
+        6.0, "Facets with a wider circumcircle bridge a gap in the data.", unit="m", minimum=1.0, maximum=30.0
+    )
+    wall_m: float = parameter(2.0, "MX_zdiff from which a facet is a wall.", unit="m", minimum=0.5, maximum=10.0)
+    steep_deg: float = parameter(
+        70.0, "Facets steeper than this cut too, from steep_m on.", unit="deg", minimum=45.0, maximum=90.0
+    )
+    steep_m: float = parameter(
+        1.0, "Least elevation difference of a facet that cuts by its slope.", unit="m", minimum=0.2, maximum=10.0
+    )
+    step_height_m: float = parameter(
+        2.0, "A wall whose foot stands this high above the terrain is a step.", unit="m", minimum=0.5, maximum=20.0
+    )
+    reach_m: float = parameter(
+        1.0,
+        "Points closer than this in elevation to a surface belong to it.",
+        unit="m",
+        minimum=0.1,
+        maximum=5.0,
+    )
+
+    @property
+    def support_m(self) -> float:
+        """How far a fragment's facets look: two facets and their circumcircles."""
+        return 4.0 * self.max_circumradius_m + 2.0 * self.thinning_m
+
+    @property
+    def far_mm(self) -> int:
+        """How far the vertices are that a point may refer to: a tile looks at all facets with one so near its core."""
+        return round(2 * self.thinning_m * 1000)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CandidateSettings(Parameters):
+    """What a surface must be to become a candidate."""
+
+    min_object_area_m2: float = parameter(
+        4.0,
+        "Smaller surfaces are no objects: crowns fall apart into thousands of them; they are counted, not listed.",
+        unit="m2",
+        minimum=0.5,
+        maximum=100.0,
+    )
+    min_area_m2: float = parameter(
+        5.0, "Least plan area of a surface that is surely a roof.", unit="m2", minimum=1.0, maximum=1000.0
+    )
+    sure_planar_share: float = parameter(
+        0.75,
+        "Share of vertices with planar surroundings from which a surface is surely a roof.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    max_slenderness: float = parameter(
+        3.0,
+        "Largest height over mean width of a small surface that is surely a roof.",
+        minimum=0.5,
+        maximum=100.0,
+    )
+    doubtful_area_m2: float = parameter(
+        20.0, "Least plan area of a building's surface that is not.", unit="m2", minimum=1.0, maximum=1000.0
+    )
+    min_height_m: float = parameter(
+        2.0,
+        "Least height above the terrain, of a pitched roof that of its ridge, as the spread of its heights tells.",
+        unit="m",
+        minimum=0.5,
+        maximum=20.0,
+    )
+    min_width_m: float = parameter(
+        2.0,
+        "Least mean width, twice the area over the outline; half of it for what is surely a roof.",
+        unit="m",
+        minimum=0.0,
+        maximum=20.0,
+    )
+    min_planar_share: float = parameter(
+        0.5, "Least share of vertices with planar surroundings.", minimum=0.0, maximum=1.0
+    )
+    max_canopy_share: float = parameter(
+        0.35, "Largest share of earlier returns above the surface.", minimum=0.0, maximum=1.0
+    )
+    min_wall_share: float = parameter(0.15, "Least share of the outline that touches walls.", minimum=0.0, maximum=1.0)
+    min_top_share: float = parameter(
+        0.3,
+        "Least share of the touching walls at whose top the surface lies (the Z_avg rule by surface).",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    unite_share: float = parameter(
+        0.5,
+        "A surface with at least this share of its outline along steps joins the largest roof beside them.",
+        minimum=0.1,
+        maximum=1.0,
+    )
+    unite_reach_m: float = parameter(
+        3.0, "Farthest that this roof may be, between the boxes around both.", unit="m", minimum=0.0, maximum=50.0
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class UnitSettings(Parameters):
+    """How touching buildings are told apart."""
+
+    split: str = parameter(
+        "ridges",
+        "What separates units within a candidate: nothing, steps, or steps and valleys between parallel ridges.",
+        choices=("nothing", "steps", "ridges"),
+    )
+    min_step_m: float = parameter(0.3, "Least step between the roofs of two units.", unit="m", minimum=0.1, maximum=5.0)
+    min_area_m2: float = parameter(
+        25.0, "Least plan area of a unit; what is smaller joins its neighbour.", unit="m2", minimum=1.0, maximum=1000.0
+    )
+    enclosed_share: float = parameter(
+        0.5,
+        "A unit with at least this share of its outline against one other joins it, as towers do.",
+        minimum=0.1,
+        maximum=1.0,
+    )
+    annex_share: float = parameter(
+        0.5,
+        "A unit below this share of the area of its only neighbour joins it if its top lies below that one's middle.",
+        minimum=0.0,
+        maximum=1.0,
+    )

@@ -1,0 +1,44 @@
+"""How far the steps of the ground filter and of planarity look: lengths that settings add up to the halo of a tile.
+
+They are no settings: each is a few cells of the terrain lattice or a number of rounds, and a test of whole scenes was
+no better with others.
+"""
+
+from __future__ import annotations
+
+PIT_CELLS = 2
+"""The pit test looks at the 24 cells around a cell."""
+
+GAP_CELLS = 4
+"""Gaps between points are closed this far from their rims; the fill is smoothed in as many rounds."""
+
+CLUMP_CELLS = 6
+"""Half side of the square in which a clump of low outliers must be rare."""
+
+ALONG_CELLS = 6
+"""The edges of a deck are compared with those of the cells this far along them, to both sides."""
+
+COARSE = 2
+"""Side of a coarse cell in cells of the terrain lattice, which are metres."""
+
+FILL = 2
+"""Coarse cells by which the gaps between sparse points are closed."""
+
+NARROW = 2
+"""Half the width, in coarse cells, of the courtyards, trenches and clumps of low outliers that are filled first."""
+
+RIM_CELLS = 3
+"""Corners this near to a wide object belong to it."""
+
+PLANARITY_SCALES = 3
+"""Planarity is judged in windows of one, two and four radii."""
+
+
+def wide_support_m(radius: int) -> float:
+    """How far `wide_objects` looks: alignment of the coarse cells, gaps, closing, opening, neighbours, corners."""
+    return float(COARSE * (FILL + 2 * NARROW + 2 * -(-radius // COARSE) + 1) + COARSE - 1 + RIM_CELLS)
+
+
+def between_walls_support_m(widest: int) -> float:
+    """How far `between_walls` looks: the width of a deck, and the cells along its edges."""
+    return float(widest + ALONG_CELLS)
