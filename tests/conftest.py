@@ -55,7 +55,7 @@ LONGEST_FIRST = (
     "90_benchmarks/test_entries.py",
     "55_runtime/test_isolation.py",
     "55_runtime/test_classify.py",
-    "15_synthetic/test_solids.py",
+    "15_simulation/test_solids.py",
     "81_postgres/test_schedules.py",
     "81_postgres/test_store.py",
     "65_report/test_evaluation_page.py",

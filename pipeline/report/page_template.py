@@ -1,4 +1,4 @@
-"""Templates of the pages: what is put into them is text and never markup, unless it says that it is."""
+"""Templates of the pages. Values are escaped as text unless they are marked as markup."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import jinja2
 from markupsafe import Markup, escape
 
 
-def page_template(name: str) -> jinja2.Template:
-    """A template by its file name; the filter `code` sets what stands between backticks."""
+def page_template(name: str, package: str = "pipeline.report") -> jinja2.Template:
+    """A template of a package, which may include those of `pipeline.report`; the filter `code` renders backticks."""
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pipeline.report"),
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(package), jinja2.PackageLoader("pipeline.report")]),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -22,5 +22,5 @@ def page_template(name: str) -> jinja2.Template:
 
 
 def _code(text: str) -> Markup:
-    """One line of Markdown as HTML: what stands between backticks is code."""
+    """One line of Markdown as HTML, with text between backticks as code."""
     return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704 -- escaped

@@ -22,7 +22,6 @@ from PIL import Image
 from processes import program
 
 from pipeline.report.maps import BAD, GOOD, MISSING, Map
-from pipeline.report.svg_chart import rebinned
 from pipeline.ruler.evaluation.chapters import printed
 from pipeline.ruler.evaluation.definitions import DEFINITIONS as ALL
 from pipeline.ruler.evaluation.evaluate import Evaluation
@@ -32,6 +31,7 @@ from pipeline.ruler.report.evaluation_maps import maps
 from pipeline.ruler.report.evaluation_page import HEADLINE, page, write_page
 from pipeline.ruler.report.histograms import charts
 from pipeline.ruler.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_line, residual_class, section_svg
+from pipeline.ruler.report.svg_chart import rebinned
 from pipeline.ruler.report.worst_cases import MAX_NOT_FOUND, chosen_rows, worst_cases
 
 KINDS: tuple[dict[str, bool], ...] = (

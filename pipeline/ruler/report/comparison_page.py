@@ -87,7 +87,7 @@ def page(comparison: Comparison) -> str:
     kinds = {
         record.roof_type for case in comparison.cases for record in case.choice.building.records if record.is_model
     }
-    return page_template("comparison.html").render(
+    return page_template("comparison.html", "pipeline.ruler.report").render(
         title=comparison.title,
         subject=comparison.subject,
         labels=[run.label for run in comparison.runs],

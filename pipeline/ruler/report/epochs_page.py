@@ -13,7 +13,6 @@ from pipeline.io.storage import LocalStorage
 from pipeline.report.class_map import MAX_DRAWN, ClassMap
 from pipeline.report.page_template import page_template
 from pipeline.report.pictures import data_uri
-from pipeline.report.svg_chart import Axis, Ordinate, histogram_svg
 from pipeline.ruler.epochs.diff import Diff
 from pipeline.ruler.epochs.epoch import Epoch
 from pipeline.ruler.epochs.records import CHANGES, DOUBTS, INCOMPARABLE, Change, Doubt, Incomparable
@@ -23,6 +22,7 @@ from pipeline.ruler.epochs.writing import PARQUET
 from pipeline.ruler.evaluation.chapters import NOTHING as _NOTHING
 from pipeline.ruler.report.epochs_map import COLOURS
 from pipeline.ruler.report.epochs_pictures import HEIGHT_PX, NEW_LINE, OLD_LINE, WIDTH_PX, Case, cases
+from pipeline.ruler.report.svg_chart import Axis, Ordinate, histogram_svg
 
 PAGE = "changes.html"
 """The file."""
@@ -64,7 +64,7 @@ def page(diff: Diff, rows: ClassMap) -> str:
     pictures = cases(largest, diff.old, diff.new)
     listed = [_row(row) for row in largest.to_pylist()]
     changed = sum(one["rows"] for name, one in told["changes"].items() if name != Change.UNCHANGED.value)
-    return page_template("epochs.html").render(
+    return page_template("epochs.html", "pipeline.ruler.report").render(
         title=" to ".join(_names_of(diff.old.run_dir, diff.new.run_dir)),
         subject=_subject(diff),
         warnings=diff.warnings,

@@ -76,7 +76,7 @@ def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINIT
     found = chapters(evaluation, definitions)
     measured, against = told_subject(evaluation)
     name = evaluation.models.name
-    return page_template("evaluation.html").render(
+    return page_template("evaluation.html", "pipeline.ruler.report").render(
         title=name if evaluation.reference is None else f"{name} against {evaluation.reference.name}",
         measured=measured,
         against=against,

@@ -12,8 +12,8 @@ import pyarrow as pa
 from markupsafe import Markup
 
 from pipeline.model import BoolArray, FloatArray
-from pipeline.report.svg_chart import Axis, Ordinate, category_svg, histogram_svg, rebinned
 from pipeline.ruler.evaluation.counts import floats
+from pipeline.ruler.report.svg_chart import Axis, Ordinate, category_svg, histogram_svg, rebinned
 
 GOOD_M = 0.2
 """Where the line stands in charts of distances: METHODS counts points within it."""

@@ -11,8 +11,8 @@ import shapely
 from markupsafe import Markup, escape
 
 from pipeline.model import FloatArray, LabelArray
-from pipeline.report.svg_chart import ticks
 from pipeline.ruler.evaluation.models import RoofModel
+from pipeline.ruler.report.svg_chart import ticks
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
