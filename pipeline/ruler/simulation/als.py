@@ -1,22 +1,23 @@
 """An airborne laser scanner over a scene: parallel strips, scan lines, beams with a footprint, several returns.
 
-Every pulse draws its random numbers from a state of its own (seed, strip, line, pulse), so what it measures depends
-neither on the order nor on the chunks in which the pulses are made.
+Every pulse draws its random numbers from a state of its own (seed, strip, line, pulse). Its measurement depends neither
+on the order nor on the chunks in which the pulses are made.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.model import BoolArray, ByteArray, FloatArray, LabelArray, PointCloud
-from pipeline.ruler.simulation.beam import COLUMNS, MAX_RETURNS, FlightLine, scan_lines
+from pipeline.ruler.simulation.beam import COLUMNS, MAX_RETURNS, FlightLine, Survey, scan_lines
 from pipeline.ruler.simulation.scene import Scene
 from pipeline.ruler.simulation.scene_arrays import SceneArrays, scene_arrays
 from pipeline.ruler.simulation.strips import ScannerSettings, flight_lines, lines_over, reach_m
@@ -24,8 +25,11 @@ from pipeline.ruler.simulation.survey_faults import fault_rows, move_faulty
 
 __all__ = ["ScanBlock", "ScannerSettings", "joined", "reach_m", "scan", "scan_all", "strip_count"]
 
-_PULSES_A_BLOCK = 131_072
-"""Work unit of a thread: it holds at most this many pulses in memory."""
+_PULSES_PER_BLOCK = 131_072
+"""Work unit of a thread, which bounds its memory."""
+
+_Job = tuple[FlightLine, range]
+"""Consecutive scan lines of one strip."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,7 +45,7 @@ class ScanBlock:
     building: LabelArray
     """(n,) int32, number of the building that was hit; -1 for none."""
     face: LabelArray
-    """(n,) int32, number of its roof face; -1 for walls and for what is no building."""
+    """(n,) int32, number of its roof face; -1 for walls and other objects."""
     mixed: BoolArray
     """(n,) bool, True where echoes of different surfaces melted into this return."""
 
@@ -53,15 +57,6 @@ class ScanBlock:
     def wall(self) -> BoolArray:
         """(n,) bool, True where a wall was hit."""
         return (self.building >= 0) & (self.face < 0)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Job:
-    """Consecutive scan lines of one strip."""
-
-    line: FlightLine
-    first: int
-    stop: int
 
 
 def strip_count(scene: Scene, settings: ScannerSettings) -> int:
@@ -85,11 +80,11 @@ def scan(
     settings : ScannerSettings
         The survey.
     seed : int
-        Seed of the scanner; content depends on nothing but scene, settings and seed.
+        Seed of the scanner. The content depends on scene, settings and seed alone.
     chunk_points : int
-        At least so many returns a chunk (the last may be smaller); at most some 100,000 more.
+        Smallest number of returns per chunk, except the last; a chunk has at most some 100,000 more.
     threads : int
-        Threads that work ahead; memory grows with them, content does not change.
+        Threads that work ahead. They cost memory and do not change the content.
 
     Yields
     ------
@@ -103,8 +98,10 @@ def scan(
     """
     margin_m = settings.beam_radius_m + settings.pulse_spacing_m
     arrays = scene_arrays(scene, settings.max_lean, margin_m, settings.beam_radius_m)
+    survey = _survey(scene, settings, seed)
+    jobs = _jobs(scene, settings, seed, min(_PULSES_PER_BLOCK, chunk_points) // survey.pulses_per_line)
     pending: list[ScanBlock] = []
-    for block in _in_order(_jobs(scene, settings, seed, chunk_points), arrays, scene, settings, seed, threads):
+    for block in _in_order(jobs, functools.partial(_block, scene, arrays, survey), threads):
         if len(block):
             pending.append(block)
         if sum(len(one) for one in pending) >= chunk_points:
@@ -115,7 +112,7 @@ def scan(
 
 
 def scan_all(scene: Scene, settings: ScannerSettings, seed: int) -> ScanBlock:
-    """The whole scan in memory: for small scenes.
+    """The whole scan in memory, for small scenes.
 
     Raises
     ------
@@ -140,64 +137,60 @@ def joined(blocks: list[ScanBlock]) -> ScanBlock:
     return ScanBlock(points=points, **{name: np.concatenate([getattr(b, name) for b in blocks]) for name in others})
 
 
-def _jobs(scene: Scene, settings: ScannerSettings, seed: int, chunk_points: int) -> Iterator[_Job]:
+def _survey(scene: Scene, settings: ScannerSettings, seed: int) -> Survey:
     spacing = settings.pulse_spacing_m
-    per_line = math.ceil(2 * settings.half_swath_m / spacing)
-    step = max(1, min(_PULSES_A_BLOCK, chunk_points) // per_line)
+    return Survey(
+        spacing=spacing,
+        half_swath=settings.half_swath_m,
+        altitude=settings.altitude_m,
+        jitter=settings.jitter,
+        range_noise=settings.range_noise_m,
+        beam_radius=settings.beam_radius_m,
+        range_resolution=settings.range_resolution_m,
+        drop_out=settings.drop_out,
+        speed=settings.speed_m_s,
+        wrong_row_share=settings.wrong_row_share,
+        wrong_row_lift=settings.wrong_row_lift_m,
+        pulses_per_line=math.ceil(2 * settings.half_swath_m / spacing),
+        extent=np.array(scene.extent, dtype=np.float64),
+        seed=seed,
+    )
+
+
+def _jobs(scene: Scene, settings: ScannerSettings, seed: int, lines_per_block: int) -> Iterator[_Job]:
+    step = max(1, lines_per_block)
     for line in flight_lines(scene, settings, seed):
         needed = lines_over(line, scene, settings)
         for first in needed[::step]:
-            yield _Job(line=line, first=first, stop=min(first + step, needed.stop))
+            yield line, range(first, min(first + step, needed.stop))
 
 
-def _in_order(
-    jobs: Iterator[_Job], arrays: SceneArrays, scene: Scene, settings: ScannerSettings, seed: int, threads: int
-) -> Iterator[ScanBlock]:
+def _in_order(jobs: Iterator[_Job], block_of: Callable[[_Job], ScanBlock], threads: int) -> Iterator[ScanBlock]:
     """Blocks in the order of the jobs, a bounded number in flight."""
     if threads < 2:
-        for job in jobs:
-            yield _block(job, arrays, scene, settings, seed)
+        yield from map(block_of, jobs)
         return
     with ThreadPoolExecutor(threads) as pool:
         running: deque[Future[ScanBlock]] = deque()
         for job in jobs:
-            running.append(pool.submit(_block, job, arrays, scene, settings, seed))
+            running.append(pool.submit(block_of, job))
             if len(running) > threads:
                 yield running.popleft().result()
         while running:
             yield running.popleft().result()
 
 
-def _block(job: _Job, arrays: SceneArrays, scene: Scene, settings: ScannerSettings, seed: int) -> ScanBlock:
+def _block(scene: Scene, arrays: SceneArrays, survey: Survey, job: _Job) -> ScanBlock:
     """Scan some lines of a strip."""
-    spacing = settings.pulse_spacing_m
-    per_line = math.ceil(2 * settings.half_swath_m / spacing)
-    capacity = (job.stop - job.first) * per_line * MAX_RETURNS
-    floats = np.empty((capacity, 5))
-    integers = np.empty((capacity, COLUMNS), np.int32)
-    survey = np.array(
-        [
-            spacing,
-            settings.half_swath_m,
-            settings.altitude_m,
-            settings.jitter,
-            settings.range_noise_m,
-            settings.beam_radius_m,
-            settings.range_resolution_m,
-            settings.drop_out,
-            settings.speed_m_s,
-            settings.wrong_row_share,
-            settings.wrong_row_lift_m,
-        ]
-    )
-    count = scan_lines(
-        arrays, job.line, survey, np.array(scene.extent), seed, job.first, job.stop, per_line, floats, integers
-    )
+    flight, lines = job
+    capacity = len(lines) * survey.pulses_per_line * MAX_RETURNS
+    floats, integers = np.empty((capacity, 5)), np.empty((capacity, COLUMNS), np.int32)
+    count = scan_lines(arrays, flight, survey, lines.start, lines.stop, floats, integers)
     floats, integers = floats[:count], integers[:count]
     faults = fault_rows(scene.survey_faults, floats)
     if len(faults):
-        move_faulty(floats, np.ascontiguousarray(integers[:, 7]), faults, seed, job.line.number)
-    return _as_block(floats, integers, scene, job.line.number)
+        move_faulty(floats, np.ascontiguousarray(integers[:, 7]), faults, survey.seed, flight.number)
+    return _as_block(floats, integers, scene, flight.number)
 
 
 def _as_block(floats: FloatArray, integers: LabelArray, scene: Scene, strip: int) -> ScanBlock:

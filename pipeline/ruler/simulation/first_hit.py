@@ -1,16 +1,16 @@
-"""What a line from above hits first: exact, over flat arrays and a grid of objects.
+"""The first hit of a ray from above: exact, over flat arrays and a grid of objects.
 
-A line is given by its point on the terrain and its lean (metres east and north per metre up). The first hit from above
-is then the highest one, so elevation itself is the parameter along the line and no ray marching is needed.
+A ray is given by its point on the terrain and its lean (metres east and north per metre up). The first hit from above
+is then the highest one, so elevation itself is the parameter along the ray and no ray marching is needed.
 
-The inner kernels take the arrays that they read one by one: a `SceneArrays` handed down would cost them a count of
-references for every array in it, several times what a hit costs.
+The inner kernels take the arrays that they read one by one: passing a whole `SceneArrays` would count references to
+each of its arrays, which costs several times as much as a hit.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,13 +21,29 @@ from pipeline.ruler.simulation.scene_arrays import CELL_M, SceneArrays
 GROUND, ROOF, WALL, TREE, BOX = 0, 1, 2, 3, 4
 """Kinds of hits."""
 
+# Numerical guards, not settings: metres that rounding may move a point, and iterations that always suffice.
 _ON_ROOF_M = 1e-6
 _ON_TERRAIN_M = 1e-7
 _STEPS = 40
 _SLOW = 0.05
 """A fixed-point step that leaves more of the error than this is followed by a secant step."""
 _ROUNDING_M = 1e-6
-"""Bounds are taken wider by this."""
+"""Bounds are widened by this."""
+
+
+class Ray(NamedTuple):
+    """A straight line through a point (x, y, z) in metres, scene frame."""
+
+    x: float
+    """Easting."""
+    y: float
+    """Northing."""
+    z: float
+    """Elevation."""
+    lean_x: float
+    """Metres east per metre up."""
+    lean_y: float
+    """Metres north per metre up."""
 
 
 @kernel
@@ -55,22 +71,20 @@ def terrain_z(terrain: FloatArray, waves: FloatArray, x: float, y: float) -> flo
 
 
 @kernel
-def terrain_hit(
-    terrain: FloatArray, waves: FloatArray, x: float, y: float, z: float, lean_x: float, lean_y: float
-) -> Any:
-    """Where the line through (x, y, z) meets the terrain.
+def terrain_hit(terrain: FloatArray, waves: FloatArray, ray: Ray) -> Ray:
+    """The same ray, given by its point on the terrain.
 
-    Fixed-point steps, each shrinks the error by slope * lean; where that is slow, secant steps. `scene_arrays` has seen
-    to it that slope * lean is less than 1, so that there is one such place; where the steps get nowhere, bisection
-    finds it.
+    Each fixed-point step shrinks the error by slope * lean; secant steps help where that is slow, and bisection where
+    both fail. `scene_arrays` ensures that slope * lean is less than 1, so there is exactly one such point.
     """
+    x, y, z, lean_x, lean_y = ray
     start_x, start_y, start_z = x, y, z
     up, rise_before = 0.0, np.inf
     for _ in range(_STEPS):
         ground = terrain_z(terrain, waves, x, y)
         rise = ground - z
         if abs(rise) < _ON_TERRAIN_M:
-            return x, y, z
+            return Ray(x, y, z, lean_x, lean_y)
         if abs(rise) > _SLOW * abs(rise_before):
             up *= rise / (rise_before - rise)
             z += up
@@ -91,12 +105,12 @@ def terrain_hit(
             low = up
         else:
             high = up
-    return start_x + high * lean_x, start_y + high * lean_y, start_z + high
+    return Ray(start_x + high * lean_x, start_y + high * lean_y, start_z + high, lean_x, lean_y)
 
 
 @kernel
 def _inside(edges: FloatArray, start: int, stop: int, x: float, y: float) -> bool:
-    """Point in polygon by crossings of all rings; points on the border belong to one side or the other."""
+    """Point in polygon by crossings of the edges (n, 4) of all rings; border points may count as inside or outside."""
     inside = False
     for k in range(start, stop):
         y1, y2 = edges[k, 1], edges[k, 3]
@@ -108,16 +122,16 @@ def _inside(edges: FloatArray, start: int, stop: int, x: float, y: float) -> boo
 
 
 @kernel
-def _passes_by(circles: FloatArray, prism: int, x: float, y: float, z: float, lean: float, radius: float) -> bool:
-    """Whether a line stays out of the circle around a prism by more than a radius: most do."""
-    away_x, away_y = x - circles[prism, 0], y - circles[prism, 1]
-    reach = circles[prism, 2] + max(0.0, circles[prism, 3] - z) * lean + radius
+def _passes_by(circles: FloatArray, prism: int, ray: Ray, lean: float, radius: float) -> bool:
+    """Whether a ray stays outside the circle around a prism by more than a radius; most do."""
+    away_x, away_y = ray.x - circles[prism, 0], ray.y - circles[prism, 1]
+    reach = circles[prism, 2] + max(0.0, circles[prism, 3] - ray.z) * lean + radius
     return bool(away_x * away_x + away_y * away_y > reach * reach)
 
 
 @kernel
 def _near_bounds(faces: FloatArray, face: int, x1: float, y1: float, x2: float, y2: float, distance: float) -> bool:
-    """Whether the rectangle around two places comes near to the bounds of a face."""
+    """Whether the rectangle around two points comes within a distance in metres of the bounds of a face."""
     reach = distance + _ROUNDING_M
     return bool(
         max(x1, x2) > faces[face, 3] - reach
@@ -128,37 +142,35 @@ def _near_bounds(faces: FloatArray, face: int, x1: float, y1: float, x2: float, 
 
 
 @kernel
-def _meets_crown(
-    trees: FloatArray, tree: int, x: float, y: float, z: float, lean_x: float, lean_y: float, radius: float
-) -> bool:
-    """Whether a line comes into a crown that is wider by a radius."""
+def _meets_crown(trees: FloatArray, tree: int, ray: Ray, radius: float) -> bool:
+    """Whether a ray enters a crown that is enlarged by a radius in metres."""
     wide, tall = trees[tree, 3] + radius, trees[tree, 4] + radius
-    from_x, from_y, from_z = (x - trees[tree, 0]) / wide, (y - trees[tree, 1]) / wide, (z - trees[tree, 2]) / tall
-    to_x, to_y, to_z = lean_x / wide, lean_y / wide, 1.0 / tall
+    from_x, from_y = (ray.x - trees[tree, 0]) / wide, (ray.y - trees[tree, 1]) / wide
+    from_z = (ray.z - trees[tree, 2]) / tall
+    to_x, to_y, to_z = ray.lean_x / wide, ray.lean_y / wide, 1.0 / tall
     linear = from_x * to_x + from_y * to_y + from_z * to_z
     square = to_x * to_x + to_y * to_y + to_z * to_z
     return bool(linear * linear > square * (from_x * from_x + from_y * from_y + from_z * from_z - 1.0))
 
 
 @kernel
-def is_clear(
-    scene: SceneArrays, cell: int, x: float, y: float, z: float, lean_x: float, lean_y: float, radius: float
-) -> bool:
-    """Whether a beam of a radius around a line meets no edge of a roof face and no crown.
+def is_clear(scene: SceneArrays, cell: int, ray: Ray, radius: float) -> bool:
+    """Whether a beam with a radius in metres around a ray meets no edge of a roof face and no crown.
 
-    Each face is looked at in its own plane, whether it is hit or hidden, so a beam past an eave is not clear. Edges of
-    walls alone (the vertical corners of a house) are not looked at.
+    Each face is tested in its own plane, whether it is hit or hidden, so a beam past an eave is not clear. Vertical
+    edges, the corners of walls, are not tested.
     """
+    x, y, z, lean_x, lean_y = ray
     face_start, edge_start, circles = scene.face_start, scene.edge_start, scene.circles
     faces, edges, trees = scene.faces, scene.edges, scene.trees
     lean = math.sqrt(lean_x * lean_x + lean_y * lean_y)
     for entry in range(scene.cell_start[cell], scene.cell_start[cell + 1]):
         number = scene.entries[entry, 0]
         if number < 0:
-            if _meets_crown(trees, ~number, x, y, z, lean_x, lean_y, radius):
+            if _meets_crown(trees, ~number, ray, radius):
                 return False
             continue
-        if _passes_by(circles, number, x, y, z, lean, radius):
+        if _passes_by(circles, number, ray, lean, radius):
             continue
         for face in range(face_start[number], face_start[number + 1]):
             a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
@@ -188,19 +200,16 @@ def _prism_hit(
     faces: FloatArray,
     edges: FloatArray,
     prism: int,
-    x: float,
-    y: float,
-    z: float,
-    lean_x: float,
-    lean_y: float,
+    ray: Ray,
 ) -> Any:
-    """Highest hit of a line with the prisms under the faces: elevation (-inf for none), face or -1 for a wall.
+    """Highest hit of a ray with the prisms under the faces: elevation (-inf for none), face or -1 for a wall.
 
-    Where two faces share an edge in plan but not in height, the line enters the prism of the higher one through its
-    side: the step edge's wall. What of that side lies under the lower face is hidden in the other prism.
+    Where two faces share an edge in plan but not in height, the ray enters the prism of the higher one through its
+    side, the wall of the step edge. The part of that side under the lower face is hidden in the other prism.
     """
+    x, y, z, lean_x, lean_y = ray
     best, hit = -np.inf, -1
-    if _passes_by(circles, prism, x, y, z, math.sqrt(lean_x * lean_x + lean_y * lean_y), 0.0):
+    if _passes_by(circles, prism, ray, math.sqrt(lean_x * lean_x + lean_y * lean_y), 0.0):
         return best, hit
     first = face_start[prism]
     for face in range(first, face_start[prism + 1]):
@@ -209,7 +218,7 @@ def _prism_hit(
         if leaning > 1e-9:
             top = (a * (x - z * lean_x) + b * (y - z * lean_y) + c) / leaning
             if top <= best:
-                continue  # what the line meets of the sides lies below
+                continue  # any hit with the sides lies below
             at_x, at_y = x + (top - z) * lean_x, y + (top - z) * lean_y
             if not _near_bounds(faces, face, at_x, at_y, x, y, 0.0):
                 continue
@@ -238,10 +247,9 @@ def _prism_hit(
 
 
 @kernel
-def _tree_hit(
-    trees: FloatArray, tree: int, x: float, y: float, z: float, lean_x: float, lean_y: float, chance: float
-) -> float:
-    """Elevation where a beam ends in a crown, -inf where it passes: depth = -ln(chance) * free path along the chord."""
+def _tree_hit(trees: FloatArray, tree: int, ray: Ray, chance: float) -> float:
+    """Elevation where a ray ends in a crown, -inf if it passes: depth = -ln(chance) * free path along the chord."""
+    x, y, z, lean_x, lean_y = ray
     radius, half_height = trees[tree, 3], trees[tree, 4]
     from_x = (x - trees[tree, 0]) / radius
     from_y = (y - trees[tree, 1]) / radius
@@ -262,7 +270,7 @@ def _tree_hit(
 
 @kernel
 def cell_of(grid: FloatArray, across: int, up: int, x: float, y: float) -> int:
-    """Number of the grid's cell, -1 outside."""
+    """Number of the grid cell at (x, y); -1 outside the grid."""
     column = math.floor((x - grid[0]) / CELL_M)
     row = math.floor((y - grid[1]) / CELL_M)
     if column < 0 or row < 0 or column >= across or row >= up:
@@ -272,22 +280,12 @@ def cell_of(grid: FloatArray, across: int, up: int, x: float, y: float) -> int:
 
 
 @kernel
-def first_hit(
-    scene: SceneArrays,
-    cell: int,
-    x: float,
-    y: float,
-    z: float,
-    lean_x: float,
-    lean_y: float,
-    state: np.uint64,
-    draw: int,
-) -> Any:
-    """Highest hit of the line through the terrain point (x, y, z): elevation, kind, object, roof face.
+def first_hit(scene: SceneArrays, cell: int, ray: Ray, state: np.uint64, draw: int) -> Any:
+    """Highest hit of a ray given by its terrain point: elevation, kind, object, roof face.
 
-    A crown's chance is drawn from the state at draw + the entry's own; draw < 0 leaves crowns out.
+    The chance of a crown is drawn from the state at draw + the number of its entry; draw < 0 leaves crowns out.
     """
-    best, kind, thing, face = z, GROUND, -1, -1
+    best, kind, thing, face = ray.z, GROUND, -1, -1
     if cell < 0:
         return best, kind, thing, face
     entries, n_buildings = scene.entries, scene.n_buildings
@@ -296,13 +294,13 @@ def first_hit(
     for entry in range(scene.cell_start[cell], scene.cell_start[cell + 1]):
         number = entries[entry, 0]
         if number >= 0:
-            top, hit = _prism_hit(face_start, edge_start, circles, faces, edges, number, x, y, z, lean_x, lean_y)
+            top, hit = _prism_hit(face_start, edge_start, circles, faces, edges, number, ray)
             if top > best:
                 best, thing, face = top, number, hit
                 kind = (ROOF if hit >= 0 else WALL) if number < n_buildings else BOX
         elif draw >= 0:
             chance = uniform_of(state, draw + entries[entry, 1])
-            top = _tree_hit(trees, ~number, x, y, z, lean_x, lean_y, chance)
+            top = _tree_hit(trees, ~number, ray, chance)
             if top > best:
                 best, kind, thing, face = top, TREE, ~number, -1
     if kind == BOX:
@@ -312,7 +310,7 @@ def first_hit(
 
 @kernel(inline="always")
 def is_wet(spot_start: LabelArray, spots: FloatArray, building: int, x: float, y: float) -> bool:
-    """Whether a place on a building's roof lies in one of its wet spots."""
+    """Whether (x, y) on the roof of a building lies in one of its wet spots (x, y, squared radius)."""
     for spot in range(spot_start[building], spot_start[building + 1]):
         away_x, away_y = x - spots[spot, 0], y - spots[spot, 1]
         if away_x * away_x + away_y * away_y < spots[spot, 2]:

@@ -1,4 +1,4 @@
-"""What many lines hit first, as arrays; among them the vertical ones, which see the top surface."""
+"""The first hits of many rays as arrays; vertical rays see the top surface."""
 
 from __future__ import annotations
 
@@ -9,60 +9,37 @@ import numpy.typing as npt
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, LabelArray
-from pipeline.ruler.simulation.first_hit import ROOF, WALL, cell_of, first_hit, terrain_hit
+from pipeline.ruler.simulation.first_hit import ROOF, WALL, Ray, cell_of, first_hit, terrain_hit
 from pipeline.ruler.simulation.scene import Scene
 from pipeline.ruler.simulation.scene_arrays import SceneArrays, scene_arrays
 
 
 @kernel
 def _first_hits(
-    scene: SceneArrays,
-    x: FloatArray,
-    y: FloatArray,
-    z: FloatArray,
-    lean_x: FloatArray,
-    lean_y: FloatArray,
-    states: npt.NDArray[np.uint64],
-    kind: LabelArray,
-    thing: LabelArray,
-    face: LabelArray,
+    scene: SceneArrays, rays: FloatArray, states: npt.NDArray[np.uint64], top: FloatArray, hits: LabelArray
 ) -> None:
-    """The first hits of lines through terrain points; z is replaced by the elevation of the hit."""
-    for k in range(len(x)):
-        z[k], kind[k], thing[k], face[k] = first_hit(
-            scene,
-            cell_of(scene.grid, scene.cells_across, scene.cells_up, x[k], y[k]),
-            x[k],
-            y[k],
-            z[k],
-            lean_x[k],
-            lean_y[k],
-            states[k] if len(states) > 0 else np.uint64(0),
-            0 if len(states) > 0 else -1,
-        )
-
-
-@kernel
-def _landings(
-    scene: SceneArrays, x: FloatArray, y: FloatArray, z: FloatArray, lean_x: FloatArray, lean_y: FloatArray
-) -> None:
-    """Move points (x, y, z) along their lines to the terrain."""
-    for k in range(len(x)):
-        x[k], y[k], z[k] = terrain_hit(scene.terrain, scene.waves, x[k], y[k], z[k], lean_x[k], lean_y[k])
+    """Move rays (n, 5) to the terrain; write the elevations (n,) and the kind, object and face (n, 3) that they hit."""
+    for k in range(len(rays)):
+        ray = Ray(rays[k, 0], rays[k, 1], rays[k, 2], rays[k, 3], rays[k, 4])
+        ray = terrain_hit(scene.terrain, scene.waves, ray)
+        rays[k, 0], rays[k, 1], rays[k, 2] = ray.x, ray.y, ray.z
+        cell = cell_of(scene.grid, scene.cells_across, scene.cells_up, ray.x, ray.y)
+        state, draw = (states[k], 0) if len(states) > 0 else (np.uint64(0), -1)
+        top[k], hits[k, 0], hits[k, 1], hits[k, 2] = first_hit(scene, cell, ray, state, draw)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Hits:
-    """What n lines hit first."""
+    """The first hits of n rays."""
 
     xyz: FloatArray
     """(n, 3) float64, scene frame, metres."""
     kind: LabelArray
     """(n,) int32: GROUND, ROOF, WALL, TREE or BOX."""
     building: LabelArray
-    """(n,) int32, number of the building; -1 where there is none."""
+    """(n,) int32, number of the building; -1 for none."""
     face: LabelArray
-    """(n,) int32, number of its roof face; -1 for walls and where there is no building."""
+    """(n,) int32, number of its roof face; -1 for walls and without a building."""
 
     @property
     def z(self) -> FloatArray:
@@ -78,27 +55,26 @@ class Hits:
 def hits_of_lines(
     arrays: SceneArrays, places: FloatArray, leans: FloatArray, states: npt.NDArray[np.uint64] | None = None
 ) -> Hits:
-    """What leaning lines hit first.
+    """The first hits of leaning rays.
 
     Parameters
     ----------
     arrays : SceneArrays
         Made for at least this lean.
     places : ndarray (n, 3)
-        Any place of each line, scene frame.
+        Any point of each ray, scene frame, metres.
     leans : ndarray (n, 2)
         Metres east and north per metre up.
     states : ndarray (n,) uint64, optional
-        Random states that decide how deep lines sink into crowns; without them crowns are left out.
+        Random states that decide how deep rays sink into crowns; without them crowns are left out.
     """
-    x, y, z = (np.array(column, dtype=np.float64) for column in places.T)
-    lean_x, lean_y = (np.array(column, dtype=np.float64) for column in leans.T)
-    _landings(arrays, x, y, z, lean_x, lean_y)
-    top, kind, thing, face = z.copy(), *(np.empty(len(x), np.int32) for _ in range(3))
-    states = np.zeros(0, np.uint64) if states is None else states
-    _first_hits(arrays, x, y, top, lean_x, lean_y, states, kind, thing, face)
+    rays = np.column_stack([places, leans]).astype(np.float64)
+    top, hits = np.empty(len(rays)), np.empty((len(rays), 3), np.int32)
+    _first_hits(arrays, rays, np.zeros(0, np.uint64) if states is None else states, top, hits)
+    kind, thing, face = (np.ascontiguousarray(column) for column in hits.T)
     building = np.where((kind == ROOF) | (kind == WALL), thing, -1).astype(np.int32)
-    xyz = np.column_stack([x + (top - z) * lean_x, y + (top - z) * lean_y, top])
+    up = top - rays[:, 2]
+    xyz = np.column_stack([rays[:, 0] + up * rays[:, 3], rays[:, 1] + up * rays[:, 4], top])
     return Hits(xyz=xyz, kind=kind, building=building, face=face)
 
 
