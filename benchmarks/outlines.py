@@ -45,8 +45,9 @@ from pipeline.ruler.evaluation.blocks import joined_reference
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference_truth import read_truth_reference
 from pipeline.ruler.simulation.city import CITY_SCANNER
-from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.dataset import Output, simulate
 from pipeline.ruler.simulation.seeds import seed_of
+from pipeline.ruler.simulation.suites import SUITES
 from pipeline.ruler.simulation.sweep import DENSITIES_PER_M2, NOISES_M, cell_name
 from pipeline.scene import BUILDING_CLASS
 from pipeline.settings import RunSettings
@@ -101,7 +102,7 @@ def sweep_rows(out: Path, split: str, outline: str) -> Iterator[list[str]]:
                     seed_of(split, 0),
                     density_per_m2=density,
                     noise_m=noise,
-                    with_classes=True,
+                    output=Output(with_classes=True),
                 )
             yield [f"{density:g}", f"{noise:.2f}", *compared(folder / cell_name(density, noise), outline)]
 
@@ -120,7 +121,8 @@ def beam_rows(out: Path, split: str, outline: str) -> Iterator[list[str]]:
                         pulse_density_per_m2=density,
                         strip_shift_m=0.0,
                     )
-                    simulate("city", folder, seed_of(split, 0), size_m=CITY_SIZE_M, scanner=survey, with_classes=True)
+                    city = dataclasses.replace(SUITES["city"], scanner=survey)
+                    simulate(city, folder, seed_of(split, 0), size_m=CITY_SIZE_M, output=Output(with_classes=True))
                 yield [f"{radius:g}", f"{azimuth:g}", f"{density:g}", *compared(folder, outline)]
 
 

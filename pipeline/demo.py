@@ -10,17 +10,17 @@ from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
 from pipeline.ruler.evaluation.writing import write_tables
 from pipeline.ruler.report.evaluation_page import write_page
-from pipeline.ruler.simulation.dataset import ScenePaths, simulate
+from pipeline.ruler.simulation.dataset import Output, ScenePaths, simulate
 from pipeline.runtime.monitoring.events import Event, Listener
 from pipeline.runtime.run import RunRequest, RunSummary, run
 
 SUITE = "suburb"
-"""What is simulated."""
+"""The suite of the demo."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Demo:
-    """What the demo made."""
+    """The results of the demo."""
 
     scene: ScenePaths
     """The simulated tile and its truth."""
@@ -29,7 +29,7 @@ class Demo:
     evaluation: Evaluation
     """The run's models against the truth."""
     page: Path
-    """The report of the evaluation, for people."""
+    """The page of the evaluation."""
     picture: Path
     """The run, drawn."""
 
@@ -43,27 +43,25 @@ def demonstrate(
     size_m: tuple[float, float] | None,
     seed: int | None,
 ) -> Demo:
-    """Simulate, reconstruct, measure, draw.
+    """Simulate, reconstruct, measure and draw into the folders `scene/`, `run/`, `report/` and the file `demo.png`.
 
     Parameters
     ----------
     out : str or Path
-        Folder of everything: `scene/`, `run/`, `report/` and `demo.png`.
+        Folder of everything.
     on_event : callable
         Gets the events of all steps.
     workers : int or None
-        Processes of the embedded cluster; 0 runs serially, None leaves it to the estimate.
+        Processes of the embedded cluster; 0 runs serially, None follows the estimate.
     overwrite : bool
         Replace an earlier demo.
-    size_m : tuple of float or None
-        Extent of the suburb east and north; its own by default.
-    seed : int or None
-        Of the suburb; its own by default.
+    size_m, seed : tuple of float or None, int or None
+        Extent of the suburb east and north, and its seed; its own by default.
 
     Raises
     ------
     RunError
-        There is a run already, and `overwrite` is not asked for.
+        There is a run already, and `overwrite` is False.
     """
     folder = Path(out)
     scene = simulate(
@@ -71,7 +69,7 @@ def demonstrate(
         folder / "scene",
         seed,
         size_m=size_m,
-        on_points=lambda n: on_event(Event(kind="progress", stage="scan", done=n)),
+        output=Output(on_points=lambda n: on_event(Event(kind="progress", stage="scan", done=n))),
     )
     request = RunRequest(inputs=(str(scene.laz),), out=str(folder / "run"), workers=workers, overwrite=overwrite)
     summary = run(request, on_event)

@@ -49,6 +49,7 @@ def simulate(
     """Simulate a scene as LAZ tiles, with the exact truth beside them."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.errors import SettingsError
+        from pipeline.ruler.simulation.dataset import Output
         from pipeline.ruler.simulation.dataset import simulate as simulate_scene
         from pipeline.ruler.simulation.seeds import seed_of
         from pipeline.runtime.monitoring.events import Event
@@ -64,8 +65,10 @@ def simulate(
             size_m=size,
             density_per_m2=density,
             noise_m=noise,
-            with_classes=with_classes,
-            on_points=lambda n: console.on_event(Event(kind="progress", stage="scan", done=n)),
+            output=Output(
+                with_classes=with_classes,
+                on_points=lambda n: console.on_event(Event(kind="progress", stage="scan", done=n)),
+            ),
         )
         console.say(f"{paths.points} points of {paths.buildings} buildings in {paths.laz}, the truth in {paths.truth}")
         console.document(dataclasses.asdict(paths))

@@ -19,7 +19,6 @@ import shapely
 from pipeline.errors import SettingsError
 from pipeline.model import FloatArray
 from pipeline.ruler.evaluation.reading import read_models
-from pipeline.ruler.simulation import suites
 from pipeline.ruler.simulation.als import ScanBlock, scan_all
 from pipeline.ruler.simulation.city import CITY_SCANNER, CityPlan, city
 from pipeline.ruler.simulation.conditions import terrain_slope_deg
@@ -32,6 +31,7 @@ from pipeline.ruler.simulation.truth_files import write_models
 SIZE = (300.0, 220.0)
 SPARSE = dataclasses.replace(CITY_SCANNER, pulse_density_per_m2=1.0)
 TILE_M = 150.0
+SPARSE_CITY = dataclasses.replace(SUITES["city"], scanner=SPARSE, tile_m=TILE_M)
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +41,7 @@ def whole() -> Scene:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> ScenePaths:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(suites.SUITES, "city", dataclasses.replace(SUITES["city"], tile_m=TILE_M))
-        return simulate("city", tmp_path_factory.mktemp("city"), 1_005, size_m=SIZE, scanner=SPARSE)
+    return simulate(SPARSE_CITY, tmp_path_factory.mktemp("city"), 1_005, size_m=SIZE)
 
 
 def in_order(xyz: FloatArray) -> FloatArray:
@@ -107,7 +105,7 @@ def test_a_tile_holds_the_buildings_whose_middle_lies_in_it(whole: Scene, made: 
 def test_the_same_call_gives_the_same_bytes(tmp_path: Path) -> None:
     digests = []
     for name in ("a", "b"):
-        paths = simulate("city", tmp_path / name, 7, size_m=(60.0, 50.0), scanner=SPARSE)
+        paths = simulate(SPARSE_CITY, tmp_path / name, 7, size_m=(60.0, 50.0))
         files = sorted(path for path in (tmp_path / name).rglob("*") if path.is_file())
         digests.append([hashlib.sha256(path.read_bytes()).hexdigest() for path in files])
         assert paths.tiles == 1
@@ -116,10 +114,9 @@ def test_the_same_call_gives_the_same_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_smaller_city_in_the_same_folder_leaves_nothing_of_the_larger_one(tmp_path: Path) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(suites.SUITES, "city", dataclasses.replace(SUITES["city"], tile_m=50.0))
-        assert simulate("city", tmp_path, 7, size_m=(90.0, 50.0), scanner=SPARSE).tiles == 2
-        again = simulate("city", tmp_path, 7, size_m=(50.0, 50.0), scanner=SPARSE)
+    tiled = dataclasses.replace(SPARSE_CITY, tile_m=50.0)
+    assert simulate(tiled, tmp_path, 7, size_m=(90.0, 50.0)).tiles == 2
+    again = simulate(tiled, tmp_path, 7, size_m=(50.0, 50.0))
     assert [path.name for path in (tmp_path / "tiles").iterdir()] == ["city_x0_y0.laz"]
     assert len(read_models(again.truth).models) == again.buildings
     assert len(read_truth(again.truth).classification) == again.points
@@ -228,7 +225,7 @@ def test_a_city_is_written_in_bounded_memory(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("slope_deg", [0.0, 20.0, 30.0])
 def test_a_city_on_a_hillside_has_one_slope_all_over(tmp_path: Path, slope_deg: float) -> None:
-    made = simulate("city", tmp_path, 9, size_m=(90.0, 80.0), scanner=SPARSE, slope_deg=slope_deg)
+    made = simulate(SPARSE_CITY, tmp_path, 9, size_m=(90.0, 80.0), slope_deg=slope_deg)
     table = pq.read_table(made.truth / "conditions.parquet")
     slopes = np.array(table["terrain_slope_deg"].to_pylist())
     assert len(slopes) > 2

@@ -18,7 +18,7 @@ from pipeline.errors import InputError, SettingsError
 from pipeline.io import open_source
 from pipeline.ruler.evaluation.reading import read_models
 from pipeline.ruler.simulation.conditions import CONDITIONS
-from pipeline.ruler.simulation.dataset import ScenePaths, read_truth, simulate
+from pipeline.ruler.simulation.dataset import Output, ScenePaths, read_truth, simulate
 from pipeline.ruler.simulation.suites import SUITES
 
 SIZE = (110.0, 90.0)
@@ -59,7 +59,7 @@ def test_the_tile_is_read_by_our_own_reader(made: ScenePaths) -> None:
 
 def test_the_tile_is_raw_and_holds_classes_only_when_asked(made: ScenePaths, tmp_path: Path) -> None:
     assert set(np.asarray(laspy.read(made.laz).classification).tolist()) == {1}
-    told = simulate("suburb", tmp_path, 5, size_m=SIZE, with_classes=True)
+    told = simulate("suburb", tmp_path, 5, size_m=SIZE, output=Output(with_classes=True))
     truth = read_truth(told.truth)
     assert np.array_equal(np.asarray(laspy.read(told.laz).classification), truth.classification)
 
@@ -123,7 +123,7 @@ def test_the_manifest_lists_the_tile_with_its_points_and_bounds(made: ScenePaths
 
 def test_the_same_call_gives_the_same_bytes_whatever_the_chunks(made: ScenePaths, tmp_path: Path) -> None:
     again = simulate("suburb", tmp_path / "again", 5, size_m=SIZE)
-    small = simulate("suburb", tmp_path / "small", 5, size_m=SIZE, chunk_points=7_000)
+    small = simulate("suburb", tmp_path / "small", 5, size_m=SIZE, output=Output(chunk_points=7_000))
     assert digest(again.laz) == digest(small.laz) == digest(made.laz)
     assert digest(again.labels) == digest(made.labels)
     assert pq.ParquetFile(small.labels).num_row_groups > 3
@@ -134,7 +134,8 @@ def test_the_same_call_gives_the_same_bytes_whatever_the_chunks(made: ScenePaths
 
 def test_density_and_noise_can_be_chosen(tmp_path: Path) -> None:
     told: list[int] = []
-    paths = simulate("gable", tmp_path, 2, density_per_m2=20.0, noise_m=0.0, chunk_points=5_000, on_points=told.append)
+    output = Output(chunk_points=5_000, on_points=told.append)
+    paths = simulate("gable", tmp_path, 2, density_per_m2=20.0, noise_m=0.0, output=output)
     assert paths.points / 1600 == pytest.approx(20.0, rel=0.25)
     assert told[-1] == paths.points
     assert told == sorted(told)
@@ -198,7 +199,7 @@ def test_a_call_that_was_interrupted_can_be_made_again(tmp_path: Path) -> None:
 
     simulate("cube", tmp_path)
     with pytest.raises(KeyboardInterrupt):
-        simulate("cube", tmp_path, on_points=stop)
+        simulate("cube", tmp_path, output=Output(on_points=stop))
     assert not (tmp_path / "truth" / "scene.json").exists()
     (tmp_path / "truth" / "labels").mkdir()  # of tiles that were written before it stopped
     assert simulate("cube", tmp_path).points > 0
@@ -223,8 +224,8 @@ def test_ten_million_points_are_streamed_in_bounded_memory(tmp_path: Path) -> No
     """Measured in a process of its own: the peak may not grow with the number of points."""
     program = (
         "import resource, sys\n"
-        "from pipeline.ruler.simulation.dataset import simulate\n"
-        "made = simulate('town', sys.argv[1], size_m=(float(sys.argv[2]),) * 2, chunk_points=500_000)\n"
+        "from pipeline.ruler.simulation.dataset import Output, simulate\n"
+        "made = simulate('town', sys.argv[1], size_m=(float(sys.argv[2]),) * 2, output=Output(chunk_points=500_000))\n"
         "print(made.points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
     )
     figures = []

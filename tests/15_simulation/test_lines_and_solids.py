@@ -39,7 +39,7 @@ def scene_of(shape: RoofShape, seed: int, slope_deg: float = 4.0) -> Scene:
     if can_have_dormers(shape):
         size = dataclasses.replace(size, additions=(*boxes, *random_dormers(shape, size, random, besides=boxes)))
     azimuth = float(random.uniform(0, 360))
-    house = place_building("it", shape, size, x=40.0, y=40.0, azimuth_deg=azimuth, eave_height_m=5.0, terrain=terrain)
+    house = place_building("it", shape, size, at=(40.0, 40.0), azimuth_deg=azimuth, eave_height_m=5.0, terrain=terrain)
     return Scene(name="one", origin=(0, 0, 0), crs=None, extent=(0, 0, 80, 80), terrain=terrain, buildings=(house,))
 
 
@@ -207,8 +207,7 @@ def test_a_house_on_a_steep_slope_is_hit_by_lines_that_land_far_below_it(shift_m
         "it",
         RoofShape.FLAT,
         size,
-        x=60.0 + shift_m,
-        y=60.0,
+        at=(60.0 + shift_m, 60.0),
         azimuth_deg=0.0,
         eave_height_m=6.0,
         terrain=terrain,

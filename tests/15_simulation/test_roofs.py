@@ -55,7 +55,9 @@ def furnished(shape: RoofShape, seed: int) -> RoofDimensions:
 
 def placed(shape: RoofShape, size: RoofDimensions, azimuth_deg: float = 33.0) -> Building:
     terrain = Terrain(base_z_m=30.0)
-    return place_building("a", shape, size, x=51.3, y=47.9, azimuth_deg=azimuth_deg, eave_height_m=4.0, terrain=terrain)
+    return place_building(
+        "a", shape, size, at=(51.3, 47.9), azimuth_deg=azimuth_deg, eave_height_m=4.0, terrain=terrain
+    )
 
 
 def slope_of(pitch_deg: float) -> float:

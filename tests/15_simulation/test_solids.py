@@ -38,7 +38,7 @@ LEVEL = Terrain(base_z_m=30.0)
 
 def placed(shape: RoofShape, azimuth_deg: float = 33.0, terrain: Terrain = LEVEL) -> Building:
     return place_building(
-        "a", shape, SIZES[shape], x=51.3, y=47.9, azimuth_deg=azimuth_deg, eave_height_m=4.0, terrain=terrain
+        "a", shape, SIZES[shape], at=(51.3, 47.9), azimuth_deg=azimuth_deg, eave_height_m=4.0, terrain=terrain
     )
 
 
@@ -70,7 +70,7 @@ def drawn(shape: RoofShape, seed: int, *, furnished: bool) -> Building:
         size = dataclasses.replace(size, additions=dormers + boxes)
     x, y, azimuth_deg = (float(value) for value in random.uniform((0, 0, 0), (2000, 2000, 360)))
     slope = undulating_terrain(30.0, float(random.uniform(0, 25)), 140.0, 1.0, 60.0, random)
-    return place_building("drawn", shape, size, x=x, y=y, azimuth_deg=azimuth_deg, eave_height_m=3.0, terrain=slope)
+    return place_building("drawn", shape, size, at=(x, y), azimuth_deg=azimuth_deg, eave_height_m=3.0, terrain=slope)
 
 
 def signed_volume(solid: Solid) -> float:
@@ -176,7 +176,7 @@ def test_inner_steps_get_walls_down_to_the_lower_roof() -> None:
         ),
     )
     building = place_building(
-        "s", RoofShape.MULTI_LEVEL_FLAT, size, x=0.0, y=0.0, azimuth_deg=90.0, eave_height_m=4.0, terrain=LEVEL
+        "s", RoofShape.MULTI_LEVEL_FLAT, size, at=(0.0, 0.0), azimuth_deg=90.0, eave_height_m=4.0, terrain=LEVEL
     )
     assert has_steps(building)
     solid = building_solid(building)
@@ -193,7 +193,7 @@ def test_a_roof_face_around_a_box_has_a_hole_in_record_and_solid() -> None:
     shaft = Addition(kind=AdditionKind.BOX, u_m=1.0, v_m=0.5, length_m=2.0, width_m=3.0, height_m=1.5)
     size = dataclasses.replace(SIZES[RoofShape.FLAT], additions=(shaft,))
     building = place_building(
-        "h", RoofShape.FLAT, size, x=0.0, y=0.0, azimuth_deg=20.0, eave_height_m=4.0, terrain=LEVEL
+        "h", RoofShape.FLAT, size, at=(0.0, 0.0), azimuth_deg=20.0, eave_height_m=4.0, terrain=LEVEL
     )
     record = truth_record(building, (0.0, 0.0, 0.0))
     assert [len(face.polygon.interiors) for face in record.faces] == [1, 0]
@@ -208,7 +208,7 @@ def test_the_front_of_a_gable_dormer_is_one_wall_and_the_roof_beneath_has_no_cor
     dormer = Addition(kind=AdditionKind.GABLE_DORMER, u_m=0.0, v_m=-2.2, length_m=2.0, width_m=2.2, height_m=1.0)
     size = dataclasses.replace(SIZES[RoofShape.GABLE], additions=(dormer,))
     building = place_building(
-        "d", RoofShape.GABLE, size, x=0.0, y=0.0, azimuth_deg=77.0, eave_height_m=4.0, terrain=LEVEL
+        "d", RoofShape.GABLE, size, at=(0.0, 0.0), azimuth_deg=77.0, eave_height_m=4.0, terrain=LEVEL
     )
     solid = building_solid(building)
     walls = [face.rings[0] for face in solid.faces if face.kind is FaceKind.WALL]
@@ -221,7 +221,7 @@ def test_the_front_of_a_gable_dormer_is_one_wall_and_the_roof_beneath_has_no_cor
 def test_a_courtyard_is_a_hole_in_footprint_and_floor() -> None:
     size = RoofDimensions(length_m=24.0, width_m=20.0, pitch_deg=30.0, wing_width_m=6.0)
     building = place_building(
-        "c", RoofShape.COURTYARD, size, x=5.0, y=5.0, azimuth_deg=20.0, eave_height_m=4.0, terrain=LEVEL
+        "c", RoofShape.COURTYARD, size, at=(5.0, 5.0), azimuth_deg=20.0, eave_height_m=4.0, terrain=LEVEL
     )
     assert not has_steps(building)
     record = truth_record(building, (0.0, 0.0, 0.0))
@@ -241,7 +241,7 @@ def test_defects_decide_whether_a_building_is_good() -> None:
 
 def test_a_square_hip_roof_is_a_pyramid() -> None:
     size = RoofDimensions(length_m=8.0, width_m=8.0, pitch_deg=30.0)
-    building = place_building("p", RoofShape.HIP, size, x=0, y=0, azimuth_deg=0, eave_height_m=3, terrain=LEVEL)
+    building = place_building("p", RoofShape.HIP, size, at=(0, 0), azimuth_deg=0, eave_height_m=3, terrain=LEVEL)
     assert [len(face[0]) for face in building.faces] == [3, 3, 3, 3]
     assert check_solid(building_solid(building)) == ()
 

@@ -124,8 +124,7 @@ def test_tiles_of_a_steep_survey_hold_what_their_beams_can_reach() -> None:
             f"{k}",
             RoofShape.GABLE,
             RoofDimensions(length_m=12.0, width_m=9.0, pitch_deg=35.0),
-            x=float(x),
-            y=float(y),
+            at=(float(x), float(y)),
             azimuth_deg=float(random.uniform(0, 360)),
             eave_height_m=4.0,
             terrain=terrain,
@@ -162,17 +161,16 @@ def test_a_scene_of_its_own_is_scanned_as_its_own_survey() -> None:
 
 def hall(wet_spots: tuple[WetSpot, ...] = ()) -> Building:
     """A flat roof of 30 x 20 m over the field."""
-    return place_building(
+    dry = place_building(
         "hall",
         RoofShape.FLAT,
         RoofDimensions(length_m=30.0, width_m=20.0),
-        x=50.0,
-        y=50.0,
+        at=(50.0, 50.0),
         azimuth_deg=90.0,
         eave_height_m=6.0,
         terrain=FIELD.terrain,
-        wet_spots=wet_spots,
     )
+    return dataclasses.replace(dry, wet_spots=wet_spots)
 
 
 def test_a_wet_spot_takes_the_returns_of_its_roof_and_no_others() -> None:

@@ -59,8 +59,7 @@ def test_the_truth_of_every_shape_has_its_type(shape: RoofShape) -> None:
             f"{shape}-{draw}",
             shape,
             size,
-            x=50.0,
-            y=50.0,
+            at=(50.0, 50.0),
             azimuth_deg=float(random.uniform(0.0, 360.0)),
             eave_height_m=4.0,
             terrain=Terrain(base_z_m=0.0),
@@ -92,7 +91,7 @@ def test_a_roof_of_many_small_directions_is_a_combination_though_its_top_is_flat
     mansard = dataclasses.replace(size, second_pitch_deg=0.0, pitch_deg=65.0, break_share=0.2)
     terrain = Terrain(base_z_m=0.0)
     building = place_building(
-        "m", RoofShape.MANSARD, mansard, x=0.0, y=0.0, azimuth_deg=20.0, eave_height_m=4.0, terrain=terrain
+        "m", RoofShape.MANSARD, mansard, at=(0.0, 0.0), azimuth_deg=20.0, eave_height_m=4.0, terrain=terrain
     )
     truth = truth_record(building, (0.0, 0.0, 0.0))
     shares = [face.polygon.area / truth.footprint.area for face in truth.faces]  # type: ignore[union-attr]

@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.errors import SettingsError
 from pipeline.io import ReadOptions, open_source
-from pipeline.ruler.simulation.dataset import simulate
+from pipeline.ruler.simulation.dataset import Output, simulate
 from pipeline.settings import RunSettings
 from pipeline.terrain.class_codes import OTHER, ClassCodeSettings
 
@@ -23,7 +23,7 @@ OWN = {"class-codes": {"ground": [40], "building": [6, 67], "vegetation": [3, 4,
 def classified(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tile with the true classes in ASPRS codes."""
     folder = tmp_path_factory.mktemp("classified")
-    simulate("suburb", folder, 3, size_m=(70.0, 70.0), density_per_m2=4.0, with_classes=True)
+    simulate("suburb", folder, 3, size_m=(70.0, 70.0), density_per_m2=4.0, output=Output(with_classes=True))
     return folder / "suburb.laz"
 
 

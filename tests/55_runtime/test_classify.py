@@ -60,10 +60,10 @@ def classes_in(summary: ClassifySummary, number: int = 0) -> np.ndarray[Any, Any
 @pytest.fixture(scope="session")
 def true_suburb(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The suburb with its true classes."""
-    from pipeline.ruler.simulation.dataset import simulate
+    from pipeline.ruler.simulation.dataset import Output, simulate
 
     folder = tmp_path_factory.mktemp("true")
-    simulate("suburb", folder, 3, size_m=(90.0, 90.0), density_per_m2=6.0, with_classes=True)
+    simulate("suburb", folder, 3, size_m=(90.0, 90.0), density_per_m2=6.0, output=Output(with_classes=True))
     return folder / "suburb.laz"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -18,6 +19,7 @@ from pipeline.ruler.evaluation.reference_truth import read_truth_reference
 from pipeline.ruler.evaluation.survey_shift import mean_shifts
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.strips import ScannerSettings
+from pipeline.ruler.simulation.suites import SUITES
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,7 @@ def shifted(tmp_path_factory: pytest.TempPathFactory) -> Path:
         strip_lift_m=0.3,
     )
     folder = tmp_path_factory.mktemp("shifted")
-    return simulate("suburb", folder, 3, size_m=(110.0, 100.0), scanner=survey).truth
+    return simulate(dataclasses.replace(SUITES["suburb"], scanner=survey), folder, 3, size_m=(110.0, 100.0)).truth
 
 
 def shift_of(truth: Path) -> np.ndarray:

@@ -15,14 +15,16 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.console import ExitCode
-from pipeline.ruler.simulation.dataset import ScenePaths, simulate
+from pipeline.ruler.simulation.dataset import Output, ScenePaths, simulate
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> ScenePaths:
     """A classified tile of a few houses, and its truth."""
     folder = tmp_path_factory.mktemp("scene")
-    return simulate("suburb", folder, 90_003, size_m=(110.0, 100.0), density_per_m2=6.0, with_classes=True)
+    return simulate(
+        "suburb", folder, 90_003, size_m=(110.0, 100.0), density_per_m2=6.0, output=Output(with_classes=True)
+    )
 
 
 def evaluated(*words: str | Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Layout of a city of any size that is never held as a whole: a tile asks for the blocks that it can see."""
+"""Layout of a city of any size that is never in memory as a whole: each tile makes the blocks that it can see."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.city_blocks import BLOCK_M, CITY_AZIMUTH_DEG, STREET_M, TALLEST_M, Block
 from pipeline.ruler.simulation.scene import Scene, Terrain, turned, undulating_terrain
+from pipeline.ruler.simulation.street_blocks import in_street_frame
 from pipeline.ruler.simulation.strips import ScannerSettings, reach_m
 
 Extent = tuple[float, float, float, float]
@@ -38,7 +39,7 @@ CITY_SCANNER = ScannerSettings(
     wrong_row_share=0.0005,
     wrong_row_lift_m=0.6,
 )
-"""Strips with their own shift and lift, and now and then a wrong scan row."""
+"""Strips with their own shift and lift, and an occasional wrong scan row."""
 
 
 def city_terrain(seed: int) -> Terrain:
@@ -67,7 +68,7 @@ def hillside(seed: int, slope_deg: float) -> Terrain:
     Parameters
     ----------
     seed : int
-        Of the aspect and the waves; not negative.
+        Seed of the aspect and the waves; not negative.
     slope_deg : float
         0 to `STEEPEST_DEG` + 1; 0 is level ground with the waves alone.
     """
@@ -77,16 +78,16 @@ def hillside(seed: int, slope_deg: float) -> Terrain:
 
 
 class CityPlan:
-    """A city that is made where it is looked at.
+    """A city that is made tile by tile.
 
     Parameters
     ----------
     seed : int
         Of the layout; not negative.
     size_m : tuple of float
-        Extent east and north. A larger city holds the smaller one unchanged, but for what its edge cut off.
+        Extent east and north. A larger city contains the smaller one unchanged, except at the edge of the smaller one.
     settings : ScannerSettings
-        The survey: says how far a tile can see.
+        The survey, which determines how far a tile can see.
     name : str
         Name of the scene, and of its buildings.
     terrain : Terrain, optional
@@ -114,7 +115,7 @@ class CityPlan:
         return 0.0, 0.0, *self.size_m
 
     def part(self, extent: Extent) -> Scene:
-        """The scene as a tile sees it: all that can change a return of a pulse that aims into the extent."""
+        """The scene of one tile: everything that can change a return of a pulse that aims into the extent."""
         reach = reach_m(self.terrain, extent, self.settings, TALLEST_M)
         seen = (extent[0] - reach, extent[1] - reach, extent[2] + reach, extent[3] + reach)
         blocks = list(self._blocks_over(seen))
@@ -151,11 +152,11 @@ class CityPlan:
         )
 
     def _blocks_over(self, extent: Extent) -> Iterator[Block]:
-        """The blocks that reach into an extent, row by row; those made last are kept."""
+        """The blocks that reach into an extent, row by row; recent ones are cached."""
         step = np.array([BLOCK_M[0] + STREET_M, BLOCK_M[1] + STREET_M])
         x0, y0, x1, y1 = extent
         corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
-        local = _to_local(corners)
+        local = in_street_frame(corners, CITY_AZIMUTH_DEG)
         first = np.floor((local.min(axis=0) - _BLOCK_REACH_M) / step).astype(int)
         last = np.ceil((local.max(axis=0) + _BLOCK_REACH_M) / step).astype(int)
         for row in range(first[1], last[1] + 1):
@@ -179,19 +180,12 @@ class CityPlan:
 
 
 def city(seed: int, *, size_m: tuple[float, float] = (1000.0, 1000.0), name: str = "city") -> Scene:
-    """A whole city in memory: for small ones. A square kilometre has about 1,500 buildings."""
+    """A whole small city in memory. A square kilometre has about 1,500 buildings."""
     plan = CityPlan(seed, size_m, name=name)
     return plan.part(plan.whole)
 
 
-def _to_local(places: FloatArray) -> FloatArray:
-    """Scene coordinates (n, 2) in the frame of the streets: the inverse of `turned`."""
-    azimuth = math.radians(CITY_AZIMUTH_DEG)
-    east, north = math.sin(azimuth), math.cos(azimuth)
-    return np.column_stack([places[:, 0] * east + places[:, 1] * north, places[:, 1] * east - places[:, 0] * north])
-
-
 def _meets(corners: FloatArray, extent: Extent) -> bool:
-    """Whether the box around some places (n, 2 or more) reaches into an extent."""
+    """Whether the bounding box of points (n, 2 or more) reaches into an extent."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     return bool(high[0] > extent[0] and high[1] > extent[1] and low[0] < extent[2] and low[1] < extent[3])

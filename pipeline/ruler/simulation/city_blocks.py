@@ -1,6 +1,6 @@
 """The blocks of a city: rows, perimeters with courtyards, halls, towers, churches, detached houses, parks.
 
-Every block is made from its own random state, so it is the same in a city of any size and seen from any tile.
+Every block draws from its own random state. It is the same in a city of any size and for any tile.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -19,8 +20,9 @@ from pipeline.ruler.simulation.conditions import terrain_slope_deg
 from pipeline.ruler.simulation.plots import PlannedBuilding
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import Box, Building, Defect, Terrain, Tree, WetSpot, place_building, turned
-from pipeline.ruler.simulation.suburb import car_at, tree_at
+from pipeline.ruler.simulation.scene import Building, Defect, Terrain, WetSpot
+from pipeline.ruler.simulation.street_blocks import StreetBlock
+from pipeline.ruler.simulation.suburb import tree_at
 
 BLOCK_M = (96.0, 60.0)
 """A block along and across the streets."""
@@ -29,10 +31,12 @@ STREET_M = 14.0
 CITY_AZIMUTH_DEG = 67.0
 """Direction of the long streets, clockwise from north: borders of tiles cut houses at an angle."""
 TALLEST_M = 60.0
-"""Nothing in a block stands higher over the lowest ground beneath it."""
+"""No object of a block is higher than this above the lowest ground below it."""
 
 _DEPTH_M = 11.5
+"""Depth of the houses of a row."""
 _INSET_M = 2.0
+"""Front gardens of rows."""
 _OVERHANGING = 0.25
 """Share of the trees that may hang over a house."""
 _STEEP_DEG = 9.0
@@ -81,21 +85,26 @@ _DETACHED = (
 )
 
 
-class Block:
-    """One block: its buildings, trees and cars."""
+class _Chances(NamedTuple):
+    """Chances of additions to the roof of a building, 0 to 1."""
+
+    dormers: float = 0.0
+    boxes: float = 0.0
+    wet: float = 0.02
+
+
+_NO_CHANCES = _Chances()
+
+
+class Block(StreetBlock):
+    """One block of the city."""
 
     def __init__(self, name: str, middle: FloatArray, terrain: Terrain, state: tuple[int, ...]) -> None:
-        self.name = name
-        self.middle = middle
-        self.terrain = terrain
-        self.random = np.random.default_rng(list(state))
-        self.buildings: list[Building] = []
-        self.trees: list[Tree] = []
-        self.boxes: list[Box] = []
+        super().__init__(name, middle, CITY_AZIMUTH_DEG, terrain, state)
         self._outlines: list[shapely.Polygon] = []
         self.kind = self._drawn_kind()
         _MAKERS[self.kind](self)
-        self._kerb()
+        self._line_kerbs(BLOCK_M, tree_share=0.3, radii_m=(1.5, 3.2), tree_m=3.4)
         self._mark_overhung()
 
     def _drawn_kind(self) -> BlockKind:
@@ -106,56 +115,33 @@ class Block:
             return BlockKind.PARK if kind in {BlockKind.PARK, BlockKind.HALL} else BlockKind.DETACHED
         return kind
 
-    def _uniform(self, low: float, high: float) -> float:
-        return float(self.random.uniform(low, high))
-
-    def _place(self, u: float, v: float) -> tuple[float, float]:
-        x, y = turned(np.array([(u, v)]), float(self.middle[0]), float(self.middle[1]), CITY_AZIMUTH_DEG)[0]
-        return float(x), float(y)
-
     def _build(
         self,
         shape: RoofShape,
         size: RoofDimensions,
-        u: float,
-        v: float,
+        at: tuple[float, float],
+        chances: _Chances = _NO_CHANCES,
         *,
         eave_m: float,
         turn_deg: float = 0.0,
         block: str | None = None,
-        dormers: float = 0.0,
-        boxes: float = 0.0,
-        wet: float = 0.02,
     ) -> Building:
-        """Put up a building; dormers, boxes and wet are chances of such things on its roof."""
+        """Put up a building, with additions to its roof by chance."""
         defects = []
-        if can_have_dormers(shape) and self.random.random() < dormers:
+        if can_have_dormers(shape) and self.random.random() < chances.dormers:
             additions = random_dormers(shape, size, self.random)
             size = dataclasses.replace(size, additions=size.additions + additions)
             defects += [Defect.DORMERS] * bool(additions)
-        if self.random.random() < boxes:
+        if self.random.random() < chances.boxes:
             additions = random_superstructures(shape, size, self.random, besides=size.additions)
             size = dataclasses.replace(size, additions=size.additions + additions)
             defects += [Defect.SUPERSTRUCTURE] * bool(additions)
-        x, y = self._place(u, v)
-        building = place_building(
-            f"{self.name}-{len(self.buildings):02d}",
-            shape,
-            size,
-            x=x,
-            y=y,
-            azimuth_deg=(CITY_AZIMUTH_DEG + turn_deg) % 360.0,
-            eave_height_m=eave_m,
-            terrain=self.terrain,
-            block_id=block,
-        )
-        if self.random.random() < wet:
-            spot = self._wet_spot(building)
-            building = dataclasses.replace(building, wet_spots=(spot,))
+        building = self._put_up(shape, size, at, eave_m=eave_m, turn_deg=turn_deg, block=block)
+        if self.random.random() < chances.wet:
+            building = dataclasses.replace(building, wet_spots=(self._wet_spot(building),))
             defects.append(Defect.WET_SPOT)
-        building = dataclasses.replace(building, defects=tuple(defects))
-        self.buildings.append(building)
-        return building
+        self.buildings[-1] = dataclasses.replace(building, defects=tuple(defects))
+        return self.buildings[-1]
 
     def _wet_spot(self, building: Building) -> WetSpot:
         """A circle over a vertex of the roof's plan, drawn towards the middle of the building."""
@@ -185,20 +171,11 @@ class Block:
                     length_m=width, width_m=_DEPTH_M, pitch_deg=62.0, second_pitch_deg=24.0, break_share=0.35
                 )
                 shape = RoofShape.GAMBREL
-            u, v = (at + width / 2, middle) if along else (middle, at + width / 2)
+            place = (at + width / 2, middle) if along else (middle, at + width / 2)
             is_flat = shape is RoofShape.FLAT
-            self._build(
-                shape,
-                size,
-                u,
-                v,
-                eave_m=eave,
-                turn_deg=0.0 if along else 270.0,
-                block=f"{self.name}-{side}",
-                dormers=0.25,
-                boxes=0.4 if is_flat else 0.12,
-                wet=0.1 if is_flat else 0.01,
-            )
+            chances = _Chances(dormers=0.25, boxes=0.4 if is_flat else 0.12, wet=0.1 if is_flat else 0.01)
+            turn_deg = 0.0 if along else 270.0
+            self._build(shape, size, place, chances, eave_m=eave, turn_deg=turn_deg, block=f"{self.name}-{side}")
             at += width
 
     def rows(self) -> None:
@@ -223,7 +200,7 @@ class Block:
         for side in (-1.0, 1.0):
             self._row(False, side * (half_u - _DEPTH_M / 2), 2 * (half_v - _DEPTH_M), storeys, pitch, "perimeter")
         shed = RoofDimensions(length_m=self._uniform(6.0, 14.0), width_m=self._uniform(4.0, 7.0), pitch_deg=8.0)
-        self._build(RoofShape.PENT, shed, self._uniform(-18.0, 18.0), 0.0, eave_m=2.8)
+        self._build(RoofShape.PENT, shed, (self._uniform(-18.0, 18.0), 0.0), eave_m=2.8)
         self._planted(20, half_u - _DEPTH_M - 3.0, half_v - _DEPTH_M - 3.0)
 
     def courtyards(self) -> None:
@@ -231,7 +208,7 @@ class Block:
         for side in (-1.0, 1.0):
             shape = (RoofShape.COURTYARD, RoofShape.U_SHAPE, RoofShape.MANSARD)[int(self.random.integers(3))]
             area = self._uniform(600.0, 900.0)
-            self._fitted(shape, side * BLOCK_M[0] / 4, 0.0, (44.0, 54.0), area, storeys=(3, 6), dormers=0.4)
+            self._fitted(shape, (side * BLOCK_M[0] / 4, 0.0), (44.0, 54.0), area, (3, 6), dormers=0.4)
         self._planted(18, BLOCK_M[0] / 2 - 3.0, BLOCK_M[1] / 2 - 3.0)
 
     def detached(self) -> None:
@@ -239,15 +216,8 @@ class Block:
         for side in (-1.0, 1.0):
             for k in range(4):
                 shape = _DETACHED[int(self.random.integers(len(_DETACHED)))]
-                house = self._fitted(
-                    shape,
-                    (k - 1.5) * 23.5 + self._uniform(-0.5, 0.5),
-                    side * 15.0 + self._uniform(-0.5, 0.5),
-                    (19.5, 24.0),
-                    self._uniform(70.0, 200.0),
-                    storeys=(1, 3),
-                    dormers=0.3,
-                )
+                at = ((k - 1.5) * 23.5 + self._uniform(-0.5, 0.5), side * 15.0 + self._uniform(-0.5, 0.5))
+                house = self._fitted(shape, at, (19.5, 24.0), self._uniform(70.0, 200.0), (1, 3), dormers=0.3)
                 if self.random.random() < 0.3:
                     self._overhanging(house)
         self._planted(44, BLOCK_M[0] / 2 - 2.0, BLOCK_M[1] / 2 - 2.0)
@@ -257,13 +227,11 @@ class Block:
         length, depth = self._uniform(40.0, 52.0), self._uniform(26.0, 42.0)
         high, block = self._uniform(7.0, 12.0), f"{self.name}-hall"
         hall = RoofDimensions(length_m=length, width_m=depth)
-        self._build(RoofShape.FLAT, hall, -16.0, 0.0, eave_m=high, block=block, boxes=1.0, wet=0.3)
+        self._build(RoofShape.FLAT, hall, (-16.0, 0.0), _Chances(boxes=1.0, wet=0.3), eave_m=high, block=block)
         office = RoofDimensions(length_m=self._uniform(9.0, 14.0), width_m=depth)
         at = -16.0 + length / 2 + office.length_m / 2
-        self._build(RoofShape.FLAT, office, at, 0.0, eave_m=high - 3.4, block=block, boxes=0.5, wet=0.1)
-        self._fitted(
-            RoofShape.MULTI_LEVEL_FLAT, BLOCK_M[0] / 2 - 10.0, 0.0, (16.0, 50.0), 220.0, storeys=(1, 3), boxes=0.5
-        )
+        self._build(RoofShape.FLAT, office, (at, 0.0), _Chances(boxes=0.5, wet=0.1), eave_m=high - 3.4, block=block)
+        self._fitted(RoofShape.MULTI_LEVEL_FLAT, (BLOCK_M[0] / 2 - 10.0, 0.0), (16.0, 50.0), 220.0, (1, 3), boxes=0.5)
         self._planted(14, BLOCK_M[0] / 2 - 2.0, BLOCK_M[1] / 2 - 2.0)
 
     def towers(self) -> None:
@@ -271,17 +239,10 @@ class Block:
         for side in (-1.0, 1.0):
             size = RoofDimensions(length_m=self._uniform(22.0, 34.0), width_m=self._uniform(12.0, 16.0))
             storeys = int(self.random.integers(6, 13))
-            self._build(
-                RoofShape.FLAT,
-                size,
-                side * 26.0,
-                side * 8.0,
-                eave_m=2.9 * storeys + 1.0,
-                turn_deg=90.0 * int(self.random.integers(0, 2)),
-                boxes=1.0,
-                wet=0.3,
-            )
-        self._fitted(RoofShape.MULTI_LEVEL_FLAT, 0.0, 0.0, (14.0, 22.0), 160.0, storeys=(1, 2))
+            turn_deg, eave_m = 90.0 * int(self.random.integers(0, 2)), 2.9 * storeys + 1.0
+            chances = _Chances(boxes=1.0, wet=0.3)
+            self._build(RoofShape.FLAT, size, (side * 26.0, side * 8.0), chances, eave_m=eave_m, turn_deg=turn_deg)
+        self._fitted(RoofShape.MULTI_LEVEL_FLAT, (0.0, 0.0), (14.0, 22.0), 160.0, (1, 2))
         self._planted(40, BLOCK_M[0] / 2 - 3.0, BLOCK_M[1] / 2 - 3.0)
 
     def church(self) -> None:
@@ -295,31 +256,30 @@ class Block:
             wing_length_m=self._uniform(4.0, 7.0),
             wing_offset_m=6.0,
         )
-        self._build(RoofShape.CROSS, nave, 4.0, 0.0, eave_m=self._uniform(9.0, 12.0), block=block)
+        self._build(RoofShape.CROSS, nave, (4.0, 0.0), eave_m=self._uniform(9.0, 12.0), block=block)
         side = self._uniform(6.0, 8.0)
         tower = RoofDimensions(length_m=side, width_m=side, pitch_deg=self._uniform(55.0, 68.0))
         west = 4.0 - nave.length_m / 2 - side / 2
-        self._build(RoofShape.PYRAMID, tower, west, 0.0, eave_m=self._uniform(22.0, 32.0), block=block)
+        self._build(RoofShape.PYRAMID, tower, (west, 0.0), eave_m=self._uniform(22.0, 32.0), block=block)
         self._planted(40, BLOCK_M[0] / 2 - 3.0, BLOCK_M[1] / 2 - 3.0)
 
     def park(self) -> None:
         """Trees and a kiosk."""
-        self._build(RoofShape.PYRAMID, RoofDimensions(length_m=5.0, width_m=5.0, pitch_deg=25.0), 0.0, 0.0, eave_m=2.6)
+        kiosk = RoofDimensions(length_m=5.0, width_m=5.0, pitch_deg=25.0)
+        self._build(RoofShape.PYRAMID, kiosk, (0.0, 0.0), eave_m=2.6)
         self._planted(60, BLOCK_M[0] / 2 - 4.0, BLOCK_M[1] / 2 - 4.0)
 
     def _fitted(
         self,
         shape: RoofShape,
-        u: float,
-        v: float,
+        at: tuple[float, float],
         lot_m: tuple[float, float],
         area_m2: float,
-        *,
         storeys: tuple[int, int],
         dormers: float = 0.0,
         boxes: float = 0.12,
     ) -> Building:
-        """A building of a shape that fits a lot about (u, v): made smaller until it does."""
+        """A building of a shape about `at`, made smaller until it fits a lot."""
         quarter = 90.0 * int(self.random.integers(0, 4))
         while True:
             size = random_dimensions(shape, self.random, area_m2=area_m2)
@@ -331,17 +291,9 @@ class Block:
             area_m2 *= 0.93
         eave = 2.9 * int(self.random.integers(*storeys)) + self._uniform(0.2, 0.8)
         flat = shape in {RoofShape.FLAT, RoofShape.MULTI_LEVEL_FLAT}
-        return self._build(
-            shape,
-            size,
-            u - float(low[0] + high[0]) / 2,
-            v - float(low[1] + high[1]) / 2,
-            eave_m=eave,
-            turn_deg=quarter,
-            dormers=dormers,
-            boxes=boxes,
-            wet=0.1 if flat else 0.02,
-        )
+        place = (at[0] - float(low[0] + high[0]) / 2, at[1] - float(low[1] + high[1]) / 2)
+        chances = _Chances(dormers=dormers, boxes=boxes, wet=0.1 if flat else 0.02)
+        return self._build(shape, size, place, chances, eave_m=eave, turn_deg=quarter)
 
     def _overhanging(self, house: Building) -> None:
         """A tree whose crown hangs over a house."""
@@ -381,20 +333,6 @@ class Block:
                 if top_z_m > house.eave_z_m and Defect.OVERHANGING_TREE not in house.defects:
                     defects = (*house.defects, Defect.OVERHANGING_TREE)
                     self.buildings[k] = dataclasses.replace(house, defects=defects)
-
-    def _kerb(self) -> None:
-        """Cars and trees at the kerbs of the long sides."""
-        for side in (-1.0, 1.0):
-            for u in np.arange(-BLOCK_M[0] / 2 + 4.0, BLOCK_M[0] / 2 - 4.0, 7.5):
-                kind, shift = self.random.random(), self._uniform(-1.0, 1.0)
-                if kind < 0.45:
-                    x, y = self._place(float(u) + shift, side * (BLOCK_M[1] / 2 + 1.3))
-                    self.boxes.append(car_at(x, y, CITY_AZIMUTH_DEG, self.terrain, self.random))
-                elif kind < 0.75:
-                    radius = self._uniform(1.5, 3.2)
-                    height = radius * 2.8
-                    x, y = self._place(float(u) + shift, side * (BLOCK_M[1] / 2 + 3.4))
-                    self.trees.append(tree_at(x, y, radius, height, self.terrain))
 
 
 _MAKERS: Mapping[BlockKind, Callable[[Block], None]] = {

@@ -4,11 +4,11 @@
 <suite>.laz                     points without classes, as a survey delivers them
 tiles/<suite>_<key>.laz         the same of a suite that is made tile by tile (city)
 truth/scene.json                suite, seed, split, scanner, counts, list of the tiles with their points and bounds
-truth/labels.parquet            one row a point, in the order of the LAZ: class, building_id, face, mixed
+truth/labels.parquet            one row per point, in the order of the LAZ: class, building_id, face, mixed
 truth/labels/<key>.parquet      the same of one tile
-truth/conditions.parquet        one row a building: shape, defects, groups of its faces, slope of the terrain
+truth/conditions.parquet        one row per building: shape, defects, groups of its faces, slope of the terrain
 truth/buildings, planes, meshes, cityjson      the exact models, laid out and named as in a run directory
-<cell>/ and sweep.json          a suite of several surveys (sweep): such a data set a cell, and the list of the cells
+<cell>/ and sweep.json          a suite of several surveys (sweep): one such data set per cell, and their list
 ```
 """
 
@@ -33,16 +33,16 @@ from pipeline.ruler.simulation.survey_files import TileFiles, last_returns, writ
 from pipeline.ruler.simulation.sweep import Cell, chosen_cells
 from pipeline.ruler.simulation.truth_files import SceneTruth, read_truth, write_manifest, write_models
 
-__all__ = ["ScenePaths", "SceneTruth", "read_truth", "simulate"]
+__all__ = ["Output", "ScenePaths", "SceneTruth", "read_truth", "simulate"]
 
-_BUILDINGS_A_PART = 500
+_BUILDINGS_PER_PART = 500
+"""Buildings per file of the exact models."""
 _TRUTH_FILES = ("scene.json", "labels.parquet", "conditions.parquet")
 _TRUTH_FOLDERS = ("labels", "buildings", "planes", "rejected", "meshes", "cityjson")
 _TILED_CHUNK_POINTS = 250_000
-"""The scanner goes on while a chunk is compressed; small ones keep it busy."""
-
+"""The scanner goes on while a chunk is compressed; small chunks keep it busy."""
 _STEEPEST_DEG = 30.0
-"""Of the ground that a city can be put on."""
+"""Steepest ground for a city."""
 
 OnPoints = Callable[[int], None]
 Extent = tuple[float, float, float, float]
@@ -51,108 +51,99 @@ Extent = tuple[float, float, float, float]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ScenePaths:
-    """What `simulate` wrote."""
+    """The files that `simulate` wrote. With cells, every path is the folder of the data set."""
 
     laz: Path
-    """The tile; the folder of the tiles where there are several, the data set's folder where there are cells."""
+    """The tile, or the folder of several tiles."""
     truth: Path
-    """The folder of the truth: a run directory of the exact models, plus conditions, labels and scene.json. The data
-    set's folder where there are cells."""
+    """The folder of the truth: a run directory of the exact models, plus conditions, labels and scene.json."""
     labels: Path
-    """Per-point truth; the folder of it where there are several tiles, the data set's folder where there are cells."""
+    """Per-point truth, or the folder of it for several tiles."""
     points: int
     """Returns in all tiles."""
     buildings: int
-    """Buildings in the scene; of all cells together where there are cells."""
+    """Buildings in the scene, or in all cells together."""
     tiles: int = 1
     """LAZ files."""
     cells: tuple[ScenePaths, ...] = ()
-    """What was written for every cell of a suite of several surveys."""
+    """The files of every cell of a suite of several surveys."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Output:
+    """How a data set is written."""
+
+    with_classes: bool = False
+    """Write the true classes into the LAZ too; otherwise all points are class 1 (unclassified)."""
+    chunk_points: int = 1_000_000
+    """Points held in memory at a time, about; the content does not depend on it."""
+    on_points: OnPoints | None = None
+    """Called with the number of points written so far."""
+
+
+_DEFAULT_OUTPUT = Output()
 
 
 def simulate(
-    suite: str,
+    suite: str | Suite,
     out_dir: str | Path,
     seed: int | None = None,
     *,
     size_m: tuple[float, float] | None = None,
     density_per_m2: float | None = None,
     noise_m: float | None = None,
-    scanner: ScannerSettings | None = None,
     slope_deg: float | None = None,
-    with_classes: bool = False,
-    chunk_points: int = 1_000_000,
-    on_points: OnPoints | None = None,
+    output: Output = _DEFAULT_OUTPUT,
 ) -> ScenePaths:
-    """Make a suite's scene, scan it, write the tiles and the truth.
+    """Make the scene of a suite, scan it, write the tiles and the truth.
 
     Parameters
     ----------
-    suite : str
-        Name of a suite.
+    suite : str or Suite
+        A suite, or the name of one.
     out_dir : str or Path
-        Folder, made where it does not exist; what an earlier call made there, of whatever suite, is replaced.
+        Folder, created if missing. The files of an earlier call are replaced, whatever its suite was.
     seed : int, optional
-        Of layout and scanner; the suite's own by default. The same call gives the same bytes.
+        Seed of layout and scanner; the suite's own by default. The same call gives the same bytes.
     size_m : tuple of float, optional
         Extent east and north; the suite's own by default.
     density_per_m2, noise_m : float, optional
-        Pulse density and range noise in place of the suite's; of a suite of several surveys, which of its cells.
-    scanner : ScannerSettings, optional
-        A whole survey in place of the suite's.
+        Replace the pulse density and range noise of the suite, or select cells of a suite of several surveys.
     slope_deg : float, optional
-        Put a city on ground of this slope all over, 0 to 30 deg, in place of its plain and hillside.
-    with_classes : bool
-        Write the true classes into the LAZ too; by default all points are class 1 (unclassified).
-    chunk_points : int
-        Points held in memory at a time, about; the content does not depend on it.
-    on_points : callable, optional
-        Told the number of points written so far.
-
-    Returns
-    -------
-    ScenePaths
-        What was written, and where.
+        Put a city on ground with this slope everywhere, 0 to 30 deg, instead of its plain and hillside.
+    output : Output
+        How it is written.
 
     Raises
     ------
     SettingsError
         Unknown suite, negative seed, or a size or survey out of range.
     InputError
-        The survey hits nothing, or the folder cannot be written or holds somebody else's truth.
+        The survey hits nothing, or the folder cannot be written or holds the truth of another program.
     """
-    plan = suite_named(suite)
+    plan = suite if isinstance(suite, Suite) else suite_named(suite)
     seed = plan.seed if seed is None else seed
-    faults = _faults(plan, seed, size_m)
-    if slope_deg is not None and plan.on_slope is None:
-        faults.append(f"{plan.name} has ground of its own: leave out slope_deg")
-    elif slope_deg is not None and not 0.0 <= slope_deg <= _STEEPEST_DEG:
-        faults.append(f"slope_deg is {slope_deg:g}: use 0 to {_STEEPEST_DEG:g}")
+    faults = _faults(plan, seed, size_m, slope_deg)
     if "://" in str(out_dir):
         faults.append(f"out is {out_dir}: simulate writes to a folder of this machine")
     if faults:
         raise SettingsError(faults)
     if slope_deg is not None:
         plan = _sloped(plan, slope_deg)
-    writing = _Writing(
+    request = _Request(
         plan=plan,
         seed=seed,
         size_m=plan.size_m if size_m is None else size_m,
-        with_classes=with_classes,
-        chunk_points=chunk_points,
-        on_points=on_points,
+        scanner=plan.scanner,
+        output=output,
     )
-    settings = scanner or plan.scanner
     out = Path(out_dir)
     if plan.cells:
-        return _simulate_cells(writing, settings, chosen_cells(plan.cells, density_per_m2, noise_m), out)
-    if density_per_m2 is not None:
-        settings = dataclasses.replace(settings, pulse_density_per_m2=float(density_per_m2))
-    if noise_m is not None:
-        settings = dataclasses.replace(settings, range_noise_m=float(noise_m))
+        return _simulate_cells(request, chosen_cells(plan.cells, density_per_m2, noise_m), out)
+    request = request.surveyed(density_per_m2, noise_m)
     if plan.part is not None:
-        return _simulate_tiles(writing, settings, out)
-    return _simulate_one(writing, settings, plan.make(seed, writing.size_m), out)
+        return _simulate_tiles(request, out)
+    return _simulate_one(request, plan.make(seed, request.size_m), out)
 
 
 def _sloped(plan: Suite, slope_deg: float) -> Suite:
@@ -163,8 +154,8 @@ def _sloped(plan: Suite, slope_deg: float) -> Suite:
     return dataclasses.replace(plan, part=lambda seed, size_m, settings: on_slope(seed, size_m, settings, slope_deg))
 
 
-def _faults(plan: Suite, seed: int, size_m: tuple[float, float] | None) -> list[str]:
-    """What is wrong with a request."""
+def _faults(plan: Suite, seed: int, size_m: tuple[float, float] | None, slope_deg: float | None) -> list[str]:
+    """The faults of a request."""
     faults = []
     if size_m is not None and not plan.is_sized:
         faults.append(f"the size of {plan.name} follows from its buildings: leave out --size")
@@ -172,50 +163,61 @@ def _faults(plan: Suite, seed: int, size_m: tuple[float, float] | None) -> list[
         faults += [f"size is {size:g} m: use 20 to 50000 m" for size in size_m if not 20.0 <= size <= 50_000.0]
     if not 0 <= seed < 2**32:
         faults.append(f"seed is {seed}: use 0 to {2**32 - 1}")
+    if slope_deg is not None and plan.on_slope is None:
+        faults.append(f"{plan.name} has ground of its own: leave out slope_deg")
+    elif slope_deg is not None and not 0.0 <= slope_deg <= _STEEPEST_DEG:
+        faults.append(f"slope_deg is {slope_deg:g}: use 0 to {_STEEPEST_DEG:g}")
     return faults
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Writing:
-    """What one call makes, and how."""
+class _Request:
+    """A checked call of `simulate`."""
 
     plan: Suite
     seed: int
     size_m: tuple[float, float]
-    with_classes: bool
-    chunk_points: int
-    on_points: OnPoints | None
+    scanner: ScannerSettings
+    output: Output
 
-    def tile(self, scene: Scene, settings: ScannerSettings, laz: Path, labels: Path, before: int) -> TileFiles:
-        """Scan a scene into a LAZ file and its labels; `before` points were written by earlier tiles."""
-        blocks = scan(scene, settings, self.seed, chunk_points=self.chunk_points)
+    def surveyed(self, density_per_m2: float | None, noise_m: float | None) -> _Request:
+        """The same with another density and noise, where they are given."""
+        scanner = self.scanner
+        if density_per_m2 is not None:
+            scanner = dataclasses.replace(scanner, pulse_density_per_m2=float(density_per_m2))
+        if noise_m is not None:
+            scanner = dataclasses.replace(scanner, range_noise_m=float(noise_m))
+        return dataclasses.replace(self, scanner=scanner)
+
+    def write_tile(self, scene: Scene, laz: Path, labels: Path, before: int) -> TileFiles:
+        """Scan a scene into a LAZ file and its labels; earlier tiles have `before` points."""
+        blocks = scan(scene, self.scanner, self.seed, chunk_points=self.output.chunk_points)
         if self.plan.last_returns_only:
             blocks = last_returns(blocks)
-        told = self.on_points
-        return write_points(
-            blocks, scene, laz, labels, self.with_classes, None if told is None else lambda n: told(before + n)
-        )
+        notify = self.output.on_points
+        on_points = None if notify is None else lambda n: notify(before + n)
+        return write_points(blocks, scene, laz, labels, self.output.with_classes, on_points)
 
 
-def _simulate_one(writing: _Writing, settings: ScannerSettings, scene: Scene, out: Path, before: int = 0) -> ScenePaths:
+def _simulate_one(request: _Request, scene: Scene, out: Path, before: int = 0) -> ScenePaths:
     """A data set of one tile."""
-    truth = _emptied(out, writing.plan.name)
-    laz, labels = out / f"{writing.plan.name}.laz", truth / "labels.parquet"
-    tile = writing.tile(scene, settings, laz, labels, before)
+    truth = _emptied(out, request.plan.name)
+    laz, labels = out / f"{request.plan.name}.laz", truth / "labels.parquet"
+    tile = request.write_tile(scene, laz, labels, before)
     if tile.points == 0:
         raise InputError(str(laz), "the survey hit nothing", "Use a larger scene or a higher density")
     rows = []
-    for first in range(0, len(scene.buildings), _BUILDINGS_A_PART):
-        part = f"part{first // _BUILDINGS_A_PART:05d}"
-        rows += write_models(scene.buildings[first : first + _BUILDINGS_A_PART], scene, settings, truth, part)
+    for first in range(0, len(scene.buildings), _BUILDINGS_PER_PART):
+        part = f"part{first // _BUILDINGS_PER_PART:05d}"
+        rows += write_models(scene.buildings[first : first + _BUILDINGS_PER_PART], scene, request.scanner, truth, part)
     write_conditions(rows, truth / "conditions.parquet")
     write_manifest(
         scene,
-        settings,
-        writing.seed,
+        request.scanner,
+        request.seed,
         [tile],
         truth,
-        strips=strip_count(scene, settings),
+        strips=strip_count(scene, request.scanner),
         buildings=len(scene.buildings),
         trees=len(scene.trees),
         cars=len(scene.boxes),
@@ -224,7 +226,7 @@ def _simulate_one(writing: _Writing, settings: ScannerSettings, scene: Scene, ou
 
 
 def _emptied(out: Path, suite: str) -> Path:
-    """The folder of the truth, made where it is missing, without what an earlier call left there."""
+    """The folder of the truth, created if missing, without the files of an earlier call."""
     truth = out / "truth"
     try:
         truth.mkdir(parents=True, exist_ok=True)
@@ -239,7 +241,7 @@ def _emptied(out: Path, suite: str) -> Path:
         raise InputError(str(truth), problem, "Give another --out, or move them away")
     for laz in _known_tiles(manifest):
         laz.unlink(missing_ok=True)
-    begun.touch()  # until scene.json takes its place it tells the next call that what lies here is ours
+    begun.touch()  # marks the folder as ours until scene.json takes its place
     for name in _TRUTH_FILES:
         (truth / name).unlink(missing_ok=True)
     for name in _TRUTH_FOLDERS:
@@ -251,7 +253,7 @@ def _emptied(out: Path, suite: str) -> Path:
 
 
 def _known_tiles(manifest: Path) -> list[Path]:
-    """The LAZ files of an earlier call, of whatever suite, that lie in its folder."""
+    """The LAZ files of an earlier call, of any suite, in its folder."""
     try:
         names = [str(tile["laz"]) for tile in json.loads(manifest.read_text(encoding="utf-8"))["tiles"]]
     except (OSError, ValueError, KeyError, TypeError):
@@ -261,18 +263,18 @@ def _known_tiles(manifest: Path) -> list[Path]:
     return [tile for tile in tiles if tile.suffix == ".laz" and tile.parent in {out, out / "tiles"}]
 
 
-def _simulate_cells(writing: _Writing, settings: ScannerSettings, cells: tuple[Cell, ...], out: Path) -> ScenePaths:
-    """A data set a cell: the same scene under every survey."""
-    scene = writing.plan.make(writing.seed, writing.size_m)
+def _simulate_cells(request: _Request, cells: tuple[Cell, ...], out: Path) -> ScenePaths:
+    """One data set per cell: the same scene under every survey."""
+    scene = request.plan.make(request.seed, request.size_m)
     made: list[ScenePaths] = []
     for cell in cells:
-        survey = dataclasses.replace(settings, pulse_density_per_m2=cell.density_per_m2, range_noise_m=cell.noise_m)
-        made.append(_simulate_one(writing, survey, scene, out / cell.key, sum(one.points for one in made)))
+        survey = request.surveyed(cell.density_per_m2, cell.noise_m)
+        made.append(_simulate_one(survey, scene, out / cell.key, sum(one.points for one in made)))
     listed = [
         {"cell": cell.key, "density_per_m2": cell.density_per_m2, "noise_m": cell.noise_m, "points": one.points}
         for cell, one in zip(cells, made, strict=True)
     ]
-    document: dict[str, Any] = {"suite": writing.plan.name, "seed": writing.seed, "cells": listed}
+    document: dict[str, Any] = {"suite": request.plan.name, "seed": request.seed, "cells": listed}
     (out / "sweep.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     return ScenePaths(
         laz=out,
@@ -285,20 +287,21 @@ def _simulate_cells(writing: _Writing, settings: ScannerSettings, cells: tuple[C
     )
 
 
-def _simulate_tiles(writing: _Writing, settings: ScannerSettings, out: Path) -> ScenePaths:
+def _simulate_tiles(request: _Request, out: Path) -> ScenePaths:
     """A data set of many tiles: the whole scene is never in memory.
 
     While one tile is scanned and written, one thread lays out the next and writes the models of the one before.
     """
-    size, plan = writing.size_m, writing.plan
+    size, plan, settings = request.size_m, request.plan, request.scanner
     if plan.part is None:
         raise TypeError(f"{plan.name} is not made tile by tile")
     truth = _emptied(out, plan.name)
     tiles_dir, labels_dir = out / "tiles", truth / "labels"
     for folder in (tiles_dir, labels_dir):
         folder.mkdir(parents=True, exist_ok=True)
-    part_of = plan.part(writing.seed, size, settings)
-    writing = dataclasses.replace(writing, chunk_points=min(writing.chunk_points, _TILED_CHUNK_POINTS))
+    part_of = plan.part(request.seed, size, settings)
+    output = dataclasses.replace(request.output, chunk_points=min(request.output.chunk_points, _TILED_CHUNK_POINTS))
+    request = dataclasses.replace(request, output=output)
     tiles: list[TileFiles] = []
     truths: list[Future[_TileTruth]] = []
     points = 0
@@ -311,7 +314,7 @@ def _simulate_tiles(writing: _Writing, settings: ScannerSettings, out: Path) -> 
                 ahead = aside.submit(part_of, todo[number + 1][1])
             truths.append(aside.submit(_tile_truth, scene, settings, extent, truth, key))
             laz, labels = tiles_dir / f"{plan.name}_{key}.laz", labels_dir / f"{key}.parquet"
-            made = writing.tile(scene, settings, laz, labels, points)
+            made = request.write_tile(scene, laz, labels, points)
             points += made.points
             if made.points:
                 tiles.append(made)
@@ -326,7 +329,7 @@ def _simulate_tiles(writing: _Writing, settings: ScannerSettings, out: Path) -> 
     write_manifest(
         scene,
         settings,
-        writing.seed,
+        request.seed,
         tiles,
         truth,
         strips=strip_count(scene, settings),
@@ -341,7 +344,7 @@ def _simulate_tiles(writing: _Writing, settings: ScannerSettings, out: Path) -> 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _TileTruth:
-    """What a tile owns."""
+    """The truth of the objects that a tile owns."""
 
     rows: list[dict[str, Any]]
     trees: int
@@ -369,7 +372,7 @@ def tile_extents(size_m: tuple[float, float], tile_m: float) -> Iterator[tuple[s
 
 
 def _owns(extent: Extent, whole: Extent, x: float, y: float) -> bool:
-    """Half-open ownership; what has its middle outside of the whole scene belongs to the nearest tile."""
+    """Half-open ownership; an object with its middle outside the whole scene belongs to the nearest tile."""
     inside_x = min(max(x, whole[0]), math.nextafter(whole[2], -math.inf))
     inside_y = min(max(y, whole[1]), math.nextafter(whole[3], -math.inf))
     return extent[0] <= inside_x < extent[2] and extent[1] <= inside_y < extent[3]

@@ -1,8 +1,8 @@
 """The 310 buildings of Hofmann, Maas and Streilein (2003), made again: their roof types, sizes, spacing and nuisances.
 
-What the paper tells is held exactly for every seed: the counts of the roof types (its table 4-1), how many of each are
-"expected to have good results" (its table 4-2), and that 16 % suffer from the borders of strips or from wrong scan
-rows. What else makes the others hard (dormers, superstructures, wet spots, trees) and all sizes are drawn.
+Every seed reproduces the figures of the paper exactly: the counts of the roof types (its table 4-1), how many of each
+are "expected to have good results" (its table 4-2), and that 16 % suffer from the borders of strips or from wrong scan
+rows. The other defects (dormers, superstructures, wet spots, trees) and all sizes are drawn at random.
 
 Source: Hofmann, A. D., Maas, H.-G., Streilein, A. (2003): Derivation of roof types by cluster analysis in parameter
 spaces of airborne laserscanner point clouds. IAPRS 34, 3/W13, 112-117.
@@ -69,7 +69,7 @@ _AREA_SPREAD = 0.6
 _GABLE_PITCH_DEG = (25.0, 45.0)
 _UNEQUAL_DEG = 5.0
 _FREE_GROUND_M = (3.0, 10.0)
-"""Between a building and whatever stands next."""
+"""Smallest and largest distance from a building to its neighbours."""
 _TREE_TRIES = 40
 _STRIP_M = 100.0
 _STRIPS = 7
@@ -85,8 +85,8 @@ SCANNER = ScannerSettings(
     strip_shift_m=0.30,
     strip_lift_m=0.20,
 )
-"""1.2 m between points. The paper's errors (0.3 m in plan, 0.2 m in height) are correlated within a building: they are
-the strips' own shift; what is left between the points of one building is small."""
+"""1.2 m between points. The errors of the paper (0.3 m in plan, 0.2 m in height) are correlated within a building: they
+are the shift of the strips, and the errors between points of one building are small."""
 
 
 def hofmann310(seed: int) -> Scene:
@@ -126,7 +126,7 @@ def hofmann310(seed: int) -> Scene:
 
 
 def _areas(shapes: list[RoofShape], random: np.random.Generator) -> FloatArray:
-    """Footprint areas: the quantiles of a log-normal distribution, the larger ones rather to the compound roofs."""
+    """Footprint areas: quantiles of a log-normal distribution; compound roofs tend to get the larger ones."""
     n, normal = len(shapes), NormalDist()
     deviates = np.array([normal.inv_cdf((k + 0.5) / n) for k in range(n)])
     areas = np.exp(_AREA_SPREAD * deviates)
@@ -137,7 +137,7 @@ def _areas(shapes: list[RoofShape], random: np.random.Generator) -> FloatArray:
 
 
 def _drawn_defects(shapes: list[RoofShape], random: np.random.Generator) -> list[tuple[Defect, ...]]:
-    """What makes each building hard: nothing for as many of each roof type as the paper expected to be good."""
+    """The defects of each building: none for as many of each roof type as the paper expected to be good."""
     types = [ROOF_TYPES[shape] for shape in shapes]
     hard: list[int] = []
     for roof_type, good in GOOD.items():
@@ -162,7 +162,7 @@ def _drawn_defects(shapes: list[RoofShape], random: np.random.Generator) -> list
 def _planned(
     shape: RoofShape, area_m2: float, wanted: tuple[Defect, ...], random: np.random.Generator
 ) -> tuple[PlannedBuilding, tuple[Defect, ...]]:
-    """A building with what stands on its roof, and its defects: where a dormer finds no room it is a tree instead."""
+    """A building with the additions on its roof, and its defects. A tree replaces an addition that finds no room."""
     is_gable = ROOF_TYPES[shape] is RoofType.GABLE
     pitch = float(random.uniform(*_GABLE_PITCH_DEG)) if is_gable else None
     size = random_dimensions(shape, random, area_m2=area_m2, pitch_deg=pitch)
@@ -215,16 +215,13 @@ def _built(
         building_id,
         plan.shape,
         plan.dimensions,
-        x=plot.x,
-        y=plot.y,
+        at=(plot.x, plot.y),
         azimuth_deg=plan.azimuth_deg,
         eave_height_m=_eave_height_m(plan.dimensions, random),
         terrain=terrain,
-        defects=defects,
     )
-    if Defect.WET_SPOT in defects:
-        return dataclasses.replace(building, wet_spots=_wet_spots(building, random))
-    return building
+    wet_spots = _wet_spots(building, random) if Defect.WET_SPOT in defects else ()
+    return dataclasses.replace(building, defects=defects, wet_spots=wet_spots)
 
 
 def _eave_height_m(size: RoofDimensions, random: np.random.Generator) -> float:
@@ -249,10 +246,10 @@ def _wet_spots(building: Building, random: np.random.Generator) -> tuple[WetSpot
 
 
 def _faults(building: Building, plot: Plot, random: np.random.Generator) -> list[SurveyFault]:
-    """What the survey does wrong over a plot."""
+    """The errors of the survey over a plot."""
     found = []
     if Defect.STRIP_SHIFT in building.defects:
-        # Two strips, each with its own error: what is between them is larger than either.
+        # Two strips, each with its own error: the difference is larger than either.
         plan = random.normal(0.0, math.sqrt(2.0) * SCANNER.strip_shift_m, 2)
         up = float(random.uniform(1.0, 2.5)) * SCANNER.strip_lift_m * (1.0 if random.random() < 0.5 else -1.0)
         shift = (float(plan[0]), float(plan[1]), up)
@@ -264,7 +261,7 @@ def _faults(building: Building, plot: Plot, random: np.random.Generator) -> list
         found.append(fault)
     if Defect.WRONG_ROWS in building.defects:
         up = float(random.uniform(0.5, 1.5)) * (1.0 if random.random() < 0.5 else -1.0)
-        # One row or two through the middle of the building: rows that are drawn by chance may miss a small house.
+        # One or two rows through the middle of the building: rows chosen at random might miss a small house.
         half = SCANNER.pulse_spacing_m * (0.5 if random.random() < 0.5 else 1.0)
         extent = (plot.extent[0], building.y - half, plot.extent[2], building.y + half)
         found.append(SurveyFault(extent=extent, kind=FaultKind.WRONG_ROWS, shift=(0.0, 0.0, up), share=1.0))
@@ -307,8 +304,8 @@ def _overhanging(
 ) -> Tree:
     """A tree beside a wall, higher than the eave, with a third to two thirds of its crown's radius over the roof.
 
-    It is made smaller until its trunk is outside (away from the middle of an L can be into its wing) and it is clear of
-    the neighbours; the last one is, whatever their distance.
+    It shrinks until its trunk stands outside (away from the middle of an L can lead into its wing) and clear of the
+    neighbours. The last try is kept in any case.
     """
     height = building.eave_z_m - building.floor_z_m + float(random.uniform(2.0, 5.0))
     for left in range(_TREE_TRIES, -1, -1):

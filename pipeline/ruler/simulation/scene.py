@@ -1,7 +1,6 @@
 """Scenes with exact truth: buildings as solids, analytic terrain, trees and small boxes (cars).
 
-A scene has its own frame: metres east, north and up from `Scene.origin`. What a vertical or leaning line hits first in
-it is the business of `first_hit`.
+A scene has its own frame: metres east, north and up from `Scene.origin`. `first_hit` finds what a ray hits in it.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from pipeline.ruler.simulation.roofs import ROOF_TYPES, ROOFS, FaceRings, RoofDi
 
 
 class Defect(StrEnum):
-    """What can make a building hard to reconstruct from its points."""
+    """A reason why a building is hard to reconstruct from its points."""
 
     STRIP_SHIFT = "strip_shift"
     WRONG_ROWS = "wrong_rows"
@@ -29,7 +28,7 @@ class Defect(StrEnum):
 
 
 class FaultKind(StrEnum):
-    """What can be wrong with a survey inside a rectangle."""
+    """A kind of survey error inside a rectangle."""
 
     STRIP_SHIFT = "strip_shift"
     WRONG_ROWS = "wrong_rows"
@@ -46,7 +45,7 @@ class Terrain:
     slope_y: float = 0.0
     """Rise per metre of northing."""
     waves: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 4)))
-    """(k, 4) float64: amplitude in metres, wave number east and north in radians a metre, phase."""
+    """(k, 4) float64: amplitude in metres, wave number east and north in radians per metre, phase."""
 
     def elevation(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Elevation at scene coordinates; arrays of one shape."""
@@ -84,7 +83,7 @@ class WetSpot:
     x: float
     """Easting of its middle, scene frame."""
     y: float
-    """Northing of it."""
+    """Northing of its middle."""
     radius_m: float
     """Radius."""
 
@@ -102,9 +101,9 @@ class Building:
     dimensions: RoofDimensions
     """Its size."""
     x: float
-    """Easting of the main rectangle's middle, scene frame."""
+    """Easting of the middle of the main rectangle, scene frame."""
     y: float
-    """Northing of it."""
+    """Northing of the same."""
     azimuth_deg: float
     """Direction of the ridge, clockwise from north."""
     floor_z_m: float
@@ -118,20 +117,20 @@ class Building:
     planes: tuple[Plane, ...]
     """Exact plane of each roof face in the scene frame, without points (n_points 0, rmse_m 0)."""
     groups: tuple[int, ...]
-    """A number for every roof face; faces of one number count as one, as the two parts of a bent hip's side."""
+    """A number for every roof face; faces with one number count as one, such as both parts of a side of a bent hip."""
     wet_spots: tuple[WetSpot, ...] = ()
-    """Where its roof does not return pulses."""
+    """Circles where its roof does not return pulses."""
     defects: tuple[Defect, ...] = ()
-    """What makes it hard."""
+    """Reasons why it is hard."""
 
     @property
     def roof_type(self) -> RoofType:
-        """As the records call it."""
+        """Its roof type in the records."""
         return ROOF_TYPES[self.shape]
 
     @property
     def is_good(self) -> bool:
-        """Whether nothing makes it hard."""
+        """Whether it has no defects."""
         return not self.defects
 
     @property
@@ -155,7 +154,7 @@ def _polygon(vertices: FloatArray, rings: FaceRings) -> shapely.Polygon:
 
 
 def _outline(plan: FloatArray, faces: tuple[FaceRings, ...]) -> shapely.Polygon:
-    """What the faces over plan vertices (v, 2) cover together."""
+    """The union of the faces over plan vertices (v, 2)."""
     union = shapely.union_all([_polygon(plan, face) for face in faces])
     pieces = [piece for piece in shapely.get_parts(union) if isinstance(piece, shapely.Polygon)]
     if len(pieces) != 1:
@@ -183,7 +182,7 @@ class Tree:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Box:
-    """A small thing that is no building: a car."""
+    """A small object that is not a building: a car."""
 
     corners: FloatArray
     """(4, 2) float64, counter-clockwise, scene frame."""
@@ -193,7 +192,7 @@ class Box:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SurveyFault:
-    """What is wrong with the survey inside a rectangle."""
+    """An error of the survey inside a rectangle."""
 
     extent: tuple[float, float, float, float]
     """Smallest x, smallest y, largest x, largest y in the scene frame."""
@@ -201,7 +200,7 @@ class SurveyFault:
     """strip_shift: the border of two strips runs through the middle, and the returns beyond it are shifted.
     wrong_rows: the returns of some scan rows are shifted."""
     shift: tuple[float, float, float]
-    """Metres east, north and up that the wrong returns are moved by."""
+    """Metres east, north and up by which the wrong returns are moved."""
     azimuth_deg: float = 0.0
     """strip_shift: direction of the border, clockwise from north; the returns to the right of it are moved."""
     share: float = 0.0
@@ -210,28 +209,28 @@ class SurveyFault:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Everything that a scanner can hit."""
+    """Everything that a scanner can hit, and its survey errors."""
 
     name: str
     """Name of the suite."""
     origin: tuple[float, float, float]
     """CRS coordinates of the scene frame's origin, whole metres."""
     crs: str | None
-    """Anything that pyproj understands, `EPSG:25832+7837`; None where there is none."""
+    """Any text that pyproj understands, such as `EPSG:25832+7837`; None without a CRS."""
     extent: tuple[float, float, float, float]
-    """What is scanned: smallest x, smallest y, largest x, largest y in the scene frame."""
+    """Scanned rectangle: smallest x, smallest y, largest x, largest y in the scene frame."""
     terrain: Terrain
     """The ground."""
     buildings: tuple[Building, ...]
-    """Numbered in this order by hits and labels."""
+    """Hits and labels number them in this order."""
     trees: tuple[Tree, ...] = ()
     """Trees and shrubs."""
     boxes: tuple[Box, ...] = ()
     """Cars."""
     survey_extent: tuple[float, float, float, float] | None = None
-    """The whole survey that the strips are laid over, in the scene frame, where the scene is one tile of it."""
+    """Extent of the whole survey, scene frame, if the scene is one tile of it: the strips are laid over it."""
     survey_faults: tuple[SurveyFault, ...] = ()
-    """Where the survey is wrong."""
+    """Errors of the survey."""
 
 
 def turned(local: FloatArray, x: float, y: float, azimuth_deg: float) -> FloatArray:
@@ -243,7 +242,7 @@ def turned(local: FloatArray, x: float, y: float, azimuth_deg: float) -> FloatAr
 
 
 def face_plane(ring: FloatArray) -> Plane:
-    """The exact plane through a planar, not vertical ring (n, 3), from its normal by Newell's sums."""
+    """The exact plane through a planar ring (n, 3) that is not vertical, by Newell's sums."""
     middle = ring.mean(axis=0)
     here = ring - middle
     there = np.roll(here, -1, axis=0)
@@ -251,7 +250,7 @@ def face_plane(ring: FloatArray) -> Plane:
     normal_y = float(np.sum((here[:, 2] - there[:, 2]) * (here[:, 0] + there[:, 0])))
     normal_z = float(np.sum((here[:, 0] - there[:, 0]) * (here[:, 1] + there[:, 1])))
     a, b = -normal_x / normal_z, -normal_y / normal_z
-    if np.ptp(ring[:, 2]) == 0:  # exactly horizontal, whatever the sums rounded to
+    if np.ptp(ring[:, 2]) == 0:  # exactly horizontal, despite the rounding of the sums
         a = b = 0.0
     return Plane(a=a, b=b, c=float(middle[2] - a * middle[0] - b * middle[1]), n_points=0, rmse_m=0.0)
 
@@ -270,50 +269,43 @@ def place_building(
     shape: RoofShape,
     dimensions: RoofDimensions,
     *,
-    x: float,
-    y: float,
+    at: tuple[float, float],
     azimuth_deg: float,
     eave_height_m: float,
     terrain: Terrain,
     block_id: str | None = None,
-    wet_spots: tuple[WetSpot, ...] = (),
-    defects: tuple[Defect, ...] = (),
 ) -> Building:
-    """Put a building on the terrain.
+    """Put a building without defects on the terrain.
 
     Parameters
     ----------
     building_id : str
         Unique name.
     shape, dimensions : RoofShape, RoofDimensions
-        What it is.
-    x, y : float
-        Middle of the main rectangle, scene frame, metres.
+        Its roof.
+    at : tuple of float
+        Middle of the main rectangle: easting and northing in the scene frame, metres.
     azimuth_deg : float
         Direction of the ridge, clockwise from north.
     eave_height_m : float
-        Eave above the *highest* terrain at the outline, so that no wall vanishes uphill.
+        Height of the eave above the *highest* terrain at the outline, so that no wall vanishes uphill.
     terrain : Terrain
-        The ground that it stands on.
+        The ground.
     block_id : str, optional
         Shared by buildings that touch.
-    wet_spots : tuple of WetSpot
-        Where its roof does not return pulses.
-    defects : tuple of Defect
-        What makes it hard.
 
     Returns
     -------
     Building
-        With exact roof vertices and planes; the floor is the lowest terrain at the outline, down to whole millimetres.
+        With exact roof vertices and planes. Its floor is the lowest terrain at the outline, rounded down to 1 mm.
 
     Raises
     ------
     ValueError
-        Where the sizes give no such roof.
+        The dimensions give no such roof.
     """
     roof = ROOFS[shape](dimensions)
-    plan = turned(roof.vertices[:, :2], x, y, azimuth_deg)
+    plan = turned(roof.vertices[:, :2], *at, azimuth_deg)
     outline = _outline(plan, roof.faces)
     samples = outline_samples(shapely.get_coordinates(outline.exterior)[:-1])
     ground = terrain.elevation(samples[:, 0], samples[:, 1])
@@ -324,8 +316,8 @@ def place_building(
         block_id=block_id or building_id,
         shape=shape,
         dimensions=dimensions,
-        x=x,
-        y=y,
+        x=at[0],
+        y=at[1],
         azimuth_deg=azimuth_deg,
         floor_z_m=math.floor(float(ground.min()) * 1000) / 1000,
         eave_z_m=eave_z,
@@ -333,6 +325,4 @@ def place_building(
         faces=roof.faces,
         planes=tuple(face_plane(vertices[list(face[0])]) for face in roof.faces),
         groups=roof.groups,
-        wet_spots=wet_spots,
-        defects=defects,
     )

@@ -90,7 +90,7 @@ def _cube(seed: int, size_m: tuple[float, float]) -> Scene:
     middle_x, middle_y = size_m[0] / 2, size_m[1] / 2
     size = RoofDimensions(length_m=10.0, width_m=10.0)
     cube = place_building(
-        "cube", RoofShape.FLAT, size, x=middle_x, y=middle_y, azimuth_deg=0.0, eave_height_m=10.0, terrain=terrain
+        "cube", RoofShape.FLAT, size, at=(middle_x, middle_y), azimuth_deg=0.0, eave_height_m=10.0, terrain=terrain
     )
     return Scene(
         name="cube", origin=(0.0, 0.0, 0.0), crs=None, extent=(0.0, 0.0, *size_m), terrain=terrain, buildings=(cube,)
@@ -162,8 +162,7 @@ def single_building(
         str(shape),
         shape,
         dimensions or _SINGLE_SIZES[shape],
-        x=size_m[0] / 2,
-        y=size_m[1] / 2,
+        at=(size_m[0] / 2, size_m[1] / 2),
         azimuth_deg=float(random.uniform(0, 360)),
         eave_height_m=4.0,
         terrain=terrain,

@@ -20,7 +20,7 @@ from pipeline.ruler.simulation.suburb import tree_at
 DENSITIES_PER_M2 = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 50.0)
 NOISES_M = (0.02, 0.05, 0.10)
 PLAIN_OF_EACH = 3
-"""Buildings of each shape without anything on the roof; one more carries dormers or superstructures."""
+"""Buildings of each shape with a bare roof; one more carries dormers or superstructures."""
 ROWS = 2
 """Rows of touching houses."""
 _STRIP_M = 150.0
@@ -45,7 +45,7 @@ class Cell:
     """One survey of the sweep."""
 
     density_per_m2: float
-    """Pulses a square metre of one strip."""
+    """Pulses per square metre of one strip."""
     noise_m: float
     """Standard deviation along the beam."""
 
@@ -64,7 +64,7 @@ def chosen_cells(cells: tuple[Cell, ...], density_per_m2: float | None, noise_m:
     Raises
     ------
     SettingsError
-        Where there are none, naming those that there are.
+        There are none; the message lists those that exist.
     """
     chosen = tuple(
         cell
@@ -116,19 +116,16 @@ def sweep(seed: int) -> Scene:
                 f"sweep-row{number - len(defects)}", plot.x, plot.y, terrain
             )
             continue
-        buildings.append(
-            place_building(
-                f"sweep-{number:03d}-{plan.shape}",
-                plan.shape,
-                plan.dimensions,
-                x=plot.x,
-                y=plot.y,
-                azimuth_deg=plan.azimuth_deg,
-                eave_height_m=2.9 * int(random.integers(1, 4)) + float(random.uniform(0.0, 0.6)),
-                terrain=terrain,
-                defects=defects[number],
-            )
+        building = place_building(
+            f"sweep-{number:03d}-{plan.shape}",
+            plan.shape,
+            plan.dimensions,
+            at=(plot.x, plot.y),
+            azimuth_deg=plan.azimuth_deg,
+            eave_height_m=2.9 * int(random.integers(1, 4)) + float(random.uniform(0.0, 0.6)),
+            terrain=terrain,
         )
+        buildings.append(dataclasses.replace(building, defects=defects[number]))
     return Scene(
         name="sweep",
         origin=(567_000.0, 5_936_000.0, 0.0),
@@ -174,8 +171,7 @@ class _Row:
                     f"{name}-{k}",
                     RoofShape.GABLE,
                     RoofDimensions(length_m=width, width_m=self.depth_m, pitch_deg=self.pitch_deg),
-                    x=x + middle * math.sin(azimuth),
-                    y=y + middle * math.cos(azimuth),
+                    at=(x + middle * math.sin(azimuth), y + middle * math.cos(azimuth)),
                     azimuth_deg=self.azimuth_deg,
                     eave_height_m=eave,
                     terrain=terrain,
@@ -199,7 +195,7 @@ def _row(random: np.random.Generator) -> _Row:
 def _trees(
     buildings: list[Building], size: tuple[float, float], terrain: Terrain, random: np.random.Generator
 ) -> list[Tree]:
-    """About one tree a building, none with its crown over a roof."""
+    """About one tree per building, none with its crown over a roof."""
     index = shapely.STRtree([building.footprint for building in buildings])
     trees = []
     for _ in range(2 * len(buildings)):

@@ -11,17 +11,9 @@ import numpy as np
 
 from pipeline.model import FloatArray
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
-from pipeline.ruler.simulation.scene import (
-    Box,
-    Building,
-    Scene,
-    Terrain,
-    Tree,
-    place_building,
-    turned,
-    undulating_terrain,
-)
-from pipeline.ruler.simulation.suburb import car_at, house_size, tree_at
+from pipeline.ruler.simulation.scene import Box, Building, Scene, Terrain, Tree, turned, undulating_terrain
+from pipeline.ruler.simulation.street_blocks import StreetBlock, in_street_frame
+from pipeline.ruler.simulation.suburb import house_size, tree_at
 
 BLOCK_M = (84.0, 52.0)
 """A block along and across the streets."""
@@ -49,7 +41,7 @@ def town(seed: int, *, size_m: tuple[float, float] = (400.0, 400.0), name: str =
     terrain = undulating_terrain(42.0, 1.2, random.uniform(0, 360), 2.5, 420.0, random)
     step = np.array([BLOCK_M[0] + STREET_M, BLOCK_M[1] + STREET_M])
     corners = np.array([(0.0, 0.0), (size_m[0], 0.0), size_m, (0.0, size_m[1])])
-    local = _to_local(corners)
+    local = in_street_frame(corners, TOWN_AZIMUTH_DEG)
     first, last = np.floor(local.min(axis=0) / step).astype(int), np.ceil(local.max(axis=0) / step).astype(int)
     buildings: list[Building] = []
     trees: list[Tree] = []
@@ -59,7 +51,7 @@ def town(seed: int, *, size_m: tuple[float, float] = (400.0, 400.0), name: str =
             middle = turned((np.array([(column, row)]) + 0.5) * step, 0.0, 0.0, TOWN_AZIMUTH_DEG)[0]
             if not (-60.0 < middle[0] < size_m[0] + 60.0 and -60.0 < middle[1] < size_m[1] + 60.0):
                 continue
-            block = _Block(f"{name}-{column}_{row}", middle, terrain, seed, column, row)
+            block = _Block(f"{name}-{column}_{row}", middle, terrain, (seed, 0x71, column + 2**20, row + 2**20))
             buildings += [one for one in block.buildings if _is_inside(one.vertices, size_m)]
             trees += [one for one in block.trees if 0 <= one.x < size_m[0] and 0 <= one.y < size_m[1]]
             boxes += [one for one in block.boxes if _is_inside(one.corners, size_m)]
@@ -75,30 +67,17 @@ def town(seed: int, *, size_m: tuple[float, float] = (400.0, 400.0), name: str =
     )
 
 
-def _to_local(places: FloatArray) -> FloatArray:
-    """Scene coordinates (n, 2) in the frame of the streets: the inverse of `turned`."""
-    azimuth = math.radians(TOWN_AZIMUTH_DEG)
-    east, north = math.sin(azimuth), math.cos(azimuth)
-    return np.column_stack([places[:, 0] * east + places[:, 1] * north, places[:, 1] * east - places[:, 0] * north])
-
-
 def _is_inside(vertices: FloatArray, size_m: tuple[float, float]) -> bool:
     """Whether any part reaches into the extent."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     return bool(high[0] > 0 and high[1] > 0 and low[0] < size_m[0] and low[1] < size_m[1])
 
 
-class _Block:
-    """One block: its buildings, trees and cars, all from its own random state."""
+class _Block(StreetBlock):
+    """One block of the town."""
 
-    def __init__(self, name: str, middle: FloatArray, terrain: Terrain, seed: int, column: int, row: int) -> None:
-        self.name = name
-        self.middle = middle
-        self.terrain = terrain
-        self.random = np.random.default_rng([seed, 0x71, column + 2**20, row + 2**20])
-        self.buildings: list[Building] = []
-        self.trees: list[Tree] = []
-        self.boxes: list[Box] = []
+    def __init__(self, name: str, middle: FloatArray, terrain: Terrain, state: tuple[int, ...]) -> None:
+        super().__init__(name, middle, TOWN_AZIMUTH_DEG, terrain, state)
         kind = self.random.random()
         if kind < 0.55:
             self._rows()
@@ -108,53 +87,24 @@ class _Block:
             self._hall()
         else:
             self._planted(14, BLOCK_M[0] / 2 - 5.0, BLOCK_M[1] / 2 - 5.0)
-        self._kerb()
-
-    def _place(self, u: float, v: float) -> tuple[float, float]:
-        x, y = turned(np.array([(u, v)]), float(self.middle[0]), float(self.middle[1]), TOWN_AZIMUTH_DEG)[0]
-        return float(x), float(y)
-
-    def _build(
-        self,
-        shape: RoofShape,
-        size: RoofDimensions,
-        u: float,
-        v: float,
-        turn_deg: float,
-        eave_m: float,
-        block: str | None,
-    ) -> None:
-        x, y = self._place(u, v)
-        self.buildings.append(
-            place_building(
-                f"{self.name}-{len(self.buildings):02d}",
-                shape,
-                size,
-                x=x,
-                y=y,
-                azimuth_deg=(TOWN_AZIMUTH_DEG + turn_deg) % 360.0,
-                eave_height_m=eave_m,
-                terrain=self.terrain,
-                block_id=block,
-            )
-        )
+        self._line_kerbs(BLOCK_M, tree_share=0.15, radii_m=(1.5, 2.8), tree_m=1.5)
 
     def _rows(self) -> None:
         """Two rows of touching houses, 2 to 4 storeys, and trees in the court between them."""
         for side in (-1.0, 1.0):
             u, end = -BLOCK_M[0] / 2 + _ROW_INSET_M, BLOCK_M[0] / 2 - _ROW_INSET_M
             storeys = int(self.random.integers(2, 5))
-            pitch = float(self.random.uniform(30.0, 45.0))
+            pitch = self._uniform(30.0, 45.0)
             while end - u > 5.5:
-                width = float(self.random.uniform(6.0, 9.0))
+                width = self._uniform(6.0, 9.0)
                 if end - u - width < 5.5:
                     width = end - u
                 flat = self.random.random() < 0.2
-                eave = 3.1 * max(2, storeys + int(self.random.integers(-1, 2))) + float(self.random.uniform(-0.4, 0.4))
+                eave = 3.1 * max(2, storeys + int(self.random.integers(-1, 2))) + self._uniform(-0.4, 0.4)
                 size = RoofDimensions(length_m=width, width_m=_ROW_DEPTH_M, pitch_deg=0.0 if flat else pitch)
                 shape = RoofShape.FLAT if flat else RoofShape.GABLE
                 v = side * (BLOCK_M[1] / 2 - _ROW_INSET_M - _ROW_DEPTH_M / 2)
-                self._build(shape, size, u + width / 2, v, 0.0, eave, f"{self.name}-row{'-+'[side > 0]}")
+                self._put_up(shape, size, (u + width / 2, v), eave_m=eave, block=f"{self.name}-row{'-+'[side > 0]}")
                 u += width
         self._planted(5, BLOCK_M[0] / 2 - 6.0, BLOCK_M[1] / 2 - _ROW_INSET_M - _ROW_DEPTH_M - 5.0)
 
@@ -164,47 +114,33 @@ class _Block:
         for side in (-1.0, 1.0):
             for k in range(4):
                 shape = shapes[int(self.random.integers(len(shapes)))]
-                turn = (0.0 if side > 0 else 180.0) + float(self.random.uniform(-2.0, 2.0))
-                eave = 2.9 * int(self.random.integers(1, 3)) + float(self.random.uniform(0.2, 0.8))
+                turn = (0.0 if side > 0 else 180.0) + self._uniform(-2.0, 2.0)
+                eave = 2.9 * int(self.random.integers(1, 3)) + self._uniform(0.2, 0.8)
                 # The wing of an L stands out to the left of the ridge: turned so that this is the court.
-                self._build(
-                    shape, house_size(shape, self.random), (k - 1.5) * 20.5, side * 15.5, turn + 180.0, eave, None
-                )
+                size = house_size(shape, self.random)
+                self._put_up(shape, size, ((k - 1.5) * 20.5, side * 15.5), eave_m=eave, turn_deg=turn + 180.0)
         self._planted(4, BLOCK_M[0] / 2 - 6.0, 2.0)
 
     def _hall(self) -> None:
         """A large flat hall with a lower flat part that touches it."""
-        length, depth = float(self.random.uniform(42.0, 56.0)), float(self.random.uniform(24.0, 34.0))
-        high = float(self.random.uniform(7.0, 11.0))
+        length, depth = self._uniform(42.0, 56.0), self._uniform(24.0, 34.0)
+        high = self._uniform(7.0, 11.0)
         block = f"{self.name}-hall"
         hall = RoofDimensions(length_m=length, width_m=depth)
-        self._build(RoofShape.FLAT, hall, -8.0, 0.0, 0.0, high, block)
+        self._put_up(RoofShape.FLAT, hall, (-8.0, 0.0), eave_m=high, block=block)
         office = RoofDimensions(length_m=12.0, width_m=depth)
-        self._build(RoofShape.FLAT, office, -8.0 + length / 2 + 6.0, 0.0, 0.0, high - 3.4, block)
+        self._put_up(RoofShape.FLAT, office, (-8.0 + length / 2 + 6.0, 0.0), eave_m=high - 3.4, block=block)
         self._planted(2, BLOCK_M[0] / 2 - 2.0, BLOCK_M[1] / 2 - 2.0)
 
     def _planted(self, count: int, half_length_m: float, half_width_m: float) -> None:
         """Trees in a rectangle, none with its trunk in a house."""
         for _ in range(count):
-            u, v = self.random.uniform(-half_length_m, half_length_m), self.random.uniform(-half_width_m, half_width_m)
-            radius = float(self.random.uniform(2.0, 4.2))
-            height = radius * float(self.random.uniform(2.2, 3.0))
-            x, y = self._place(float(u), float(v))
+            u, v = self._uniform(-half_length_m, half_length_m), self._uniform(-half_width_m, half_width_m)
+            radius = self._uniform(2.0, 4.2)
+            height = radius * self._uniform(2.2, 3.0)
+            x, y = self._place(u, v)
             if not any(_stands_in(one, x, y, 0.6 * radius) for one in self.buildings):
                 self.trees.append(tree_at(x, y, radius, height, self.terrain))
-
-    def _kerb(self) -> None:
-        """Cars and trees at the kerb."""
-        for side in (-1.0, 1.0):
-            for u in np.arange(-BLOCK_M[0] / 2 + 4.0, BLOCK_M[0] / 2 - 4.0, 7.5):
-                kind, shift = self.random.random(), float(self.random.uniform(-1.0, 1.0))
-                if kind < 0.45:
-                    x, y = self._place(float(u) + shift, side * (BLOCK_M[1] / 2 + 1.3))
-                    self.boxes.append(car_at(x, y, TOWN_AZIMUTH_DEG, self.terrain, self.random))
-                elif kind < 0.6:
-                    x, y = self._place(float(u) + shift, side * (BLOCK_M[1] / 2 + 1.5))
-                    radius = float(self.random.uniform(1.5, 2.8))
-                    self.trees.append(tree_at(x, y, radius, radius * 2.8, self.terrain))
 
 
 def _stands_in(building: Building, x: float, y: float, margin_m: float) -> bool:
@@ -214,7 +150,5 @@ def _stands_in(building: Building, x: float, y: float, margin_m: float) -> bool:
     u = (x - building.x) * east + (y - building.y) * north
     v = (y - building.y) * east - (x - building.x) * north
     size = building.dimensions
-    out = size.wing_length_m
-    return (
-        abs(u) < size.length_m / 2 + margin_m and -size.width_m / 2 - margin_m < v < size.width_m / 2 + out + margin_m
-    )
+    right, left = size.width_m / 2 + margin_m, size.width_m / 2 + size.wing_length_m + margin_m
+    return abs(u) < size.length_m / 2 + margin_m and -right < v < left
