@@ -49,12 +49,12 @@ def within_share(model: RoofModel | None, xyz: FloatArray) -> float:
     return float(np.mean(np.abs(high[:, 2] - model.top(high[:, 0], high[:, 1])) <= _WITHIN_M))
 
 
-def cell(pictures: BuildingPictures, told: Sequence[str]) -> Image.Image:
+def cell(pictures: BuildingPictures, reported: Sequence[str]) -> Image.Image:
     """The pictures of one building side by side, with a line of text under each."""
     drawn = [pictures.plan, *pictures.views]
     image = Image.new("RGB", (pictures.width_px * len(drawn), pictures.height_px + _TEXT_PX), "white")
     pen = ImageDraw.Draw(image)
-    for column, (png, words) in enumerate(zip(drawn, told, strict=True)):
+    for column, (png, words) in enumerate(zip(drawn, reported, strict=True)):
         if png is not None:
             picture = Image.open(io.BytesIO(png)).convert("RGBA")
             image.paste(picture, (column * pictures.width_px, 0), picture)
@@ -125,10 +125,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             own = [each.get(name) for each in models]
             shares = [within_share(model, xyz) for model in own]
             faces = [0 if model is None else len(model.surfaces) for model in own]
-            told = [f"{share:.2f}, {count} faces" for share, count in zip(shares, faces, strict=True)]
+            reported = [f"{share:.2f}, {count} faces" for share, count in zip(shares, faces, strict=True)]
             pictures = draw_building(own, own[0] if asked.edges else None, xyz)
-            cells.append(cell(pictures, [f"{number + 1}: {name[:20]}", *told]))
-            lines.append(f"| {number + 1} | {name} | " + " | ".join(told) + " |")
+            cells.append(cell(pictures, [f"{number + 1}: {name[:20]}", *reported]))
+            lines.append(f"| {number + 1} | {name} | " + " | ".join(reported) + " |")
         sheet(cells, asked.across).save(asked.out / f"sheet_{first // on_sheet + 1:02d}.png")
     (asked.out / "sheets.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     print(f"{len(chosen)} of {len(names)} buildings on {math.ceil(len(chosen) / on_sheet)} sheets in {asked.out}")

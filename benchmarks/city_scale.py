@@ -7,12 +7,12 @@ makes the city of `city_tiles.py` in DIR/city<tiles> (minutes), runs the pipelin
 looks at them from outside, and writes DIR/<label>.md (tables), DIR/<label>.json and DIR/<label>.trace.json (a row a
 task; `scaling_simulation.py` reads it). `traced` is the run of `gablework reconstruct` with an executor that keeps what
 each task took; `plain` is the command itself, looked at from outside only; `apart` is `traced` with the scheduler and
-the workers (`gablework worker`) as processes of their own, so that driver and scheduler can be told apart. With
+the workers (`gablework worker`) as processes of their own, so that driver and scheduler are measured separately. With
 `--kill-every S` a worker's process is killed every S seconds, in turns, from when the run has its workers.
 
 Efficiency is the CPU time of all task bodies, their child processes included, over wall-clock time times workers. On a
-machine that others use too it is told too small: the wall grows, the CPU time does not. So the share of the time in
-which the workers had a task (occupancy) and the share of all CPU time that was spent in tasks are told beside it;
+machine that others use too, it comes out too small: the wall grows, the CPU time does not. So the share of the time in
+which the workers had a task (occupancy) and the share of all CPU time that was spent in tasks are reported beside it;
 on a quiet machine efficiency is about their product.
 """
 
@@ -44,14 +44,14 @@ RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state")
 
 
 def free_port() -> int:
-    """A port that nobody listens on."""
+    """A free port."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         return int(found.getsockname()[1])
 
 
 def wait_for_listener(port: int, log: Path) -> None:
-    """Return once somebody listens on a port of this machine."""
+    """Return once a process listens on a port of this machine."""
     end = time.monotonic() + _SCHEDULER_WAIT_S
     while True:
         with socket.socket() as asking:
@@ -131,7 +131,7 @@ def watched_run(arguments: argparse.Namespace, tiles: Path, run_dir: Path) -> di
 
 
 def is_mark(line: Mapping[str, Any]) -> bool:
-    """Whether a line of the diary begins a stage or ends the run; workers that are back are told as of the run, too."""
+    """Whether a line of the diary begins a stage or ends the run; returning workers are logged for the run, too."""
     return line["kind"] in {"stage", "finished"} or (line["kind"] == "run" and line["stage"] == "plan")
 
 
@@ -242,13 +242,13 @@ def report(seen: Mapping[str, Any], trace: Mapping[str, Any] | None, run_dir: Pa
         figures["scratch_bytes_a_point"] = max(trace["scratch_bytes"].values()) / points
         held = "reached" if figures["efficiency"] >= WANTED else "required reached"
         held = held if figures["efficiency"] >= REQUIRED else "missed"
-        told = (
+        reported = (
             f"efficiency {figures['efficiency']:.3f} ({held}; required {REQUIRED:g}, wanted {WANTED:g}), "
             f"occupancy {figures['occupancy']:.3f}, tasks' share of all CPU time {figures['task_share_of_cpu']:.3f}; "
             f"CPU of task bodies {cpu_s:.1f} s.  \n"
             f"Scratch {figures['scratch_bytes_a_point']:.1f} bytes a point at most."
         )
-        lines += ["", told, "", stage_table(figures["stages"]), sizes_told(trace)]
+        lines += ["", reported, "", stage_table(figures["stages"]), sizes_told(trace)]
     lines += [
         "",
         markdown_table(

@@ -3,10 +3,10 @@
     python -m benchmarks.engine_costs --out DIR [--workers 2 20 100 300] [--tasks 2000] [--city DIR/city36]
 
 A scheduler of its own process serves so many workers, all of them in one more process (they have nothing to do), and
-tasks that do nothing go through `DaskExecutor` as those of a run do. Told are the CPU seconds of the scheduler and of
+tasks that do nothing go through `DaskExecutor` as those of a run do. It reports the CPU seconds of the scheduler and of
 the driver a task, with small results and with large ones. With `--city` its tiles are split, what they hand on is
-laid side by side so many times, and the CPU time and the memory of the join are told; a straight line is fitted to the
-logarithms. DIR/engine_costs.json is what `scaling_simulation.py` reads.
+laid side by side so many times, and the CPU time and the memory of the join are measured; a straight line is fitted
+to the logarithms. DIR/engine_costs.json is what `scaling_simulation.py` reads.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def cpu_of(process: psutil.Process) -> float:
 def all_there(executor: DaskExecutor, count: int) -> None:
     """Wait until so many workers are there."""
     end = time.monotonic() + _WAIT_S
-    while len(executor._client.scheduler_info(n_workers=-1)["workers"]) < count:  # noqa: SLF001 - nothing else tells
+    while len(executor._client.scheduler_info(n_workers=-1)["workers"]) < count:  # noqa: SLF001 - nothing else knows
         if time.monotonic() > end:
             raise SystemExit(f"{count} workers did not come")
         time.sleep(0.2)
@@ -136,7 +136,7 @@ def cost_of_tasks(count: int, tasks: int, size_bytes: int, log: Path) -> dict[st
 
 
 def splits_of(folder: Path, tile_size_m: float) -> tuple[Plan, list[Split], int]:
-    """The descriptors of a city's tiles, and how many buildings it has after the units were told apart."""
+    """The descriptors of a city's tiles, and how many buildings it has after blocks were split into units."""
     settings = RunSettings.from_mapping({"classes": "ignore", "tile_size_m": tile_size_m})
     tiles = sorted(str(path) for path in folder.glob("*.laz"))
     plan = make_plan(tiles, ReadOptions(), settings)

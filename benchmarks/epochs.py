@@ -45,7 +45,7 @@ EXPECTED: Mapping[Work | None, Change] = {
     Work.EXTENDED: Change.RESHAPED,
     None: Change.UNCHANGED,
 }
-"""What is to be told of a building, by what was done to it."""
+"""The change expected for a building, by what was done to it."""
 MISSED = "missed"
 """Of a building over which no row lies."""
 _MIN_SHARE = 0.5
@@ -89,10 +89,10 @@ CASES: Mapping[str, Case] = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Found:
-    """What was told of a case."""
+    """The result of a case."""
 
-    told: Counter[tuple[Work | None, str]]
-    """Buildings by what was done and what was told; those within the scene's extent."""
+    reported: Counter[tuple[Work | None, str]]
+    """Buildings by what was done and the reported change; those within the scene's extent."""
     right: Counter[Change]
     """Rows by class over a building of which that is true."""
     rows: Counter[Change]
@@ -122,7 +122,7 @@ def judged(epochs: TwoEpochs, changes: Path) -> Found:
     tree, areas = shapely.STRtree(geometries), shapely.area(geometries)
     origin, extent = np.array(epochs.later.origin[:2]), shapely.box(*epochs.later.extent)
     standing = {b.building_id: b for b in (*epochs.earlier.buildings, *epochs.later.buildings)}
-    told: Counter[tuple[Work | None, str]] = Counter()
+    reported: Counter[tuple[Work | None, str]] = Counter()
     true_of: list[set[Change]] = [set() for _ in rows]
     for name, building in sorted(standing.items()):
         footprint = shapely.transform(building.footprint, lambda xy: xy + origin)
@@ -134,12 +134,12 @@ def judged(epochs: TwoEpochs, changes: Path) -> Found:
             true_of[place].add(EXPECTED[work])
         if extent.covers(building.footprint):
             words = sorted({rows[place]["change"] for place in over})
-            told[work, "+".join(words) or MISSED] += 1
+            reported[work, "+".join(words) or MISSED] += 1
     changes_of = [Change(row["change"]) for row in rows]
     right = [change for change, true in zip(changes_of, true_of, strict=True) if change in true]
     sure = [not row["doubts"] for row in rows]
     return Found(
-        told=told,
+        reported=reported,
         right=Counter(right),
         rows=Counter(changes_of),
         sure_right=Counter(c for c, t, s in zip(changes_of, true_of, sure, strict=True) if s and c in t),
@@ -148,20 +148,20 @@ def judged(epochs: TwoEpochs, changes: Path) -> Found:
 
 
 def tables(found: Mapping[str, Found]) -> str:
-    """The tables of the page: of all cases what was told by what was done, then precision by class."""
-    header = ["scene", "done", "buildings", "told so", "recall", "not comparable", "told otherwise"]
+    """The tables of the page: reported changes by what was done, then precision by class."""
+    header = ["scene", "done", "buildings", "reported", "recall", "not comparable", "reported otherwise"]
     rows: list[Sequence[str]] = []
     for name, one in found.items():
         for work in (*Work, None):
-            told = {word: count for (done, word), count in one.told.items() if done is work}
-            right, hidden = told.pop(EXPECTED[work].value, 0), told.pop(Change.NOT_COMPARABLE.value, 0)
-            rest = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in sorted(told.items()))
-            comparable = right + sum(told.values())
+            reported = {word: count for (done, word), count in one.reported.items() if done is work}
+            right, hidden = reported.pop(EXPECTED[work].value, 0), reported.pop(Change.NOT_COMPARABLE.value, 0)
+            rest = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in sorted(reported.items()))
+            comparable = right + sum(reported.values())
             recall = f"{100.0 * right / comparable:.1f} %" if comparable else "-"
             done = "nothing" if work is None else work.value.replace("_", " ")
             rows.append([name, done, str(comparable + hidden), str(right), recall, str(hidden), rest or "-"])
     recalls = markdown_table(header, rows)
-    header = ["scene", "told", "rows", "true", "precision", "without doubt", "true of these", "precision of these"]
+    header = ["scene", "change", "rows", "true", "precision", "without doubt", "true of these", "precision of these"]
     rows = []
     for name, one in found.items():
         for change in (c for c in Change if c is not Change.NOT_COMPARABLE):

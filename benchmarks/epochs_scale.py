@@ -152,8 +152,8 @@ def measured(folder: Path, count: int) -> list[str]:
     seconds = time.perf_counter() - began
     if child.returncode != 0:
         raise SystemExit(f"the comparison of {count} buildings ended with {child.returncode}")
-    told = json.loads((folder / "diff" / "changes.json").read_text())["changes"]
-    wrong = sum(abs(told[kind]["rows"] - number) for kind, number in made.items())
+    reported = json.loads((folder / "diff" / "changes.json").read_text())["changes"]
+    wrong = sum(abs(reported[kind]["rows"] - number) for kind, number in made.items())
     cpu = used.ru_utime + used.ru_stime
     return [
         f"{sum(made.values()):,}",

@@ -75,7 +75,7 @@ class Sample:
 
 
 @dataclasses.dataclass(frozen=True)
-class Told:
+class Estimate:
     """A figure with its interval."""
 
     value: float
@@ -100,7 +100,7 @@ class Table:
     """What is in it, under which conditions."""
     header: list[str]
     """One head a column."""
-    rows: list[list[str | Told]]
+    rows: list[list[str | Estimate]]
     """The cells."""
 
     def lines(self) -> list[str]:
@@ -109,25 +109,25 @@ class Table:
         return [self.caption, "", *("| " + " | ".join(line) + " |" for line in lines), ""]
 
 
-def share(hits: Sequence[bool]) -> Told:
+def share(hits: Sequence[bool]) -> Estimate:
     """Percent, with the 95 % interval of Wilson."""
     n, p, z = len(hits), float(np.mean(hits)), 1.96
     middle = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return Told(100 * p, 100 * (middle - half), 100 * (middle + half))
+    return Estimate(100 * p, 100 * (middle - half), 100 * (middle + half))
 
 
-def mean(values: Sequence[float], digits: int = 1, factor: float = 1.0) -> Told:
+def mean(values: Sequence[float], digits: int = 1, factor: float = 1.0) -> Estimate:
     """Mean of those that are known, with its 95 % bootstrap interval."""
     known = factor * np.array([value for value in values if math.isfinite(value)])
     if len(known) == 0:
-        return Told(math.nan, math.nan, math.nan)
+        return Estimate(math.nan, math.nan, math.nan)
     random = np.random.default_rng(0)
     low, high = np.percentile(random.choice(known, (1000, len(known))).mean(axis=1), [2.5, 97.5])
-    return Told(float(known.mean()), float(low), float(high), digits)
+    return Estimate(float(known.mean()), float(low), float(high), digits)
 
 
-Rows = list[list[str | Told]]
+Rows = list[list[str | Estimate]]
 
 
 def right(roof: SyntheticRoof, found: Segmentation) -> bool:
@@ -147,7 +147,7 @@ def with_absorption(settings: FuzzySartSettings, absorption: str) -> FuzzySartSe
 
 def absorbed(
     sample: Sample, settings: FuzzySartSettings, kinds: Sequence[str], density: float, noise_m: float
-) -> list[Told]:
+) -> list[Estimate]:
     """Error of normals, clusters a plane, all right before and after the refinement."""
     errors, clusters, before, after = [], [], [], []
     for roof in sample.roofs(kinds, density, noise_m):
@@ -194,7 +194,7 @@ def vector_row(
     *,
     vectors: Vectors = facet_vectors,
     centre: Centre = centre_of_building,
-) -> list[Told]:
+) -> list[Estimate]:
     """Facet pairs that match, of one plane and of two; clusters; all right before and after the refinement."""
     one, two, clusters, before, after = [], [], [], [], []
     for roof in sample.roofs(kinds, density, NOISE_M):
@@ -256,7 +256,7 @@ SCALES: dict[str, tuple[Vectors, float]] = {
 
 def weights(
     sample: Sample, kinds: Sequence[str], density: float, settings: FuzzySartSettings, vectors: Vectors
-) -> list[Told]:
+) -> list[Estimate]:
     """Rank correlation of 1 - VDM with the difference in each dimension: how much each decides."""
     found: list[FloatArray] = []
     for roof in sample.roofs(kinds, density, NOISE_M):
@@ -306,8 +306,8 @@ def cube(sample: Sample) -> list[Table]:
                 within.append(off <= 0.05)
                 worst.append(off)
                 residuals.append(rmse)
-            told = [share(single), share(within), mean(worst, 3), mean(residuals, 3)]
-            rows.append([preset, f"{density:g}", *told])
+            reported = [share(single), share(within), mean(worst, 3), mean(residuals, 3)]
+            rows.append([preset, f"{density:g}", *reported])
     header = ["preset", "points a m2", "exactly one plane", "largest plane within 0.05 m everywhere"]
     header += ["farthest of it from the truth, m", "residuals of the points on it, m"]
     return [Table(caption=f"{CUBES} draws.", header=header, rows=rows)]
@@ -361,9 +361,9 @@ def refinement(sample: Sample) -> list[Table]:
                     ridge = [
                         share_labelled_right(roof, one, places) for (roof, one), places in zip(both, near, strict=True)
                     ]
-                    told = [share([right(*pair) for pair in both]), mean(planes)]
-                    told += [mean(rights, 0, 100.0), mean(ridge, 0, 100.0)]
-                    rows.append([preset, f"{density:g}", name, *told])
+                    reported = [share([right(*pair) for pair in both]), mean(planes)]
+                    reported += [mean(rights, 0, 100.0), mean(ridge, 0, 100.0)]
+                    rows.append([preset, f"{density:g}", name, *reported])
         header = ["preset", "points a m2", "step", "all right", "planes a true plane"]
         header += ["points on their plane, %", "the same near ridges, %"]
         tables.append(Table(caption=f"{title}, {NOISE_M:g} m of noise.", header=header, rows=rows))
@@ -385,7 +385,7 @@ def sensitivity(sample: Sample) -> list[Table]:
         chosen += [dataclasses.replace(settings, tau_epochs=tau) for tau in TAUS]
         rows: Rows = []
         for one in chosen:
-            cells: list[str | Told] = [f"{one.vigilance:g}", str(one.tau_epochs)]
+            cells: list[str | Estimate] = [f"{one.vigilance:g}", str(one.tau_epochs)]
             cells += [
                 share([right(roof, segment(roof.candidate, one)) for roof in dev.roofs((*HOUSES, LARGE), *survey)])
                 for survey in ((0.77, 0.05), (0.77, 0.10), (8.0, 0.05))

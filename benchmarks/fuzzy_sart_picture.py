@@ -57,10 +57,10 @@ def draw_claims(found: Mapping[str, Sequence[Any]], path: Path) -> None:
     plt.close(figure)
 
 
-def _curve(axis: Any, places: Sequence[float], told: Sequence[Any], **style: Any) -> None:
+def _curve(axis: Any, places: Sequence[float], reported: Sequence[Any], **style: Any) -> None:
     """A line through figures, with their intervals."""
-    values = [one.value for one in told]
-    ends = [[max(0.0, one.value - one.low) for one in told], [max(0.0, one.high - one.value) for one in told]]
+    values = [one.value for one in reported]
+    ends = [[max(0.0, one.value - one.low) for one in reported], [max(0.0, one.high - one.value) for one in reported]]
     axis.errorbar(places, values, yerr=ends, capsize=2.5, lw=1.4, elinewidth=0.7, **style)
 
 

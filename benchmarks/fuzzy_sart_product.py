@@ -111,22 +111,22 @@ def outcomes(run: Path, truth: Path) -> dict[str, Outcomes]:
     for face in found.tables["true_faces"].to_pylist():
         if face["area_m2"] >= MIN_FACE_AREA_M2:
             faces_of.setdefault(face["building_id"], []).append(bool(face["found"]))
-    told = {}
+    reported = {}
     for kind in ("large", "small"):
         mine = [row for row in rows if row["building_id"].startswith(kind)]
         faces = [faces_of.get(row["building_id"], []) for row in mine]
-        told[kind] = Outcomes(
+        reported[kind] = Outcomes(
             delivered=[row["model_status"] == "ok" for row in mine],
             all_right=[row["faces_found"] == row["faces_to_find"] and row["faces_wrong"] == 0 for row in mine],
             correct=[row["outcome"] == "correct" for row in mine],
             faces=[float(np.mean(one)) if one else math.nan for one in faces],
         )
-    return told
+    return reported
 
 
 def measured(out: Path | None, split: str, presets: Sequence[str]) -> dict[tuple[str, float, str], Outcomes]:
     """Outcomes by preset, density and kind; what a folder holds already is not done again."""
-    told = {}
+    reported = {}
     with tempfile.TemporaryDirectory() as temporary:
         base = out if out is not None else Path(temporary)
         for density in DENSITIES_PER_M2:
@@ -139,8 +139,8 @@ def measured(out: Path | None, split: str, presets: Sequence[str]) -> dict[tuple
                     tile = scene / f"{SUITE}.laz"
                     _reconstruct(tile, run, preset)
                 for kind, one in outcomes(run, scene / "truth").items():
-                    told[preset, density, kind] = one
-    return told
+                    reported[preset, density, kind] = one
+    return reported
 
 
 def _reconstruct(tile: Path, run: Path, preset: str) -> None:
@@ -158,9 +158,9 @@ def large_and_small(
     mean: Callable[[Sequence[float], int, float], Figure],
 ) -> list[list[str | Figure]]:
     """The rows of the table: kind, preset, density, delivered, faces found, all right, correct."""
-    told = measured(out, split, ("robust", "faithful"))
+    reported = measured(out, split, ("robust", "faithful"))
     rows: list[list[str | Figure]] = []
-    for (preset, density, kind), one in sorted(told.items(), key=lambda item: (item[0][2], item[0][0] != "robust")):
+    for (preset, density, kind), one in sorted(reported.items(), key=lambda item: (item[0][2], item[0][0] != "robust")):
         figures = [share(one.delivered), mean(one.faces, 0, 100.0), share(one.all_right), share(one.correct)]
         rows.append([kind, preset, f"{density:g}", *figures])
     return rows

@@ -4,7 +4,7 @@
 
 Three synthetic giants with the same points: a flat hall, a hall with a saw-tooth roof of 60 m2 a face, and a hall with
 200 things on its roof. Each is modelled in a process of its own with all methods loaded, as the supervised child
-has them; told is the largest resident size above the size before the building came, and bytes a point.
+has them. It reports the largest resident size above the size before the building came, and bytes a point.
 """
 
 from __future__ import annotations

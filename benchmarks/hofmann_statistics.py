@@ -178,8 +178,8 @@ def rows(draws: Sequence[Drawn]) -> list[tuple[str, str, str]]:
         if not values:
             return "no such face"
         low_value, high_value = np.percentile(values, [10, 90])
-        told = f"{np.median(values):.{digits}f} {unit} ({low_value:.{digits}f} to {high_value:.{digits}f})"
-        return f"{told}, {len(values)} faces"
+        reported = f"{np.median(values):.{digits}f} {unit} ({low_value:.{digits}f} to {high_value:.{digits}f})"
+        return f"{reported}, {len(values)} faces"
 
     def band(first: float, last: float) -> list[FaceSpread]:
         return [face for face in good if first <= face.slope_deg < last]

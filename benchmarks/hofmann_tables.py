@@ -8,7 +8,7 @@ buildings correct, passable and false by roof type, on draws of `hofmann310`. Wr
 - An outcome is the ruler's: correct is a building of which all roof faces and only those are found *and* whose roof
   type is right; passable, at least half of the faces; false, the rest. A building that was not found is false.
 - True buildings stand where the survey saw them (as `evaluate --as-surveyed`). The strips of this survey are off by
-  0.3 m in plan and 0.2 m in elevation, as the paper tells of its data, and a roof face counts as found within 0.3 m:
+  0.3 m in plan and 0.2 m in elevation, as the paper says of its data, and a roof face counts as found within 0.3 m:
   without this the error of the GPS would be held against the method. The paper looked at clusters, which a common
   shift of all points of a building does not touch.
 - Counts are means of the draws, shares and 95 % bootstrap intervals are over the buildings of all draws together.
@@ -297,7 +297,8 @@ def pattern_table(found: Mapping[str, Outcomes]) -> str:
         other = label.replace(TWO_D, THREE_D, 1)
         if label.startswith(TWO_D) and other in found:
             rows = [
-                (sentence, "yes" if shows else "no", told) for sentence, shows, told in pattern(outcomes, found[other])
+                (sentence, "yes" if shows else "no", reported)
+                for sentence, shows, reported in pattern(outcomes, found[other])
             ]
             header = ["the paper's pattern", "shows?", f"percent correct: {label} and {other}"]
             parts.append(markdown_table(header, rows))
@@ -342,8 +343,8 @@ def document(found: Mapping[str, Outcomes], split: str, draws: int) -> str:
     if found:
         parts += ["### Terrain that could be a roof\n", terrain_table(found)]
     parts.append("### Misprints of the paper\n")
-    parts += [f"- table {name}: {told}" for name, table in PAPER.items() for told in misprints(table)]
-    parts += [f"- table 4-2 against 4-1: {told}" for told in contradictions()]
+    parts += [f"- table {name}: {reported}" for name, table in PAPER.items() for reported in misprints(table)]
+    parts += [f"- table 4-2 against 4-1: {reported}" for reported in contradictions()]
     return "\n".join(parts) + "\n"
 
 
@@ -361,9 +362,11 @@ def main() -> int:
     entries = hofmann_entries(arguments.split, arguments.draws)
     faults = measure_all([(entry, variants) for entry in entries], place, arguments.jobs)
     read = {one.label: read_outcomes(one, place, arguments.split, arguments.draws) for one in variants}
-    told = document({label: one for label, one in read.items() if one is not None}, arguments.split, arguments.draws)
-    (place.root / "hofmann_tables.md").write_text(told, encoding="utf-8")
-    print(told)
+    reported = document(
+        {label: one for label, one in read.items() if one is not None}, arguments.split, arguments.draws
+    )
+    (place.root / "hofmann_tables.md").write_text(reported, encoding="utf-8")
+    print(reported)
     print("\n".join(faults), file=sys.stderr)
     return int(bool(faults))
 

@@ -2,9 +2,9 @@
 
     python benchmarks/isolation.py ../shared/data/ahn3/delft_west.laz --crs EPSG:7415 [--rounds 5] [--json]
 
-All ways take turns in one process, so that a busy machine slows all alike. The first round of each is told apart: it
+All ways take turns in one process, so a busy machine slows all alike. The first round of each is reported apart: it
 starts children and loads compiled kernels (and compiles them, where `gablework warm-up` was not run). Of the others
-medians are told, in seconds of wall clock, and in processor seconds of all processes together, which a busy machine
+medians are reported, in seconds of wall clock, and in processor seconds of all processes together, which a busy machine
 blurs less; then the overhead over the serial way in percent. All digests must agree.
 """
 

@@ -37,7 +37,7 @@ from pipeline.runtime.compare import Variant, settings_of
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ClockedSettings(ReconstructSettings):
-    """Settings whose segmentation tells how long it took: the building is modelled once, with a clock within."""
+    """Settings whose segmentation measures its time: the building is modelled once, with a clock within."""
 
     clocked: list[float] = dataclasses.field(default_factory=list)
     """Processor seconds of each segmentation, in their order."""
@@ -78,7 +78,7 @@ def clock(candidates: Sequence[Candidate], variants: Sequence[Variant], entry: E
     variants : sequence of Variant
         The methods.
     entry : Entry
-        Tells the settings of the roof.
+        Gives the settings of the roof.
     repeat : int
         Times over; the shortest time of each building counts.
     """
@@ -111,7 +111,7 @@ def clock(candidates: Sequence[Candidate], variants: Sequence[Variant], entry: E
     return found
 
 
-def told(seconds: FloatArray) -> list[str]:
+def reported(seconds: FloatArray) -> list[str]:
     """Median, mean and 95 % quantile in milliseconds."""
     figures = (np.median(seconds), seconds.mean(), np.quantile(seconds, 0.95))
     return [f"{1000.0 * float(value):.1f}" for value in figures]
@@ -125,7 +125,13 @@ def times_table(found: dict[str, Times]) -> str:
         counts = "/".join(str(times.statuses.count(status)) for status in ("ok", "fallback", "failed"))
         together = times.segmentation_s + times.solids_s
         rows.append(
-            [label, counts, *told(times.segmentation_s), *told(times.solids_s), f"{1000 * float(together.mean()):.1f}"]
+            [
+                label,
+                counts,
+                *reported(times.segmentation_s),
+                *reported(times.solids_s),
+                f"{1000 * float(together.mean()):.1f}",
+            ]
         )
     return markdown_table(["ms a building", "ok/block/failed", *heads, "together, mean"], rows)
 

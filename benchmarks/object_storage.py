@@ -114,7 +114,7 @@ def measured(work: Callable[[], Any]) -> tuple[float, float, float]:
     return wall, cpu, (max(most[0], before) - before) / 1e6
 
 
-def told(what: str, found: tuple[float, float, float]) -> None:
+def reported(what: str, found: tuple[float, float, float]) -> None:
     """A row of a table."""
     print(f"| {what} | {found[0]:.1f} | {found[1]:.1f} | {found[2]:.0f} |", flush=True)
 
@@ -127,7 +127,7 @@ def publishing(run: Path) -> None:
     print(f"{len(files)} files of {len(tiles)} tiles, {size / 1e6:.1f} MB\n")
     print("| into | wall s | CPU s | MB more |\n| --- | --- | --- | --- |")
     with tempfile.TemporaryDirectory() as folder:
-        told("a folder", measured(lambda: publish(storage_at(folder), run, tiles)))
+        reported("a folder", measured(lambda: publish(storage_at(folder), run, tiles)))
     for delay_ms in DELAYS_MS:
         server, bucket = served(delay_ms)
         try:
@@ -136,7 +136,7 @@ def publishing(run: Path) -> None:
                 storage = storage_at(f"{bucket}/{name[0]}")
                 storage.put("warm", b"")
                 found = measured(lambda way=way, storage=storage: way(storage, run, tiles))
-                told(f"moto + {delay_ms} ms, {name}", found)
+                reported(f"moto + {delay_ms} ms, {name}", found)
         finally:
             server.terminate()
             server.wait()
@@ -151,18 +151,18 @@ def reading(tile: Path) -> None:
     """The table of reads."""
     print(f"\n{tile.name}, {tile.stat().st_size / 1e6:.1f} MB\n")
     print("| read | wall s | CPU s | MB more |\n| --- | --- | --- | --- |")
-    told("from the disk", measured(lambda: points(open_source(tile))))
+    reported("from the disk", measured(lambda: points(open_source(tile))))
     for delay_ms in DELAYS_MS:
         server, bucket = served(delay_ms)
         url = f"{bucket}/{tile.name}"
         try:
             filesystem_of(url).put_file(str(tile), url)
-            told(f"header only, + {delay_ms} ms", measured(lambda url=url: open_source(url)))
-            told(f"by ranges, + {delay_ms} ms", measured(lambda url=url: points(open_source(url))))
+            reported(f"header only, + {delay_ms} ms", measured(lambda url=url: open_source(url)))
+            reported(f"by ranges, + {delay_ms} ms", measured(lambda url=url: points(open_source(url))))
             with tempfile.TemporaryDirectory() as folder:
                 copy = Path(folder, tile.name)
-                told(f"fetched, + {delay_ms} ms", measured(lambda url=url, copy=copy: RemoteFile(url).fetch(copy)))
-                told(
+                reported(f"fetched, + {delay_ms} ms", measured(lambda url=url, copy=copy: RemoteFile(url).fetch(copy)))
+                reported(
                     f"fetched and read, + {delay_ms} ms",
                     measured(lambda url=url, copy=copy: (RemoteFile(url).fetch(copy), points(open_source(copy)))),
                 )

@@ -11,7 +11,7 @@ little but the outlines is judged. Compared are blocks of true buildings that to
 `delft` compares walls: along every straight facade of the given footprints of 5 m or more, how far outside it the
 outline lies, and where the split pulses lie: those that met a roof and came back from below as well lie on a band
 about the edge of the roof, so their mean is where the eave is, however the outline was drawn. With `--outline walls` it
-tells, too, of how much of the outlines facade points show the wall.
+also reports how much of the outlines has facade points that show the wall.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Who spends what in a tree of processes: CPU time and peak memory by role, looked at from outside.
 
 Looks come four times a second. The last one at a process that dies is at most a quarter of a second old, so its CPU
-time is told a little too small.
+time comes out a little too small.
 """
 
 from __future__ import annotations
@@ -131,9 +131,9 @@ class Watcher:
 
     def by_role(self) -> dict[str, tuple[int, float, int]]:
         """Of every role that was seen: how many processes, CPU seconds of all, and the largest peak in bytes."""
-        told = {}
+        reported = {}
         for role in ROLES:
             own = [seen for seen in self.seen.values() if seen.role == role]
             if own:
-                told[role] = (len(own), sum(seen.cpu_s for seen in own), max(seen.peak_bytes for seen in own))
-        return told
+                reported[role] = (len(own), sum(seen.cpu_s for seen in own), max(seen.peak_bytes for seen in own))
+        return reported

@@ -18,9 +18,9 @@ held against the outlines of its own class 6, and has no figures of roofer.
   a miss. Top-visible points have no other one of the same building more than 1.1 m higher within 0.5 m in plan.
 - Buildings that differ are those of a serial run and one of two workers, by all columns that `gablework digest` counts.
 - Thinned surveys keep the points whose hash of their place is small, of all classes alike (`thinned_surveys.py`), so
-  that class 6 inside the outlines has the density told; the score is over the points of the whole survey.
-- Told less: class 6 made class 1, or no footprints given, or both. A building's loss is the share of its points within
-  0.2 m that it has less than with all told.
+  that class 6 inside the outlines has the stated density; the score is over the points of the whole survey.
+- Less input: class 6 made class 1, or no footprints given, or both. A building's loss is the share of its points within
+  0.2 m that it has less than with the full input.
 
 Writes DIR/roofer_table_<survey>.md and the same figures, with those of each building, as .json.
 """
@@ -52,7 +52,7 @@ from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.reference_points import read_points_reference
 from pipeline.runtime.compare import Variant
 
-PARTS = ("times", "seconds", "differences", "thinned", "told-less")
+PARTS = ("times", "seconds", "differences", "thinned", "less-input")
 """What can be left out."""
 NO_CLASS_6, NO_FOOTPRINTS, NEITHER = "no-class-6", "no-footprints", "neither"
 
@@ -96,8 +96,8 @@ class Figures:
     """Buildings that two runs made differently."""
     thinned: Mapping[str, RunScore] = dataclasses.field(default_factory=dict)
     """By the density."""
-    told_less: Mapping[str, RunScore] = dataclasses.field(default_factory=dict)
-    """By what was not told."""
+    less_input: Mapping[str, RunScore] = dataclasses.field(default_factory=dict)
+    """By the input that was left out."""
     losses: Mapping[str, ScoreLoss] = dataclasses.field(default_factory=dict)
     """The same, building by building against `whole`."""
 
@@ -108,13 +108,13 @@ def poorer_surveys(entry: Entry, reference: Reference, place: Workplace, skip: C
     if "thinned" not in skip:
         found = roof_density(reference).per_m2
         changes |= {f"{wanted:g}": thinned(wanted / found) for wanted in THINNED if wanted < found}
-    if "told-less" not in skip:
+    if "less-input" not in skip:
         changes[NO_CLASS_6] = without_buildings
     poorer = {}
     for name, change in changes.items():
         tiles = write_changed(entry.tiles, place.root / "surveys" / entry.name / name, change)
         poorer[name] = dataclasses.replace(entry, name=f"{entry.name}-{name}", tiles=tiles)
-    if "told-less" not in skip and entry.footprints is not None:
+    if "less-input" not in skip and entry.footprints is not None:
         poorer[NO_FOOTPRINTS] = dataclasses.replace(entry, name=f"{entry.name}-{NO_FOOTPRINTS}", footprints=None)
         poorer[NEITHER] = dataclasses.replace(poorer[NO_CLASS_6], name=f"{entry.name}-{NEITHER}", footprints=None)
     return poorer
@@ -132,22 +132,22 @@ def measure(
     val3dity = os.environ.get("GABLEWORK_VAL3DITY")
     out, skip = place.run(variant, entry), arguments.skip
     first = run_survey(entry, variant, out)
-    told(variant, entry, first)
+    reported(variant, entry, first)
     warm = cold = differing = None
     if "seconds" not in skip:
         runs = [run_survey(entry, variant, out) for _ in range(arguments.repeat)]
         warm = min(runs, key=lambda run: run.processor)
-        told(variant, entry, warm)
+        reported(variant, entry, warm)
     if "differences" not in skip:
         other = out.with_name("two_workers")
-        told(variant, entry, run_survey(entry, variant, other, workers=2))
+        reported(variant, entry, run_survey(entry, variant, other, workers=2))
         differing = tuple(sorted(differing_buildings(out, other)))
     if arguments.cold:
         cold = cold_run(entry, variant, out.with_name("cold"))
     whole = score_run(out, reference, val3dity)
     scores = {}
     for name, survey in poorer.items():
-        told(variant, survey, run_survey(survey, variant, place.run(variant, survey)))
+        reported(variant, survey, run_survey(survey, variant, place.run(variant, survey)))
         scores[name] = score_run(place.run(variant, survey), reference, val3dity)
     less = {name: score for name, score in scores.items() if name in TOLD_LESS}
     return Figures(
@@ -156,12 +156,12 @@ def measure(
         cold=cold,
         differing=differing,
         thinned={name: score for name, score in scores.items() if name not in less},
-        told_less=less,
+        less_input=less,
         losses={name: score_loss(whole, score) for name, score in less.items()},
     )
 
 
-def told(variant: Variant, entry: Entry, seconds: Seconds) -> None:
+def reported(variant: Variant, entry: Entry, seconds: Seconds) -> None:
     """Say on the terminal that a run is done."""
     print(f"{variant.label} on {entry.name}: {seconds.processor:.1f} CPU s, {seconds.clock:.1f} s", flush=True)
 
@@ -221,7 +221,7 @@ def _judged(own: int, other: int | None, whole: int) -> str:
 
 def _valid_elsewhere(found: Figures) -> str:
     """Models of the poorer surveys that are valid."""
-    scores = [*found.thinned.values(), *found.told_less.values()]
+    scores = [*found.thinned.values(), *found.less_input.values()]
     if not scores:
         return ""
     others = [score.models_val3dity for score in scores if score.models_val3dity is not None]
@@ -231,7 +231,7 @@ def _valid_elsewhere(found: Figures) -> str:
 
 def _poorer(name: str, cell: Callable[[RunScore], str], found: Figures) -> str:
     """A figure of a poorer survey; empty where there is none."""
-    scores = {**found.thinned, **found.told_less}
+    scores = {**found.thinned, **found.less_input}
     return cell(scores[name]) if name in scores else ""
 
 
@@ -256,7 +256,7 @@ THINNED: Mapping[float, tuple[tuple[str, str, str], tuple[str, str, str]]] = {
 }
 """By class-6 points a square metre: roofer, required and stretch of what is delivered, and of points within 0.2 m."""
 TOLD_LESS: Mapping[str, str] = {NO_CLASS_6: "no class 6", NO_FOOTPRINTS: "no footprints", NEITHER: "neither"}
-"""What is not told, and what the table calls it."""
+"""The input that is left out, and what the table calls it."""
 
 
 def _row(label: str, printed: tuple[str, str, str], cell: Callable[[Figures], str]) -> Row:
@@ -276,7 +276,7 @@ def _thinned_rows() -> Iterator[Row]:
         yield _row(label, within, partial(_poorer, f"{density:g}", _within))
 
 
-def _told_less_rows() -> Iterator[Row]:
+def _less_input_rows() -> Iterator[Row]:
     for name, label in TOLD_LESS.items():
         yield Row(label=f"{label}: LoD2.2", roofer="0", cell=partial(_poorer, name, _lod2))
         yield Row(label=f"{label}: within 0.2 m, all / top-visible", cell=partial(_poorer, name, _both_within))
@@ -352,7 +352,7 @@ ROWS: tuple[Row, ...] = (
         cell=lambda found: "" if found.differing is None else str(len(found.differing)),
     ),
     *_thinned_rows(),
-    *_told_less_rows(),
+    *_less_input_rows(),
     Row(label="models of these poorer surveys that are valid, own checker / val3dity", cell=_valid_elsewhere),
 )
 """The table, line by line."""

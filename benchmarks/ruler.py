@@ -4,7 +4,7 @@
                                [--methods METHOD[:PRESET] ...] [--no-pages]
 
 By default every method with its default settings. An entry of the table below is simulated once (suites), its
-candidates are found once, each method models them, and each run is measured; `benchmarks/entries.py` tells where
+candidates are found once, each method models them, and each run is measured; `benchmarks/entries.py` says where
 everything lies. DIR/methods.md then holds one line an entry and method, DIR/sweep.md a table a method: the roof faces
 of at least 10 m2 by density and noise. What is there already is not done again: delete it to repeat it.
 """

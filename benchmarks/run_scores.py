@@ -171,11 +171,11 @@ def valid_by_val3dity(run: Path, program: str) -> set[str]:
     for file in sorted(run.glob("cityjson/*/*.city.jsonl")):
         with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
             report = Path(folder, "report.json")
-            told = subprocess.run(
+            reported = subprocess.run(
                 [program, str(file), "--report", str(report)], capture_output=True, text=True, check=False
             )
             if not report.exists():
-                raise RuntimeError(f"{program} gives no report of {file}: {(told.stdout + told.stderr)[-300:]}")
+                raise RuntimeError(f"{program} gives no report of {file}: {(reported.stdout + reported.stderr)[-300:]}")
             valid |= valid_features(json.loads(report.read_text(encoding="utf-8")))
     return valid
 
@@ -208,14 +208,14 @@ def _contents(run: Path) -> dict[str, list[str]]:
     rows: dict[str, list[str]] = {}
     for table in ("buildings", "planes"):
         for row in read_table(str(run), table).to_pylist():
-            told = sorted((name, value) for name, value in row.items() if name not in NOT_CONTENT)
-            rows.setdefault(row["building_id"], []).append(f"{table} {told!r}")
+            reported = sorted((name, value) for name, value in row.items() if name not in NOT_CONTENT)
+            rows.setdefault(row["building_id"], []).append(f"{table} {reported!r}")
     return rows
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ScoreLoss:
-    """How much less of the roofs a run meets than another one that was told more, building by building."""
+    """How much less of the roofs a run meets than another one with more input, building by building."""
 
     buildings: int
     """Reference buildings with roof points."""
@@ -229,12 +229,12 @@ class ScoreLoss:
     """Median loss."""
 
 
-def score_loss(told_more: RunScore, told_less: RunScore) -> ScoreLoss:
+def score_loss(more_input: RunScore, less_input: RunScore) -> ScoreLoss:
     """Compare two runs on the same reference building by building."""
     lost = np.array(
         [
-            one.within - told_less.buildings[name].within
-            for name, one in told_more.buildings.items()
+            one.within - less_input.buildings[name].within
+            for name, one in more_input.buildings.items()
             if one.points and not math.isnan(one.within)
         ]
     )

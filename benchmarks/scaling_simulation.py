@@ -12,7 +12,7 @@ submission, result; never less than a task that does nothing), the scheduler an 
 result its way through both, a byte of scratch its share of the bandwidth. `--storage-mb-s 0` sets no limit to it.
 
 Every trace is also replayed: its own tasks with the wall-clock times that they had there, by as many workers. How far
-the simulated wall is from the measured one is the error that is told.
+the simulated wall is from the measured one is the reported error.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class _Server:
         self.worked_s = 0.0
 
     def serve(self, now_s: float, cost_s: float) -> float:
-        """When somebody who comes now is done."""
+        """When a request that comes now is done."""
         self.free_s = max(now_s, self.free_s) + cost_s
         self.worked_s += cost_s
         return self.free_s
@@ -248,8 +248,8 @@ class Engine:
     plan_s: float
     """Of the driver, a file."""
     join_s: float
-    """Of the driver, a building: from the end of the splits to the first task of the join. `engine_costs.py` tells that
-    it grows no faster than the city."""
+    """Driver seconds per building from the end of the splits to the first task of the join. `engine_costs.py` measures
+    that it grows no faster than the city."""
     digest_s: float
     """Of the driver, a building: digest, sums and the removal of scratch at the end."""
     driver_s: Mapping[str, float]
@@ -282,8 +282,8 @@ def measured_engine(trace: Mapping[str, Any], costs: Mapping[str, Any], tile_m: 
         for stage in STAGES
     }
     # CPU time, since others may have used the machine: from the last tile's result to the end
-    told = {(line["kind"], line["stage"]): line["cpu_s"] for line in trace["diary"]}
-    ending_s = told["finished", ""] - told["progress", "publish"]
+    reported = {(line["kind"], line["stage"]): line["cpu_s"] for line in trace["diary"]}
+    ending_s = reported["finished", ""] - reported["progress", "publish"]
     return Engine(
         times=times,
         buildings=counts["candidates"],
@@ -502,7 +502,7 @@ def tables(
     replays: Sequence[tuple[str, int, float, float]],
     found: Mapping[tuple[int, str], Sequence[Outcome]],
 ) -> str:
-    """All that is told."""
+    """The whole report."""
     storage = wanted.storage_mb_s * 1e6 if wanted.storage_mb_s else math.inf
     rows = [[name, str(n), f"{a:.1f}", f"{b:.1f}", f"{100 * (a / b - 1):+.1f} %"] for name, n, a, b in replays]
     parts = ["## Replayed\n", markdown_table(["trace", "workers", "simulated, s", "measured, s", "error"], rows)]

@@ -99,7 +99,7 @@ def draw_scene(
         axes.set_ylim(y0, y1)
         axes.set_aspect("equal")
         axes.ticklabel_format(useOffset=False, style="plain")
-        told = "green found, red missed, blue false" if wanted.any() else "blue found, without a reference"
-        axes.set_title(f"{title}: {told};\nblack outlines" + (", yellow given footprints" if len(given) else ""))
+        reported = "green found, red missed, blue false" if wanted.any() else "blue found, without a reference"
+        axes.set_title(f"{title}: {reported};\nblack outlines" + (", yellow given footprints" if len(given) else ""))
         figure.tight_layout()
         figure.savefig(path)

@@ -6,10 +6,10 @@
                                            [--simulate-only] [--keep]
 
 `clock` runs the three stages again and again over one tile, read without its classes. The first round, which compiles
-or loads the kernels and starts the workers, does not count. Told are the median of the rounds by stage, points a
+or loads the kernels and starts the workers, does not count. It reports the median of the rounds by stage, points a
 second, and of the serial run the functions that take most CPU time (cProfile). `large` writes one LAS file of about a
-hundred million points, a piece of a simulated city laid side by side, splits it, and tells the peak of resident memory
-of every process; the file is removed afterwards. DIR/speed.md and DIR/large.md hold the tables.
+hundred million points, a piece of a simulated city laid side by side, splits it, and reports the peak memory of every
+process; the file is removed afterwards. DIR/speed.md and DIR/large.md hold the tables.
 """
 
 from __future__ import annotations
@@ -178,15 +178,15 @@ def run_clock(arguments: argparse.Namespace) -> int:
             label = f"{workers} workers" if workers else "in one process"
             rows.append(speed_row(label, found))
             best = max(best, found[0].points / statistics.median(lap.total_s for lap in found))
-        told = profile([str(tile)], arguments.crs, folder, arguments.top) if arguments.top else ""
+        reported = profile([str(tile)], arguments.crs, folder, arguments.top) if arguments.top else ""
     held = [
         f"{'reached' if best >= limit else 'missed'}: {name} of {limit / 1e6:g} million points a second"
         for name, limit in (("required", REQUIRED_POINTS_A_SECOND), ("wanted", WANTED_POINTS_A_SECOND))
     ]
     text = f"`{tile.name}`, {arguments.rounds} rounds after the first.\n\n{speed_table(rows)}\n{'; '.join(held)}.\n"
     (arguments.out / "speed.md").write_text(text, encoding="utf-8")
-    (arguments.out / "profile.txt").write_text(told + "\n", encoding="utf-8")
-    print(f"\n{text}\n{told}")
+    (arguments.out / "profile.txt").write_text(reported + "\n", encoding="utf-8")
+    print(f"\n{text}\n{reported}")
     return 0
 
 

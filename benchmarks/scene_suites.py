@@ -198,8 +198,10 @@ def suite_tables(scores: Sequence[SuiteScore], split: str) -> str:
     """All figures."""
     blocks = {s.scene.slope_deg: s.detection.objects for s in scores}
     houses = {s.scene.slope_deg: s.houses for s in scores}
-    told = ", ".join(f"{blocks[slope]} blocks of {houses[slope]} houses on {slope:g} deg" for slope in sorted(blocks))
-    head = f"`city` of {SIZE_M[0]:g} m x {SIZE_M[1]:g} m, {split} seed {seed_of(split, 0)}: {told}; pulses a m2.\n"
+    reported = ", ".join(
+        f"{blocks[slope]} blocks of {houses[slope]} houses on {slope:g} deg" for slope in sorted(blocks)
+    )
+    head = f"`city` of {SIZE_M[0]:g} m x {SIZE_M[1]:g} m, {split} seed {seed_of(split, 0)}: {reported}; pulses a m2.\n"
     return "\n".join((head, *(suite_table(scores, name) for name in FIGURES)))
 
 

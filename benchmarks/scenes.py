@@ -7,7 +7,7 @@
 candidate as its model would have it, and compares: by area on the raster of class 6 with and without the ring at its
 edges, by objects of at least 16 m2, and where given footprints cover by IoU and area of blocks of touching ones.
 Nothing is modelled, so it takes seconds. DIR/real.md holds the tables, DIR/TILE.md what is missed and wrong one by
-one, DIR/TILE.png a picture: green found, red missed, blue false. `suites` is told in `benchmarks/scene_suites.py`.
+one, DIR/TILE.png a picture: green found, red missed, blue false. `suites` is described in `benchmarks/scene_suites.py`.
 """
 
 from __future__ import annotations

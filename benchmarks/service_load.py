@@ -3,7 +3,7 @@
     python benchmarks/service_load.py [--tile FILE] [--uploads 50] [--pollers 200] [--with-driver]
 
 Sends the tile as so many jobs at once while pollers ask for the status of what was submitted. Checks that no job and
-no upload is lost or doubled and that every stored file has the SHA-256 of the tile; tells the peak memory of the API
+no upload is lost or doubled and that every stored file has the SHA-256 of the tile; reports the peak memory of the API
 process (the kernel's own high-water mark) and the duration of the status calls. Fails above the limits of the design.
 """
 
@@ -46,14 +46,14 @@ def serving(state: Path, *options: str) -> Iterator[tuple[str, int]]:
     command = [sys.executable, "-m", "service.cli", "serve", "--json", "--port", "0", "--state", str(state), *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None
-        told = ""
-        while not told.rstrip().endswith("}"):
+        reported = ""
+        while not reported.rstrip().endswith("}"):
             line = process.stdout.readline()
             if not line:
                 raise SystemExit(f"serve ended with {process.wait()}")
-            told += line
+            reported += line
         try:
-            yield json.loads(told)["url"], process.pid
+            yield json.loads(reported)["url"], process.pid
         finally:
             process.send_signal(signal.SIGTERM)
 
@@ -161,9 +161,9 @@ def stored_faults(url: str, state: Path, jobs: list[str], sha256: str) -> list[s
         for job in jobs
         for tile in httpx.get(f"{url}/jobs/{job}", timeout=60.0).json()["request"]["inputs"]["tiles"]
     ]
-    told = {httpx.get(tile, timeout=60.0).json()["sha256"] for tile in tiles}
-    if len(set(tiles)) != len(jobs) or told != {sha256}:
-        faults.append(f"{len(set(tiles))} uploads for {len(jobs)} jobs, told with the hashes {sorted(told)}")
+    reported = {httpx.get(tile, timeout=60.0).json()["sha256"] for tile in tiles}
+    if len(set(tiles)) != len(jobs) or reported != {sha256}:
+        faults.append(f"{len(set(tiles))} uploads for {len(jobs)} jobs, reported with the hashes {sorted(reported)}")
     return faults
 
 

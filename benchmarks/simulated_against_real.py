@@ -11,7 +11,7 @@ field of detached houses and the real tiles are old towns. Measured alike everyw
   orthogonal residuals with six degrees of freedom. Buildings are class 6; where a tile has no classes, on both sides
   all last returns more than 3 m over the lowest within 12 m: roofs, and crowns that nothing penetrated;
 - the share of pulses with several returns: all, and those whose first return is of a building, or of anything else
-  above the ground. The ISPRS file tells a first and a last return of every pulse: there two are several where they
+  above the ground. The ISPRS file has a first and a last return of every pulse: there two are several where they
   differ by 0.5 m in height.
 """
 
@@ -62,7 +62,7 @@ class Points:
 
 
 def real_points(path: Path) -> Points:
-    """A tile; of a file that tells two returns of every pulse, several are those that differ in height."""
+    """A tile; of a file with two returns of every pulse, several are those that differ in height."""
     tile = laspy.read(path)
     number, count = np.asarray(tile.return_number), np.asarray(tile.number_of_returns)
     xyz = np.asarray(tile.xyz)

@@ -6,7 +6,7 @@ CHECKOUT is another checkout of this repository with its environment (`make .ven
 table in docs/results/start_up.md. Both versions run in turns, the medians of their runs are divided. Processor
 seconds are those of a command and of everything that it starts, also of what outlives it for a moment: such processes
 are waited for. Compiled kernels are there, but for the rows of the demo, which clone both checkouts and begin with
-nothing. A machine that others use at the same time tells the ratios of processor seconds all the same; those of wall
+nothing. A machine that others use at the same time still gives valid ratios of processor seconds; those of wall
 seconds want a quiet one.
 """
 
@@ -34,10 +34,10 @@ from numba.core import event
 seen = []
 
 class Counting(event.Listener):
-    def on_start(self, told):
-        seen.append(told.data["dispatcher"].py_func)
+    def on_start(self, event):
+        seen.append(event.data["dispatcher"].py_func)
 
-    def on_end(self, told):
+    def on_end(self, event):
         pass
 
 event.register("numba:compile", Counting())
@@ -307,21 +307,21 @@ def main() -> None:
             else measured(every[name], baseline, arguments.repeat)
         )
         for cells in lines:
-            told(cells)
+            reported(cells)
     if "engines" in wanted:
         table("wall", "`--workers auto`", "`--workers 0`", "`--workers 2`", "`auto` to the better of both")
         for cells in engines(every, arguments.repeat):
-            told(cells)
+            reported(cells)
 
 
 def table(*heads: str) -> None:
     """Begin a table."""
     print()
-    told(heads)
-    told(["---"] * len(heads))
+    reported(heads)
+    reported(["---"] * len(heads))
 
 
-def told(cells: Sequence[str]) -> None:
+def reported(cells: Sequence[str]) -> None:
     """Print a line of a table."""
     print("| " + " | ".join(cells) + " |", flush=True)
 

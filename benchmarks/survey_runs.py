@@ -71,10 +71,12 @@ def run_survey(
     variables = {**os.environ, **(environment or {}), "PYTHONPATH": os.pathsep.join(paths)}
     variables.pop("PYTHONDONTWRITEBYTECODE", None)  # a second run finds what the first compiled
     before, began = _processor_s(), time.perf_counter()
-    told = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
+    reported = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
     seconds = Seconds(processor=_processor_s() - before, clock=time.perf_counter() - began)
-    if told.returncode:
-        raise RuntimeError(f"{variant.label} on {entry.name} ended with {told.returncode}: {told.stderr[-600:]}")
+    if reported.returncode:
+        raise RuntimeError(
+            f"{variant.label} on {entry.name} ended with {reported.returncode}: {reported.stderr[-600:]}"
+        )
     return seconds
 
 

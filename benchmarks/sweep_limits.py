@@ -6,7 +6,7 @@
 The quality of the roof faces of at least 10 m2, TP / (TP + FP + FN) in the true and the modelled faces together, is
 that of the evaluation (`faces.quality_10m2`). A limit is where it falls below 80 % or 50 %: the density interpolated
 in its logarithm between the cells of one noise, the noise between those of one density. A quality need not fall with
-the density at both ends, so what is told is the range in which it holds: `from 0.9` (to the densest cell), `to 12`,
+the density at both ends, so the result is the range in which it holds: `from 0.9` (to the densest cell), `to 12`,
 `0.9 to 12`, `always` (in all cells), `never`. Writes DIR/sweep_limits.md, and the plot.
 """
 
@@ -27,7 +27,7 @@ from pipeline.ruler.simulation.sweep import CELLS
 from pipeline.runtime.compare import Variant
 
 LEVELS = (0.8, 0.5)
-"""Qualities whose limits are told."""
+"""Qualities whose limits are reported."""
 NOISE_COLOURS = ("#1b6ca8", "#2a9d55", "#d1495b")
 """One a noise, from clean to noisy."""
 DENSEST_FAITHFUL = 16.0
@@ -103,17 +103,17 @@ def told_ranges(ranges: Sequence[HeldRange]) -> str:
     >>> told_ranges([HeldRange(low=0.9, high=12.0), HeldRange(low=30.0, high=math.inf)])
     '0.90 to 12, from 30'
     """
-    told = []
+    reported = []
     for one in ranges:
         if math.isinf(one.low) and math.isinf(one.high):
             return "always"
         if math.isinf(one.high):
-            told.append(f"from {_told(one.low)}")
+            reported.append(f"from {_told(one.low)}")
         elif math.isinf(one.low):
-            told.append(f"to {_told(one.high)}")
+            reported.append(f"to {_told(one.high)}")
         else:
-            told.append(f"{_told(one.low)} to {_told(one.high)}")
-    return ", ".join(told) or "never"
+            reported.append(f"{_told(one.low)} to {_told(one.high)}")
+    return ", ".join(reported) or "never"
 
 
 def _told(value: float) -> str:
@@ -289,10 +289,10 @@ def main() -> int:
         one.label: sweep_qualities(one, place, [entry for entry, ways in wanted if one in ways]) for one in variants
     }
     found = {label: qualities for label, qualities in found.items() if qualities}
-    told = document(found, arguments.split)
-    (place.root / "sweep_limits.md").write_text(told, encoding="utf-8")
+    reported = document(found, arguments.split)
+    (place.root / "sweep_limits.md").write_text(reported, encoding="utf-8")
     draw(found, arguments.plot or place.root / "sweep_limits.png")
-    print(told)
+    print(reported)
     print("\n".join(faults), file=sys.stderr)
     return int(bool(faults))
 

@@ -22,7 +22,7 @@ from pipeline.ruler.evaluation.reference import Reference
 from pipeline.scene import BUILDING_CLASS
 
 UNCLASSIFIED = 1
-"""What a building point becomes where the buildings are not told."""
+"""What a building point becomes when the buildings are left out."""
 
 _ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 _MIXERS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
@@ -112,7 +112,7 @@ def thinned(share: float) -> Change:
 
 
 def without_buildings(las: laspy.LasData) -> laspy.LasData:
-    """The change that tells no buildings: class 6 becomes 1, all else stays."""
+    """The change that hides the buildings: class 6 becomes 1, all else stays."""
     classes = np.array(las.classification)
     classes[classes == BUILDING_CLASS] = UNCLASSIFIED
     las.classification = classes

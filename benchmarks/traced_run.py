@@ -4,7 +4,7 @@
                                     [--tile-size M]
 
 It does what `gablework reconstruct` does, by the same function, with an executor that hands tasks on and keeps what
-`Measured` tells of each. Of every eighth task the sizes of task and result are taken, too.
+`Measured` reports of each. Of every eighth task the sizes of task and result are taken, too.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def folder_bytes(folder: Path) -> int:
 
 
 class Diary:
-    """What the driver tells while it runs, with its own CPU time."""
+    """What the driver reports while it runs, with its own CPU time."""
 
     def __init__(self, scratch: Path) -> None:
         self._scratch = scratch

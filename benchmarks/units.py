@@ -1,11 +1,11 @@
-"""How well touching buildings are told apart: candidates against the houses of a simulated city, or given footprints.
+"""How well touching buildings are separated: candidates against the houses of a simulated city, or given footprints.
 
     python -m benchmarks.units city --out DIR [--split dev|test] [--densities 1 4 10] [--size 600 500]
     python -m benchmarks.units real TILES… --crs EPSG:n --footprints FILE
 
 A candidate and a house belong together where they share more than a fifth of the points of either. Counted are pairs
 that belong to each other alone (1:1), candidates of several houses (1:N) with the houses in them, and houses in several
-candidates (N:1): before units are told apart, with steps alone, and as the default settings do it. Only houses with
+candidates (N:1): before blocks are split into units, with steps alone, and with the default settings. Only houses with
 points in some candidate count; detection is measured elsewhere. Classes are not looked at.
 """
 

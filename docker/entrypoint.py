@@ -4,7 +4,7 @@
 | --- | --- |
 | api | the REST service and the page; refuses to start without keys |
 | driver | claims jobs and runs them on the scheduler's workers |
-| scheduler | Dask's scheduler; whoever reaches it can run code, so it is never published |
+| scheduler | Dask's scheduler; anyone who reaches it can run code, so it is never published |
 | worker | a Dask worker; ends its tasks before it stops |
 | healthy | the health check of the role that runs in this container |
 
@@ -81,7 +81,7 @@ DASK_TLS: Mapping[str, tuple[str, ...]] = {
 
 
 def dask_tls_of(given: Mapping[str, str]) -> dict[str, str]:
-    """Our names of the certificates in Dask's words, so that all roles are told alike; then it speaks TLS only.
+    """Our names of the certificates in Dask's words, so that all roles use the same variables; then it uses TLS only.
 
     >>> dask_tls_of({"GABLEWORK_TLS_CA": "/run/secrets/ca"})
     {'DASK_DISTRIBUTED__COMM__TLS__CA_FILE': '/run/secrets/ca', 'DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION': 'True'}
@@ -98,7 +98,7 @@ def dask_tls_of(given: Mapping[str, str]) -> dict[str, str]:
 
 
 def environment_of(given: Mapping[str, str]) -> dict[str, str]:
-    """The environment of the role: the password is read from its file, certificates are told to Dask."""
+    """The environment of the role: the password is read from its file, certificates are passed to Dask."""
     wanted = {**dask_tls_of(given), **given}
     secret = wanted.pop("GABLEWORK_DATABASE_PASSWORD_FILE", "")
     if secret:

@@ -118,10 +118,10 @@ def needs_program() -> Callable[..., str]:
             found = shutil.which(name)
             if found is not None:
                 return found
-        told = f"none of the programs {', '.join(candidates)} is installed"
+        reported = f"none of the programs {', '.join(candidates)} is installed"
         if os.environ.get(REQUIRED_PROGRAMS) == "1":
-            pytest.fail(f"{told}, but {REQUIRED_PROGRAMS}=1")
-        pytest.skip(told)
+            pytest.fail(f"{reported}, but {REQUIRED_PROGRAMS}=1")
+        pytest.skip(reported)
 
     return find
 

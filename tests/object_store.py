@@ -126,8 +126,10 @@ class FaultyProxy:
     def count(self, what: str = "", method: str = "", path: str = "") -> int:
         """How many requests of a kind came: by what became of them, their method, a part of their path."""
         return sum(
-            (not what or told == what) and (not method or r.method == method) and re.search(path, r.path) is not None
-            for r, told in self.seen
+            (not what or reported == what)
+            and (not method or r.method == method)
+            and re.search(path, r.path) is not None
+            for r, reported in self.seen
         )
 
     def _handle(self, client: BaseHTTPRequestHandler) -> None:
@@ -167,9 +169,9 @@ class FaultyProxy:
         response = connection.getresponse()
         content = response.read()
         kept = [(k, v) for k, v in response.getheaders() if k.lower() not in HOP_BY_HOP]
-        told = response.getheader("Content-Length")
+        reported = response.getheader("Content-Length")
         connection.close()
-        return response.status, kept, content, int(told) if client.command == "HEAD" and told else None
+        return response.status, kept, content, int(reported) if client.command == "HEAD" and reported else None
 
 
 def _body(client: BaseHTTPRequestHandler) -> bytes:

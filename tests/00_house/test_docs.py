@@ -182,9 +182,9 @@ def test_every_column_is_told_with_its_type_in_order(table: str) -> None:
     text = (DOCS / "reference" / "records.md").read_text()
     section = re.search(rf"^## {table}\n(.*?)(?=^## )", text, re.MULTILINE | re.DOTALL)
     assert section is not None
-    told = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", section[1], re.MULTILINE)
-    assert [name for name, _ in told] == SCHEMAS[table].names
-    for name, kind in told:
+    reported = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", section[1], re.MULTILINE)
+    assert [name for name, _ in reported] == SCHEMAS[table].names
+    for name, kind in reported:
         real = str(SCHEMAS[table].field(name).type)
         assert re.sub(r"list<\w+: ", "list<", real).split("[")[0] == kind, name
 
@@ -193,8 +193,8 @@ def test_every_reason_status_and_roof_type_is_told() -> None:
     text = (DOCS / "reference" / "records.md").read_text()
     reasons = text.split("## Reasons")[1]
     assert re.findall(r"^\| `(\w+)` \|", reasons, re.MULTILINE) == [reason.value for reason in Reason]
-    told = re.findall(r"^\| `\w+` \| \w+ \| (.*) \|$", reasons, re.MULTILINE)
-    assert [re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text) for text in told] == [REASONS[reason] for reason in Reason]
+    reported = re.findall(r"^\| `\w+` \| \w+ \| (.*) \|$", reasons, re.MULTILINE)
+    assert [re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text) for text in reported] == [REASONS[reason] for reason in Reason]
     status = text.split("## Status")[1].split("## Reasons")[0]
     assert re.findall(r"^\| `(\w+)` \|", status, re.MULTILINE) == [entry.value for entry in Status]
     row = re.search(r"^\| `roof_type`.*$", text, re.MULTILINE)

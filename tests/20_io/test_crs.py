@@ -37,10 +37,10 @@ def resolve(in_header=None, **more):
     ],
 )
 def test_units_of_plan_and_elevation_come_from_their_own_axes(crs, epsg, horizontal_m, vertical_m, warns):
-    reference, told = resolve(crs)
+    reference, reported = resolve(crs)
     assert reference.horizontal_unit_m == pytest.approx(horizontal_m, rel=1e-9)
     assert reference.vertical_unit_m == pytest.approx(vertical_m, rel=1e-9)
-    assert any("no vertical unit" in warning for warning in told) == warns
+    assert any("no vertical unit" in warning for warning in reported) == warns
     if epsg is not None:
         assert reference.epsg == epsg
 
@@ -48,19 +48,19 @@ def test_units_of_plan_and_elevation_come_from_their_own_axes(crs, epsg, horizon
 def test_the_order_of_precedence_of_the_vertical_unit():
     assert resolve("EPSG:28992", vertical_unit="ft")[0].vertical_unit_m == FOOT_M
     assert resolve("EPSG:7415", vertical_unit="us-ft")[0].vertical_unit_m == US_SURVEY_FOOT_M
-    reference, told = resolve("EPSG:28992", header_vertical_unit_m=FOOT_M)
-    assert (reference.vertical_unit_m, told) == (FOOT_M, ())
+    reference, reported = resolve("EPSG:28992", header_vertical_unit_m=FOOT_M)
+    assert (reference.vertical_unit_m, reported) == (FOOT_M, ())
     assert resolve("EPSG:7415", header_vertical_unit_m=FOOT_M)[0].vertical_unit_m == 1.0
     # The header's unit belongs to the header's CRS.
     assert resolve("EPSG:2992", crs="EPSG:28992", header_vertical_unit_m=FOOT_M)[0].vertical_unit_m == 1.0
 
 
 def test_no_crs_is_unknown_and_told_with_its_fix():
-    reference, told = resolve()
+    reference, reported = resolve()
     assert reference == SpatialReference()
     assert (reference.wkt, reference.epsg, reference.projjson, reference.crs) == (None, None, None, None)
-    assert len(told) == 1
-    assert "--crs" in told[0]
+    assert len(reported) == 1
+    assert "--crs" in reported[0]
     in_feet, _ = resolve(header_horizontal_unit_m=FOOT_M)
     assert (in_feet.horizontal_unit_m, in_feet.vertical_unit_m) == (FOOT_M, FOOT_M)
 
@@ -84,9 +84,9 @@ def test_an_unknown_unit_lists_the_known_ones():
 
 
 def test_the_given_crs_replaces_the_header_s_and_says_so_only_where_they_differ():
-    reference, told = resolve("EPSG:2154", crs="EPSG:7415")
+    reference, reported = resolve("EPSG:2154", crs="EPSG:7415")
     assert reference.epsg == 7415
-    assert any("in place of the header's" in warning for warning in told)
+    assert any("in place of the header's" in warning for warning in reported)
     assert resolve("EPSG:28992", crs="EPSG:7415")[1] == ()
 
 

@@ -106,8 +106,8 @@ def test_invalid_polygons_are_repaired_and_told(tmp_path):
     assert found.polygons[1].equals(box(0, 0, 10, 10))
     assert "2 footprints are invalid and were repaired" in found.warnings
     assert "1 features are left out: 1 invalid and without area" in found.warnings
-    told = [(issue.source_id, issue.problem, issue.action) for issue in found.issues]
-    assert told == [
+    reported = [(issue.source_id, issue.problem, issue.action) for issue in found.issues]
+    assert reported == [
         ("1", "invalid", "repaired to 2 polygons of 50.0 m2"),
         ("2", "invalid", "repaired to one polygon of 100.0 m2"),
         ("3", "no_area", "left out"),

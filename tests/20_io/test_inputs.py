@@ -151,7 +151,7 @@ def test_an_object_that_is_named_like_a_pattern_is_a_file(bucket):
 
 def test_what_is_not_in_a_bucket_is_told(bucket):
     put(f"{bucket}/t/notes.txt", b"no points\n")
-    for entry, told in (
+    for entry, reported in (
         (f"{bucket}/t/missing.laz", "there is no such thing"),
         (f"{bucket}/t", "a folder, not a file.*End its name with /"),
         (f"{bucket}/t/*.laz", "meets no files"),
@@ -161,7 +161,7 @@ def test_what_is_not_in_a_bucket_is_told(bucket):
         ("https://host/folder/", "tells no list of its files.*a tile index"),
         ("ftp://host/a.laz", "ftp:// is not understood"),
     ):
-        with pytest.raises(UnreadableInputError, match=told):
+        with pytest.raises(UnreadableInputError, match=reported):
             find_inputs([entry])
 
 

@@ -40,7 +40,7 @@ def first(what, n=1, method=""):
 def test_a_put_that_fails_is_made_again_and_is_there_once(storage, s3, what):
     s3.script = first(what, 2)
     storage.put("run.json", b"content")
-    assert [told for _, told in s3.seen] == [what, what, "pass"]
+    assert [reported for _, reported in s3.seen] == [what, what, "pass"]
     assert storage.get("run.json") == b"content"
     assert storage.keys() == ["run.json"]
 
@@ -143,7 +143,7 @@ def test_without_the_extra_the_error_names_it():
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("url", "reported"),
     [
         ("ftp://host/run", "ftp:// is not understood"),
         ("https://host/run", "nothing can be stored there"),
@@ -152,7 +152,7 @@ def test_without_the_extra_the_error_names_it():
         ("https://me:hidden@host/run?token=hidden", "nothing can be stored there"),
     ],
 )
-def test_urls_where_nothing_can_be_stored_are_refused(url, told):
-    with pytest.raises(RunError, match=told) as refused:
+def test_urls_where_nothing_can_be_stored_are_refused(url, reported):
+    with pytest.raises(RunError, match=reported) as refused:
         storage_at(url)
     assert "hidden" not in str(refused.value)

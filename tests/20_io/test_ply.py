@@ -95,9 +95,9 @@ def test_single_precision_that_is_too_coarse_is_told(tmp_path):
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
     head += b"property float x\nproperty float y\nproperty float z\nend_header\n"
     (tmp_path / "a.ply").write_bytes(head + rows.tobytes())
-    told = open_source(tmp_path / "a.ply", RD).info.warnings
-    assert [warning[0] for warning in told] == ["x", "y"]
-    assert "steps are 0.5 units" in told[1]
+    reported = open_source(tmp_path / "a.ply", RD).info.warnings
+    assert [warning[0] for warning in reported] == ["x", "y"]
+    assert "steps are 0.5 units" in reported[1]
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

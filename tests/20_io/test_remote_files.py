@@ -146,10 +146,10 @@ def test_what_cannot_be_fetched_is_told_by_url_status_and_fix_without_its_secret
     with pytest.raises(UnreadableInputError, match=r"a\.laz\?query-.*: cannot be fetched: .*404.*Check the name"):
         RemoteFile(f"{site.url}?token=hidden", QUICK).stat()
     site.faults = [503] * 99
-    with pytest.raises(UnreadableInputError, match=r"the server is busy at all of 3 attempts .*503") as told:
+    with pytest.raises(UnreadableInputError, match=r"the server is busy at all of 3 attempts .*503") as reported:
         RemoteFile(site.url.replace("http://", "http://me:hidden@") + "?token=hidden", QUICK).stat()
-    assert "hidden" not in str(told.value)
-    assert told.value.__cause__ is None
+    assert "hidden" not in str(reported.value)
+    assert reported.value.__cause__ is None
 
 
 def test_a_server_that_is_not_there_is_told():

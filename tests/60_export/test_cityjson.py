@@ -152,8 +152,8 @@ def test_attributes_are_the_record_without_what_is_unknown(contexts: Contexts) -
     by_id = {feature["id"]: feature["CityObjects"][feature["id"]]["attributes"] for feature in sequence(first)[1:]}
     row = building_row(small.courtyard(), first, mesh_path="meshes/t/a.obj")
     wanted = {n: v for n, v in row.items() if v is not None and n not in {"geometry", "building_id", *SOLID_COLUMNS}}
-    told = {name: value for name, value in wanted.items() if not name.startswith("acquired")}
-    assert {n: v for n, v in by_id["courtyard"].items() if not n.startswith("acquired")} == told
+    reported = {name: value for name, value in wanted.items() if not name.startswith("acquired")}
+    assert {n: v for n, v in by_id["courtyard"].items() if not n.startswith("acquired")} == reported
     assert by_id["courtyard"]["acquired_from"] == "2014-03-01T10:00:00.000125+00:00"
     assert by_id["failed"]["reason"] == "too_few_points"
     assert "ridge_z" not in by_id["failed"]

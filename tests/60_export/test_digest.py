@@ -156,7 +156,7 @@ def test_a_lost_row_changes_the_digest(run_dir: Path, tmp_path: Path) -> None:
 
 def test_how_arrow_holds_the_values_does_not_count(run_dir: Path) -> None:
     (batch,) = read_table(str(run_dir), "buildings").combine_chunks().to_batches()
-    told = list(canonical_rows(batch))
+    reported = list(canonical_rows(batch))
     casts = {"method": pa.large_string(), "n_planes": pa.int64()}
     casts |= {"acquired_from": pa.timestamp("ns", tz="UTC"), "validity_codes": pa.large_list(pa.int64())}
     columns = {
@@ -166,8 +166,8 @@ def test_how_arrow_holds_the_values_does_not_count(run_dir: Path) -> None:
         for name in reversed(batch.schema.names)
     }
     other = pa.RecordBatch.from_pydict(columns)
-    assert list(canonical_rows(other)) == told
-    assert [row for i in range(len(told)) for row in canonical_rows(batch.slice(i, 1))] == told
+    assert list(canonical_rows(other)) == reported
+    assert [row for i in range(len(reported)) for row in canonical_rows(batch.slice(i, 1))] == reported
 
 
 def test_null_zero_and_nothing_are_three_things() -> None:

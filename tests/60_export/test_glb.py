@@ -98,8 +98,8 @@ def test_roofs_look_up_the_ground_looks_down_and_walls_stand_upright(glb: Glb) -
             sides = primitive.triangles[:, 1:] - primitive.triangles[:, :1]
             drawn = np.cross(sides[:, 0], sides[:, 1])
             drawn /= np.linalg.norm(drawn, axis=1)[:, None]
-            told = primitive.normals[primitive.indices]
-            assert np.allclose(told, drawn[:, None, :], atol=1e-5)
+            reported = primitive.normals[primitive.indices]
+            assert np.allclose(reported, drawn[:, None, :], atol=1e-5)
             up = drawn[:, 1]
             wanted = {"RoofSurface": up > 0.1, "WallSurface": np.abs(up) < 1e-6, "GroundSurface": up < -0.999}
             assert wanted[primitive.material].all()
@@ -147,11 +147,13 @@ def test_a_node_a_building_holds_its_record_and_a_primitive_its_part(contexts: C
 def test_roof_planes_are_told_a_vertex_and_nothing_else_has_one(glb: Glb) -> None:
     planes = {}
     for primitive in glb.nodes["two_parts"].primitives:
-        told = set(primitive.planes[primitive.indices].ravel().tolist())
-        planes[primitive.extras["part"], primitive.material] = told
+        reported = set(primitive.planes[primitive.indices].ravel().tolist())
+        planes[primitive.extras["part"], primitive.material] = reported
     assert planes["two_parts-0", "RoofSurface"] == {0.0, 1.0}
     assert planes["two_parts-1", "RoofSurface"] == {2.0, 3.0}
-    assert {frozenset(told) for (_, name), told in planes.items() if name != "RoofSurface"} == {frozenset({-1.0})}
+    assert {frozenset(reported) for (_, name), reported in planes.items() if name != "RoofSurface"} == {
+        frozenset({-1.0})
+    }
 
 
 def test_materials_are_the_three_surfaces_and_none_is_seen_from_both_sides(glb: Glb) -> None:
@@ -214,13 +216,13 @@ def test_the_rules_would_find_a_fault(contexts: Contexts) -> None:
 
 def test_a_tile_is_published_with_one_file_that_its_rows_name(tmp_path: Path, contexts: Contexts) -> None:
     results = [build() for build in (*BUILT, small.failed)]
-    told = write_tile(tmp_path, "t1", results, [], contexts["compound"], "glb")
-    assert [path for path in told.digests if path.startswith("meshes/")] == ["meshes/t1/t1.glb"]
+    reported = write_tile(tmp_path, "t1", results, [], contexts["compound"], "glb")
+    assert [path for path in reported.digests if path.startswith("meshes/")] == ["meshes/t1/t1.glb"]
     found = read_glb((tmp_path / "meshes" / "t1" / "t1.glb").read_bytes())
     assert set(found.nodes) == {"gable", "courtyard", "two_parts", "pent"}
     assert {node.extras["mesh_path"] for node in found.nodes.values()} == {"meshes/t1/t1.glb"}
     again = write_tile(tmp_path / "again", "t1", results[::-1], [], contexts["compound"], "glb")
-    assert again == told
+    assert again == reported
     nothing = write_tile(tmp_path, "t2", [small.failed()], [], contexts["compound"], "glb")
     assert not any(path.startswith("meshes/") for path in nothing.digests)
 

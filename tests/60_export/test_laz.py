@@ -103,9 +103,9 @@ def test_every_dimension_survives_but_the_class(point_format: int) -> None:
     new = written(las, classes)
     assert new.header.version == "1.4"
     assert new.point_format.id == NEWER_FORMAT[point_format]
-    told = set(las.point_format.dimension_names) - {"classification", "scan_angle_rank", "scan_angle"}
-    assert told >= {*PLAIN, *SUBFIELDS, "reflectance", "pulse", "deviation"}
-    for name in sorted(told):
+    reported = set(las.point_format.dimension_names) - {"classification", "scan_angle_rank", "scan_angle"}
+    assert reported >= {*PLAIN, *SUBFIELDS, "reflectance", "pulse", "deviation"}
+    for name in sorted(reported):
         assert (np.asarray(new[name]) == np.asarray(las[name])).all(), name
     if point_format >= 6:
         assert (new.scan_angle == las.scan_angle).all()

@@ -40,8 +40,8 @@ def solids_again(columns: dict[str, Any], units_m: tuple[float, float]) -> list[
     polygons = shapely.get_parts(shapely.from_wkb(columns["solid"]))
     faces: dict[int, list[SolidFace]] = {}
     places: dict[int, dict[tuple[float, ...], int]] = {}
-    told = zip(polygons, columns["solid_parts"], columns["solid_surfaces"], columns["solid_planes"], strict=True)
-    for polygon, part, surface, plane in told:
+    reported = zip(polygons, columns["solid_parts"], columns["solid_surfaces"], columns["solid_planes"], strict=True)
+    for polygon, part, surface, plane in reported:
         numbers = places.setdefault(part, {})
         rings = []
         for ring in (polygon.exterior, *polygon.interiors):
@@ -142,10 +142,10 @@ def test_coarser_solids_have_columns_of_their_own(contexts: Contexts) -> None:
     assert tuple(columns) == SOLID_COLUMNS
     for model in result.coarser:
         name = f"solid_lod{model.lod.replace('.', '')}"
-        told = {end: columns[f"{name}_{end}"] for end in ("parts", "surfaces")}
+        reported = {end: columns[f"{name}_{end}"] for end in ("parts", "surfaces")}
         planes = [face.plane for solid in model.solids for face in solid.faces]
         again = solids_again(
-            {"solid": columns[name], "solid_planes": planes, **{f"solid_{end}": v for end, v in told.items()}},
+            {"solid": columns[name], "solid_planes": planes, **{f"solid_{end}": v for end, v in reported.items()}},
             (1.0, 1.0),
         )
         assert [volume(solid) for solid in again] == pytest.approx([volume(solid) for solid in model.solids])

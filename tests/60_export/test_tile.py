@@ -34,8 +34,8 @@ def files_of(folder: Path) -> dict[str, str]:
 def test_a_tile_writes_the_designed_files_and_tells_their_digests(
     tmp_path: Path, contexts: Contexts, rejected_objects: RejectedObjects
 ) -> None:
-    told = write_tile(tmp_path, "x85_y447", [build() for build in BUILT], rejected_objects, contexts["compound"])
-    assert sorted(told.digests) == [
+    reported = write_tile(tmp_path, "x85_y447", [build() for build in BUILT], rejected_objects, contexts["compound"])
+    assert sorted(reported.digests) == [
         "buildings/tile=x85_y447/part-0.parquet",
         "cityjson/tile=x85_y447/part-0.city.jsonl",
         "meshes/x85_y447/gable.obj",
@@ -43,8 +43,8 @@ def test_a_tile_writes_the_designed_files_and_tells_their_digests(
         "planes/tile=x85_y447/part-0.parquet",
         "rejected/tile=x85_y447/part-0.parquet",
     ]
-    assert told.digests == files_of(tmp_path)
-    assert (told.n_buildings, told.n_planes, told.n_rejected) == (3, 6, 2)
+    assert reported.digests == files_of(tmp_path)
+    assert (reported.n_buildings, reported.n_planes, reported.n_rejected) == (3, 6, 2)
 
 
 def test_mesh_paths_of_the_table_are_those_of_the_files(tmp_path: Path, contexts: Contexts) -> None:
@@ -54,8 +54,8 @@ def test_mesh_paths_of_the_table_are_those_of_the_files(tmp_path: Path, contexts
     ):
         folder = tmp_path / meshes
         write_tile(folder, "t1", [build() for build in BUILT], [], contexts["compound"], meshes)
-        told = read_table(str(folder), "buildings")["mesh_path"].to_pylist()
-        assert {path for path in told if path} == wanted
+        reported = read_table(str(folder), "buildings")["mesh_path"].to_pylist()
+        assert {path for path in reported if path} == wanted
         assert {path.relative_to(folder).as_posix() for path in folder.rglob("*.obj")} == wanted
     text = (tmp_path / "tile" / "meshes" / "t1" / "t1.obj").read_text()
     assert [line for line in text.splitlines() if line.startswith("o ")] == [
@@ -105,9 +105,9 @@ def test_a_temporary_file_is_seen_by_no_reader(tmp_path: Path, contexts: Context
 
 def test_another_store_gets_the_same_files(tmp_path: Path, contexts: Contexts) -> None:
     stored: dict[str, bytes] = {}
-    told = write_tile("bucket/run", "t1", [small.gable()], [], contexts["compound"], put=stored.__setitem__)
-    assert {path: hashlib.sha256(data).hexdigest() for path, data in stored.items()} == told.digests
-    assert write_tile(tmp_path, "t1", [small.gable()], [], contexts["compound"]) == told
+    reported = write_tile("bucket/run", "t1", [small.gable()], [], contexts["compound"], put=stored.__setitem__)
+    assert {path: hashlib.sha256(data).hexdigest() for path, data in stored.items()} == reported.digests
+    assert write_tile(tmp_path, "t1", [small.gable()], [], contexts["compound"]) == reported
 
 
 @pytest.mark.parametrize("key", ["", "85", "-3", "a/b", "tile=x", "x 1"])
@@ -145,9 +145,9 @@ def test_every_level_of_detail_has_mesh_files_of_its_own(
     tmp_path: Path, contexts: Contexts, meshes: str, stems: tuple[str, ...], ending: str
 ) -> None:
     context = dataclasses.replace(contexts["compound"], coarser_lods=("1.2", "1.3"))
-    told = write_tile(tmp_path, "t1", [small.levelled(), small.courtyard(), small.failed()], [], context, meshes)
+    reported = write_tile(tmp_path, "t1", [small.levelled(), small.courtyard(), small.failed()], [], context, meshes)
     wanted = {f"meshes/t1/{stem}{suffix}.{ending}" for stem in stems for suffix in ("", "-lod12", "-lod13")}
-    assert {path for path in told.digests if path.startswith("meshes/")} == wanted
-    assert told.digests == files_of(tmp_path)
+    assert {path for path in reported.digests if path.startswith("meshes/")} == wanted
+    assert reported.digests == files_of(tmp_path)
     paths = {path for path in read_table(str(tmp_path), "buildings")["mesh_path"].to_pylist() if path}
     assert paths == {path for path in wanted if "-lod" not in path}

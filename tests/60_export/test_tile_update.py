@@ -51,12 +51,12 @@ def test_an_updated_tile_is_the_tile_written_whole(
     gone = dataclasses.replace(rejected_objects[1], object_id="gable" if "gable" in replaced else "pole")
     has_gable = any(b.building_id == "gable" for b in after)
     rejected = rejected_objects[:1] if has_gable else [*rejected_objects[:1], gone]
-    told = write_tile(tmp_path / "new", KEY, after, rejected, context, meshes)
+    reported = write_tile(tmp_path / "new", KEY, after, rejected, context, meshes)
     update = updated_tile(tmp_path / "old", KEY, replaced, fresh, rejected[1:], context, meshes)
     found = {**contents(tmp_path / "old"), **update.files}
     assert set(update.gone) <= set(found) - set(update.files)
     assert {path: data for path, data in found.items() if path not in update.gone} == contents(tmp_path / "new")
-    assert all(told.digests[path] == digest for path, digest in update.digests.items())
+    assert all(reported.digests[path] == digest for path, digest in update.digests.items())
     assert update.digests == {path: hashlib.sha256(data).hexdigest() for path, data in update.files.items()}
 
 

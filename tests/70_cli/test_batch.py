@@ -51,18 +51,18 @@ def rows(text: str) -> dict[str, str]:
 
 def test_a_batch_is_planned_run_and_told(folder: Path) -> None:
     file = folder / "city.toml"
-    code, told, _ = call("plan", file)
+    code, reported, _ = call("plan", file)
     assert code == 0
-    plan = rows(told)
+    plan = rows(reported)
     assert plan["inputs"].startswith("files: 1, 0.0 million points")
     assert "of 40 m" in plan["tiles"]
     assert not (folder / "models").exists()
-    code, told, error = call("status", file)
+    code, reported, error = call("status", file)
     assert code == 4
     assert "this batch was never run" in error
-    code, told, _ = call("run", file, "--json")
+    code, reported, _ = call("run", file, "--json")
     assert code == 0
-    first = json.loads(told)
+    first = json.loads(reported)
     assert first["statuses"]["ok"] > 0
     assert (folder / "models" / "run.html").is_file()
     assert rows(call("status", file)[1])["state"] == "finished"
@@ -83,9 +83,9 @@ def test_a_batch_that_leaves_its_workers_to_the_estimate_gives_what_one_process_
     for workers in ("0", '"auto"'):
         file = tmp_path / f"city{len(digests)}.toml"
         file.write_text(text.replace("workers = 0", f"workers = {workers}").replace('"models"', f'"{file.stem}"'))
-        code, told, error = call("run", file, "--json")
+        code, reported, error = call("run", file, "--json")
         assert code == 0, error
-        digests[workers] = json.loads(told)["digest"]
+        digests[workers] = json.loads(reported)["digest"]
         manifest = json.loads((tmp_path / file.stem / "run.json").read_text())
         assert (len(manifest["peak_memory_bytes"]) > 1) is (workers != "0")
     assert digests['"auto"'] == digests["0"]
@@ -100,12 +100,15 @@ def test_a_tile_index_and_a_bucket_are_inputs_and_results_of_a_batch(folder: Pat
     text = (folder / "city.toml").read_text().replace("tiles/*.laz", "index/tiles.txt")
     file.write_text(text.replace('"models"', f'"{bucket}/models"'))
     assert rows(call("plan", file)[1])["inputs"].startswith("files: 1, ")
-    code, told, error = call("run", file, "--json")
+    code, reported, error = call("run", file, "--json")
     assert code == 0, error
-    assert json.loads(told)["digest"] == run_digest(f"{bucket}/models")
+    assert json.loads(reported)["digest"] == run_digest(f"{bucket}/models")
     assert b"Failures" not in storage_at(f"{bucket}/models").get("run.html")
     again = json.loads(call("run", file, "--json")[1])
-    assert (again["digest"], again["counts"]["reused"]) == (json.loads(told)["digest"], again["counts"]["candidates"])
+    assert (again["digest"], again["counts"]["reused"]) == (
+        json.loads(reported)["digest"],
+        again["counts"]["candidates"],
+    )
 
 
 def test_the_report_is_that_of_the_last_run_or_none(
@@ -146,26 +149,26 @@ def test_times_are_told_before_the_first_run(folder: Path, tmp_path: Path) -> No
     file = tmp_path / "city.toml"
     text = (folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/")
     file.write_text(text + '[schedule]\ncron = "30 2 * * *"\ntime_zone = "Europe/Amsterdam"\n')
-    code, told, _ = call("status", file)
-    assert (code, rows(told)["state"]) == (0, "never run")
-    assert rows(told)["next times"].count("02:30 CE") == 3
+    code, reported, _ = call("status", file)
+    assert (code, rows(reported)["state"]) == (0, "never run")
+    assert rows(reported)["next times"].count("02:30 CE") == 3
     assert "next times" in rows(call("plan", file)[1])
 
 
 @pytest.mark.parametrize(("hangup", "times"), [(signal.SIG_IGN, 2), (signal.SIG_DFL, 3)])
 def test_a_schedule_ends_by_signals_and_under_nohup_outlives_its_terminal(hangup: Any, times: int) -> None:
     numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-    told: list[int] = []
+    reported: list[int] = []
     before = {number: signal.getsignal(number) for number in numbers}
     try:
         signal.signal(signal.SIGHUP, hangup)
-        _end_by_signals(lambda: told.append(1))
+        _end_by_signals(lambda: reported.append(1))
         for number in numbers:
             signal.raise_signal(number)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-    assert len(told) == times
+    assert len(reported) == times
 
 
 def test_a_batch_that_somebody_runs_is_refused(folder: Path, tmp_path: Path) -> None:
@@ -278,10 +281,10 @@ def test_the_disk_that_work_and_results_share_must_hold_both(
 ) -> None:
     file = tmp_path / "city.toml"
     file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
-    told = json.loads(call("plan", file, "--json")[1])
-    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: told["work_bytes"] + told["out_bytes"])
+    reported = json.loads(call("plan", file, "--json")[1])
+    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: reported["work_bytes"] + reported["out_bytes"])
     assert call("plan", file)[0] == 0
-    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: told["work_bytes"] + told["out_bytes"] - 1)
+    monkeypatch.setattr("pipeline.batch.estimates._free", lambda _: reported["work_bytes"] + reported["out_bytes"] - 1)
     code, _, error = call("plan", file)
     assert code == 4
     assert "of one disk" in " ".join(error.split())
@@ -293,9 +296,9 @@ def test_kernels_that_are_yet_to_be_compiled_are_told_with_their_time(
     ends = []
     for compiled in (True, False):
         monkeypatch.setattr("pipeline.batch.estimates.kernels_are_compiled", lambda compiled=compiled: compiled)
-        told = json.loads(call("plan", folder / "city.toml", "--json")[1])
-        assert any("gablework warm-up" in text for text in told["warnings"]) is not compiled
-        ends.append(told["seconds"][1])
+        reported = json.loads(call("plan", folder / "city.toml", "--json")[1])
+        assert any("gablework warm-up" in text for text in reported["warnings"]) is not compiled
+        ends.append(reported["seconds"][1])
     assert ends[1] > ends[0] + 0.5 * RATES.compiling_s
 
 
@@ -321,9 +324,9 @@ def test_what_is_odd_in_every_input_is_told_once(folder: Path, tmp_path: Path) -
         shutil.copy(laz, tmp_path / name)
     file = tmp_path / "city.toml"
     file.write_text('[inputs]\npaths = ["*.laz"]\ncrs = "EPSG:28992"\n[output]\npath = "models"\n')
-    told = json.loads(call("plan", file, "--json")[1])["warnings"]
-    assert told
-    assert all(text.startswith(f"{tmp_path}/a.laz and 2 more inputs: ") for text in told)
+    reported = json.loads(call("plan", file, "--json")[1])["warnings"]
+    assert reported
+    assert all(text.startswith(f"{tmp_path}/a.laz and 2 more inputs: ") for text in reported)
 
 
 def test_faults_name_keys_of_the_batch_file(folder: Path, tmp_path: Path) -> None:

@@ -45,12 +45,12 @@ def test_a_file_comes_back_with_classes_and_rasters(house: Path, tmp_path: Path)
     words = (str(house), "--out", str(tmp_path / "out"), "--workers", "0", "--rasters", "--json")
     code, out, _ = invoke(*words, "--crs", "EPSG:7415", "--raster-cell", "1")
     assert code == 0
-    told = json.loads(out)
-    las = laspy.read(told["files"][0]["path"])
+    reported = json.loads(out)
+    las = laspy.read(reported["files"][0]["path"])
     roof = (np.abs(las.x - 25) < 6) & (np.abs(las.y - 25) < 5)
     assert (np.asarray(las.classification) == np.where(roof, 6, 2)).mean() > 0.999
-    assert told["classes"].keys() == {"2", "6"}
-    assert told["buildings"] == 1
+    assert reported["classes"].keys() == {"2", "6"}
+    assert reported["buildings"] == 1
     names = {"house.laz", "terrain.tif", "surface.tif", "height.tif"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
 
@@ -74,8 +74,8 @@ def test_this_process_or_its_children_as_the_estimate_says_give_the_same_file(
     code, out, _ = invoke(str(house), "--out", str(tmp_path / "auto"), "--json")
     assert code == 0
     assert [type(one) for one in engines] == [SerialExecutor if is_small else LocalExecutor]
-    (told,) = json.loads(out)["files"]
-    assert (laspy.read(told["path"]).points.array == laspy.read(serial / "house.laz").points.array).all()
+    (reported,) = json.loads(out)["files"]
+    assert (laspy.read(reported["path"]).points.array == laspy.read(serial / "house.laz").points.array).all()
 
 
 def test_people_see_a_table_of_classes(house: Path, tmp_path: Path) -> None:

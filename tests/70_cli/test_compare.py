@@ -35,8 +35,8 @@ def compared(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     out = tmp_path_factory.mktemp("compared") / "out"
     methods = ("--methods", "fuzzy-sart,kmeans:faithful", "--methods", "parameter-space-3d")
     options = ("--truth", str(scene / "truth"), "--workers", "0", "--json")
-    code, said, told = invoke("compare", str(scene / "suburb.laz"), *methods, "--out", str(out), *options)
-    assert code == 0, told
+    code, said, reported = invoke("compare", str(scene / "suburb.laz"), *methods, "--out", str(out), *options)
+    assert code == 0, reported
     return out, json.loads(said)
 
 
@@ -54,16 +54,19 @@ def test_the_document_is_what_compare_json_holds(compared: tuple[Path, dict[str,
     out, document = compared
     stored = json.loads((out / "compare.json").read_text())
     assert {name: document[name] for name in stored} == stored
-    candidates = {told["counts"]["candidates"] for told in stored["variants"]}
+    candidates = {reported["counts"]["candidates"] for reported in stored["variants"]}
     assert len(candidates) == 1
-    for told in stored["variants"]:
-        assert sum(told["statuses"].values()) == candidates.copy().pop()
-        assert json.loads((out / told["run_dir"] / "run.json").read_text())["content_sha256"] == told["content_sha256"]
-        assert told["seconds_a_building"]["median"] > 0.0
+    for reported in stored["variants"]:
+        assert sum(reported["statuses"].values()) == candidates.copy().pop()
+        assert (
+            json.loads((out / reported["run_dir"] / "run.json").read_text())["content_sha256"]
+            == reported["content_sha256"]
+        )
+        assert reported["seconds_a_building"]["median"] > 0.0
         table = pq.read_table(out / "buildings.parquet", columns=["label", "seconds"])
-        seconds = [row["seconds"] for row in table.to_pylist() if row["label"] == told["label"]]
+        seconds = [row["seconds"] for row in table.to_pylist() if row["label"] == reported["label"]]
         expected = {"mean": np.mean(seconds), "median": np.median(seconds), "p95": np.quantile(seconds, 0.95)}
-        assert told["seconds_a_building"] == pytest.approx(expected, abs=1e-6)
+        assert reported["seconds_a_building"] == pytest.approx(expected, abs=1e-6)
 
 
 def test_every_building_has_a_row_a_method(compared: tuple[Path, dict[str, Any]]) -> None:
@@ -71,15 +74,15 @@ def test_every_building_has_a_row_a_method(compared: tuple[Path, dict[str, Any]]
     table = pq.read_table(out / "buildings.parquet")
     candidates = document["variants"][0]["counts"]["candidates"]
     assert table.num_rows == 3 * candidates
-    assert set(table.column("label").to_pylist()) == {told["label"] for told in document["variants"]}
+    assert set(table.column("label").to_pylist()) == {reported["label"] for reported in document["variants"]}
     assert "outcome" in table.column_names
 
 
 def test_the_page_names_every_method_and_every_building(compared: tuple[Path, dict[str, Any]]) -> None:
     out, document = compared
     page = (out / "index.html").read_text()
-    for told in document["variants"]:
-        assert told["label"] in page
+    for reported in document["variants"]:
+        assert reported["label"] in page
     for building_id in set(pq.read_table(out / "buildings.parquet").column("building_id").to_pylist()):
         assert building_id in page
 
@@ -89,8 +92,10 @@ def test_children_give_what_this_process_gives(
 ) -> None:
     methods = ("--methods", "fuzzy-sart,kmeans:faithful,parameter-space-3d")
     options = ("--truth", str(scene / "truth"), "--json")
-    code, said, told = invoke("compare", str(scene / "suburb.laz"), *methods, "--out", str(tmp_path / "out"), *options)
-    assert code == 0, told
+    code, said, reported = invoke(
+        "compare", str(scene / "suburb.laz"), *methods, "--out", str(tmp_path / "out"), *options
+    )
+    assert code == 0, reported
     local, serial = json.loads(said)["variants"], compared[1]["variants"]
     for name in ("label", "statuses", "counts", "content_sha256"):
         assert [one[name] for one in local] == [one[name] for one in serial]
@@ -100,19 +105,19 @@ def test_children_give_what_this_process_gives(
 
 
 def test_bad_variants_are_refused_before_anything_is_written(scene: Path, tmp_path: Path) -> None:
-    code, _, told = invoke(
+    code, _, reported = invoke(
         "compare", str(scene / "suburb.laz"), "--methods", "magic,fuzzy-sart:bold", "--out", str(tmp_path / "out")
     )
     assert code == 2
-    assert "magic" in told
-    assert "bold" in told
+    assert "magic" in reported
+    assert "bold" in reported
     assert not (tmp_path / "out").exists()
 
 
 def test_a_reference_that_cannot_be_read_is_told_before_the_runs(scene: Path, tmp_path: Path) -> None:
     nowhere = ("--truth", str(tmp_path / "nowhere"), "--workers", "0")
     methods = ("--methods", "fuzzy-sart,fuzzy-sart:faithful")
-    code, _, told = invoke("compare", str(scene / "suburb.laz"), *methods, "--out", str(tmp_path / "out"), *nowhere)
+    code, _, reported = invoke("compare", str(scene / "suburb.laz"), *methods, "--out", str(tmp_path / "out"), *nowhere)
     assert code != 0
-    assert "nowhere" in told
+    assert "nowhere" in reported
     assert not (tmp_path / "out").exists()

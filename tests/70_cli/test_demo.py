@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The folder of a demo on two workers, and what it told."""
+    """The folder of a demo on two workers, and what it printed."""
     folder = tmp_path_factory.mktemp("demo") / "out"
     words = ["demo", "--out", str(folder), "--size", "110", "110", "--workers", "2", "--json"]
     result = CliRunner().invoke(app, words)
@@ -24,9 +24,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     return folder, json.loads(result.stdout)
 
 
-def figures(told: dict[str, Any]) -> dict[str, float]:
+def figures(reported: dict[str, Any]) -> dict[str, float]:
     """The measures over all buildings by name."""
-    return {row["name"]: row["value"] for row in told["measures"] if row["subset"] == "all"}
+    return {row["name"]: row["value"] for row in reported["measures"] if row["subset"] == "all"}
 
 
 def test_every_house_is_found_and_nothing_else(made: tuple[Path, dict[str, Any]]) -> None:
@@ -42,17 +42,17 @@ def test_the_roofs_lie_where_they_are(made: tuple[Path, dict[str, Any]]) -> None
 
 
 def test_what_the_demo_points_at_is_there(made: tuple[Path, dict[str, Any]]) -> None:
-    folder, told = made
-    assert Path(told["picture"]).read_bytes().startswith(b"\x89PNG")
+    folder, reported = made
+    assert Path(reported["picture"]).read_bytes().startswith(b"\x89PNG")
     assert "</html>" in (folder / "report" / "report.html").read_text()
     assert (folder / "scene" / "suburb.laz").is_file()
-    assert len(list((folder / "run" / "meshes").glob("*/*.obj"))) == told["statuses"]["ok"] + told["statuses"].get(
-        "fallback", 0
-    )
+    assert len(list((folder / "run" / "meshes").glob("*/*.obj"))) == reported["statuses"]["ok"] + reported[
+        "statuses"
+    ].get("fallback", 0)
 
 
 def test_one_process_gives_the_same_content_as_two_workers(made: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    folder, told = made
+    folder, reported = made
     words = [
         "reconstruct",
         str(folder / "scene" / "suburb.laz"),
@@ -63,13 +63,13 @@ def test_one_process_gives_the_same_content_as_two_workers(made: tuple[Path, dic
         "--json",
     ]
     result = CliRunner().invoke(app, words)
-    assert json.loads(result.stdout)["digest"] == told["digest"]
+    assert json.loads(result.stdout)["digest"] == reported["digest"]
 
 
 def test_the_same_picture_and_figures_come_from_the_run_alone(
     made: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
-    folder, told = made
+    folder, reported = made
     picture = tmp_path / "again.png"
     words = [
         "evaluate",
@@ -81,5 +81,5 @@ def test_the_same_picture_and_figures_come_from_the_run_alone(
         "--json",
     ]
     result = CliRunner().invoke(app, words)
-    assert json.loads(result.stdout)["measures"] == told["measures"]
+    assert json.loads(result.stdout)["measures"] == reported["measures"]
     assert picture.read_bytes() == (folder / "demo.png").read_bytes()

@@ -100,6 +100,6 @@ def test_what_does_not_go_together_is_refused(scene: ScenePaths, tmp_path: Path)
     unclassified = laspy.read(scene.laz)
     unclassified.classification[:] = 1
     unclassified.write(tmp_path / "raw.laz")
-    told = refused(scene.truth, "--points", tmp_path / "raw.laz")
-    assert "raw.laz" in told
-    assert "class" in told
+    reported = refused(scene.truth, "--points", tmp_path / "raw.laz")
+    assert "raw.laz" in reported
+    assert "class" in reported

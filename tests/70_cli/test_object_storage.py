@@ -33,7 +33,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def document(*words: str) -> Any:
-    """What a command prints as JSON; it succeeds and tells no secrets."""
+    """What a command prints as JSON; it succeeds and shows no secrets."""
     code, said, events = invoke(*words, "--json")
     assert code == 0, events
     assert SECRET not in said + events

@@ -47,16 +47,16 @@ with TestClient(create_app(ServiceSettings(state=sys.argv[1])), base_url="http:/
 
 def imported(program: str, tmp_path: Path, *arguments: str, code: int = 0) -> set[str]:
     """The packages that a program has imported when it ends."""
-    told = tmp_path / "modules.json"
+    reported = tmp_path / "modules.json"
     ended = subprocess.run(
         [sys.executable, "-c", program, *arguments],
-        env={**os.environ, "MODULES": str(told)},
+        env={**os.environ, "MODULES": str(reported)},
         capture_output=True,
         text=True,
         check=False,
     )
     assert ended.returncode == code, ended.stderr
-    return set(json.loads(told.read_text()))
+    return set(json.loads(reported.read_text()))
 
 
 def test_what_a_command_imports_is_seen(tmp_path: Path) -> None:

@@ -71,30 +71,30 @@ def test_every_group_that_is_listed_can_be_named_and_adds_kernels(compiled: list
 def test_a_name_that_is_not_known_is_exit_code_2_with_the_choices(
     compiled: list[list[Listed]], words: tuple[str, ...]
 ) -> None:
-    code, _, told = invoke(*words)
-    told = " ".join(told.split())
+    code, _, reported = invoke(*words)
+    reported = " ".join(reported.split())
     assert code == 2
-    assert f"'magic' is not known: use {', '.join(warm_up.groups())} or all" in told
-    assert "'reconstruct' is not known" not in told
+    assert f"'magic' is not known: use {', '.join(warm_up.groups())} or all" in reported
+    assert "'reconstruct' is not known" not in reported
     assert compiled == []
 
 
 def test_all_names_that_are_not_known_are_told_at_once(compiled: list[list[Listed]]) -> None:
-    told = invoke("magic", "spells")[2]
-    assert "'magic'" in told
-    assert "'spells'" in told
+    reported = invoke("magic", "spells")[2]
+    assert "'magic'" in reported
+    assert "'spells'" in reported
     assert compiled == []
 
 
 def test_machines_get_seconds_and_kernels_and_how_far_it_is(compiled: list[list[Listed]]) -> None:
-    code, said, told = invoke("diff", "--json")
+    code, said, reported = invoke("diff", "--json")
     assert code == 0
     document = json.loads(said)
     count = len(compiled[0])
     assert set(document) == {"seconds", "kernels"}
     assert document["kernels"] == count
     assert document["seconds"] >= 0.0
-    events = [json.loads(line) for line in told.splitlines()]
+    events = [json.loads(line) for line in reported.splitlines()]
     assert {event["stage"] for event in events} == {"compile"}
     assert [event["done"] for event in events if event["kind"] == "progress"] == list(range(1, count + 1))
     assert {event["total"] for event in events} == {count}

@@ -269,7 +269,7 @@ def test_all_name_the_scheduler_of_the_operator_over_tls() -> None:
 
 def test_the_scheduler_is_reached_from_inside_only() -> None:
     policies = {one["metadata"]["name"]: one["spec"] for one in of_kind("NetworkPolicy")}
-    assert policies["nobody"] == {"podSelector": {}, "policyTypes": ["Ingress"]}
+    assert policies["deny-all"] == {"podSelector": {}, "policyTypes": ["Ingress"]}
     labels = {"dask.org/cluster-name": "gablework", "dask.org/component": "scheduler"}
     (scheduler,) = (one for one in policies.values() if one["podSelector"].get("matchLabels") == labels)
     by_port = {rule["ports"][0]["port"]: rule["from"] for rule in scheduler["ingress"]}

@@ -104,11 +104,11 @@ def test_the_tables_have_the_printed_rows_first_and_blanks_where_nothing_is() ->
 
 
 def test_the_document_holds_both_subsets_and_all_misprints() -> None:
-    told = document({"parameter-space-2d": outcomes_of(PAPER_2D)}, "dev", 1)
-    assert "### Of all 310 buildings" in told
-    assert "### Of the 197 that nothing makes hard" in told
-    assert "Not both parameter spaces were measured" in told
-    assert told.count("- table ") == sum(len(misprints(table)) for table in PAPER.values()) + len(contradictions())
+    reported = document({"parameter-space-2d": outcomes_of(PAPER_2D)}, "dev", 1)
+    assert "### Of all 310 buildings" in reported
+    assert "### Of the 197 that nothing makes hard" in reported
+    assert "Not both parameter spaces were measured" in reported
+    assert reported.count("- table ") == sum(len(misprints(table)) for table in PAPER.values()) + len(contradictions())
 
 
 def test_buildings_are_told_by_the_slope_of_their_terrain() -> None:
@@ -123,7 +123,7 @@ def test_buildings_are_told_by_the_slope_of_their_terrain() -> None:
 
 
 def test_the_printed_tables_are_wrong_where_the_paper_is() -> None:
-    assert [told.split(":")[0] for told in misprints(PAPER["3-1"])] == ["flat", "hip", "hip", "hip"]
+    assert [reported.split(":")[0] for reported in misprints(PAPER["3-1"])] == ["flat", "hip", "hip", "hip"]
     assert contradictions() == ["pent: 8 of the 13 good ones correct, but 6 of all"]
     assert misprints(PAPER["4-2"]) == ["gable: 8 of 157 false is 5 %, not 6 %"]
 

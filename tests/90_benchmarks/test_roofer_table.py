@@ -233,7 +233,7 @@ def test_only_what_was_measured_has_a_line_and_roofer_stands_beside_delft_alone(
         median_ms=2.0,
         differing=(),
         thinned={"2": score(a=0.4)},
-        told_less={"neither": score(a=0.4)},
+        less_input={"neither": score(a=0.4)},
         losses={"neither": score_loss(whole, score(a=0.4))},
     )
     text = roofer_table({"arrangement": found, "kmeans": Figures(whole=whole)}, with_roofer=True)
@@ -291,5 +291,5 @@ def test_the_table_of_a_small_survey_is_written_with_all_parts(shared_data: Path
     assert figures["warm"] is None
     assert figures["median_ms"] > 0.0
     assert list(figures["thinned"]) == ["4", "2", "1", "0.5"]
-    assert list(figures["told_less"]) == ["no-class-6"]
+    assert list(figures["less_input"]) == ["no-class-6"]
     assert figures["thinned"]["0.5"]["within"] < figures["thinned"]["4"]["within"] <= figures["whole"]["within"] + 0.02

@@ -1,4 +1,4 @@
-"""How the stages are clocked, and what is told of it."""
+"""How the stages are timed, and how the times are reported."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def test_rounds_after_the_first_are_clocked_over_all_points(suburb: Path, tmp_pa
 
 
 def test_the_profile_names_the_kernels(suburb: Path, tmp_path: Path) -> None:
-    told = profile([str(suburb)], None, str(tmp_path), 60)
-    assert "tottime" in told
-    assert "ingest.py" in told
+    reported = profile([str(suburb)], None, str(tmp_path), 60)
+    assert "tottime" in reported
+    assert "ingest.py" in reported
 
 
 def test_a_tile_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -68,8 +68,8 @@ def test_a_large_city_is_made_once_split_and_removed(tmp_path: Path) -> None:
     written = (tmp_path / "large_city.las").stat().st_mtime_ns
     assert main([*words, "--workers", "0", "--keep"]) == 0
     assert (tmp_path / "large_city.las").stat().st_mtime_ns == written
-    told = (tmp_path / "large.md").read_text()
-    assert "0 workers" in told
-    assert "| driver | " in told
+    reported = (tmp_path / "large.md").read_text()
+    assert "0 workers" in reported
+    assert "| driver | " in reported
     assert main([*words, "--workers", "0"]) == 0
     assert not (tmp_path / "large_city.las").exists()

@@ -135,8 +135,8 @@ def test_a_small_city_is_found_measured_and_drawn(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(scene_suites, "SIZE_M", (130.0, 110.0))
     monkeypatch.setattr(scene_suites, "PICTURED", ((20.0, 2.0),))
     scene = SuiteScene(slope_deg=20.0, density_per_m2=2.0)
-    told: list[str] = []
-    (score,) = measure_cities([scene], "dev", tmp_path, 0, told.append)
+    reported: list[str] = []
+    (score,) = measure_cities([scene], "dev", tmp_path, 0, reported.append)
     assert score.detection.objects > 3
     assert score.detection.completeness_without_ring > 0.8
     assert score.detection.correctness_without_ring > 0.9
@@ -144,7 +144,7 @@ def test_a_small_city_is_found_measured_and_drawn(tmp_path: Path, monkeypatch: p
     assert score.points > 20_000
     record = json.loads((tmp_path / "dev" / f"{scene.key}.json").read_text())
     assert record["detection"]["objects"] == score.detection.objects
-    assert told[0].startswith(scene.key)
+    assert reported[0].startswith(scene.key)
     other = SuiteScene(slope_deg=10.0, density_per_m2=2.0)
     assert known_scores("dev", tmp_path, [other, scene]) == [score]
     draw_scores([score], tmp_path / "plot.png")

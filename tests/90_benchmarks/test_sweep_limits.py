@@ -48,7 +48,7 @@ def test_one_cell_alone_is_always_or_never() -> None:
 
 
 @pytest.mark.parametrize(
-    ("qualities", "told"),
+    ("qualities", "reported"),
     [
         ([0.9, 0.9, 0.7], "to 0.075"),
         ([0.7, 0.9, 0.9], "from 0.035"),
@@ -58,8 +58,8 @@ def test_one_cell_alone_is_always_or_never() -> None:
         ([0.9, 0.8, 0.9], "always"),
     ],
 )
-def test_limits_are_told_in_words(qualities: list[float], told: str) -> None:
-    assert told_ranges(held_ranges(NOISES, qualities, 0.8, logarithmic=False)) == told
+def test_limits_are_told_in_words(qualities: list[float], reported: str) -> None:
+    assert told_ranges(held_ranges(NOISES, qualities, 0.8, logarithmic=False)) == reported
 
 
 def test_the_tables_have_a_row_a_method_and_each_its_own_cells() -> None:
