@@ -42,6 +42,7 @@ from pipeline.geometry import point_spacing_m
 from pipeline.methods.fuzzy_sart import segment
 from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import FloatArray, Segmentation
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.segmentation.fuzzy_sart import centre_of_building, facet_vectors
@@ -300,7 +301,7 @@ def cube(sample: Sample) -> list[Table]:
             single, within, worst, residuals = [], [], [], []
             for draw in range(CUBES):
                 roof = _cube(density, seed_of(sample.split, draw))
-                found = segment(roof.candidate, settings)
+                found = segment(prepare_cloud(roof.candidate), settings)
                 single.append(len(found.planes) == 1)
                 off, rmse = _cube_errors(roof, found)
                 within.append(off <= 0.05)
@@ -387,11 +388,16 @@ def sensitivity(sample: Sample) -> list[Table]:
         for one in chosen:
             cells: list[str | Estimate] = [f"{one.vigilance:g}", str(one.tau_epochs)]
             cells += [
-                share([right(roof, segment(roof.candidate, one)) for roof in dev.roofs((*HOUSES, LARGE), *survey)])
+                share(
+                    [
+                        right(roof, segment(prepare_cloud(roof.candidate), one))
+                        for roof in dev.roofs((*HOUSES, LARGE), *survey)
+                    ]
+                )
                 for survey in ((0.77, 0.05), (0.77, 0.10), (8.0, 0.05))
             ]
             low = [roof for pitch in LOW_PITCHES_DEG for roof in dev.roofs(("gable",), 0.77, NOISE_M, pitch)]
-            cells.append(share([right(roof, segment(roof.candidate, one)) for roof in low]))
+            cells.append(share([right(roof, segment(prepare_cloud(roof.candidate), one)) for roof in low]))
             rows.append(cells)
         caption = f"Preset {preset} (V = {settings.vigilance:g}, tau = {settings.tau_epochs}), dev draws: all right."
         surveys = [".77 a m2, 0.05 m", ".77 a m2, 0.10 m", "8 a m2, 0.05 m", "gables of 8, 12, 18 deg, .77 a m2"]

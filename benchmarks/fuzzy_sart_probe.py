@@ -22,6 +22,7 @@ from pipeline.geometry import facet_areas_m2, facet_normals
 from pipeline.methods import fuzzy_sart
 from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Segmentation
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.ruler.simulation.additions import random_dormers
 from pipeline.ruler.simulation.random_dimensions import random_dimensions
 from pipeline.ruler.simulation.roofs import RoofDimensions, RoofShape
@@ -205,7 +206,7 @@ def observe(
     with ExitStack() as stack:
         for name, function in {**watched, "facet_vectors": vectors, "centre_of_building": centre}.items():
             stack.enter_context(mock.patch.object(fuzzy_sart, name, noted(name, function)))
-        final = fuzzy_sart.segment(candidate, settings)
+        final = fuzzy_sart.segment(prepare_cloud(candidate), settings)
     (points, *_), greedy = calls["insert_greedily"][0]
     (facets, facet_clusters, *_), rough = calls["labels_of_points"][0]
     (_, normals, *_), clustered_vectors = calls["facet_vectors"][0]

@@ -30,7 +30,7 @@ import numpy as np
 from benchmarks.candidates import candidates_of
 from benchmarks.entries import Entry, Workplace, all_variants, hofmann_entries, markdown_table, run_settings, tiles_of
 from pipeline.methods import Method, ReconstructSettings
-from pipeline.model import Candidate, FloatArray, Segmentation
+from pipeline.model import Candidate, FloatArray, PreparedCloud, Segmentation
 from pipeline.reconstruct import reconstruct_building
 from pipeline.runtime.compare import Variant, settings_of
 
@@ -42,14 +42,14 @@ class ClockedSettings(ReconstructSettings):
     clocked: list[float] = dataclasses.field(default_factory=list)
     """Processor seconds of each segmentation, in their order."""
 
-    def segmentation(self, method: Method) -> Callable[[Candidate], Segmentation]:
+    def segmentation(self, method: Method) -> Callable[[PreparedCloud], Segmentation]:
         """The method with its settings bound, and a clock about it."""
         segment = super().segmentation(method)
 
-        def clocked(candidate: Candidate) -> Segmentation:
+        def clocked(cloud: PreparedCloud) -> Segmentation:
             began = time.process_time()
             try:
-                return segment(candidate)
+                return segment(cloud)
             finally:
                 self.clocked.append(time.process_time() - began)
 

@@ -36,6 +36,7 @@ from benchmarks.scene_scores import OBJECT_M2, footprint_score, outlined_models
 from pipeline.errors import BuildingError
 from pipeline.geometry import top_visible
 from pipeline.model import BoolArray, FloatArray
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.block import block_plane
 from pipeline.roof.edge_position import EdgePoints, mixed_pulse_reach_mm
 from pipeline.roof.facades import eave_of
@@ -242,7 +243,7 @@ def seen_lines(tiles: list[str]) -> list[str]:
     roof, eaves = settings.building.roof, []
     for candidate in found_scene(tiles, "EPSG:7415", settings).candidates:
         try:
-            bare = roof_points(candidate, roof)
+            bare = roof_points(prepare_cloud(candidate), roof)
             plane = block_plane(bare.points, candidate.ground_z_m, roof.block_height_percentile)
             at_eaves = dataclasses.replace(bare, facades=None, labels=np.zeros(len(bare.points), np.int32))
             outline_mm = partition_roof(at_eaves, [plane], roof).outline_mm

@@ -24,6 +24,7 @@ from pipeline.methods import ReconstructSettings
 from pipeline.methods.parameter_space import facets_of, roof_clusters_3d
 from pipeline.methods.settings import ParameterSpace3dSettings
 from pipeline.model import Candidate, FaceKind, FloatArray, LabelArray
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.reconstruct import reconstruct_building
 
 COLOURS = np.array(["#c0392b", "#2471a3", "#229954", "#b7950b", "#7d3c98", "#ca6f1e"])
@@ -42,7 +43,7 @@ def draw(candidate: Candidate, path: str) -> None:
         The PNG file to write.
     """
     settings = ParameterSpace3dSettings.faithful()
-    facets = facets_of(candidate, settings)
+    facets = facets_of(prepare_cloud(candidate), settings)
     labels, centres = roof_clusters_3d(facets, settings)
     colours = np.append(COLOURS[np.arange(labels.max() + 1) % len(COLOURS)], OTHER)[labels]
     figure = plt.figure(figsize=(9, 7))

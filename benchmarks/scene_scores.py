@@ -16,6 +16,7 @@ from shapely import MultiPolygon, Polygon
 
 from pipeline.errors import BuildingError
 from pipeline.model import Candidate, RoofType, Status
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.block import block_plane
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.plan import partition_roof, roof_points
@@ -48,7 +49,7 @@ def candidate_outline(candidate: Candidate, settings: RoofSettings) -> Polygon |
         As for its model.
     """
     try:
-        bare = roof_points(candidate, settings)
+        bare = roof_points(prepare_cloud(candidate), settings)
         plane = block_plane(bare.points, candidate.ground_z_m, settings.block_height_percentile)
         labelled = dataclasses.replace(bare, labels=np.zeros(len(bare.points), np.int32))
         outline_mm = partition_roof(labelled, [plane], settings).outline_mm

@@ -28,9 +28,9 @@ from benchmarks.candidates import candidates_of
 from pipeline.geometry import vertical_residuals_m
 from pipeline.methods import METHODS, ReconstructSettings
 from pipeline.methods.kmeans import BuildingTop, building_top, planes_of, sides_of
-from pipeline.methods.local_frame import local_metres
 from pipeline.methods.settings import KMeansSettings
 from pipeline.model import BuildingResult, Candidate, FloatArray, LabelArray, Plane, RoofType, Status
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.reconstruct import reconstruct_building
 from pipeline.report.perspective import VIEW_SUN, View, ViewedFace, draw_view, projected
 from pipeline.report.pictures import png_of
@@ -64,15 +64,14 @@ class Steps:
 def steps_of(candidate: Candidate) -> Steps:
     """The faithful recipe once more, keeping what it finds."""
     settings = KMeansSettings.faithful()
-    points, shift = local_metres(candidate.points)
-    top = building_top(points, settings)
+    cloud = prepare_cloud(candidate)
+    top = building_top(cloud, settings)
     planes, labels = planes_of(top, settings)
     described = describe_planes(top.points, planes, labels)
-    ground_z_m = candidate.ground_z_m - float(shift[2])
     fit = fit_gable(
-        top.points, labels, (described[0], described[1]), ground_z_m, min_side_share=settings.min_side_share
+        top.points, labels, (described[0], described[1]), cloud.ground_z_m, min_side_share=settings.min_side_share
     )
-    return Steps(candidate=candidate, shift=shift, top=top, labels=labels, planes=described, fit=fit)
+    return Steps(candidate=candidate, shift=cloud.shift_m, top=top, labels=labels, planes=described, fit=fit)
 
 
 def picked(candidates: Iterator[Candidate], arguments: argparse.Namespace) -> tuple[Steps, BuildingResult] | None:

@@ -248,6 +248,62 @@ class Segmentation:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class PreparedCloud:
+    """A candidate's points, prepared once for the method and for the roof."""
+
+    candidate: Candidate
+    """Where they come from."""
+    shift_m: FloatArray
+    """(3,) float64, the origin of `points` in the candidate's frame: whole metres. Results do not depend on where the
+    building stands."""
+    points_mm: IntArray
+    """(n, 3) int64, all points about that origin, millimetres, each coordinate at least 0."""
+    points: FloatArray
+    """(n, 3) float64, the same in metres."""
+    visible: IntArray
+    """(v,) int64, ascending indices of the points that see the sky."""
+    highest: IntArray
+    """(h,) int64, ascending indices of the highest of these at every position in plan."""
+
+    @property
+    def ground_z_m(self) -> float:
+        """Elevation of the floor about the origin of `points`, metres."""
+        return self.candidate.ground_z_m - float(self.shift_m[2])
+
+    def segmentation(
+        self,
+        planes: tuple[Plane, ...],
+        index: IntArray,
+        labels: LabelArray,
+        *,
+        faces: tuple[PlanFace, ...] | None = None,
+        roof_type: RoofType | None = None,
+    ) -> Segmentation:
+        """The result of a method, in the candidate's frame.
+
+        Parameters
+        ----------
+        planes : tuple of Plane
+            Over the origin of `points`.
+        index : (k,) int64
+            The points that the method labelled, `visible` or `highest`; all others get the label -1.
+        labels : (k,) int32
+            Their planes.
+        faces, roof_type
+            As in `Segmentation`.
+        """
+        all_labels = np.full(len(self.points), -1, np.int32)
+        all_labels[index] = labels
+        x, y, z = self.shift_m.tolist()
+        return Segmentation(
+            planes=tuple(dataclasses.replace(plane, c=plane.c + z - plane.a * x - plane.b * y) for plane in planes),
+            labels=all_labels,
+            faces=faces,
+            roof_type=roof_type,
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class SolidFace:
     """A planar face: an outer ring and holes, as vertex indices."""
 

@@ -1,8 +1,11 @@
-"""One building end to end, without I/O: from a candidate's points to closed solids and their record."""
+"""One building end to end, without I/O: from a candidate's points to closed solids and their record.
+
+The steps: prepare the points, find planes, try the forms of the model until one is valid, deliver it with its record;
+a block where none is.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 import traceback
@@ -21,6 +24,7 @@ from pipeline.model import (
     Candidate,
     LodModel,
     Plane,
+    PreparedCloud,
     Reason,
     RoofFace,
     RoofType,
@@ -28,39 +32,62 @@ from pipeline.model import (
     Solid,
     Status,
 )
-from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, TOLERANCE_M, model_quality
-from pipeline.quality.residuals import summarise, surface_of, vertical_residuals
+from pipeline.prepared_cloud import prepare_cloud
+from pipeline.quality.model_quality import DRAWN_OUTLINE_SPACINGS, model_quality
+from pipeline.quality.residuals import vertical_residuals
 from pipeline.quality.validity import check_solid
 from pipeline.roof.block import block_forms, block_plane
 from pipeline.roof.flush_walls import unite_flush_walls
-from pipeline.roof.footprint import hull_of_points, outline, simpler_outlines
+from pipeline.roof.footprint import hull_of_points, outline
+from pipeline.roof.forms import UNDRAWABLE, FaceForm, arranged_forms, template_forms, traced_forms
 from pipeline.roof.lower_lods import LodParts, lower_lods
 from pipeline.roof.partition import RoofPartition
-from pipeline.roof.plan import (
-    RoofPlan,
-    RoofPoints,
-    arranged_faces,
-    drawn_outline,
-    level_unsupported_faces,
-    partition_roof,
-    plan_forms,
-    roof_points,
-)
+from pipeline.roof.plan import RoofPlan, RoofPoints, level_unsupported_faces, partition_roof, roof_points
 from pipeline.roof.primitives import primitive_partition
 from pipeline.roof.roof_type import roof_type
-from pipeline.roof.settings import RoofSettings
 from pipeline.roof.solid import SolidPart, solid_parts
-from pipeline.roof.templates.fitting import MAX_POINTS, RankedFaces, Templates, fit_templates, margin_of_templates
-from pipeline.roof.voids import without_voids
+from pipeline.roof.templates.fitting import RankedFaces
 
 __all__ = ["ReconstructSettings", "failed_building", "reconstruct_building"]
+
+_MUCH_LEVELLED = 0.05
+"""Share of the plan. Where faces of more than this had to be made level, other forms are drawn and compared with it."""
+_AROUND_M, _FAR_M = 1.0, 1.0
+"""Points this near to a face in plan bound its height, within this tolerance: a few point spacings, less than a
+storey."""
+_FEW_EXPLAINED = 0.75
+"""Share of its roof points that a model has to explain where they are fewer than usual, or show no plane though they
+are dense: a tree would make a roof, too."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Building:
+    """What every step of one building takes."""
+
+    candidate: Candidate
+    method: str
+    settings: ReconstructSettings
+    roof: RoofPoints
+    """The roof points, without labels."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Model(LodParts):
+    """A model of a building, not yet judged."""
+
+    roof_type: RoofType | None = None
+    """The type that the method names; None for the rule over the delivered planes."""
+    bic_margin: float = math.nan
+    """By how much its faces were better than those that they competed with; nan where they did not."""
+    is_levelled: bool = False
+    """True where a large part of its faces had to be made level."""
 
 
 def reconstruct_building(candidate: Candidate, method: str, settings: ReconstructSettings) -> BuildingResult:
     """Model one building.
 
-    The method finds planes; the plan is cut into roof faces and extruded. Solids that fail the validity check are
-    tried again with all their border vertices; what still fails becomes a block.
+    The method finds planes; the plan is cut into roof faces and extruded. The first form whose solids are valid is
+    delivered, and a block where none is.
 
     Parameters
     ----------
@@ -85,14 +112,18 @@ def reconstruct_building(candidate: Candidate, method: str, settings: Reconstruc
     MemoryError
         As it came.
     """
-    segment = settings.segmentation(method_named(method))
+    entry = method_named(method)
+    segment, is_arranged = settings.segmentation(entry), settings.arranges(entry)
     try:
-        return _reconstruct(candidate, method, segment, settings)
+        cloud = prepare_cloud(candidate, settings.roof.max_points)
+        roof = roof_points(cloud, settings.roof)
+        building = _Building(candidate=candidate, method=method, settings=settings, roof=roof)
+        return _reconstruct(building, cloud, segment, is_arranged=is_arranged)
     except BuildingError as error:
         return failed_building(candidate, method, error.reason, error.detail)
     except MemoryError:
         raise
-    except Exception as error:  # noqa: BLE001 - told in the record, with its place
+    except Exception as error:  # noqa: BLE001 - the record holds it, with its place
         return failed_building(candidate, method, Reason.INTERNAL_ERROR, _describe(error))
 
 
@@ -104,242 +135,125 @@ def _describe(error: Exception) -> str:
 
 
 def _reconstruct(
-    candidate: Candidate,
-    method: str,
-    segment: Callable[[Candidate], Segmentation],
-    settings: ReconstructSettings,
+    building: _Building, cloud: PreparedCloud, segment: Callable[[PreparedCloud], Segmentation], *, is_arranged: bool
 ) -> BuildingResult:
-    """The chain of a method's own solids, then the block."""
-    is_arranged = settings.arranges(method_named(method))
-    bare = roof_points(candidate, settings.roof)
+    """The first valid form of the method's own model, else the first valid block."""
+    settings = building.settings
     plan: RoofPlan | None = None
     codes: tuple[int, ...] = ()
     try:
-        segmentation, lack = _segmented(candidate, segment, bare)
-        roof = dataclasses.replace(bare, labels=segmentation.labels[bare.index])
-        forms: Iterable[_Form]
+        segmentation, lack = _segmented(cloud, segment, building.roof)
+        roof = dataclasses.replace(building.roof, labels=segmentation.labels[building.roof.index])
         if lack is not None:
-            if not is_arranged or len(roof.points) > MAX_POINTS:
+            if not is_arranged:
                 raise lack
-            forms = _template_forms(roof, lack, settings.roof)
+            forms: Iterator[FaceForm] = template_forms(roof, lack, settings.roof)
         elif segmentation.faces is not None:
-            forms = (partial(primitive_partition, segmentation.faces),)
-        elif not is_arranged:
-            plan = partition_roof(roof, segmentation.planes, settings.roof)
-            forms = _traced_forms(plan, roof, settings.roof)
+            forms = iter([partial(primitive_partition, segmentation.faces)])
+        elif is_arranged:
+            forms = arranged_forms(roof, segmentation.planes, settings.roof, settings.plan)
         else:
-            forms = _arranged_forms(roof, segmentation.planes, settings)
-        parts, planes, codes, margin = _own_solids(
-            candidate, roof, forms, segmentation.planes, settings.roof, settings.plan.residual_cap_m,
-            is_primitive=segmentation.faces is not None,
-        )  # fmt: skip
-        if parts:
-            few = len(roof.points) < settings.roof.min_points
-            unlikely = few or (lack is not None and roof.spacing_m < settings.roof.templates_spacing_m)
-            share = _explained_share(roof, parts, planes, settings.plan.residual_cap_m) if unlikely else 1.0
-            if share < _FEW_EXPLAINED:
-                if lack is not None and not few:
-                    raise lack
-                told = f"{share:.0%} of {len(roof.points)} roof points lie on a roof, less than {_FEW_EXPLAINED:.0%}"
-                fewest = f"where there are fewer than min_points = {settings.roof.min_points}"
-                return failed_building(candidate, method, Reason.TOO_FEW_POINTS, f"{told}, {fewest}")
-            deliver = partial(_result, candidate, method, settings, roof=roof, status=Status.OK, bic_margin=margin)
-            own_type = segmentation.roof_type
-            if settings.lods == ("2.2",):
-                return deliver(parts, planes, own_type, lod="2.2")
-            detailed = LodParts(lod="2.2", parts=parts, planes=planes)
-            models = lower_lods(
-                detailed, roof.points, candidate.ground_z_m, settings.roof, settings.lods, lambda s: not check_solid(s)
-            )
-            if models and models[0].lod == settings.lods[-1]:
-                if models[0] is not detailed:  # level parts tell nothing of the roof's type
-                    own_type = deliver(parts, planes, own_type, lod="2.2").roof_type
-                finest, *coarser = models
-                if finest.lod != detailed.lod:  # what competed is not what is delivered
-                    deliver = partial(deliver, bic_margin=math.nan)
-                record = deliver(finest.parts, finest.planes, own_type, lod=finest.lod)
-                return dataclasses.replace(record, coarser=tuple(_lod_model(model) for model in coarser))
-        reason = Reason.INVALID_SOLID
-        detail = f"validity codes {', '.join(map(str, codes)) or 'none'}: no form of the solid passes"
+            plan = partition_roof(roof, segmentation.planes, settings.roof)
+            forms = traced_forms(plan, roof, settings.roof)
+        model, codes = _first_valid(
+            (partial(_own_model, building, segmentation, roof, form) for form in forms), building
+        )
+        if model is not None:
+            if too_few := _too_few_points(building, model, lack):
+                return failed_building(building.candidate, building.method, Reason.TOO_FEW_POINTS, too_few)
+            if record := _delivered(building, model):
+                return record
+        codes_met = ", ".join(map(str, codes)) or "none"
+        fallback = BuildingError(Reason.INVALID_SOLID, f"validity codes {codes_met}: no form of the solid passes")
     except BuildingError as error:
-        reason, detail = error.reason, error.detail
+        fallback = error
     except shapely.errors.GEOSException as error:
-        reason, detail = Reason.NO_PARTITION, f"the plan cannot be drawn: {error}"
-    parts, planes = _block(candidate, bare, plan, settings.roof)
-    if settings.lods == ("1.2",):  # a block is what was asked for
-        return _result(candidate, method, settings, parts, planes, roof=bare, status=Status.OK, lod="1.2")
-    return _result(
-        candidate, method, settings, parts, planes, roof=bare, status=Status.FALLBACK, lod="1.2",
-        reason=reason, detail=detail, codes=codes,
-    )  # fmt: skip
-
-
-_WIDER_CLEARANCES = (2.5, 4.0)
-"""Times the usual distances between an arrangement's vertices, where these made no sound solid."""
-
-_MUCH_LEVELLED = 0.05
-"""Share of the plan: where faces of more than this had to be made level, other forms are drawn and held against it."""
-
-_AROUND_M, _FAR_M = 1.0, 1.0
-"""Points so near to a face in plan tell how high it may be, give or take this."""
-
-_Form = Callable[[], RoofPartition | RankedFaces]
-"""Draws roof faces: over the planes of the segmentation, or over planes of their own."""
-
-
-def _arranged_forms(roof: RoofPoints, planes: Sequence[Plane], settings: ReconstructSettings) -> Iterator[_Form]:
-    """The arrangement; behind it coarser ones and the traced faces, drawn only where no solid of it is sound.
-
-    Where points are few, templates compete with the arrangement: the better go first, worse ones last of all. Given
-    outlines of many short edges are made simpler before faces are traced: those are drawn back to be sound.
-    """
-    outline_mm = drawn_outline(roof, settings.roof)
-    if roof.footprint_mm is not None:
-        outline_mm = without_voids(outline_mm, roof.points, roof.spacing_m, settings.roof)
-    first, last = _best_forms(roof, planes, outline_mm, settings)
-    yield from first
-    # many planes that meet nearly in one point: with more room between its vertices the solid is sound
-    for clearance in _WIDER_CLEARANCES:
-        yield partial(arranged_faces, roof, planes, outline_mm, settings.plan, clearance)
-    if roof.footprint_mm is not None:
-        for simpler in simpler_outlines(outline_mm):
-            yield from _best_forms(roof, planes, simpler, settings)[0]
-    try:
-        plan = partition_roof(roof, planes, settings.roof)
-    except BuildingError:
-        if not last:
-            raise
-    else:
-        yield from _traced_forms(plan, roof, settings.roof)
-    yield from last
-
-
-def _traced_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> Iterator[_Form]:
-    """The traced faces; behind them the same within simpler outlines, where the outline is given."""
-    yield from plan_forms(plan, roof, settings)
-    if roof.footprint_mm is not None:
-        for simpler in simpler_outlines(plan.outline_mm):
-            yield from plan_forms(dataclasses.replace(plan, outline_mm=simpler), roof, settings)
-
-
-def _best_forms(
-    roof: RoofPoints, planes: Sequence[Plane], outline_mm: MultiPolygon, settings: ReconstructSettings
-) -> tuple[tuple[_Form, ...], tuple[_Form, ...]]:
-    """The arrangement within an outline, and where points are few the templates: what goes first, what last."""
-    arranged = partial(arranged_faces, roof, planes, outline_mm, settings.plan)
-    if roof.spacing_m < settings.roof.templates_spacing_m or len(roof.points) > MAX_POINTS:
-        return (arranged,), ()
-    return _ranked_forms(roof, planes, outline_mm, arranged)
-
-
-def _ranked_forms(
-    roof: RoofPoints, planes: Sequence[Plane], outline_mm: MultiPolygon, arranged: Callable[[], RoofPartition]
-) -> tuple[tuple[_Form, ...], tuple[_Form, ...]]:
-    """The arrangement and the templates, those of them that can be had: what goes first, what last."""
-    templates: Templates | None = None
-    with contextlib.suppress(BuildingError, shapely.errors.GEOSException):
-        templates = fit_templates(roof.points, outline_mm)
-    if templates is None:
-        return (arranged,), ()
-    try:
-        drawn = arranged()
-    except (BuildingError, shapely.errors.GEOSException):
-        return (templates.faces,), ()
-    drawn_planes = drawn.planes or tuple(planes)
-    margin = margin_of_templates(roof.points, templates, drawn, drawn_planes)
-    own = RankedFaces(partition=drawn, planes=drawn_planes, labels=roof.labels, bic_margin=-margin)
-    form = partial(templates.faces, margin)
-    return ((form, lambda: own), ()) if margin > 0.0 else ((lambda: own,), (form,))
-
-
-def _template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings) -> Iterator[_Form]:
-    """The templates alone, where no planes were found; raises that lack where they explain too little."""
-    try:
-        outline_mm = drawn_outline(roof, settings)
-        templates = fit_templates(roof.points, outline_mm)
-    except (BuildingError, shapely.errors.GEOSException):
-        raise lack from None
-    yield templates.faces
-    if roof.footprint_mm is not None:
-        for simpler in simpler_outlines(outline_mm):
-            with contextlib.suppress(BuildingError, shapely.errors.GEOSException):
-                yield fit_templates(roof.points, simpler).faces
+        fallback = BuildingError(Reason.NO_PARTITION, f"the plan cannot be drawn: {error}")
+    block, _ = _first_valid(_blocks(building, plan), building)
+    if block is None:
+        raise BuildingError(Reason.NO_FOOTPRINT, f"no valid block over {len(building.roof.points)} roof points")
+    if settings.lods == ("1.2",):  # the settings ask for a block
+        return _record(building, block)
+    return _record(building, block, fallback, codes)
 
 
 def _segmented(
-    candidate: Candidate, segment: Callable[[Candidate], Segmentation], roof: RoofPoints
+    cloud: PreparedCloud, segment: Callable[[PreparedCloud], Segmentation], roof: RoofPoints
 ) -> tuple[Segmentation, BuildingError | None]:
     """The segmentation, and what it lacks where no roof point lies on a plane."""
     try:
-        segmentation = segment(candidate)
+        segmentation = segment(cloud)
     except BuildingError as error:
-        return Segmentation(planes=(), labels=np.full(len(candidate.points), -1, np.int32)), error
+        return Segmentation(planes=(), labels=np.full(len(cloud.points), -1, np.int32)), error
     if len(segmentation.planes) == 0 or not (segmentation.labels[roof.index] >= 0).any():
         found = f"{len(segmentation.planes)} planes; none explains any of {len(roof.points)} roof points"
         return segmentation, BuildingError(Reason.NO_PLANE, found)
     return segmentation, None
 
 
-def _own_solids(
-    candidate: Candidate,
-    roof: RoofPoints,
-    forms: Iterable[_Form],
-    planes: Sequence[Plane],
-    settings: RoofSettings,
-    within_m: float,
-    *,
-    is_primitive: bool,
-) -> tuple[list[SolidPart], list[Plane], tuple[int, ...], float]:
-    """The first form of the method's solids that is valid throughout; no parts and all codes met where none is.
+def _first_valid(models: Iterable[Callable[[], _Model]], building: _Building) -> tuple[_Model | None, tuple[int, ...]]:
+    """The first model that is valid throughout, or None and the codes of all faults.
 
-    A form that had to make a large face level waits: it is taken unless a later one explains more roof points. Of
-    those the first is taken whose faces stay near the points, else the one that explains most. The last is by how much
-    its faces were better than those that they competed with, nan where they did not.
+    A model with a large face made level waits: it is taken unless a later one explains more roof points. Of those the
+    first is taken whose faces stay near the points, else the one that explains most.
     """
     codes: set[int] = set()
-    waiting: tuple[list[SolidPart], list[Plane], float] | None = None
+    waiting: _Model | None = None
     share = 0.0
-    remaining = iter(forms)
+    remaining = iter(models)
     while True:
         try:
             form = next(remaining, None)
-        except (BuildingError, shapely.errors.GEOSException):
+        except UNDRAWABLE:
             if not codes and waiting is None:
                 raise
-            form = None  # what was drawn before tells more
+            form = None  # the forms before it say more about the building
         if form is None:
-            break
+            return waiting, () if waiting is not None else tuple(sorted(codes))
         try:
-            drawn, own_planes, labelled, margin = form(), list(planes), roof, math.nan
-            if isinstance(drawn, RankedFaces):
-                own_planes, margin = list(drawn.planes), drawn.bic_margin
-                drawn, labelled = drawn.partition, dataclasses.replace(roof, labels=drawn.labels)
-            elif drawn.planes is not None:
-                own_planes = list(drawn.planes)
-            is_levelled = False
-            if not is_primitive:  # a primitive is one form: with a side made level it would be another
-                level, own_planes = level_unsupported_faces(drawn, labelled, own_planes, candidate.ground_z_m, settings)
-                is_levelled = _is_much_changed(drawn, level)
-                drawn = level
-            parts = large_parts(solid_parts(drawn, own_planes, candidate.ground_z_m), settings.min_part_area_m2)
-            if is_primitive:
-                parts = [unite_flush_walls(part) for part in parts]
-        except (BuildingError, shapely.errors.GEOSException):
+            model = form()
+        except UNDRAWABLE:
             continue
-        faults = {code for part in parts for code in check_solid(part.solid)}
+        faults = {code for part in model.parts for code in check_solid(part.solid)}
         codes |= faults
-        if not parts or faults:
+        if not model.parts or faults:
             continue
-        if waiting is None and not is_levelled:
-            return parts, own_planes, (), margin
-        explained = _explained_share(roof, parts, own_planes, within_m)
+        if waiting is None and not model.is_levelled:
+            return model, ()
+        explained = _explained_share(building, model)
         if waiting is None or explained > share:
-            waiting, share = (parts, own_planes, margin), explained
-            if not is_levelled and _stays_near(parts, roof):
-                break
-    if waiting is None:
-        return [], [], tuple(sorted(codes)), math.nan
-    return *waiting[:2], (), waiting[2]
+            waiting, share = model, explained
+            if not model.is_levelled and _stays_near(model.parts, building.roof):
+                return model, ()
+
+
+def _own_model(building: _Building, segmentation: Segmentation, roof: RoofPoints, form: FaceForm) -> _Model:
+    """Solids over the roof faces that a form draws."""
+    settings, ground_z_m = building.settings.roof, building.candidate.ground_z_m
+    drawn, planes, margin = form(), segmentation.planes, math.nan
+    if isinstance(drawn, RankedFaces):
+        planes, margin = drawn.planes, drawn.bic_margin
+        drawn, roof = drawn.partition, dataclasses.replace(roof, labels=drawn.labels)
+    elif drawn.planes is not None:
+        planes = drawn.planes
+    if segmentation.faces is not None:  # a primitive is one form: with a side made level it would be another
+        parts = large_parts(solid_parts(drawn, list(planes), ground_z_m), settings.min_part_area_m2)
+        return _Model(
+            lod="2.2",
+            parts=[unite_flush_walls(part) for part in parts],
+            planes=list(planes),
+            roof_type=segmentation.roof_type,
+            bic_margin=margin,
+        )
+    level, extended = level_unsupported_faces(drawn, roof, planes, ground_z_m, settings)
+    return _Model(
+        lod="2.2",
+        parts=large_parts(solid_parts(level, extended, ground_z_m), settings.min_part_area_m2),
+        planes=extended,
+        roof_type=segmentation.roof_type,
+        bic_margin=margin,
+        is_levelled=_is_much_changed(drawn, level),
+    )
 
 
 def _is_much_changed(drawn: RoofPartition, level: RoofPartition) -> bool:
@@ -366,11 +280,50 @@ def large_parts(parts: list[SolidPart], min_area_m2: float) -> list[SolidPart]:
     return large or sorted(parts, key=lambda part: -part.footprint.area)[:1]
 
 
-def _block(
-    candidate: Candidate, roof: RoofPoints, plan: RoofPlan | None, settings: RoofSettings
-) -> tuple[list[SolidPart], list[Plane]]:
-    """A valid block on the footprint, else on the partition's outline, else on the points' outline."""
-    plane = block_plane(roof.points, candidate.ground_z_m, settings.block_height_percentile)
+def _too_few_points(building: _Building, model: _Model, lack: BuildingError | None) -> str:
+    """The measured figure where few points do not explain a model, else empty; raises `lack` where points are dense."""
+    settings, n = building.settings.roof, len(building.roof.points)
+    are_few = n < settings.min_points
+    if not are_few and (lack is None or not building.roof.spacing_m < settings.templates_spacing_m):
+        return ""
+    share = _explained_share(building, model)
+    if share >= _FEW_EXPLAINED:
+        return ""
+    if lack is not None and not are_few:
+        raise lack
+    found = f"{share:.0%} of {n} roof points lie on a roof, less than {_FEW_EXPLAINED:.0%}"
+    return f"{found}, where there are fewer than min_points = {settings.min_points}"
+
+
+def _explained_share(building: _Building, model: _Model) -> float:
+    """Share of the roof points that lie near the roof faces, vertically."""
+    faces = [RoofFace(plane=face.plane, polygon=face.polygon) for part in model.parts for face in part.faces]
+    residuals = vertical_residuals(building.roof.points, faces, model.planes)
+    return float(np.mean(np.abs(residuals) <= building.settings.plan.residual_cap_m))
+
+
+def _delivered(building: _Building, model: _Model) -> BuildingResult | None:
+    """The record of a model at the levels of detail that the settings ask for; None where the finest is not valid."""
+    settings = building.settings
+    if settings.lods == (model.lod,):
+        return _record(building, model)
+    models = lower_lods(
+        model, building.roof.points, building.candidate.ground_z_m, settings.roof, settings.lods,
+        lambda solid: not check_solid(solid),
+    )  # fmt: skip
+    if not models or models[0].lod != settings.lods[-1]:
+        return None
+    finest, *coarser = models
+    if finest is not model:  # level parts say nothing about the roof's type, and nothing competed with them
+        own_type = _record(building, model).roof_type
+        model = _Model(lod=finest.lod, parts=finest.parts, planes=finest.planes, roof_type=own_type)
+    return dataclasses.replace(_record(building, model), coarser=tuple(_lod_model(one) for one in coarser))
+
+
+def _blocks(building: _Building, plan: RoofPlan | None) -> Iterator[Callable[[], _Model]]:
+    """Blocks on the footprint, else on the partition's outline; behind them those on the points' outline."""
+    roof, settings, ground_z_m = building.roof, building.settings.roof, building.candidate.ground_z_m
+    plane = block_plane(roof.points, ground_z_m, settings.block_height_percentile)
     if plan is None and roof.footprint_mm is not None:
         outlines = [roof.footprint_mm]
     else:
@@ -380,97 +333,79 @@ def _block(
         outlines = [plan.outline_mm]
         if plan.raw is not None:
             outlines.append(outline(plan.raw))
-    tolerance = settings.simplification_spacings * roof.spacing_m
     hull = hull_of_points(roof.points)
     if hull is not None:
         outlines.append(MultiPolygon([shapely.transform(hull, lambda xy: np.rint(xy * 1e3))]))
+    tolerance = settings.simplification_spacings * roof.spacing_m
     for footprint in outlines:
-        for form in block_forms(footprint, plane, candidate.ground_z_m, tolerance, settings.min_part_area_m2):
-            try:
-                parts = form()
-            except (BuildingError, shapely.errors.GEOSException):
-                continue
-            if not any(check_solid(part.solid) for part in parts):
-                return parts, [plane]
-    raise BuildingError(Reason.NO_FOOTPRINT, f"no valid block over {len(roof.points)} roof points")
+        for form in block_forms(footprint, plane, ground_z_m, tolerance, settings.min_part_area_m2):
+            yield partial(_block_model, form, plane)
 
 
-def _result(
-    candidate: Candidate,
-    method: str,
-    settings: ReconstructSettings,
-    parts: Sequence[SolidPart],
-    planes: Sequence[Plane],
-    own_type: RoofType | None = None,
-    *,
-    roof: RoofPoints,
-    status: Status,
-    lod: str,
-    reason: Reason | None = None,
-    detail: str = "",
-    codes: tuple[int, ...] = (),
-    bic_margin: float = math.nan,
+def _block_model(form: Callable[[], list[SolidPart]], plane: Plane) -> _Model:
+    """The block that a form draws."""
+    return _Model(lod="1.2", parts=form(), planes=[plane])
+
+
+def _record(
+    building: _Building, model: _Model, fallback: BuildingError | None = None, codes: tuple[int, ...] = ()
 ) -> BuildingResult:
-    """The record of a building with a model; planes that no face uses are left out."""
-    used = sorted({face.plane for part in parts for face in part.faces})
+    """The record of a building with a model; planes that no face uses are left out.
+
+    Parameters
+    ----------
+    building : _Building
+        Its candidate, method and settings.
+    model : _Model
+        Valid solids.
+    fallback : BuildingError, optional
+        Why the model is a block; None where it is the one that was asked for.
+    codes : tuple of int
+        Of the faults that kept the method's own solids from delivery.
+    """
+    candidate, roof = building.candidate, building.roof
+    used = sorted({face.plane for part in model.parts for face in part.faces})
     number = {plane: k for k, plane in enumerate(used)}
-    delivered = tuple(planes[plane] for plane in used)
-    faces = tuple(RoofFace(plane=number[face.plane], polygon=face.polygon) for part in parts for face in part.faces)
-    solids = tuple(_renumbered(part.solid, number) for part in parts)
-    footprint = _united([part.footprint for part in parts])
-    surface = surface_of(faces, delivered)
-    top, face_of_point = surface.at(candidate.points[:, 0], candidate.points[:, 1])
-    residuals = candidate.points[:, 2] - top
-    summary = summarise(residuals, TOLERANCE_M)
+    planes = tuple(model.planes[plane] for plane in used)
+    faces = tuple(
+        RoofFace(plane=number[face.plane], polygon=face.polygon) for part in model.parts for face in part.faces
+    )
+    solids = tuple(_renumbered(part.solid, number) for part in model.parts)
+    footprint = _united([part.footprint for part in model.parts])
+    residuals, quality = model_quality(
+        candidate.points,
+        faces,
+        planes,
+        solids,
+        spacing_m=roof.spacing_m,
+        outline_sigma_m=0.0 if candidate.footprint is not None else roof.spacing_m * DRAWN_OUTLINE_SPACINGS,
+        is_planar=model.lod == "2.2",
+    )
     return BuildingResult(
         building_id=candidate.building_id,
         origin=candidate.origin,
         source_id=candidate.source_id,
-        status=status,
-        reason=reason,
-        reason_detail=detail,
-        method=method,
-        roof_type=own_type or roof_type(delivered, faces, solids, settings.roof_type),
-        lod=lod,
+        status=Status.OK if fallback is None else Status.FALLBACK,
+        reason=None if fallback is None else fallback.reason,
+        reason_detail="" if fallback is None else fallback.detail,
+        method=building.method,
+        roof_type=model.roof_type or roof_type(planes, faces, solids, building.settings.roof_type),
+        lod=model.lod,
         footprint=footprint,
         footprint_share=math.nan if roof.footprint_mm is None else footprint.area / (roof.footprint_mm.area * 1e-6),
-        planes=delivered,
+        planes=planes,
         faces=faces,
         solids=solids,
         validity_codes=codes,
         ground_z_m=candidate.ground_z_m,
         n_points=len(candidate.points),
         density_per_m2=len(candidate.points) / footprint.area,
-        rmse_m=summary.rmse_m,
-        p95_m=summary.p95_m,
-        coverage=summary.coverage,
-        quality=model_quality(
-            candidate.points,
-            surface,
-            residuals,
-            face_of_point,
-            summary,
-            faces,
-            delivered,
-            solids,
-            spacing_m=roof.spacing_m,
-            outline_sigma_m=0.0 if candidate.footprint is not None else roof.spacing_m * DRAWN_OUTLINE_SPACINGS,
-            is_planar=lod == "2.2",
-            bic_margin=bic_margin,
-        ),
+        rmse_m=residuals.rmse_m,
+        p95_m=residuals.p95_m,
+        coverage=residuals.coverage,
+        quality=dataclasses.replace(quality, bic_margin=model.bic_margin),
         touches_data_edge=candidate.touches_data_edge,
     )
-
-
-_FEW_EXPLAINED = 0.75
-"""Share of its roof points that a model has to explain where they are fewer than usual, or show no plane though they
-are dense: a tree would make a roof, too."""
-
-
-def _explained_share(roof: RoofPoints, parts: Sequence[SolidPart], planes: Sequence[Plane], within_m: float) -> float:
-    """Share of the roof points that lie near the roof faces, vertically."""
-    faces = [RoofFace(plane=face.plane, polygon=face.polygon) for part in parts for face in part.faces]
-    return float(np.mean(np.abs(vertical_residuals(roof.points, faces, planes)) <= within_m))
 
 
 def _lod_model(model: LodParts) -> LodModel:

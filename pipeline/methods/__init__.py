@@ -19,7 +19,7 @@ from pipeline.roof.settings import ArrangementSettings, RoofSettings, RoofTypeSe
 from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 
 if TYPE_CHECKING:
-    from pipeline.model import Candidate, Segmentation
+    from pipeline.model import PreparedCloud, Segmentation
 
 LODS = ("1.2", "1.3", "2.2")
 """Levels of detail (Biljecki, Ledoux and Stoter 2016): one block, level parts, the roof faces themselves."""
@@ -35,8 +35,8 @@ class Method:
     """As on the command line and in the records."""
     settings_type: type[Parameters]
     """Its settings class."""
-    segment: Callable[[Candidate, Any], Segmentation]
-    """From a candidate and an instance of `settings_type` to planes and labels."""
+    segment: Callable[[PreparedCloud, Any], Segmentation]
+    """From a prepared cloud and an instance of `settings_type` to planes and labels."""
     faithful: Parameters | None = None
     """The settings that keep to the paper's words, None for a method of our own; the defaults of `settings_type` are
     those that measured better."""
@@ -68,34 +68,34 @@ class Method:
         return self.faithful
 
 
-def _arrangement(candidate: Candidate, settings: AdaptivePlaneSettings) -> Segmentation:
+def _arrangement(cloud: PreparedCloud, settings: AdaptivePlaneSettings) -> Segmentation:
     from pipeline.methods import arrangement
 
-    return arrangement.segment(candidate, settings)
+    return arrangement.segment(cloud, settings)
 
 
-def _fuzzy_sart(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
+def _fuzzy_sart(cloud: PreparedCloud, settings: FuzzySartSettings) -> Segmentation:
     from pipeline.methods import fuzzy_sart
 
-    return fuzzy_sart.segment(candidate, settings)
+    return fuzzy_sart.segment(cloud, settings)
 
 
-def _parameter_space_2d(candidate: Candidate, settings: ParameterSpace2dSettings) -> Segmentation:
+def _parameter_space_2d(cloud: PreparedCloud, settings: ParameterSpace2dSettings) -> Segmentation:
     from pipeline.methods import parameter_space
 
-    return parameter_space.segment_2d(candidate, settings)
+    return parameter_space.segment_2d(cloud, settings)
 
 
-def _parameter_space_3d(candidate: Candidate, settings: ParameterSpace3dSettings) -> Segmentation:
+def _parameter_space_3d(cloud: PreparedCloud, settings: ParameterSpace3dSettings) -> Segmentation:
     from pipeline.methods import parameter_space
 
-    return parameter_space.segment_3d(candidate, settings)
+    return parameter_space.segment_3d(cloud, settings)
 
 
-def _kmeans(candidate: Candidate, settings: KMeansSettings) -> Segmentation:
+def _kmeans(cloud: PreparedCloud, settings: KMeansSettings) -> Segmentation:
     from pipeline.methods import kmeans
 
-    return kmeans.segment(candidate, settings)
+    return kmeans.segment(cloud, settings)
 
 
 METHODS: Mapping[str, Method] = {
@@ -158,7 +158,7 @@ class ReconstructSettings:
     lods: tuple[str, ...] = LODS[-1:]
     """Levels of detail to be modelled, of `LODS` and in their order."""
 
-    def segmentation(self, method: Method) -> Callable[[Candidate], Segmentation]:
+    def segmentation(self, method: Method) -> Callable[[PreparedCloud], Segmentation]:
         """The method with its settings bound.
 
         Raises
@@ -167,7 +167,7 @@ class ReconstructSettings:
             Where the settings belong to another method.
         """
         settings = self._of(method)
-        return lambda candidate: method.segment(candidate, settings)
+        return lambda cloud: method.segment(cloud, settings)
 
     def arranges(self, method: Method) -> bool:
         """Whether the plan is cut into roof faces along the lines in which planes meet.

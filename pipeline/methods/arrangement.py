@@ -7,18 +7,15 @@ steps cut the outline into cells, a minimum cut gives each cell its plane (`roof
 
 from __future__ import annotations
 
-import numpy as np
-
-from pipeline.errors import BuildingError
-from pipeline.geometry import point_spacing_m, top_visible
-from pipeline.methods.local_frame import local_metres, plane_over_origin
-from pipeline.model import Candidate, Reason, Segmentation
+from pipeline.geometry import point_spacing_m
+from pipeline.model import PreparedCloud, Segmentation
+from pipeline.prepared_cloud import require_visible
 from pipeline.segmentation.adaptive_planes import detect_planes
 from pipeline.segmentation.plane_refinement import describe_planes
 from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
 
 
-def segment(candidate: Candidate, settings: AdaptivePlaneSettings) -> Segmentation:
+def segment(cloud: PreparedCloud, settings: AdaptivePlaneSettings) -> Segmentation:
     """Find the roof planes of one building.
 
     Points that a higher point of the building hides take no part and keep the label -1, as do points that no plane
@@ -26,7 +23,7 @@ def segment(candidate: Candidate, settings: AdaptivePlaneSettings) -> Segmentati
 
     Parameters
     ----------
-    candidate : Candidate
+    cloud : PreparedCloud
         Its points.
     settings : AdaptivePlaneSettings
         Thresholds.
@@ -41,16 +38,7 @@ def segment(candidate: Candidate, settings: AdaptivePlaneSettings) -> Segmentati
     BuildingError
         Reason ``too_few_points`` below the fewest points of a plane.
     """
-    points, shift = local_metres(candidate.points)
-    visible = np.flatnonzero(top_visible(points))
-    roof = points[visible]
-    if len(roof) < settings.min_points:
-        raise BuildingError(
-            Reason.TOO_FEW_POINTS,
-            f"{len(roof)} of {len(points)} points are visible from above, min_points is {settings.min_points}",
-        )
+    require_visible(cloud, cloud.visible, settings.min_points, f"min_points is {settings.min_points}")
+    roof = cloud.points[cloud.visible]
     found = detect_planes(roof, point_spacing_m(roof), settings)
-    labels = np.full(len(points), -1, np.int32)
-    labels[visible] = found.labels
-    described = describe_planes(points, found.coefficients, labels)
-    return Segmentation(planes=tuple(plane_over_origin(plane, shift) for plane in described), labels=labels)
+    return cloud.segmentation(describe_planes(roof, found.coefficients, found.labels), cloud.visible, found.labels)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.errors import BuildingError
 from pipeline.geometry import (
     facet_areas_m2,
     facet_centroids,
@@ -18,12 +17,12 @@ from pipeline.geometry import (
     nearest_neighbours,
     noise_sigma_m,
     point_spacing_m,
-    top_visible,
 )
-from pipeline.methods.local_frame import check_extent, ground_around, local_metres, plane_over_origin
+from pipeline.methods.building_tin import check_extent, ground_around
 from pipeline.methods.refinement import planes_of_clusters
 from pipeline.methods.settings import FuzzySartSettings
-from pipeline.model import BoolArray, Candidate, FloatArray, Reason, Segmentation
+from pipeline.model import BoolArray, FloatArray, PreparedCloud, Segmentation
+from pipeline.prepared_cloud import require_visible
 from pipeline.segmentation.facet_clusters import connected_parts, labels_of_points
 from pipeline.segmentation.fuzzy_sart import (
     centre_of_building,
@@ -35,7 +34,7 @@ from pipeline.terrain.height_rule import facets_above_z_avg
 from pipeline.tin.greedy_insertion import GreedyInsertionSettings, GreedyTin, insert_greedily
 
 
-def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
+def segment(cloud: PreparedCloud, settings: FuzzySartSettings) -> Segmentation:
     """Find the roof planes of one building.
 
     Points that a higher point of the building hides (facades, returns from below the roof) take no part and keep the
@@ -43,7 +42,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
 
     Parameters
     ----------
-    candidate : Candidate
+    cloud : PreparedCloud
         Its points, and the terrain around it.
     settings : FuzzySartSettings
         `FuzzySartSettings()` or `FuzzySartSettings.faithful()`.
@@ -58,14 +57,8 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
     BuildingError
         Reason ``too_few_points`` below the fewest points of a plane; ``too_complex`` beyond a limit of work.
     """
-    points, shift = local_metres(candidate.points)
-    visible = np.flatnonzero(top_visible(points))
-    roof = points[visible]
-    if len(roof) < settings.min_points:
-        raise BuildingError(
-            Reason.TOO_FEW_POINTS,
-            f"{len(roof)} of {len(points)} points are visible from above, min_points is {settings.min_points}",
-        )
+    require_visible(cloud, cloud.visible, settings.min_points, f"min_points is {settings.min_points}")
+    roof = cloud.points[cloud.visible]
     spacing_m = point_spacing_m(roof)
     sigma_m = noise_sigma_m(roof)
     neighbours = nearest_neighbours(roof, settings.neighbours)
@@ -73,7 +66,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
 
     # 3.1: the TIN of the building with its ground; points near a facet are absorbed by it.
     gap_m = max(settings.ground_gap_spacings * spacing_m, settings.min_ground_gap_m)
-    ground = ground_around(candidate.ground, shift, roof, gap_m)
+    ground = ground_around(cloud, roof, gap_m)
     building_with_ground = np.concatenate([roof, ground])
     check_extent(building_with_ground)
     insertion = GreedyInsertionSettings(
@@ -81,7 +74,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
         absorption_distance_m=settings.absorption_distance_m(sigma_m),
         absorption_slope_deg=settings.max_absorption_slope_deg,
     )
-    greedy = insert_greedily(building_with_ground, insertion, candidate.ground_z_m - float(shift[2]))
+    greedy = insert_greedily(building_with_ground, insertion, cloud.ground_z_m)
     facets = greedy.tin.facets
     normals = facet_normals(greedy.vertices, facets)
     areas_m2 = facet_areas_m2(greedy.vertices, facets)
@@ -112,10 +105,7 @@ def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
         settings=settings,
     )
 
-    all_labels = np.full(len(points), -1, np.int32)
-    all_labels[visible] = labels
-    described = describe_planes(points, planes, all_labels)
-    return Segmentation(planes=tuple(plane_over_origin(plane, shift) for plane in described), labels=all_labels)
+    return cloud.segmentation(describe_planes(roof, planes, labels), cloud.visible, labels)
 
 
 def _roof_facets(greedy: GreedyTin, normals: FloatArray, n_roof: int, settings: FuzzySartSettings) -> BoolArray:

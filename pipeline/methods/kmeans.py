@@ -24,13 +24,13 @@ from pipeline.geometry import (
     nearest_neighbours,
     noise_sigma_m,
     point_spacing_m,
-    top_visible,
     vertical_residuals_m,
 )
-from pipeline.methods.local_frame import check_extent, local_metres, plane_over_origin
+from pipeline.methods.building_tin import check_extent
 from pipeline.methods.refinement import planes_of_clusters
 from pipeline.methods.settings import KMeansSettings
-from pipeline.model import Candidate, FloatArray, IntArray, LabelArray, Plane, PlanFace, Reason, Segmentation, Tin
+from pipeline.model import FloatArray, LabelArray, Plane, PlanFace, PreparedCloud, Reason, Segmentation, Tin
+from pipeline.prepared_cloud import require_visible
 from pipeline.roof.primitives import BuildingPrimitive, fit_box, fit_gable
 from pipeline.segmentation.facet_clusters import connected_parts
 from pipeline.segmentation.facet_smoothing import passes_for_noise, smoothed_normals
@@ -42,7 +42,7 @@ from pipeline.segmentation.kmeans_normals import (
 from pipeline.segmentation.plane_refinement import describe_planes
 from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums
 from pipeline.segmentation.surrounding_ground import far_from
-from pipeline.tin.delaunay import triangulate, unique_xy
+from pipeline.tin.delaunay import triangulate
 
 _MIN_FACETS = 3
 """Fewer facets are no two groups."""
@@ -53,9 +53,7 @@ class BuildingTop:
     """The points of a building that see the sky, one a position, and their TIN."""
 
     points: FloatArray
-    """(n, 3) float64, metres about an origin of their own."""
-    index: IntArray
-    """(n,) int64, which of the candidate's points they are."""
+    """(n, 3) float64, metres about the origin of the cloud."""
     spacing_m: float
     """Mean point spacing in plan."""
     sigma_m: float
@@ -66,7 +64,7 @@ class BuildingTop:
     """Planar Delaunay triangulation; vertex i is point i."""
 
 
-def segment(candidate: Candidate, settings: KMeansSettings) -> Segmentation:
+def segment(cloud: PreparedCloud, settings: KMeansSettings) -> Segmentation:
     """Find the roof planes of one building, and the model that they make.
 
     Points that a higher point of the building hides (facades, returns from below the roof) take no part and keep the
@@ -74,7 +72,7 @@ def segment(candidate: Candidate, settings: KMeansSettings) -> Segmentation:
 
     Parameters
     ----------
-    candidate : Candidate
+    cloud : PreparedCloud
         Its points, and the height of the ground.
     settings : KMeansSettings
         `KMeansSettings()` or `KMeansSettings.faithful()`.
@@ -90,38 +88,30 @@ def segment(candidate: Candidate, settings: KMeansSettings) -> Segmentation:
         Reason ``too_few_points`` or ``no_plane`` where there is too little to cluster; ``no_partition`` where two
         planes must make a model and meet beside the building; ``too_complex`` beyond a limit of work.
     """
-    points, shift = local_metres(candidate.points)
-    top = building_top(points, settings)
+    top = building_top(cloud, settings)
     planes, labels = planes_of(top, settings)
     described = describe_planes(top.points, planes, labels)
     faces: tuple[PlanFace, ...] | None = None
     roof_type = None
-    keeps_footprint = settings.outline == "footprint" and candidate.footprint is not None
+    keeps_footprint = settings.outline == "footprint" and cloud.candidate.footprint is not None
     if settings.model != "never" and not keeps_footprint:
-        model = model_of(top, described, labels, candidate.ground_z_m - float(shift[2]), settings)
+        model = model_of(top, described, labels, cloud.ground_z_m, settings)
         if model is not None:
             labels = sides_of(model, top.points, settings.model_distance_m)
             described = describe_planes(top.points, np.array([plane.coefficients for plane in model.planes]), labels)
             roof_type = model.roof_type if settings.model == "always" else None
-            x, y, _ = shift.tolist()
+            x, y, _ = cloud.shift_m.tolist()
             faces = tuple(_moved(face, x, y) for face in model.faces)
-    all_labels = np.full(len(points), -1, np.int32)
-    all_labels[top.index] = labels
-    return Segmentation(
-        planes=tuple(plane_over_origin(plane, shift) for plane in described),
-        labels=all_labels,
-        faces=faces,
-        roof_type=roof_type,
-    )
+    return cloud.segmentation(described, cloud.highest, labels, faces=faces, roof_type=roof_type)
 
 
-def building_top(points: FloatArray, settings: KMeansSettings) -> BuildingTop:
+def building_top(cloud: PreparedCloud, settings: KMeansSettings) -> BuildingTop:
     """The TIN of a building's visible points: the highest one of every position.
 
     Parameters
     ----------
-    points : (n, 3) float64
-        From `local_metres`.
+    cloud : PreparedCloud
+        With at least one point.
     settings : KMeansSettings
         `min_points`, and the distance that follows the noise.
 
@@ -134,25 +124,16 @@ def building_top(points: FloatArray, settings: KMeansSettings) -> BuildingTop:
     BuildingError
         Reason ``too_few_points`` or ``too_complex``.
     """
-    index = np.flatnonzero(top_visible(points))
-    grid = np.rint(points[index] * 1000.0).astype(np.int64)
-    kept, _ = unique_xy(grid[:, :2], grid[:, 2])
-    index = index[kept]
-    top = points[index]
-    if len(top) < settings.min_points:
-        raise BuildingError(
-            Reason.TOO_FEW_POINTS,
-            f"{len(top)} of {len(points)} points are visible from above, min_points is {settings.min_points}",
-        )
+    require_visible(cloud, cloud.highest, settings.min_points, f"min_points is {settings.min_points}")
+    top = cloud.points[cloud.highest]
     check_extent(top)
     sigma_m = noise_sigma_m(top)
     return BuildingTop(
         points=top,
-        index=index,
         spacing_m=point_spacing_m(top),
         sigma_m=sigma_m,
         distance_m=settings.plane_distance_m(sigma_m),
-        tin=triangulate(grid[kept, :2]),
+        tin=triangulate(cloud.points_mm[cloud.highest, :2]),
     )
 
 

@@ -12,11 +12,11 @@ import dataclasses
 
 import numpy as np
 
-from pipeline.errors import BuildingError
-from pipeline.geometry import facet_areas_m2, nearest_neighbours, noise_sigma_m, point_spacing_m, top_visible
-from pipeline.methods.local_frame import check_extent, ground_around, local_metres, plane_over_origin
+from pipeline.geometry import facet_areas_m2, nearest_neighbours, noise_sigma_m, point_spacing_m
+from pipeline.methods.building_tin import check_extent, ground_around
 from pipeline.methods.settings import ParameterSpace2dSettings, ParameterSpace3dSettings, ParameterSpaceSettings
-from pipeline.model import BoolArray, Candidate, FloatArray, LabelArray, Reason, RoofType, Segmentation, Tin
+from pipeline.model import BoolArray, FloatArray, LabelArray, PreparedCloud, RoofType, Segmentation, Tin
+from pipeline.prepared_cloud import require_visible
 from pipeline.segmentation.cluster_membership import may_be_roof, refine_clusters
 from pipeline.segmentation.facet_clusters import labels_of_points
 from pipeline.segmentation.facet_parameters import about_barycentre, cluster_means, facet_parameters
@@ -40,11 +40,7 @@ class BuildingFacets:
     """The TIN of a building with its surroundings, and the parameters of its facets."""
 
     roof: FloatArray
-    """(n, 3) float64, the points visible from above, metres about an origin of whole metres."""
-    visible: LabelArray
-    """(n,) their indices among the candidate's points."""
-    shift: FloatArray
-    """(3,) that origin."""
+    """(n, 3) float64, the points visible from above, metres about the origin of the cloud."""
     spacing_m: float
     """Mean point spacing of the roof."""
     tin_spacing_m: float
@@ -61,12 +57,12 @@ class BuildingFacets:
     """(m,) bool, True where all vertices are roof points."""
 
 
-def segment_2d(candidate: Candidate, settings: ParameterSpace2dSettings) -> Segmentation:
+def segment_2d(cloud: PreparedCloud, settings: ParameterSpace2dSettings) -> Segmentation:
     """Roof planes and type of one building from clusters of its facets in slope and orientation (section 3).
 
     Parameters
     ----------
-    candidate : Candidate
+    cloud : PreparedCloud
         Its points, and the terrain around it.
     settings : ParameterSpace2dSettings
         `ParameterSpace2dSettings()` or `ParameterSpace2dSettings.faithful()`.
@@ -81,17 +77,17 @@ def segment_2d(candidate: Candidate, settings: ParameterSpace2dSettings) -> Segm
     BuildingError
         Reason ``too_few_points`` where hardly any are visible; ``too_complex`` beyond a limit of work.
     """
-    facets = facets_of(candidate, settings)
+    facets = facets_of(cloud, settings)
     labels, centres = roof_clusters_2d(facets, settings)
-    return _primitive(candidate, facets, labels, centres, classify_2d(centres, settings).roof_type, settings)
+    return _primitive(cloud, facets, labels, centres, classify_2d(centres, settings).roof_type, settings)
 
 
-def segment_3d(candidate: Candidate, settings: ParameterSpace3dSettings) -> Segmentation:
+def segment_3d(cloud: PreparedCloud, settings: ParameterSpace3dSettings) -> Segmentation:
     """Roof planes and type of one building from clusters of its facets in all three parameters (section 4).
 
     Parameters
     ----------
-    candidate : Candidate
+    cloud : PreparedCloud
         Its points, and the terrain around it.
     settings : ParameterSpace3dSettings
         `ParameterSpace3dSettings()` or `ParameterSpace3dSettings.faithful()`.
@@ -106,9 +102,9 @@ def segment_3d(candidate: Candidate, settings: ParameterSpace3dSettings) -> Segm
     BuildingError
         Reason ``too_few_points`` where hardly any are visible; ``too_complex`` beyond a limit of work.
     """
-    facets = facets_of(candidate, settings)
+    facets = facets_of(cloud, settings)
     labels, centres = roof_clusters_3d(facets, settings)
-    return _primitive(candidate, facets, labels, centres, classify_3d(centres, settings).roof_type, settings)
+    return _primitive(cloud, facets, labels, centres, classify_3d(centres, settings).roof_type, settings)
 
 
 def roof_clusters_2d(facets: BuildingFacets, settings: ParameterSpace2dSettings) -> tuple[LabelArray, FloatArray]:
@@ -151,7 +147,7 @@ def roof_clusters_3d(facets: BuildingFacets, settings: ParameterSpace3dSettings)
     return _kept_clusters(labels, refined.centres, kept)
 
 
-def facets_of(candidate: Candidate, settings: ParameterSpaceSettings) -> BuildingFacets:
+def facets_of(cloud: PreparedCloud, settings: ParameterSpaceSettings) -> BuildingFacets:
     """Section 2: the Delaunay TIN of the building with some surrounding ground, about its barycentre.
 
     Raises
@@ -159,29 +155,21 @@ def facets_of(candidate: Candidate, settings: ParameterSpaceSettings) -> Buildin
     BuildingError
         Reason ``too_few_points`` where hardly any are visible; ``too_complex`` where they extend too far.
     """
-    points, shift = local_metres(candidate.points)
-    visible = np.flatnonzero(top_visible(points)).astype(np.int32)
-    roof = points[visible]
-    if len(roof) < _MIN_POINTS:
-        raise BuildingError(
-            Reason.TOO_FEW_POINTS,
-            f"{len(roof)} of {len(points)} points are visible from above, at least {_MIN_POINTS} are needed",
-        )
+    require_visible(cloud, cloud.visible, _MIN_POINTS, f"at least {_MIN_POINTS} are needed")
+    roof = cloud.points[cloud.visible]
     spacing_m = max(point_spacing_m(roof), 1e-3)
     gap_m = max(settings.ground_gap_spacings * spacing_m, 1e-3)
-    ground = ground_around(candidate.ground, shift, roof, gap_m, settings.surroundings_m)
+    ground = ground_around(cloud, roof, gap_m, settings.surroundings_m)
     thinned, thinned_of_point = _one_a_square(roof, settings.tin_spacing_m)
-    cloud = np.concatenate([roof[thinned], ground])
-    check_extent(cloud)
-    millimetres = np.rint(cloud * 1000.0).astype(np.int64)
+    with_ground = np.concatenate([roof[thinned], ground])
+    check_extent(with_ground)
+    millimetres = np.rint(with_ground * 1000.0).astype(np.int64)
     kept, kept_of_point = unique_xy(millimetres[:, :2], millimetres[:, 2])
     tin = triangulate(millimetres[kept, :2])
-    vertices, _ = about_barycentre(cloud[kept])
+    vertices, _ = about_barycentre(with_ground[kept])
     is_roof_vertex = kept < len(thinned)
     return BuildingFacets(
         roof=roof,
-        visible=visible,
-        shift=shift,
         spacing_m=spacing_m,
         tin_spacing_m=max(spacing_m, settings.tin_spacing_m),
         vertices=vertices,
@@ -236,7 +224,7 @@ def _kept_clusters(labels: LabelArray, centres: FloatArray, kept: BoolArray) -> 
 
 
 def _primitive(
-    candidate: Candidate,
+    cloud: PreparedCloud,
     facets: BuildingFacets,
     labels: LabelArray,
     centres: FloatArray,
@@ -252,14 +240,9 @@ def _primitive(
         planes, groups = _grown(facets, groups, centres, settings)
     else:
         planes, groups = _interpolated(facets.roof, groups, len(centres), settings.min_points)
-    all_labels = np.full(len(candidate.points), -1, np.int32)
-    all_labels[facets.visible] = groups
     described = describe_planes(facets.roof, planes, groups)
-    return Segmentation(
-        planes=tuple(plane_over_origin(plane, facets.shift) for plane in described),
-        labels=all_labels,
-        roof_type=roof_type if settings.type_from == "tree" and len(planes) else None,
-    )
+    named = roof_type if settings.type_from == "tree" and len(planes) else None
+    return cloud.segmentation(described, cloud.visible, groups, roof_type=named)
 
 
 def _interpolated(

@@ -11,10 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 
-from pipeline.model import FloatArray, LabelArray, ModelQuality, Plane, RoofFace, Solid
+from pipeline.model import FloatArray, ModelQuality, Plane, RoofFace, Solid
 from pipeline.quality.curved_roof import is_curved_roof
-from pipeline.quality.residuals import ResidualSummary, TopSurface
+from pipeline.quality.residuals import ResidualSummary, TopSurface, summarise, surface_of
 from pipeline.quality.ridge_height import ridge_height_sigma_m
+from pipeline.quality.unseen_roof import Raster
 
 TOLERANCE_M = 0.2
 """A point within this vertical distance of the roof is explained by it."""
@@ -32,10 +33,6 @@ _MAX_CELLS = 20_000
 
 def model_quality(
     points: FloatArray,
-    surface: TopSurface,
-    residuals: FloatArray,
-    face_of_point: LabelArray,
-    summary: ResidualSummary,
     faces: Sequence[RoofFace],
     planes: Sequence[Plane],
     solids: Sequence[Solid],
@@ -43,22 +40,13 @@ def model_quality(
     spacing_m: float,
     outline_sigma_m: float,
     is_planar: bool,
-    bic_margin: float = math.nan,
-) -> ModelQuality:
+) -> tuple[ResidualSummary, ModelQuality]:
     """Measure a delivered model by its points.
 
     Parameters
     ----------
     points : (n, 3) float64
         All points of the candidate, local metres.
-    surface : TopSurface
-        Of the faces.
-    residuals : (n,) float64
-        Points minus top surface, metres; nan where there is no roof.
-    face_of_point : (n,) int32
-        The face that each point was held against; -1 for none.
-    summary : ResidualSummary
-        Of these residuals, with `TOLERANCE_M`.
     faces, planes, solids : sequences
         The model.
     spacing_m : float
@@ -66,16 +54,20 @@ def model_quality(
     outline_sigma_m : float
         Standard deviation of the outline's place in plan; 0 where it was given.
     is_planar : bool
-        Whether the faces follow the roof's planes (LoD2). What a block leaves is the roof's form, not noise, and the
-        top of a block is no ridge: both are then nan.
-    bic_margin : float
-        By how much the chosen form is better than the next one; nan where none competed.
+        Whether the faces follow the roof's planes (LoD2). Residuals of a block are the roof's form, not noise, and the
+        top of a block is not a ridge: both figures are then nan.
 
     Returns
     -------
+    ResidualSummary
+        Of all points, with `TOLERANCE_M`.
     ModelQuality
-        nan where there are no points to tell.
+        nan where no points say anything; `bic_margin` is left open.
     """
+    surface = surface_of(faces, planes)
+    top, face_of_point = surface.at(points[:, 0], points[:, 1])
+    residuals = points[:, 2] - top
+    summary = summarise(residuals, TOLERANCE_M)
     unexplained, hole = _seen(points, surface, residuals, faces, spacing_m)
     noise = sigma = math.nan
     if is_planar:
@@ -84,14 +76,13 @@ def model_quality(
         plane_of_point = np.where(face_of_point >= 0, owner[face_of_point], np.int32(-1)).astype(np.int32)
         reach = max(TOLERANCE_M, 3.0 * noise)
         sigma = ridge_height_sigma_m(points, residuals, plane_of_point, reach, planes, solids, outline_sigma_m)
-    return ModelQuality(
+    return summary, ModelQuality(
         point_spacing_m=spacing_m,
         noise_m=noise,
         share_within=summary.share_within if summary.n_points else math.nan,
         unexplained_m2=unexplained,
         largest_hole_m=hole,
         ridge_z_sigma_m=sigma,
-        bic_margin=bic_margin,
         is_curved=is_planar and is_curved_roof(planes, faces, solids),
     )
 
@@ -104,7 +95,8 @@ def _seen(
         return math.nan, math.nan
     low_x, low_y, high_x, high_y = surface.bounds
     cell = max(_MIN_CELL_M, spacing_m, math.sqrt((high_x - low_x) * (high_y - low_y) / _MAX_CELLS))
-    raster = (low_x, low_y, cell, math.floor((high_x - low_x) / cell) + 1, math.floor((high_y - low_y) / cell) + 1)
+    columns, rows = math.floor((high_x - low_x) / cell) + 1, math.floor((high_y - low_y) / cell) + 1
+    raster = Raster(low_x, low_y, cell, columns, rows)
     places, unseen, square = surface.seen(points, residuals, raster, TOLERANCE_M, GAP_SPACINGS * spacing_m)
     if places == 0:
         return math.nan, math.nan

@@ -14,7 +14,7 @@ from shapely import MultiPolygon, Polygon
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, RoofFace
-from pipeline.quality.unseen_roof import middles_of_cells, unseen_cells
+from pipeline.quality.unseen_roof import Raster, middles_of_cells, unseen_cells
 
 _MAX_CELLS = 1_000_000
 
@@ -214,16 +214,15 @@ def _laid_out(
 def _seen(
     points: FloatArray,
     residuals: FloatArray,
-    raster: tuple[float, float, float, int, int],
+    raster: Raster,
     tolerance_m: float,
     gap_m: float,
     faces: _Faces,
 ) -> tuple[int, int, float]:
     """The kernel of `TopSurface.seen`."""
-    low_x, low_y, cell, columns, rows = raster
-    x, y = middles_of_cells(low_x, low_y, cell, columns, rows)
+    x, y = middles_of_cells(raster)
     _, number = _top_surface(x, y, faces)
-    return unseen_cells(points, residuals, number >= 0, low_x, low_y, cell, columns, rows, tolerance_m, gap_m)
+    return unseen_cells(points, residuals, number >= 0, raster, tolerance_m, gap_m)
 
 
 class TopSurface:
@@ -316,7 +315,7 @@ class TopSurface:
         self,
         points: FloatArray,
         residuals: FloatArray,
-        raster: tuple[float, float, float, int, int],
+        raster: Raster,
         tolerance_m: float,
         gap_m: float,
     ) -> tuple[int, int, float]:
@@ -328,8 +327,8 @@ class TopSurface:
             Metres.
         residuals : (n,) float64
             Points minus this surface, metres; nan where there is no face.
-        raster : tuple
-            Lower left corner, cell in metres, columns, rows.
+        raster : Raster
+            Its cells.
         tolerance_m : float
             Vertical distance up to which a point is on the surface.
         gap_m : float

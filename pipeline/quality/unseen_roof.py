@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,9 +11,22 @@ from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray
 
 
+class Raster(NamedTuple):
+    """Square cells over a roof in plan."""
+
+    low_x: float
+    low_y: float
+    """Lower left corner, metres."""
+    cell: float
+    """Side of a cell, metres."""
+    columns: int
+    rows: int
+
+
 @kernel(inline="always")
-def middles_of_cells(low_x: float, low_y: float, cell: float, columns: int, rows: int) -> tuple[FloatArray, FloatArray]:
+def middles_of_cells(raster: Raster) -> tuple[FloatArray, FloatArray]:
     """Middles of a raster's cells, line by line, x and y, (rows * columns,) metres."""
+    low_x, low_y, cell, columns, rows = raster
     x = np.empty(rows * columns)
     y = np.empty(rows * columns)
     for row in range(rows):
@@ -27,11 +41,7 @@ def unseen_cells(
     points: FloatArray,
     residuals: FloatArray,
     on_roof: BoolArray,
-    low_x: float,
-    low_y: float,
-    cell: float,
-    columns: int,
-    rows: int,
+    raster: Raster,
     tolerance_m: float,
     gap_m: float,
 ) -> tuple[int, int, float]:
@@ -45,14 +55,14 @@ def unseen_cells(
         Points minus roof; nan where there is none.
     on_roof : (rows * columns,) bool
         Cells whose middle has a roof.
-    low_x, low_y, cell, columns, rows
-        The raster.
+    raster : Raster
+        Its cells, line by line.
     tolerance_m : float
         Points this near to the roof, vertically, are on it.
     gap_m : float
         A cell farther than this from all of them is unseen.
     """
-    squares = _nearest_squares(points, residuals, tolerance_m, low_x, low_y, cell, columns, rows)
+    squares = _nearest_squares(points, residuals, tolerance_m, raster)
     places = 0
     unseen = 0
     largest = 0.0
@@ -69,11 +79,7 @@ def _nearest_squares(
     points: FloatArray,
     residuals: FloatArray,
     tolerance_m: float,
-    low_x: float,
-    low_y: float,
-    cell: float,
-    columns: int,
-    rows: int,
+    raster: Raster,
 ) -> FloatArray:
     """Squared distance in plan from every cell's middle to the nearest point over or under a roof, and to one on it.
 
@@ -86,6 +92,7 @@ def _nearest_squares(
     (rows * columns, 2) float64
         m2; infinite without points.
     """
+    low_x, low_y, cell, columns, rows = raster
     n = rows * columns
     # per cell: the square to any point, its x and y, in cells; the same of a point on the roof
     kept = np.full((n, 6), np.inf)

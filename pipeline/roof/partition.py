@@ -21,14 +21,10 @@ from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import ascending_order
 from pipeline.kernels.union_find import numbered_sets, unite
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason, Tin
+from pipeline.prepared_cloud import SHADING_HEIGHT_M
 
 OUTSIDE = -1
 """The label of what is no roof."""
-
-
-SHADING_RADIUS_M = 0.5
-SHADING_HEIGHT_M = 1.1
-"""Points with another this much higher within this distance are not partitioned: see `top_visible`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

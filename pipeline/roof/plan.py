@@ -12,8 +12,8 @@ import shapely
 from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
-from pipeline.geometry import spacing_over_area_m, top_visible
-from pipeline.model import BoolArray, Candidate, FloatArray, IntArray, LabelArray, Plane, Reason
+from pipeline.geometry import spacing_over_area_m
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray, Plane, PreparedCloud, Reason
 from pipeline.roof.arrangement.arranging import arrange
 from pipeline.roof.borders import straighten_borders
 from pipeline.roof.eaves import straighten
@@ -23,15 +23,13 @@ from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprin
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
 from pipeline.roof.partition import (
     OUTSIDE,
-    SHADING_HEIGHT_M,
-    SHADING_RADIUS_M,
     RoofPartition,
     absorb_small_regions,
     march,
 )
 from pipeline.roof.settings import ArrangementSettings, RoofSettings
 from pipeline.roof.simplification import simplify_partition, unite_close_vertices
-from pipeline.tin.delaunay import triangulate, unique_xy
+from pipeline.tin.delaunay import triangulate
 
 _PITCH_SPACINGS = 1.2
 _MARGIN_SPACINGS = 4.0
@@ -63,13 +61,13 @@ class RoofPoints:
     """What tells of the walls beneath; None where the outline is to be drawn at the eaves."""
 
 
-def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
+def roof_points(cloud: PreparedCloud, settings: RoofSettings) -> RoofPoints:
     """Select the roof points of a candidate.
 
     Parameters
     ----------
-    candidate : Candidate
-        Its points.
+    cloud : PreparedCloud
+        The candidate's points.
     settings : RoofSettings
         `min_roof_height_m`, `min_points`, `min_points_in_footprint`.
 
@@ -81,39 +79,30 @@ def roof_points(candidate: Candidate, settings: RoofSettings) -> RoofPoints:
     Raises
     ------
     BuildingError
-        `too_few_points`, `too_complex` or `no_footprint`.
-    ValueError
-        Where a coordinate is not finite.
+        `too_few_points` or `no_footprint`.
     """
-    points = candidate.points
-    if not np.isfinite(points).all():
-        raise ValueError("a point of the candidate has a coordinate that is not finite")
-    if len(points) > settings.max_points:
-        raise BuildingError(Reason.TOO_COMPLEX, f"{len(points)} points, more than max_points = {settings.max_points}")
-    chosen = top_visible(points, SHADING_RADIUS_M, SHADING_HEIGHT_M) & (
-        points[:, 2] >= candidate.ground_z_m + settings.min_roof_height_m
-    )
-    index = np.flatnonzero(chosen)
-    grid = np.rint(points[index] * 1e3).astype(np.int64)
-    kept, _ = unique_xy(grid[:, :2], grid[:, 2])
-    index = index[kept]
+    candidate = cloud.candidate
+    highest = candidate.points[cloud.highest]
+    is_above = highest[:, 2] >= candidate.ground_z_m + settings.min_roof_height_m
+    index, points = cloud.highest[is_above], highest[is_above]
     name, fewest = "min_points", settings.min_points
     if candidate.footprint is not None and settings.min_points_in_footprint < fewest:
         name, fewest = "min_points_in_footprint", settings.min_points_in_footprint
     if len(index) < fewest:
         raise BuildingError(Reason.TOO_FEW_POINTS, f"{len(index)} roof points, fewer than {name} = {fewest}")
     footprint = None if candidate.footprint is None else footprint_in_mm(candidate.footprint)
+    xy_mm = cloud.points_mm[index, :2] + (cloud.shift_m[:2] * 1e3).astype(np.int64)
     return RoofPoints(
-        points=points[index],
-        xy_mm=grid[kept, :2],
+        points=points,
+        xy_mm=xy_mm,
         index=index,
         labels=np.full(len(index), -1, np.int32),
-        split=_are_among(grid[kept, :2], np.rint(candidate.split_returns[:, :2] * 1e3).astype(np.int64)),
-        spacing_m=min(max(spacing_over_area_m(points[index]), 0.1), 3.0),
+        split=_are_among(xy_mm, np.rint(candidate.split_returns[:, :2] * 1e3).astype(np.int64)),
+        spacing_m=min(max(spacing_over_area_m(points), 0.1), 3.0),
         footprint_mm=footprint,
         outline_mm=None if candidate.outline is None else footprint_in_mm(candidate.outline),
         facades=FacadePoints.of(
-            candidate.beside, candidate.beside_later, points[index], candidate.ground, candidate.ground_z_m
+            candidate.beside, candidate.beside_later, points, candidate.ground, candidate.ground_z_m
         )
         if settings.at_walls
         else None,

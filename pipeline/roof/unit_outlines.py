@@ -15,6 +15,7 @@ from shapely import MultiPolygon
 
 from pipeline.errors import BuildingError
 from pipeline.model import Candidate, LabelArray, Plane
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.plan import FORMS, draw_clipped, partition_roof, roof_points
 from pipeline.roof.settings import RoofSettings
@@ -40,7 +41,7 @@ def unit_outlines(candidate: Candidate, units: LabelArray, settings: RoofSetting
     """
     count = int(units.max(initial=-1)) + 1
     try:
-        bare = roof_points(candidate, settings)
+        bare = roof_points(prepare_cloud(candidate, settings.max_points), settings)
         roof = dataclasses.replace(bare, labels=np.ascontiguousarray(units[bare.index], np.int32))
         plan = partition_roof(roof, _levels(candidate, units, count), settings)
         partition = draw_clipped(plan, roof, settings, FORMS[0])

@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BuildingError, SettingsError
-from pipeline.methods.fuzzy_sart import segment
+from pipeline.methods import fuzzy_sart
 from pipeline.methods.settings import FuzzySartSettings
-from pipeline.model import Candidate, FloatArray, LabelArray, Reason
+from pipeline.model import Candidate, FloatArray, LabelArray, Reason, Segmentation
+from pipeline.prepared_cloud import prepare_cloud
+
+
+def segment(candidate: Candidate, settings: FuzzySartSettings) -> Segmentation:
+    return fuzzy_sart.segment(prepare_cloud(candidate), settings)
 
 
 def candidate_of(points: FloatArray, half: int = 14, ground_sigma: float = 0.02, seed: int = 9) -> Candidate:

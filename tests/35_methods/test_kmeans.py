@@ -15,11 +15,11 @@ import shapely
 
 from pipeline.errors import BuildingError, SettingsError
 from pipeline.geometry import vertical_residuals_m
-from pipeline.methods import METHODS, ReconstructSettings
-from pipeline.methods.kmeans import building_top, cluster_facets, segment
-from pipeline.methods.local_frame import local_metres
+from pipeline.methods import METHODS, ReconstructSettings, kmeans
+from pipeline.methods.kmeans import building_top, cluster_facets
 from pipeline.methods.settings import KMeansSettings
 from pipeline.model import Candidate, FloatArray, Reason, RoofType, Segmentation, Status
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
 from pipeline.reconstruct import reconstruct_building
 
@@ -27,6 +27,10 @@ PAGE = Path(__file__).parents[2] / "docs" / "methods" / "kmeans.md"
 FAITHFUL = KMeansSettings.faithful()
 ROBUST = KMeansSettings()
 PRESETS = pytest.mark.parametrize("settings", [ROBUST, FAITHFUL], ids=["robust", "faithful"])
+
+
+def segment(candidate: Candidate, settings: KMeansSettings) -> Segmentation:
+    return kmeans.segment(prepare_cloud(candidate), settings)
 
 
 def candidate_of(points: FloatArray, footprint: shapely.Polygon | None = None) -> Candidate:
@@ -246,8 +250,7 @@ def test_the_order_of_the_points_does_not_matter(settings: KMeansSettings) -> No
 
 def test_the_two_clusters_of_a_gable_are_its_two_sides() -> None:
     candidate = roof(gable_planes(), density=1.0, noise=0.05, turn_deg=0.0)
-    points, _ = local_metres(candidate.points)
-    top = building_top(points, FAITHFUL)
+    top = building_top(prepare_cloud(candidate), FAITHFUL)
     labels, clusters = cluster_facets(top, FAITHFUL)
     north = top.points[top.tin.facets][:, :, 1] > top.points[:, 1].mean() + 1.0
     south = top.points[top.tin.facets][:, :, 1] < top.points[:, 1].mean() - 1.0

@@ -18,16 +18,17 @@ from pipeline.methods import METHODS
 from pipeline.methods.parameter_space import segment_2d, segment_3d
 from pipeline.methods.settings import ParameterSpace2dSettings, ParameterSpace3dSettings
 from pipeline.model import Candidate, FloatArray, Reason, RoofType, Segmentation
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.settings import RunSettings
 
 Height = Callable[[FloatArray, FloatArray], FloatArray]
 Segment = Callable[[Candidate], Segmentation]
 
 RECIPES: dict[str, Segment] = {
-    "2d faithful": lambda candidate: segment_2d(candidate, ParameterSpace2dSettings.faithful()),
-    "3d faithful": lambda candidate: segment_3d(candidate, ParameterSpace3dSettings.faithful()),
-    "2d robust": lambda candidate: segment_2d(candidate, ParameterSpace2dSettings()),
-    "3d robust": lambda candidate: segment_3d(candidate, ParameterSpace3dSettings()),
+    "2d faithful": lambda candidate: segment_2d(prepare_cloud(candidate), ParameterSpace2dSettings.faithful()),
+    "3d faithful": lambda candidate: segment_3d(prepare_cloud(candidate), ParameterSpace3dSettings.faithful()),
+    "2d robust": lambda candidate: segment_2d(prepare_cloud(candidate), ParameterSpace2dSettings()),
+    "3d robust": lambda candidate: segment_3d(prepare_cloud(candidate), ParameterSpace3dSettings()),
 }
 FAITHFUL = [name for name in RECIPES if "faithful" in name]
 ROBUST = [name for name in RECIPES if "robust" in name]
@@ -158,8 +159,12 @@ def test_a_flat_roof_is_one_plane_where_terrain_is_left_out(recipe: str) -> None
 def test_clusters_of_terrain_and_walls_carry_no_plane_whatever_becomes_of_them(choice: str) -> None:
     candidate = gable(slope=0.2)
     for found in (
-        segment_2d(candidate, ParameterSpace2dSettings(ground_clusters=choice, point_groups="membership")),
-        segment_3d(candidate, ParameterSpace3dSettings(ground_clusters=choice, point_groups="membership")),
+        segment_2d(
+            prepare_cloud(candidate), ParameterSpace2dSettings(ground_clusters=choice, point_groups="membership")
+        ),
+        segment_3d(
+            prepare_cloud(candidate), ParameterSpace3dSettings(ground_clusters=choice, point_groups="membership")
+        ),
     ):
         assert all(25 < plane.slope_deg < 45 for plane in found.planes if plane.n_points > 20)
         assert sum(plane.n_points > 20 for plane in found.planes) == 2
@@ -278,9 +283,9 @@ def test_a_candidate_wider_than_a_tin_is_too_complex(recipe: str) -> None:
 
 def test_beyond_the_limits_of_work_a_building_is_too_complex() -> None:
     with pytest.raises(BuildingError, match="linkage_work_limit is 5"):
-        segment_2d(gable(), ParameterSpace2dSettings(linkage_work_limit=5))
+        segment_2d(prepare_cloud(gable()), ParameterSpace2dSettings(linkage_work_limit=5))
     with pytest.raises(BuildingError, match="membership_work_limit is 5"):
-        segment_3d(gable(), ParameterSpace3dSettings(membership_work_limit=5))
+        segment_3d(prepare_cloud(gable()), ParameterSpace3dSettings(membership_work_limit=5))
 
 
 def test_the_faithful_settings_hold_the_papers_figures() -> None:
@@ -329,16 +334,14 @@ def test_a_city_block_of_100_000_points_is_segmented_whole() -> None:
 def test_a_roof_without_any_noise_is_one_plane(segment: Any, settings: Any, rise: float) -> None:
     steps = np.arange(0.25, 10.0, 0.5)
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing="ij"))
-    found = segment(
-        Candidate(
-            building_id="b",
-            origin=(0.0, 0.0, 0.0),
-            points=np.rint(np.column_stack((x, y, 6.0 + rise * x)) * 1e3) / 1e3,
-            ground=np.zeros((0, 3)),
-            ground_z_m=0.0,
-        ),
-        settings,
+    candidate = Candidate(
+        building_id="b",
+        origin=(0.0, 0.0, 0.0),
+        points=np.rint(np.column_stack((x, y, 6.0 + rise * x)) * 1e3) / 1e3,
+        ground=np.zeros((0, 3)),
+        ground_z_m=0.0,
     )
+    found = segment(prepare_cloud(candidate), settings)
     assert len(found.planes) == 1
     assert found.planes[0].a == pytest.approx(rise, abs=1e-3)
     assert (found.labels == 0).all()

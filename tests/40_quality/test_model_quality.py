@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from pipeline.geometry import fit_plane
 from pipeline.model import FloatArray, ModelQuality, Plane
 from pipeline.quality.curved_roof import is_curved_roof
-from pipeline.quality.model_quality import TOLERANCE_M, model_quality
-from pipeline.quality.residuals import summarise, surface_of
+from pipeline.quality.model_quality import model_quality
 from pipeline.quality.ridge_height import _weights
-from pipeline.quality.unseen_roof import _nearest_squares
+from pipeline.quality.unseen_roof import Raster, _nearest_squares
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart, solid_parts
 
@@ -41,15 +40,8 @@ def measured(
 ) -> ModelQuality:
     parts, planes = model
     faces = [face for part in parts for face in part.faces]
-    surface = surface_of(faces, planes)
-    top, face_of_point = surface.at(points[:, 0], points[:, 1])
-    residuals = points[:, 2] - top
-    return model_quality(
+    _, quality = model_quality(
         points,
-        surface,
-        residuals,
-        face_of_point,
-        summarise(residuals, TOLERANCE_M),
         faces,
         planes,
         [part.solid for part in parts],
@@ -57,6 +49,7 @@ def measured(
         outline_sigma_m=outline_sigma_m,
         is_planar=is_planar,
     )
+    return quality
 
 
 def lattice(width: float, depth: float, step: float = 0.5) -> FloatArray:
@@ -135,7 +128,7 @@ def test_the_nearest_point_of_every_cell_is_that_of_a_plain_search_to_a_tenth_of
     points = rng.uniform(0, 1, (int(rng.integers(1, 60)), 3)) * [columns * cell, rows * cell, 9.0]
     residuals = rng.uniform(-0.4, 0.4, len(points))
     residuals[rng.uniform(size=len(points)) < 0.2] = np.nan
-    found = _nearest_squares(points, residuals, 0.2, 0.0, 0.0, cell, columns, rows)[:, 1]
+    found = _nearest_squares(points, residuals, 0.2, Raster(0.0, 0.0, cell, columns, rows))[:, 1]
     x = np.tile((np.arange(columns) + 0.5) * cell, rows)
     y = np.repeat((np.arange(rows) + 0.5) * cell, columns)
     near = points[np.abs(residuals) <= 0.2]

@@ -11,6 +11,7 @@ import pytest
 import shapely
 
 from pipeline.model import Candidate, FloatArray, LabelArray, Plane, Solid
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.plan import RoofPlan, RoofPoints, partition_roof, plan_forms, roof_points
 from pipeline.roof.settings import RoofSettings
@@ -69,7 +70,7 @@ class ExactRoof:
     def partition(self, settings: RoofSettings | None = None) -> tuple[RoofPlan, RoofPoints, RoofSettings]:
         """The roof's plan from its true labels."""
         settings = settings or RoofSettings()
-        roof = roof_points(self.candidate, settings)
+        roof = roof_points(prepare_cloud(self.candidate), settings)
         roof = dataclasses.replace(roof, labels=self.labels[roof.index])
         return partition_roof(roof, self.planes, settings), roof, settings
 

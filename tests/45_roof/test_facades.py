@@ -10,6 +10,7 @@ import pytest
 import shapely
 
 from pipeline.model import Candidate, FloatArray
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.block import block_plane
 from pipeline.roof.facades import Eave, FacadePoints, at_walls, eave_of, mean_overhang_m
 from pipeline.roof.plan import partition_roof, roof_points
@@ -212,7 +213,7 @@ def test_scanned_buildings_without_overhangs_keep_their_true_area() -> None:
             beside=xyz[~own & (of == 1)],
             beside_later=xyz[~own & (of > 1) & (order == of)],
         )
-        bare = roof_points(candidate, settings)
+        bare = roof_points(prepare_cloud(candidate), settings)
         labelled = dataclasses.replace(bare, labels=np.zeros(len(bare.points), np.int32))
         planes = [block_plane(bare.points, floor, 70.0)]
         at_eaves = partition_roof(dataclasses.replace(labelled, facades=None), planes, settings).outline_mm

@@ -10,6 +10,7 @@ import pytest
 import shapely
 
 from pipeline.model import Candidate
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.roof.block import block_plane
 from pipeline.roof.plan import partition_roof, roof_points
 from pipeline.roof.settings import RoofSettings
@@ -46,7 +47,7 @@ def outlines(density: float, beam_radius_m: float, *, tell_returns: bool = True)
             ground_z_m=float(xyz[roof, 2].min()) - 3.0,
             split_returns=xyz[split] if tell_returns else np.zeros((0, 3)),
         )
-        bare = roof_points(candidate, settings)
+        bare = roof_points(prepare_cloud(candidate), settings)
         plane = block_plane(bare.points, candidate.ground_z_m, 70.0)
         labelled = dataclasses.replace(bare, labels=np.zeros(len(bare.points), np.int32))
         drawn_mm = partition_roof(labelled, [plane], settings).outline_mm

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import BuildingError
 from pipeline.model import Candidate, IntArray, LabelArray, Plane, Reason, Solid, Tin
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
 from pipeline.roof.partition import RoofPartition, absorb_small_regions, connected_regions, march
 from pipeline.roof.plan import level_unsupported_faces, partition_roof, plan_forms, roof_points
@@ -256,7 +257,7 @@ def test_random_labels_and_planes_always_give_some_valid_form(seed: int, with_fo
         footprint=footprint if with_footprint else None,
     )
     roof_settings = RoofSettings()
-    roof = roof_points(candidate, roof_settings)
+    roof = roof_points(prepare_cloud(candidate), roof_settings)
     roof = dataclasses.replace(roof, labels=labels[roof.index])
     if not (roof.labels >= 0).any():
         return

@@ -12,7 +12,7 @@ from candidates_by_hand import candidate
 from pipeline import reconstruct
 from pipeline.errors import SettingsError
 from pipeline.methods import LODS, Method, ReconstructSettings
-from pipeline.model import BuildingResult, Candidate, Reason, RoofType, Segmentation, Status
+from pipeline.model import BuildingResult, Candidate, PreparedCloud, Reason, RoofType, Segmentation, Status
 from pipeline.parameters import Parameters
 from pipeline.quality.validity import check_solid
 from pipeline.reconstruct import reconstruct_building
@@ -31,8 +31,8 @@ def house(n: int = 2_400, seed: int = 0) -> Candidate:
 def planeless(monkeypatch: pytest.MonkeyPatch) -> None:
     """Makes a method of the name `planeless`, which finds no plane."""
 
-    def segment(candidate: Candidate, _: Parameters) -> Segmentation:
-        return Segmentation(planes=(), labels=np.full(len(candidate.points), -1, np.int32))
+    def segment(cloud: PreparedCloud, _: Parameters) -> Segmentation:
+        return Segmentation(planes=(), labels=np.full(len(cloud.points), -1, np.int32))
 
     method = Method(name="planeless", settings_type=Parameters, segment=segment)
     monkeypatch.setattr(reconstruct, "method_named", lambda _: method)

@@ -39,7 +39,12 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Install:
     """`stub(function)` makes a segmentation function the method `stub`."""
 
     def install(segment: Callable[[Candidate], Segmentation]) -> None:
-        method = Method(name="stub", settings_type=Parameters, segment=lambda c, _: segment(c), faithful=Parameters())
+        method = Method(
+            name="stub",
+            settings_type=Parameters,
+            segment=lambda cloud, _: segment(cloud.candidate),
+            faithful=Parameters(),
+        )
         monkeypatch.setattr(reconstruct, "method_named", lambda _: method)
 
     return install

@@ -54,10 +54,10 @@ def test_one_broken_building_costs_only_itself(suburb: Path, reconstruct: Any, m
     def sabotaged(name: str) -> Any:
         method = real(name)
 
-        def segment(candidate: Any, settings: Any) -> Any:
-            if candidate.building_id == victim:
+        def segment(cloud: Any, settings: Any) -> Any:
+            if cloud.candidate.building_id == victim:
                 raise ZeroDivisionError("on purpose")
-            return method.segment(candidate, settings)
+            return method.segment(cloud, settings)
 
         return type(method)(**{**vars(method), "segment": segment})
 

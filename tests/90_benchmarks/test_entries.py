@@ -23,7 +23,8 @@ from benchmarks.entries import (
 from benchmarks.method_times import ClockedSettings
 from benchmarks.ruler import cell, methods_table
 from pipeline.methods import METHODS, Method, ReconstructSettings
-from pipeline.model import Candidate, Segmentation
+from pipeline.model import Candidate, PreparedCloud, Segmentation
+from pipeline.prepared_cloud import prepare_cloud
 from pipeline.ruler.simulation.sweep import CELLS
 from pipeline.runtime.compare import Variant, settings_of
 
@@ -66,7 +67,7 @@ def test_the_clock_stands_within_the_segmentation_and_changes_nothing() -> None:
     settings_type = METHODS["fuzzy-sart"].settings_type
     answer = Segmentation(planes=(), labels=np.zeros(0, np.int32))
 
-    def segment(candidate: Candidate, settings: object) -> Segmentation:
+    def segment(cloud: PreparedCloud, settings: object) -> Segmentation:
         assert isinstance(settings, settings_type)
         until = time.process_time() + 0.02
         while time.process_time() < until:
@@ -79,8 +80,8 @@ def test_the_clock_stands_within_the_segmentation_and_changes_nothing() -> None:
     )
     clocked = ClockedSettings()
     assert isinstance(clocked, ReconstructSettings)
-    assert clocked.segmentation(method)(candidate) is answer
-    assert clocked.segmentation(method)(candidate) is answer
+    assert clocked.segmentation(method)(prepare_cloud(candidate)) is answer
+    assert clocked.segmentation(method)(prepare_cloud(candidate)) is answer
     assert len(clocked.clocked) == 2
     assert all(seconds >= 0.02 for seconds in clocked.clocked)
 

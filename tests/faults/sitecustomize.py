@@ -177,7 +177,7 @@ def wrap(module: ModuleType) -> None:
     """Put faults before the functions of a module that was just executed."""
     if module.__name__ == BUILDINGS:
         # inside what catches a building's own exceptions
-        happen = functools.partial(_of_candidate, at_modelling)
+        happen = functools.partial(_of_building, at_modelling)
         module._reconstruct = before(module._reconstruct, happen)  # type: ignore[attr-defined]
         return
     if module.__name__ == URLS:
@@ -189,8 +189,8 @@ def wrap(module: ModuleType) -> None:
         module.gather = before(module.gather, _gathering)  # type: ignore[attr-defined]
 
 
-def _of_candidate(happen: Callable[[str], None], candidate: Any, *_: Any) -> None:
-    happen(candidate.building_id)
+def _of_building(happen: Callable[[str], None], building: Any, *_: Any) -> None:
+    happen(building.candidate.building_id)
 
 
 def _gathering(scratch: Any, grid: Any, site: Any, *_: Any) -> None:

@@ -1,0 +1,113 @@
+"""The forms that the roof faces of a building can take, the most wanted first.
+
+A form is a function that draws the faces when it is called: a later one costs nothing where an earlier one is valid.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+
+import shapely
+from shapely import MultiPolygon
+
+from pipeline.errors import BuildingError
+from pipeline.model import Plane
+from pipeline.roof.footprint import simpler_outlines
+from pipeline.roof.partition import RoofPartition
+from pipeline.roof.plan import RoofPlan, RoofPoints, arranged_faces, drawn_outline, partition_roof, plan_forms
+from pipeline.roof.settings import ArrangementSettings, RoofSettings
+from pipeline.roof.templates.fitting import MAX_POINTS, RankedFaces, Templates, fit_templates, margin_of_templates
+from pipeline.roof.voids import without_voids
+
+FaceForm = Callable[[], RoofPartition | RankedFaces]
+"""Draws roof faces, over the planes of the segmentation or over planes of their own."""
+
+UNDRAWABLE = (BuildingError, shapely.errors.GEOSException)
+"""Raised by a form that cannot be drawn."""
+
+_WIDER_CLEARANCES = (2.5, 4.0)
+"""Times the usual distances between an arrangement's vertices. Not settings: tried only where the usual distances made
+no valid solid."""
+
+
+def arranged_forms(
+    roof: RoofPoints, planes: Sequence[Plane], settings: RoofSettings, costs: ArrangementSettings
+) -> Iterator[FaceForm]:
+    """The arrangement; behind it coarser ones and the traced faces, drawn only where no solid of it is valid.
+
+    Where points are few, templates compete with the arrangement: the better go first, worse ones last of all. Given
+    outlines of many short edges are made simpler before faces are traced: those are drawn back to be valid.
+    """
+    outline_mm = drawn_outline(roof, settings)
+    if roof.footprint_mm is not None:
+        outline_mm = without_voids(outline_mm, roof.points, roof.spacing_m, settings)
+    first, last = _competing_forms(roof, planes, outline_mm, settings, costs)
+    yield from first
+    # many planes that meet nearly in one point: with more room between its vertices the solid is valid
+    for clearance in _WIDER_CLEARANCES:
+        yield partial(arranged_faces, roof, planes, outline_mm, costs, clearance)
+    if roof.footprint_mm is not None:
+        for simpler in simpler_outlines(outline_mm):
+            yield from _competing_forms(roof, planes, simpler, settings, costs)[0]
+    try:
+        plan = partition_roof(roof, planes, settings)
+    except BuildingError:
+        if not last:
+            raise
+    else:
+        yield from traced_forms(plan, roof, settings)
+    yield from last
+
+
+def traced_forms(plan: RoofPlan, roof: RoofPoints, settings: RoofSettings) -> Iterator[FaceForm]:
+    """The traced faces; behind them the same within simpler outlines, where the outline is given."""
+    yield from plan_forms(plan, roof, settings)
+    if roof.footprint_mm is not None:
+        for simpler in simpler_outlines(plan.outline_mm):
+            yield from plan_forms(dataclasses.replace(plan, outline_mm=simpler), roof, settings)
+
+
+def template_forms(roof: RoofPoints, lack: BuildingError, settings: RoofSettings) -> Iterator[FaceForm]:
+    """The templates alone, where no planes were found; raises `lack` where there are no templates either."""
+    if len(roof.points) > MAX_POINTS:
+        raise lack
+    try:
+        outline_mm = drawn_outline(roof, settings)
+        templates = fit_templates(roof.points, outline_mm)
+    except UNDRAWABLE:
+        raise lack from None
+    yield templates.faces
+    if roof.footprint_mm is not None:
+        for simpler in simpler_outlines(outline_mm):
+            with contextlib.suppress(*UNDRAWABLE):
+                yield fit_templates(roof.points, simpler).faces
+
+
+def _competing_forms(
+    roof: RoofPoints,
+    planes: Sequence[Plane],
+    outline_mm: MultiPolygon,
+    settings: RoofSettings,
+    costs: ArrangementSettings,
+) -> tuple[tuple[FaceForm, ...], tuple[FaceForm, ...]]:
+    """The arrangement within an outline and, where points are few, the templates: what goes first, what last."""
+    arranged = partial(arranged_faces, roof, planes, outline_mm, costs)
+    if roof.spacing_m < settings.templates_spacing_m or len(roof.points) > MAX_POINTS:
+        return (arranged,), ()
+    templates: Templates | None = None
+    with contextlib.suppress(*UNDRAWABLE):
+        templates = fit_templates(roof.points, outline_mm)
+    if templates is None:
+        return (arranged,), ()
+    try:
+        drawn = arranged()
+    except UNDRAWABLE:
+        return (templates.faces,), ()
+    drawn_planes = drawn.planes or tuple(planes)
+    margin = margin_of_templates(roof.points, templates, drawn, drawn_planes)
+    own = RankedFaces(partition=drawn, planes=drawn_planes, labels=roof.labels, bic_margin=-margin)
+    form = partial(templates.faces, margin)
+    return ((form, lambda: own), ()) if margin > 0.0 else ((lambda: own,), (form,))
