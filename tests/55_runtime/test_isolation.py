@@ -23,7 +23,7 @@ from faults.asked import environment
 
 import pipeline.reconstruct
 from pipeline.errors import RunCancelledError, RunError, SettingsError
-from pipeline.model import Candidate, Reason
+from pipeline.model import Reason
 from pipeline.runtime.isolation import child_main, child_pool
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
 from pipeline.runtime.isolation.messages import Frames, frame
@@ -363,10 +363,10 @@ def test_a_building_that_meets_a_fault_of_ours_is_kept_with_and_without_a_child(
         monkeypatch.setenv(name, value)
     real = pipeline.reconstruct._reconstruct
 
-    def faulty(candidate: Candidate, *rest: Any) -> Any:
-        if candidate.building_id == victim:
+    def faulty(building: Any, *rest: Any, **options: Any) -> Any:
+        if building.candidate.building_id == victim:
             raise ZeroDivisionError("on purpose")
-        return real(candidate, *rest)
+        return real(building, *rest, **options)
 
     monkeypatch.setattr(pipeline.reconstruct, "_reconstruct", faulty)
     summary = reconstruct(suburb, isolate=isolate)
