@@ -1,7 +1,4 @@
-"""Schedules: frozen records of what is to run again and again, and of what became of each of its times.
-
-No SQL, no HTTP; when something is due, and what becomes of it, is told by `pipeline.schedule`.
-"""
+"""The service's schedules: what `pipeline.schedule` has, and the jobs. No SQL, no HTTP."""
 
 from __future__ import annotations
 
@@ -9,58 +6,34 @@ import dataclasses
 import datetime as dt
 from enum import StrEnum
 
-from pipeline.schedule import Cron, Missed, Overlap
+from pipeline.schedule import Entry, Outcome, Rules
 from service.jobs import JobRequest
 
-
-class Outcome(StrEnum):
-    """What became of a slot, or of a run by hand."""
-
-    SUBMITTED = "submitted"
-    """A job was made."""
-    WAITING = "waiting"
-    """It waits for the job before it to end."""
-    SKIPPED = "skipped"
-    """The job before it was under way."""
-    MISSED = "missed"
-    """Nobody saw it in time, or a later slot took its place."""
-    FAILED = "failed"
-    """No job could be made; the message tells why."""
-
-
-COUNTED = tuple(outcome for outcome in Outcome if outcome is not Outcome.WAITING)
+OUTCOMES = (Outcome.SUBMITTED, Outcome.WAITING, Outcome.SKIPPED, Outcome.MISSED, Outcome.FAILED)
+"""What may become of a slot of the service, or of a run by hand."""
+COUNTED = tuple(outcome for outcome in OUTCOMES if outcome is not Outcome.WAITING)
 """Outcomes that are final."""
 
 
 class Trigger(StrEnum):
-    """What made a run."""
+    """What caused a run."""
 
     CLOCK = "clock"
     """Its time had come."""
     HAND = "hand"
-    """A client asked for it."""
+    """A client requested it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Definition:
-    """What a client says about a schedule; checked already."""
+class Definition(Rules):
+    """A schedule as the client defines it; checked already."""
 
     title: str | None = None
-    """The user's words; also the title of its jobs, where the request has none."""
-    cron: Cron
-    """When it is due."""
+    """A text by the user; also the title of its jobs if the request has none."""
     request: JobRequest
-    """What each of its jobs is to do."""
+    """The request of each of its jobs."""
     priority: int = 0
-    """Of its jobs; higher goes first."""
-    missed: Missed = Missed.RUN_LATEST
-    """What becomes of slots that are seen too late."""
-    grace_s: float = 300.0
-    """How late a slot may be seen and still count as seen in time."""
-    overlap: Overlap = Overlap.SKIP
-    """What becomes of a slot that comes while a job of this schedule is under way."""
-    is_paused: bool = False
-    """Whether the clock is left alone; a run by hand is still possible."""
+    """Priority of its jobs; higher runs first."""
 
     def job_request(self) -> JobRequest:
         """The request of the next job."""
@@ -68,31 +41,17 @@ class Definition:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ScheduleRun:
-    """What became of a slot, of a stretch of slots that were missed together, or of a run by hand."""
+class ScheduleRun(Entry):
+    """An entry in the history of a schedule."""
 
     schedule_id: str
-    """Whose."""
+    """The schedule."""
     number: int
     """Counts up within the schedule, from 1."""
     trigger: Trigger
-    """What made it."""
-    outcome: Outcome
-    """What became of it."""
-    slot: dt.datetime | None
-    """When it was due, of a stretch the last one; None of a run by hand."""
-    first_slot: dt.datetime | None = None
-    """The first slot of a stretch; None of a single one."""
-    slots: int = 1
-    """How many slots a stretch has."""
-    is_counted: bool = True
-    """Whether `slots` is exact; else there are more."""
+    """What caused it."""
     job_id: str | None = None
-    """The job that was made, or the one that was under way; it may be gone by now."""
-    at: dt.datetime
-    """When this was decided."""
-    message: str = ""
-    """Why, in a sentence."""
+    """The job that was made, or the one that was under way; it may be removed by now."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -102,22 +61,22 @@ class Schedule:
     schedule_id: str
     """32 hexadecimal digits, random: it cannot be guessed."""
     owner: str | None
-    """Id of the key that made it; its jobs belong to the same key. None where keys are not used."""
+    """Id of the key that made it; its jobs belong to the same key. None if keys are not used."""
     definition: Definition
-    """What the client says."""
+    """The client's part."""
     version: int
     """Counts the client's changes, from 1."""
     created_at: dt.datetime
-    """With a time zone, as all times here."""
+    """With a time zone, like all times here."""
     updated_at: dt.datetime
-    """When the client changed it last."""
+    """Time of the client's last change."""
     decided_until: dt.datetime
-    """Up to when all its slots are decided."""
+    """Time up to which all slots are decided."""
     next_at: dt.datetime | None
-    """When it is looked at again; None while it is paused."""
+    """Time of the next look; None while it is paused."""
     waiting_slot: dt.datetime | None = None
     """The slot that waits for a job to end."""
     counts: dict[Outcome, int] = dataclasses.field(default_factory=dict)
-    """Slots and runs by hand by their outcome, since the schedule was made."""
+    """Slots and runs by hand by outcome, since the schedule was made."""
     last_run: ScheduleRun | None = None
-    """The latest one for which a job was made."""
+    """The latest one that made a job."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime as dt
 import sys
 
-from service.schedules import Outcome
+from pipeline.schedule import Outcome
 from service.store import JobStore
 
 
@@ -19,7 +19,7 @@ def main(url: str, start: dt.datetime, step: dt.timedelta, ticks: int, lap: int)
     with JobStore(url) as store:
         for number in range(ticks):
             if number % lap == 0 and not sys.stdin.readline():
-                sys.exit("nobody is there any more")
+                sys.exit("the test has ended")
             told = store.schedules.tick(now=start + number * step, max_queued=10**6, max_queued_per_key=10**6)
             for run in told:
                 if run.outcome is Outcome.SUBMITTED and run.job_id is not None:

@@ -27,7 +27,7 @@ from pipeline.export.mesh_kinds import MESHES
 from pipeline.parameters import Parameters, build, parameter
 from pipeline.runtime.cluster.tls import given_tls
 from pipeline.runtime.isolation.isolated_items import IsolationLimits
-from pipeline.schedule import Cron, Missed, Overlap
+from pipeline.schedule import Cron, Missed, Overlap, Rules
 from pipeline.settings import RunSettings
 
 if TYPE_CHECKING:
@@ -128,6 +128,17 @@ class ScheduleTable(Parameters):
         maximum=86_400.0,
     )
     paused: bool = parameter(False, "Leave the clock alone.")
+
+    @property
+    def rules(self) -> Rules:
+        """As the scheduler reads it; only if it has times."""
+        return Rules(
+            cron=Cron(self.cron, self.time_zone),
+            missed=Missed(self.missed),
+            grace_s=self.grace_s,
+            overlap=Overlap(self.overlap),
+            is_paused=self.paused,
+        )
 
 
 TABLES: Mapping[str, type[Parameters]] = {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import functools
-import json
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -83,7 +82,7 @@ def schedule(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> 
     """Run a batch at the times of its table [schedule], until this command is ended; a missed time is told."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.batch.batch_file import read_batch
-        from pipeline.batch.scheduled import Ending, keep_schedule, start_run
+        from pipeline.batch.schedule_process import Ending, keep_schedule, start_run
 
         ending = Ending()
         _end_by_signals(ending.set)
@@ -104,28 +103,27 @@ def _end_by_signals(end: Callable[[], None]) -> None:
 
 def _scheduled(batch: Batch) -> dict[str, Any] | None:
     """What is remembered of a batch's times, as plain JSON values."""
-    from pipeline.batch.schedule_state import read_schedule
+    from pipeline.batch.schedule_file import read_schedule
 
     state = read_schedule(batch.work_folder)
-    return None if state is None else json.loads(state.to_json())
+    return None if state is None else state.as_dict()
 
 
 def _times(batch: Batch) -> list[tuple[str, str]]:
     """The next times, and what became of the last one."""
-    from pipeline.batch.schedule_state import read_schedule
-    from pipeline.schedule import Cron
+    from pipeline.batch.schedule_file import iso, read_schedule
 
     if not batch.schedule.cron:
         return []
     told = "paused"
     if not batch.schedule.paused:
-        cron = Cron(batch.schedule.cron, batch.schedule.time_zone)
-        told = ", ".join(f"{at:%Y-%m-%d %H:%M %Z}" for at in cron.next_times(dt.datetime.now(tz=dt.UTC), _NEXT))
+        times = batch.schedule.rules.cron.next_times(dt.datetime.now(tz=dt.UTC), _NEXT)
+        told = ", ".join(f"{at:%Y-%m-%d %H:%M %Z}" for at in times)
     rows = [("next times", told)]
     state = read_schedule(batch.work_folder)
     if state is not None and state.entries:
         last = state.entries[-1]
-        rows.append(("last time", f"{last.slot}: {last.outcome.value}{last.message and ', '}{last.message}"))
+        rows.append(("last time", f"{iso(last.slot)}: {last.outcome.value}{last.message and ', '}{last.message}"))
         rows.append(("times so far", ", ".join(f"{count} {name}" for name, count in state.counts.items())))
     return rows
 

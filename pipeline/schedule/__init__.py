@@ -1,8 +1,40 @@
-"""When something is to run again: cron times in a time zone, and what becomes of each. Pure; time is an argument."""
+"""The scheduler of batches and of the service: cron times, decisions, state, history. Pure; time is an argument."""
 
 from pipeline.schedule.cron import Cron
-from pipeline.schedule.decisions import Decision, Missed, Overlap, decide
+from pipeline.schedule.decisions import Decision, Missed, Overlap, Rules, decide
 from pipeline.schedule.slots import PassedSlots, passed_slots
+from pipeline.schedule.state import (
+    Entry,
+    Look,
+    Outcome,
+    ScheduleBook,
+    ScheduleState,
+    enter,
+    look,
+    miss_passed,
+    miss_waiting,
+    utc,
+)
 from pipeline.schedule.time_zones import time_zone
 
-__all__ = ["Cron", "Decision", "Missed", "Overlap", "PassedSlots", "decide", "passed_slots", "time_zone"]
+__all__ = [
+    "Cron",
+    "Decision",
+    "Entry",
+    "Look",
+    "Missed",
+    "Outcome",
+    "Overlap",
+    "PassedSlots",
+    "Rules",
+    "ScheduleBook",
+    "ScheduleState",
+    "decide",
+    "enter",
+    "look",
+    "miss_passed",
+    "miss_waiting",
+    "passed_slots",
+    "time_zone",
+    "utc",
+]

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 from pipeline.errors import ClusterError
+from pipeline.schedule import Outcome
 from service.driver.attempt import Tools, Workshop
 from service.driver.clusters import SharedCluster
 from service.driver.endings import FIRST_PAUSE_S, LONGEST_PAUSE_S, Attempts
@@ -22,7 +23,6 @@ from service.driver.janitor import tidy
 from service.driver.logs import configure, quieten
 from service.errors import LeaseLostError, StoreError
 from service.files import StateFolder
-from service.schedules import Outcome
 from service.settings import ServiceSettings
 from service.store import JobStore
 

@@ -63,25 +63,9 @@ def event_of(row: sa.Row[Any]) -> JobEvent:
 
 def upload_of(row: sa.Row[Any]) -> Upload:
     """A row of `uploads`."""
-    return Upload(
-        upload_id=row.upload_id,
-        owner=row.owner,
-        filename=row.filename,
-        size_bytes=row.size_bytes,
-        sha256=row.sha256,
-        created_at=row.created_at,
-        expires_at=row.expires_at,
-        preflight=row.preflight,
-    )
+    return Upload(**row._asdict())
 
 
 def key_of(row: sa.Row[Any]) -> Key:
     """A row of `keys`."""
-    return Key(
-        key_id=row.key_id,
-        name=row.name,
-        digest=row.digest,
-        scopes=frozenset(Scope(scope) for scope in row.scopes),
-        created_at=row.created_at,
-        revoked_at=row.revoked_at,
-    )
+    return Key(**row._asdict() | {"scopes": frozenset(Scope(scope) for scope in row.scopes)})

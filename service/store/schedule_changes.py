@@ -1,7 +1,9 @@
-"""Schedules as clients make, change and remove them. Within a transaction."""
+"""What clients do with schedules: make, change, remove. Within a transaction."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import datetime as dt
 import uuid
 from typing import Any
@@ -10,9 +12,9 @@ import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
 from pipeline.errors import SettingsError
-from pipeline.schedule import Cron, passed_slots
+from pipeline.schedule import Cron, Rules, enter, look, miss_passed
 from service.errors import ChangedMeanwhileError, TooManySchedulesError
-from service.schedules import Definition, Outcome
+from service.schedules import Definition
 from service.store.records import storable
 from service.store.schedules import COLUMN_OF, lock
 from service.store.slot_book import SlotBook
@@ -26,7 +28,7 @@ def insert(connection: Connection, definition: Definition, *, owner: str | None,
     Raises
     ------
     TooManySchedulesError
-        The key has as many as it may have.
+        The key already has the most that it may have.
     NoSuchUploadError
         It names an upload that is gone.
     """
@@ -65,9 +67,9 @@ def change(
     version: int,
     now: dt.datetime,
 ) -> None:
-    """Change what the client says, if nobody else did since.
+    """Change what the client defines, if the version is still the one that the client saw.
 
-    Where the times change, slots that have passed undecided are missed.
+    If the times change, slots that have passed undecided are missed.
 
     Raises
     ------
@@ -84,42 +86,25 @@ def change(
             f"schedule {schedule_id} has version {row.version}, the change is for version {version}: "
             "read it again, then change it"
         )
-    book = SlotBook(connection, row, now)
+    book = SlotBook(connection, row)
     values = _columns(definition) | {"version": version + 1, "updated_at": now}
     if _times_of(definition) != (row.cron, row.time_zone, row.is_paused):
-        _miss_passed(book)
-        # a clock that was put back brings no slot a second time
-        decided_until = max(now, row.decided_until)
-        values |= {"decided_until": decided_until, "next_at": _next_at(definition, decided_until)}
-    if definition.is_paused and row.waiting_slot is not None:
-        book.add(Outcome.MISSED, row.waiting_slot, message="the schedule was paused while this slot waited")
-        values["waiting_slot"] = None
-    book.close(**values)
+        # a time zone that this machine does not know is changed for that very reason
+        with contextlib.suppress(SettingsError):
+            before = Rules(cron=Cron(row.cron, row.time_zone), is_paused=row.is_paused)
+            why = "not decided before the times of the schedule were changed"
+            enter(book, miss_passed(book.state, before, now, why))
+        book.state = dataclasses.replace(book.state, decided_until=max(now, row.decided_until))
+        if definition.is_paused:
+            enter(book, look(book.state, definition, now, under_way=None))
+        values["next_at"] = _next_at(definition, book.state.decided_until)
+    book.save(**values)
     connection.execute(sa.delete(SCHEDULE_UPLOADS).where(SCHEDULE_UPLOADS.c.schedule_id == schedule_id))
     _need_uploads(connection, schedule_id, definition)
 
 
-def _miss_passed(book: SlotBook) -> None:
-    """Tell the slots that have passed by the times that are to be changed, and that no driver saw."""
-    row = book.row
-    try:
-        passed = None if row.is_paused else passed_slots(Cron(row.cron, row.time_zone), row.decided_until, book.now)
-    except SettingsError:
-        # a zone that this machine does not know: it is changed for that very reason
-        return
-    if passed is not None:
-        book.add(
-            Outcome.MISSED,
-            passed.latest,
-            first_slot=passed.first,
-            slots=passed.earlier + 1,
-            is_counted=passed.is_counted,
-            message="no driver looked before the times of the schedule were changed",
-        )
-
-
 def remove(connection: Connection, schedule_id: str, owner: str | None) -> None:
-    """Forget a schedule and what became of its slots; its jobs stay.
+    """Delete a schedule and its history; its jobs stay.
 
     Raises
     ------
@@ -132,7 +117,7 @@ def remove(connection: Connection, schedule_id: str, owner: str | None) -> None:
 
 
 def _columns(definition: Definition) -> dict[str, Any]:
-    """What the client says, as columns."""
+    """The client's part, as columns."""
     cron, zone, is_paused = _times_of(definition)
     return {
         "title": None if definition.title is None else storable(definition.title),
@@ -149,7 +134,7 @@ def _columns(definition: Definition) -> dict[str, Any]:
 
 
 def _times_of(definition: Definition) -> tuple[str, str, bool]:
-    """What decides when it is due, as columns: cron, time zone, whether it is paused."""
+    """The columns that decide when it is due: cron, time zone, whether it is paused."""
     cron = definition.cron
     return storable(cron.expression, 200), storable(cron.time_zone, 128), definition.is_paused
 

@@ -1,4 +1,4 @@
-"""The schedules of a store: every method is one transaction, committed when it returns."""
+"""The schedules of a store. Every method is one transaction, committed when it returns."""
 
 from __future__ import annotations
 
@@ -6,21 +6,22 @@ import builtins
 import datetime as dt
 import functools
 
+from pipeline.schedule import Outcome
 from service.jobs import Job
-from service.schedules import Definition, Outcome, Schedule, ScheduleRun
+from service.schedules import Definition, Schedule, ScheduleRun
 from service.store import queries, schedule_changes, schedules, ticks
 from service.store.database import LOCK_SUBMISSIONS, Database
 from service.store.schedules import ScheduleFilter
-from service.store.ticks import LineLimits
+from service.store.ticks import QueueLimits
 
-MAX_A_TICK = 200
+MAX_PER_TICK = 200
 """Schedules that one tick decides; the next tick goes on."""
 
 
 class ScheduleStore:
-    """Schedules and what became of their slots; `JobStore.schedules`.
+    """Schedules and their history; `JobStore.schedules`.
 
-    The time is the database's: replicas whose clocks differ agree on what is due.
+    It goes by the clock of the database: replicas whose clocks differ agree on what is due.
 
     Parameters
     ----------
@@ -39,21 +40,21 @@ class ScheduleStore:
         Parameters
         ----------
         definition : Definition
-            What is to be run, and when; checked already.
+            Checked already.
         owner : str or None
-            The key that makes it; None where keys are not used.
+            The key that makes it; None if keys are not used.
         most : int
-            How many schedules the key may have, or all may have together where keys are not used.
+            Most schedules of the key, or in total if keys are not used.
 
         Raises
         ------
         TooManySchedulesError
-            The key has as many as it may have.
+            The key already has the most that it may have.
         NoSuchUploadError
             The request names an upload that is gone.
         """
         with self._database.write() as connection:
-            # counting and adding: nobody else adds in between
+            # no other process adds one between counting and adding
             self._database.lock(connection, LOCK_SUBMISSIONS)
             now = self._database.now(connection)
             schedule_id = schedule_changes.insert(connection, definition, owner=owner, most=most, now=now)
@@ -76,10 +77,9 @@ class ScheduleStore:
             return schedules.listed(connection, criteria)
 
     def change(self, schedule_id: str, definition: Definition, *, version: int, owner: str | None = None) -> Schedule:
-        """Change what the client says of a schedule whose version the client saw.
+        """Change what the client defines, if the version is still the one that the client saw.
 
-        Where the times change, they count from now on; slots that have passed by the old times, and that no driver saw,
-        are told as missed.
+        New times count from now on; slots of the old times that have passed undecided are missed.
 
         Raises
         ------
@@ -96,7 +96,7 @@ class ScheduleStore:
             return schedules.get(connection, schedule_id, owner)
 
     def remove(self, schedule_id: str, *, owner: str | None = None) -> None:
-        """Forget a schedule and what became of its slots; its jobs stay, one that runs goes on.
+        """Delete a schedule and its history; its jobs stay, and one that runs goes on.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class ScheduleStore:
     def runs(
         self, schedule_id: str, *, owner: str | None = None, limit: int = 100, offset: int = 0
     ) -> builtins.list[ScheduleRun]:
-        """What became of a schedule's slots and runs by hand, latest first.
+        """The history of a schedule, latest first.
 
         Raises
         ------
@@ -147,21 +147,21 @@ class ScheduleStore:
     def tick(
         self, *, max_queued: int, max_queued_per_key: int, now: dt.datetime | None = None
     ) -> builtins.list[ScheduleRun]:
-        """Decide every slot that has passed: make jobs, skip, or tell what was missed. Any number of drivers may do so.
+        """Decide every slot that has passed. Any number of drivers may do so at once.
 
         Each schedule is a transaction of its own, in which its slots are decided and its job is made.
 
         Parameters
         ----------
         max_queued, max_queued_per_key : int
-            Most jobs that may wait, of all and of one key.
+            Most jobs that may wait, in total and per key.
         now : datetime, optional
             The present; by default the database's clock, read once.
 
         Returns
         -------
         list of ScheduleRun
-            What became of the slots that this call decided.
+            New history.
         """
         # most looks find nothing: they take no lock
         with self._database.read() as connection:
@@ -169,15 +169,15 @@ class ScheduleStore:
             if not ticks.something_is_due(connection, at):
                 return []
         limits = self._limits(max_queued, max_queued_per_key)
-        told: list[ScheduleRun] = []
-        for _ in range(MAX_A_TICK):
+        added: list[ScheduleRun] = []
+        for _ in range(MAX_PER_TICK):
             with self._database.write() as connection:
                 found = ticks.decide_first(connection, now=at, limits=limits)
             if found is None:
                 break
-            told += found
-        return told
+            added += found
+        return added
 
-    def _limits(self, max_queued: int, max_queued_per_key: int) -> LineLimits:
+    def _limits(self, max_queued: int, max_queued_per_key: int) -> QueueLimits:
         lock = functools.partial(self._database.lock, number=LOCK_SUBMISSIONS)
-        return LineLimits(max_queued=max_queued, max_queued_per_key=max_queued_per_key, lock=lock)
+        return QueueLimits(max_queued=max_queued, max_queued_per_key=max_queued_per_key, lock=lock)

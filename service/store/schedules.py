@@ -1,4 +1,4 @@
-"""Reading schedules and what became of their slots. Within a transaction."""
+"""Reads schedules and their history. Within a transaction."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any, Literal
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from pipeline.schedule import Cron, Missed, Overlap
+from pipeline.schedule import Cron, Missed, Outcome, Overlap
 from service.errors import NoSuchScheduleError
 from service.files import is_id
 from service.jobs import JobRequest, JobStatus
-from service.schedules import COUNTED, Definition, Outcome, Schedule, ScheduleRun, Trigger
+from service.schedules import Definition, Schedule, ScheduleRun, Trigger
 from service.store.records import storable
 from service.store.tables import JOBS, SCHEDULE_RUNS, SCHEDULES
 
@@ -22,7 +22,7 @@ COLUMN_OF = {
     Outcome.MISSED: "missed_slots",
     Outcome.FAILED: "failed",
 }
-"""The columns that count slots, by outcome."""
+"""The columns that count slots, by final outcome."""
 
 _NOT_OVER = [status.value for status in JobStatus if not status.is_over]
 
@@ -32,11 +32,11 @@ class ScheduleFilter:
     """Which schedules to list."""
 
     owner: str | None = None
-    """Only this key's; None for everybody's."""
+    """Only schedules of this key; None for all."""
     state: Literal["active", "paused"] | None = None
-    """Only these; None for all."""
+    """Only schedules in this state; None for all."""
     process_id: str | None = None
-    """Only of this process."""
+    """Only schedules of this process."""
     limit: int = 100
     """Most schedules to list."""
     offset: int = 0
@@ -44,7 +44,7 @@ class ScheduleFilter:
 
 
 def lock(connection: Connection, schedule_id: str, owner: str | None) -> sa.Row[Any]:
-    """A schedule's row, which nobody else changes until the transaction ends.
+    """A schedule's row, locked until the transaction ends.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def listed(connection: Connection, criteria: ScheduleFilter) -> list[Schedule]:
 
 
 def runs(connection: Connection, schedule_id: str, owner: str | None, *, limit: int, offset: int) -> list[ScheduleRun]:
-    """What became of a schedule's slots, latest first.
+    """The history of a schedule, latest first.
 
     Raises
     ------
@@ -95,13 +95,13 @@ def runs(connection: Connection, schedule_id: str, owner: str | None, *, limit: 
 
 
 def busy_job(connection: Connection, schedule_id: str) -> str | None:
-    """The job of a schedule that is not over; None where there is none."""
+    """The job of a schedule that is not over; None if there is none."""
     active = sa.and_(JOBS.c.schedule_id == schedule_id, JOBS.c.status.in_(_NOT_OVER))
     return connection.execute(sa.select(JOBS.c.job_id).where(active).limit(1)).scalar_one_or_none()
 
 
 def is_busy() -> sa.ColumnElement[bool]:
-    """The same as a condition on rows of `schedules`."""
+    """Whether a schedule has a job that is not over, as a condition on rows of `schedules`."""
     active = sa.and_(JOBS.c.schedule_id == SCHEDULES.c.schedule_id, JOBS.c.status.in_(_NOT_OVER))
     return sa.exists(sa.select(JOBS.c.job_id).where(active))
 
@@ -110,9 +110,9 @@ def counts(connection: Connection) -> tuple[dict[str, int], dict[Outcome, int]]:
     """Schedules by state, and the slots of all of them by outcome."""
     grouped = sa.select(SCHEDULES.c.is_paused, sa.func.count()).group_by(SCHEDULES.c.is_paused)
     found = {bool(paused): number for paused, number in connection.execute(grouped)}
-    sums = [sa.func.coalesce(sa.func.sum(SCHEDULES.c[COLUMN_OF[outcome]]), 0) for outcome in COUNTED]
+    sums = [sa.func.coalesce(sa.func.sum(SCHEDULES.c[column]), 0) for column in COLUMN_OF.values()]
     slots = connection.execute(sa.select(*sums)).one()
-    by_outcome: dict[Outcome, int] = {outcome: int(number) for outcome, number in zip(COUNTED, slots, strict=True)}
+    by_outcome = {outcome: int(number) for outcome, number in zip(COLUMN_OF, slots, strict=True)}
     return {"active": found.get(False, 0), "paused": found.get(True, 0)}, by_outcome
 
 
@@ -150,19 +150,7 @@ def schedule_of(row: sa.Row[Any], last_run: ScheduleRun | None = None) -> Schedu
 
 def run_of(row: sa.Row[Any]) -> ScheduleRun:
     """A row of `schedule_runs`."""
-    return ScheduleRun(
-        schedule_id=row.schedule_id,
-        number=row.number,
-        trigger=Trigger(row.trigger),
-        outcome=Outcome(row.outcome),
-        slot=row.slot,
-        first_slot=row.first_slot,
-        slots=row.slots,
-        is_counted=row.is_counted,
-        job_id=row.job_id,
-        at=row.at,
-        message=row.message,
-    )
+    return ScheduleRun(**row._asdict() | {"trigger": Trigger(row.trigger), "outcome": Outcome(row.outcome)})
 
 
 def _row(connection: Connection, schedule_id: str, owner: str | None, *, locked: bool) -> sa.Row[Any]:
@@ -176,7 +164,7 @@ def _row(connection: Connection, schedule_id: str, owner: str | None, *, locked:
 
 
 def _last_runs(connection: Connection, schedule_ids: list[str]) -> dict[str, ScheduleRun]:
-    """Of each schedule the latest run for which a job was made."""
+    """The latest run of each schedule that made a job."""
     made = sa.and_(SCHEDULE_RUNS.c.schedule_id.in_(schedule_ids), SCHEDULE_RUNS.c.outcome == Outcome.SUBMITTED.value)
     latest = (
         sa.select(SCHEDULE_RUNS.c.schedule_id, sa.func.max(SCHEDULE_RUNS.c.number).label("number"))

@@ -1,68 +1,66 @@
-"""What becomes of a schedule's slots, written down and counted. Within a transaction that holds the schedule's row."""
+"""The history of a schedule as rows. Within a transaction that holds the schedule's row."""
 
 from __future__ import annotations
 
 import dataclasses
-import datetime as dt
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.engine import Connection
 
-from service.schedules import Outcome, ScheduleRun, Trigger
+from pipeline.schedule import Entry, Outcome, ScheduleState
+from service.schedules import ScheduleRun, Trigger
 from service.store.records import storable
-from service.store.schedules import COLUMN_OF
+from service.store.schedules import COLUMN_OF, busy_job
 from service.store.tables import SCHEDULE_RUNS, SCHEDULES
 
 MAX_KEPT = 1000
-"""Runs of a schedule that are kept; its counts go on."""
+"""Entries per schedule that are stored; the counts include all."""
 
 
 class SlotBook:
-    """Writes down what becomes of one schedule's slots; the row is locked."""
+    """The `ScheduleBook` of one schedule in a database; the schedule's row is locked."""
 
-    def __init__(self, connection: Connection, row: sa.Row[Any], now: dt.datetime) -> None:
+    def __init__(self, connection: Connection, row: sa.Row[Any]) -> None:
         self.connection = connection
         self.row = row
-        self.now = now
-        self.told: list[ScheduleRun] = []
+        self.state = ScheduleState(decided_until=row.decided_until, waiting=row.waiting_slot)
+        self.busy_with = busy_job(connection, row.schedule_id)
+        self.added: list[ScheduleRun] = []
         self._number = row.last_number
         self._counts = {outcome: getattr(row, column) for outcome, column in COLUMN_OF.items()}
 
-    def add(self, outcome: Outcome, slot: dt.datetime | None, *, message: str, **values: Any) -> None:
-        """What became of a slot; of the one that waited, its row changes."""
-        message = storable(message)
-        number = None
-        if slot is not None and slot == self.row.waiting_slot:
-            number = _end_waiting(
-                self.connection,
-                self.row,
-                outcome=outcome,
-                now=self.now,
-                message=message,
-                job_id=values.get("job_id"),
-            )
+    @property
+    def under_way(self) -> str | None:
+        """The schedule's job that is under way, in words."""
+        return None if self.busy_with is None else f"job {self.busy_with} of this schedule"
+
+    def add(self, entry: Entry, *, trigger: Trigger = Trigger.CLOCK, job_id: str | None = None) -> None:
+        """Add to the history. The final entry of a slot that waited changes its row."""
+        if entry.outcome in {Outcome.SKIPPED, Outcome.WAITING}:
+            job_id = self.busy_with
+        clean = dataclasses.replace(entry, message=storable(entry.message))
+        number = self._end_waiting(clean, job_id)
         run = ScheduleRun(
+            **vars(clean),
             schedule_id=self.row.schedule_id,
-            number=self._number + 1 if number is None else number,
-            outcome=outcome,
-            slot=slot,
-            at=self.now,
-            message=message,
-            **{"trigger": Trigger.CLOCK, **values},
+            number=number or self._number + 1,
+            trigger=trigger,
+            job_id=job_id,
         )
         if number is None:
             self._number = run.number
             self.connection.execute(sa.insert(SCHEDULE_RUNS).values(**dataclasses.asdict(run)))
-        if outcome in self._counts:
-            self._counts[outcome] += run.slots
-        self.told.append(run)
+        if run.outcome in self._counts:
+            self._counts[run.outcome] += run.slots
+        self.added.append(run)
 
-    def close(self, **values: Any) -> None:
-        """Write the schedule's own row; forget its oldest runs."""
-        counted = {COLUMN_OF[outcome]: count for outcome, count in self._counts.items()}
+    def save(self, **columns: Any) -> None:
+        """Write the schedule's own row, with further columns; delete its oldest entries."""
+        values = {COLUMN_OF[outcome]: count for outcome, count in self._counts.items()} | columns
+        values |= {"decided_until": self.state.decided_until, "waiting_slot": self.state.waiting}
         one = SCHEDULES.c.schedule_id == self.row.schedule_id
-        self.connection.execute(sa.update(SCHEDULES).where(one).values(last_number=self._number, **counted, **values))
+        self.connection.execute(sa.update(SCHEDULES).where(one).values(last_number=self._number, **values))
         old = sa.and_(
             SCHEDULE_RUNS.c.schedule_id == self.row.schedule_id,
             SCHEDULE_RUNS.c.number <= self._number - MAX_KEPT,
@@ -70,18 +68,11 @@ class SlotBook:
         )
         self.connection.execute(sa.delete(SCHEDULE_RUNS).where(old))
 
-
-def _end_waiting(
-    connection: Connection,
-    row: sa.Row[Any],
-    *,
-    outcome: Outcome,
-    now: dt.datetime,
-    message: str,
-    job_id: str | None = None,
-) -> int:
-    """Tell what became of the slot that waited; the number of its run."""
-    waited = sa.and_(SCHEDULE_RUNS.c.schedule_id == row.schedule_id, SCHEDULE_RUNS.c.slot == row.waiting_slot)
-    told = {"outcome": outcome.value, "at": now, "message": message, "job_id": job_id}
-    connection.execute(sa.update(SCHEDULE_RUNS).where(waited).values(**told))
-    return int(connection.execute(sa.select(SCHEDULE_RUNS.c.number).where(waited)).scalar_one())
+    def _end_waiting(self, entry: Entry, job_id: str | None) -> int | None:
+        """Change the row of the slot that waited; its number, or None if the entry is about another slot."""
+        if entry.slot is None or entry.slot != self.row.waiting_slot:
+            return None
+        waited = sa.and_(SCHEDULE_RUNS.c.schedule_id == self.row.schedule_id, SCHEDULE_RUNS.c.slot == entry.slot)
+        changed = {"outcome": entry.outcome.value, "at": entry.at, "message": entry.message, "job_id": job_id}
+        self.connection.execute(sa.update(SCHEDULE_RUNS).where(waited).values(**changed))
+        return int(self.connection.execute(sa.select(SCHEDULE_RUNS.c.number).where(waited)).scalar_one())

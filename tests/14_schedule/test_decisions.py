@@ -9,14 +9,14 @@ from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.schedule import Cron, Decision, Missed, Overlap, PassedSlots, decide, passed_slots, time_zone
+from pipeline.schedule import Cron, Decision, Missed, Overlap, PassedSlots, Rules, decide, passed_slots, time_zone
 from pipeline.schedule.slots import MAX_COUNTED
 
 HOURLY = Cron("@hourly", "Europe/Amsterdam")
 NIGHTLY = Cron("30 2 * * *", "Europe/Amsterdam")
 NOON = dt.datetime(2026, 1, 1, 12, tzinfo=dt.UTC)
 HOUR = dt.timedelta(hours=1)
-GRACE = dt.timedelta(minutes=5)
+GRACE = dt.timedelta(seconds=Rules.grace_s)
 MOMENT = dt.timedelta(milliseconds=1)
 
 
@@ -73,15 +73,9 @@ def test_a_long_stretch_may_end_long_before_now() -> None:
 
 
 def decided(passed: PassedSlots | None, **options: object) -> Decision:
-    values = {
-        "waiting": None,
-        "is_busy": False,
-        "now": NOON,
-        "missed": Missed.RUN_LATEST,
-        "overlap": Overlap.SKIP,
-        "grace": GRACE,
-    }
-    return decide(passed, **(values | options))  # type: ignore[arg-type]
+    values = {"waiting": None, "is_busy": False, "now": NOON} | options
+    policies = {name: values.pop(name) for name in ("missed", "overlap") if name in values}
+    return decide(passed, Rules(cron=HOURLY, **policies), **values)  # type: ignore[arg-type]
 
 
 def test_a_slot_that_is_seen_in_time_is_run() -> None:

@@ -9,111 +9,94 @@ import os
 import shutil
 import signal
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
+from schedule_contract import HOUR, NOON, ScheduleContract, StoredSchedule
 
-from pipeline.batch import scheduled
-from pipeline.batch.batch_file import Batch, ScheduleTable, read_batch
-from pipeline.batch.schedule_state import KEPT, NAME, Outcome, ScheduleState, look, read_schedule
-from pipeline.batch.scheduled import Ending, keep_schedule
+from pipeline.batch import schedule_file, schedule_process
+from pipeline.batch.batch_file import Batch, read_batch
+from pipeline.batch.schedule_file import MAX_KEPT, NAME, FileBook, ScheduleRecord, read_schedule
+from pipeline.batch.schedule_process import LOCK, RUN_LOCK, Ending, keep_schedule
 from pipeline.errors import RunError, SettingsError
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.scratch.work_folder import held_lock, held_work, make_work
+from pipeline.schedule import Entry, Outcome, ScheduleState
 
 AT = dt.datetime(2026, 3, 1, 2, 0, tzinfo=dt.UTC)
-HOUR = dt.timedelta(hours=1)
 FILE = '[inputs]\npaths = ["tiles"]\n[output]\npath = "models"\n[schedule]\ncron = "0 * * * *"\n'
 
 
-def told(state: ScheduleState) -> list[tuple[str, str | None, int]]:
-    return [(entry.outcome.value, entry.slot, entry.slots) for entry in state.entries]
+class InFile:
+    """A schedule in a work folder, for the contract that all storages of schedules meet."""
+
+    done, max_kept = Outcome.RAN, MAX_KEPT
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[FileBook]:
+        yield FileBook(self._folder, NOON)
+
+    def run(self, book: FileBook, slot: dt.datetime, now: dt.datetime) -> None:
+        book.add(Entry(outcome=self.done, slot=slot, at=now))
+
+    def entries(self) -> list[Entry]:
+        return list(FileBook(self._folder, NOON).record.entries)
+
+    def counts(self) -> Mapping[str, int]:
+        return FileBook(self._folder, NOON).record.counts
 
 
-# --- what becomes of times
+class TestScheduleInAFile(ScheduleContract):
+    """All of the contract, on a file."""
+
+    @pytest.fixture
+    def schedule(self, tmp_path: Path) -> StoredSchedule:
+        return InFile(tmp_path)
 
 
-def test_a_time_that_comes_is_run_once() -> None:
-    state, table = ScheduleState(decided_until=AT - HOUR / 2), ScheduleTable(cron="0 * * * *")
-    state, due = look(state, table, AT + dt.timedelta(seconds=1), is_busy=False)
-    assert due == AT
-    assert look(state, table, AT + dt.timedelta(seconds=2), is_busy=False) == (
-        ScheduleState(decided_until=AT + dt.timedelta(seconds=2)),
-        None,
-    )
+def test_a_file_of_an_earlier_version_is_read_and_continued(tmp_path: Path) -> None:
+    """That version had no `first_slot`, and no entry for a slot that waits."""
+    entry = {"slots": 1, "is_counted": True, "started_at": None, "exit_code": None, "message": ""}
+    missed = entry | {"outcome": "missed", "slot": "2030-06-01T12:00:00+00:00", "at": "2030-06-01T14:00:05+00:00"}
+    written = {
+        "decided_until": "2030-06-01T14:00:05+00:00",
+        "waiting": "2030-06-01T14:00:00+00:00",
+        "running": "2030-06-01T13:00:00+00:00",
+        "times": "0 * * * * UTC",
+        "counts": {"missed": 1},
+        "entries": [missed],
+    }
+    (tmp_path / NAME).write_text(json.dumps(written))
+    book = FileBook(tmp_path, NOON)
+    assert book.state == ScheduleState(decided_until=NOON + dt.timedelta(hours=2, seconds=5), waiting=NOON + 2 * HOUR)
+    assert (book.record.running, book.record.entries[0].slot) == (NOON + HOUR, NOON)
+    assert book.record.as_dict() == written | {"entries": [missed | {"first_slot": None}]}
+    book.add(Entry(outcome=Outcome.MISSED, slot=NOON + 2 * HOUR, at=NOON + 2 * HOUR))
+    book.save()
+    assert FileBook(tmp_path, NOON).record == book.record
 
 
-def test_times_that_nobody_saw_are_missed_and_the_latest_is_run() -> None:
-    state, due = look(
-        ScheduleState(decided_until=AT - 5.5 * HOUR), ScheduleTable(cron="0 * * * *"), AT + HOUR / 2, is_busy=False
-    )
-    assert due == AT
-    assert told(state) == [("missed", "2026-03-01T01:00:00+00:00", 5)]
-    assert state.counts == {"missed": 5}
-
-
-def test_none_is_run_late_where_that_is_not_wanted() -> None:
-    table = ScheduleTable(cron="0 * * * *", missed="skip", grace_s=60.0)
-    state, due = look(ScheduleState(decided_until=AT - HOUR / 2), table, AT + HOUR / 2, is_busy=False)
-    assert due is None
-    assert told(state) == [("missed", "2026-03-01T02:00:00+00:00", 1)]
-
-
-def test_a_time_during_a_run_is_skipped_or_waits() -> None:
-    state, due = look(ScheduleState(decided_until=AT - HOUR), ScheduleTable(cron="0 * * * *"), AT, is_busy=True)
-    assert (due, told(state)) == (None, [("skipped", "2026-03-01T02:00:00+00:00", 1)])
-    waits = ScheduleTable(cron="0 * * * *", overlap="wait")
-    state, due = look(ScheduleState(decided_until=AT - HOUR), waits, AT, is_busy=True)
-    assert (due, state.waiting, told(state)) == (None, AT, [])
-    state, due = look(state, waits, AT + HOUR, is_busy=True)
-    assert (state.waiting, told(state)) == (AT + HOUR, [("missed", "2026-03-01T02:00:00+00:00", 1)])
-    state, due = look(state, waits, AT + 1.1 * HOUR, is_busy=False)
-    assert (due, state.waiting) == (AT + HOUR, None)
-
-
-def test_a_paused_schedule_misses_nothing_but_what_waited() -> None:
-    paused = ScheduleTable(cron="0 * * * *", paused=True)
-    state = ScheduleState(decided_until=AT - HOUR, waiting=AT - HOUR)
-    state, due = look(state, paused, AT + 3 * HOUR, is_busy=False)
-    assert (due, told(state)) == (None, [("missed", "2026-03-01T01:00:00+00:00", 1)])
-    state, due = look(state, ScheduleTable(cron="0 * * * *"), AT + 3.5 * HOUR, is_busy=False)
-    assert (due, len(state.entries)) == (None, 1)
-
-
-def test_a_clock_that_is_put_back_brings_no_time_again() -> None:
-    table = ScheduleTable(cron="0 * * * *")
-    state, due = look(ScheduleState(decided_until=AT - HOUR), table, AT, is_busy=False)
-    assert due == AT
-    state, due = look(state, table, AT - HOUR, is_busy=False)
-    assert (due, state.decided_until) == (None, AT)
-    assert look(state, table, AT + HOUR / 60, is_busy=False)[1] is None
-
-
-@pytest.mark.parametrize("day", ["2026-03-29", "2026-10-25"])
-def test_a_nightly_run_comes_once_on_the_days_that_shift_the_clock(day: str) -> None:
-    table = ScheduleTable(cron="30 2 * * *", time_zone="Europe/Amsterdam")
-    now = dt.datetime.fromisoformat(f"{day}T00:00:00+01:00")
-    state, due = ScheduleState(decided_until=now), []
-    for _ in range(24 * 12):
-        now += dt.timedelta(minutes=5)
-        state, slot = look(state, table, now, is_busy=False)
-        due += [slot] if slot else []
-    assert (len(due), state.entries) == (1, ())
-
-
-def test_what_is_remembered_is_bounded_and_survives_writing() -> None:
-    state, table = ScheduleState(decided_until=AT, running=AT), ScheduleTable(cron="0 * * * *")
-    for k in range(KEPT + 20):
-        state, _ = look(state, table, AT + (k + 1) * HOUR, is_busy=True)
-    assert (len(state.entries), state.counts) == (KEPT, {"skipped": KEPT + 20})
-    assert ScheduleState.from_json(state.to_json()) == state
-    told = json.loads(state.to_json())
-    for damage in ({"running": "2026-03-01T02:00:00"}, {"counts": 7}, {"entries": [{"outcome": "lost"}]}):
-        with pytest.raises(ValueError, match=r"time zone|not iterable|'lost'"):
-            ScheduleState.from_json(json.dumps(told | damage))
-    with pytest.raises(ValueError, match="entries"):
-        ScheduleState.from_json('{"decided_until": "2026-01-01T00:00:00+00:00", "waiting": null, "running": null}')
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        ({"running": "2026-03-01T02:00:00"}, "time zone"),
+        ({"counts": 7}, "not iterable"),
+        ({"entries": [{"outcome": "lost"}]}, "'lost'"),
+        ({"entries": None}, "not iterable"),
+        ({"decided_until": None}, "decided_until"),
+    ],
+)
+def test_a_damaged_file_is_named(file: Path, damage: dict[str, object], reason: str) -> None:
+    work = file.with_suffix(".work")
+    make_work(work)
+    written = ScheduleRecord(state=ScheduleState(decided_until=AT)).as_dict()
+    (work / NAME).write_text(json.dumps(written | damage))
+    with pytest.raises(RunError, match=rf"schedule\.json cannot be read: .*{reason}.*Remove it to begin anew"):
+        Days([]).go(file)
 
 
 # --- the process
@@ -157,7 +140,7 @@ class Days(Ending):
         return self.runs[-1]
 
     def wait(self, seconds: float) -> None:
-        assert 0.0 < seconds <= scheduled.LONGEST_SLEEP_S
+        assert 0.0 < seconds <= schedule_process.LONGEST_SLEEP_S
         if self._steps:
             self._steps.pop(0)()
         else:
@@ -177,7 +160,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def state_of(file: Path) -> ScheduleState:
+def record_of(file: Path) -> ScheduleRecord:
     state = read_schedule(str(file.with_suffix(".work")))
     assert state is not None
     return state
@@ -194,12 +177,12 @@ def test_runs_follow_one_another_and_are_told_with_their_codes(file: Path) -> No
         lambda: setattr(days.runs[2], "code", 4),
     ]
     days.go(file)
-    assert [entry.outcome for entry in state_of(file).entries] == [
+    assert [entry.outcome for entry in record_of(file).entries] == [
         Outcome.RAN,
         Outcome.INCOMPLETE,
         Outcome.FAILED,
     ]
-    assert state_of(file).counts == {"ran": 1, "incomplete": 1, "failed": 1}
+    assert record_of(file).counts == {"ran": 1, "incomplete": 1, "failed": 1}
     kinds = Counter(event.kind for event in days.events)
     assert kinds == {"run": 4, "warning": 2}
 
@@ -209,14 +192,14 @@ def test_an_end_interrupts_the_run_and_the_next_start_goes_on(file: Path) -> Non
     days._steps = [lambda: days.later(0.5)]
     days.go(file)
     assert days.runs[0].signals == [signal.SIGINT]
-    assert [entry.outcome for entry in state_of(file).entries] == [Outcome.INTERRUPTED]
-    assert state_of(file).running == AT
+    assert [entry.outcome for entry in record_of(file).entries] == [Outcome.INTERRUPTED]
+    assert record_of(file).running == AT
     again = Days([])
     again.time = AT + HOUR / 4
     again._steps = [lambda: setattr(again.runs[0], "code", 0)]
     again.go(file)
     assert len(again.runs) == 1
-    assert (state_of(file).running, state_of(file).counts) == (None, {"interrupted": 1, "ran": 1})
+    assert (record_of(file).running, record_of(file).counts) == (None, {"interrupted": 1, "ran": 1})
 
 
 def test_a_run_by_hand_is_not_met(file: Path) -> None:
@@ -224,13 +207,13 @@ def test_a_run_by_hand_is_not_met(file: Path) -> None:
     days._steps = [lambda: days.later(0.5), lambda: days.later(1.0)]
     with held_work(str(file.with_suffix(".work"))):
         days.go(file)
-    assert (days.runs, state_of(file).counts) == ([], {"skipped": 2})
+    assert (days.runs, record_of(file).counts) == ([], {"skipped": 2})
 
 
 def test_a_second_process_is_refused(file: Path) -> None:
     work = file.with_suffix(".work")
     make_work(work)
-    with held_lock(work, scheduled.LOCK), pytest.raises(RunError, match="is at work already"):
+    with held_lock(work, LOCK), pytest.raises(RunError, match="is at work already"):
         Days([]).go(file)
 
 
@@ -258,8 +241,8 @@ def test_times_before_a_change_are_decided_by_the_old_ones_later_ones_by_the_new
         lambda: days.later(2.0),
     ]
     days.go(file)
-    slots = [entry.slot for entry in state_of(file).entries]
-    assert slots == ["2026-03-01T01:58:00+00:00", "2026-03-01T02:58:00+00:00"]
+    slots = [entry.slot for entry in record_of(file).entries]
+    assert slots == [AT - HOUR / 30, AT + HOUR * 29 / 30]
 
 
 def test_a_time_that_was_overslept_counts_by_what_the_file_said_then(file: Path) -> None:
@@ -272,7 +255,7 @@ def test_a_time_that_was_overslept_counts_by_what_the_file_said_then(file: Path)
 
     days._steps = [overslept, lambda: setattr(days.runs[0], "code", 0)]
     days.go(file)
-    assert [entry.slot for entry in state_of(file).entries] == ["2026-03-01T02:00:00+00:00"]
+    assert [entry.slot for entry in record_of(file).entries] == [AT]
 
 
 def test_other_times_of_a_schedule_that_was_down_count_from_its_start_on(file: Path) -> None:
@@ -281,7 +264,7 @@ def test_other_times_of_a_schedule_that_was_down_count_from_its_start_on(file: P
     days = Days([])
     days.time = AT
     days.go(file)
-    assert (days.runs, state_of(file).entries) == ([], ())
+    assert (days.runs, record_of(file).entries) == ([], ())
 
 
 def test_a_broken_file_runs_nothing_and_every_time_is_told_until_it_is_mended(file: Path) -> None:
@@ -296,13 +279,13 @@ def test_a_broken_file_runs_nothing_and_every_time_is_told_until_it_is_mended(fi
         lambda: setattr(days.runs[0], "code", 0),
     ]
     days.go(file)
-    assert [(entry.outcome, entry.slot) for entry in state_of(file).entries] == [
-        (Outcome.FAILED, "2026-03-01T02:00:00+00:00"),
-        (Outcome.FAILED, "2026-03-01T03:00:00+00:00"),
-        (Outcome.RAN, "2026-03-01T04:00:00+00:00"),
+    assert [(entry.outcome, entry.slot) for entry in record_of(file).entries] == [
+        (Outcome.FAILED, AT),
+        (Outcome.FAILED, AT + HOUR),
+        (Outcome.RAN, AT + 2 * HOUR),
     ]
-    assert "its minute is '77'" in state_of(file).entries[0].message
-    assert "[work] path is another folder" in state_of(file).entries[1].message
+    assert "its minute is '77'" in record_of(file).entries[0].message
+    assert "[work] path is another folder" in record_of(file).entries[1].message
 
 
 def test_a_paused_schedule_goes_on_with_a_run_that_was_cut_off_only_when_it_is_resumed(file: Path) -> None:
@@ -312,13 +295,13 @@ def test_a_paused_schedule_goes_on_with_a_run_that_was_cut_off_only_when_it_is_r
     file.write_text(FILE + "paused = true\n")
     paused = Days([])
     paused.go(file)
-    assert (paused.runs, state_of(file).running) == ([], AT)
+    assert (paused.runs, record_of(file).running) == ([], AT)
     file.write_text(FILE)
     again = Days([])
     again.time = AT + HOUR / 4
     again._steps = [lambda: setattr(again.runs[0], "code", 0)]
     again.go(file)
-    assert (len(again.runs), state_of(file).running) == (1, None)
+    assert (len(again.runs), record_of(file).running) == (1, None)
 
 
 @pytest.mark.parametrize(("code", "goes_on"), [(0, False), (1, True), (4, True), (130, True), (-15, True), (143, True)])
@@ -330,27 +313,25 @@ def test_only_a_run_that_is_whole_is_not_gone_on_with(file: Path, code: int, goe
 
     days._steps = [lambda: days.later(0.5), ends]
     days.go(file)
-    assert (state_of(file).running is not None) is goes_on
+    assert (record_of(file).running is not None) is goes_on
 
 
 def test_a_full_disk_starts_nothing_and_ends_nothing(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     days = Days([])
-    real = scheduled.LocalStorage.put
+    real = schedule_file.LocalStorage.put
 
     def full(self: object, key: str, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
     days._steps = [
-        lambda: monkeypatch.setattr(scheduled.LocalStorage, "put", full),
+        lambda: monkeypatch.setattr(schedule_file.LocalStorage, "put", full),
         lambda: days.later(0.5),
         lambda: days.later(0.1),
-        lambda: monkeypatch.setattr(scheduled.LocalStorage, "put", real),
+        lambda: monkeypatch.setattr(schedule_file.LocalStorage, "put", real),
         lambda: setattr(days.runs[0], "code", 0),
     ]
     days.go(file)
-    assert [(entry.outcome, entry.slot) for entry in state_of(file).entries] == [
-        (Outcome.RAN, "2026-03-01T02:00:00+00:00")
-    ]
+    assert [(entry.outcome, entry.slot) for entry in record_of(file).entries] == [(Outcome.RAN, AT)]
     assert any("cannot be written, so no run is started" in event.message for event in days.events)
 
 
@@ -363,7 +344,7 @@ def test_a_run_that_cannot_be_started_is_told(file: Path) -> None:
     days = Poor([])
     days._steps = [lambda: days.later(0.5)]
     days.go(file)
-    (entry,) = state_of(file).entries
+    (entry,) = record_of(file).entries
     assert (entry.outcome, "Cannot allocate memory" in entry.message) == (Outcome.FAILED, True)
 
 
@@ -374,9 +355,9 @@ def test_a_run_that_outlived_the_process_before_is_waited_for(file: Path) -> Non
     work = file.with_suffix(".work")
     again = Days([])
     again.time = AT + HOUR / 4
-    with held_lock(work, scheduled.RUN_LOCK):
+    with held_lock(work, RUN_LOCK):
         again.go(file)
-    assert (again.runs, state_of(file).running) == ([], AT)
+    assert (again.runs, record_of(file).running) == ([], AT)
 
 
 def test_a_run_that_does_not_end_is_killed_where_the_end_is_asked_for_once_more(file: Path) -> None:
@@ -395,7 +376,7 @@ def test_a_run_that_does_not_end_is_killed_where_the_end_is_asked_for_once_more(
     days._steps = [lambda: days.later(0.5), days.set, lambda: None]
     days.go(file)
     assert days.runs[0].signals == [signal.SIGINT, signal.SIGKILL]
-    assert state_of(file).running == AT
+    assert record_of(file).running == AT
 
 
 def test_a_work_folder_that_is_removed_is_made_and_held_again(file: Path) -> None:
@@ -403,7 +384,7 @@ def test_a_work_folder_that_is_removed_is_made_and_held_again(file: Path) -> Non
     work = file.with_suffix(".work")
 
     def second() -> None:
-        with pytest.raises(RunError, match="is at work already"), held_lock(work, scheduled.LOCK):
+        with pytest.raises(RunError, match="is at work already"), held_lock(work, LOCK):
             pass
 
     days._steps = [
@@ -413,7 +394,7 @@ def test_a_work_folder_that_is_removed_is_made_and_held_again(file: Path) -> Non
         lambda: setattr(days.runs[0], "code", 0),
     ]
     days.go(file)
-    assert state_of(file).counts == {"ran": 1}
+    assert record_of(file).counts == {"ran": 1}
     with held_work(str(work)):
         pass  # a run of the batch takes it for a work folder
 
@@ -424,12 +405,12 @@ def test_a_time_that_waited_is_told_as_missed_where_other_times_came_meanwhile(f
         days = Days([])
         days._steps = [lambda: days.later(0.5)]
         days.go(file)
-    assert state_of(file).waiting == AT
+    assert record_of(file).state.waiting == AT
     file.write_text(FILE.replace("0 *", "45 *"))
     again = Days([])
     again.time = AT + HOUR / 4
     again.go(file)
-    assert (again.runs, state_of(file).waiting, state_of(file).counts) == ([], None, {"missed": 1})
+    assert (again.runs, record_of(file).state.waiting, record_of(file).counts) == ([], None, {"missed": 1})
 
 
 def test_a_time_that_comes_while_a_broken_file_keeps_a_run_from_going_on_is_no_overlap(file: Path) -> None:
@@ -439,11 +420,11 @@ def test_a_time_that_comes_while_a_broken_file_keeps_a_run_from_going_on_is_no_o
     again = Days([])
     again.time = AT + HOUR / 4
     outlived = contextlib.ExitStack()
-    outlived.enter_context(held_lock(file.with_suffix(".work"), scheduled.RUN_LOCK))
+    outlived.enter_context(held_lock(file.with_suffix(".work"), RUN_LOCK))
     again._steps = [write(again, file, FILE.replace("0 *", "77 *")), outlived.close, lambda: again.later(1.0)]
     again.go(file)
-    assert (again.runs, state_of(file).running) == ([], AT)
-    assert state_of(file).counts == {"interrupted": 1, "failed": 1}
+    assert (again.runs, record_of(file).running) == ([], AT)
+    assert record_of(file).counts == {"interrupted": 1, "failed": 1}
 
 
 def test_an_end_is_told_also_while_somebody_sleeps_by_it() -> None:
@@ -471,11 +452,3 @@ def test_times_are_checked_with_the_file(file: Path) -> None:
     file.write_text(FILE + 'time_zone = "Europe/Amsterdm"\n')
     with pytest.raises(SettingsError, match=r"\[schedule\] time zone is 'Europe/Amsterdm'.*Europe/Amsterdam"):
         read_batch(file)
-
-
-def test_what_is_remembered_and_damaged_is_named(file: Path) -> None:
-    work = file.with_suffix(".work")
-    make_work(work)
-    (work / NAME).write_text("{")
-    with pytest.raises(RunError, match=r"schedule\.json cannot be read"):
-        Days([]).go(file)

@@ -8,12 +8,13 @@ from typing import Any
 
 import pytest
 from driver_bench import Bench, until
-from schedule_contract import HOUR, jobs_of, make, runs_of
+from schedule_contract import HOUR
+from schedule_store_contract import jobs_of, make, runs_of
 
-from pipeline.schedule import Overlap
+from pipeline.schedule import Outcome, Overlap
 from service.errors import StoreError
 from service.jobs import Job, JobStatus
-from service.schedules import Outcome, Schedule, Trigger
+from service.schedules import Schedule, Trigger
 from service.store.schedule_store import ScheduleStore
 
 

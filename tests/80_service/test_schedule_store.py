@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-pytest.register_assert_rewrite("store_contract", "schedule_contract")
-
-from migrated import with_tables  # noqa: E402
-from schedule_contract import ScheduleContract  # noqa: E402
+from migrated import with_tables
+from schedule_store_contract import ScheduleStoreContract
 
 
-class TestSchedulesOnSqlite(ScheduleContract):
+class TestSchedulesOnSqlite(ScheduleStoreContract):
     """All of the contract, on a file."""
 
     @pytest.fixture

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import sqlite3
-import sys
 from pathlib import Path
 
 import pytest
+from migrated import with_tables
+from store_contract import StoreContract, claim, submit
 
 from service.errors import StartUpError, StoreError
 from service.store import JobStore, database
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-pytest.register_assert_rewrite("store_contract")
-
-from migrated import with_tables  # noqa: E402
-from store_contract import StoreContract, claim, submit  # noqa: E402
 
 
 class TestOnSqlite(StoreContract):

@@ -1,12 +1,5 @@
 """The programs that tests start."""
 
-from __future__ import annotations
-
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from processes import postgres_server, postgres_url, programs
 
 __all__ = ["postgres_server", "postgres_url", "programs"]

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import pytest
 from processes import PostgresServer
-from schedule_contract import HOUR, LIMITS, NOON, ScheduleContract, jobs_of, make
+from schedule_contract import HOUR, NOON
+from schedule_store_contract import LIMITS, ScheduleStoreContract, jobs_of, make
 
 from service.store import JobStore
 
 pytestmark = pytest.mark.slow
 
 
-class TestSchedulesOnPostgres(ScheduleContract):
+class TestSchedulesOnPostgres(ScheduleStoreContract):
     """All of the contract, on PostgreSQL."""
 
     @pytest.fixture

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import datetime as dt
-import json
 import os
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 from batch_faults import BatchRun
 from processes import Program, Programs, program
 
-from pipeline.batch.schedule_state import NAME, ScheduleState
-from pipeline.batch.scheduled import RUN_LOCK
-from pipeline.io import LocalStorage
+from pipeline.batch.schedule_file import FileBook, ScheduleRecord, read_schedule
+from pipeline.batch.schedule_process import RUN_LOCK
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.scratch.work_folder import is_held, make_work
 
@@ -32,8 +29,9 @@ def run(tmp_path: Path, programs: Programs) -> BatchRun:
     month = (dt.datetime.now(dt.UTC).month + 5) % 12 + 1
     run.file.write_text(f'{run.file.read_text()}[schedule]\ncron = "0 0 1 {month} *"\n')
     make_work(run.file.with_suffix(".work"))
-    state = ScheduleState(decided_until=dt.datetime.now(dt.UTC), running=SLOT)
-    LocalStorage(root=run.file.with_suffix(".work")).put(NAME, state.to_json().encode())
+    book = FileBook(run.file.with_suffix(".work"), dt.datetime.now(dt.UTC))
+    book.change(running=SLOT)
+    book.save()
     return run
 
 
@@ -42,8 +40,9 @@ def scheduled(run: BatchRun, programs: Programs) -> Program:
     return programs.start("schedule", command, env=run.environment)
 
 
-def told(run: BatchRun) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((run.file.with_suffix(".work") / NAME).read_text())
+def record(run: BatchRun) -> ScheduleRecord:
+    found = read_schedule(str(run.file.with_suffix(".work")))
+    assert found is not None
     return found
 
 
@@ -55,13 +54,13 @@ def test_an_ended_schedule_interrupts_its_run_and_the_next_one_goes_on(run: Batc
     first.wait_for_text("the run is interrupted")
     run.gates.open()
     assert first.ended() == 0, first.tail()
-    assert (told(run)["counts"], told(run)["running"]) == ({"interrupted": 1}, SLOT.isoformat())
+    assert (record(run).counts, record(run).running) == ({"interrupted": 1}, SLOT)
     assert run.status()["state"] == "interrupted"
     second = scheduled(run, programs)
-    second.wait_for(lambda: told(run)["counts"].get("ran"), "the run's end")
+    second.wait_for(lambda: record(run).counts.get("ran"), "the run's end")
     os.kill(second.pid, signal.SIGTERM)
     assert second.ended() == 0, second.tail()
-    assert (told(run)["counts"], told(run)["running"]) == ({"interrupted": 1, "ran": 1}, None)
+    assert (record(run).counts, record(run).running) == ({"interrupted": 1, "ran": 1}, None)
     assert run.status()["state"] == "finished"
     assert '"counts": {' in second.text
 
@@ -76,10 +75,10 @@ def test_a_run_that_outlives_a_killed_schedule_is_not_met_by_another(run: BatchR
     second = scheduled(run, programs)
     second.wait_for(lambda: is_held(work, "schedule.lock"), "the schedule")
     os.kill(pid, 0)  # the task of the first run is still there, and the gates are closed
-    assert told(run)["counts"] == {}
+    assert record(run).counts == {}
     run.gates.open()
-    second.wait_for(lambda: told(run)["counts"], "what became of the run")
+    second.wait_for(lambda: record(run).counts, "what became of the run")
     os.kill(second.pid, signal.SIGTERM)
     assert second.ended() == 0, second.tail()
-    assert told(run)["counts"] == {"ran": 1}
+    assert record(run).counts == {"ran": 1}
     assert run.status()["state"] == "finished"

@@ -18,7 +18,7 @@ from pipeline import __version__
 from pipeline.schedule import Cron, Missed, Overlap
 from service.routes.documented import SCHEMAS
 from service.routes.schedule_requests import FIELDS, LONGEST_GRACE_S
-from service.schedules import Definition, Outcome
+from service.schedules import OUTCOMES, Definition
 from service.settings import ServiceSettings
 from service.store.slot_book import MAX_KEPT
 
@@ -111,7 +111,7 @@ def test_the_page_tells_every_outcome_and_policy_with_the_defaults_of_the_code(p
     row = r"^\| `(\w+)` \| (.*) \|$"
     fields, outcomes = page.split("| outcome | what it means |")
     rows = dict(re.findall(row, fields, re.MULTILINE))
-    assert [name for name, _ in re.findall(row, outcomes, re.MULTILINE)] == list(Outcome)
+    assert [name for name, _ in re.findall(row, outcomes, re.MULTILINE)] == list(OUTCOMES)
     assert rows["overlap"].startswith(f"`{Definition.overlap}` (default)")
     assert rows["missed"].startswith(f"`{Definition.missed}` (default)")
     assert rows["graceSeconds"].startswith(f"{Definition.grace_s:g} ")
@@ -154,7 +154,7 @@ def test_the_document_of_the_api_says_the_same_as_the_reader_of_requests() -> No
     assert fields["missed"]["enum"] == list(Missed)
     assert fields["overlap"]["enum"] == list(Overlap)
     assert fields["graceSeconds"]["maximum"] == LONGEST_GRACE_S
-    assert SCHEMAS["ScheduleRun"]["properties"]["outcome"]["enum"] == list(Outcome)
+    assert SCHEMAS["ScheduleRun"]["properties"]["outcome"]["enum"] == list(OUTCOMES)
     assert f"Default {Definition.missed}." in fields["missed"]["description"]
     assert f"Default {Definition.overlap}." in fields["overlap"]["description"]
     assert f"Default {Definition.grace_s:g}." in fields["graceSeconds"]["description"]

@@ -1,0 +1,173 @@
+"""The state and history of a schedule, and what one look at the clock makes of them.
+
+A batch stores both in its work folder, the service in its database: two implementations of `ScheduleBook`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime as dt
+from enum import StrEnum
+from typing import Protocol
+
+from pipeline.schedule.decisions import Rules, decide
+from pipeline.schedule.slots import PassedSlots, passed_slots
+
+
+class Outcome(StrEnum):
+    """What became of a slot or of a run. These words are stored, shown and counted."""
+
+    SUBMITTED = "submitted"
+    """The service made a job."""
+    WAITING = "waiting"
+    """It waits until the run before it is over. Not final and not counted."""
+    RAN = "ran"
+    """A batch run ended well."""
+    INCOMPLETE = "incomplete"
+    """A batch run ended, and some tiles failed."""
+    INTERRUPTED = "interrupted"
+    """A batch run was cut off; if the schedule itself was ended, the run continues when it is started again."""
+    SKIPPED = "skipped"
+    """The run before it was still under way."""
+    MISSED = "missed"
+    """It was seen too late, a later slot replaced it, or the schedule was paused while it waited."""
+    FAILED = "failed"
+    """No run could be made, or a batch run ended with an error; the message says why."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Entry:
+    """History: what became of a slot, of several slots that were missed together, or of a run without a slot."""
+
+    outcome: Outcome
+    """What became of it."""
+    slot: dt.datetime | None
+    """When it was due, the last one of several; None for a run by hand."""
+    first_slot: dt.datetime | None = None
+    """The first of several slots; None for a single one."""
+    slots: int = 1
+    """Number of slots."""
+    is_counted: bool = True
+    """Whether `slots` is exact; otherwise there are more."""
+    at: dt.datetime
+    """When this was decided; for a batch run, when it ended."""
+    message: str = ""
+    """The reason, in a sentence."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ScheduleState:
+    """What has to be remembered between two looks at the clock."""
+
+    decided_until: dt.datetime
+    """Time up to which all slots are decided."""
+    waiting: dt.datetime | None = None
+    """The slot that waits for a run to end."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Look:
+    """The result of a look at the clock."""
+
+    state: ScheduleState
+    """The state from now on."""
+    entries: tuple[Entry, ...] = ()
+    """New history, in order."""
+    due: dt.datetime | None = None
+    """The slot to run now. Its entry is for the caller to write."""
+
+
+class ScheduleBook(Protocol):
+    """Stores the state and history of one schedule."""
+
+    state: ScheduleState
+    """As read or last changed; stored with `save`."""
+
+    def add(self, entry: Entry) -> None:
+        """Add to the history and count it by its outcome.
+
+        The final entry of a slot that waited replaces its entry `WAITING`. Old entries are dropped, their counts stay.
+        """
+
+    def save(self) -> None:
+        """Store state and history."""
+
+
+def enter(book: ScheduleBook, found: Look) -> dt.datetime | None:
+    """Enter the result of a look into the book, without saving it; return the slot to run now."""
+    for entry in found.entries:
+        book.add(entry)
+    book.state = found.state
+    return found.due
+
+
+def look(state: ScheduleState, rules: Rules, now: dt.datetime, *, under_way: str | None) -> Look:
+    """Decide all slots that have passed.
+
+    Parameters
+    ----------
+    state : ScheduleState
+        The state until now.
+    rules : Rules
+        The schedule.
+    now : datetime
+        The present, with a time zone.
+    under_way : str or None
+        The run of this schedule that is under way, in words for the history; None if there is none.
+    """
+    # after the clock was put back no slot comes a second time
+    decided_until = max(now, state.decided_until)
+    if rules.is_paused:
+        found = miss_waiting(state, now, "the schedule was paused while it waited")
+        return dataclasses.replace(found, state=ScheduleState(decided_until=decided_until))
+    passed = passed_slots(rules.cron, state.decided_until, now)
+    decision = decide(passed, rules, waiting=state.waiting, is_busy=under_way is not None, now=now)
+    entries = []
+    if passed is not None and (decision.late is not None or passed.earlier):
+        fate = "only the latest of them counts" if decision.late is None else f"seen later than {rules.grace_s:g} s"
+        message = f"the clock was not looked at from {utc(passed.first or passed.latest)} to {utc(now)}: {fate}"
+        entries.append(_missed_together(passed, now, message, with_latest=decision.late is not None))
+    if decision.replaced is not None:
+        message = "a later slot took its place while it waited"
+        entries.append(Entry(outcome=Outcome.MISSED, slot=decision.replaced, at=now, message=message))
+    if decision.skipped is not None:
+        message = f"{under_way} was still under way"
+        entries.append(Entry(outcome=Outcome.SKIPPED, slot=decision.skipped, at=now, message=message))
+    if decision.waits != state.waiting and decision.waits is not None:
+        message = f"waits until {under_way} is over"
+        entries.append(Entry(outcome=Outcome.WAITING, slot=decision.waits, at=now, message=message))
+    after = ScheduleState(decided_until=decided_until, waiting=decision.waits)
+    return Look(state=after, entries=tuple(entries), due=decision.run)
+
+
+def miss_passed(state: ScheduleState, rules: Rules, now: dt.datetime, message: str) -> Look:
+    """Miss all slots that have passed and are not decided; the slot that waits goes on waiting."""
+    passed = None if rules.is_paused else passed_slots(rules.cron, state.decided_until, now)
+    entries = () if passed is None else (_missed_together(passed, now, message, with_latest=True),)
+    after = dataclasses.replace(state, decided_until=max(now, state.decided_until))
+    return Look(state=after, entries=entries)
+
+
+def miss_waiting(state: ScheduleState, now: dt.datetime, message: str) -> Look:
+    """Miss the slot that waits, if there is one."""
+    if state.waiting is None:
+        return Look(state=state)
+    entry = Entry(outcome=Outcome.MISSED, slot=state.waiting, at=now, message=message)
+    return Look(state=dataclasses.replace(state, waiting=None), entries=(entry,))
+
+
+def _missed_together(passed: PassedSlots, now: dt.datetime, message: str, *, with_latest: bool) -> Entry:
+    return Entry(
+        outcome=Outcome.MISSED,
+        slot=passed.latest if with_latest else passed.before_latest,
+        first_slot=passed.first,
+        slots=passed.earlier + with_latest,
+        is_counted=passed.is_counted,
+        at=now,
+        message=message,
+    )
+
+
+def utc(at: dt.datetime) -> str:
+    """A time in a message: ISO 8601 in UTC."""
+    return at.astimezone(dt.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
