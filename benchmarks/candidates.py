@@ -8,16 +8,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.io import ReadOptions
-from pipeline.io.gps_time import GpsTimeKind
 from pipeline.model import Candidate
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.monitoring.events import ignore
+from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.plan import make_plan
+from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import gather
-from pipeline.runtime.stages.join import RejectedSite
-from pipeline.runtime.stages.progress import Progress
-from pipeline.runtime.stages.stages import Stages, given_footprints
+from pipeline.runtime.stages.given_footprints import given_footprints
+from pipeline.runtime.stages.ingest import ingest
+from pipeline.runtime.stages.join import join
+from pipeline.runtime.stages.outline import outline
+from pipeline.runtime.stages.sites import RejectedSite
+from pipeline.runtime.stages.split import split
 from pipeline.settings import RunSettings
 
 
@@ -43,30 +47,21 @@ def found_scene(
     """Ingest, split and join point files, serially and in this process, with given footprints where there are any."""
     plan = make_plan(tiles, ReadOptions(crs=crs), settings)
     given = None if footprints is None else given_footprints(footprints, plan)
-    kinds = {info.gps_time_kind for info in plan.sources}
-    kind = kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
     progress = Progress(ignore)
     with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
         scratch = Scratch(str(Path(folder, "scratch")))
         scratch.create()
-        stages = Stages(
-            settings=settings,
-            meshes="none",
-            plan=plan,
-            progress=progress,
-            executor=SerialExecutor(),
-            scratch=scratch,
-        )
-        splits = stages.split(stages.ingest(tiles), given)
-        joined = stages.outline(stages.join(splits, given, plan.sources[0].reference))
+        context = RunContext(plan=plan, progress=progress, executor=SerialExecutor(), scratch=scratch)
+        splits = split(context, settings, ingest(context, tiles), given)
+        joined = outline(context, settings.building.roof, join(context, settings.scene, splits, given))
         return FoundScene(
             candidates=tuple(
-                gather(scratch, plan.grid, site, kind, beside=settings.building.roof.at_walls)[0]
+                gather(scratch, plan.grid, site, plan.gps_kind, beside=settings.building.roof.at_walls)[0]
                 for site in joined.candidates
             ),
             rejected=joined.rejected,
             small_fragments=joined.small_fragments,
-            points=sum(split.points for split in splits.told),
+            points=sum(found.points for found in splits.figures),
             seconds=progress.timings,
         )
 

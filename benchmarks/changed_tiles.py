@@ -28,7 +28,9 @@ import numpy as np
 
 from benchmarks.city_tiles import main as make_tiles
 from pipeline.runtime.monitoring.events import Event
-from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import RunSummary, run
 from pipeline.settings import RunSettings
 
 STAGES = ("ingest", "split", "reconstruct", "publish")
@@ -105,9 +107,8 @@ def measured(what: str, tiles: Path, folder: Path, workers: int, *, fresh: bool 
         inputs=(str(tiles),),
         out=str(out),
         settings=RunSettings.from_mapping({"classes": "ignore"}),
-        workers=workers,
+        resources=Resources(workers=workers, work=None if fresh else str(folder / "work")),
         overwrite=fresh,
-        work=None if fresh else str(folder / "work"),
         meshes="tile",
     )
     began = time.perf_counter()

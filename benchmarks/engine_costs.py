@@ -38,13 +38,16 @@ from pipeline.model import IntArray
 from pipeline.runtime.cluster.dask_executor import Cluster, DaskExecutor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.monitoring.events import Watch, ignore
+from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.plan import Plan, make_plan
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.outcomes import result_of
-from pipeline.runtime.stages.join import NOWHERE, join
+from pipeline.runtime.stages.ingest import ingest
+from pipeline.runtime.stages.join import NOWHERE, join, join_tiles
 from pipeline.runtime.stages.open_fragments import BorderFacets
-from pipeline.runtime.stages.split import Split
-from pipeline.runtime.stages.stages import Progress, Stages
+from pipeline.runtime.stages.split import split
+from pipeline.runtime.stages.split_window import Split
 from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
 
@@ -142,25 +145,23 @@ def splits_of(folder: Path, tile_size_m: float) -> tuple[Plan, list[Split], int]
     plan = make_plan(tiles, ReadOptions(), settings)
     with (
         tempfile.TemporaryDirectory(prefix="gablework-") as place,
-        executor_for(workers=2, scheduler=None, local_directory=place) as executor,
+        executor_for(Resources(workers=2), local_directory=place) as executor,
     ):
         scratch = Scratch(str(Path(place, "scratch")))
         scratch.create()
-        stages = Stages(
-            settings=settings, meshes="none", plan=plan, progress=Progress(ignore), executor=executor, scratch=scratch
-        )
-        found = stages.split(stages.ingest(tiles), None)
-        splits = [result_of(scratch, place) for _, place in sorted(found.places.items())]
-        joined = stages.join(found, None, plan.sources[0].reference)
+        context = RunContext(plan=plan, progress=Progress(ignore), executor=executor, scratch=scratch)
+        found = split(context, settings, ingest(context, tiles), None)
+        splits = list(found.stored(scratch))
+        joined = join(context, settings.scene, found, None)
     return plan, splits, len(joined.candidates)
 
 
-def moved(split: Split, columns: int, size_mm: int) -> Split:
+def moved(one: Split, columns: int, size_mm: int) -> Split:
     """The same surfaces so many tiles farther east; a copy that shares no memory."""
-    tile = Tile(split.tile.column + columns, split.tile.row)
-    found = split.surfaces
+    tile = Tile(one.tile.column + columns, one.tile.row)
+    found = one.surfaces
     if found is None:
-        return dataclasses.replace(split, tile=tile)
+        return dataclasses.replace(one, tile=tile)
     shift = columns * size_mm
 
     def points(places: IntArray) -> IntArray:
@@ -197,12 +198,12 @@ def moved(split: Split, columns: int, size_mm: int) -> Split:
         step_facets=facets(found.step_facets),
         along_steps=found.along_steps.copy(),
     )
-    return dataclasses.replace(split, tile=tile, surfaces=surfaces)
+    return dataclasses.replace(one, tile=tile, surfaces=surfaces)
 
 
 def cost_of_join(plan: Plan, splits: Sequence[Split], buildings: int, times: int) -> dict[str, Any]:
     """CPU seconds and memory of the join of a city laid side by side so many times; in a process of its own."""
-    columns = [split.tile.column for split in splits]
+    columns = [one.tile.column for one in splits]
     stride = max(columns) - min(columns) + 3
     gc.collect()
     before = psutil.Process().memory_info().rss
@@ -212,24 +213,24 @@ def cost_of_join(plan: Plan, splits: Sequence[Split], buildings: int, times: int
         # one at a time, as the driver reads them
         nonlocal making_s
         for k in range(times):
-            for split in splits:
+            for one in splits:
                 began_s = time.process_time()
-                one = moved(split, stride * k, plan.grid.size_mm)
+                copy = moved(one, stride * k, plan.grid.size_mm)
                 making_s += time.process_time() - began_s
-                yield one
+                yield copy
 
-    join(iter(splits), plan.grid, RunSettings().scene.candidates, "EPSG:25832")  # kernels are loaded once
+    join_tiles(iter(splits), plan.grid, RunSettings().scene.candidates, "EPSG:25832")  # kernels are loaded once
     began = time.process_time()
-    joined = join(city(), plan.grid, RunSettings().scene.candidates, "EPSG:25832")
+    joined = join_tiles(city(), plan.grid, RunSettings().scene.candidates, "EPSG:25832")
     cpu_s = time.process_time() - began - making_s
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
     return {
         "buildings": times * buildings,
         "candidates": len(joined.candidates),
         "tiles": times * len(splits),
-        "fragments": times * sum(0 if split.surfaces is None else len(split.surfaces.kind) for split in splits),
+        "fragments": times * sum(0 if one.surfaces is None else len(one.surfaces.kind) for one in splits),
         "cpu_s": cpu_s,
-        "splits_bytes": times * sum(len(pickle.dumps(split, protocol=pickle.HIGHEST_PROTOCOL)) for split in splits),
+        "splits_bytes": times * sum(len(pickle.dumps(one, protocol=pickle.HIGHEST_PROTOCOL)) for one in splits),
         "peak_bytes": peak,
     }
 

@@ -40,9 +40,11 @@ from pipeline.ruler.evaluation.writing import write_tables
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.ruler.simulation.sweep import CELLS, Cell
-from pipeline.runtime.compare import Variant, settings_of
-from pipeline.runtime.run import RunRequest, RunVariant, run_variants
-from pipeline.runtime.stages.reconstruct import load
+from pipeline.runtime.compare import Variant, run_variant, settings_of
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run_variants
+from pipeline.runtime.stages.model_batch import load
 from pipeline.settings import RunSettings
 
 GROUND = "ground."
@@ -179,7 +181,7 @@ def run_request(entry: Entry, place: Workplace, out: Path) -> RunRequest:
         settings=run_settings(entry),
         footprints=None if entry.footprints is None else str(entry.footprints),
         crs=entry.crs,
-        workers=0,
+        resources=SERIAL,
         meshes="none",
         overwrite=True,
     )
@@ -212,18 +214,11 @@ def measure_entry(entry: Entry, variants: Sequence[Variant], place: Workplace) -
         folder = place.root / "scratch" / f"{entry.name}-{os.getpid()}"  # another program may be at the same entry
         folder.mkdir(parents=True, exist_ok=True)
         request = run_request(entry, place, folder)
-        ways = [
-            RunVariant(
-                settings=settings_of(request.settings, variant),
-                out=str(place.run(variant, entry)),
-                label=variant.label,
-            )
-            for variant in to_run
-        ]
+        ways = [run_variant(request.settings, variant, str(place.run(variant, entry))) for variant in to_run]
         for variant in to_run:  # of the measures nothing may be left that is of an earlier run
             shutil.rmtree(place.report(variant, entry), ignore_errors=True)
         load()  # also where one variant is left: its seconds are not those of kernels that are loaded
-        run_variants(request, ways, str(folder))
+        run_variants(request, ways)
         shutil.rmtree(folder)
         lap("runs")
     _evaluate(entry, unmeasured, place)

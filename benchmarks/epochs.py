@@ -32,7 +32,9 @@ from pipeline.ruler.simulation.suites import suite_named
 from pipeline.ruler.simulation.survey_files import write_points
 from pipeline.ruler.simulation.two_epochs import TwoEpochs, Work, two_epochs
 from pipeline.runtime.manifest import NAME, RunStatus, read_manifest
-from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import run
 
 SCANS = (101, 202)
 """Seeds of the scanner in the earlier and the later epoch."""
@@ -111,7 +113,11 @@ def reconstructed(scene: Scene, survey: ScannerSettings, seed: int, folder: Path
     folder.mkdir(parents=True, exist_ok=True)
     laz = folder / "points.laz"
     write_points(scan(scene, survey, seed), scene, laz, folder / "labels.parquet")
-    run(RunRequest(inputs=(str(laz),), out=str(run_dir), meshes="none", workers=jobs, overwrite=True))
+    run(
+        RunRequest(
+            inputs=(str(laz),), out=str(run_dir), meshes="none", resources=Resources(workers=jobs), overwrite=True
+        )
+    )
     return run_dir
 
 

@@ -22,7 +22,9 @@ import psutil
 
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
-from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import run
 
 STAGES = ("split", "reconstruct", "total")
 COMPARED = ("reconstruct", "total", "cpu")
@@ -56,7 +58,11 @@ def run_once(way: Way, tile: str, crs: str | None, executor: Executor) -> dict[s
     """Seconds and digest of one run, into a folder that goes at once."""
     with tempfile.TemporaryDirectory(prefix="gablework-") as folder:
         request = RunRequest(
-            inputs=(tile,), out=f"{folder}/run", crs=crs, workers=way.workers, isolate=way.isolate, meshes="tile"
+            inputs=(tile,),
+            out=f"{folder}/run",
+            crs=crs,
+            resources=Resources(workers=way.workers, isolate=way.isolate),
+            meshes="tile",
         )
         before = cpu_s()
         summary = run(request, executor=executor)

@@ -38,10 +38,14 @@ from pipeline.ruler.simulation.seeds import seed_of
 from pipeline.runtime.cluster.serial_executor import Executor, SerialExecutor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.monitoring.events import ignore
+from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.plan import Plan, make_plan
+from pipeline.runtime.resources import SERIAL, Resources
+from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.stages.progress import Progress
-from pipeline.runtime.stages.stages import Stages
+from pipeline.runtime.stages.ingest import ingest
+from pipeline.runtime.stages.join import join
+from pipeline.runtime.stages.split import split
 from pipeline.settings import RunSettings
 
 STAGES = ("ingest", "split", "join")
@@ -84,18 +88,16 @@ def one_lap(tiles: Sequence[str], plan: Plan, settings: RunSettings, executor: E
     with tempfile.TemporaryDirectory(prefix="gablework-", dir=folder) as place:
         scratch = Scratch(str(Path(place, "scratch")))
         scratch.create()
-        stages = Stages(
-            settings=settings, meshes="none", plan=plan, progress=progress, executor=executor, scratch=scratch
-        )
+        context = RunContext(plan=plan, progress=progress, executor=executor, scratch=scratch)
         began = time.process_time()
-        splits = stages.split(stages.ingest(tiles), None)
-        joined = stages.join(splits, None, plan.sources[0].reference)
+        splits = split(context, settings, ingest(context, tiles), None)
+        joined = join(context, settings.scene, splits, None)
         cpu_s = time.process_time() - began
         held = sum(path.stat().st_size for path in Path(place).rglob("*") if path.is_file())
     return Lap(
         seconds={stage: progress.timings[stage] for stage in STAGES},
         cpu_s=cpu_s if isinstance(executor, SerialExecutor) else None,
-        points=sum(split.points for split in splits.told),
+        points=sum(found.points for found in splits.figures),
         candidates=len(joined.candidates),
         peaks=dict(progress.peaks),
         scratch_bytes=held,
@@ -120,7 +122,7 @@ def laps(tiles: Sequence[str], crs: str | None, workers: int, rounds: int, folde
     """
     settings = settings_without_classes()
     plan = make_plan(tiles, ReadOptions(crs=crs), settings)
-    with executor_for(workers=workers, scheduler=None, local_directory=folder) as executor:
+    with executor_for(Resources(workers=workers), local_directory=folder) as executor:
         return [one_lap(tiles, plan, settings, executor, folder) for _ in range(rounds + 1)][1:]
 
 
@@ -129,7 +131,7 @@ def profile(tiles: Sequence[str], crs: str | None, folder: str, top: int) -> str
     settings = settings_without_classes()
     plan = make_plan(tiles, ReadOptions(crs=crs), settings)
     profiler = cProfile.Profile(time.process_time)
-    with executor_for(workers=0, scheduler=None, local_directory=folder) as executor:
+    with executor_for(SERIAL, local_directory=folder) as executor:
         one_lap(tiles, plan, settings, executor, folder)
         profiler.enable()
         one_lap(tiles, plan, settings, executor, folder)
@@ -247,7 +249,7 @@ def run_large(arguments: argparse.Namespace) -> int:
         plan = make_plan([str(path)], ReadOptions(), settings)
         with (
             tempfile.TemporaryDirectory(prefix="gablework-", dir=arguments.out) as folder,
-            executor_for(workers=arguments.workers, scheduler=None, local_directory=folder) as executor,
+            executor_for(Resources(workers=arguments.workers), local_directory=folder) as executor,
         ):
             lap = one_lap([str(path)], plan, settings, executor, folder)
     finally:

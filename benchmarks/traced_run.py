@@ -27,7 +27,9 @@ from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured, Result, Task
-from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import run
 from pipeline.settings import RunSettings
 
 SIZED_EVERY = 8
@@ -154,15 +156,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         inputs=(wanted.input,),
         out=str(wanted.out),
         settings=settings,
-        workers=wanted.workers,
-        scheduler=wanted.scheduler,
+        resources=Resources(workers=wanted.workers, scheduler=wanted.scheduler),
         overwrite=True,
     )
     diary = Diary(wanted.out / "scratch")
     place = tempfile.mkdtemp(prefix="gablework-dask-")
     began_s = time.time()
     found: dict[str, Any] = {"began_s": began_s, "workers": wanted.workers, "diary": diary.lines}
-    executor = TracingExecutor(executor_for(workers=wanted.workers, scheduler=wanted.scheduler, local_directory=place))
+    executor = TracingExecutor(executor_for(request.resources, local_directory=place))
     try:
         found["summary"] = dataclasses.asdict(run(request, diary, executor))
     finally:

@@ -12,7 +12,9 @@ from pipeline.ruler.evaluation.writing import write_tables
 from pipeline.ruler.report.evaluation_page import write_page
 from pipeline.ruler.simulation.dataset import Output, ScenePaths, simulate
 from pipeline.runtime.monitoring.events import Event, Listener
-from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import RunSummary, run
 
 SUITE = "suburb"
 """The suite of the demo."""
@@ -71,7 +73,9 @@ def demonstrate(
         size_m=size_m,
         output=Output(on_points=lambda n: on_event(Event(kind="progress", stage="scan", done=n))),
     )
-    request = RunRequest(inputs=(str(scene.laz),), out=str(folder / "run"), workers=workers, overwrite=overwrite)
+    request = RunRequest(
+        inputs=(str(scene.laz),), out=str(folder / "run"), resources=Resources(workers=workers), overwrite=overwrite
+    )
     summary = run(request, on_event)
     on_event(Event(kind="stage", stage="measure", total=1))
     evaluation = evaluate_files(EvaluationRequest(models=summary.run_dir, truth=str(scene.truth)))

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.model import IntArray, Reason
-from pipeline.runtime.stages.join import CandidateSite, Joined, PointRange, RejectedSite, object_id
+from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, RejectedSite, object_id
 from pipeline.terrain.candidates import NOWHERE, Surfaces, Verdict
 from pipeline.terrain.facets import FacetKind
 from pipeline.terrain.settings import CandidateSettings

@@ -31,7 +31,7 @@ from pipeline.schedule import Cron, Missed, Overlap, Rules
 from pipeline.settings import RunSettings
 
 if TYPE_CHECKING:
-    from pipeline.runtime.run import RunRequest
+    from pipeline.runtime.request import RunRequest
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -195,7 +195,9 @@ class Batch:
 
     def request(self) -> RunRequest:
         """What the engine is asked to do."""
-        from pipeline.runtime.run import RunRequest  # with all that a run needs, and a status does not
+        # loads all that a run needs, which a status does not need
+        from pipeline.runtime.request import RunRequest
+        from pipeline.runtime.resources import Resources
 
         def given(name: str) -> str | None:
             return self.whole(name) if name else None
@@ -210,18 +212,20 @@ class Batch:
             vertical_unit=self.inputs.vertical_unit or None,
             bbox=self.bbox,
             aoi=given(self.inputs.aoi),
-            workers=self.workers,
-            scheduler=self.cluster.scheduler or None,
+            resources=Resources(
+                workers=self.workers,
+                scheduler=self.cluster.scheduler or None,
+                traffic="batch",
+                tls=given_tls(given(self.cluster.tls_ca), given(self.cluster.tls_cert), given(self.cluster.tls_key)),
+                performance_report=given(self.cluster.performance_report),
+                work=self.work_folder,
+                isolate=None if self.cluster.isolate else False,
+                building_timeout_s=self.cluster.building_timeout_s,
+                building_memory_bytes=round(self.cluster.building_memory_gib * 2**30),
+            ),
             meshes=self.output.meshes,
             licence=self.inputs.licence or None,
-            traffic="batch",
-            tls=given_tls(given(self.cluster.tls_ca), given(self.cluster.tls_cert), given(self.cluster.tls_key)),
-            performance_report=given(self.cluster.performance_report),
             overwrite=self.output.overwrite,
-            work=self.work_folder,
-            isolate=self.cluster.isolate and (self.workers != 0 or bool(self.cluster.scheduler)),
-            building_timeout_s=self.cluster.building_timeout_s,
-            building_memory_bytes=round(self.cluster.building_memory_gib * 2**30),
         )
 
 

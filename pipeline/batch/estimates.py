@@ -27,12 +27,13 @@ from pipeline.runtime.engine import engine_of
 from pipeline.runtime.expected import RATES, expected
 from pipeline.runtime.monitoring.events import ignore
 from pipeline.runtime.monitoring.machine import cores, memory_bytes
+from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.plan import Plan, check_memory
-from pipeline.runtime.run import check_out, plan_inputs
+from pipeline.runtime.request import plan_inputs
+from pipeline.runtime.run import check_out
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.runtime.scratch.work_folder import refuse_foreign
-from pipeline.runtime.stages.progress import Progress
-from pipeline.runtime.stages.stages import given_footprints
+from pipeline.runtime.stages.given_footprints import given_footprints
 from pipeline.tiling import MM
 
 _RANGE = 2.0
@@ -113,7 +114,7 @@ def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Es
 def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     request = batch.request()
     progress = Progress(ignore)
-    plan, paths = plan_inputs(request, batch.settings, progress)
+    plan, paths = plan_inputs(request, progress)
     work = expected(plan)
     points = work.points
     if not work.tiles:
@@ -127,19 +128,14 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     else:
         buildings, told = _objects(plan, points, [path for path in paths if shown(path) in work.points_by_file], read)
     work = dataclasses.replace(work, buildings=buildings)
-    engine, processes = engine_of(
-        workers=request.workers,
-        scheduler=request.scheduler,
-        expected_cpu_s=sum(work.cpu_s().values()),
-        at=cores(),
-        performance_report=request.performance_report is not None,
-    )
+    resources = request.resources
+    engine, processes = engine_of(resources, expected_cpu_s=sum(work.cpu_s().values()), at=cores())
     limit: int | None = memory_bytes()
     workers = processes
     if engine != "local":
         embedded = processes if engine == "cluster" else 0
-        workers, limit = memory_of_workers(workers=embedded, scheduler=request.scheduler, tls=request.tls)
-    hands = workers if request.scheduler is not None else min(workers, cores())
+        workers, limit = memory_of_workers(workers=embedded, scheduler=resources.scheduler, tls=resources.tls)
+    hands = workers if resources.scheduler is not None else min(workers, cores())
     side = plan.grid.size_mm / MM
     stages = work.wall_s(hands)
     total = RATES.start_s + sum(stages.values()) + (RATES.cluster_start_s if engine == "cluster" else 0.0)
@@ -156,10 +152,10 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
         *_disk_refused(batch, work_bytes, work_free, out_bytes, out_free),
     ]
     warnings = list(progress.warnings)
-    if request.scheduler is not None and workers == 0:
-        warnings.append(f"the scheduler {request.scheduler} has no worker now: the run would wait for one")
+    if resources.scheduler is not None and workers == 0:
+        warnings.append(f"the scheduler {resources.scheduler} has no worker now: the run would wait for one")
     cold_s = 0.0
-    if request.scheduler is None and not kernels_are_compiled():
+    if resources.scheduler is None and not kernels_are_compiled():
         cold_s = RATES.compiling_s
         warnings.append(
             "numba kernels are not compiled on this machine yet: this run compiles them, which may take "

@@ -17,7 +17,7 @@ from pipeline.runtime.cluster.run_metrics import RunMetrics, both, serve_metrics
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.events import Event, Listener, ignore, never
 from pipeline.runtime.run import RunSummary, run
-from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, held_lock, make_work, refuse_held
+from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, locked_file, make_work, refuse_locked
 
 _READ = 1
 """Inputs that are read in whole for the estimate of a run: it is to begin soon."""
@@ -51,13 +51,13 @@ def run_batch(
     InputError, SettingsError, ClusterError, RunCancelledError
         As `pipeline.runtime.run.run`.
     """
-    refuse_held(batch.work_folder)
+    refuse_locked(batch.work_folder)
     refuse(places_refused(batch))
     with contextlib.ExitStack() as shown, said_in_keys():
         # who comes second says nothing in the status of who came first
         work = Path(batch.work_folder).resolve()
         make_work(work)
-        shown.enter_context(held_lock(work, DRIVER_LOCK))
+        shown.enter_context(locked_file(work, DRIVER_LOCK))
         known = buildings_before(batch.work_folder)
         status = StatusWriter(batch.work_folder, str(batch.path), batch.out)
         if batch.cluster.metrics_port:

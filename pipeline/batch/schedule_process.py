@@ -20,7 +20,7 @@ from pipeline.batch.batch_file import Batch, read_batch
 from pipeline.batch.schedule_file import NAME, BatchEntry, FileBook, iso
 from pipeline.errors import RunError, SettingsError
 from pipeline.runtime.monitoring.events import Event, EventKind, Listener, ignore
-from pipeline.runtime.scratch.work_folder import held_lock, is_at_work, is_held, make_work, take_lock
+from pipeline.runtime.scratch.work_folder import is_at_work, is_locked, locked_file, make_work, take_lock
 from pipeline.schedule import Entry, Look, Outcome, Rules, ScheduleState, enter, look, miss_waiting
 
 LOCK, RUN_LOCK = "schedule.lock", "run.lock"
@@ -196,7 +196,7 @@ class _Scheduler:
         """Hold the work folder's lock for schedules. The folder is made if it does not exist."""
         self._lock.close()
         make_work(self._folder)
-        self._lock.enter_context(held_lock(self._folder, LOCK))
+        self._lock.enter_context(locked_file(self._folder, LOCK))
 
     @property
     def _rules(self) -> Rules:
@@ -212,7 +212,7 @@ class _Scheduler:
         self._note_end(now)
         before, written_at = self._rules, self._reread()
         rules = self._rules
-        is_busy = self._run is not None or is_at_work(str(self._folder)) or is_held(str(self._folder), RUN_LOCK)
+        is_busy = self._run is not None or is_at_work(str(self._folder)) or is_locked(str(self._folder), RUN_LOCK)
         # a run that was cut off together with the schedule's process goes first
         cut = None if is_busy or rules.is_paused or self._refused else book.record.running
         under_way, slot = "a run" if is_busy or cut is not None else None, None
@@ -306,7 +306,7 @@ class _Scheduler:
         if not self._rules.is_paused and not self._book.is_changed:
             return True
         try:
-            if not is_held(str(self._folder), LOCK):  # the work folder was removed
+            if not is_locked(str(self._folder), LOCK):  # the work folder was removed
                 self._hold()
             self._book.save()
         except (OSError, RunError) as error:

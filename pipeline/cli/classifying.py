@@ -59,6 +59,7 @@ def classify(
         from pipeline.runtime.classify import ClassifyRequest
         from pipeline.runtime.classify import classify as classify_files
         from pipeline.runtime.cluster.tls import given_tls
+        from pipeline.runtime.resources import Resources
         from pipeline.settings import RunSettings
 
         if not is_surely_small(tiles):
@@ -75,9 +76,7 @@ def classify(
             vertical_unit=vertical_unit,
             rasters=rasters,
             raster_cell=raster_cell,
-            workers=workers,
-            scheduler=scheduler,
-            tls=given_tls(tls_ca, tls_cert, tls_key),
+            resources=Resources(workers=workers, scheduler=scheduler, tls=given_tls(tls_ca, tls_cert, tls_key)),
             overwrite=overwrite,
         )
         summary = classify_files(request, console.on_event)

@@ -90,7 +90,9 @@ def reconstruct(
     """Reconstruct buildings from tiles into a run directory."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.cluster.tls import given_tls
-        from pipeline.runtime.run import RunRequest, run
+        from pipeline.runtime.request import RunRequest
+        from pipeline.runtime.resources import Resources
+        from pipeline.runtime.run import run
 
         start_early(
             "reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=method
@@ -106,17 +108,19 @@ def reconstruct(
             vertical_unit=vertical_unit,
             bbox=bbox,
             aoi=aoi,
-            workers=workers,
-            scheduler=scheduler,
-            tls=given_tls(tls_ca, tls_cert, tls_key),
-            performance_report=performance_report,
-            scratch=scratch,
+            resources=Resources(
+                workers=workers,
+                scheduler=scheduler,
+                tls=given_tls(tls_ca, tls_cert, tls_key),
+                performance_report=performance_report,
+                scratch=scratch,
+                isolate=isolate,
+                building_timeout_s=building_timeout,
+                building_memory_bytes=round(building_memory * 2**30),
+            ),
             meshes=meshes,
             licence=licence,
             overwrite=overwrite,
-            isolate=isolate,
-            building_timeout_s=building_timeout,
-            building_memory_bytes=round(building_memory * 2**30),
         )
         summary = run(request, console.on_event)
         show_summary(console, summary)
@@ -149,22 +153,24 @@ def rerun(
     """Model single buildings of a run again, after other overrides; all others stay untouched."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.runtime.cluster.tls import given_tls
-        from pipeline.runtime.isolation.isolated_items import IsolationLimits
         from pipeline.runtime.rerun import RerunRequest
         from pipeline.runtime.rerun import rerun as rerun_buildings
+        from pipeline.runtime.resources import Resources
 
         start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=False, method=None)
 
-        serial = workers == 0 and scheduler is None
-        limits = IsolationLimits(timeout_s=building_timeout, memory_bytes=round(building_memory * 2**30))
         request = RerunRequest(
             run_dir=run_dir,
             overrides=overrides,
             only=tuple(only or ()),
-            workers=workers,
-            scheduler=scheduler,
-            tls=given_tls(tls_ca, tls_cert, tls_key),
-            isolation=limits if (not serial if isolate is None else isolate) else None,
+            resources=Resources(
+                workers=workers,
+                scheduler=scheduler,
+                tls=given_tls(tls_ca, tls_cert, tls_key),
+                isolate=isolate,
+                building_timeout_s=building_timeout,
+                building_memory_bytes=round(building_memory * 2**30),
+            ),
         )
         summary = rerun_buildings(request, console.on_event)
         console.table("Made again", ["building", "status"], list(summary.buildings.items()))
@@ -215,7 +221,8 @@ def compare(
         from pipeline.ruler.report.evaluation_page import headline
         from pipeline.runtime.cluster.tls import given_tls
         from pipeline.runtime.compare import CompareRequest, own_tables, parse_variants
-        from pipeline.runtime.run import RunRequest
+        from pipeline.runtime.request import RunRequest
+        from pipeline.runtime.resources import Resources
         from pipeline.settings import RunSettings, read_table
 
         start_early("reconstruct", workers=workers, scheduler=scheduler, footprints=footprints is not None, method=None)
@@ -234,15 +241,17 @@ def compare(
                 vertical_unit=vertical_unit,
                 bbox=bbox,
                 aoi=aoi,
-                workers=workers,
-                scheduler=scheduler,
-                tls=given_tls(tls_ca, tls_cert, tls_key),
+                resources=Resources(
+                    workers=workers,
+                    scheduler=scheduler,
+                    tls=given_tls(tls_ca, tls_cert, tls_key),
+                    isolate=isolate,
+                    building_timeout_s=building_timeout,
+                    building_memory_bytes=round(building_memory * 2**30),
+                ),
                 meshes=meshes,
                 licence=licence,
                 overwrite=overwrite,
-                isolate=isolate,
-                building_timeout_s=building_timeout,
-                building_memory_bytes=round(building_memory * 2**30),
             ),
             variants=parse_variants(methods),
             tables=tables,

@@ -1,32 +1,34 @@
-"""Classification: plan, ingest, split and join as of a run, then a class for every point, written in file order."""
+"""Classification: plan, ingest, split and join as in a run, then a class for every point, written in file order."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from uuid import uuid4
 
 from pipeline.errors import InputError, RunError, SettingsError
 from pipeline.export.raster import RasterLattice
-from pipeline.io import SpatialReference, is_url, shown
+from pipeline.io import is_url, shown
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.cluster.tls import TlsFiles
-from pipeline.runtime.engine import executor_for
 from pipeline.runtime.expected import expected
 from pipeline.runtime.isolation.preloading import loads_of
-from pipeline.runtime.monitoring.events import Listener, Watch, ignore, never
+from pipeline.runtime.monitoring.events import Listener, ignore, never
 from pipeline.runtime.monitoring.measurement import peak_of_process
-from pipeline.runtime.plan import check_memory
-from pipeline.runtime.run import RunRequest, calling_off, plan_inputs
+from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.request import RunRequest, plan_inputs
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.folder_lock import held_folder, remove_abandoned
-from pipeline.runtime.stages.ingest import Ingested, part_of
-from pipeline.runtime.stages.join import Joined, PointRange
+from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
+from pipeline.runtime.stages.given_footprints import given_footprints
+from pipeline.runtime.stages.ingest import ingest, part_of
+from pipeline.runtime.stages.ingested import Ingested, classes_in_use
+from pipeline.runtime.stages.join import join
 from pipeline.runtime.stages.label import LabelTask, label, neighbourhood
-from pipeline.runtime.stages.progress import Progress
 from pipeline.runtime.stages.rasters import (
     RASTERS,
     MosaicTask,
@@ -36,7 +38,8 @@ from pipeline.runtime.stages.rasters import (
     with_neighbours,
     write_mosaic,
 )
-from pipeline.runtime.stages.stages import Stages, classes_in_use, given_footprints
+from pipeline.runtime.stages.sites import Joined, PointRange
+from pipeline.runtime.stages.split import split
 from pipeline.runtime.stages.write_classified import (
     ClassifiedFile,
     ClassifiedTask,
@@ -52,30 +55,26 @@ _SCRATCH = "scratch"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ClassifyRequest:
-    """What is to be done."""
+    """What to classify, and how."""
 
     inputs: tuple[str, ...]
     """Files, folders or patterns."""
     out: str
-    """The folder to write; what else is in it stays."""
+    """The folder to write; other files in it stay."""
     settings: RunSettings = dataclasses.field(default_factory=RunSettings)
-    """All settings; those of methods do not matter."""
+    """All settings; those of methods have no effect."""
     footprints: str | None = None
-    """A vector file of building outlines: then only what lies inside them is building."""
+    """A vector file of building outlines; then only points inside them become buildings."""
     crs: str | None = None
-    """Stands above the headers' CRS, and is written."""
+    """Overrides the CRS in the headers, and is written."""
     vertical_unit: str | None = None
-    """Stands above the headers' vertical unit."""
+    """Overrides the vertical unit in the headers."""
     rasters: bool = False
-    """Write terrain, surface and height too."""
+    """Also write rasters of terrain, surface and height."""
     raster_cell: float | None = None
     """Side of their cells in units of the CRS; None for half a metre."""
-    workers: int | None = None
-    """Processes of the embedded cluster; 0 runs serially in this process, None leaves it to the estimate."""
-    scheduler: str | None = None
-    """Address of a Dask scheduler that takes the place of the embedded cluster."""
-    tls: TlsFiles | None = None
-    """Certificates for the cluster's traffic; by default those of the environment."""
+    resources: Resources = dataclasses.field(default_factory=Resources)
+    """What the command runs with; scratch lies in `out`, and no work folder is used."""
     overwrite: bool = False
     """Replace files of the same names."""
 
@@ -87,7 +86,7 @@ class ClassifySummary:
     out: str
     """The folder."""
     files: tuple[ClassifiedFile, ...]
-    """One an input, in the order of their names."""
+    """One per input, in the order of their names."""
     rasters: tuple[str, ...]
     """Paths of the rasters."""
     classes: dict[int, int]
@@ -113,29 +112,20 @@ def classify(
     Parameters
     ----------
     request : ClassifyRequest
-        What is to be done.
-    on_event : callable
-        Gets an `Event` for every stage, step and warning.
-    executor : Executor, optional
-        Where tasks run; by default what the request asks for.
-    cancelled : callable
-        Asked several times a second, from another thread; once it is true the command ends as soon as it can.
-
-    Returns
-    -------
-    ClassifySummary
-        Files, counts, timings.
+        What to classify, and how.
+    on_event, executor, cancelled
+        As in `pipeline.runtime.run.run`.
 
     Raises
     ------
     InputError
-        An input cannot be used, or not be written anew without loss.
+        An input cannot be used, or cannot be written again without loss.
     SettingsError
         Settings are out of range.
     RunError
-        A file cannot be written, or is there already.
+        A file cannot be written, or exists already.
     RunCancelledError
-        `cancelled` called it off; files that were complete stay.
+        `cancelled` ended it; complete files stay.
     ClusterError
         The scheduler does not answer or was lost.
     """
@@ -150,11 +140,10 @@ def classify(
         inputs=request.inputs,
         out=request.out,
         settings=request.settings,
-        footprints=request.footprints,
         crs=request.crs,
         vertical_unit=request.vertical_unit,
     )
-    plan, paths = plan_inputs(run_request, request.settings, progress)
+    plan, paths = plan_inputs(run_request, progress)
     for path in paths:
         if is_url(path):
             raise InputError(shown(path), "classify reads files of this machine only", "Fetch it first")
@@ -163,54 +152,49 @@ def classify(
     footprints = None if request.footprints is None else given_footprints(request.footprints, plan)
     for warning in () if footprints is None else footprints.warnings:
         progress.warn("plan", warning)
-    reference = plan.sources[0].reference
-    cell = default_cell(reference.horizontal_unit_m) if request.raster_cell is None else request.raster_cell
-    boxes = [info.bounds_m for info in plan.sources]
-    RasterLattice.over(_bounds_of_boxes(boxes), cell, reference.horizontal_unit_m)  # refused early
+    unit_m = plan.reference.horizontal_unit_m
+    cell = default_cell(unit_m) if request.raster_cell is None else request.raster_cell
+    RasterLattice.over(_bounds_of_boxes([info.bounds_m for info in plan.sources]), cell, unit_m)  # refused early
     out = _checked_folder(request, paths)
     for name in remove_abandoned(out / _SCRATCH):
         progress.warn("plan", f"removed {out / _SCRATCH / name}: an earlier command was cut off and left it")
     progress.timings["plan"] = time.perf_counter() - began
-    with held_folder(out / _SCRATCH) as scratch_dir:
-        scratch = Scratch(str(scratch_dir))
-        engine = executor or executor_for(
-            workers=request.workers,
-            scheduler=request.scheduler,
-            local_directory=str(scratch_dir / "dask"),
-            work=expected(plan, 0),
-            tls=request.tls,
-            isolates=False,
-            loads=loads_of("classify", footprints=request.footprints is not None),
-        )
-        with calling_off(scratch, cancelled) as called_off, engine:
-            progress.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)
-            engine.prepare("plan", progress.watch)
-            check_memory(plan, engine.memory_limit_bytes)
-            stages = Stages(
-                settings=request.settings,
-                meshes="none",
-                plan=plan,
-                progress=progress,
-                executor=engine,
-                scratch=scratch,
-            )
-            try:
-                ingested = stages.ingest(paths)
-                splits = stages.split(ingested, footprints)
-                joined = stages.join(splits, footprints, reference)
-                tiles = sorted(splits.places)
-                _label_all(stages, tiles, joined, ingested)
-                files = _write_all(stages, paths, ingested, out)
-                rasters = _draw_all(stages, tiles, ingested, cell, reference, out) if request.rasters else []
-            except BaseException:
-                scratch.cancel()
-                raise
-    for file in files:
-        for warning in file.warnings:
-            progress.warn("write", f"{file.source}: {warning}")
+    with run_context(
+        plan,
+        progress,
+        request.resources,
+        _scratch(out),
+        dataclasses.replace(expected(plan, 0), models=False),
+        loads=loads_of("classify", footprints=footprints is not None),
+        executor=executor,
+        cancelled=cancelled,
+    ) as context:
+        ingested = ingest(context, paths)
+        splits = split(context, request.settings, ingested, footprints)
+        joined = join(context, request.settings.scene, splits, footprints)
+        tiles = sorted(splits.places)
+        _label_all(context, request.settings, tiles, joined, ingested)
+        files = _write_all(context, paths, ingested, out)
+        rasters = _draw_all(context, request.settings, tiles, ingested, cell, out) if request.rasters else []
+    return _summary(progress, out, files, rasters, len(joined.candidates), began)
+
+
+@contextlib.contextmanager
+def _scratch(out: Path) -> Iterator[Scratch]:
+    """Scratch in a folder of its own, since several commands may write into the same place."""
+    with locked_folder(out / _SCRATCH) as folder:
+        yield Scratch(str(folder))
+
+
+def _summary(
+    progress: Progress, out: Path, files: Sequence[ClassifiedFile], rasters: Sequence[str], buildings: int, began: float
+) -> ClassifySummary:
+    """What was written; warns of what was odd in the files."""
     classes: Counter[int] = Counter()
     for file in files:
         classes.update(file.classes)
+        for warning in file.warnings:
+            progress.warn("write", f"{file.source}: {warning}")
     driver, peak_bytes = peak_of_process()
     progress.peaks[driver] = peak_bytes
     progress.timings["total"] = time.perf_counter() - began
@@ -220,93 +204,93 @@ def classify(
         files=tuple(files),
         rasters=tuple(rasters),
         classes={code: classes[code] for code in sorted(classes)},
-        buildings=len(joined.candidates),
+        buildings=buildings,
         timings_s=progress.timings,
         peak_memory_bytes=progress.peaks,
         warnings=tuple(progress.warnings),
     )
 
 
-def _label_all(stages: Stages, tiles: Sequence[Tile], joined: Joined, ingested: Sequence[Ingested]) -> None:
+def _label_all(
+    context: RunContext, settings: RunSettings, tiles: Sequence[Tile], joined: Joined, ingested: Sequence[Ingested]
+) -> None:
     """The classes of all tiles' points, in scratch."""
-    plan, settings = stages.plan, stages.settings
+    grid = context.plan.grid
     classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
-    held: dict[Tile, list[PointRange]] = {}
+    ranges: dict[Tile, list[PointRange]] = {}
     for site in joined.candidates:
         for part in site.ranges:
-            held.setdefault(part.tile, []).append(part)
+            ranges.setdefault(part.tile, []).append(part)
     tasks = [
         LabelTask(
             tile=tile,
-            grid=plan.grid,
+            grid=grid,
             settings=settings.scene,
             classes=classes,
-            scratch=stages.scratch,
+            scratch=context.scratch,
             buildings=tuple(
                 part
-                for other in plan.grid.tiles_over(neighbourhood(tile, plan.grid, settings.scene))
-                for part in held.get(other, ())
+                for other in grid.tiles_over(neighbourhood(tile, grid, settings.scene))
+                for part in ranges.get(other, ())
             ),
         )
         for tile in tiles
     ]
-    stages.progress.stage(stages.executor, "classify", label, tasks)
+    context.map("classify", label, tasks)
 
 
-def _write_all(stages: Stages, paths: Sequence[str], ingested: Sequence[Ingested], out: Path) -> list[ClassifiedFile]:
+def _write_all(
+    context: RunContext, paths: Sequence[str], ingested: Sequence[Ingested], out: Path
+) -> list[ClassifiedFile]:
     """All files, in the inputs' order."""
     tasks = [
         ClassifiedTask(
             part=part_of(path),
             path=path,
-            used=sum(ingested[k].points_by_tile.values()),
+            used=sum(found.points_by_tile.values()),
             name=output_name(path),
             out=str(out),
-            options=stages.plan.options,
-            grid=stages.plan.grid,
-            scratch=stages.scratch,
+            options=context.plan.options,
+            grid=context.plan.grid,
+            scratch=context.scratch,
         )
-        for k, path in enumerate(paths)
+        for path, found in zip(paths, ingested, strict=True)
     ]
-    files = stages.progress.stage(stages.executor, "write", write_classified, tasks)
-    return sorted(files, key=lambda file: file.source)
+    return sorted(context.map("write", write_classified, tasks), key=lambda file: file.source)
 
 
 def _draw_all(
-    stages: Stages,
+    context: RunContext,
+    settings: RunSettings,
     tiles: Sequence[Tile],
     ingested: Sequence[Ingested],
     cell: float,
-    reference: SpatialReference,
     out: Path,
 ) -> list[str]:
     """All rasters, each one mosaic of the tiles; their paths."""
+    reference = context.plan.reference
     boxes = [tuple(v / MM for v in found.bounds_mm) for found in ingested if found.bounds_mm is not None]
     lattice = RasterLattice.over(_bounds_of_boxes(boxes), cell, reference.horizontal_unit_m)
     drawn = with_neighbours(set(tiles))
-    stages.progress.stage(
-        stages.executor,
-        "rasters",
-        draw_tile,
-        [
-            RasterTask(
-                tile=tile,
-                grid=stages.plan.grid,
-                lattice=lattice,
-                settings=stages.settings.scene,
-                scratch=stages.scratch,
-                vertical_unit_m=reference.vertical_unit_m,
-            )
-            for tile in drawn
-        ],
-    )
+    tasks = [
+        RasterTask(
+            tile=tile,
+            grid=context.plan.grid,
+            lattice=lattice,
+            settings=settings.scene,
+            scratch=context.scratch,
+            vertical_unit_m=reference.vertical_unit_m,
+        )
+        for tile in drawn
+    ]
+    context.map("rasters", draw_tile, tasks)
     mosaics = [
         MosaicTask(
-            name=name, tiles=tuple(drawn), lattice=lattice, scratch=stages.scratch, out=str(out), reference=reference
+            name=name, tiles=tuple(drawn), lattice=lattice, scratch=context.scratch, out=str(out), reference=reference
         )
         for name in RASTERS
     ]
-    return sorted(stages.progress.stage(stages.executor, "mosaics", write_mosaic, mosaics))
+    return sorted(context.map("mosaics", write_mosaic, mosaics))
 
 
 def _bounds_of_boxes(boxes: Sequence[tuple[float, ...]]) -> tuple[float, float, float, float]:
@@ -320,13 +304,13 @@ def _bounds_of_boxes(boxes: Sequence[tuple[float, ...]]) -> tuple[float, float, 
 
 
 def _checked_folder(request: ClassifyRequest, paths: Sequence[str]) -> Path:
-    """The folder of the outcome, made, after a look at what would be written.
+    """The folder of the outcome, checked against all that would be written, and made.
 
     Raises
     ------
     RunError
-        Two inputs would get one name, an input would be replaced, a file is there already, something stands in the
-        way, or it cannot be written.
+        Two inputs would get the same name, an input would be replaced, a file exists already, a folder or file is in
+        the way, or the folder cannot be written.
     """
     if "://" in request.out:
         raise RunError(f"{request.out} is no local path: this version writes local folders only")

@@ -1,4 +1,4 @@
-"""Several methods on the same candidates: one run directory a variant below one folder."""
+"""Comparison: several methods on the same candidates, one run directory per variant below one folder."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from pipeline.parameters import build
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.manifest import NAME as MANIFEST
 from pipeline.runtime.monitoring.events import Listener, ignore, never
-from pipeline.runtime.run import RunRequest, RunSummary, RunVariant, run_variants
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.run import RunSummary, RunVariant, run_variants
 from pipeline.settings import RunSettings
 
 RUNS = "runs"
 """Folder of the run directories below the comparison's."""
 
 SUMMARY = "compare.json"
-"""The file that tells what was compared, written last; the mark of a comparison's folder."""
+"""The file with what was compared, written last: the mark of a comparison's folder."""
 
 BUILDINGS = "buildings.parquet"
-"""One row a building and run."""
+"""One row per building and run."""
 
 REPORT = "compare.md"
 """The figures as Markdown."""
@@ -48,7 +49,7 @@ class Variant:
 
     @property
     def label(self) -> str:
-        """What tables, folders and pages call it: the preset is told where it is not the default."""
+        """Its name in tables, folders and pages; it includes a preset that is not the default."""
         return self.method if self.preset == PRESETS[0] else f"{self.method}-{self.preset}"
 
     @classmethod
@@ -72,7 +73,7 @@ class Variant:
 
 
 def parse_variants(texts: Sequence[str]) -> tuple[Variant, ...]:
-    """Variants from what a user gives, several by commas too.
+    """Variants from the words of a user, each with one or more variants separated by commas.
 
     Raises
     ------
@@ -104,20 +105,19 @@ def parse_variants(texts: Sequence[str]) -> tuple[Variant, ...]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CompareRequest:
-    """What is to be compared."""
+    """What to compare, and how."""
 
     run: RunRequest
-    """Inputs and how to run; its `out` is the comparison's folder. Of its settings all counts but what is the method's
-    own."""
+    """Inputs and how to run; its `out` is the comparison's folder. The settings of its method have no effect."""
     variants: tuple[Variant, ...]
     """At least two, each once."""
     tables: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
-    """What differs from a method's presets, by the method's name: counts for all its variants."""
+    """Values that differ from a method's presets, by the method's name, for all its variants."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CompareSummary:
-    """What a comparison found."""
+    """The outcome of a comparison."""
 
     out: str
     """Its folder."""
@@ -133,41 +133,24 @@ def compare(
     executor: Executor | None = None,
     cancelled: Callable[[], bool] = never,
 ) -> CompareSummary:
-    """Model the candidates of the inputs by several methods.
-
-    Parameters
-    ----------
-    request : CompareRequest
-        What is to be compared.
-    on_event, executor, cancelled
-        As of `pipeline.runtime.run.run`.
-
-    Returns
-    -------
-    CompareSummary
-        A summary a variant.
+    """Model the candidates of the inputs by several methods; arguments and errors as in `pipeline.runtime.run.run`.
 
     Raises
     ------
     RunError
-        The folder cannot be used.
-    InputError, SettingsError, RunCancelledError, ClusterError
-        As `pipeline.runtime.run.run`.
+        Also where the folder cannot be used.
     """
     out = _checked(request.run)
     variants = [
-        RunVariant(
-            settings=settings_of(request.run.settings, variant, request.tables),
-            out=str(out / RUNS / variant.label),
-            label=variant.label,
-        )
+        run_variant(request.run.settings, variant, str(out / RUNS / variant.label), request.tables)
         for variant in request.variants
     ]
-    # a page of an earlier comparison would be taken for that of the new runs, should these never come to theirs
-    stale = [out / name for name in _WRITTEN]
-    outcomes = run_variants(request.run, variants, str(out), on_event, executor, cancelled, stale=stale)
+    # should the new runs fail, the page of an earlier comparison must not pass for theirs
+    outdated = [out / name for name in _WRITTEN]
+    run_request = dataclasses.replace(request.run, out=str(out))
+    outcomes = run_variants(run_request, variants, on_event, executor, cancelled, outdated)
     for run_dir in (out / RUNS).iterdir():
-        # what an earlier comparison left of other methods would be taken for a part of this one
+        # runs of other methods, left by an earlier comparison, are not part of this one
         if run_dir.name not in {variant.label for variant in variants} and (run_dir / MANIFEST).exists():
             shutil.rmtree(run_dir)
     labelled = dict(zip((variant.label for variant in variants), outcomes, strict=True))
@@ -178,19 +161,21 @@ def compare(
     )
 
 
-def settings_of(
-    settings: RunSettings, variant: Variant, tables: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
-) -> RunSettings:
-    """A run's settings with a variant's method in the place of theirs.
+def run_variant(
+    settings: RunSettings, variant: Variant, out: str, tables: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
+) -> RunVariant:
+    """A variant of a run with some settings.
 
     Parameters
     ----------
     settings : RunSettings
-        All but the method's own count.
+        All settings except those of the method.
     variant : Variant
         The method and its preset.
+    out : str
+        The variant's run directory.
     tables : mapping
-        What differs from the presets, by the method's name.
+        Values that differ from the presets, by the method's name.
 
     Raises
     ------
@@ -203,10 +188,15 @@ def settings_of(
     own = build(entry.settings_type, variant.method, values, faults, entry.preset(variant.preset))
     if faults:
         raise SettingsError(faults)
-    general = dataclasses.replace(settings.general, method=variant.method, preset=variant.preset)
-    return RunSettings(
-        general=general, scene=settings.scene, building=dataclasses.replace(settings.building, method=own)
-    )
+    building = dataclasses.replace(settings.building, method=own)
+    return RunVariant(method=variant.method, preset=variant.preset, building=building, out=out, label=variant.label)
+
+
+def settings_of(
+    settings: RunSettings, variant: Variant, tables: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
+) -> RunSettings:
+    """A run's settings with a variant's method in the place of theirs; as in `run_variant`."""
+    return run_variant(settings, variant, "", tables).settings_in(settings)
 
 
 def own_tables(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -224,8 +214,8 @@ def own_tables(table: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """
     named = [name for name in ("method", "preset") if name in table]
     if named:
-        told = "name what is compared in methods, as METHOD or METHOD:PRESET"
-        raise SettingsError([f"settings.{name} is {table[name]!r}: {told}" for name in named])
+        fix = "name what is compared in methods, as METHOD or METHOD:PRESET"
+        raise SettingsError([f"settings.{name} is {table[name]!r}: {fix}" for name in named])
     return {name: table[name] for name in METHODS if name in table}
 
 
@@ -235,7 +225,7 @@ def _checked(request: RunRequest) -> Path:
     Raises
     ------
     RunError
-        It holds something that is no comparison, or one that is not to be replaced.
+        It is not a comparison, or one that must not be replaced.
     """
     if "://" in request.out:
         raise RunError(f"{request.out} is no local path: this version writes local folders only")
@@ -246,7 +236,7 @@ def _checked(request: RunRequest) -> Path:
         raise RunError(f"{out} cannot be read: {error.strerror or error}. Give another --out") from error
     if left and not request.overwrite:
         raise RunError(f"{out} is not empty ({left[0]} …): give another --out, or --overwrite")
-    # one that was broken off has no summary, and nothing but what a comparison writes
+    # an interrupted comparison has no summary, and only files that a comparison writes
     strange = [name for name in left if name not in (RUNS, _SCRATCH, *_WRITTEN) and not name.startswith(".")]
     if left and SUMMARY not in left and (strange or RUNS not in left):
         raise RunError(f"{out} holds {(strange or left)[0]} and is no comparison: give another --out")

@@ -1,4 +1,4 @@
-"""The run that a rerun changes: what its directory tells of it, and whether its inputs are still the same."""
+"""The earlier run that a rerun changes: what its directory says of it, and whether its inputs are still the same."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ from pipeline.export.geoparquet import table_dataset
 from pipeline.export.records import KEYS
 from pipeline.io.urls import has_mark, is_url, shown
 from pipeline.runtime.manifest import RunManifest, RunStatus, read_manifest
-from pipeline.runtime.run import OVERRIDES, RunRequest, told_file
-from pipeline.runtime.stages.ingest import Ingested
+from pipeline.runtime.request import RunRequest, input_file
+from pipeline.runtime.run import OVERRIDES
+from pipeline.runtime.stages.ingested import Ingested
 from pipeline.settings import RunSettings
 
 REJECTED = "rejected"
-"""In the place of a status, of what is no building."""
+"""Status of objects that are not buildings."""
 
 _AGAIN = "Run the whole again"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Record:
-    """What the tables of a run tell of one building or rejected object."""
+    """What the tables of a run say about one building or rejected object."""
 
     points: int
     box: tuple[float, float, float, float] | None
@@ -39,22 +40,22 @@ class Record:
     status: str
     """As in the table of buildings, or `rejected`."""
     input_hash: str | None
-    """None of rejected objects."""
+    """None for rejected objects."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Earlier:
-    """What the run directory tells before the rerun."""
+    """What the run directory says before the rerun."""
 
     run_dir: Path
     manifest: RunManifest
     fingerprints: Mapping[str, str]
-    """What overrides did, by building_id."""
+    """Fingerprints of the overrides that took effect, by building_id."""
     redrawn: frozenset[str]
-    """Buildings that overrides gave another footprint."""
+    """Buildings with another footprint from overrides."""
 
     def records(self, names: Collection[str], source_ids: Collection[str] = ()) -> dict[str, Record]:
-        """What the tables tell of some buildings and rejected objects, by id; those that are none are not there."""
+        """The records of some buildings and rejected objects, by id; unknown ids are missing."""
         found: dict[str, Record] = {}
         of_buildings = _is_one_of("building_id", names) | _is_one_of("source_id", source_ids)
         chosen = {"buildings": of_buildings, "rejected": _is_one_of("object_id", names)}
@@ -88,12 +89,12 @@ def _is_one_of(column: str, values: Collection[str]) -> pc.Expression:
 
 
 def earlier_run(run_dir: str) -> Earlier:
-    """What a run directory tells of its run.
+    """What a run directory says about its run.
 
     Raises
     ------
     RunError
-        It holds no finished run of this version that tells how it was asked for.
+        It has no finished run of this version with its request.
     """
     if is_url(run_dir):
         raise RunError(
@@ -109,8 +110,8 @@ def earlier_run(run_dir: str) -> Earlier:
         raise RunError(f"the run in {root} {made}: its other buildings could differ. {_AGAIN}")
     if not manifest.request:
         raise RunError(f"run.json in {root} does not tell how the run was asked for. {_AGAIN}")
-    told = json.loads((root / OVERRIDES).read_text(encoding="utf-8")) if (root / OVERRIDES).is_file() else []
-    effective = [entry for entry in told if entry["fingerprint"] is not None]
+    entries = json.loads((root / OVERRIDES).read_text(encoding="utf-8")) if (root / OVERRIDES).is_file() else []
+    effective = [entry for entry in entries if entry["fingerprint"] is not None]
     return Earlier(
         run_dir=root,
         manifest=manifest,
@@ -125,7 +126,7 @@ def request_of(manifest: RunManifest) -> RunRequest:
     settings = RunSettings.from_mapping({**sections.pop("general"), **sections})
     if settings.settings_hash != manifest.settings_hash:
         raise RunError("the settings in run.json are not those of its settings_hash: it was changed by hand")
-    told = manifest.request
+    asked = manifest.request
     hidden = [entry.path for entry in manifest.inputs if has_mark(entry.path)]
     if hidden:
         raise RunError(f"{hidden[0]}: run.json keeps no queries of URLs, so this cannot be fetched again. {_AGAIN}")
@@ -133,17 +134,17 @@ def request_of(manifest: RunManifest) -> RunRequest:
         inputs=tuple(entry.path for entry in manifest.inputs if entry.n_points is not None),
         out="",
         settings=settings,
-        footprints=told["footprints"],
-        crs=told["crs"],
-        vertical_unit=told["vertical_unit"],
-        bbox=None if told["bbox"] is None else tuple(told["bbox"]),
-        aoi=told["aoi"],
-        meshes=told["meshes"],
+        footprints=asked["footprints"],
+        crs=asked["crs"],
+        vertical_unit=asked["vertical_unit"],
+        bbox=None if asked["bbox"] is None else tuple(asked["bbox"]),
+        aoi=asked["aoi"],
+        meshes=asked["meshes"],
     )
 
 
 def check_points(manifest: RunManifest, paths: Sequence[str], ingested: Sequence[Ingested]) -> None:
-    """Refuse points that are not those of the run."""
+    """Refuse points that the run did not have."""
     known = {entry.path: entry.sha256 for entry in manifest.inputs}
     for path, found in zip(paths, ingested, strict=True):
         if known.get(shown(path)) != found.sha256:
@@ -151,8 +152,8 @@ def check_points(manifest: RunManifest, paths: Sequence[str], ingested: Sequence
 
 
 def check_outlines(manifest: RunManifest, request: RunRequest) -> None:
-    """Refuse footprints, or an area of interest, that are not those of the run."""
+    """Refuse footprints, or an area of interest, that the run did not have."""
     known = {entry.path: entry.sha256 for entry in manifest.inputs if entry.n_points is None}
     for path in (request.footprints, request.aoi):
-        if path is not None and known.get(shown(path)) != told_file(path).sha256:
+        if path is not None and known.get(shown(path)) != input_file(path).sha256:
             raise RunError(f"{shown(path)} is not the file that the run read. {_AGAIN}")

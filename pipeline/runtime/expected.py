@@ -58,7 +58,9 @@ class Expected:
     buildings: int
     """How many."""
     task_bytes: int = 0
-    """Of its largest task, above the process's own size."""
+    """Memory of its largest task, above the process's own size."""
+    models: bool = True
+    """Whether buildings are modelled."""
 
     @property
     def points(self) -> int:

@@ -10,7 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 import shapely
 
 from pipeline.errors import CrsError, EmptyInputError, InputError, all_at_fault
-from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
+from pipeline.io import ReadOptions, SourceInfo, SpatialReference, is_url, open_source, shown
+from pipeline.io.gps_time import GpsTimeKind
 from pipeline.runtime.cluster.memory_needs import WINDOW_BASE_BYTES
 from pipeline.settings import RunSettings
 from pipeline.terrain.scene_settings import ClassesInUse
@@ -44,6 +45,17 @@ class Plan:
     """Estimated peak of the largest task above the process's own size."""
     warnings: tuple[str, ...]
     """What is odd but usable."""
+
+    @property
+    def reference(self) -> SpatialReference:
+        """The CRS and units of all inputs."""
+        return self.sources[0].reference
+
+    @property
+    def gps_kind(self) -> GpsTimeKind:
+        """What the GPS times of all inputs are; NONE where the inputs differ."""
+        kinds = {info.gps_time_kind for info in self.sources}
+        return kinds.pop() if len(kinds) == 1 else GpsTimeKind.NONE
 
 
 def tile_size_m(density_per_m2: float, halo_m: float, area_m2: float) -> float:

@@ -19,7 +19,7 @@ from pipeline.model import BuildingResult, Reason
 from pipeline.reconstruct import failed_building
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
 from pipeline.runtime.isolation.replay_bundle import Bundle
-from pipeline.runtime.stages.reconstruct import model_bundle
+from pipeline.runtime.stages.model_batch import model_bundle
 
 _OF_THE_RUN = ("geometry", "acquired_from", "acquired_to", "mesh_path", "input_hash", "settings_hash", *SOLID_COLUMNS)
 

@@ -1,8 +1,8 @@
-"""Rerun: single buildings of a finished run again, after other overrides or on request; all others stay untouched.
+"""Rerun: single buildings of a finished run are modelled again, after other overrides or on request.
 
-The inputs are read again and only the tiles around these buildings are split. What is found there is held against the
-records of the run: where a building is not the one that the run had, all tiles are split. All files are written, tile
-by tile, beside the run before the first of its own is touched; then each is renamed into its place.
+The inputs are read again, and only the tiles around these buildings are split. Their candidates are compared with the
+records of the run; where a building differs from the run, all tiles are split. All new files are written beside the
+run, tile by tile, before the first of its own is touched; then each is renamed into its place.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from uuid import uuid4
 
 import shapely
 
@@ -26,7 +25,6 @@ from pipeline.export.tile_update import updated_tile
 from pipeline.io import LocalStorage
 from pipeline.model import Reason
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.cluster.tls import TlsFiles
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.earlier import (
     REJECTED,
@@ -37,78 +35,70 @@ from pipeline.runtime.earlier import (
     earlier_run,
     request_of,
 )
-from pipeline.runtime.engine import executor_for
 from pipeline.runtime.expected import expected
-from pipeline.runtime.isolation.isolated_items import IsolationLimits
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.isolation.replay_bundle import SUFFIX
 from pipeline.runtime.manifest import PAGE, SLOWEST, RunManifest, RunStatus, SlowBuilding, write_manifest
-from pipeline.runtime.monitoring.events import Listener, Watch, ignore, never
+from pipeline.runtime.monitoring.events import Listener, ignore, never
+from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.overrides.overrides_file import Override, read_overrides
-from pipeline.runtime.plan import check_memory
-from pipeline.runtime.run import (
-    OVERRIDES,
-    RunRequest,
-    calling_off,
-    plan_inputs,
-    put_json,
-    told_file,
-    told_request,
-)
+from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import OVERRIDES, put_json
+from pipeline.runtime.run_context import RunContext, run_context
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.folder_lock import held_results
-from pipeline.runtime.scratch.location import SCRATCH, remove_folder
-from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome
+from pipeline.runtime.scratch.folder_lock import locked_results
+from pipeline.runtime.scratch.location import run_scratch
+from pipeline.runtime.stages.apply_overrides import WARNING, EntryOutcome, apply_overrides
 from pipeline.runtime.stages.gather import gather
-from pipeline.runtime.stages.ingest import Ingested
-from pipeline.runtime.stages.join import CandidateSite, Joined, RejectedSite
-from pipeline.runtime.stages.progress import Progress
-from pipeline.runtime.stages.publish import QUARANTINE, rejected_object
-from pipeline.runtime.stages.reconstruct import Modelled, StoredResult
-from pipeline.runtime.stages.stages import GivenFootprints, Models, Splits, Stages, given_footprints, points_by_tile
+from pipeline.runtime.stages.given_footprints import GivenFootprints, given_footprints
+from pipeline.runtime.stages.ingest import ingest
+from pipeline.runtime.stages.ingested import Ingested, points_by_tile
+from pipeline.runtime.stages.join import join
+from pipeline.runtime.stages.model_batch import Modelled, StoredResult
+from pipeline.runtime.stages.outline import outline
+from pipeline.runtime.stages.publish import record_context, rejected_object
+from pipeline.runtime.stages.reconstruct import QUARANTINE, Models, reconstruct
+from pipeline.runtime.stages.sites import CandidateSite, Joined, RejectedSite
+from pipeline.runtime.stages.split import Splits, split
 from pipeline.tiling import MM, Tile
 
 AROUND_M = 30.0
-"""Tiles that come nearer than this to a building are split: it sees terrain up to 15 m away."""
+"""Tiles nearer than this to a building are split. Not a setting: a building sees terrain up to 15 m away, and where
+this does not suffice all tiles are split."""
 _NEW = "new"
-"""In scratch, the files that will take the place of the run's."""
+"""Folder of scratch for the files that will replace those of the run."""
 _QUARANTINED = (Reason.INTERNAL_ERROR, Reason.CRASHED, Reason.TIMED_OUT, Reason.OUT_OF_MEMORY)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RerunRequest:
-    """What is to be done again."""
+    """Which buildings to model again."""
 
     run_dir: str
     """The directory of a finished run."""
     overrides: str | None = None
-    """The overrides file that takes the place of the run's own; None keeps that."""
+    """The overrides file that replaces the run's own; None uses that."""
     only: tuple[str, ...] = ()
-    """Buildings, by building_id, that are modelled again whatever the overrides say."""
-    workers: int | None = None
-    """Processes of the embedded cluster; 0 runs serially in this process, None leaves it to the estimate."""
-    scheduler: str | None = None
-    """Address of a Dask scheduler that takes the place of the embedded cluster."""
-    tls: TlsFiles | None = None
-    """Certificates for the cluster's traffic; by default those of the environment."""
-    isolation: IsolationLimits | None = None
-    """Limits of the supervised children that model buildings; None models them in the workers themselves."""
+    """Buildings, by building_id, to model again whatever the overrides say."""
+    resources: Resources = dataclasses.field(default_factory=Resources)
+    """What the rerun runs with."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RerunSummary:
-    """What came out."""
+    """The outcome of a rerun."""
 
     run_dir: str
     """The directory."""
     digest: str
-    """sha256 of the content, as of a whole run with these overrides."""
+    """sha256 of the content, the same as for a whole run with these overrides."""
     buildings: dict[str, str]
-    """Status by id of the buildings that were made again; `rejected` of those that are none now."""
+    """Status of the buildings modelled again, by id; `rejected` for those that are not buildings now."""
     tiles: tuple[str, ...]
-    """Tiles whose files were written anew."""
+    """Tiles with new files."""
     tiles_split: int
-    """Tiles that were split for it."""
+    """Number of tiles that were split."""
     warnings: tuple[str, ...]
     """What was odd but usable."""
     seconds: float
@@ -126,33 +116,24 @@ def rerun(
     Parameters
     ----------
     request : RerunRequest
-        What is to be done.
-    on_event : callable
-        Gets an `Event` for every stage, step and warning.
-    executor : Executor, optional
-        Where tasks run; by default what the request asks for.
-    cancelled : callable
-        Asked several times a second, from another thread; once it is true the rerun ends as soon as it can.
-
-    Returns
-    -------
-    RerunSummary
-        What was made again; the digest is that of a whole run with these overrides.
+        Which buildings to model again.
+    on_event, executor, cancelled
+        As in `pipeline.runtime.run.run`.
 
     Raises
     ------
     RunError
-        The directory holds no finished run of this version, its inputs changed, an id is none of its buildings, or
+        The directory has no finished run of this version, its inputs changed, an id is not one of its buildings, or
         another run writes it.
     SettingsError
-        The overrides hold faults.
+        The overrides have faults.
     InputError
-        An input cannot be read any more.
+        An input can no longer be read.
     RunCancelledError
-        `cancelled` called it off; the run directory is as it was.
+        `cancelled` ended it; the run directory is unchanged.
     """
-    with held_results(str(earlier_run(request.run_dir).run_dir)):
-        # as it is now that nobody else writes it
+    with locked_results(str(earlier_run(request.run_dir).run_dir)):
+        # read it again: only now is it certain that no other process writes it
         return _rerun(request, earlier_run(request.run_dir), on_event, executor, cancelled)
 
 
@@ -171,56 +152,42 @@ def _rerun(
     unknown = [name for name in request.only if name not in known or known[name].status == REJECTED]
     if unknown:
         raise RunError(f"{', '.join(unknown)}: no building of {earlier.run_dir}. Give ids of its buildings table")
-    plan, paths = plan_inputs(wanted, wanted.settings, progress)
+    plan, paths = plan_inputs(wanted, progress)
     footprints = None if wanted.footprints is None else given_footprints(wanted.footprints, plan)
-    reference = plan.sources[0].reference
-    overrides = () if wanted.overrides is None else read_overrides(wanted.overrides, reference, wanted.settings)
+    overrides = () if wanted.overrides is None else read_overrides(wanted.overrides, plan.reference, wanted.settings)
     check_outlines(earlier.manifest, wanted)
-    scratch_dir = earlier.run_dir / SCRATCH
-    remove_folder(scratch_dir)
-    scratch = Scratch(str(scratch_dir / uuid4().hex))
-    engine = executor or executor_for(
-        workers=request.workers,
-        scheduler=request.scheduler,
-        local_directory=str(scratch_dir / "dask"),
-        # a few tiles are split for it; they are not known yet, and all inputs are read
-        work=dataclasses.replace(expected(plan, 0), seen_points=0.0),
-        tls=request.tls,
+    with run_context(
+        plan,
+        progress,
+        request.resources,
+        run_scratch(str(earlier.run_dir), None),
+        # a few tiles are split, which are not known yet; all inputs are read
+        dataclasses.replace(expected(plan, 0), seen_points=0.0),
         loads=loads_of("reconstruct", footprints=False, method=wanted.settings.general.method),
-    )
-    scratch.create()
-    try:
-        with calling_off(scratch, cancelled) as called_off, engine:
-            progress.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)
-            engine.prepare("plan", progress.watch)
-            check_memory(plan, engine.memory_limit_bytes)
-            stages = Stages(
-                settings=wanted.settings,
-                meshes=wanted.meshes,
-                plan=plan,
-                progress=progress,
-                executor=engine,
-                scratch=scratch,
-                isolation=request.isolation,
-            )
-            try:
-                ingested = stages.ingest(paths)
-                check_points(earlier.manifest, paths, ingested)
-                found = _found(stages, earlier, ingested, footprints, overrides, request.only)
-                for outcome in found.outcomes:
-                    if outcome.warning:
-                        progress.warn("join", outcome.warning)
-                models = stages.reconstruct(found.again)
-                modelled = list(models.each())
-                new = LocalStorage(root=Path(scratch.root, _NEW))
-                prepared = _prepared(stages, earlier, found, models, wanted.meshes, new)
-            except BaseException:
-                scratch.cancel()
-                raise
-            scratch.check_cancelled()
-            digest = _written(earlier, wanted, found, modelled, prepared, new, scratch, began)
-    finally:
-        remove_folder(scratch_dir)
+        executor=executor,
+        cancelled=cancelled,
+    ) as context:
+        ingested = ingest(context, paths)
+        check_points(earlier.manifest, paths, ingested)
+        search = _Search(
+            context=context,
+            earlier=earlier,
+            request=wanted,
+            ingested=ingested,
+            footprints=footprints,
+            overrides=overrides,
+            only=request.only,
+        )
+        found = search.found()
+        for outcome in found.outcomes:
+            if outcome.warning:
+                progress.warn("join", outcome.warning)
+        models = reconstruct(context, wanted.settings, found.again)
+        modelled = list(models.each())
+        new = LocalStorage(root=Path(context.scratch.root, _NEW))
+        prepared = _prepared(search, found, models, new)
+        context.scratch.check_cancelled()
+        digest = _written(search, found, modelled, prepared, new, began)
     status = {**{m.building_id: m.status for m in modelled}, **{s.object_id: "rejected" for s in found.again.rejected}}
     seconds = time.perf_counter() - began
     progress.tell("finished", "", f"{len(found.changed)} buildings in {seconds:.1f} s")
@@ -229,7 +196,7 @@ def _rerun(
         digest=digest,
         buildings=dict(sorted(status.items())),
         tiles=tuple(sorted(tile.key for tile in prepared)),
-        tiles_split=len(found.splits.told),
+        tiles_split=len(found.splits.figures),
         warnings=tuple(outcome.warning for outcome in found.outcomes if outcome.warning),
         seconds=seconds,
     )
@@ -243,148 +210,141 @@ def _overrides_file(request: RerunRequest, earlier: Earlier) -> str | None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Found:
-    """What the split of some tiles, or of all, found."""
+    """The candidates of some tiles, or of all."""
 
     splits: Splits
     judged: Joined
-    """Before the overrides."""
+    """The candidates before the overrides."""
     outcomes: tuple[EntryOutcome, ...]
     changed: frozenset[str]
-    """Buildings that are to be made again."""
+    """Buildings to model again."""
     again: Joined
-    """These alone, after the overrides."""
+    """Only these, after the overrides."""
 
 
-def _found(
-    stages: Stages,
-    earlier: Earlier,
-    ingested: Sequence[Ingested],
-    footprints: GivenFootprints | None,
-    overrides: Sequence[Override],
-    only: Collection[str],
-) -> _Found:
-    """The buildings to be made again, from the tiles around them, or from all where those do not suffice."""
-    near = _tiles_near(stages, earlier, ingested, footprints, overrides, only)
-    if near is not None:
-        found = _join(stages, earlier, ingested, footprints, overrides, only, near)
-        if _as_in_the_run(stages, earlier, found):
-            return found
-    found = _join(stages, earlier, ingested, footprints, overrides, only, None)
-    there = {site.building_id for site in found.again.candidates} | {site.object_id for site in found.again.rejected}
-    if there != found.changed:
-        lost = ", ".join(sorted(found.changed - there))
-        raise RunError(f"{lost} cannot be found again in the inputs of {earlier.run_dir}. Run the whole again")
-    return found
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Search:
+    """The search for the buildings to model again."""
 
+    context: RunContext
+    earlier: Earlier
+    request: RunRequest
+    """The request of the run, with the new overrides."""
+    ingested: Sequence[Ingested]
+    footprints: GivenFootprints | None
+    overrides: Sequence[Override]
+    only: Collection[str]
+    """Buildings to model again whatever the overrides say."""
 
-def _join(
-    stages: Stages,
-    earlier: Earlier,
-    ingested: Sequence[Ingested],
-    footprints: GivenFootprints | None,
-    overrides: Sequence[Override],
-    only: Collection[str],
-    tiles: frozenset[Tile] | None,
-) -> _Found:
-    reference = stages.plan.sources[0].reference
-    splits = stages.split(ingested, footprints, tiles)
-    judged = stages.outline(stages.join(splits, footprints, reference))
-    joined, outcomes = stages.override(judged, overrides, ingested)
-    now = {o.building_id: o.effective.fingerprint for o in outcomes if o.building_id and o.effective is not None}
-    names = {*now, *earlier.fingerprints}
-    changed = frozenset({name for name in names if now.get(name) != earlier.fingerprints.get(name)} | set(only))
-    return _Found(
-        splits=splits,
-        judged=judged,
-        outcomes=outcomes,
-        changed=changed,
-        again=dataclasses.replace(
-            joined,
-            candidates=tuple(site for site in joined.candidates if site.building_id in changed),
-            rejected=tuple(site for site in joined.rejected if site.object_id in changed),
-        ),
-    )
+    def found(self) -> _Found:
+        """The buildings to model again, from the tiles around them, or from all tiles where those do not suffice."""
+        near = self._tiles_near()
+        if near is not None:
+            found = self._candidates(near)
+            if self._as_in_the_run(found):
+                return found
+        found = self._candidates(None)
+        there = {site.building_id for site in found.again.candidates}
+        there |= {site.object_id for site in found.again.rejected}
+        if there != found.changed:
+            lost = ", ".join(sorted(found.changed - there))
+            raise RunError(f"{lost} cannot be found again in the inputs of {self.earlier.run_dir}. Run the whole again")
+        return found
 
+    def _candidates(self, tiles: frozenset[Tile] | None) -> _Found:
+        """The candidates of some tiles; of all tiles for None."""
+        context, settings = self.context, self.request.settings
+        splits = split(context, settings, self.ingested, self.footprints, tiles)
+        judged = outline(context, settings.building.roof, join(context, settings.scene, splits, self.footprints))
+        joined, outcomes = apply_overrides(context, settings, judged, self.overrides, self.ingested)
+        now = {o.building_id: o.effective.fingerprint for o in outcomes if o.building_id and o.effective is not None}
+        before = self.earlier.fingerprints
+        changed = frozenset({name for name in {*now, *before} if now.get(name) != before.get(name)} | set(self.only))
+        return _Found(
+            splits=splits,
+            judged=judged,
+            outcomes=outcomes,
+            changed=changed,
+            again=dataclasses.replace(
+                joined,
+                candidates=tuple(site for site in joined.candidates if site.building_id in changed),
+                rejected=tuple(site for site in joined.rejected if site.object_id in changed),
+            ),
+        )
 
-def _tiles_near(
-    stages: Stages,
-    earlier: Earlier,
-    ingested: Sequence[Ingested],
-    footprints: GivenFootprints | None,
-    overrides: Sequence[Override],
-    only: Collection[str],
-) -> frozenset[Tile] | None:
-    """The tiles around all places that overrides, old and new, speak of; None where a place is not known."""
-    unit = stages.plan.sources[0].reference.horizontal_unit_m
-    boxes: list[tuple[float, ...]] = []
-    names = {*only, *earlier.fingerprints, *(str(o.building_id) for o in overrides if o.building_id is not None)}
-    records = earlier.records(names, [o.source_id for o in overrides if o.source_id is not None])
-    if not names <= set(records):
-        return None
-    boxes.extend((*o.point_m, *o.point_m) for o in overrides if o.point_m is not None)
-    boxes.extend(o.footprint.bounds for o in overrides if o.footprint is not None)
-    given = {} if footprints is None else dict(zip(footprints.ids, footprints.polygons, strict=True))
-    for record in records.values():
-        if record.source_id in given:
-            boxes.append(given[record.source_id].bounds)
-        elif record.box is not None:
-            boxes.append(tuple(value * unit for value in record.box))
-        else:
+    def _tiles_near(self) -> frozenset[Tile] | None:
+        """The tiles around all places named by overrides, old and new; None where a place is unknown."""
+        overrides, grid = self.overrides, self.context.plan.grid
+        unit = self.context.plan.reference.horizontal_unit_m
+        boxes: list[tuple[float, ...]] = []
+        named = {str(o.building_id) for o in overrides if o.building_id is not None}
+        names = {*self.only, *self.earlier.fingerprints, *named}
+        records = self.earlier.records(names, [o.source_id for o in overrides if o.source_id is not None])
+        if not names <= set(records):
             return None
-    margin = round(AROUND_M * MM)
-    near = set()
-    for tile in points_by_tile(ingested):
-        core = stages.plan.grid.core(tile).grown(margin)
-        square = shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM)
-        if any(square.intersects(shapely.box(*box)) for box in boxes):
-            near.add(tile)
-    return frozenset(near)
+        boxes.extend((*o.point_m, *o.point_m) for o in overrides if o.point_m is not None)
+        boxes.extend(o.footprint.bounds for o in overrides if o.footprint is not None)
+        given = {}
+        if self.footprints is not None:
+            given = dict(zip(self.footprints.ids, self.footprints.polygons, strict=True))
+        for record in records.values():
+            if record.source_id in given:
+                boxes.append(given[record.source_id].bounds)
+            elif record.box is not None:
+                boxes.append(tuple(value * unit for value in record.box))
+            else:
+                return None
+        margin = round(AROUND_M * MM)
+        near = set()
+        for tile in points_by_tile(self.ingested):
+            core = grid.core(tile).grown(margin)
+            square = shapely.box(core.x0_mm / MM, core.y0_mm / MM, core.x1_mm / MM, core.y1_mm / MM)
+            if any(square.intersects(shapely.box(*box)) for box in boxes):
+                near.add(tile)
+        return frozenset(near)
 
-
-def _as_in_the_run(stages: Stages, earlier: Earlier, found: _Found) -> bool:
-    """Whether each building to be made again is known to be what the run had there."""
-    if any(outcome.building_id is None for outcome in found.outcomes):
-        return False
-    candidates = {site.building_id: site for site in found.judged.candidates}
-    rejected = {site.object_id: site for site in found.judged.rejected}
-    records = earlier.records(found.changed)
-    for name in found.changed:
-        # of a building that is cut off where the split tiles end, neither points nor id are those of the run
-        site, record = candidates.get(name) or rejected.get(name), records.get(name)
-        if site is None or record is None or name in earlier.redrawn or not _same(stages, record, site):
+    def _as_in_the_run(self, found: _Found) -> bool:
+        """Whether each building to model again is the same as in the run, as far as its records show."""
+        if any(outcome.building_id is None for outcome in found.outcomes):
             return False
-    return True
-
-
-def _same(stages: Stages, record: Record, site: CandidateSite | RejectedSite) -> bool:
-    """Whether a site, without overrides, is that of a record."""
-    if record.points != site.points:
-        return False
-    if isinstance(site, RejectedSite):
+        candidates = {site.building_id: site for site in found.judged.candidates}
+        rejected = {site.object_id: site for site in found.judged.rejected}
+        records = self.earlier.records(found.changed)
+        for name in found.changed:
+            # a building cut off at the edge of the split tiles has other points, or another id, than in the run
+            site, record = candidates.get(name) or rejected.get(name), records.get(name)
+            if site is None or record is None or name in self.earlier.redrawn or not self._same(record, site):
+                return False
         return True
-    if record.input_hash is None:
-        # the outline of a unit hangs on all units of its block, which may reach beyond the split tiles
-        return site.block is None
-    at_walls = stages.settings.building.roof.at_walls
-    _, facts = gather(stages.scratch, stages.plan.grid, site, stages.gps_kind, beside=at_walls)
-    return facts.input_hash == record.input_hash
+
+    def _same(self, record: Record, site: CandidateSite | RejectedSite) -> bool:
+        """Whether a site, without overrides, is that of a record."""
+        if record.points != site.points:
+            return False
+        if isinstance(site, RejectedSite):
+            return True
+        if record.input_hash is None:
+            # the outline of a unit depends on all units of its block, which may reach beyond the split tiles
+            return site.block is None
+        plan, at_walls = self.context.plan, self.request.settings.building.roof.at_walls
+        _, facts = gather(self.context.scratch, plan.grid, site, plan.gps_kind, beside=at_walls)
+        return facts.input_hash == record.input_hash
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Prepared:
-    """The new files of a tile, whole, in scratch: only their digests are held."""
+    """The new files of a tile, complete in scratch; only their digests are in memory."""
 
     digests: Mapping[str, str]
     """sha256 by path relative to the run directory, hexadecimal."""
     gone: tuple[str, ...]
-    """Paths of meshes that no row names any more."""
+    """Paths of meshes that no row names now."""
 
 
-def _prepared(
-    stages: Stages, earlier: Earlier, found: _Found, models: Models, meshes: str, new: LocalStorage
-) -> dict[Tile, _Prepared]:
-    """Write the new files of the tiles that own what was made again, one tile at a time, beside the run's."""
-    context = stages.record_context(stages.plan.sources[0].reference)
+def _prepared(search: _Search, found: _Found, models: Models, new: LocalStorage) -> dict[Tile, _Prepared]:
+    """Write the new files of the tiles that own what was modelled again, one tile at a time, beside the run's."""
+    earlier, request = search.earlier, search.request
+    records = record_context(search.context.plan, request.settings)
     rejected: dict[Tile, list[RejectedSite]] = {}
     for site in found.again.rejected:
         rejected.setdefault(site.owner, []).append(site)
@@ -398,8 +358,8 @@ def _prepared(
             found.changed,
             [entry.result for entry in stored],
             [rejected_object(site) for site in rejected.get(tile, ())],
-            dataclasses.replace(context, facts={entry.result.building_id: entry.facts for entry in stored}),
-            meshes,
+            dataclasses.replace(records, facts={entry.result.building_id: entry.facts for entry in stored}),
+            request.meshes,
         )
         for path, data in update.files.items():
             new.put(path, data)
@@ -410,20 +370,19 @@ def _prepared(
 
 
 def _written(
-    earlier: Earlier,
-    request: RunRequest,
+    search: _Search,
     found: _Found,
     modelled: Sequence[Modelled],
     prepared: Mapping[Tile, _Prepared],
     new: LocalStorage,
-    scratch: Scratch,
     began: float,
 ) -> str:
     """Put the new files in place, each whole, and the manifest last; the digest."""
+    earlier, request = search.earlier, search.request
     root = earlier.run_dir
     storage = LocalStorage(root=root)
     manifest = _manifest(earlier, request, found, modelled)
-    # whoever reads now, or after a power cut, sees that the directory is being changed
+    # readers see that the directory changes, also after a power cut
     changing = dataclasses.replace(earlier.manifest, status=RunStatus.RUNNING, content_sha256=None)
     write_manifest(root, changing, storage.put)
     storage.clear((PAGE,))
@@ -435,14 +394,15 @@ def _written(
             _put_state(storage, tile, update)
             for path in update.gone:
                 (root / path).unlink(missing_ok=True)
-        _put_bundles(storage, scratch, found.changed, modelled)
+        _put_bundles(storage, search.context.scratch, found.changed, modelled)
         if request.overrides is not None:
             put_json(root, OVERRIDES, [outcome.as_dict() for outcome in found.outcomes])
         digest = run_digest(str(root))
     except BaseException as error:
-        told = (*changing.warnings, f"{type(error).__name__}: {error}".removesuffix(": "))
-        with contextlib.suppress(OSError):  # a full disk takes no manifest either: then it says running
-            write_manifest(root, dataclasses.replace(changing, status=RunStatus.FAILED, warnings=told), storage.put)
+        warnings = (*changing.warnings, f"{type(error).__name__}: {error}".removesuffix(": "))
+        failed = dataclasses.replace(changing, status=RunStatus.FAILED, warnings=warnings)
+        with contextlib.suppress(OSError):  # a full disk takes no manifest either, which then still says running
+            write_manifest(root, failed, storage.put)
         raise
     seconds = {**earlier.manifest.timings_s, "rerun": round(time.perf_counter() - began, 3)}
     finished = dt.datetime.now(tz=dt.UTC)
@@ -454,19 +414,19 @@ def _written(
 def _put_bundles(
     storage: LocalStorage, scratch: Scratch, changed: Collection[str], modelled: Sequence[Modelled]
 ) -> None:
-    """The bundles of the buildings that met a fault this time, in place of those of an earlier one."""
-    told = {m.building_id: m.reason for m in modelled}
+    """Replace the bundles of an earlier fault by those of this rerun."""
+    reasons = {m.building_id: m.reason for m in modelled}
     for name in sorted(changed):
         key = f"{QUARANTINE}/{name}{SUFFIX}"
         made = Path(scratch.root, key)
-        if told.get(name) in _QUARANTINED and made.is_file():
+        if reasons.get(name) in _QUARANTINED and made.is_file():
             storage.put(key, made.read_bytes())
         else:
             storage.path(key).unlink(missing_ok=True)
 
 
 def _put_state(storage: LocalStorage, tile: Tile, update: _Prepared) -> None:
-    """The tile's state with the digests of its new files."""
+    """Put the tile's state with the digests of its new files."""
     key = f"state/{tile.key}.json"
     state = json.loads(storage.get(key))
     files = {path: digest for path, digest in state["files"].items() if path not in update.gone}
@@ -475,7 +435,7 @@ def _put_state(storage: LocalStorage, tile: Tile, update: _Prepared) -> None:
 
 
 def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Sequence[Modelled]) -> RunManifest:
-    """The manifest of the run as if it had been made with these overrides; without its digest."""
+    """The manifest of the run, as if it had run with these overrides; without its digest."""
     before = Counter(record.status for record in earlier.records(found.changed).values())
     after = Counter(m.status for m in modelled)
     counts = Counter(earlier.manifest.counts)
@@ -487,12 +447,12 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
     old = earlier.manifest.request["overrides"]
     inputs = [entry for entry in earlier.manifest.inputs if entry.n_points is not None or entry.path != old]
     if request.overrides is not None:
-        inputs.append(told_file(request.overrides))
+        inputs.append(input_file(request.overrides))
     warnings = [text for text in earlier.manifest.warnings if not text.startswith(WARNING)]
     warnings.extend(outcome.warning for outcome in found.outcomes if outcome.warning)
     return dataclasses.replace(
         earlier.manifest,
-        request={**earlier.manifest.request, "overrides": told_request(request)["overrides"]},
+        request={**earlier.manifest.request, "overrides": request_record(request)["overrides"]},
         inputs=tuple(inputs),
         counts=dict(counts),
         slowest=_slowest(earlier, found, modelled),
@@ -501,7 +461,7 @@ def _manifest(earlier: Earlier, request: RunRequest, found: _Found, modelled: Se
 
 
 def _slowest(earlier: Earlier, found: _Found, modelled: Sequence[Modelled]) -> tuple[SlowBuilding, ...]:
-    """Those that took longest, of the buildings that stayed and of those that were modelled again."""
+    """The buildings that took longest, among those that stayed and those that were modelled again."""
     stayed = [one for one in earlier.manifest.slowest if one.building_id not in found.changed]
     again = [SlowBuilding(building_id=m.building_id, seconds=round(m.seconds, 3)) for m in modelled]
     return tuple(heapq.nlargest(SLOWEST, (*stayed, *again), key=lambda one: (one.seconds, one.building_id)))

@@ -6,37 +6,17 @@ import contextlib
 import dataclasses
 import datetime as dt
 import json
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from uuid import uuid4
-
-import shapely
 
 from pipeline import __version__
-from pipeline.errors import RunCancelledError, RunError, SettingsError
-from pipeline.io import (
-    ReadOptions,
-    SpatialReference,
-    find_inputs,
-    is_url,
-    open_source,
-    sha256_of,
-    shown,
-    storage_at,
-)
-from pipeline.io.footprints import read_area
-from pipeline.io.remote_file import on_this_machine
-from pipeline.io.tile_index import TileIndex
-from pipeline.runtime.cluster.dispatch import TICK_S
-from pipeline.runtime.cluster.priorities import Traffic
+from pipeline.errors import RunCancelledError, RunError
+from pipeline.io import SpatialReference, Storage, is_url, shown, storage_at
+from pipeline.methods import ReconstructSettings
 from pipeline.runtime.cluster.serial_executor import Executor
-from pipeline.runtime.cluster.tls import TlsFiles
-from pipeline.runtime.engine import executor_for
 from pipeline.runtime.expected import expected
-from pipeline.runtime.isolation.isolated_items import IsolationLimits
 from pipeline.runtime.isolation.preloading import loads_of
 from pipeline.runtime.manifest import (
     NAME,
@@ -48,98 +28,41 @@ from pipeline.runtime.manifest import (
     write_manifest,
 )
 from pipeline.runtime.monitoring.events import Listener, Watch, ignore, never
-from pipeline.runtime.monitoring.logs import about
 from pipeline.runtime.monitoring.measurement import peak_of_process
-from pipeline.runtime.overrides.overrides_file import read_overrides
-from pipeline.runtime.plan import Plan, check_memory, make_plan, without_far_files
-from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.folder_lock import held_results
-from pipeline.runtime.scratch.location import check_scratch, remove_folder, scratch_folder
-from pipeline.runtime.scratch.work_folder import held_work
+from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.overrides.overrides_file import Override, read_overrides
+from pipeline.runtime.plan import Plan
+from pipeline.runtime.request import RunRequest, input_file, plan_inputs, request_record
+from pipeline.runtime.run_context import RunContext, run_context
+from pipeline.runtime.scratch.folder_lock import locked_results
+from pipeline.runtime.scratch.location import check_scratch, run_scratch
+from pipeline.runtime.scratch.work_folder import locked_work
+from pipeline.runtime.stages.apply_overrides import apply_overrides
 from pipeline.runtime.stages.cleanup import tidy
-from pipeline.runtime.stages.counts import Counted, told_counts
-from pipeline.runtime.stages.ingest import Ingested
-from pipeline.runtime.stages.join import Joined
-from pipeline.runtime.stages.progress import Progress
-from pipeline.runtime.stages.publish import QUARANTINE, Published
-from pipeline.runtime.stages.stages import MODELS, Models, Stages, given_footprints
+from pipeline.runtime.stages.counts import Counted, run_counts
+from pipeline.runtime.stages.given_footprints import GivenFootprints, given_footprints
+from pipeline.runtime.stages.ingest import ingest
+from pipeline.runtime.stages.ingested import Ingested
+from pipeline.runtime.stages.join import join
+from pipeline.runtime.stages.outline import outline
+from pipeline.runtime.stages.publish import Published, RunOutput, publish
+from pipeline.runtime.stages.reconstruct import QUARANTINE, Models, models_stage, reconstruct
+from pipeline.runtime.stages.sites import Joined
+from pipeline.runtime.stages.split import Splits, split
 from pipeline.settings import RunSettings
 from pipeline.tiling import MM
 
 FOOTPRINTS = "footprints.json"
-"""What was wrong with the given footprints, one by one; there where footprints were given."""
+"""File of the run directory with the faults of the given footprints, one by one."""
 OVERRIDES = "overrides.json"
-"""What became of each entry of the overrides; there where overrides were given."""
+"""File of the run directory with the outcome of each entry of the overrides."""
 
 _RESULTS = ("buildings", "planes", "rejected", "meshes", "cityjson", "state", QUARANTINE)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunRequest:
-    """What is to be done."""
-
-    inputs: tuple[str, ...]
-    """Files, folders, patterns, URLs or tile indexes."""
-    out: str
-    """The run directory, a folder or `s3://bucket/prefix`; new or empty, unless `overwrite`."""
-    settings: RunSettings = dataclasses.field(default_factory=RunSettings)
-    """All settings."""
-    footprints: str | None = None
-    """A vector file of building outlines to be modelled."""
-    overrides: str | None = None
-    """A TOML file that says of single buildings what is to be done; `pipeline.runtime.overrides.overrides_file`."""
-    crs: str | None = None
-    """Stands above the headers' CRS."""
-    vertical_unit: str | None = None
-    """Stands above the headers' vertical unit."""
-    bbox: tuple[float, float, float, float] | None = None
-    """x_min, y_min, x_max, y_max in the CRS's units."""
-    aoi: str | None = None
-    """A vector file of areas of interest."""
-    workers: int | None = None
-    """Processes of the embedded cluster; 0 runs serially in this process, None leaves it to the estimate."""
-    scheduler: str | None = None
-    """Address of a Dask scheduler that takes the place of the embedded cluster."""
-    tls: TlsFiles | None = None
-    """Certificates for the cluster's traffic; by default those of the environment."""
-    traffic: Traffic = "interactive"
-    """Whether somebody waits for the run; tasks of a `batch` go behind where workers are scarce."""
-    performance_report: str | None = None
-    """Gets a page about the workers' time; none by default."""
-    scratch: str | None = None
-    """A folder for what is neither input nor result, the same for all workers; by default the run directory, or a
-    temporary folder of this machine where that is a URL."""
-    only_files: bool = False
-    """Take each input for the path of a file and follow neither folders, patterns, URLs nor tile indexes: for inputs
-    that strangers name."""
-    meshes: str = "building"
-    """One OBJ a building, one a tile, or none."""
-    licence: str | None = None
-    """Licence of the source data, in the user's words."""
-    overwrite: bool = False
-    """Replace what an earlier run left in `out`."""
-    work: str | None = None
-    """A folder that keeps what the tasks find. A run with the same one goes on where the one before was cut off, and
-    does again only what changed since; None keeps nothing."""
-    isolate: bool | None = None
-    """Model buildings in supervised child processes; None does so with workers and not serially."""
-    building_timeout_s: float = IsolationLimits.timeout_s
-    """Wall-clock seconds that one building may take where buildings are isolated."""
-    building_memory_bytes: int = IsolationLimits.memory_bytes
-    """Memory that the process of one building may take where buildings are isolated."""
-
-    @property
-    def isolation(self) -> IsolationLimits | None:
-        """Limits of the supervised children; None where buildings are modelled in the workers themselves."""
-        serial = self.workers == 0 and self.scheduler is None
-        if not (not serial if self.isolate is None else self.isolate):
-            return None
-        return IsolationLimits(timeout_s=self.building_timeout_s, memory_bytes=self.building_memory_bytes)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """What a run found."""
+    """The outcome of a run."""
 
     run_dir: str
     """Where the results are: a path, or a URL."""
@@ -150,7 +73,7 @@ class RunSummary:
     reasons: dict[str, int]
     """Candidates that are not ok, by reason."""
     rejected: dict[str, int]
-    """Objects that are no buildings, by reason."""
+    """Objects that are not buildings, by reason."""
     roof_types: dict[str, int]
     """Candidates by roof type."""
     counts: dict[str, int]
@@ -169,22 +92,31 @@ class RunSummary:
 class RunVariant:
     """One way to model the candidates of a run, and where its results go."""
 
-    settings: RunSettings
-    """Those of the request but for method, preset and what models a building."""
+    method: str
+    """The method that models the buildings."""
+    preset: str
+    """Where the method's settings start."""
+    building: ReconstructSettings
+    """From a candidate to its model."""
     out: str
     """Its own run directory."""
     label: str = ""
-    """What messages call it; empty where there is but one."""
+    """Its name in messages; empty for a single variant."""
+
+    def settings_in(self, settings: RunSettings) -> RunSettings:
+        """The settings of a run with this method in the place of theirs."""
+        general = dataclasses.replace(settings.general, method=self.method, preset=self.preset)
+        return dataclasses.replace(settings, general=general, building=self.building)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VariantOutcome:
-    """What became of one variant."""
+    """The outcome of one variant."""
 
     summary: RunSummary
-    """As of a run."""
+    """As for a run."""
     seconds: dict[str, float]
-    """Wall-clock seconds of each building, by its id; empty where there is but one variant."""
+    """Wall-clock seconds of each building, by its id; empty for a single variant."""
 
 
 def run(
@@ -198,13 +130,13 @@ def run(
     Parameters
     ----------
     request : RunRequest
-        What is to be done.
+        What to reconstruct, and how.
     on_event : callable
         Gets an `Event` for every stage, step and warning.
     executor : Executor, optional
-        Where tasks run; by default what the request asks for.
+        Runs the tasks; by default the one that the request calls for.
     cancelled : callable
-        Asked several times a second, from another thread; once it is true the run ends as soon as it can.
+        Asked several times a second, from another thread. Once it is true, the run ends as soon as it can.
 
     Returns
     -------
@@ -220,38 +152,38 @@ def run(
     RunError
         The run directory cannot be used, or workers died again and again on one task.
     RunCancelledError
-        `cancelled` called the run off; its scratch is gone, and `run.json` says so.
+        `cancelled` ended the run; its scratch is gone, and `run.json` says so.
     ClusterError
         The scheduler does not answer or was lost, or its processes run other versions; the run may be tried again.
     """
-    variant = RunVariant(settings=request.settings, out=request.out)
-    (outcome,) = run_variants(request, (variant,), request.out, on_event, executor, cancelled)
+    settings = request.settings
+    variant = RunVariant(
+        method=settings.general.method, preset=settings.general.preset, building=settings.building, out=request.out
+    )
+    (outcome,) = run_variants(request, (variant,), on_event, executor, cancelled)
     return outcome.summary
 
 
 def run_variants(
     request: RunRequest,
     variants: Sequence[RunVariant],
-    work_dir: str,
     on_event: Listener = ignore,
     executor: Executor | None = None,
     cancelled: Callable[[], bool] = never,
-    stale: Sequence[Path] = (),
+    outdated: Sequence[Path] = (),
 ) -> list[VariantOutcome]:
-    """Model the same candidates in several ways: ingest, split and join run once, the rest once a variant.
+    """Model the same candidates in several ways: ingest, split and join run once, the rest once per variant.
 
     Parameters
     ----------
     request : RunRequest
-        The inputs and how to run; its `settings` and `out` are not looked at.
+        The inputs and how to run. Scratch goes to its `out`; its method does not count.
     variants : sequence of RunVariant
-        At least one; they agree in all that finds candidates.
-    work_dir : str
-        Folder for the scratch.
+        At least one.
     on_event, executor, cancelled
-        As of `run`. Progress of a stage counts all variants together.
-    stale : sequence of Path
-        Files that tell of an earlier run: they go with its results.
+        As in `run`. Progress of a stage counts all variants together.
+    outdated : sequence of Path
+        Files about an earlier run, removed together with its results.
 
     Returns
     -------
@@ -260,200 +192,234 @@ def run_variants(
 
     Raises
     ------
-    SettingsError
-        The variants would not find the same candidates.
-    InputError, RunError, RunCancelledError, ClusterError
-        As `run`.
+    InputError, SettingsError, RunError, RunCancelledError, ClusterError
+        As in `run`.
     """
-    started_at = dt.datetime.now(tz=dt.UTC)
-    if request.work is None:
-        check_scratch(work_dir, request.scratch, request.scheduler)
+    started_at, began = dt.datetime.now(tz=dt.UTC), time.perf_counter()
+    resources, settings = request.resources, variants[0].settings_in(request.settings)
+    if resources.work is None:
+        check_scratch(request.out, resources.scratch, resources.scheduler)
     for variant in variants:
-        storage_at(variant.out)  # a URL where nothing can be stored is told before anything is read
-    shared = Progress(on_event)
-    began = time.perf_counter()
-    settings = _common_settings(variants)
-    shared.tell("run", "plan", f"run into {work_dir}")
-    plan, paths = plan_inputs(request, settings, shared)
+        storage_at(variant.out)  # refuses a URL of no storage before anything is read
+    progress = Progress(on_event)
+    progress.tell("run", "plan", f"run into {request.out}")
+    plan, paths = plan_inputs(request, progress)
     footprints = None if request.footprints is None else given_footprints(request.footprints, plan)
     for warning in () if footprints is None else footprints.warnings:
-        shared.warn("plan", warning)
-    reference = plan.sources[0].reference
-    overrides = () if request.overrides is None else read_overrides(request.overrides, reference, settings)
-    run_dirs = [_checked(variant.out, overwrite=request.overwrite, work=request.work) for variant in variants]
-    manifests = [
-        RunManifest(
-            status=RunStatus.RUNNING,
-            engine_version=__version__,
-            method=variant.settings.general.method,
-            settings=variant.settings.as_dict(),
-            settings_hash=variant.settings.settings_hash,
-            started_at=started_at,
-            crs=_crs_facts(reference),
-            request=told_request(request),
-            lattice={
-                "tile_size_m": plan.grid.size_mm / MM,
-                "origin_x_m": plan.grid.origin_x_mm / MM,
-                "origin_y_m": plan.grid.origin_y_mm / MM,
-            },
-            source_licence=request.licence,
-        )
-        for variant in variants
-    ]
-    shared.timings["plan"] = time.perf_counter() - began
-    with contextlib.ExitStack() as held:
-        for run_dir in run_dirs:
-            held.enter_context(held_results(run_dir))
-            # whoever held it a moment ago may have left something
-            check_out(run_dir, overwrite=request.overwrite, work=request.work)
-        scratch = held.enter_context(
-            _scratch(work_dir, request.scratch) if request.work is None else held_work(request.work)
-        )
-        engine = executor or executor_for(
-            workers=request.workers,
-            scheduler=request.scheduler,
-            local_directory=str(Path(scratch.root, "dask")),
-            work=expected(plan, None if footprints is None else len(footprints.polygons)),
-            traffic=request.traffic,
-            tls=request.tls,
-            performance_report=request.performance_report,
-            loads=loads_of("reconstruct", footprints=footprints is not None, method=settings.general.method),
-        )
-        starting = time.perf_counter()
-        with about(run=scratch.name), calling_off(scratch, cancelled) as called_off, engine:
-            shared.watch = Watch(cancelled=called_off, stop=scratch.cancel, listener=on_event)
-            engine.prepare("plan", shared.watch)
-            shared.timings["start workers"] = time.perf_counter() - starting
-            check_memory(plan, engine.memory_limit_bytes)
-            # nothing of an earlier run goes before all that can be checked is checked
-            for run_dir, manifest in zip(run_dirs, manifests, strict=True):
-                # whoever reads meanwhile sees that the directory is being changed
-                known = request.work is not None and _is_of_work(run_dir, request.work)
-                write_manifest(run_dir, manifest, storage_at(run_dir).put)
-                storage_at(run_dir).clear((PAGE,) if known else (*_RESULTS, FOOTPRINTS, OVERRIDES, PAGE))
-                if footprints is not None:
-                    put_json(run_dir, FOOTPRINTS, footprints.report)
-            for path in stale:
-                path.unlink(missing_ok=True)
-            stages = Stages(
-                settings=settings,
-                meshes=request.meshes,
-                plan=plan,
-                progress=shared,
-                executor=engine,
-                scratch=scratch,
-                isolation=request.isolation,
-                compared=len(variants) > 1,
+        progress.warn("plan", warning)
+    overrides = () if request.overrides is None else read_overrides(request.overrides, plan.reference, settings)
+    runs = [_VariantRun.of(variant, request, plan, progress, started_at) for variant in variants]
+    progress.timings["plan"] = time.perf_counter() - began
+    with contextlib.ExitStack() as locks:
+        for one in runs:
+            locks.enter_context(locked_results(one.run_dir))
+            # the process that held it a moment ago may have left something
+            check_out(one.run_dir, overwrite=request.overwrite, work=resources.work)
+        context = locks.enter_context(
+            run_context(
+                plan,
+                progress,
+                resources,
+                run_scratch(request.out, resources.scratch) if resources.work is None else locked_work(resources.work),
+                expected(plan, None if footprints is None else len(footprints.polygons)),
+                loads=loads_of("reconstruct", footprints=footprints is not None, method=settings.general.method),
+                executor=executor,
+                cancelled=cancelled,
             )
-            progresses: list[Progress] = []
-            try:
-                ingested = stages.ingest(paths)
-                splits = stages.split(ingested, footprints)
-                joined = stages.outline(stages.join(splits, footprints, reference))
-                if request.overrides is not None:
-                    joined, outcomes_of_entries = stages.override(joined, overrides, ingested)
-                    for outcome in outcomes_of_entries:
-                        if outcome.warning:
-                            shared.warn("join", outcome.warning)
-                    for run_dir in run_dirs:
-                        put_json(run_dir, OVERRIDES, [outcome.as_dict() for outcome in outcomes_of_entries])
-                progresses.extend(shared.part(k, len(variants), v.label) for k, v in enumerate(variants))
-                each = [
-                    dataclasses.replace(stages, settings=v.settings, progress=own)
-                    for v, own in zip(variants, progresses, strict=True)
-                ]
-                modelled = [own.reconstruct(joined) for own in each]
-                published = [
-                    own.publish(splits, joined, models, reference, run_dir)
-                    for own, models, run_dir in zip(each, modelled, run_dirs, strict=True)
-                ]
-                found = [Counted.of(models, each_told=len(variants) > 1) for models in modelled]
-            except BaseException as error:
-                scratch.cancel()
-                off = isinstance(error, RunCancelledError | KeyboardInterrupt)
-                status = RunStatus.CANCELLED if off else RunStatus.FAILED
-                message = f"{type(error).__name__}: {error}".removesuffix(": ")
-                for k, (run_dir, manifest) in enumerate(zip(run_dirs, manifests, strict=True)):
-                    warnings = (progresses[k] if progresses else shared).warnings
-                    broken = dataclasses.replace(manifest, status=status, warnings=(*warnings, message))
-                    write_manifest(run_dir, broken, storage_at(run_dir).put)
-                raise
-            if request.work is not None:
-                tidy(scratch, joined, {f"{MODELS}-{v.settings.settings_hash[:16]}" for v in variants}, run_dirs)
-    inputs = _inputs_told(request, paths, ingested, plan)
-    driver, peak_bytes = peak_of_process()
-    outcomes = []
-    for k, (run_dir, own) in enumerate(zip(run_dirs, progresses, strict=True)):
-        finishing = time.perf_counter()
-        content = (run_dir, _with_tables(run_dir, joined, modelled[k], published[k]))
-        # the run can be called off no more
-        digest = engine.run_step("digest", _digest_of, content, Watch())
-        own.timings["digest"] = time.perf_counter() - finishing
-        # of several variants each is told with what it took alone: the shared stages and its own
-        alone = len(variants) == 1
-        own.timings["total"] = time.perf_counter() - began if alone else sum(own.timings.values())
-        own.peaks[driver] = peak_bytes
-        tiles = [outcome.tile.key for outcome in published[k]]
-        failed_tiles = [outcome.tile.key for outcome in published[k] if outcome.error]
-        counts = told_counts(plan, ingested, splits, joined, found[k])
-        write_manifest(
-            run_dir,
-            dataclasses.replace(
-                manifests[k],
-                status=RunStatus.INCOMPLETE if failed_tiles else RunStatus.FINISHED,
-                finished_at=dt.datetime.now(tz=dt.UTC),
-                inputs=inputs,
-                tiles=tuple(tiles),
-                failed_tiles=tuple(failed_tiles),
-                counts=counts,
-                timings_s={name: round(seconds, 3) for name, seconds in own.timings.items()},
-                peak_memory_bytes=own.peaks,
-                slowest=found[k].slowest,
-                warnings=tuple(own.warnings),
-                content_sha256=digest,
-            ),
-            storage_at(run_dir).put,
         )
-        summary = RunSummary(
-            run_dir=run_dir,
-            digest=digest,
-            statuses=dict(found[k].statuses),
-            reasons=dict(found[k].reasons),
-            rejected=dict(Counter(site.verdict.reason.value for site in joined.rejected)),
-            roof_types=dict(found[k].roof_types),
-            counts=counts,
-            timings_s=own.timings,
-            peak_memory_bytes=own.peaks,
-            warnings=tuple(own.warnings),
-            failed_tiles=tuple(failed_tiles),
-        )
-        outcomes.append(VariantOutcome(summary=summary, seconds=found[k].seconds))
+        # all checks passed: only now are results of an earlier run removed
+        for one in runs:
+            one.begin(footprints, resources.work)
+        for path in outdated:
+            path.unlink(missing_ok=True)
+        try:
+            found = _find_candidates(context, settings, paths, footprints)
+            if request.overrides is not None:
+                found = _override(context, settings, found, overrides, runs)
+            _model(context, request, found, runs)
+        except BaseException as error:
+            context.scratch.cancel()
+            for one in runs:
+                one.fail(error)
+            raise
+        if resources.work is not None:
+            stages = {models_stage(variant.settings_in(request.settings)) for variant in variants}
+            tidy(context.scratch, found.joined, stages, [one.run_dir for one in runs])
+    inputs = _input_files(request, paths, found.ingested, plan)
+    # a single run took all the time; of several, each took that of the shared stages and its own
+    outcomes = [one.finish(context, found, inputs, began if len(runs) == 1 else None) for one in runs]
     seconds = time.perf_counter() - began
-    shared.tell("finished", "", f"{outcomes[0].summary.counts['candidates']} candidates in {seconds:.1f} s")
+    progress.tell("finished", "", f"{outcomes[0].summary.counts['candidates']} candidates in {seconds:.1f} s")
     return outcomes
 
 
-def _common_settings(variants: Sequence[RunVariant]) -> RunSettings:
-    """The settings that find the candidates.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Candidates:
+    """What the stages that all variants share found."""
 
-    Raises
-    ------
-    SettingsError
-        The variants differ in them.
-    """
-    first = variants[0].settings
-    method, preset = first.general.method, first.general.preset
-    for variant in variants[1:]:
-        general = dataclasses.replace(variant.settings.general, method=method, preset=preset)
-        if variant.settings.scene != first.scene or general != first.general:
-            raise SettingsError([f"{variant.label} would find other candidates than {variants[0].label}"])
-    return first
+    ingested: Sequence[Ingested]
+    splits: Splits
+    joined: Joined
 
 
-def _inputs_told(
+def _find_candidates(
+    context: RunContext, settings: RunSettings, paths: Sequence[str], footprints: GivenFootprints | None
+) -> _Candidates:
+    """The stages up to the candidates."""
+    ingested = ingest(context, paths)
+    splits = split(context, settings, ingested, footprints)
+    joined = join(context, settings.scene, splits, footprints)
+    return _Candidates(ingested=ingested, splits=splits, joined=outline(context, settings.building.roof, joined))
+
+
+def _override(
+    context: RunContext,
+    settings: RunSettings,
+    found: _Candidates,
+    overrides: Sequence[Override],
+    runs: Sequence[_VariantRun],
+) -> _Candidates:
+    """The candidates after the overrides; the outcome of each entry goes into the run directories."""
+    joined, entries = apply_overrides(context, settings, found.joined, overrides, found.ingested)
+    for entry in entries:
+        if entry.warning:
+            context.progress.warn("join", entry.warning)
+    for one in runs:
+        put_json(one.run_dir, OVERRIDES, [entry.as_dict() for entry in entries])
+    return dataclasses.replace(found, joined=joined)
+
+
+def _model(context: RunContext, request: RunRequest, found: _Candidates, runs: Sequence[_VariantRun]) -> None:
+    """The stages of each variant: models, then publishing."""
+    several = len(runs) > 1
+    for number, one in enumerate(runs):
+        one.progress = context.progress.part(number, len(runs), one.variant.label)
+    own = [
+        (one, dataclasses.replace(context, progress=one.progress), one.variant.settings_in(request.settings))
+        for one in runs
+    ]
+    for one, part, settings in own:
+        one.models = reconstruct(part, settings, found.joined, compared=several)
+    for one, part, settings in own:
+        output = RunOutput(run_dir=one.run_dir, meshes=request.meshes)
+        one.published = publish(part, settings, found.splits, found.joined, one.models, output)
+    for one in runs:
+        one.counted = Counted.of(one.models, each=several)
+
+
+@dataclasses.dataclass(kw_only=True)
+class _VariantRun:
+    """One variant while it runs: its run directory, its manifest, and what its own stages found."""
+
+    variant: RunVariant
+    run_dir: str
+    manifest: RunManifest
+    progress: Progress
+    models: Models = dataclasses.field(init=False)
+    published: list[Published] = dataclasses.field(init=False)
+    counted: Counted = dataclasses.field(init=False)
+
+    @classmethod
+    def of(
+        cls, variant: RunVariant, request: RunRequest, plan: Plan, progress: Progress, started_at: dt.datetime
+    ) -> _VariantRun:
+        """A variant that is about to run; its run directory exists and may be written."""
+        settings = variant.settings_in(request.settings)
+        return cls(
+            variant=variant,
+            run_dir=_checked(variant.out, overwrite=request.overwrite, work=request.resources.work),
+            manifest=RunManifest(
+                status=RunStatus.RUNNING,
+                engine_version=__version__,
+                method=variant.method,
+                settings=settings.as_dict(),
+                settings_hash=settings.settings_hash,
+                started_at=started_at,
+                crs=_crs_facts(plan.reference),
+                request=request_record(request),
+                lattice={
+                    "tile_size_m": plan.grid.size_mm / MM,
+                    "origin_x_m": plan.grid.origin_x_mm / MM,
+                    "origin_y_m": plan.grid.origin_y_mm / MM,
+                },
+                source_licence=request.licence,
+            ),
+            progress=progress,
+        )
+
+    @property
+    def storage(self) -> Storage:
+        """The run directory's storage."""
+        return storage_at(self.run_dir)
+
+    def begin(self, footprints: GivenFootprints | None, work: str | None) -> None:
+        """Remove an earlier run, except what the work folder knows; readers see that the directory changes."""
+        known = work is not None and _is_of_work(self.run_dir, work)
+        write_manifest(self.run_dir, self.manifest, self.storage.put)
+        self.storage.clear((PAGE,) if known else (*_RESULTS, FOOTPRINTS, OVERRIDES, PAGE))
+        if footprints is not None:
+            put_json(self.run_dir, FOOTPRINTS, footprints.report)
+
+    def fail(self, error: BaseException) -> None:
+        """Write how the run ended."""
+        cancelled = isinstance(error, RunCancelledError | KeyboardInterrupt)
+        message = f"{type(error).__name__}: {error}".removesuffix(": ")
+        ended = dataclasses.replace(
+            self.manifest,
+            status=RunStatus.CANCELLED if cancelled else RunStatus.FAILED,
+            warnings=(*self.progress.warnings, message),
+        )
+        write_manifest(self.run_dir, ended, self.storage.put)
+
+    def finish(
+        self, context: RunContext, found: _Candidates, inputs: tuple[InputFile, ...], began: float | None
+    ) -> VariantOutcome:
+        """Compute the digest and write the manifest; the run can no longer be cancelled."""
+        finishing = time.perf_counter()
+        content = (self.run_dir, _with_tables(self.run_dir, found.joined, self.models, self.published))
+        digest = context.executor.run_step("digest", _digest_of, content, Watch())
+        timings = self.progress.timings
+        timings["digest"] = time.perf_counter() - finishing
+        timings["total"] = sum(timings.values()) if began is None else time.perf_counter() - began
+        driver, peak_bytes = peak_of_process()
+        self.progress.peaks[driver] = peak_bytes
+        failed_tiles = tuple(outcome.tile.key for outcome in self.published if outcome.error)
+        counts = run_counts(context.plan, found.ingested, found.splits, found.joined, self.counted)
+        manifest = dataclasses.replace(
+            self.manifest,
+            status=RunStatus.INCOMPLETE if failed_tiles else RunStatus.FINISHED,
+            finished_at=dt.datetime.now(tz=dt.UTC),
+            inputs=inputs,
+            tiles=tuple(outcome.tile.key for outcome in self.published),
+            failed_tiles=failed_tiles,
+            counts=counts,
+            timings_s={name: round(seconds, 3) for name, seconds in timings.items()},
+            peak_memory_bytes=self.progress.peaks,
+            slowest=self.counted.slowest,
+            warnings=tuple(self.progress.warnings),
+            content_sha256=digest,
+        )
+        write_manifest(self.run_dir, manifest, self.storage.put)
+        summary = RunSummary(
+            run_dir=self.run_dir,
+            digest=digest,
+            statuses=dict(self.counted.statuses),
+            reasons=dict(self.counted.reasons),
+            rejected=dict(Counter(site.verdict.reason.value for site in found.joined.rejected)),
+            roof_types=dict(self.counted.roof_types),
+            counts=counts,
+            timings_s=timings,
+            peak_memory_bytes=self.progress.peaks,
+            warnings=manifest.warnings,
+            failed_tiles=failed_tiles,
+        )
+        return VariantOutcome(summary=summary, seconds=self.counted.seconds)
+
+
+def _input_files(
     request: RunRequest, paths: Sequence[str], ingested: Sequence[Ingested], plan: Plan
 ) -> tuple[InputFile, ...]:
-    """The inputs as the manifest tells them."""
+    """The inputs for the manifest."""
     sizes = {info.path: info.file_size for info in plan.sources}
     inputs = [
         InputFile(
@@ -465,52 +431,24 @@ def _inputs_told(
         )
         for path, found in zip(paths, ingested, strict=True)
     ]
-    inputs.extend(told_file(name) for name in (request.footprints, request.aoi, request.overrides) if name is not None)
+    inputs.extend(input_file(name) for name in (request.footprints, request.aoi, request.overrides) if name is not None)
     return tuple(inputs)
 
 
 def _digest_of(content: tuple[str, list[str] | None]) -> str:
-    """The digest of a run directory, and of which tiles."""
-    from pipeline.runtime.digest import run_digest  # with Arrow, which a driver does without
+    """The digest of a run directory, given its tiles with tables."""
+    from pipeline.runtime.digest import run_digest  # loads Arrow, which the driver does not need
 
     run_dir, tiles = content
     return run_digest(run_dir, tiles=tiles)
 
 
 def _plan_bounds_m(found: Ingested) -> tuple[float, float, float, float] | None:
-    """Where the kept points of an input lie."""
+    """Bounds of an input's kept points."""
     if found.bounds_mm is None:
         return None
     x0, y0, _, x1, y1, _ = found.bounds_mm
     return x0 / MM, y0 / MM, x1 / MM, y1 / MM
-
-
-def told_file(name: str) -> InputFile:
-    """A file beside the point clouds as the manifest tells it."""
-    with on_this_machine(name) as path:
-        return InputFile(path=_told_path(name), sha256=sha256_of(path), size_bytes=path.stat().st_size)
-
-
-def _told_path(name: str) -> str:
-    return shown(name) if is_url(name) else str(Path(name).resolve())
-
-
-def told_request(request: RunRequest) -> dict[str, object]:
-    """What of a request `run.json` keeps, so that single buildings of the run can be modelled again."""
-
-    def whole(path: str | None) -> str | None:
-        return None if path is None else _told_path(path)
-
-    return {
-        "footprints": whole(request.footprints),
-        "overrides": whole(request.overrides),
-        "crs": request.crs,
-        "vertical_unit": request.vertical_unit,
-        "bbox": None if request.bbox is None else list(request.bbox),
-        "aoi": whole(request.aoi),
-        "meshes": request.meshes,
-        "work": whole(request.work),
-    }
 
 
 def put_json(run_dir: str | Path, name: str, content: object) -> None:
@@ -519,102 +457,20 @@ def put_json(run_dir: str | Path, name: str, content: object) -> None:
     storage_at(run_dir).put(name, text.encode())
 
 
-@contextlib.contextmanager
-def calling_off(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
-    """Watch for the end of a run from a thread of its own, so that a task in this very process learns of it, too.
-
-    Yields
-    ------
-    callable
-        Whether the run was called off; then its scratch is marked.
-    """
-    if cancelled is never:
-        yield never
-        return
-    if cancelled():  # before it began: a short run could else be over before it is asked again
-        scratch.cancel()
-        yield lambda: True
-        return
-    over, off = threading.Event(), threading.Event()
-
-    def ask() -> None:
-        try:
-            while not over.wait(TICK_S) and not cancelled():
-                pass
-        finally:
-            # a run whose end nobody could tell any more ends, too
-            if not over.is_set():
-                off.set()
-                scratch.cancel()
-
-    asking = threading.Thread(target=ask, name="gablework-cancelled", daemon=True)
-    asking.start()
-    try:
-        yield off.is_set
-    finally:
-        over.set()
-        asking.join()
-
-
-def plan_inputs(request: RunRequest, settings: RunSettings, progress: Progress) -> tuple[Plan, list[str]]:
-    """The plan and the input files in order."""
-    options = ReadOptions(
-        crs=request.crs,
-        vertical_unit=request.vertical_unit,
-        bbox=request.bbox,
-        class_table=settings.class_codes.table,
-    )
-
-    def cut(index: TileIndex) -> Sequence[str]:
-        """The files of an index that the window may need: the others are neither opened nor fetched."""
-        if request.bbox is None and request.aoi is None:
-            return index.locations
-        reference = open_source(index.locations[0], options).info.reference
-        area = None if request.aoi is None else read_area(request.aoi, reference)
-        if request.bbox is not None:
-            box = shapely.box(*request.bbox)
-            area = box if area is None else box & area
-        return index.within(area, reference)
-
-    paths = find_inputs(request.inputs, only_files=request.only_files, cut=cut)
-    if request.aoi is not None:
-        reference = open_source(paths[0], options).info.reference
-        options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
-    plan = make_plan(paths, options, settings)
-    plan, paths = without_far_files(plan, paths)
-    for warning in plan.warnings:
-        progress.warn("plan", warning)
-    if not any(info.has_returns for info in plan.sources):
-        progress.warn("plan", "the inputs have one return a pulse: vegetation is told by its roughness alone")
-    return plan, paths
-
-
-@contextlib.contextmanager
-def _scratch(work_dir: str, wanted: str | None) -> Iterator[Scratch]:
-    """A scratch folder for the duration of a run."""
-    folder = scratch_folder(work_dir, wanted)
-    scratch = Scratch(str(folder / uuid4().hex))
-    scratch.create()
-    try:
-        yield scratch
-    finally:
-        remove_folder(folder)
-
-
 def _is_of_work(run_dir: str, work: str) -> bool:
-    """Whether a run directory was written from this very work folder, so that what is there is known there."""
+    """Whether a run directory was written from this work folder, which then knows what is there."""
     try:
-        told = read_manifest(run_dir).request.get("work")
+        known = read_manifest(run_dir).request.get("work")
     except RunError:
         return False
-    return told == str(Path(work).resolve())
+    return known == str(Path(work).resolve())
 
 
 def _with_tables(run_dir: str, joined: Joined, models: Models, published: Sequence[Published]) -> list[str] | None:
-    """The tiles that have tables in an object store, so that their digest needs no listing; None to list.
+    """The tiles that have tables in an object store, so that their digest needs no listing; None to list them.
 
-    A store may list what is there some time after it was put. Of tiles that failed nobody knows what was put, so that
-    the store must be asked; where all of them failed it has no folder to list.
+    A store may list an object only some time after it was put. Which tables a failed tile has is unknown, so then the
+    store must list them; where all tiles failed it has no folder to list.
     """
     tiles = sorted(outcome.tile.key for outcome in published)
     failed = {outcome.tile.key for outcome in published if outcome.error}
@@ -625,12 +481,12 @@ def _with_tables(run_dir: str, joined: Joined, models: Models, published: Sequen
 
 
 def _checked(out: str, *, overwrite: bool, work: str | None = None) -> str:
-    """The run directory, which may be written: a path, or a URL.
+    """The run directory, a path or URL, made and checked.
 
     Raises
     ------
     RunError
-        It holds something and `overwrite` is not asked for, or it cannot be written.
+        It is not empty and `overwrite` is not set, or it cannot be written.
     """
     check_out(out, overwrite=overwrite, work=work)
     storage = storage_at(out)
@@ -642,12 +498,12 @@ def _checked(out: str, *, overwrite: bool, work: str | None = None) -> str:
 
 
 def check_out(out: str, *, overwrite: bool, work: str | None = None) -> None:
-    """Say whether a run directory may be written, by what is there; nothing is made.
+    """Refuse a run directory that must not be written, by its content; makes nothing.
 
     Raises
     ------
     RunError
-        It holds something and `overwrite` is not asked for, or it cannot be read.
+        It is not empty and `overwrite` is not set, or it cannot be read.
     """
     storage = storage_at(out)
     run_dir = storage.place

@@ -14,7 +14,9 @@ from pipeline.errors import RunCancelledError
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.monitoring.events import Event, Listener
-from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import RunSummary, run
 from pipeline.settings import RunSettings
 from service.driver.clusters import SharedCluster
 from service.driver.held import HeldJob
@@ -241,11 +243,13 @@ def run_request(
         crs=request.crs,
         vertical_unit=request.vertical_unit,
         bbox=request.bbox,
-        scheduler=settings.scheduler,
+        resources=Resources(
+            scheduler=settings.scheduler,
+            building_timeout_s=settings.building_timeout_s,
+            building_memory_bytes=settings.building_memory_bytes,
+        ),
         meshes=request.meshes,
         licence=request.licence,
-        building_timeout_s=settings.building_timeout_s,
-        building_memory_bytes=settings.building_memory_bytes,
     )
 
 

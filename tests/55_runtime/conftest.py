@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
@@ -17,7 +18,9 @@ from pipeline.reconstruct import reconstruct_building
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.monitoring.measurement import Measured, measure
-from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import RunSummary, run
 from pipeline.settings import RunSettings
 
 
@@ -74,11 +77,12 @@ def shuffled() -> type[ShuffledExecutor]:
 
 
 Reconstruct = Callable[..., RunSummary]
+RESOURCES = {field.name for field in dataclasses.fields(Resources)}
 
 
 @pytest.fixture
 def reconstruct(tmp_path: Path) -> Reconstruct:
-    """Run serially into a fresh directory: `reconstruct(*paths, settings={...}, executor=..., **request fields)`."""
+    """Run serially into a fresh directory: `reconstruct(*paths, settings={...}, **fields)` of request or resources."""
     numbers = iter(range(1000))
 
     def go(*paths: Path, settings: dict[str, Any] | None = None, executor: Any = None, **fields: Any) -> RunSummary:
@@ -86,7 +90,7 @@ def reconstruct(tmp_path: Path) -> Reconstruct:
             inputs=tuple(str(path) for path in paths),
             out=fields.pop("out", str(tmp_path / f"run-{next(numbers)}")),
             settings=RunSettings.from_mapping(settings or {}),
-            workers=fields.pop("workers", 0),
+            resources=Resources(**{"workers": 0} | {name: fields.pop(name) for name in RESOURCES & fields.keys()}),
             **fields,
         )
         return run(request, executor=executor)

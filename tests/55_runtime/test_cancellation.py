@@ -16,9 +16,11 @@ from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.manifest import RunStatus, read_manifest
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.measurement import Measured, measure
-from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.outcomes import keep
+from pipeline.runtime.scratch.outcomes import run_and_store
 from pipeline.settings import RunSettings
 
 STAGES = ("ingest", "split", "reconstruct", "publish")
@@ -101,7 +103,7 @@ def start(suburb: Path, tmp_path: Path) -> Callable[..., RunSummary]:
     def go(out: str = "run", **options: Any) -> RunSummary:
         settings = RunSettings.from_mapping({"tile_size_m": 40.0})
         request = RunRequest(
-            inputs=(str(suburb),), out=str(tmp_path / out), settings=settings, workers=0, overwrite=True
+            inputs=(str(suburb),), out=str(tmp_path / out), settings=settings, resources=SERIAL, overwrite=True
         )
         return run(request, **options)
 
@@ -190,7 +192,7 @@ def test_no_late_task_changes_a_run_that_is_over(late: dict[str, list[Any]], tmp
     for tasks in late.values():
         for task in tasks:
             with pytest.raises((RunCancelledError, FileNotFoundError)):
-                keep(task)
+                run_and_store(task)
     assert files_below(tmp_path / "run") == before
 
 
@@ -203,7 +205,7 @@ def test_a_late_task_does_not_meet_the_scratch_of_the_next_run(
         if event.kind == "stage" and event.stage == "reconstruct":
             for task in late["ingest"]:
                 with pytest.raises(RunCancelledError):
-                    keep(task)
+                    run_and_store(task)
                 refused.append(task)
 
     digest = start("other").digest

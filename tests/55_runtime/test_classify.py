@@ -26,7 +26,8 @@ from pipeline.io import open_source
 from pipeline.io.las_frame import read_frame
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
 from pipeline.runtime.monitoring.events import Event
-from pipeline.runtime.scratch.folder_lock import held_folder, remove_abandoned
+from pipeline.runtime.resources import SERIAL, Resources
+from pipeline.runtime.scratch.folder_lock import locked_folder, remove_abandoned
 from pipeline.settings import RunSettings
 
 Classify = Callable[..., ClassifySummary]
@@ -45,7 +46,7 @@ def run_classify(tmp_path: Path) -> Classify:
             inputs=tuple(str(path) for path in paths),
             out=fields.pop("out", str(tmp_path / f"classified-{next(numbers)}")),
             settings=RunSettings.from_mapping(settings or {"classes": "ignore"}),
-            workers=fields.pop("workers", 0),
+            resources=Resources(workers=fields.pop("workers", 0)),
             **fields,
         )
         return classify(request, executor=executor)
@@ -293,14 +294,14 @@ def test_a_file_that_changes_meanwhile_is_told(
 
 
 def test_a_cell_of_rasters_that_nobody_asked_for_is_an_error(true_suburb: Path, tmp_path: Path) -> None:
-    request = ClassifyRequest(inputs=(str(true_suburb),), out=str(tmp_path / "out"), raster_cell=2.0, workers=0)
+    request = ClassifyRequest(inputs=(str(true_suburb),), out=str(tmp_path / "out"), raster_cell=2.0, resources=SERIAL)
     with pytest.raises(SettingsError, match=r"raster_cell is 2 where no rasters are asked for: give --rasters too"):
         classify(request)
     assert not (tmp_path / "out").exists()
 
 
 def test_a_classification_that_is_called_off_leaves_no_file(true_suburb: Path, tmp_path: Path) -> None:
-    request = ClassifyRequest(inputs=(str(true_suburb),), out=str(tmp_path / "out"), workers=0)
+    request = ClassifyRequest(inputs=(str(true_suburb),), out=str(tmp_path / "out"), resources=SERIAL)
     with pytest.raises(RunCancelledError):
         classify(request, cancelled=lambda: True)
     assert list((tmp_path / "out").iterdir()) == []
@@ -314,7 +315,7 @@ def test_an_interruption_leaves_whole_files_and_no_scratch(
         if (event.kind, event.stage) == ("stage", stage):
             raise KeyboardInterrupt
 
-    request = ClassifyRequest(inputs=(str(true_suburb),), out=str(tmp_path / "out"), workers=0, rasters=True)
+    request = ClassifyRequest(inputs=(str(true_suburb),), out=str(tmp_path / "out"), resources=SERIAL, rasters=True)
     with pytest.raises(KeyboardInterrupt):
         classify(request, interrupt)
     assert [path.name for path in (tmp_path / "out").iterdir()] == left
@@ -370,7 +371,7 @@ def test_what_a_killed_command_left_is_removed_and_told_by_the_next_into_the_sam
     assert killed.returncode == -signal.SIGKILL
     (left,) = (out / "scratch").iterdir()
     (out / "scratch" / "notes").mkdir()
-    with held_folder(out / "scratch") as in_use:
+    with locked_folder(out / "scratch") as in_use:
         summary = run_classify(true_suburb, out=str(out))
         assert {path.name for path in (out / "scratch").iterdir()} == {"notes", in_use.name}
     assert summary.warnings[-1] == f"removed {left}: an earlier command was cut off and left it"
@@ -378,7 +379,7 @@ def test_what_a_killed_command_left_is_removed_and_told_by_the_next_into_the_sam
 
 
 def test_a_folder_that_is_held_no_more_is_removed_and_an_empty_parent_with_it(tmp_path: Path) -> None:
-    with held_folder(tmp_path / "scratch") as folder:
+    with locked_folder(tmp_path / "scratch") as folder:
         assert remove_abandoned(tmp_path / "scratch") == []
         (folder / "points").mkdir()
     assert not (tmp_path / "scratch").exists()

@@ -24,16 +24,18 @@ from pipeline.runtime.compare import (
     settings_of,
 )
 from pipeline.runtime.monitoring.events import Event
-from pipeline.runtime.run import RunRequest, RunVariant, run, run_variants
-from pipeline.runtime.stages import reconstruct
-from pipeline.runtime.stages.reconstruct import load_once
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run
+from pipeline.runtime.stages import model_batch
+from pipeline.runtime.stages.model_batch import load_once
 from pipeline.settings import RunSettings
 
 BOTH = parse_variants(["fuzzy-sart,fuzzy-sart:faithful"])
 
 
 def request(suburb: Path, out: Path, **fields: object) -> CompareRequest:
-    run_request = RunRequest(inputs=(str(suburb),), out=str(out), workers=0)
+    run_request = RunRequest(inputs=(str(suburb),), out=str(out), resources=SERIAL)
     return CompareRequest(run=dataclasses.replace(run_request, **fields), variants=BOTH)
 
 
@@ -49,7 +51,7 @@ def test_each_variant_has_the_content_of_a_run_of_its_own(
     suburb: Path, compared: tuple[CompareSummary, list[Event]], variant: Variant, tmp_path: Path
 ) -> None:
     settings = RunSettings.from_mapping({"method": variant.method, "preset": variant.preset})
-    alone = run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "alone"), settings=settings, workers=0))
+    alone = run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "alone"), settings=settings, resources=SERIAL))
     beside = compared[0].runs[variant.label]
     assert beside.digest == alone.digest
     assert beside.counts == alone.counts
@@ -158,8 +160,8 @@ def test_no_building_is_charged_for_loading_its_method(
 ) -> None:
     loaded: list[str] = []
     # a clock that stands still but while a method is loaded
-    monkeypatch.setattr(reconstruct, "time", SimpleNamespace(perf_counter=lambda: 100.0 * len(loaded)))
-    monkeypatch.setattr(reconstruct, "load", loaded.append)
+    monkeypatch.setattr(model_batch, "time", SimpleNamespace(perf_counter=lambda: 100.0 * len(loaded)))
+    monkeypatch.setattr(model_batch, "load", loaded.append)
     load_once.cache_clear()
     try:
         variants = parse_variants(["fuzzy-sart,kmeans,fuzzy-sart:faithful"])
@@ -172,19 +174,9 @@ def test_no_building_is_charged_for_loading_its_method(
 
 def test_a_run_by_one_method_loads_nothing_ahead(suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded: list[str] = []
-    monkeypatch.setattr(reconstruct, "load_once", loaded.append)
-    run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "out"), workers=0))
+    monkeypatch.setattr(model_batch, "load_once", loaded.append)
+    run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "out"), resources=SERIAL))
     assert loaded == []
-
-
-def test_variants_that_would_find_other_candidates_are_refused(suburb: Path, tmp_path: Path) -> None:
-    given = RunRequest(inputs=(str(suburb),), out=str(tmp_path), workers=0)
-    ways = [
-        RunVariant(settings=RunSettings.from_mapping(table), out=str(tmp_path / label), label=label)
-        for label, table in (("a", {}), ("b", {"ground": {"max_slope": 0.5}}))
-    ]
-    with pytest.raises(SettingsError, match="b would find other candidates than a"):
-        run_variants(given, ways, str(tmp_path / "work"))
 
 
 @pytest.mark.parametrize(

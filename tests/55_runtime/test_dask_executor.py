@@ -27,6 +27,7 @@ from pipeline.runtime.isolation.forked_child import can_fork
 from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured, measure_packed, packed
 from pipeline.runtime.monitoring.versions import ENGINE, differences, fingerprint, versions_here, versions_of
+from pipeline.runtime.resources import Resources
 
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
 
@@ -321,7 +322,7 @@ def test_a_broken_connection_to_the_scheduler_is_told_at_once() -> None:
 
 def test_a_scheduler_that_is_not_there_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.runtime.cluster.dask_executor.CONNECT_S", 1.0)
-    executor = executor_for(workers=2, scheduler="tcp://127.0.0.1:9", local_directory="")
+    executor = executor_for(Resources(workers=2, scheduler="tcp://127.0.0.1:9"), local_directory="")
     with pytest.raises(ClusterError, match=r"tcp://127.0.0.1:9 does not answer.*Check the address"), executor:
         pytest.fail("it connected")
 

@@ -15,6 +15,7 @@ from pipeline.runtime.expected import RATES, Expected, expected
 from pipeline.runtime.isolation import preloading
 from pipeline.runtime.monitoring import machine
 from pipeline.runtime.plan import make_plan
+from pipeline.runtime.resources import SERIAL, Resources
 from pipeline.settings import RunSettings
 
 
@@ -37,8 +38,8 @@ from pipeline.settings import RunSettings
 def test_what_is_asked_for_counts_before_what_a_job_costs(
     workers: int | None, scheduler: str | None, cpu_s: float, at: int, report: bool, engine: tuple[str, int]
 ) -> None:
-    found = engine_of(workers=workers, scheduler=scheduler, expected_cpu_s=cpu_s, at=at, performance_report=report)
-    assert found == engine
+    resources = Resources(workers=workers, scheduler=scheduler, performance_report="time.html" if report else None)
+    assert engine_of(resources, expected_cpu_s=cpu_s, at=at) == engine
 
 
 @pytest.mark.parametrize(("starts", "engine"), [(9.0, "local"), (11.0, "cluster")])
@@ -47,11 +48,11 @@ def test_a_cluster_starts_only_where_its_start_is_less_than_a_tenth_of_the_job(
     at: int, starts: float, engine: str
 ) -> None:
     cpu_s = starts * RATES.cluster_start_s * at
-    assert engine_of(workers=None, scheduler=None, expected_cpu_s=cpu_s, at=at) == (engine, at)
+    assert engine_of(Resources(), expected_cpu_s=cpu_s, at=at) == (engine, at)
 
 
 @pytest.mark.parametrize(
-    ("workers", "isolates", "cpu_s", "report", "engine"),
+    ("workers", "models", "cpu_s", "report", "engine"),
     [
         (None, False, 0.0, False, ("serial", 1)),
         (None, False, 0.9 * ALONE_S, False, ("serial", 1)),
@@ -63,12 +64,10 @@ def test_a_cluster_starts_only_where_its_start_is_less_than_a_tenth_of_the_job(
     ],
 )
 def test_only_the_smallest_jobs_without_buildings_need_no_children(
-    workers: int | None, isolates: bool, cpu_s: float, report: bool, engine: tuple[str, int]
+    workers: int | None, models: bool, cpu_s: float, report: bool, engine: tuple[str, int]
 ) -> None:
-    found = engine_of(
-        workers=workers, scheduler=None, expected_cpu_s=cpu_s, at=4, performance_report=report, isolates=isolates
-    )
-    assert found == engine
+    resources = Resources(workers=workers, performance_report="time.html" if report else None)
+    assert engine_of(resources, expected_cpu_s=cpu_s, at=4, models=models) == engine
 
 
 def test_a_large_job_has_no_more_workers_than_there_is_memory_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,16 +78,17 @@ def test_a_large_job_has_no_more_workers_than_there_is_memory_for(monkeypatch: p
     monkeypatch.setattr("pipeline.runtime.engine.memory_bytes", lambda: 16 * 2**30)
     large = Expected(points_by_file={"a": 10**9}, tiles=99, seen_points=2e9, buildings=10**6, task_bytes=3 * 2**30)
     for workers in (None, 8):
-        executor_for(workers=workers, scheduler=None, local_directory="", work=large)
+        executor_for(Resources(workers=workers), local_directory="", work=large)
     assert made == [4, 8]
 
 
 def test_executors_are_what_the_engine_says() -> None:
-    assert isinstance(executor_for(workers=0, scheduler=None, local_directory=""), SerialExecutor)
-    assert isinstance(executor_for(workers=None, scheduler=None, local_directory=""), LocalExecutor)
-    assert isinstance(executor_for(workers=None, scheduler=None, local_directory="", isolates=False), SerialExecutor)
+    assert isinstance(executor_for(SERIAL, local_directory=""), SerialExecutor)
+    assert isinstance(executor_for(Resources(), local_directory=""), LocalExecutor)
+    nothing = Expected(points_by_file={}, tiles=0, seen_points=0.0, buildings=0, models=False)
+    assert isinstance(executor_for(Resources(), local_directory="", work=nothing), SerialExecutor)
     with pytest.raises(SettingsError, match="--workers 1"):
-        executor_for(workers=0, scheduler=None, local_directory="", performance_report="time.html")
+        executor_for(Resources(workers=0, performance_report="time.html"), local_directory="")
 
 
 def test_inputs_are_surely_small_where_all_are_files_of_this_machine_and_small_together(tmp_path: Path) -> None:

@@ -34,9 +34,13 @@ def features(run_dir: str) -> dict[str, dict[str, Any]]:
 @pytest.fixture(scope="module")
 def houses(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Polygon]:
     """Outlines of the suburb's houses, by a run without footprints."""
-    from pipeline.runtime.run import RunRequest, run
+    from pipeline.runtime.request import RunRequest
+    from pipeline.runtime.resources import SERIAL
+    from pipeline.runtime.run import run
 
-    summary = run(RunRequest(inputs=(str(suburb),), out=str(tmp_path_factory.mktemp("found") / "run"), workers=0))
+    summary = run(
+        RunRequest(inputs=(str(suburb),), out=str(tmp_path_factory.mktemp("found") / "run"), resources=SERIAL)
+    )
     found = ds.dataset(f"{summary.run_dir}/buildings").to_table(columns=["geometry"]).column("geometry").to_pylist()
     return sorted((shapely.from_wkb(data).envelope for data in found), key=lambda polygon: polygon.bounds)
 

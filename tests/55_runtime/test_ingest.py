@@ -15,7 +15,8 @@ from pipeline.io.las import LasFile
 from pipeline.io.records import PointRecords
 from pipeline.model import PointCloud
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.ingest import IngestTask, ingest, spread_m, to_records
+from pipeline.runtime.stages.ingest import IngestTask, ingest_file, to_records
+from pipeline.runtime.stages.ingested import spread_m
 from pipeline.tiling import TileGrid
 
 
@@ -32,7 +33,7 @@ def stored(folder: Path) -> dict[str, np.ndarray]:
 
 def test_points_land_in_their_own_tile(suburb: Path, tmp_path: Path) -> None:
     job = task(suburb, tmp_path)
-    found = ingest(job)
+    found = ingest_file(job)
     buckets = stored(tmp_path)
     assert sum(map(len, buckets.values())) == len(laspy.read(suburb).points)
     assert {tile.key: n for tile, n in found.points_by_tile.items()} == {key: len(p) for key, p in buckets.items()}
@@ -41,7 +42,7 @@ def test_points_land_in_their_own_tile(suburb: Path, tmp_path: Path) -> None:
 
 
 def test_coordinates_are_whole_millimetres_of_the_file(suburb: Path, tmp_path: Path) -> None:
-    ingest(task(suburb, tmp_path))
+    ingest_file(task(suburb, tmp_path))
     las = laspy.read(suburb)
     expected = np.rint(np.column_stack((las.x, las.y, las.z)) * 1000).astype(np.int64)
     points = np.concatenate(list(stored(tmp_path).values()))
@@ -50,9 +51,9 @@ def test_coordinates_are_whole_millimetres_of_the_file(suburb: Path, tmp_path: P
 
 
 def test_a_task_that_runs_twice_leaves_every_point_once(suburb: Path, tmp_path: Path) -> None:
-    first = ingest(task(suburb, tmp_path))
+    first = ingest_file(task(suburb, tmp_path))
     before = stored(tmp_path)
-    assert ingest(task(suburb, tmp_path)) == first
+    assert ingest_file(task(suburb, tmp_path)) == first
     after = stored(tmp_path)
     assert {key: len(p) for key, p in after.items()} == {key: len(p) for key, p in before.items()}
     assert not list(tmp_path.rglob("*.part"))
@@ -64,12 +65,12 @@ def test_a_line_has_no_spread_wherever_it_is_cut(tmp_path: Path) -> None:
         path = tmp_path / f"{index}.xyz"
         along = np.arange(300) + shift
         np.savetxt(path, np.column_stack((4e5 + 0.6 * along, 5e6 + 0.8 * along, along % 5)), fmt="%.3f")
-        results.append(ingest(task(path, tmp_path / "scratch", index)))
+        results.append(ingest_file(task(path, tmp_path / "scratch", index)))
     assert spread_m(results) < 0.01
 
 
 def test_a_town_has_the_spread_that_numpy_finds(suburb: Path, tmp_path: Path) -> None:
-    found = ingest(task(suburb, tmp_path))
+    found = ingest_file(task(suburb, tmp_path))
     las = laspy.read(suburb)
     covariance = np.cov(np.column_stack((las.x, las.y)).T, bias=True)
     assert spread_m([found]) == pytest.approx(np.sqrt(np.linalg.eigvalsh(covariance)[0]), rel=1e-6)
@@ -92,9 +93,9 @@ def test_an_elevation_beyond_32_bits_of_millimetres_is_refused() -> None:
 def test_many_tiles_in_a_chunk_are_sorted_apart_as_few_are(
     suburb: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = ingest(task(suburb, tmp_path / "few"))
+    few = ingest_file(task(suburb, tmp_path / "few"))
     monkeypatch.setattr("pipeline.runtime.stages.ingest._TWO_BYTES", 1)
-    many = ingest(task(suburb, tmp_path / "many"))
+    many = ingest_file(task(suburb, tmp_path / "many"))
     assert many == few
     for key, bucket in stored(tmp_path / "few").items():
         assert (stored(tmp_path / "many")[key] == bucket).all()

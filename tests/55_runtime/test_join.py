@@ -22,9 +22,10 @@ from pipeline.kernels.union_find import united
 from pipeline.model import IntArray, Tin
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.stages.border_facets import facet_names, telling_facets, united_by_name
-from pipeline.runtime.stages.join import Joined, join
+from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.open_fragments import open_fragments
-from pipeline.runtime.stages.split import Split
+from pipeline.runtime.stages.sites import Joined
+from pipeline.runtime.stages.split_window import Split
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints, split_tile
 from pipeline.terrain.candidates import NOWHERE
 from pipeline.terrain.facets import FacetKind, VertexKind
@@ -74,7 +75,7 @@ def both_joins(
 ) -> tuple[Joined, Joined]:
     """The slow join of all fragments, and the join of what is handed on, in another order of the tiles."""
     handed = [handed_on(whole, grid, cut, judging) for whole in wholes]
-    return whole_join(wholes, grid, judging, CRS), join(reversed(handed), grid, judging, CRS)
+    return whole_join(wholes, grid, judging, CRS), join_tiles(reversed(handed), grid, judging, CRS)
 
 
 def sorted_points(tile: Tile, fragments: Fragments, point_fragment: npt.NDArray[np.int32]) -> WholeSplit:
@@ -195,8 +196,8 @@ def test_the_tiles_do_not_decide_what_is_found(scene: Patchwork, grid: TileGrid)
     (alone,) = [handed_on(whole, everything, CUT, EASY) for whole in scene.cut(everything)]
     assert alone.surfaces is not None
     assert len(alone.surfaces.kind) == alone.surfaces.steps == len(alone.surfaces.facets.names) == 0
-    whole = join([alone], everything, EASY, CRS)
-    cut = join([handed_on(one, grid, CUT, EASY) for one in scene.cut(grid)], grid, EASY, CRS)
+    whole = join_tiles([alone], everything, EASY, CRS)
+    cut = join_tiles([handed_on(one, grid, CUT, EASY) for one in scene.cut(grid)], grid, EASY, CRS)
     assert Counter((c.building_id, c.points) for c in cut.candidates) == Counter(
         (c.building_id, c.points) for c in whole.candidates
     )
@@ -214,7 +215,7 @@ def test_the_patches_have_what_the_join_is_for() -> None:
         grid = TileGrid(size_mm=14_000, halo_mm=8_000, origin_x_mm=1000 * seed)
         wholes = scene.cut(grid)
         handed = [handed_on(whole, grid, CUT, EASY) for whole in wholes]
-        found = join(handed, grid, EASY, CRS)
+        found = join_tiles(handed, grid, EASY, CRS)
         tiles_of = [{part.tile for part in site.ranges} for site in found.candidates]
         surfaces, surface, offsets = whole_surfaces(wholes)
         tile_of = np.repeat(np.arange(len(wholes)), np.diff(offsets))
@@ -360,7 +361,7 @@ def test_a_step_unites_roofs_of_two_tiles_through_a_third_in_which_nothing_lies_
 
 
 def test_no_tiles_have_no_sites() -> None:
-    assert join([], CORNER, EASY, CRS) == Joined(candidates=(), rejected=(), small_fragments=0)
+    assert join_tiles([], CORNER, EASY, CRS) == Joined(candidates=(), rejected=(), small_fragments=0)
 
 
 # -- towns -------------------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from pipeline.runtime.cluster.memory_needs import (
 from pipeline.runtime.isolation.isolated_items import IsolationLimits
 from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.plan import window_bytes
-from pipeline.runtime.stages.reconstruct import BatchTask
+from pipeline.runtime.stages.model_batch import BatchTask
 from pipeline.tiling import Tile, TileGrid
 
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))

@@ -23,8 +23,10 @@ from pipeline.runtime.classify import ClassifyRequest, classify
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.isolation.replay_bundle import read_bundle
 from pipeline.runtime.manifest import RunStatus, read_manifest
+from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun
-from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.resources import SERIAL, Resources
+from pipeline.runtime.run import run
 from pipeline.settings import RunSettings
 
 SETTINGS = RunSettings.from_mapping({"tile_size_m": 62.5})
@@ -35,7 +37,7 @@ SETTINGS = RunSettings.from_mapping({"tile_size_m": 62.5})
 def local(suburb, tmp_path_factory):
     """The run into a folder that all others are held against."""
     out = tmp_path_factory.mktemp("local") / "run"
-    return run(RunRequest(inputs=(str(suburb),), out=str(out), settings=SETTINGS, workers=0))
+    return run(RunRequest(inputs=(str(suburb),), out=str(out), settings=SETTINGS, resources=SERIAL))
 
 
 @pytest.fixture
@@ -53,8 +55,10 @@ def quick(monkeypatch):
     monkeypatch.setitem(persistently.__kwdefaults__, "sleep", lambda _: None)
 
 
-def request(tile, bucket, **more):
-    return RunRequest(inputs=(tile,), out=f"{bucket}/run", settings=SETTINGS, workers=0, **more)
+def request(tile, bucket, scratch=None, **more):
+    return RunRequest(
+        inputs=(tile,), out=f"{bucket}/run", settings=SETTINGS, resources=Resources(workers=0, scratch=scratch), **more
+    )
 
 
 def files(place):
@@ -125,7 +129,7 @@ def test_a_run_that_is_there_is_only_replaced_when_asked(local, tile, bucket):
     assert files(f"{bucket}/run") == files(local.run_dir)
     storage_at(f"{bucket}/other").put("important.txt", b"")
     with pytest.raises(RunError, match=r"no run\.json, so it is no run"):
-        run(RunRequest(inputs=(tile,), out=f"{bucket}/other", workers=0, overwrite=True))
+        run(RunRequest(inputs=(tile,), out=f"{bucket}/other", resources=SERIAL, overwrite=True))
 
 
 def test_whoever_reads_while_a_run_is_replaced_sees_that_it_is_not_finished(tile, bucket, s3):
@@ -200,7 +204,7 @@ def test_nothing_of_the_credentials_or_of_signed_urls_is_kept(tile, bucket, s3):
     signed = f"{s3.endpoint}/{tile.removeprefix('s3://')}?signature=very-hidden"
     events = []
     # moto takes the query of an open object for none of its business
-    run(RunRequest(inputs=(signed,), out=f"{bucket}/run", workers=0), events.append)
+    run(RunRequest(inputs=(signed,), out=f"{bucket}/run", resources=SERIAL), events.append)
     storage = storage_at(f"{bucket}/run")
     names = storage.keys()
     kept = b"".join(storage.get(key) for key in names) + repr(events).encode()
@@ -239,11 +243,11 @@ def test_scratch_is_on_this_machine_and_goes(tile, bucket, tmp_path, monkeypatch
 
 
 def test_workers_elsewhere_need_a_scratch_that_they_see(bucket):
-    elsewhere = RunRequest(inputs=("a.laz",), out=f"{bucket}/run", scheduler="tcp://127.0.0.1:1")
+    elsewhere = RunRequest(inputs=("a.laz",), out=f"{bucket}/run", resources=Resources(scheduler="tcp://127.0.0.1:1"))
     with pytest.raises(RunError, match="no scratch: give a folder that all of them and this machine see, by --scratch"):
         run(elsewhere)
     with pytest.raises(RunError, match="is a URL: give a folder"):
-        run(RunRequest(inputs=("a.laz",), out=f"{bucket}/run", scratch=f"{bucket}/scratch"))
+        run(RunRequest(inputs=("a.laz",), out=f"{bucket}/run", resources=Resources(scratch=f"{bucket}/scratch")))
 
 
 def test_an_input_that_vanishes_after_the_plan_is_told_by_its_url(tile, bucket, s3, quick):
@@ -272,31 +276,31 @@ def test_only_what_an_area_needs_is_fetched(local, tile, bucket, s3, tmp_path):
     index.to_file(tmp_path / "index.gpkg")
     storage_at(bucket).put("index.gpkg", (tmp_path / "index.gpkg").read_bytes())
     s3.reset()
-    run(RunRequest(inputs=(f"{bucket}/index.gpkg",), out=f"{bucket}/run", bbox=bbox, workers=0))
+    run(RunRequest(inputs=(f"{bucket}/index.gpkg",), out=f"{bucket}/run", bbox=bbox, resources=SERIAL))
     assert s3.count(path="far.laz") == 0
     assert [entry.path for entry in read_manifest(f"{bucket}/run").inputs] == [tile]
     # without an index the headers tell
     away = tuple(value + 10_000.0 for value in bbox)
     with pytest.raises(EmptyInputError, match="all 2 inputs lie off --bbox and --aoi"):
-        run(RunRequest(inputs=(f"{bucket}/in/",), out=f"{bucket}/off", bbox=away, workers=0))
+        run(RunRequest(inputs=(f"{bucket}/in/",), out=f"{bucket}/off", bbox=away, resources=SERIAL))
 
 
 def test_what_only_works_in_folders_says_so(tile, bucket, tmp_path):
     with pytest.raises(RunError, match=r"only runs in folders are changed in place.*Copy the run"):
         rerun(RerunRequest(run_dir=f"{bucket}/run"))
     with pytest.raises(InputError, match="classify reads files of this machine only"):
-        classify(ClassifyRequest(inputs=(tile,), out=str(tmp_path / "out"), workers=0))
+        classify(ClassifyRequest(inputs=(tile,), out=str(tmp_path / "out"), resources=SERIAL))
 
 
 def test_a_run_of_signed_urls_cannot_be_changed_later(tile, bucket, s3, tmp_path):
     signed = f"{s3.endpoint}/{tile.removeprefix('s3://')}?signature=x"
-    summary = run(RunRequest(inputs=(signed,), out=str(tmp_path / "run"), workers=0))
+    summary = run(RunRequest(inputs=(signed,), out=str(tmp_path / "run"), resources=SERIAL))
     with pytest.raises(RunError, match=r"run\.json keeps no queries of URLs"):
-        rerun(RerunRequest(run_dir=summary.run_dir, workers=0))
+        rerun(RerunRequest(run_dir=summary.run_dir, resources=SERIAL))
 
 
 def test_a_run_of_remote_inputs_can_be_changed_later(tile, tmp_path):
-    summary = run(RunRequest(inputs=(tile,), out=str(tmp_path / "run"), workers=0))
+    summary = run(RunRequest(inputs=(tile,), out=str(tmp_path / "run"), resources=SERIAL))
     (first, *_) = sorted(path.stem for path in Path(summary.run_dir, "meshes").rglob("*.obj"))
-    again = rerun(RerunRequest(run_dir=summary.run_dir, only=(first,), workers=0))
+    again = rerun(RerunRequest(run_dir=summary.run_dir, only=(first,), resources=SERIAL))
     assert again.digest == summary.digest

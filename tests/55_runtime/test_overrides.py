@@ -26,7 +26,8 @@ from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.earlier import Record
 from pipeline.runtime.overrides.overrides_file import overrides_of, own_modelling, read_overrides
 from pipeline.runtime.rerun import RerunRequest, rerun
-from pipeline.runtime.stages.join import CandidateSite
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.stages.sites import CandidateSite
 from pipeline.settings import RunSettings
 from pipeline.tiling import Tile
 
@@ -75,10 +76,11 @@ def write_outlines(path: Path, outlines: dict[str, Any], **attributes: str) -> P
 @pytest.fixture(scope="module")
 def plain(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The run without overrides."""
-    from pipeline.runtime.run import RunRequest, run
+    from pipeline.runtime.request import RunRequest
+    from pipeline.runtime.run import run
 
     out = str(tmp_path_factory.mktemp("plain") / "run")
-    return run(RunRequest(inputs=(str(suburb),), out=out, settings=RunSettings.from_mapping(TILES), workers=0))
+    return run(RunRequest(inputs=(str(suburb),), out=out, settings=RunSettings.from_mapping(TILES), resources=SERIAL))
 
 
 @pytest.fixture
@@ -394,7 +396,7 @@ def copied(suburb: Path, plain: Any, reconstruct: Any, tmp_path: Path) -> Any:
 
 
 def again(run_dir: str, **fields: Any) -> Any:
-    return rerun(RerunRequest(run_dir=run_dir, workers=0, **fields))
+    return rerun(RerunRequest(run_dir=run_dir, resources=SERIAL, **fields))
 
 
 @pytest.mark.parametrize(
@@ -525,7 +527,7 @@ def test_a_rerun_that_is_called_off_leaves_the_run_as_it_was(plain: Any, copied:
     before = files(first.run_dir) | {"run.json": (Path(first.run_dir) / "run.json").read_bytes()}
     name = min(rows(first.run_dir, "buildings"))
     with pytest.raises(RunCancelledError):
-        rerun(RerunRequest(run_dir=first.run_dir, only=(name,), workers=0), cancelled=lambda: True)
+        rerun(RerunRequest(run_dir=first.run_dir, only=(name,), resources=SERIAL), cancelled=lambda: True)
     assert files(first.run_dir) | {"run.json": (Path(first.run_dir) / "run.json").read_bytes()} == before
 
 

@@ -15,6 +15,7 @@ import rasterio
 from pipeline.errors import SettingsError
 from pipeline.export.raster import NO_VALUE, RasterLattice, write_cog
 from pipeline.runtime.classify import ClassifyRequest, ClassifySummary, classify
+from pipeline.runtime.resources import SERIAL
 from pipeline.runtime.stages.rasters import RASTERS
 from pipeline.settings import RunSettings
 
@@ -31,7 +32,7 @@ def rasters_of(tmp_path: Path) -> Callable[..., ClassifySummary]:
             inputs=(str(path),),
             out=str(tmp_path / f"rasters-{next(numbers)}"),
             settings=RunSettings.from_mapping({"classes": "ignore", **(settings or {})}),
-            workers=0,
+            resources=SERIAL,
             rasters=True,
             **fields,
         )

@@ -17,9 +17,11 @@ import pipeline.reconstruct
 from pipeline.errors import EmptyInputError, InconsistentInputError, InputError, RunError
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.monitoring.events import Event
+from pipeline.runtime.request import RunRequest
 from pipeline.runtime.rerun import RerunRequest, rerun
-from pipeline.runtime.run import RunRequest, run
-from pipeline.runtime.scratch.folder_lock import held_results
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run
+from pipeline.runtime.scratch.folder_lock import locked_results
 from pipeline.settings import RunSettings
 
 
@@ -113,15 +115,15 @@ def test_an_earlier_run_is_kept_unless_told_otherwise(suburb: Path, reconstruct:
 def test_two_runs_never_write_one_directory_at_once(suburb: Path, reconstruct: Any, tmp_path: Path) -> None:
     out = tmp_path / "run"
     out.mkdir()
-    with held_results(str(out)), pytest.raises(RunError, match=r"is being written by another run: wait for it, or"):
+    with locked_results(str(out)), pytest.raises(RunError, match=r"is being written by another run: wait for it, or"):
         reconstruct(suburb, out=str(out))
     assert list(out.iterdir()) == []
     first = reconstruct(suburb, out=str(out))
-    with held_results(first.run_dir):
+    with locked_results(first.run_dir):
         with pytest.raises(RunError, match="is being written by another run"):
             reconstruct(suburb, out=str(out), overwrite=True)
         with pytest.raises(RunError, match="is being written by another run"):
-            rerun(RerunRequest(run_dir=first.run_dir, workers=0))
+            rerun(RerunRequest(run_dir=first.run_dir, resources=SERIAL))
     assert run_digest(first.run_dir) == first.digest
 
 
@@ -136,7 +138,9 @@ def test_a_folder_that_is_no_run_is_never_replaced(suburb: Path, reconstruct: An
 def test_progress_is_told_by_stage_and_never_runs_backwards(suburb: Path, tmp_path: Path) -> None:
     events: list[Event] = []
     settings = RunSettings.from_mapping({"tile_size_m": 40.0})
-    run(RunRequest(inputs=(str(suburb),), out=str(tmp_path / "run"), settings=settings, workers=0), events.append)
+    run(
+        RunRequest(inputs=(str(suburb),), out=str(tmp_path / "run"), settings=settings, resources=SERIAL), events.append
+    )
     stages = [event.stage for event in events if event.kind == "stage"]
     assert stages == ["ingest", "split", "join", "outline", "reconstruct", "publish"]
     for stage in ("ingest", "split", "reconstruct", "publish"):

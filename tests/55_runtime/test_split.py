@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.runtime.scratch.folder import POINT
-from pipeline.runtime.stages.split import _order_by_owner
+from pipeline.runtime.stages.split_window import _order_by_owner
 
 
 def points(n: int, side_mm: int, seed: int) -> np.ndarray:

@@ -23,9 +23,9 @@ from pipeline.roof.settings import RoofSettings
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages import outline
 from pipeline.runtime.stages.gather import gather, points_of
-from pipeline.runtime.stages.join import CandidateSite, PointRange, object_id
 from pipeline.runtime.stages.outline import draw_outlines, outline_tasks
-from pipeline.runtime.stages.reconstruct_tasks import divide, unit_tasks
+from pipeline.runtime.stages.sites import CandidateSite, PointRange, object_id
+from pipeline.runtime.stages.units import divide, unit_tasks
 from pipeline.terrain.lattice import CELL_MM
 from pipeline.terrain.settings import UnitSettings
 from pipeline.tiling import TileGrid

@@ -29,6 +29,7 @@ from pipeline.runtime.monitoring import logs
 from pipeline.runtime.monitoring.events import Event, Watch
 from pipeline.runtime.monitoring.measurement import Measured, measure
 from pipeline.runtime.monitoring.tallies import TALLIES, Tallies
+from pipeline.runtime.resources import Resources
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.tiling import Tile
 
@@ -299,7 +300,7 @@ def test_a_place_where_no_page_can_be_written_is_told_before_anything_runs(tmp_p
     with pytest.raises(RunError, match="make the folder"):
         Cluster(scheduler="tcp://127.0.0.1:9").executor(performance_report=str(tmp_path / "none" / "time.html"))
     with pytest.raises(SettingsError, match="there are none: use --workers 1"):
-        executor_for(workers=0, scheduler=None, local_directory="", performance_report=str(tmp_path / "time.html"))
+        executor_for(Resources(workers=0, performance_report=str(tmp_path / "time.html")), local_directory="")
 
 
 def test_a_run_on_workers_leaves_the_page_and_its_tallies(tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ import shapely
 from pipeline.errors import InputError
 from pipeline.io import ReadOptions
 from pipeline.runtime.plan import Plan, check_windows, make_plan, split_grid
-from pipeline.runtime.stages import stages
-from pipeline.runtime.stages.split import Split, SplitTask, split
+from pipeline.runtime.stages import split
+from pipeline.runtime.stages.split_window import Split, SplitTask, split_window
 from pipeline.settings import RunSettings
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.terrain.settings import GroundSettings
@@ -63,11 +63,11 @@ def grids(monkeypatch: pytest.MonkeyPatch) -> list[TileGrid]:
     """Gets the lattices by which the runs of a test split their tiles."""
     seen: list[TileGrid] = []
 
-    def watched(task: SplitTask) -> Split:
+    def watched(task: SplitTask, settings: SceneSettings) -> Split:
         seen.append(task.grid)
-        return split(task)
+        return split_window(task, settings)
 
-    monkeypatch.setattr(stages, "split", watched)
+    monkeypatch.setattr(split, "split_window", watched)
     return seen
 
 

@@ -21,8 +21,10 @@ from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.measurement import Measured
-from pipeline.runtime.run import RunRequest, RunSummary, run
-from pipeline.runtime.scratch.work_folder import held_work, is_at_work
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.run import RunSummary, run
+from pipeline.runtime.scratch.work_folder import is_at_work, locked_work
 from pipeline.settings import RunSettings
 
 STAGES = ("ingest", "split", "reconstruct", "publish")
@@ -61,8 +63,7 @@ class Place:
             inputs=(str(self.inputs),),
             out=str(self.folder / out),
             settings=RunSettings.from_mapping({"tile_size_m": TILE_M, **(settings or {})}),
-            workers=0,
-            work=None if work is None else str(self.folder / work),
+            resources=Resources(workers=0, work=None if work is None else str(self.folder / work)),
         )
         try:
             return run(request, executor=executor, **options)
@@ -305,18 +306,18 @@ def test_another_machine_goes_on_with_all_that_was_kept(
 
 
 def test_who_only_asks_whether_a_folder_is_held_refuses_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with held_work(str(tmp_path / "work")):
+    with locked_work(str(tmp_path / "work")):
         pass
     asking = os.open(tmp_path / "work" / "lock", os.O_RDWR)
     fcntl.flock(asking, fcntl.LOCK_SH)
     monkeypatch.setattr("time.sleep", lambda _: fcntl.flock(asking, fcntl.LOCK_UN))
-    with held_work(str(tmp_path / "work")):
+    with locked_work(str(tmp_path / "work")):
         assert is_at_work(str(tmp_path / "work"))
     os.close(asking)
 
 
 def test_two_runs_do_not_work_in_one_folder(place: Place) -> None:
-    with held_work(str(place.folder / "work")):
+    with locked_work(str(place.folder / "work")):
         assert is_at_work(str(place.folder / "work"))
         with pytest.raises(RunError, match=r"at work already \(process \d+ on "):
             place.run()
@@ -330,9 +331,9 @@ def test_a_folder_of_other_things_is_no_work_folder(place: Place) -> None:
 
 
 def test_tasks_of_a_driver_that_died_write_nothing_any_more(tmp_path: Path) -> None:
-    with held_work(str(tmp_path / "work")) as late:
+    with locked_work(str(tmp_path / "work")) as late:
         pass
     assert not late.cancelled
-    with held_work(str(tmp_path / "work")) as now:
+    with locked_work(str(tmp_path / "work")) as now:
         assert late.cancelled
         assert not now.cancelled

@@ -24,7 +24,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.Monk
     request = batch.request()
     assert request.inputs == (str(tmp_path / "tiles" / "*.laz"),)
     assert request.out == str(tmp_path / "models")
-    assert request.work == str(tmp_path.parent / "work")
+    assert request.resources.work == str(tmp_path.parent / "work")
 
 
 def test_addresses_stay_as_they_are(tmp_path: Path) -> None:
@@ -39,7 +39,8 @@ def test_what_is_not_said_is_as_in_reconstruct(tmp_path: Path) -> None:
     batch = read_batch(written(tmp_path, LEAST))
     assert batch.work_folder == str(tmp_path / "city.work")
     request = batch.request()
-    assert (request.workers, request.scheduler, request.isolate, request.meshes) == (None, None, True, "building")
+    assert (request.resources.workers, request.resources.scheduler, request.meshes) == (None, None, "building")
+    assert request.resources.isolation is not None
     assert request.settings.general.method == "arrangement"
     assert (request.crs, request.footprints, request.bbox) == (None, None, None)
 
@@ -76,15 +77,16 @@ def test_all_that_can_be_said_reaches_the_engine(tmp_path: Path) -> None:
     assert (request.crs, request.vertical_unit, request.licence) == ("EPSG:28992", "m", "CC0")
     assert request.settings.general.method == "kmeans"
     assert request.settings.scene.candidates.min_area_m2 == 20.0
-    assert (request.workers, request.isolate, request.building_timeout_s) == (0, False, 30.0)
-    assert request.building_memory_bytes == 2 * 2**30
+    resources = request.resources
+    assert (resources.workers, resources.isolation, resources.building_timeout_s) == (0, None, 30.0)
+    assert resources.building_memory_bytes == 2 * 2**30
     assert (request.meshes, request.overwrite) == ("glb", True)
 
 
 @pytest.mark.parametrize(("told", "workers"), [('"auto"', None), ("0", 0), ("3", 3)])
 def test_workers_are_a_number_or_left_to_the_estimate(tmp_path: Path, told: str, workers: int | None) -> None:
     batch = read_batch(written(tmp_path, f"{LEAST}[cluster]\nworkers = {told}\n"))
-    assert batch.workers == batch.request().workers == workers
+    assert batch.workers == batch.request().resources.workers == workers
 
 
 @pytest.mark.parametrize("told", ['"many"', '"3"', "1025", "1.5", "true"])

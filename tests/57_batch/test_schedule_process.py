@@ -21,7 +21,7 @@ from pipeline.batch.schedule_file import MAX_KEPT, NAME, FileBook, ScheduleRecor
 from pipeline.batch.schedule_process import LOCK, RUN_LOCK, Ending, keep_schedule
 from pipeline.errors import RunError, SettingsError
 from pipeline.runtime.monitoring.events import Event
-from pipeline.runtime.scratch.work_folder import held_lock, held_work, make_work
+from pipeline.runtime.scratch.work_folder import locked_file, locked_work, make_work
 from pipeline.schedule import Entry, Outcome, ScheduleState
 
 AT = dt.datetime(2026, 3, 1, 2, 0, tzinfo=dt.UTC)
@@ -205,7 +205,7 @@ def test_an_end_interrupts_the_run_and_the_next_start_goes_on(file: Path) -> Non
 def test_a_run_by_hand_is_not_met(file: Path) -> None:
     days = Days([])
     days._steps = [lambda: days.later(0.5), lambda: days.later(1.0)]
-    with held_work(str(file.with_suffix(".work"))):
+    with locked_work(str(file.with_suffix(".work"))):
         days.go(file)
     assert (days.runs, record_of(file).counts) == ([], {"skipped": 2})
 
@@ -213,7 +213,7 @@ def test_a_run_by_hand_is_not_met(file: Path) -> None:
 def test_a_second_process_is_refused(file: Path) -> None:
     work = file.with_suffix(".work")
     make_work(work)
-    with held_lock(work, LOCK), pytest.raises(RunError, match="is at work already"):
+    with locked_file(work, LOCK), pytest.raises(RunError, match="is at work already"):
         Days([]).go(file)
 
 
@@ -355,7 +355,7 @@ def test_a_run_that_outlived_the_process_before_is_waited_for(file: Path) -> Non
     work = file.with_suffix(".work")
     again = Days([])
     again.time = AT + HOUR / 4
-    with held_lock(work, RUN_LOCK):
+    with locked_file(work, RUN_LOCK):
         again.go(file)
     assert (again.runs, record_of(file).running) == ([], AT)
 
@@ -384,7 +384,7 @@ def test_a_work_folder_that_is_removed_is_made_and_held_again(file: Path) -> Non
     work = file.with_suffix(".work")
 
     def second() -> None:
-        with pytest.raises(RunError, match="is at work already"), held_lock(work, LOCK):
+        with pytest.raises(RunError, match="is at work already"), locked_file(work, LOCK):
             pass
 
     days._steps = [
@@ -395,13 +395,13 @@ def test_a_work_folder_that_is_removed_is_made_and_held_again(file: Path) -> Non
     ]
     days.go(file)
     assert record_of(file).counts == {"ran": 1}
-    with held_work(str(work)):
+    with locked_work(str(work)):
         pass  # a run of the batch takes it for a work folder
 
 
 def test_a_time_that_waited_is_told_as_missed_where_other_times_came_meanwhile(file: Path) -> None:
     file.write_text(FILE + 'overlap = "wait"\n')
-    with held_work(str(file.with_suffix(".work"))):
+    with locked_work(str(file.with_suffix(".work"))):
         days = Days([])
         days._steps = [lambda: days.later(0.5)]
         days.go(file)
@@ -420,7 +420,7 @@ def test_a_time_that_comes_while_a_broken_file_keeps_a_run_from_going_on_is_no_o
     again = Days([])
     again.time = AT + HOUR / 4
     outlived = contextlib.ExitStack()
-    outlived.enter_context(held_lock(file.with_suffix(".work"), RUN_LOCK))
+    outlived.enter_context(locked_file(file.with_suffix(".work"), RUN_LOCK))
     again._steps = [write(again, file, FILE.replace("0 *", "77 *")), outlived.close, lambda: again.later(1.0)]
     again.go(file)
     assert (again.runs, record_of(file).running) == ([], AT)

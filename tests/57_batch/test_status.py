@@ -15,7 +15,7 @@ from pipeline.batch.eta import StageProgress, remaining_s
 from pipeline.batch.status import NAME, StatusWriter, buildings_before, read_status
 from pipeline.errors import RunError
 from pipeline.runtime.monitoring.events import Event
-from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, held_lock, held_work
+from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, locked_file, locked_work
 
 PLANNED = {"ingest": 10.0, "split": 20.0, "reconstruct": 100.0, "publish": 10.0}
 
@@ -50,7 +50,7 @@ def test_it_tells_buildings_rate_and_what_is_left(writer: StatusWriter, clock: C
     for k in range(10):
         clock.s += 1.0
         writer.on_event(Event(kind="progress", stage="reconstruct", done=4 * (k + 1), total=100, failed=(k + 1) // 2))
-    with held_work(str(tmp_path)):
+    with locked_work(str(tmp_path)):
         found = read_status(str(tmp_path))
     assert found.state == "running"
     assert found.buildings == {"done": 40, "failed": 5, "queued": 60, "total": 100}
@@ -83,7 +83,7 @@ def test_workers_that_are_missing_are_told_until_they_are_back(writer: StatusWri
 
 def test_a_run_that_nobody_holds_is_dead(writer: StatusWriter, tmp_path: Path) -> None:
     writer.on_event(Event(kind="stage", stage="split", total=2))
-    with held_work(str(tmp_path)):
+    with locked_work(str(tmp_path)):
         assert read_status(str(tmp_path)).state == "running"
     found = read_status(str(tmp_path))
     assert found.state == "dead"
@@ -144,7 +144,7 @@ def test_a_damaged_status_is_named_and_stops_no_run(tmp_path: Path, text: str) -
 
 def test_a_run_that_is_planned_says_so(tmp_path: Path, clock: Clock) -> None:
     StatusWriter(str(tmp_path), "city.toml", "models", clock, clock.now).begin()
-    with held_work(str(tmp_path)):
+    with locked_work(str(tmp_path)):
         found = read_status(str(tmp_path))
     assert (found.state, found.stage, found.stages) == ("running", "plan", {})
 
@@ -167,7 +167,7 @@ def test_what_happened_within_the_second_is_written_though_nothing_follows(
 
 def test_a_run_that_still_plans_is_not_dead(writer: StatusWriter, tmp_path: Path) -> None:
     writer.on_event(Event(kind="stage", stage="plan"))
-    with held_lock(tmp_path, DRIVER_LOCK):
+    with locked_file(tmp_path, DRIVER_LOCK):
         assert read_status(str(tmp_path)).state == "running"
     assert read_status(str(tmp_path)).state == "dead"
 

@@ -17,7 +17,9 @@ from pipeline.ruler.simulation.suites import suite_named
 from pipeline.ruler.simulation.survey_files import write_points
 from pipeline.ruler.simulation.two_epochs import TwoEpochs, Work, two_epochs
 from pipeline.runtime.manifest import read_manifest
-from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run
 
 EXPECTED = {
     Work.BUILT: "new",
@@ -44,7 +46,7 @@ def runs(epochs: TwoEpochs, tmp_path_factory: pytest.TempPathFactory) -> tuple[s
         folder = tmp_path_factory.mktemp("epoch")
         laz = folder / "points.laz"
         write_points(scan(scene, suite_named("suburb").scanner, seed), scene, laz, folder / "labels.parquet")
-        run(RunRequest(inputs=(str(laz),), out=str(folder / "run"), meshes="none", workers=0))
+        run(RunRequest(inputs=(str(laz),), out=str(folder / "run"), meshes="none", resources=SERIAL))
         made.append(str(folder / "run"))
     return made[0], made[1]
 

@@ -23,7 +23,7 @@ from pipeline.io import storage_at
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.digest import run_digest
 from pipeline.runtime.expected import RATES
-from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, held_lock, held_work, make_work
+from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, locked_file, locked_work, make_work
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,7 @@ def test_a_schedule_ends_by_signals_and_under_nohup_outlives_its_terminal(hangup
 def test_a_batch_that_somebody_runs_is_refused(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "city.toml"
     file.write_text((folder / "city.toml").read_text().replace("tiles/", f"{folder}/tiles/"))
-    with held_work(str(tmp_path / "city.work")):
+    with locked_work(str(tmp_path / "city.work")):
         code, _, error = call("run", file)
     assert code == 4
     assert "is at work already" in error
@@ -189,8 +189,8 @@ def test_who_comes_second_says_nothing_in_the_status_of_who_came_first(
     make_work(work)
     (work / "status.json").write_text("of the first")
     # both looked before either held the folder
-    monkeypatch.setattr("pipeline.batch.running.refuse_held", lambda _: None)
-    with held_lock(work, DRIVER_LOCK):
+    monkeypatch.setattr("pipeline.batch.running.refuse_locked", lambda _: None)
+    with locked_file(work, DRIVER_LOCK):
         code, _, error = call("run", file)
     assert code == 4
     assert "is at work already" in error

@@ -38,7 +38,7 @@ def test_a_job_is_run_and_its_results_are_kept(bench: Bench) -> None:
     assert not bench.folder.inputs(job.job_id, 1).exists()
     request, executor = bench.script.seen[0]
     assert executor.priority == 7
-    assert request.isolation.timeout_s == bench.settings.building_timeout_s
+    assert request.resources.isolation.timeout_s == bench.settings.building_timeout_s
 
 
 def test_events_tell_the_story_without_a_path_and_progress_never_falls(bench: Bench) -> None:

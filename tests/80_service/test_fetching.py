@@ -18,8 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import InputError, RunCancelledError, UnreadableInputError
-from pipeline.runtime.run import plan_inputs
-from pipeline.runtime.stages.stages import Progress
+from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.request import plan_inputs
 from service import downloads
 from service.downloads import ATTEMPTS, LONGEST_PAUSE_S, PASSING, pause_s
 from service.driver.attempt import run_request
@@ -610,5 +610,5 @@ def test_a_tile_that_reads_as_a_tile_index_leads_nowhere(tmp_path: Path) -> None
     fetched = Fetched(reference=InputReference(kind="upload", value="u"), path=tile, points=0, sha256=None)
     request = run_request(JobRequest(tiles=()), [fetched], None, tmp_path / "run", ServiceSettings())
     with pytest.raises(InputError, match=r"tiles\.txt: ") as refused:
-        plan_inputs(request, request.settings, Progress(lambda _: None))
+        plan_inputs(request, Progress(lambda _: None))
     assert "others.laz" not in str(refused.value)

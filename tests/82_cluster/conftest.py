@@ -15,7 +15,9 @@ from processes import programs
 
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.digest import run_digest
-from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run
 from pipeline.settings import RunSettings
 
 __all__ = ["programs"]
@@ -31,7 +33,7 @@ def town_tile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def undisturbed_batch(town_tile: Path, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
     """What a batch of the town delivers when nothing happens to it: a run in this process, which costs least."""
     out = str(tmp_path_factory.mktemp("undisturbed") / "run")
-    run(RunRequest(inputs=(str(town_tile),), out=out, settings=RunSettings.from_mapping(SETTINGS), workers=0))
+    run(RunRequest(inputs=(str(town_tile),), out=out, settings=RunSettings.from_mapping(SETTINGS), resources=SERIAL))
     found = Undisturbed(digest=run_digest(out), buildings=buildings_of(out))
     assert len(found.buildings) >= 24
     return found

@@ -14,7 +14,7 @@ from processes import Program, Programs, program
 from pipeline.batch.schedule_file import FileBook, ScheduleRecord, read_schedule
 from pipeline.batch.schedule_process import RUN_LOCK
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.scratch.work_folder import is_held, make_work
+from pipeline.runtime.scratch.work_folder import is_locked, make_work
 
 pytestmark = pytest.mark.slow
 
@@ -71,9 +71,9 @@ def test_a_run_that_outlives_a_killed_schedule_is_not_met_by_another(run: BatchR
     pid = run.held(first, "reconstruct")
     first.kill()
     work = str(run.file.with_suffix(".work"))
-    assert is_held(work, RUN_LOCK)
+    assert is_locked(work, RUN_LOCK)
     second = scheduled(run, programs)
-    second.wait_for(lambda: is_held(work, "schedule.lock"), "the schedule")
+    second.wait_for(lambda: is_locked(work, "schedule.lock"), "the schedule")
     os.kill(pid, 0)  # the task of the first run is still there, and the gates are closed
     assert record(run).counts == {}
     run.gates.open()

@@ -20,7 +20,9 @@ from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.tls import VARIABLES, TlsFiles
 from pipeline.runtime.manifest import read_manifest
 from pipeline.runtime.monitoring.events import Watch
-from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import SERIAL
+from pipeline.runtime.run import run
 from pipeline.settings import RunSettings
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "55_runtime" / "on_workers"))
@@ -61,7 +63,7 @@ def digest(tile: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     """Of a run in one process."""
     out = str(tmp_path_factory.mktemp("run") / "run")
     settings = RunSettings.from_mapping(SETTINGS)
-    return run(RunRequest(inputs=(str(tile),), out=out, settings=settings, workers=0)).digest
+    return run(RunRequest(inputs=(str(tile),), out=out, settings=settings, resources=SERIAL)).digest
 
 
 def options(files: TlsFiles) -> list[str]:

@@ -15,7 +15,9 @@ from processes import Programs, free_port, program, wait_for
 
 from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.manifest import read_manifest
-from pipeline.runtime.run import RunRequest, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import SERIAL, Resources
+from pipeline.runtime.run import run
 from pipeline.settings import RunSettings
 
 pytestmark = pytest.mark.slow
@@ -24,7 +26,7 @@ pytestmark = pytest.mark.slow
 def test_a_building_that_is_lost_is_named_with_its_run_and_counted(programs: Programs, tmp_path: Path) -> None:
     tile = simulate("suburb", tmp_path / "scene", 3, size_m=(60.0, 60.0), density_per_m2=4.0).laz
     request = RunRequest(
-        inputs=(str(tile),), out=str(tmp_path / "serial"), settings=RunSettings(), workers=0, meshes="none"
+        inputs=(str(tile),), out=str(tmp_path / "serial"), settings=RunSettings(), resources=SERIAL, meshes="none"
     )
     run(request)
     found = ds.dataset(tmp_path / "serial" / "buildings", partitioning="hive").to_table(["building_id", "status"])
@@ -38,7 +40,14 @@ def test_a_building_that_is_lost_is_named_with_its_run_and_counted(programs: Pro
     env = asked.environment(crash=[lost])
     worker = programs.start("worker", [*command, "--metrics-port", str(figures)], env=env)
     worker.wait_for_text("is at the scheduler")
-    summary = run(RunRequest(inputs=(str(tile),), out=str(tmp_path / "run"), settings=RunSettings(), scheduler=address))
+    summary = run(
+        RunRequest(
+            inputs=(str(tile),),
+            out=str(tmp_path / "run"),
+            settings=RunSettings(),
+            resources=Resources(scheduler=address),
+        )
+    )
     assert summary.reasons["crashed"] == 1
 
     def page() -> str:

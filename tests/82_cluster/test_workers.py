@@ -21,7 +21,9 @@ from pipeline.ruler.simulation.dataset import simulate
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.manifest import RunStatus, read_manifest
 from pipeline.runtime.monitoring.events import Event, Watch
-from pipeline.runtime.run import RunRequest, RunSummary, run
+from pipeline.runtime.request import RunRequest
+from pipeline.runtime.resources import SERIAL, Resources
+from pipeline.runtime.run import RunSummary, run
 from pipeline.settings import RunSettings
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "55_runtime" / "on_workers"))
@@ -102,7 +104,10 @@ class Bench:
         """Reconstruct the tile on the workers; called off where the test is over before."""
         settings = RunSettings.from_mapping({"tile_size_m": 40.0})
         request = RunRequest(
-            inputs=(str(self.tile),), out=str(self.folder / out), settings=settings, scheduler=self.address
+            inputs=(str(self.tile),),
+            out=str(self.folder / out),
+            settings=settings,
+            resources=Resources(scheduler=self.address),
         )
         return run(request, self.listen, cancelled=cancelled or self.over.is_set)
 
@@ -134,7 +139,7 @@ def digest(tile: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     """Of an undisturbed run in one process."""
     settings = RunSettings.from_mapping({"tile_size_m": 40.0})
     out = str(tmp_path_factory.mktemp("run") / "run")
-    return run(RunRequest(inputs=(str(tile),), out=out, settings=settings, workers=0)).digest
+    return run(RunRequest(inputs=(str(tile),), out=out, settings=settings, resources=SERIAL)).digest
 
 
 @pytest.fixture

@@ -50,10 +50,10 @@ from typing import Any
 FAULTS: dict[str, Any] = json.loads(os.environ.get("GABLEWORK_FAULTS", "{}"))
 
 STAGES = {
-    "pipeline.runtime.stages.ingest": ("ingest", "ingest"),
-    "pipeline.runtime.stages.split": ("split", "split"),
-    "pipeline.runtime.stages.reconstruct": ("model_batch", "reconstruct"),
-    "pipeline.runtime.stages.publish": ("publish", "publish"),
+    "pipeline.runtime.stages.ingest": ("ingest_file", "ingest"),
+    "pipeline.runtime.stages.split_window": ("split_window", "split"),
+    "pipeline.runtime.stages.model_batch": ("model_batch", "reconstruct"),
+    "pipeline.runtime.stages.publish": ("publish_tile", "publish"),
     "service.outputs.assemble": ("write_outputs", "outputs"),
 }
 """The function of each stage's tasks, by its module."""

@@ -21,7 +21,7 @@ GROUND = (points_by_cell, classify_facets, assign_points)
 """Kernels that every run calls that finds ground and buildings in the points alone."""
 MODELLING = (take_regions, raster_labels, subdivide, triangulate_rings, shell_intersects_itself)
 """Kernels that every process calls that models by the default method, in the order in which it comes to them
-(`pipeline.runtime.stages.reconstruct.load`). What a kernel calls is kept before it is."""
+(`pipeline.runtime.stages.model_batch.load`). What a kernel calls is kept before it is."""
 
 
 def kernels_are_compiled(kernels: Iterable[Any] = (*GROUND, *MODELLING)) -> bool:

@@ -25,7 +25,7 @@ def _prepare() -> None:
     signal.signal(signal.SIGTERM, _left_to_the_nanny)
     loads = list(STAGES)
     if kernels_are_compiled():  # or else each compiles what it needs, when the run tells that it does
-        loads.append(f"pipeline.runtime.stages.reconstruct:load_once:{_METHOD}")
+        loads.append(f"pipeline.runtime.stages.model_batch:load_once:{_METHOD}")
     fork_server.load_all(loads)
     gc.freeze()  # a collection would write to all objects, and so copy the memory that is shared
     server = os.getpid()

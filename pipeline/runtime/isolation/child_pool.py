@@ -26,7 +26,7 @@ from pipeline.runtime.monitoring.measurement import charge
 FRUITLESS_STARTS = 3
 """Children that die in a row before they begin anything: then it is nobody's building that is at fault."""
 
-_LOADS = ("pipeline.runtime.stages.reconstruct:load",)
+_LOADS = ("pipeline.runtime.stages.model_batch:load",)
 _START_TIMEOUT_S = 900.0
 """With compiled kernels a child takes two seconds; without, it compiles them."""
 

@@ -13,7 +13,7 @@ Job = Literal["reconstruct", "classify"]
 
 _METHOD = "arrangement"
 """The default method; a child loads another one by itself."""
-_STAGES = ("numpy.ma", "pipeline.runtime.stages.ingest", "pipeline.runtime.stages.split")
+_STAGES = ("numpy.ma", "pipeline.runtime.stages.ingest", "pipeline.runtime.stages.split_window")
 _LOADS = {
     "reconstruct": ("pipeline.runtime.stages.publish", "pipeline.export.tile", "pipeline.runtime.digest"),
     "classify": ("pipeline.runtime.stages.label", "pipeline.runtime.stages.write_classified"),
@@ -35,7 +35,7 @@ def loads_of(job: Job, *, footprints: bool, method: str | None = None) -> list[s
     """What the children of a job need, as `isolation.child_main` takes it; `footprints` and `method` as below."""
     loads = [*_STAGES, *_LOADS[job], f"{_SCENE}:given" if footprints else _SCENE]
     if job == "reconstruct":
-        loads.append(f"pipeline.runtime.stages.reconstruct:load_once:{method or _METHOD}")
+        loads.append(f"pipeline.runtime.stages.model_batch:load_once:{method or _METHOD}")
     return loads
 
 

@@ -22,7 +22,7 @@ _NAME = re.compile(r"\.?[0-9a-f]{32}")
 
 
 @contextlib.contextmanager
-def held_folder(parent: Path) -> Iterator[Path]:
+def locked_folder(parent: Path) -> Iterator[Path]:
     """A new folder in `parent`, held until the block ends; removed then, and `parent` with it where it is empty.
 
     Where the file system knows no locks the folder is made all the same, and nobody else's is removed there.
@@ -70,7 +70,7 @@ def _made(parent: Path) -> tuple[Path, int]:
 
 
 @contextlib.contextmanager
-def held_results(run_dir: str) -> Iterator[None]:
+def locked_results(run_dir: str) -> Iterator[None]:
     """Hold a run directory while it is written, so that no other run on this file system writes it, too.
 
     Nothing lies in it for that. In an object store, and where the file system cannot lock folders, nothing is held.
@@ -102,12 +102,12 @@ def held_results(run_dir: str) -> Iterator[None]:
 
 
 def remove_abandoned(parent: Path) -> list[str]:
-    """Remove those folders of `held_folder` that no living process holds; their names.
+    """Remove those folders of `locked_folder` that no living process holds; their names.
 
     Parameters
     ----------
     parent : Path
-        Where `held_folder` makes them; need not be there.
+        Where `locked_folder` makes them; need not be there.
     """
     removed = []
     found = parent.iterdir() if parent.is_dir() else ()

@@ -1,52 +1,56 @@
-"""Where the scratch of a run is: in the run directory, in a folder that the user names, or on this machine."""
+"""The place of a run's scratch: in the run directory, in a folder that the user names, or on this machine."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from uuid import uuid4
 
 from pipeline.errors import RunError
 from pipeline.io import is_url, shown
+from pipeline.runtime.scratch.folder import Scratch
 
 SCRATCH = "scratch"
 """In the run directory."""
 
 
-def check_scratch(work_dir: str, scratch: str | None, scheduler: str | None) -> None:
+def check_scratch(run_dir: str, scratch: str | None, scheduler: str | None) -> None:
     """Refuse a run whose workers would have no common scratch.
 
     Parameters
     ----------
-    work_dir : str
+    run_dir : str
         The run directory, a path or URL.
     scratch : str or None
         The folder that the user names.
     scheduler : str or None
-        The address of workers elsewhere; None where they are this machine's.
+        The address of workers elsewhere; None for workers of this machine.
 
     Raises
     ------
     RunError
-        The run directory is a URL, the workers are elsewhere, and no folder is named; or that is a URL itself.
+        The run directory is a URL, the workers are elsewhere, and no folder is named; or the folder is a URL itself.
     """
     if scratch is not None and is_url(scratch):
         raise RunError(f"the scratch {shown(scratch)} is a URL: give a folder, such as --scratch /data/scratch")
-    if scratch is None and is_url(work_dir) and scheduler is not None:
+    if scratch is None and is_url(run_dir) and scheduler is not None:
         raise RunError(
-            f"{shown(work_dir)} is no folder, so the workers of {scheduler} have no scratch: give a folder that all of "
+            f"{shown(run_dir)} is no folder, so the workers of {scheduler} have no scratch: give a folder that all of "
             "them and this machine see, by --scratch DIR"
         )
 
 
-def scratch_folder(work_dir: str, scratch: str | None) -> Path:
-    """The folder of a run's scratch, without what an earlier run into the same place left there.
+@contextlib.contextmanager
+def run_scratch(run_dir: str, scratch: str | None) -> Iterator[Scratch]:
+    """Scratch for the duration of a run.
 
     Parameters
     ----------
-    work_dir : str
+    run_dir : str
         The run directory, a path or URL.
     scratch : str or None
         The folder that the user names.
@@ -54,16 +58,27 @@ def scratch_folder(work_dir: str, scratch: str | None) -> Path:
     Raises
     ------
     RunError
-        What is left there cannot be removed.
+        Scratch of an earlier run cannot be removed.
     """
-    if scratch is None and is_url(work_dir):
-        # nobody else can guess its name, or look into it: what is read from scratch is trusted
+    folder = _scratch_folder(run_dir, scratch)
+    found = Scratch(str(folder / uuid4().hex))
+    found.create()
+    try:
+        yield found
+    finally:
+        remove_folder(folder)
+
+
+def _scratch_folder(run_dir: str, scratch: str | None) -> Path:
+    """The folder for the scratch of a run; what an earlier run into the same place left there is removed."""
+    if scratch is None and is_url(run_dir):
+        # no other user can guess its name, or look into it: tasks trust what they read from scratch
         return Path(tempfile.mkdtemp(prefix="gablework-"))
     if scratch is None:
-        folder = Path(work_dir).resolve() / SCRATCH
+        folder = Path(run_dir).resolve() / SCRATCH
     else:
-        place = work_dir if is_url(work_dir) else str(Path(work_dir).resolve())
-        # one a run directory: several runs may share a disk for scratch
+        place = run_dir if is_url(run_dir) else str(Path(run_dir).resolve())
+        # one per run directory: several runs may share a disk for scratch
         name = hashlib.sha256(place.encode()).hexdigest()[:16]
         folder = Path(scratch).resolve() / f"gablework-{name}"
     remove_folder(folder)
@@ -71,7 +86,7 @@ def scratch_folder(work_dir: str, scratch: str | None) -> Path:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder of scratch: renamed first, so that no late task of an earlier run finds it and fills it again.
+    """Rename a folder of scratch, then remove it: no late task of an earlier run can find it and fill it again.
 
     Raises
     ------

@@ -1,13 +1,14 @@
-"""What tasks found, kept under a key of all that it depends on: nothing is done twice, within a run or between runs.
+"""Stored outcomes of tasks, each under a key of all that it depends on: nothing is done twice, not even by later runs.
 
-A task's outcome lies in scratch at `kept/<stage>/<unit>/<key>`: the unit is what the task is about (an input file, a
-tile), the key a digest of everything that can change the outcome, versions and settings included. The outcome is put
-by the worker, whole and last, after whatever else the task leaves in scratch. Where it is there, the task need not
-run: so a run that was cut off goes on where it stopped, and a later run does again only what changed. (The build
-systems à la carte of Mokhov, Mitchell and Peyton Jones 2018 call this a constructive trace.)
+The outcome of a task lies in scratch at `kept/<stage>/<unit>/<key>`. The unit is what the task is about (an input file,
+a tile); the key is a digest of everything that can change the outcome, including versions and settings. The worker
+writes the outcome whole and last, after all other files that the task leaves in scratch. A task with a stored outcome
+need not run: an interrupted run resumes where it stopped, and a later run repeats only what changed. (Mokhov, Mitchell
+and Peyton Jones 2018, Build systems à la carte, call this a constructive trace.)
 
-What a task leaves beside its outcome lies at the unit's own place and is replaced by the unit's next task, so outcomes
-of other keys go before that task starts.
+An outcome has a brief, the small part that travels to the driver, and a result, which the tasks of later stages read.
+The other files that a task leaves belong to its unit, and the unit's next task replaces them. Outcomes of other keys
+are therefore removed before that task starts.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ from pipeline.runtime.scratch.folder import Scratch
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-Told = TypeVar("Told")
+Brief = TypeVar("Brief")
 
 FOLDER = "kept"
-"""Of scratch."""
+"""Folder of scratch for all outcomes."""
 _KEY_DIGITS = 40
 """Hexadecimal digits of a key: 160 bits."""
 
@@ -43,13 +44,13 @@ _KEY_DIGITS = 40
 def key_of(*parts: object) -> str:
     """Digest of all that an outcome depends on, and of the versions of this process.
 
-    Dataclasses, enums, mappings, sequences, numbers, texts, times, geometries and arrays are told apart by type and
-    value, and hashed alike in every process.
+    Dataclasses, enums, mappings, sequences, numbers, texts, times, geometries and arrays are hashed by type and value,
+    alike in every process.
 
     Raises
     ------
     TypeError
-        A part is of a kind whose content is not known: it must not be left out in silence.
+        A part is of an unknown kind, which must not be left out in silence.
 
     >>> key_of(1, "a") == key_of(1, "a"), key_of(1) == key_of(1.0), key_of(("a", "b")) == key_of("ab")
     (True, False, False)
@@ -62,7 +63,7 @@ def key_of(*parts: object) -> str:
 
 @functools.cache
 def _fields_of(kind: Any) -> tuple[bytes, tuple[tuple[str, bytes], ...]]:
-    """Bytes that go before the values of a dataclass: its name, and each field's. A city's keys ask a million times."""
+    """Bytes that precede the values of a dataclass: its name, and each field's. Cached: a city's keys need millions."""
     names = [field.name for field in dataclasses.fields(kind)]
     return f"{kind.__name__} {len(names)} ".encode(), tuple((name, _plain(name)) for name in names)
 
@@ -84,8 +85,8 @@ def _add(update: Callable[[bytes], None], value: object) -> None:
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         head, fields = _fields_of(type(value))
         update(head)
-        for name, told in fields:
-            update(told)
+        for name, name_bytes in fields:
+            update(name_bytes)
             _add(update, getattr(value, name))
     elif isinstance(value, Mapping):
         update(f"mapping {len(value)} ".encode())
@@ -106,12 +107,12 @@ def _add(update: Callable[[bytes], None], value: object) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Where an outcome is kept."""
+    """Where an outcome is stored."""
 
     stage: str
-    """Of the run; variants of one stage share it, since their keys differ."""
+    """Stage of the run; its variants share the stage, since their keys differ."""
     unit: str
-    """What the task is about; a name that can be a file's."""
+    """What the task is about; must be valid as a file name."""
     key: str
     """From `key_of`."""
 
@@ -122,30 +123,30 @@ class Place:
 
 
 def whole(result: Result) -> Result:
-    """Tells all of a result, where it is little."""
+    """The brief of a small result: all of it."""
     return result
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
-class Keeping(Generic[Task, Result, Told]):
-    """A task whose outcome is to be kept."""
+class OutcomeTask(Generic[Task, Result, Brief]):
+    """A task, and where its outcome will be stored."""
 
     function: Callable[[Task], Result]
     """What to do."""
     task: Task
     """Its one argument."""
     place: Place
-    """Where the outcome goes."""
+    """Where the outcome is stored."""
     scratch: Scratch
-    """Of the run."""
-    told: Callable[[Result], Told]
-    """What of the result travels to the driver: little."""
+    """The run's scratch."""
+    brief: Callable[[Result], Brief]
+    """The small part of the result that travels to the driver."""
     stage: str
-    """What people call the stage."""
+    """Name of the stage in messages."""
 
     @property
     def memory_bytes(self) -> int:
-        """What the task declares to need."""
+        """Memory that the task declares to need."""
         return int(getattr(self.task, "memory_bytes", 0))
 
     @property
@@ -154,65 +155,65 @@ class Keeping(Generic[Task, Result, Told]):
         return bool(getattr(self.task, "supervises", False))
 
     def __repr__(self) -> str:
-        """The task alone, which is what people want to see."""
+        """The task alone, for messages."""
         return repr(self.task)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Kept(Generic[Told]):
-    """An outcome that is kept."""
+class StoredOutcome(Generic[Brief]):
+    """A stored outcome, as the driver sees it."""
 
     place: Place
-    """Where."""
-    told: Told
-    """What the driver learns of it."""
+    """Where it is."""
+    brief: Brief
+    """The small part of its result."""
 
 
-def keep(work: Keeping[Task, Result, Told]) -> Kept[Told]:
-    """Do a task and keep its outcome.
+def run_and_store(work: OutcomeTask[Task, Result, Brief]) -> StoredOutcome[Brief]:
+    """Run a task and store its outcome.
 
     Raises
     ------
     RunCancelledError
-        The run was called off.
+        The run was cancelled.
     RunError
-        Scratch or results cannot be read or written; what was kept before stays.
+        Scratch or results cannot be read or written; earlier outcomes stay.
     """
     try:
         result = work.function(work.task)
-        told = work.told(result)
-        work.scratch.put_bytes(work.place.name, _packed(told, result))
+        brief = work.brief(result)
+        work.scratch.put_bytes(work.place.name, _packed(brief, result))
     except OSError as error:
-        work.scratch.check_cancelled()  # of a run that is over the folders may be gone
+        work.scratch.check_cancelled()  # the folders of a run that is over may be gone
         where = error.filename or work.scratch.root
         why = error.strerror or f"a file could not be written whole ({error})"
         raise RunError(
             f"{where}: {why}, in stage {work.stage}. Free space or mend the storage, then run again"
         ) from error
-    return Kept(place=work.place, told=told)
+    return StoredOutcome(place=work.place, brief=brief)
 
 
-def _packed(told: object, result: object) -> bytes:
-    """Both as one pickle after the other, so that the first can be read alone."""
-    first = pickle.dumps(told, protocol=pickle.HIGHEST_PROTOCOL)
-    second = b"" if result is told else pickle.dumps(result, protocol=pickle.HIGHEST_PROTOCOL)
+def _packed(brief: object, result: object) -> bytes:
+    """The two pickles one after the other, so that the brief can be read alone."""
+    first = pickle.dumps(brief, protocol=pickle.HIGHEST_PROTOCOL)
+    second = b"" if result is brief else pickle.dumps(result, protocol=pickle.HIGHEST_PROTOCOL)
     return len(first).to_bytes(8, "little") + first + second
 
 
-def told_of(scratch: Scratch, place: Place) -> Any:
-    """What a kept outcome tells the driver. Of our own scratch only: pickles run code."""
+def brief_of(scratch: Scratch, place: Place) -> Any:
+    """The brief of a stored outcome. Only for our own scratch: pickles run code."""
     with Path(scratch.root, place.name).open("rb") as stream:
         size = int.from_bytes(stream.read(8), "little")
         return pickle.loads(stream.read(size))  # noqa: S301
 
 
 def result_of(scratch: Scratch, place: Place) -> Any:
-    """A kept result, whole. Of our own scratch only: pickles run code.
+    """The result of a stored outcome. Only for our own scratch: pickles run code.
 
     Raises
     ------
     RunCancelledError
-        It is gone, and with it the run.
+        The outcome is gone, and the run with it.
     """
     try:
         content = Path(scratch.root, place.name).read_bytes()
@@ -223,35 +224,24 @@ def result_of(scratch: Scratch, place: Place) -> Any:
     return pickle.loads(content[first:] or content[8:first])  # noqa: S301
 
 
-class Keeper:
-    """Knows what is kept in a scratch folder.
-
-    Parameters
-    ----------
-    scratch : Scratch
-        Of the run.
-    """
-
-    def __init__(self, scratch: Scratch) -> None:
-        self._scratch = scratch
-
-    def units(self, stage: str) -> list[str]:
-        """Units that any outcome of a stage is kept of, sorted."""
-        return sorted(entry.name for entry in _entries(self._scratch, f"{FOLDER}/{stage}"))
-
-    def keys(self, stage: str, unit: str) -> set[str]:
-        """Keys of the outcomes that are kept of a unit."""
-        return {entry.name for entry in _entries(self._scratch, f"{FOLDER}/{stage}/{unit}") if entry.name[0] != "."}
-
-    def drop_others(self, stage: str, unit: str, wanted: Iterable[str]) -> None:
-        """Remove the outcomes of a unit but those of some keys."""
-        for key in self.keys(stage, unit) - set(wanted):
-            Path(self._scratch.root, Place(stage, unit, key).name).unlink(missing_ok=True)
+def keys_of(scratch: Scratch, stage: str, unit: str) -> list[str]:
+    """Keys of the stored outcomes of a unit, sorted."""
+    return [name for name in _names(scratch, f"{FOLDER}/{stage}/{unit}") if name[0] != "."]
 
 
-def _entries(scratch: Scratch, name: str) -> list[Path]:
-    folder = Path(scratch.root, name)
+def drop_outcomes(scratch: Scratch, stage: str, wanted: Iterable[Place]) -> None:
+    """Remove the stored outcomes of a stage except the wanted ones."""
+    names = {place.name for place in wanted}
+    for unit in _names(scratch, f"{FOLDER}/{stage}"):
+        for key in keys_of(scratch, stage, unit):
+            name = Place(stage, unit, key).name
+            if name not in names:
+                Path(scratch.root, name).unlink(missing_ok=True)
+
+
+def _names(scratch: Scratch, folder: str) -> list[str]:
+    """Names in a folder of scratch, sorted; none where it does not exist."""
     try:
-        return list(folder.iterdir())
+        return sorted(entry.name for entry in Path(scratch.root, folder).iterdir())
     except FileNotFoundError:
         return []

@@ -42,7 +42,7 @@ _OF_A_RUN = ("dask", "fetched")
 
 
 @contextlib.contextmanager
-def held_work(folder: str) -> Iterator[Scratch]:
+def locked_work(folder: str) -> Iterator[Scratch]:
     """Hold a work folder, made where it is not there, until the block ends.
 
     Parameters
@@ -62,7 +62,7 @@ def held_work(folder: str) -> Iterator[Scratch]:
     """
     root = Path(folder).resolve()
     make_work(root)
-    with held_lock(root, _LOCK):
+    with locked_file(root, _LOCK):
         scratch = Scratch(str(root / _SCRATCH), attempt=uuid4().hex)
         scratch.create()
         _distrust_the_last(root, scratch)
@@ -115,7 +115,7 @@ def make_work(root: Path) -> None:
 
 
 @contextlib.contextmanager
-def held_lock(root: Path, name: str) -> Iterator[None]:
+def locked_file(root: Path, name: str) -> Iterator[None]:
     """Hold a file in a work folder until the block ends.
 
     Raises
@@ -167,8 +167,8 @@ def take_lock(handle: int) -> None:
         time.sleep(_PAUSE_S)
 
 
-def refuse_held(folder: str) -> None:
-    """Say early that another process works in a folder; `held_work` has the last word.
+def refuse_locked(folder: str) -> None:
+    """Say early that another process works in a folder; `locked_work` has the last word.
 
     Raises
     ------
@@ -176,13 +176,13 @@ def refuse_held(folder: str) -> None:
         One does.
     """
     for name in _OF_WHO_WORKS:
-        if is_held(folder, name):
+        if is_locked(folder, name):
             raise RunError(f"{folder} is at work already ({_holder(Path(folder, name))}): wait for it, or end it first")
 
 
 def is_at_work(folder: str) -> bool:
     """Whether some process works in a folder."""
-    return any(is_held(folder, name) for name in _OF_WHO_WORKS)
+    return any(is_locked(folder, name) for name in _OF_WHO_WORKS)
 
 
 def refuse_foreign(folder: str) -> None:
@@ -209,7 +209,7 @@ def _holder(lock: Path) -> str:
         return "by another process"
 
 
-def is_held(folder: str, lock: str) -> bool:
+def is_locked(folder: str, lock: str) -> bool:
     """Whether some process of this machine, or of one that shares the folder's locks, works there just now."""
     try:
         handle = os.open(Path(folder, lock), os.O_RDWR | os.O_CLOEXEC)

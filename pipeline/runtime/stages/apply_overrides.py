@@ -1,11 +1,12 @@
-"""What overrides do to the candidates of a run: their buildings are found, then accepted, rejected or redrawn.
+"""Overrides, applied to the candidates of a run: their buildings are found, then accepted, rejected or redrawn.
 
-Candidates are judged first, as without overrides, so that one override changes its own building and no other.
+Candidates are first judged without overrides, so one override changes its own building and no other.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -15,41 +16,48 @@ import shapely
 
 from pipeline.model import Reason
 from pipeline.runtime.overrides.overrides_file import Override
+from pipeline.runtime.plan import split_grid
+from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.join import CandidateSite, Joined, PointRange, RejectedSite
+from pipeline.runtime.stages.given_footprints import numbers_by_tile
+from pipeline.runtime.stages.ingested import Ingested, classes_in_use, points_by_tile
+from pipeline.runtime.stages.join import join_footprints
+from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, RejectedSite, largest_first
+from pipeline.runtime.stages.split import SplitWindows, split_windows
+from pipeline.settings import RunSettings
 from pipeline.terrain.candidates import Verdict
 from pipeline.tiling import MM, TileGrid, Window
 
 INSIDE_M = 3.0
-"""A point of an entry is inside a building one of whose points lies that near in plan: the spacing of sparse clouds."""
-TOLD_M = 50.0
-"""How far the nearest building is sought for the message about a point that is inside none."""
+"""A place is inside a building that has a point this near in plan. Not a setting: the spacing of sparse clouds."""
+NEAREST_M = 50.0
+"""The nearest building within this distance is named in a message. Not a setting: it changes no result."""
 WARNING = "overrides: "
-"""How the warnings about entries begin."""
+"""Prefix of the warnings about entries."""
 
 Sites = Mapping[str, CandidateSite | RejectedSite]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EntryOutcome:
-    """What became of one entry of the overrides file."""
+    """The outcome of one entry of the overrides file."""
 
     override: Override
     """The entry."""
     building_id: str | None
     """The building or object that it names; None where there is none."""
     effective: Override | None
-    """What of it took effect; None where nothing did."""
-    told: str = ""
+    """The part of it that took effect; None where nothing did."""
+    fault: str = ""
     """Why nothing, or not all of it, took effect."""
 
     @property
     def warning(self) -> str:
-        """The sentence for the run's warnings; empty where all took effect."""
-        return f"{WARNING}entry {self.override.entry} ({self.override.place}): {self.told}" if self.told else ""
+        """The sentence for the run's warnings; empty where all of it took effect."""
+        return f"{WARNING}entry {self.override.entry} ({self.override.place}): {self.fault}" if self.fault else ""
 
     def as_dict(self) -> dict[str, Any]:
-        """As `overrides.json` lists it."""
+        """Its entry in `overrides.json`."""
         return {
             "entry": self.override.entry,
             "place": self.override.place,
@@ -60,22 +68,72 @@ class EntryOutcome:
             "settings": self.override.settings,
             "footprint": None if self.override.footprint is None else self.override.footprint.wkt,
             "note": self.override.note,
-            "told": self.told,
+            "told": self.fault,
             "fingerprint": None if self.effective is None else self.effective.fingerprint,
         }
+
+
+def apply_overrides(
+    context: RunContext,
+    settings: RunSettings,
+    joined: Joined,
+    overrides: Sequence[Override],
+    ingested: Sequence[Ingested],
+) -> tuple[Joined, tuple[EntryOutcome, ...]]:
+    """The candidates after the overrides, and the outcome of each entry; its time counts as join and redraw."""
+    started = time.perf_counter()
+    outcomes = outcomes_of(overrides, joined, context.scratch, context.plan.grid)
+    redrawn: dict[str, tuple[PointRange, ...]] = {}
+    for number, layer in enumerate(_layers_of(outcomes)):
+        redrawn |= _redrawn(context, settings, layer, ingested, f"redrawn-{number}")
+    changed = _overridden(joined, outcomes, redrawn, context.scratch)
+    timings = context.progress.timings
+    timings["join"] = timings.get("join", 0.0) + time.perf_counter() - started - timings.get("redraw", 0.0)
+    return changed, outcomes
+
+
+def _redrawn(
+    context: RunContext,
+    settings: RunSettings,
+    layer: Sequence[EntryOutcome],
+    ingested: Sequence[Ingested],
+    folder: str,
+) -> dict[str, tuple[PointRange, ...]]:
+    """The points inside the other footprints of some buildings, by building_id; stored in a folder of scratch."""
+    named = [(str(o.building_id), o.effective.footprint) for o in layer if o.effective and o.effective.footprint]
+    classes, _ = classes_in_use(ingested, trust=settings.general.classes == "trust")
+    if _accepts(layer[0]):
+        # the user overrules the classes, which say that there is no building
+        classes = dataclasses.replace(classes, building=False)
+    polygons, grid = [polygon for _, polygon in named], context.plan.grid
+    met = numbers_by_tile(points_by_tile(ingested), grid, polygons)
+    numbers = {tile: found for tile, found in met.items() if found}
+    windows = SplitWindows(
+        grid=split_grid(context.plan, settings, classes, footprints=True),
+        classes=classes,
+        outlines={tile: tuple(polygons[k] for k in found) for tile, found in sorted(numbers.items())},
+        numbers=numbers,
+        folder=folder,
+    )
+    splits = split_windows(context, "redraw", windows, settings, ingested)
+    names = [name for name, _ in named]
+    sites = join_footprints(splits.stored(context.scratch), grid, splits.numbers, polygons, names, "").candidates
+    return {
+        str(site.source_id): tuple(dataclasses.replace(part, folder=folder) for part in site.ranges) for site in sites
+    }
 
 
 def outcomes_of(
     overrides: Sequence[Override], joined: Joined, scratch: Scratch, grid: TileGrid
 ) -> tuple[EntryOutcome, ...]:
-    """Find the building of each entry, and what of the entry takes effect.
+    """Find the building of each entry, and which part of the entry takes effect.
 
     Parameters
     ----------
     overrides : sequence of Override
         The entries.
     joined : Joined
-        The candidates and rejected objects as they were judged.
+        The candidates and rejected objects before overrides.
     scratch, grid : Scratch, TileGrid
         Where the points are, for entries that name a place.
     """
@@ -85,24 +143,22 @@ def outcomes_of(
     found: list[EntryOutcome] = []
     entry_of: dict[str, int] = {}
     for override in overrides:
+        fault = ""
         if override.source_id is not None:
             name = by_source.get(override.source_id)
-            told = "" if name else _unknown(override.source_id, by_source, "source_id of this run")
+            fault = "" if name else _unknown(override.source_id, by_source, "source_id of this run")
         elif override.point_m is not None:
             among = (rejected, "rejected object") if override.action == "accept" else (candidates, "building")
-            name, told = _at(override.point_m, *among, scratch, grid)
+            name, fault = _at(override.point_m, *among, scratch, grid)
         else:
             name = override.building_id
-            told = ""
             if name not in candidates and name not in rejected:
-                told = _unknown(str(name), [*candidates, *rejected], "building or rejected object of this run")
+                fault = _unknown(str(name), [*candidates, *rejected], "building or rejected object of this run")
                 name = None
         if name is not None and name in entry_of:
-            told = f"{name} has entry {entry_of[name]} already"
-            found.append(EntryOutcome(override=override, building_id=name, effective=None, told=told))
-            continue
-        if name is None:
-            found.append(EntryOutcome(override=override, building_id=None, effective=None, told=told))
+            fault = f"{name} has entry {entry_of[name]} already"
+        if name is None or name in entry_of:
+            found.append(EntryOutcome(override=override, building_id=name, effective=None, fault=fault))
             continue
         entry_of[name] = override.entry
         found.append(_judged(override, name, candidates, rejected))
@@ -110,39 +166,39 @@ def outcomes_of(
 
 
 def _judged(override: Override, name: str, candidates: Sites, rejected: Sites) -> EntryOutcome:
-    """What of an entry takes effect on its building."""
+    """Which part of an entry takes effect on its building."""
     effective: Override | None = override
-    told = ""
+    fault = ""
     if name in candidates and override.action == "accept":
-        told = f"{name} is a building already: there is nothing to accept"
+        fault = f"{name} is a building already: there is nothing to accept"
         effective = dataclasses.replace(override, action=None)
     elif name not in candidates and override.action != "accept":
         site = rejected[name]
         assert isinstance(site, RejectedSite)
         done = f"{name} is rejected already ({site.verdict.reason})"
-        told = done if override.action == "reject" else f'{done}: give action = "accept", too'
+        fault = done if override.action == "reject" else f'{done}: give action = "accept", too'
         effective = None
     if effective is not None and not effective.effects:
         effective = None
-    return EntryOutcome(override=override, building_id=name, effective=effective, told=told)
+    return EntryOutcome(override=override, building_id=name, effective=effective, fault=fault)
 
 
 def _unknown(name: str, names: Iterable[str], what: str) -> str:
-    """That a name is none, and the one that begins most like it."""
+    """The fault of an unknown name, with the known name that begins most like it."""
     nearest = max(sorted(names), key=lambda other: _shared_start(name, other), default=None)
     return f"it is no {what}" + ("" if nearest is None else f"; the nearest is {nearest}")
 
 
 def _shared_start(a: str, b: str) -> int:
-    """How many characters two words begin with in common."""
+    """Number of characters that two words have in common at their start."""
     return next((k for k, (one, other) in enumerate(zip(a, b, strict=False)) if one != other), min(len(a), len(b)))
 
 
 def _at(
     point_m: tuple[float, float], sites: Sites, what: str, scratch: Scratch, grid: TileGrid
 ) -> tuple[str | None, str]:
-    """The site that a place lies in, by its footprint or by its nearest point in plan; or why there is none."""
-    reach = round(TOLD_M * MM)
+    """The site at a place, by its footprint or its nearest point in plan; or the fault that there is none."""
+    reach = round(NEAREST_M * MM)
     x, y = round(point_m[0] * MM), round(point_m[1] * MM)
     near: list[tuple[float, str, float]] = []
     for name, site in sites.items():
@@ -153,8 +209,8 @@ def _at(
             xy = plan_mm(scratch, site.ranges)
             near.append((float(np.hypot(xy[:, 0] - x, xy[:, 1] - y).min()) / MM, name, INSIDE_M))
     near.sort()
-    if not near or near[0][0] > TOLD_M:
-        return None, f"there is no {what} within {TOLD_M:g} m"
+    if not near or near[0][0] > NEAREST_M:
+        return None, f"there is no {what} within {NEAREST_M:g} m"
     inside = next((name for distance, name, limit in near if distance <= limit), None)
     distance, nearest, _ = near[0]
     return inside, "" if inside else f"it is in no {what}; the nearest is {nearest}, {distance:.1f} m away"
@@ -174,10 +230,10 @@ def plan_mm(scratch: Scratch, ranges: Sequence[PointRange]) -> npt.NDArray[np.in
     return np.concatenate(pieces)
 
 
-def layers_of(outcomes: Sequence[EntryOutcome]) -> list[list[EntryOutcome]]:
+def _layers_of(outcomes: Sequence[EntryOutcome]) -> list[list[EntryOutcome]]:
     """The entries with another footprint, in layers without overlaps; accepted objects apart from judged buildings.
 
-    So each building gets all the points in its own outline, whatever other entries draw there.
+    Each building then gets all points in its own outline, whatever other entries draw there.
     """
     layers: list[tuple[bool, list[EntryOutcome]]] = []
     drawn = [o for o in outcomes if o.effective is not None and o.effective.footprint is not None]
@@ -197,36 +253,19 @@ def _accepts(outcome: EntryOutcome) -> bool:
     return outcome.effective is not None and outcome.effective.action == "accept"
 
 
-def accepts(layer: Sequence[EntryOutcome]) -> bool:
-    """Whether a layer holds accepted objects."""
-    return _accepts(layer[0])
-
-
 def _outline(outcome: EntryOutcome) -> shapely.Geometry:
     assert outcome.effective is not None
     assert outcome.effective.footprint is not None
     return outcome.effective.footprint
 
 
-def overridden(
+def _overridden(
     joined: Joined,
     outcomes: Sequence[EntryOutcome],
     redrawn: Mapping[str, tuple[PointRange, ...]],
     scratch: Scratch,
 ) -> Joined:
-    """The candidates and rejected objects after the overrides.
-
-    Parameters
-    ----------
-    joined : Joined
-        As they were judged.
-    outcomes : sequence of EntryOutcome
-        As of `outcomes_of`.
-    redrawn : mapping
-        By building_id, the points inside its other footprint.
-    scratch : Scratch
-        Where the points are.
-    """
+    """The candidates and rejected objects after the overrides; `redrawn` has the points in other footprints, by id."""
     candidates = {site.building_id: site for site in joined.candidates}
     rejected = {site.object_id: site for site in joined.rejected}
     for outcome in outcomes:
@@ -244,18 +283,18 @@ def overridden(
         candidates[name] = dataclasses.replace(site, override=effective)
     return dataclasses.replace(
         joined,
-        candidates=tuple(sorted(candidates.values(), key=lambda c: (-c.points, c.building_id))),
+        candidates=largest_first(candidates.values()),
         rejected=tuple(sorted(rejected.values(), key=lambda r: r.object_id)),
     )
 
 
 def _accepted(site: RejectedSite) -> CandidateSite:
-    """A rejected object as a candidate of its own id."""
+    """A rejected object as a candidate with the same id."""
     return CandidateSite(building_id=site.object_id, owner=site.owner, ranges=site.ranges, points=site.points)
 
 
 def _rejected(site: CandidateSite, effective: Override, scratch: Scratch) -> RejectedSite:
-    """A candidate as a rejected object; its box is that of its points, or of its footprint where it has none."""
+    """A candidate as a rejected object; its box is that of its points, or of its footprint if it has none."""
     xy = plan_mm(scratch, site.ranges)
     if len(xy):
         box = (*xy.min(axis=0).tolist(), *xy.max(axis=0).tolist())

@@ -1,7 +1,7 @@
-"""What a scratch folder that outlives its runs holds no longer for a reason, removed before it can do harm.
+"""Removal of outdated files from a scratch folder that outlives its runs.
 
-A task leaves files beside its outcome. Whatever is there without the outcome that vouches for it - of a task that was
-cut off, of an input that changed or is gone - goes before the stage starts; whatever is there with its outcome stays.
+A task leaves files beside its outcome. Before a stage starts, such files are removed where they have no wanted outcome:
+those of interrupted tasks, and of inputs that changed or are gone. Files with a wanted outcome stay.
 """
 
 from __future__ import annotations
@@ -11,29 +11,19 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.outcomes import FOLDER, Keeper, Place, key_of, told_of
-from pipeline.runtime.stages.ingest import Ingested
-from pipeline.runtime.stages.join import Joined
-
-
-def drop_stale(scratch: Scratch, stage: str, wanted: Iterable[Place]) -> None:
-    """Remove the outcomes of a stage that are not wanted."""
-    keys: dict[str, set[str]] = {}
-    for place in wanted:
-        keys.setdefault(place.unit, set()).add(place.key)
-    keeper = Keeper(scratch)
-    for unit in keeper.units(stage):
-        keeper.drop_others(stage, unit, keys.get(unit, ()))
+from pipeline.runtime.scratch.outcomes import FOLDER, Place, brief_of, drop_outcomes, key_of
+from pipeline.runtime.stages.ingested import Ingested
+from pipeline.runtime.stages.sites import Joined
 
 
 def clear_points(scratch: Scratch, wanted: Iterable[Place]) -> None:
-    """Remove buckets of points that no wanted outcome of an ingest vouches for, after those outcomes themselves."""
+    """Remove the outcomes of ingest that are not wanted, then the buckets of points without an outcome."""
     wanted = list(wanted)
-    drop_stale(scratch, "ingest", wanted)
+    drop_outcomes(scratch, "ingest", wanted)
     tiles_of: dict[str, set[str]] = {}
     for place in wanted:
         if scratch.has(place.name):
-            found: Ingested = told_of(scratch, place)
+            found: Ingested = brief_of(scratch, place)
             tiles_of[place.unit] = {tile.key for tile in found.points_by_tile}
     for bucket in Path(scratch.root, "points").glob("*/*"):
         part = bucket.name.removesuffix(".bin")
@@ -42,9 +32,9 @@ def clear_points(scratch: Scratch, wanted: Iterable[Place]) -> None:
 
 
 def clear_tiles(scratch: Scratch, folder: str, wanted: Iterable[Place]) -> None:
-    """Remove the outcomes of splits that are not wanted, and the files of tiles that are split no more."""
+    """Remove the outcomes of splits that are not wanted, and the files of tiles that are no longer split."""
     wanted = list(wanted)
-    drop_stale(scratch, folder, wanted)
+    drop_outcomes(scratch, folder, wanted)
     tiles = {place.unit for place in wanted}
     for tile in Path(scratch.root, folder).glob("*"):
         if tile.name not in tiles:
@@ -52,16 +42,14 @@ def clear_tiles(scratch: Scratch, folder: str, wanted: Iterable[Place]) -> None:
 
 
 def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Sequence[str]) -> None:
-    """Remove what a finished run has no more use for: models by other settings, points of units that are no more.
+    """Remove what a finished run no longer needs: models by other settings, and points of units that are gone.
 
     Parameters
     ----------
-    scratch : Scratch
-        Of the run.
-    joined : Joined
-        Its candidates.
+    scratch, joined : Scratch, Joined
+        Scratch and candidates of the run.
     models : collection of str
-        Stages of its models.
+        Stages under which its models are stored.
     run_dirs : sequence of str
         Where it published.
     """
@@ -77,5 +65,5 @@ def tidy(scratch: Scratch, joined: Joined, models: Collection[str], run_dirs: Se
 
 
 def publishing(run_dir: str) -> str:
-    """The stage under which is kept what was published into a run directory."""
+    """The stage under which the outcomes of publishing into a run directory are stored."""
     return f"publish-{key_of(run_dir)}"

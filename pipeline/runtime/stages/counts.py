@@ -1,4 +1,4 @@
-"""What a run counts: of its models, and over all stages."""
+"""The counts of a run: of its models, and over all stages."""
 
 from __future__ import annotations
 
@@ -9,33 +9,34 @@ from collections.abc import Sequence
 
 from pipeline.runtime.manifest import SLOWEST, SlowBuilding
 from pipeline.runtime.plan import Plan
-from pipeline.runtime.stages.ingest import Ingested
-from pipeline.runtime.stages.join import Joined
-from pipeline.runtime.stages.stages import Models, Splits
+from pipeline.runtime.stages.ingested import Ingested
+from pipeline.runtime.stages.reconstruct import Models
+from pipeline.runtime.stages.sites import Joined
+from pipeline.runtime.stages.split import Splits
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Counted:
-    """What a run counts of its models."""
+    """The counts of a run's models."""
 
     statuses: Counter[str]
     """Candidates by status."""
     reasons: Counter[str]
-    """Those that are not ok, by reason."""
+    """Candidates that are not ok, by reason."""
     roof_types: Counter[str]
     """Candidates by roof type."""
     faces: int
     """Roof faces of all models."""
     made: int
-    """Candidates that this run modelled itself."""
+    """Candidates modelled by this run; the others were taken from earlier ones."""
     slowest: tuple[SlowBuilding, ...]
-    """Those that took longest."""
+    """The candidates that took longest."""
     seconds: dict[str, float]
-    """Wall-clock seconds of each building by its id; empty where nobody asked for each."""
+    """Wall-clock seconds of each building by its id; empty unless requested."""
 
     @classmethod
-    def of(cls, models: Models, *, each_told: bool) -> Counted:
-        """Count the models; `each_told` keeps the seconds of every one."""
+    def of(cls, models: Models, *, each: bool) -> Counted:
+        """Count the models; `each` stores the seconds of every one."""
         statuses, reasons, roof_types = Counter[str](), Counter[str](), Counter[str]()
         seconds: dict[str, float] = {}
         slowest: list[tuple[float, str]] = []
@@ -46,7 +47,7 @@ class Counted:
                 reasons[model.reason] += 1
             roof_types[model.roof_type] += 1
             faces += model.faces
-            if each_told:
+            if each:
                 seconds[model.building_id] = model.seconds
             slowest.append((round(model.seconds, 3), model.building_id))
             if len(slowest) >= 2 * SLOWEST:
@@ -62,21 +63,21 @@ class Counted:
         )
 
 
-def told_counts(
+def run_counts(
     plan: Plan, ingested: Sequence[Ingested], splits: Splits, joined: Joined, found: Counted
 ) -> dict[str, int]:
-    """The counts of run.json."""
+    """The counts in run.json."""
     by_status = found.statuses
     dropped: Counter[str] = Counter()
     for entry in ingested:
         dropped.update(entry.dropped)
     return {
         "points_promised": plan.points,
-        "points": sum(s.points for s in splits.told),
+        "points": sum(s.points for s in splits.figures),
         **{f"dropped_{cause}": count for cause, count in sorted(dropped.items())},
-        "duplicates": sum(s.duplicates for s in splits.told),
-        "outliers": sum(s.outliers for s in splits.told),
-        "tiles": len(splits.told),
+        "duplicates": sum(s.duplicates for s in splits.figures),
+        "outliers": sum(s.outliers for s in splits.figures),
+        "tiles": len(splits.figures),
         "candidates": sum(by_status.values()),
         "ok": by_status["ok"],
         "fallback": by_status["fallback"],
@@ -85,7 +86,7 @@ def told_counts(
         "reused": sum(by_status.values()) - found.made,
         "small_surfaces": joined.small_fragments,
         "roof_faces": found.faces,
-        "class_6_in_candidates": sum(s.audit[0] for s in splits.told),
-        "other_classes_in_candidates": sum(s.audit[1] for s in splits.told),
-        "class_6_elsewhere": sum(s.audit[2] for s in splits.told),
+        "class_6_in_candidates": sum(s.audit[0] for s in splits.figures),
+        "other_classes_in_candidates": sum(s.audit[1] for s in splits.figures),
+        "class_6_elsewhere": sum(s.audit[2] for s in splits.figures),
     }

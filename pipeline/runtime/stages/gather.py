@@ -18,8 +18,8 @@ from pipeline.export.facts import CandidateFacts
 from pipeline.io.gps_time import GpsTimeKind, utc_of
 from pipeline.model import BoolArray, Candidate, IntArray
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.join import CandidateSite
-from pipeline.runtime.stages.split import bucket_paths
+from pipeline.runtime.stages.sites import CandidateSite
+from pipeline.runtime.stages.window_points import bucket_paths
 from pipeline.terrain.lattice import CELL_MM, NO_DATA
 from pipeline.tiling import MM, TileGrid, Window
 

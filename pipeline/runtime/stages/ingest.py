@@ -1,32 +1,38 @@
-"""Ingest: one streamed read of an input file, its points bucketed on the lattice of tiles.
+"""Ingest: one streamed read of each input file, which buckets its points on the lattice of tiles.
 
-LAZ has no spatial index: reading windows of it would decode the file again for every tile.
+LAZ has no spatial index, so reading windows would decode the file again for every tile.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
 import shutil
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.errors import InconsistentInputError, InputError
+from pipeline.errors import EmptyInputError, InconsistentInputError, InputError
 from pipeline.io import ReadOptions, SourceInfo, is_url, open_source, shown
 from pipeline.io.remote_file import RemoteFile
 from pipeline.io.storage import sha256_of
 from pipeline.model import IntArray, PointCloud
+from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.scratch.outcomes import Place, key_of, whole
+from pipeline.runtime.stages.cleanup import clear_points
+from pipeline.runtime.stages.ingested import Ingested, points_by_tile, spread_m
 from pipeline.runtime.stages.tile_content import ZoneSums, zone_sums
 from pipeline.tiling import MM, Tile, TileGrid
 
 _CHUNK_POINTS = 250_000
-"""Points that are read at once: few enough that their arrays stay in memory that is used again and again."""
+"""Points per chunk: few enough that numpy uses the same memory again for each chunk."""
+_LINE_SPREAD_M = 0.05
+"""Points that stray less from one line make no surface. Not a setting: the noise of a scanner is of this size."""
 _MAX_MM = 2**31 - 2
 _TWO_BYTES = 2**16
 
@@ -46,39 +52,64 @@ class IngestTask:
     scratch: Scratch
     """Where the buckets go."""
     known: SourceInfo | None = None
-    """What the plan found in the file."""
+    """Header facts from the plan."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Ingested:
-    """What one input file held."""
+def ingest(context: RunContext, paths: Sequence[str]) -> list[Ingested]:
+    """Bucket the points of all inputs by tile; what each input held, in the order of the paths.
 
-    path: str
-    """The file."""
-    points_by_tile: dict[Tile, int]
-    """Points in each tile's bucket."""
-    content: dict[Tile, bytes]
-    """What points they are: the bytes of the tile's `ZoneSums`."""
-    classes: dict[int, int]
-    """Points by ASPRS class, of those kept."""
-    dropped: dict[str, int]
-    """Points left out, by cause."""
-    warnings: tuple[str, ...]
-    """What is odd but usable."""
-    bounds_mm: tuple[int, int, int, int, int, int] | None
-    """x, y, z minimum, then maximum, of the kept points; None where there are none."""
-    moments: tuple[float, ...]
-    """n, Sx, Sy, Sxx, Sxy, Syy in metres about the first kept point: tells whether all lie on one line."""
-    first_mm: tuple[int, int]
-    """That first point."""
-    multiple_returns: bool
-    """Whether any kept pulse has more than one return."""
-    sha256: str
-    """Digest of the file."""
+    Raises
+    ------
+    EmptyInputError
+        No usable point is left.
+    InconsistentInputError
+        All points lie on one line.
+    """
+    plan, progress = context.plan, context.progress
+    known = {info.path: info for info in plan.sources}
+    tasks = {}
+    for path in paths:
+        file = known[shown(path)]
+        task = IngestTask(
+            part=part_of(path),
+            path=path,
+            options=plan.options,
+            grid=plan.grid,
+            scratch=context.scratch,
+            known=file,
+        )
+        # a file without a time of modification may have changed unnoticed: read it again
+        written = file.modified_ns or uuid4().hex
+        key = key_of(path, file.file_size, written, task.options, task.grid)
+        tasks[Place("ingest", task.part, key)] = task
+    clear_points(context.scratch, tasks)
+    ingested = list(context.map_stored("ingest", ingest_file, tasks, whole).values())
+    for found in ingested:
+        for warning in found.warnings:
+            progress.warn("ingest", f"{shown(found.path)}: {warning}")
+    points = sum(points_by_tile(ingested).values())
+    if points == 0:
+        causes = Counter[str]()
+        for found in ingested:
+            causes.update(found.dropped)
+        lost = ", ".join(f"{count} {cause}" for cause, count in causes.items() if count)
+        raise EmptyInputError(
+            shown(paths[0]),
+            f"no usable point is left ({lost or 'none in the files'})",
+            "Check --bbox and --aoi; points that are withheld or of the noise classes 7 and 18 are never used",
+        )
+    spread = spread_m(ingested)
+    if spread < _LINE_SPREAD_M:
+        raise InconsistentInputError(
+            shown(paths[0]),
+            f"all {points} points lie on one line (they stray {spread:.3f} m from it)",
+            "Check the columns and the scale of the file",
+        )
+    return ingested
 
 
 def part_of(path: str) -> str:
-    """Names the parts of an input file in scratch: whatever other inputs there are.
+    """Name of an input file's parts in scratch; it does not depend on other inputs.
 
     >>> part_of("/data/37EN1.LAZ")
     '406afe307fa1d623'
@@ -110,8 +141,8 @@ def to_records(cloud: PointCloud, path: str) -> npt.NDArray[np.void]:
     return records
 
 
-def ingest(task: IngestTask) -> Ingested:
-    """Read one file and bucket its points by tile; one behind a URL is fetched into scratch for as long as it takes.
+def ingest_file(task: IngestTask) -> Ingested:
+    """Read one file and bucket its points by tile; a file behind a URL is fetched into scratch meanwhile.
 
     Returns
     -------
@@ -123,7 +154,7 @@ def ingest(task: IngestTask) -> Ingested:
     InputError
         The file cannot be used.
     RunCancelledError
-        The run was called off.
+        The run was cancelled.
     """
     task.scratch.check_cancelled()
     if not is_url(task.path):
@@ -146,7 +177,7 @@ def ingest(task: IngestTask) -> Ingested:
 
 
 def _ingested(task: IngestTask) -> Ingested:
-    """The same of a file of this machine."""
+    """As `ingest_file`, for a file of this machine."""
     source = open_source(task.path, task.options, task.known)
     suffix = f".{uuid4().hex}.part"
     counts: Counter[Tile] = Counter()
@@ -199,7 +230,7 @@ def _append_by_tile(
     suffix: str,
     content: dict[Tile, ZoneSums],
 ) -> Counter[Tile]:
-    """Append a chunk to the parts of its tiles; points of each tile. Their content is added to that of the file."""
+    """Append a chunk to the parts of its tiles, and its content to that of the file; the chunk's points by tile."""
     columns, rows = task.grid.columns_rows(x_mm, y_mm)
     west, south = int(columns.min()), int(rows.min())
     height = int(rows.max()) - south + 1
@@ -222,37 +253,3 @@ def _append_by_tile(
         content[tile] = content[tile] + sums if tile in content else sums
         counts[tile] += int(stop - start)
     return counts
-
-
-def spread_m(results: list[Ingested]) -> float:
-    """Standard deviation across the line that fits all points best: 0 where they lie on one line.
-
-    Parameters
-    ----------
-    results : list of Ingested
-        All inputs.
-    """
-    total = np.zeros(6)
-    anchor: tuple[int, int] | None = None
-    for result in results:
-        n, sx, sy, sxx, sxy, syy = result.moments
-        if n == 0:
-            continue
-        if anchor is None:
-            anchor = result.first_mm
-        # move the moments to the first file's first point
-        dx, dy = (result.first_mm[0] - anchor[0]) / MM, (result.first_mm[1] - anchor[1]) / MM
-        total += (
-            n,
-            sx + n * dx,
-            sy + n * dy,
-            sxx + 2 * dx * sx + n * dx * dx,
-            sxy + dx * sy + dy * sx + n * dx * dy,
-            syy + 2 * dy * sy + n * dy * dy,
-        )
-    n, sx, sy, sxx, sxy, syy = total
-    if n == 0:
-        return 0.0
-    xx, xy, yy = sxx / n - (sx / n) ** 2, sxy / n - sx * sy / n**2, syy / n - (sy / n) ** 2
-    smallest = (xx + yy) / 2 - math.hypot((xx - yy) / 2, xy)
-    return math.sqrt(max(0.0, smallest))

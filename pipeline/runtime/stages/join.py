@@ -1,122 +1,43 @@
 """Join: fragments become whole surfaces by union-find over the facets that cross tile borders; then they are judged.
 
-The tiles have finished what no other tile sees, and hand on the rest by columns. Here one tile is read at a time, its
-sites are made, and its columns wait for those of the others. No object is made of a fragment.
+The tiles have finished all surfaces that no other tile sees, and pass on the rest by columns. The join reads one tile
+at a time, makes its sites, and collects its columns with those of the others. It makes no object per fragment.
 """
 
 from __future__ import annotations
 
-import base64
 import collections
 import dataclasses
-import hashlib
+import functools
 import itertools
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import shapely
-from shapely import MultiPolygon, Polygon
 
 from pipeline.model import IntArray
-from pipeline.runtime.overrides.overrides_file import Override
+from pipeline.runtime.run_context import RunContext
+from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.border_facets import united_by_name
 from pipeline.runtime.stages.finished_surfaces import Finished, finished
+from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline
 from pipeline.runtime.stages.open_fragments import TileSurfaces
-from pipeline.runtime.stages.split import Split
-from pipeline.terrain.candidates import NOWHERE, Surfaces, Verdict, verdicts
+from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, RejectedSite, largest_first, object_id
+from pipeline.runtime.stages.split import Splits
+from pipeline.runtime.stages.split_window import Split
+from pipeline.runtime.stages.units import divide_units
+from pipeline.terrain.candidates import NOWHERE, Surfaces, verdicts
+from pipeline.terrain.scene_settings import SceneSettings
 from pipeline.terrain.settings import CandidateSettings
 from pipeline.terrain.surfaces import N_SUMS, Sum
 from pipeline.tiling import MM, Tile, TileGrid
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
-class PointRange:
-    """A run of points in the sorted points of one tile."""
-
-    tile: Tile
-    start: int
-    stop: int
-    folder: str = "tiles"
-    """Folder of the scratch that holds the tile's points."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
-class CandidateSite:
-    """Where the points of one candidate lie."""
-
-    building_id: str
-    """As in the records."""
-    owner: Tile
-    """The tile of its smallest point: publishes it."""
-    ranges: tuple[PointRange, ...]
-    """Its points in scratch."""
-    points: int
-    """How many they are."""
-    footprint: Polygon | MultiPolygon | None = None
-    """Given footprint in metres; None where none was given."""
-    source_id: str | None = None
-    """Its own id."""
-    source_attributes: str | None = None
-    """The given footprint's columns as the text of a JSON object; None where none was given."""
-    block: str | None = None
-    """Of a unit: the id of the candidate that it was divided from."""
-    outline: MultiPolygon | None = None
-    """What it has of the outline drawn around touching units, in metres; None where it stands alone."""
-    override: Override | None = None
-    """What the user said of this building, as far as it took effect; None where nothing was."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
-class RejectedSite:
-    """An object that was judged to be no building."""
-
-    object_id: str
-    """Made as a building_id."""
-    owner: Tile
-    """The tile of its smallest point."""
-    verdict: Verdict
-    """Why."""
-    box_mm: tuple[int, int, int, int]
-    """xmin, ymin, xmax, ymax of its facets."""
-    area_m2: float
-    """Plan area of its facets."""
-    height_m: float
-    """Mean height above the terrain."""
-    points: int
-    """Its points."""
-    ranges: tuple[PointRange, ...] = ()
-    """They in scratch, for whoever wants them modelled after all."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Joined:
-    """The candidates of a run."""
-
-    candidates: tuple[CandidateSite, ...]
-    """Largest first, then by id."""
-    rejected: tuple[RejectedSite, ...]
-    """By id."""
-    small_fragments: int
-    """Surfaces below the size of an object: counted, not listed."""
-    keys: Mapping[Tile, str] = dataclasses.field(default_factory=dict)
-    """Digest of what lies in and around each tile: equal where nothing that comes after sees a difference."""
-
-
-def object_id(crs_name: str, lowest_point_mm: Sequence[int]) -> str:
-    """Identity of an object: base32 of a sha256 over the CRS and its lexicographically smallest point in mm.
-
-    >>> object_id("EPSG:28992", (84900123, 447500000, 7000))
-    'gjjf4vlm6iovpli7yu4hjko4'
-    """
-    text = f"{crs_name}|{lowest_point_mm[0]}|{lowest_point_mm[1]}|{lowest_point_mm[2]}"
-    digest = hashlib.sha256(text.encode()).digest()
-    return base64.b32encode(digest[:15]).decode().lower()
-
-
 class _Waiting:
-    """What waits of all tiles, by columns: of each a list with an array a tile; fragments and steps are counted on."""
+    """The fragments and steps of all tiles that wait for other tiles, by columns, numbered through."""
 
     def __init__(self) -> None:
         self._columns: dict[str, list[npt.NDArray[Any]]] = collections.defaultdict(list)
@@ -124,7 +45,7 @@ class _Waiting:
         self.steps = 0
 
     def add(self, tile: int, found: TileSurfaces) -> None:
-        """Take what waits of one more tile, by its number."""
+        """Add the open fragments of one more tile, by its number."""
         held = np.flatnonzero(found.ranges[:, 1] > found.ranges[:, 0])
         new: dict[str, npt.NDArray[Any]] = {
             "kind": found.kind,
@@ -145,13 +66,13 @@ class _Waiting:
         self.steps += found.steps
 
     def take(self, name: str, *shape: int, dtype: npt.DTypeLike = np.int64) -> npt.NDArray[Any]:
-        """A column of all tiles, with rows of that shape; it is held no longer."""
+        """A column of all tiles, with rows of that shape; its memory is released."""
         parts = self._columns.pop(name, [])
         return np.concatenate(parts) if parts else np.empty((0, *shape), dtype)
 
 
 def _whole_surfaces(waiting: _Waiting) -> tuple[Surfaces, IntArray]:
-    """Unite fragments of several tiles to whole surfaces; and the ranges of their points, as `finished` takes them."""
+    """Whole surfaces, united from the fragments of several tiles, and the ranges of their points for `finished`."""
     count, steps = waiting.fragments, waiting.steps
     roots = united_by_name(count, waiting.take("names", 2, dtype=np.uint64), waiting.take("holders"))
     step = united_by_name(steps, waiting.take("step_names", 2, dtype=np.uint64), waiting.take("step_holders"))
@@ -185,7 +106,7 @@ def _whole_surfaces(waiting: _Waiting) -> tuple[Surfaces, IntArray]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Sites:
-    """Makes sites of what is finished."""
+    """Makes sites from finished surfaces."""
 
     grid: TileGrid
     settings: CandidateSettings
@@ -195,7 +116,7 @@ class _Sites:
     tiles: dict[Tile, Tile] = dataclasses.field(default_factory=dict)
 
     def add(self, found: Finished, tiles: Sequence[Tile]) -> None:
-        """The sites of what was finished somewhere; `tiles` by their numbers there."""
+        """Add the sites of some finished surfaces; `tiles` by their numbers there."""
         of_candidates = _site_ranges(found.candidate_ranges, len(found.candidate_points_mm), tiles)
         for point, ranges in zip(found.candidate_points_mm.tolist(), of_candidates, strict=True):
             self.candidates.append(
@@ -242,17 +163,63 @@ def _site_ranges(ranges: IntArray, count: int, tiles: Sequence[Tile]) -> Iterato
         )
 
 
-def join(splits: Iterable[Split], grid: TileGrid, settings: CandidateSettings, crs_name: str) -> Joined:
-    """Finish the surfaces that several tiles see, and say where each candidate's points lie.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class JoinTask:
+    """All tiles, to be joined."""
+
+    splits: Splits
+    """Where their descriptors are."""
+    scratch: Scratch
+    """The run's scratch."""
+    grid: TileGrid
+    """The lattice."""
+    crs_name: str
+    """Goes into the ids."""
+
+
+def join(context: RunContext, settings: SceneSettings, splits: Splits, footprints: GivenFootprints | None) -> Joined:
+    """The candidates of all tiles, divided into units, and the rejected objects; one per footprint where given."""
+    plan, progress = context.plan, context.progress
+    started = time.perf_counter()
+    progress.tell("stage", "join", total=1)
+    crs_name = f"EPSG:{plan.reference.epsg}" if plan.reference.epsg is not None else plan.reference.name
+    if footprints is None:
+        task = JoinTask(splits=splits, scratch=context.scratch, grid=plan.grid, crs_name=crs_name)
+        function = functools.partial(_joined, settings=settings.candidates)
+        joined = context.executor.run_step("join", function, task, progress.watch)
+        joined = divide_units(context, settings.units, dataclasses.replace(joined, keys=splits.keys), crs_name)
+    else:
+        joined = join_footprints(
+            splits.stored(context.scratch),
+            plan.grid,
+            splits.numbers,
+            footprints.polygons,
+            footprints.ids,
+            crs_name,
+            footprints.attributes,
+        )
+        joined = dataclasses.replace(joined, keys=splits.keys)
+    progress.timings["join"] = time.perf_counter() - started
+    progress.tell("progress", "join", f"{len(joined.candidates)} candidates", done=1, total=1)
+    return joined
+
+
+def _joined(task: JoinTask, settings: CandidateSettings) -> Joined:
+    """The tiles of a task, joined; a process that has the kernels does this."""
+    return join_tiles(task.splits.stored(task.scratch), task.grid, settings, task.crs_name)
+
+
+def join_tiles(splits: Iterable[Split], grid: TileGrid, settings: CandidateSettings, crs_name: str) -> Joined:
+    """Finish the surfaces that several tiles see, and find where each candidate's points lie.
 
     Parameters
     ----------
     splits : iterable of Split
-        All tiles, in any order; one is held at a time.
+        All tiles, in any order; only one is in memory at a time.
     grid : TileGrid
         The lattice, for the owners.
     settings : CandidateSettings
-        What makes a surface a candidate: those of the splits.
+        What makes a surface a candidate; the same as in the splits.
     crs_name : str
         Goes into the ids.
     """
@@ -267,7 +234,7 @@ def join(splits: Iterable[Split], grid: TileGrid, settings: CandidateSettings, c
     rest = finished(*_whole_surfaces(waiting), settings)
     sites.add(rest, tiles)
     return Joined(
-        candidates=tuple(sorted(sites.candidates, key=lambda c: (-c.points, c.building_id))),
+        candidates=largest_first(sites.candidates),
         rejected=tuple(sorted(sites.rejected, key=lambda r: r.object_id)),
         small_fragments=small + rest.small,
     )
@@ -277,12 +244,12 @@ def join_footprints(
     splits: Iterable[Split],
     grid: TileGrid,
     numbers: Mapping[Tile, Sequence[int]],
-    footprints: Sequence[Polygon | MultiPolygon],
+    footprints: Sequence[Outline],
     source_ids: Sequence[str],
     crs_name: str,
     attributes: Sequence[str | None] | None = None,
 ) -> Joined:
-    """The candidates where footprints were given: one a footprint, also where it holds no point.
+    """The candidates where footprints were given: one per footprint, also where it holds no point.
 
     Parameters
     ----------
@@ -291,7 +258,7 @@ def join_footprints(
     grid : TileGrid
         The lattice, for the owners.
     numbers : mapping
-        By tile, the numbers of the footprints that its split knows by their place.
+        By tile, the numbers of its footprints; its split numbers them from 0.
     footprints, source_ids : sequences
         The given outlines in metres, in the order of their numbers, and their own ids.
     crs_name : str
@@ -328,6 +295,4 @@ def join_footprints(
                 source_attributes=None if attributes is None else attributes[number],
             )
         )
-    return Joined(
-        candidates=tuple(sorted(candidates, key=lambda c: (-c.points, c.building_id))), rejected=(), small_fragments=0
-    )
+    return Joined(candidates=largest_first(candidates), rejected=(), small_fragments=0)

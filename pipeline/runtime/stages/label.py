@@ -18,8 +18,8 @@ import numpy.typing as npt
 from pipeline.model import BoolArray, ByteArray
 from pipeline.runtime.scratch.folder import POINT, Scratch
 from pipeline.runtime.stages.gather import Surroundings, surroundings_of
-from pipeline.runtime.stages.join import PointRange
-from pipeline.runtime.stages.split import bucket_paths, load_window
+from pipeline.runtime.stages.sites import PointRange
+from pipeline.runtime.stages.window_points import bucket_paths, load_window
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints
 from pipeline.terrain.ground import Terrain, ground_points, slopes_of
 from pipeline.terrain.lattice import NO_DATA, height_above

@@ -1,7 +1,7 @@
-"""Outlines of touching units, drawn together: one task draws some blocks, of all points of all their units.
+"""Outlines of touching units, drawn together: a task draws some blocks from all points of all their units.
 
-A stage between join and reconstruct. What a user says of one unit does not move its neighbours' walls: blocks are drawn
-before overrides are applied.
+A stage between join and reconstruct. It runs before overrides are applied, so an override of one unit does not move its
+neighbours' walls.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from pipeline.errors import GableworkError
 from pipeline.io.gps_time import GpsTimeKind
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.unit_outlines import unit_outlines
+from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, whole
 from pipeline.runtime.stages.gather import canonical_order, gather, stored_points
 from pipeline.runtime.stages.grouping import in_groups
-from pipeline.runtime.stages.join import CandidateSite
-from pipeline.tiling import TileGrid
+from pipeline.runtime.stages.sites import CandidateSite, Joined
+from pipeline.tiling import Tile, TileGrid
 
 _POINTS_PER_TASK = 50_000
 
@@ -37,16 +39,48 @@ class OutlineTask:
     grid: TileGrid
     """The lattice."""
     scratch: Scratch
-    """Where points and terrain are."""
+    """Holds points and terrain."""
+
+
+def outline(context: RunContext, settings: RoofSettings, joined: Joined) -> Joined:
+    """The candidates with the outlines of touching units, drawn together."""
+    scratch, grid = context.scratch, context.plan.grid
+    tasks = {}
+    for tile, units in _blocks_by_tile(joined.candidates).items():
+        for task in outline_tasks(units, settings, grid, scratch):
+            sites = [site for block in task.blocks for site in block]
+            tasks[Place("outline", tile.key, key_of(settings, task.blocks, joined.around(sites, grid)))] = task
+    drop_outcomes(scratch, "outline", tasks)
+    drawn = context.map_stored("outline", draw_outlines, tasks, whole)
+    outlines: dict[str, MultiPolygon] = {}
+    for found in drawn.values():
+        outlines |= found.outlines
+    for warning in sorted(warning for found in drawn.values() for warning in found.warnings):
+        context.progress.warn("outline", warning)
+    outlined = (
+        dataclasses.replace(site, outline=outlines.get(site.building_id)) if site.block is not None else site
+        for site in joined.candidates
+    )
+    return dataclasses.replace(joined, candidates=tuple(outlined))
+
+
+def _blocks_by_tile(sites: Sequence[CandidateSite]) -> dict[Tile, list[CandidateSite]]:
+    """Units by the first of the tiles that own some of their block, in their order."""
+    home: dict[str, Tile] = {}
+    for site in sites:
+        if site.block is not None:
+            home[site.block] = min(home.get(site.block, site.owner), site.owner)
+    found: dict[Tile, list[CandidateSite]] = {}
+    for site in sites:
+        if site.block is not None:
+            found.setdefault(home[site.block], []).append(site)
+    return found
 
 
 def outline_tasks(
     sites: Sequence[CandidateSite], settings: RoofSettings, grid: TileGrid, scratch: Scratch
 ) -> list[OutlineTask]:
-    """Group the blocks of several units to tasks of some tenths of a second each, the largest blocks first.
-
-    Raw outlines are drawn one by one: then there is no task.
-    """
+    """Tasks of some tenths of a second each, the largest blocks first; none where outlines are drawn one by one."""
     if not settings.straight_eaves:
         return []
     blocks: dict[str, list[CandidateSite]] = {}
@@ -64,22 +98,22 @@ class DrawnOutlines:
     """What a task drew."""
 
     outlines: dict[str, MultiPolygon]
-    """By the units' building_id, in metres of the CRS; without those that could not be drawn."""
+    """By the units' building_id, in metres of the CRS; those that could not be drawn are missing."""
     warnings: tuple[str, ...]
-    """One of each block at which drawing stumbled over a fault of its own."""
+    """One per block that could not be drawn because of a fault in the program."""
 
 
 def draw_outlines(task: OutlineTask) -> DrawnOutlines:
     """Draw the outlines of the units of some blocks.
 
-    A block that cannot be drawn costs its units the common walls, not the run: they are drawn one by one.
+    A block that cannot be drawn does not end the run: its units lose their common walls and are drawn one by one.
 
     Raises
     ------
     RunCancelledError
-        The run was called off.
+        The run was cancelled.
     MemoryError, OSError
-        Scratch cannot be read, or not held.
+        Scratch cannot be read, or does not fit into memory.
     """
     drawn: dict[str, MultiPolygon] = {}
     warnings = []
@@ -89,7 +123,7 @@ def draw_outlines(task: OutlineTask) -> DrawnOutlines:
             drawn |= _drawn(task, units)
         except (MemoryError, OSError, GableworkError):
             raise
-        except Exception as error:  # noqa: BLE001 - told in the run's warnings
+        except Exception as error:  # noqa: BLE001 - becomes a warning of the run
             names = ", ".join(sorted(site.building_id for site in units))
             warnings.append(
                 f"the outlines of {names}, which touch, are drawn one by one: {type(error).__name__}: {error}"

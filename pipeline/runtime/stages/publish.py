@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import shapely
 
+from pipeline import __version__
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.export.facts import RecordContext, RejectedObject
 from pipeline.export.putting import Put
@@ -16,14 +17,17 @@ from pipeline.io import Storage, storage_at
 from pipeline.io.storage import Puts
 from pipeline.model import Status
 from pipeline.runtime.isolation.replay_bundle import SUFFIX
+from pipeline.runtime.plan import Plan
+from pipeline.runtime.run_context import ProgressUnits, RunContext
 from pipeline.runtime.scratch.folder import Scratch
-from pipeline.runtime.scratch.outcomes import Place, told_of
-from pipeline.runtime.stages.join import RejectedSite
-from pipeline.runtime.stages.reconstruct import StoredResult, stored_results
+from pipeline.runtime.scratch.outcomes import Place, brief_of, drop_outcomes, key_of, whole
+from pipeline.runtime.stages.cleanup import publishing
+from pipeline.runtime.stages.model_batch import StoredResult, stored_results
+from pipeline.runtime.stages.reconstruct import QUARANTINE, Models
+from pipeline.runtime.stages.sites import Joined, RejectedSite
+from pipeline.runtime.stages.split import Splits
+from pipeline.settings import RunSettings
 from pipeline.tiling import MM, Tile
-
-QUARANTINE = "quarantine"
-"""Folder of a run directory, and of scratch, for the bundles of buildings that cost their process."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -36,26 +40,26 @@ class PublishTask:
     batches: tuple[Place, ...]
     """Outcomes of the batches that modelled the buildings of this tile."""
     rejected: tuple[RejectedSite, ...]
-    """Objects of this tile that are no buildings."""
+    """Objects of this tile that are not buildings."""
     context: RecordContext
     meshes: str
     again: bool = False
-    """Whether the tile was published there before: what it no longer has is removed."""
+    """Whether the tile was published there before: files that it no longer has are removed."""
     empty_tables: bool = False
-    """Whether to write tables without rows, where nothing at all was found: every run has tables."""
+    """Whether to write tables without rows because the run found nothing: every run has tables."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Published:
-    """What became of one tile."""
+    """The outcome of one tile."""
 
     tile: Tile
     n_files: int
-    """How many it has; their digests are in its state."""
+    """Number of its files; their digests are in its state."""
     error: str = ""
     """Why the tile failed; empty where it did not."""
     warning: str = ""
-    """What went wrong beside it."""
+    """A fault that did not fail the tile."""
 
 
 def rejected_object(site: RejectedSite) -> RejectedObject:
@@ -77,15 +81,82 @@ def rejected_object(site: RejectedSite) -> RejectedObject:
     )
 
 
-def publish(task: PublishTask) -> Published:
+def record_context(plan: Plan, settings: RunSettings) -> RecordContext:
+    """The facts of a run that go into its records."""
+    times = [(i.acquired_from, i.acquired_to) for i in plan.sources]
+    known = [(a, b) for a, b in times if a is not None and b is not None]
+    return RecordContext(
+        reference=plan.reference,
+        settings_hash=settings.settings_hash,
+        engine_version=__version__,
+        acquired_from=min((a for a, _ in known), default=None),
+        acquired_to=max((b for _, b in known), default=None),
+        coarser_lods=settings.building.lods[:-1],
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunOutput:
+    """Where the results of a run go, and in which form."""
+
+    run_dir: str
+    """The run directory, a path or URL."""
+    meshes: str
+    """One OBJ per building, one per tile, or none."""
+
+
+def publish(
+    context: RunContext, settings: RunSettings, splits: Splits, joined: Joined, models: Models, output: RunOutput
+) -> list[Published]:
+    """Write every tile; the outcome of each, in their order."""
+    scratch, run_dir = context.scratch, output.run_dir
+    rejected: dict[Tile, list[RejectedSite]] = {}
+    for site in joined.rejected:
+        rejected.setdefault(site.owner, []).append(site)
+    owners = sorted({*models.places, *rejected, *splits.places})
+    records = record_context(context.plan, settings)
+    stage, storage = publishing(run_dir), storage_at(run_dir)
+    # scratch that ends with its run begins with an empty run directory, which need not be listed
+    there = {PurePosixPath(name).stem for name in storage.keys("state")} if scratch.attempt else set()
+    tasks = {}
+    for tile in owners:
+        task = PublishTask(
+            tile=tile,
+            run_dir=run_dir,
+            scratch=scratch,
+            batches=tuple(models.places.get(tile, ())),
+            rejected=tuple(rejected.get(tile, ())),
+            context=records,
+            meshes=output.meshes,
+            again=tile.key in there,
+            empty_tables=not models.places and not rejected and tile == owners[0],
+        )
+        key = key_of(run_dir, task.batches, task.rejected, records, task.meshes, task.empty_tables)
+        tasks[Place(stage, tile.key, key)] = task
+    # tiles that a user removed from the run directory are published again
+    drop_outcomes(scratch, stage, [place for place in tasks if place.unit in there])
+    units = ProgressUnits[Published](failed=lambda found: int(bool(found.error)))
+    published = context.map_stored("publish", publish_tile, tasks, whole, units)
+    for tile_key in sorted(there - {tile.key for tile in owners}):
+        retire(storage, Tile.from_key(tile_key))
+    for place, outcome in published.items():
+        if outcome.warning:
+            context.progress.warn("publish", outcome.warning)
+        if outcome.error:
+            context.progress.warn("publish", f"tile {outcome.tile.key} failed: {outcome.error}")
+            Path(scratch.root, place.name).unlink(missing_ok=True)  # so that a resumed run tries it again
+    return list(published.values())
+
+
+def publish_tile(task: PublishTask) -> Published:
     """Write one tile's tables, meshes and city objects, then its state; may run twice.
 
-    A tile that fails costs only itself: its state says so, and why. A tile that owns nothing has a state and no files.
+    A tile that fails harms only itself: its state says so, and why. A tile that owns nothing has a state and no files.
 
     Raises
     ------
     RunCancelledError
-        The run was called off, or is over: whoever comes so late must not touch what another run may have written.
+        The run was cancelled, or is over: so late a task must not touch what another run may have written.
     """
     storage = storage_at(task.run_dir)
     task.scratch.check_cancelled()
@@ -97,7 +168,7 @@ def publish(task: PublishTask) -> Published:
                 files = _write(task, _tables_last(puts))
     except RunCancelledError:
         raise
-    except Exception as fault:  # noqa: BLE001 - told in the tile's state, the manifest and the exit code
+    except Exception as fault:  # noqa: BLE001 - goes into the tile's state, the manifest and the exit code
         error = f"{type(fault).__name__}: {fault}"
     before = files_of(storage, task.tile) if task.again else set()
     task.scratch.check_cancelled()
@@ -113,7 +184,7 @@ def publish(task: PublishTask) -> Published:
     try:
         storage.put(f"state/{task.tile.key}.json", json.dumps(state, indent=1).encode())
     except (RunError, OSError) as fault:
-        # a tile without its state is not finished, which is what the manifest will say of it
+        # a tile without its state is not finished, and the manifest will say so
         return Published(tile=task.tile, n_files=0, error=error or f"its state: {fault}")
     for name in sorted(before - files.keys()):
         storage.delete(name)
@@ -121,7 +192,7 @@ def publish(task: PublishTask) -> Published:
 
 
 def _tables_last(puts: Puts) -> Put:
-    """Puts that are under way together, but no table before all meshes are there: rows name them."""
+    """Concurrent puts, except that tables wait for all meshes, which their rows name."""
 
     def put(key: str, content: bytes) -> None:
         if not key.startswith("meshes/"):
@@ -138,7 +209,7 @@ def files_of(storage: Storage, tile: Tile) -> set[str]:
 
 
 def retire(storage: Storage, tile: Tile) -> None:
-    """Remove what a tile published that owns nothing any more: its files, then its state."""
+    """Remove the files of a tile that no longer owns anything, then its state."""
     for name in sorted(files_of(storage, tile)):
         storage.delete(name)
     storage.delete(f"state/{tile.key}.json")
@@ -146,7 +217,7 @@ def retire(storage: Storage, tile: Tile) -> None:
 
 def _write(task: PublishTask, put: Put) -> dict[str, str]:
     """Write the files of a tile that owns something; the sha256 of each by its path."""
-    from pipeline.export.tile import write_tile  # with Arrow, which who hands out the tasks does not need
+    from pipeline.export.tile import write_tile  # loads Arrow, which the driver does not need
 
     stored: list[StoredResult] = []
     for place in task.batches:
@@ -165,14 +236,14 @@ def _write(task: PublishTask, put: Put) -> dict[str, str]:
 
 
 def _put_bundles(task: PublishTask, storage: Storage) -> tuple[dict[str, str], str]:
-    """Put the bundles of buildings that cost their process; the sha256 of each by its path, and what went wrong.
+    """Put the bundles of buildings that ended their process; the sha256 of each by its path, and what went wrong.
 
-    A bundle is for whoever looks for the cause: that one is missing does not cost the tile.
+    A bundle helps to find a cause. A missing one does not fail the tile.
     """
     bundles: dict[str, str] = {}
     lost = ""
     for place in task.batches:
-        for model in told_of(task.scratch, place):
+        for model in brief_of(task.scratch, place):
             bundle = Path(task.scratch.root, QUARANTINE, f"{model.building_id}{SUFFIX}")
             if model.status != Status.FAILED.value or not bundle.is_file():
                 continue

@@ -17,7 +17,7 @@ from pipeline.io.crs import INTERNATIONAL_FOOT_M, US_SURVEY_FOOT_M
 from pipeline.model import BoolArray
 from pipeline.runtime.scratch.folder import Scratch
 from pipeline.runtime.stages.gather import Surroundings, surroundings_of
-from pipeline.runtime.stages.split import load_window
+from pipeline.runtime.stages.window_points import load_window
 from pipeline.scene import WindowPoints
 from pipeline.terrain.elevation_rasters import FILL_M, closed, columns_of, filled, highest_in_cells, terrain_at
 from pipeline.terrain.ground import slopes_of

@@ -1,6 +1,6 @@
-"""Loading what the stages need by running them once, over some made-up houses: libraries and compiled kernels.
+"""Rehearsal: the stages run once over some made-up houses, to load their libraries and compiled kernels.
 
-For a process from which others are forked: what is loaded there is loaded once for all of them.
+For a process from which others are forked: it loads them once for all of them.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ import numpy as np
 import shapely
 
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.stages.join import join
-from pipeline.runtime.stages.reconstruct_tasks import divide, unit_tasks
-from pipeline.runtime.stages.split import SplitTask, split
+from pipeline.runtime.stages.join import join_tiles
+from pipeline.runtime.stages.split_window import SplitTask, split_window
 from pipeline.runtime.stages.tile_content import zone_sums
+from pipeline.runtime.stages.units import divide, unit_tasks
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
 from pipeline.terrain.scene_settings import ClassesInUse, SceneSettings
 from pipeline.tiling import MM, Tile, TileGrid
 
 _SIDE_M = 24
 _HOUSES = ((4, 10), (14, 20))
-"""From where to where they stand, in both directions, metres."""
+"""Their extent in both directions, metres."""
 
 
 def rehearse_scene(outlines: str = "") -> None:
@@ -30,7 +30,7 @@ def rehearse_scene(outlines: str = "") -> None:
     Parameters
     ----------
     outlines : str
-        `given` where footprints tell where the houses are: then the tile is split alone.
+        `given` where footprints are given; then the tile is only split.
     """
     footprints = tuple(shapely.box(low, low, high, high) for low, high in _HOUSES) if outlines else None
     steps = np.arange(500, _SIDE_M * MM, 1000)
@@ -52,14 +52,13 @@ def rehearse_scene(outlines: str = "") -> None:
         task = SplitTask(
             tile=tile,
             grid=grid,
-            settings=settings,
             classes=ClassesInUse(ground=True, building=True),
             scratch=scratch,
             footprints=footprints,
         )
-        found = split(task)
+        found = split_window(task, settings)
         if footprints is not None:
             return
-        joined = join([found], grid, settings.candidates, "")
+        joined = join_tiles([found], grid, settings.candidates, "")
         for units in unit_tasks(joined.candidates, settings.units, grid, scratch, ""):
             divide(units)

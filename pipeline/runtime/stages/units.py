@@ -1,20 +1,23 @@
-"""Units: a candidate in which several buildings touch becomes one candidate a unit, as the end of the join.
+"""Units: a candidate in which several buildings touch becomes one candidate per unit, at the end of the join.
 
-A task sees all points of its candidates, whichever tiles they lie in, so the outcome does not depend on the tiles. The
+A task sees all points of its candidates, in whichever tiles they lie, so the outcome does not depend on the tiles. The
 points of a divided candidate are stored again, sorted by unit, tile by tile: a range still lies in the tile it names.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.runtime.run_context import RunContext
 from pipeline.runtime.scratch.folder import POINT, Scratch
+from pipeline.runtime.scratch.outcomes import Place, drop_outcomes, key_of, whole
 from pipeline.runtime.stages.grouping import in_groups
-from pipeline.runtime.stages.join import CandidateSite, PointRange, object_id
+from pipeline.runtime.stages.sites import CandidateSite, Joined, PointRange, by_owner, largest_first, object_id
 from pipeline.terrain.settings import UnitSettings
 from pipeline.terrain.units import smallest_points, units_of
 from pipeline.tiling import Tile, TileGrid
@@ -33,9 +36,24 @@ class UnitTask:
     grid: TileGrid
     """The lattice, for the owners."""
     scratch: Scratch
-    """Where the points are, and where those of units go."""
+    """Holds the points, and gets those of the units."""
     crs_name: str
     """Goes into the ids."""
+
+
+def divide_units(context: RunContext, settings: UnitSettings, joined: Joined, crs_name: str) -> Joined:
+    """The candidates, divided into units; part of the join and not a stage of its own."""
+    if settings.split == "nothing":
+        return joined
+    scratch, grid = context.scratch, context.plan.grid
+    tasks = {}
+    for tile, candidates in by_owner(joined.candidates).items():
+        for task in unit_tasks(candidates, settings, grid, scratch, crs_name):
+            key = key_of(settings, crs_name, task.sites, joined.around(task.sites, grid))
+            tasks[Place("units", tile.key, key)] = task
+    drop_outcomes(scratch, "units", tasks)
+    divided = context.map_stored("join", divide, tasks, whole, quiet=True)
+    return dataclasses.replace(joined, candidates=largest_first(itertools.chain(*divided.values())))
 
 
 def unit_tasks(
@@ -55,7 +73,7 @@ def divide(task: UnitTask) -> tuple[CandidateSite, ...]:
     Raises
     ------
     RunCancelledError
-        The run was called off.
+        The run was cancelled.
     """
     found: list[CandidateSite] = []
     for site in task.sites:

@@ -19,7 +19,17 @@ from hypothesis import strategies as st
 
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.scratch.folder import POINT, Scratch
-from pipeline.runtime.scratch.outcomes import Keeper, Keeping, Place, keep, key_of, result_of, told_of, whole
+from pipeline.runtime.scratch.outcomes import (
+    OutcomeTask,
+    Place,
+    brief_of,
+    drop_outcomes,
+    key_of,
+    keys_of,
+    result_of,
+    run_and_store,
+    whole,
+)
 from pipeline.runtime.stages.tile_content import content_of_window, zone_sums
 from pipeline.tiling import MM, Tile, TileGrid
 
@@ -135,37 +145,33 @@ def no_space(task: int) -> int:
     raise OSError(28, "No space left on device", "/full")
 
 
-def keeping(folder: Path, function: Callable[[int], int] = double, key: str = "k") -> Keeping[int, int, int]:
+def outcome_task(folder: Path, function: Callable[[int], int] = double) -> OutcomeTask[int, int, int]:
     scratch = Scratch(str(folder))
     scratch.create()
-    return Keeping(
-        function=function, task=21, place=Place("stage", "unit", key), scratch=scratch, told=whole, stage="split"
-    )
+    place = Place("stage", "unit", "k")
+    return OutcomeTask(function=function, task=21, place=place, scratch=scratch, brief=whole, stage="split")
 
 
-def test_an_outcome_is_kept_with_what_it_tells(tmp_path: Path) -> None:
-    work = dataclasses.replace(keeping(tmp_path), told=str)
-    assert keep(work).told == "42"
-    assert (told_of(work.scratch, work.place), result_of(work.scratch, work.place)) == ("42", 42)
-    keeper = Keeper(work.scratch)
-    assert (keeper.units("stage"), keeper.keys("stage", "unit")) == (["unit"], {"k"})
-    keeper.drop_others("stage", "unit", ["k"])
-    assert keeper.keys("stage", "unit") == {"k"}
-    keeper.drop_others("stage", "unit", [])
-    assert not keeper.keys("stage", "unit")
+def test_an_outcome_is_stored_with_its_brief(tmp_path: Path) -> None:
+    work = dataclasses.replace(outcome_task(tmp_path), brief=str)
+    assert run_and_store(work).brief == "42"
+    assert (brief_of(work.scratch, work.place), result_of(work.scratch, work.place)) == ("42", 42)
+    for wanted, left in (([work.place], ["k"]), ([], [])):
+        drop_outcomes(work.scratch, "stage", wanted)
+        assert keys_of(work.scratch, "stage", "unit") == left
     with pytest.raises(RunCancelledError, match="is gone"):
         result_of(work.scratch, work.place)
 
 
 def test_a_full_disk_names_stage_place_and_fix(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"/full: No space left on device, in stage split\. Free space"):
-        keep(keeping(tmp_path, no_space))
+        run_and_store(outcome_task(tmp_path, no_space))
     assert not list(tmp_path.rglob("k*"))
 
 
-def test_nothing_is_kept_of_a_run_that_was_called_off(tmp_path: Path) -> None:
-    work = keeping(tmp_path)
+def test_a_cancelled_run_stores_nothing(tmp_path: Path) -> None:
+    work = outcome_task(tmp_path)
     work.scratch.cancel()
     with pytest.raises(RunCancelledError):
-        keep(work)
+        run_and_store(work)
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path.name != "cancelled"]

@@ -1,0 +1,89 @@
+"""What a run learns about itself while it runs: progress, timings, peak memory, warnings."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from pipeline.runtime.monitoring.events import Event, EventKind, Listener, Watch
+from pipeline.runtime.monitoring.measurement import Measured
+
+
+class Progress:
+    """Timings, peak memory and warnings of a run; the listener gets an event for each of them.
+
+    Parameters
+    ----------
+    listener : callable
+        Gets the events.
+    watch : Watch, optional
+        Passed to the executor with every stage.
+    """
+
+    def __init__(self, listener: Listener, watch: Watch | None = None) -> None:
+        self.listener = listener
+        self.watch = watch or Watch(listener=listener)
+        self.timings: dict[str, float] = {}
+        self.peaks: dict[str, int] = {}
+        self.warnings: list[str] = []
+        self._part, self._parts, self._label = 0, 1, ""
+
+    def part(self, number: int, parts: int, label: str) -> Progress:
+        """The progress of one of several equal parts: a copy that knows what happened before.
+
+        Parameters
+        ----------
+        number, parts : int
+            Which part, from 0, and how many there are. The events of a stage count all parts one after the other.
+        label : str
+            What messages call the part.
+        """
+        own = Progress(self.listener, self.watch)
+        own.timings, own.peaks, own.warnings = dict(self.timings), dict(self.peaks), list(self.warnings)
+        own._part, own._parts, own._label = number, parts, label
+        return own
+
+    def tell(self, kind: EventKind, stage: str, message: str = "", **counts: int) -> None:
+        """Send an event; `counts` are the counting fields of `Event`."""
+        self.listener(Event(kind=kind, stage=stage, message=message, **counts))
+
+    def warn(self, stage: str, message: str) -> None:
+        """Store and send a warning; the same one only once."""
+        if message not in self.warnings:
+            self.warnings.append(message)
+            self.tell("warning", stage, message)
+
+    def measured(self, found: Measured[Any]) -> None:
+        """Note the peak memory of the process that ran a task."""
+        self.peaks[found.process] = max(self.peaks.get(found.process, 0), found.peak_bytes)
+
+    @contextlib.contextmanager
+    def stage(self, name: str, total: int, *, quiet: bool = False) -> Iterator[StageProgress]:
+        """Time a stage and report how far it is; a quiet one is part of another stage and does neither."""
+        started = time.perf_counter()
+        stage = StageProgress(self, name, self._part * total, self._parts * total, quiet=quiet)
+        if not quiet:
+            self.tell("stage", name, self._label, done=stage.done, total=stage.total)
+        yield stage
+        if not quiet:
+            self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - started
+
+
+class StageProgress:
+    """How far one stage is."""
+
+    def __init__(self, progress: Progress, name: str, done: int, total: int, *, quiet: bool) -> None:
+        self._progress = progress
+        self._name = name
+        self._quiet = quiet
+        self.done, self.total, self.failed = done, total, 0
+
+    def add(self, units: int, failed: int = 0, *, kept: int = 0, message: str = "") -> None:
+        """Count units as done, some of which failed or were kept from an earlier run."""
+        self.done += units
+        self.failed += failed
+        if not self._quiet:
+            counts = {"done": self.done, "total": self.total, "kept": kept, "failed": self.failed}
+            self._progress.tell("progress", self._name, message, **counts)

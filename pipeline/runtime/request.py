@@ -1,0 +1,119 @@
+"""The request of a run, and a first look at the inputs that it names."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import shapely
+
+from pipeline.io import ReadOptions, find_inputs, is_url, open_source, sha256_of, shown
+from pipeline.io.footprints import read_area
+from pipeline.io.remote_file import on_this_machine
+from pipeline.io.tile_index import TileIndex
+from pipeline.runtime.manifest import InputFile
+from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.plan import Plan, make_plan, without_far_files
+from pipeline.runtime.resources import Resources
+from pipeline.settings import RunSettings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunRequest:
+    """What to reconstruct, and how."""
+
+    inputs: tuple[str, ...]
+    """Files, folders, patterns, URLs or tile indexes."""
+    out: str
+    """The run directory, a folder or `s3://bucket/prefix`; new or empty, unless `overwrite`."""
+    settings: RunSettings = dataclasses.field(default_factory=RunSettings)
+    """All settings."""
+    resources: Resources = dataclasses.field(default_factory=Resources)
+    """What the run runs with."""
+    footprints: str | None = None
+    """A vector file of the building outlines to model."""
+    overrides: str | None = None
+    """A TOML file of corrections to single buildings; `pipeline.runtime.overrides.overrides_file`."""
+    crs: str | None = None
+    """Overrides the CRS in the headers."""
+    vertical_unit: str | None = None
+    """Overrides the vertical unit in the headers."""
+    bbox: tuple[float, float, float, float] | None = None
+    """x_min, y_min, x_max, y_max in the CRS's units."""
+    aoi: str | None = None
+    """A vector file of areas of interest."""
+    only_files: bool = False
+    """Take each input for the path of a file and follow neither folders, patterns, URLs nor tile indexes: for inputs
+    that strangers name."""
+    meshes: str = "building"
+    """One OBJ per building, one per tile, or none."""
+    licence: str | None = None
+    """Licence of the source data, in the user's words."""
+    overwrite: bool = False
+    """Replace an earlier run in `out`."""
+
+
+def plan_inputs(request: RunRequest, progress: Progress) -> tuple[Plan, list[str]]:
+    """The plan of a run, and its input files in order.
+
+    Raises
+    ------
+    InputError
+        An input cannot be used.
+    """
+    options = ReadOptions(
+        crs=request.crs,
+        vertical_unit=request.vertical_unit,
+        bbox=request.bbox,
+        class_table=request.settings.class_codes.table,
+    )
+
+    def cut(index: TileIndex) -> Sequence[str]:
+        """The files of an index that the window may need; the others are neither opened nor fetched."""
+        if request.bbox is None and request.aoi is None:
+            return index.locations
+        reference = open_source(index.locations[0], options).info.reference
+        area = None if request.aoi is None else read_area(request.aoi, reference)
+        if request.bbox is not None:
+            box = shapely.box(*request.bbox)
+            area = box if area is None else box & area
+        return index.within(area, reference)
+
+    paths = find_inputs(request.inputs, only_files=request.only_files, cut=cut)
+    if request.aoi is not None:
+        reference = open_source(paths[0], options).info.reference
+        options = dataclasses.replace(options, aoi=read_area(request.aoi, reference))
+    plan, paths = without_far_files(make_plan(paths, options, request.settings), paths)
+    for warning in plan.warnings:
+        progress.warn("plan", warning)
+    if not any(info.has_returns for info in plan.sources):
+        progress.warn("plan", "the inputs have one return a pulse: vegetation is told by its roughness alone")
+    return plan, paths
+
+
+def input_file(name: str) -> InputFile:
+    """The entry in `run.json` of a file that is no point cloud."""
+    with on_this_machine(name) as path:
+        return InputFile(path=_whole(name), sha256=sha256_of(path), size_bytes=path.stat().st_size)
+
+
+def request_record(request: RunRequest) -> dict[str, object]:
+    """The part of the request stored in `run.json`, from which single buildings of the run can be modelled again."""
+    files = {
+        "footprints": request.footprints,
+        "overrides": request.overrides,
+        "aoi": request.aoi,
+        "work": request.resources.work,
+    }
+    return {
+        **{name: None if path is None else _whole(path) for name, path in files.items()},
+        "crs": request.crs,
+        "vertical_unit": request.vertical_unit,
+        "bbox": None if request.bbox is None else list(request.bbox),
+        "meshes": request.meshes,
+    }
+
+
+def _whole(path: str) -> str:
+    return shown(path) if is_url(path) else str(Path(path).resolve())

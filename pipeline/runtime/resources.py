@@ -1,0 +1,49 @@
+"""What a run runs with: workers, a scheduler, certificates, isolation, scratch. Nothing here changes the models."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from pipeline.runtime.cluster.priorities import Traffic
+from pipeline.runtime.cluster.tls import TlsFiles
+from pipeline.runtime.isolation.isolated_items import IsolationLimits
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Resources:
+    """What a run runs with."""
+
+    workers: int | None = None
+    """Processes of the embedded cluster; 0 runs serially in this process, None leaves it to the estimate."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler to use in place of the embedded cluster."""
+    tls: TlsFiles | None = None
+    """Certificates for the cluster's traffic; by default those of the environment."""
+    traffic: Traffic = "interactive"
+    """Tasks of a `batch` run wait behind those of `interactive` runs where workers are scarce."""
+    isolate: bool | None = None
+    """Model buildings in supervised child processes; None does so with workers and not serially."""
+    building_timeout_s: float = IsolationLimits.timeout_s
+    """Wall-clock seconds that one isolated building may take."""
+    building_memory_bytes: int = IsolationLimits.memory_bytes
+    """Memory that the process of one isolated building may take."""
+    scratch: str | None = None
+    """A folder for intermediate results that all workers see; by default the run directory, or a temporary folder of
+    this machine where that is a URL."""
+    work: str | None = None
+    """A folder that stores the outcomes of tasks. A run with the same folder resumes where an interrupted one stopped,
+    and repeats only what changed since a finished one; None stores nothing beyond the run."""
+    performance_report: str | None = None
+    """File for a page about the workers' time; None writes none."""
+
+    @property
+    def isolation(self) -> IsolationLimits | None:
+        """Limits of the supervised child processes; None models buildings in the workers themselves."""
+        serial = self.workers == 0 and self.scheduler is None
+        if self.isolate is False or (self.isolate is None and serial):
+            return None
+        return IsolationLimits(timeout_s=self.building_timeout_s, memory_bytes=self.building_memory_bytes)
+
+
+SERIAL = Resources(workers=0)
+"""This process alone."""

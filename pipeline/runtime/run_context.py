@@ -1,0 +1,219 @@
+"""What one run has while it runs, and the one way to begin and end it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from pipeline.runtime.cluster.dispatch import TICK_S
+from pipeline.runtime.cluster.serial_executor import Executor
+from pipeline.runtime.engine import executor_for
+from pipeline.runtime.expected import Expected
+from pipeline.runtime.isolation.isolated_items import IsolationLimits
+from pipeline.runtime.monitoring.events import Watch, never
+from pipeline.runtime.monitoring.logs import about
+from pipeline.runtime.monitoring.progress import Progress
+from pipeline.runtime.plan import Plan, check_memory
+from pipeline.runtime.resources import Resources
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.outcomes import OutcomeTask, Place, brief_of, run_and_store
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+Brief = TypeVar("Brief")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ProgressUnits(Generic[Brief]):
+    """How the progress of a stage is counted."""
+
+    total: int | None = None
+    """Units of the whole stage; the number of its tasks by default."""
+    done: Callable[[Brief], int] = lambda _: 1
+    """Units of a task, by its brief."""
+    failed: Callable[[Brief], int] = lambda _: 0
+    """How many of them failed."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunContext:
+    """What one run has while it runs."""
+
+    plan: Plan
+    """What is read, on which lattice."""
+    progress: Progress
+    """Gets timings, peaks, warnings; sends events; knows whether the run was cancelled."""
+    executor: Executor
+    """Runs the tasks."""
+    scratch: Scratch
+    """Holds the intermediate results."""
+    isolation: IsolationLimits | None = None
+    """Limits of the child processes that model buildings; None models buildings in the workers themselves."""
+
+    def map(self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
+        """The results of a stage's tasks, as they come."""
+        results = []
+        # closed at once where the listener raises, so that no task goes on in vain
+        with (
+            self.progress.stage(stage, len(tasks)) as counter,
+            contextlib.closing(self.executor.map(stage, function, tasks, self.progress.watch)) as running,
+        ):
+            for found in running:
+                results.append(found.result)
+                self.progress.measured(found)
+                counter.add(1)
+        return results
+
+    def map_stored(
+        self,
+        stage: str,
+        function: Callable[[Task], Result],
+        tasks: Mapping[Place, Task],
+        brief: Callable[[Result], Brief],
+        units: ProgressUnits[Brief] | None = None,
+        on_new: Callable[[Brief], None] = lambda _: None,
+        *,
+        quiet: bool = False,
+    ) -> dict[Place, Brief]:
+        """Run those tasks of a stage that have no stored outcome, and store theirs; the briefs of all, in order.
+
+        Parameters
+        ----------
+        stage, function
+            As in `map`.
+        tasks : mapping
+            By the place of each one's outcome.
+        brief : callable
+            The small part of a result that travels to the driver.
+        units : ProgressUnits, optional
+            How progress is counted; by tasks by default.
+        on_new : callable
+            Gets the briefs of the tasks that ran now.
+        quiet : bool
+            Part of another stage: no events and no timing of its own.
+        """
+        units = units or ProgressUnits()
+        found: dict[Place, Brief] = {}
+        with self.progress.stage(stage, len(tasks) if units.total is None else units.total, quiet=quiet) as counter:
+            found |= {place: brief_of(self.scratch, place) for place in tasks if self.scratch.has(place.name)}
+            if found:
+                kept, failed = sum(map(units.done, found.values())), sum(map(units.failed, found.values()))
+                counter.add(kept, failed, kept=kept, message=f"{len(found)} of {len(tasks)} tasks were done before")
+            todo = [
+                OutcomeTask(function=function, task=task, place=place, scratch=self.scratch, brief=brief, stage=stage)
+                for place, task in tasks.items()
+                if place not in found
+            ]
+            # closed at once where the listener raises, so that no task goes on in vain
+            with contextlib.closing(self.executor.map(stage, run_and_store, todo, self.progress.watch)) as running:
+                for measured in running:
+                    new = measured.result
+                    found[new.place] = new.brief
+                    on_new(new.brief)
+                    self.progress.measured(measured)
+                    counter.add(units.done(new.brief), units.failed(new.brief))
+        return {place: found[place] for place in tasks}
+
+
+@contextlib.contextmanager
+def run_context(
+    plan: Plan,
+    progress: Progress,
+    resources: Resources,
+    scratch: AbstractContextManager[Scratch],
+    work: Expected,
+    *,
+    loads: Sequence[str],
+    executor: Executor | None = None,
+    cancelled: Callable[[], bool] = never,
+) -> Iterator[RunContext]:
+    """Open scratch, start the executor, watch for cancellation, and check that the plan fits into memory.
+
+    Parameters
+    ----------
+    plan, progress : Plan, Progress
+        Of the run.
+    resources : Resources
+        What it runs with.
+    scratch : context manager
+        Opens its scratch.
+    work : Expected
+        What there is to do: decides which executor runs it.
+    loads : sequence of str
+        What child processes load, from `loads_of`.
+    executor : Executor, optional
+        Runs the tasks; by default the one that `resources` and `work` call for.
+    cancelled : callable
+        Asked several times a second, from another thread. Once it is true, the run ends as soon as it can.
+
+    Yields
+    ------
+    RunContext
+        An exception within the block also ends the tasks that still run.
+
+    Raises
+    ------
+    InputError
+        The largest task does not fit into a worker.
+    RunCancelledError, ClusterError, RunError
+        No executor came up, or the scratch cannot be used.
+    """
+    with scratch as opened:
+        folder = str(Path(opened.root, "dask"))
+        engine = executor or executor_for(resources, local_directory=folder, work=work, loads=loads)
+        starting = time.perf_counter()
+        with about(run=opened.name), _watching(opened, cancelled) as was_cancelled, engine:
+            progress.watch = Watch(cancelled=was_cancelled, stop=opened.cancel, listener=progress.listener)
+            engine.prepare("plan", progress.watch)
+            progress.timings["start workers"] = time.perf_counter() - starting
+            check_memory(plan, engine.memory_limit_bytes)
+            try:
+                yield RunContext(
+                    plan=plan, progress=progress, executor=engine, scratch=opened, isolation=resources.isolation
+                )
+            except BaseException:
+                opened.cancel()
+                raise
+
+
+@contextlib.contextmanager
+def _watching(scratch: Scratch, cancelled: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
+    """Watch for cancellation from a thread of its own, so that a task in this very process notices it too.
+
+    Yields
+    ------
+    callable
+        Whether the run was cancelled; then its scratch is marked.
+    """
+    if cancelled is never:
+        yield never
+        return
+    if cancelled():  # before it began: a short run could else be over before the next question
+        scratch.cancel()
+        yield lambda: True
+        return
+    over, noticed = threading.Event(), threading.Event()
+
+    def ask() -> None:
+        try:
+            while not over.wait(TICK_S) and not cancelled():
+                pass
+        finally:
+            # where `cancelled` raises, no later request to end the run would be noticed: end it now
+            if not over.is_set():
+                noticed.set()
+                scratch.cancel()
+
+    asking = threading.Thread(target=ask, name="gablework-cancelled", daemon=True)
+    asking.start()
+    try:
+        yield noticed.is_set
+    finally:
+        over.set()
+        asking.join()

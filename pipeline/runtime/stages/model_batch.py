@@ -1,0 +1,427 @@
+"""Modelling of a batch: a task models some candidates, each on its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import pickle
+import time
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+import shapely
+
+from pipeline.errors import GableworkError, RunCancelledError, RunError
+from pipeline.export.facts import CandidateFacts
+from pipeline.io.crs import SpatialReference
+from pipeline.io.gps_time import GpsTimeKind
+from pipeline.methods import METHODS, ReconstructSettings
+from pipeline.model import BuildingResult, Candidate, Reason, RoofType, Status
+from pipeline.runtime.cluster.memory_needs import building_bytes
+from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
+from pipeline.runtime.isolation.replay_bundle import Bundle, Incident, write_bundle
+from pipeline.runtime.monitoring.logs import LOG
+from pipeline.runtime.monitoring.tallies import TALLIES
+from pipeline.runtime.overrides.overrides_file import OwnModelling
+from pipeline.runtime.scratch.folder import Scratch
+from pipeline.runtime.scratch.outcomes import Place, key_of, result_of
+from pipeline.runtime.stages.gather import gather
+from pipeline.runtime.stages.sites import CandidateSite
+from pipeline.tiling import Tile, TileGrid
+
+_BUNDLE_TIMEOUT_S = 60.0
+_LOST = frozenset({Reason.CRASHED, Reason.TIMED_OUT, Reason.OUT_OF_MEMORY, Reason.INTERNAL_ERROR})
+"""Reasons caused by processes or by gablework, not by the building's points: each deserves a log line."""
+_NO_BUNDLE = "there is no bundle, since its points cannot be put together"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BatchTask:
+    """Some candidates for one task."""
+
+    sites: tuple[CandidateSite, ...]
+    """The candidates."""
+    method: str
+    """Name of the method."""
+    settings: ReconstructSettings
+    """Its settings and those of the roof."""
+    grid: TileGrid
+    scratch: Scratch
+    gps_kind: GpsTimeKind
+    """Whether GPS times can be converted to dates."""
+    isolation: IsolationLimits | None = None
+    """Limits of the supervised child; None models in this process."""
+    quarantine: str = ""
+    """Folder for the bundles of buildings that ended their process or met a fault of ours; empty writes none."""
+    reference: SpatialReference = dataclasses.field(default_factory=SpatialReference)
+    """CRS of the run, for its bundles."""
+    own: Mapping[str, OwnModelling] = dataclasses.field(default_factory=dict)
+    """Method and settings of the buildings that have their own, by building_id."""
+    earlier: tuple[Place, ...] = ()
+    """Outcomes of earlier batches of these candidates' tile: models of the same input are taken from them."""
+    compared: bool = False
+    """Whether seconds are compared with those of other methods: a method is then loaded before the clock starts."""
+
+    @property
+    def memory_bytes(self) -> int:
+        """Estimated peak memory of the process that models them, one after the other."""
+        limit_bytes = None if self.isolation is None else self.isolation.memory_bytes
+        return building_bytes(max((site.points for site in self.sites), default=0), limit_bytes)
+
+    @property
+    def supervises(self) -> bool:
+        """Whether buildings are modelled in child processes of the process that runs the task."""
+        return self.isolation is not None
+
+    def way_of(self, site: CandidateSite) -> BatchTask:
+        """The task with the method and the settings of one site."""
+        own = self.own.get(site.building_id)
+        return self if own is None else dataclasses.replace(self, method=own.method, settings=own.settings)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Modelled:
+    """The figures of one building, which travel to the driver; the model itself stays in scratch."""
+
+    building_id: str
+    owner: Tile
+    status: str
+    reason: str | None
+    roof_type: str
+    faces: int
+    points: int
+    seconds: float
+    reused: bool = False
+    """Whether the model was taken from an earlier batch, of the same input."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StoredResult:
+    """A model in scratch, waiting to be published."""
+
+    result: BuildingResult
+    facts: CandidateFacts
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Batch:
+    """The models of a batch."""
+
+    modelled: tuple[Modelled, ...]
+    """The figures, in the order of the task's candidates."""
+    stored: Mapping[str, tuple[str, bytes]]
+    """By building_id: the digest of all that the model was made from, empty where it must not be used again; and a
+    pickled `StoredResult`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Packed:
+    """A model on its way to scratch: pickled once, where it was made, and never opened on the way."""
+
+    modelled: Modelled
+    """Its figures."""
+    stored: bytes
+    """A pickled `StoredResult`."""
+    made_from: str = ""
+    """Digest of candidate, method and settings; empty where the model must not be used again."""
+
+
+def model_batch(task: BatchTask) -> Batch:
+    """Model a batch.
+
+    Raises
+    ------
+    RunCancelledError
+        The run was cancelled.
+    OSError
+        Scratch cannot be read or written.
+    RunError
+        Child processes cannot be started.
+    """
+    models = _here(task) if task.isolation is None else _in_child(task, task.isolation)
+    try:
+        packed = dict(models)
+    except OSError:
+        task.scratch.check_cancelled()  # the scratch of a run that is over is gone
+        raise
+    each = [packed[index] for index in range(len(task.sites))]
+    for model in each:
+        building = model.modelled
+        TALLIES.building(building.status, building.reason)
+        if building.reason in _LOST:
+            facts = {"building": building.building_id, "tile": building.owner.key, "reason": building.reason}
+            LOG.warning("a building is lost", extra={**facts, "seconds": round(building.seconds, 3)})
+    return Batch(
+        modelled=tuple(model.modelled for model in each),
+        stored={model.modelled.building_id: (model.made_from, model.stored) for model in each},
+    )
+
+
+def stored_results(scratch: Scratch, place: Place) -> list[StoredResult]:
+    """The models of a stored batch. Only for our own scratch: pickles run code."""
+    batch: Batch = result_of(scratch, place)
+    return [pickle.loads(stored) for _, stored in batch.stored.values()]  # noqa: S301
+
+
+def _packed(
+    task: BatchTask,
+    site: CandidateSite,
+    result: BuildingResult,
+    facts: CandidateFacts,
+    seconds: float,
+    made_from: str = "",
+    *,
+    reused: bool = False,
+) -> Packed:
+    modelled = Modelled(
+        building_id=result.building_id,
+        owner=site.owner,
+        status=result.status.value,
+        reason=None if result.reason is None else result.reason.value,
+        roof_type=result.roof_type.value,
+        faces=len(result.faces),
+        points=result.n_points,
+        seconds=seconds,
+        reused=reused,
+    )
+    own = task.own.get(site.building_id)
+    facts = dataclasses.replace(
+        facts,
+        source_attributes=site.source_attributes,
+        overridden=None if site.override is None else site.override.effects,
+        settings_hash=None if own is None else own.settings_hash,
+    )
+    stored = StoredResult(result=result, facts=facts)
+    packed = pickle.dumps(stored, protocol=pickle.HIGHEST_PROTOCOL)
+    return Packed(modelled=modelled, stored=packed, made_from=made_from)
+
+
+def _here(task: BatchTask) -> Iterator[tuple[int, Packed]]:
+    """Models made in this process: one that runs out of memory becomes a record, one that crashes ends all."""
+    for index, site in enumerate(task.sites):
+        task.scratch.check_cancelled()
+        try:
+            packed = model_site(task, site)
+        except MemoryError as error:
+            detail = f"memory ran out: {error}".removesuffix(": ")
+            result = failed_site(site, task.way_of(site).method, Reason.OUT_OF_MEMORY, detail)
+            packed = _packed(task, site, result, CandidateFacts(), 0.0)
+        yield index, packed
+
+
+def _in_child(task: BatchTask, limits: IsolationLimits) -> Iterator[tuple[int, Packed]]:
+    """Models made in a supervised child process, so that a building can only harm itself."""
+    common = dataclasses.replace(task, sites=())
+    cancelled = functools.partial(_cancelled, task)
+    work = functools.partial(model_site, common)
+    for index, model in supervise(work, task.sites, limits, cancelled, loads=_loads(task)):
+        if isinstance(model, Loss):
+            yield index, _lost(common, task.sites[index], model, limits, cancelled)
+        else:
+            yield index, model
+
+
+def _loads(task: BatchTask) -> tuple[str, ...]:
+    """What a child loads before it works on the task: only its methods, since each costs a tenth of a second."""
+    methods = dict.fromkeys((task.method, *(own.method for own in task.own.values())))
+    return tuple(f"{__name__}:load_once:{method}" for method in methods)
+
+
+def _cancelled(task: BatchTask) -> bool:
+    return task.scratch.cancelled
+
+
+def model_site(task: BatchTask, site: CandidateSite) -> Packed:
+    """One candidate's model; a fault of the candidate becomes its record.
+
+    Raises
+    ------
+    MemoryError
+        Memory ran out; alone in a fresh process the candidate may succeed.
+    OSError, GableworkError
+        Scratch cannot be read, or the settings are wrong: a fault of the run, not of the candidate.
+    """
+    from pipeline.reconstruct import reconstruct_building  # loads all methods, which the driver does not need
+
+    task = task.way_of(site)
+    if task.compared:
+        # a child that used another method has not loaded this one, which would count as time of its first building
+        load_once(task.method)
+    started = time.perf_counter()
+    candidate: Candidate | None = None
+    facts = CandidateFacts()
+    made_from = ""
+    reused = False
+    try:
+        candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, beside=task.settings.roof.at_walls)
+        made_from = key_of(candidate, task.method, _settings_key(task.settings))
+        earlier = _modelled_before(task, site.building_id, made_from)
+        reused = earlier is not None
+        result = earlier or reconstruct_building(candidate, task.method, task.settings)
+    except (MemoryError, OSError, GableworkError):
+        raise
+    except Exception as error:  # noqa: BLE001 - becomes the record
+        result = failed_site(site, task.method, Reason.INTERNAL_ERROR, f"{type(error).__name__}: {error}")
+    seconds = time.perf_counter() - started
+    if result.reason is Reason.INTERNAL_ERROR:
+        incident = Incident(reason=result.reason.value, detail=result.reason_detail, seconds=seconds)
+        result = _quarantined(task, candidate, result, incident)
+        made_from = ""
+    return _packed(task, site, result, facts, seconds, made_from, reused=reused)
+
+
+@functools.lru_cache(maxsize=8)
+def _settings_key(settings: ReconstructSettings) -> str:
+    """Digest of settings, cached since most buildings of a batch share them."""
+    return key_of(settings)
+
+
+def _modelled_before(task: BatchTask, building_id: str, made_from: str) -> BuildingResult | None:
+    """The model that an earlier batch made of the same input by the same settings; None where there is none."""
+    for place in task.earlier:
+        known, stored = _batch_of(task.scratch, place).get(building_id, ("", b""))
+        if known == made_from:
+            found: StoredResult = pickle.loads(stored)  # noqa: S301 - our own scratch
+            return found.result
+    return None
+
+
+@functools.lru_cache(maxsize=8)
+def _batch_of(scratch: Scratch, place: Place) -> Mapping[str, tuple[str, bytes]]:
+    """The models of an earlier batch; none where it has been removed since."""
+    try:
+        batch: Batch = result_of(scratch, place)
+    except RunCancelledError:
+        scratch.check_cancelled()
+        return {}
+    return batch.stored
+
+
+def _lost(
+    task: BatchTask, site: CandidateSite, loss: Loss, limits: IsolationLimits, cancelled: Callable[[], bool]
+) -> Packed:
+    """The record and the bundle of a building that ended its process; also made in a child."""
+    patient = dataclasses.replace(limits, timeout_s=max(limits.timeout_s, _BUNDLE_TIMEOUT_S))
+    describe = functools.partial(lost_site, task, loss)
+    ((_, described),) = supervise(describe, [site], patient, cancelled, second_chance=False, loads=_loads(task))
+    if not isinstance(described, Loss):
+        return described
+    detail = f"{loss.detail}; {_NO_BUNDLE}: {described.detail}"
+    result = failed_site(site, task.way_of(site).method, loss.reason, detail)
+    return _packed(task, site, result, CandidateFacts(), loss.seconds)
+
+
+def lost_site(task: BatchTask, loss: Loss, site: CandidateSite) -> Packed:
+    """The record of a building that ended its process, and its bundle in the quarantine.
+
+    Raises
+    ------
+    MemoryError, OSError
+        Its points cannot be gathered.
+    """
+    from pipeline.reconstruct import failed_building  # as above
+
+    task = task.way_of(site)
+    candidate, facts = gather(task.scratch, task.grid, site, task.gps_kind, beside=task.settings.roof.at_walls)
+    result = failed_building(candidate, task.method, loss.reason, loss.detail)
+    incident = Incident(
+        reason=loss.reason.value,
+        detail=loss.detail,
+        seconds=loss.seconds,
+        memory_bytes=loss.memory_bytes,
+        stderr=loss.stderr,
+    )
+    return _packed(task, site, _quarantined(task, candidate, result, incident), facts, loss.seconds)
+
+
+def _quarantined(
+    task: BatchTask, candidate: Candidate | None, result: BuildingResult, incident: Incident
+) -> BuildingResult:
+    """Write the bundle of a building; its result, which mentions a bundle that could not be written."""
+    if not task.quarantine:
+        return result
+    if candidate is None:
+        return dataclasses.replace(result, reason_detail=f"{result.reason_detail}; {_NO_BUNDLE}")
+    bundle = Bundle(
+        candidate=candidate,
+        method=task.method,
+        settings=task.settings,
+        incident=incident,
+        reference=task.reference,
+    )
+    try:
+        write_bundle(task.quarantine, bundle)
+    except (OSError, RunError) as error:
+        why = (error.strerror if isinstance(error, OSError) else None) or error
+        detail = f"{result.reason_detail}; there is no bundle: {why}"
+        return dataclasses.replace(result, reason_detail=detail)
+    return result
+
+
+def failed_site(site: CandidateSite, method: str, reason: Reason, detail: str) -> BuildingResult:
+    """The record of a candidate whose points could not be gathered."""
+    return BuildingResult(
+        building_id=site.building_id,
+        origin=(0.0, 0.0, 0.0),
+        source_id=site.source_id,
+        status=Status.FAILED,
+        reason=reason,
+        reason_detail=detail,
+        method=method,
+        roof_type=RoofType.NONE,
+        lod="",
+        footprint=site.footprint,
+        planes=(),
+        faces=(),
+        solids=(),
+        validity_codes=(),
+        ground_z_m=math.nan,
+        n_points=site.points,
+        density_per_m2=math.nan,
+        rmse_m=math.nan,
+        p95_m=math.nan,
+        coverage=0.0,
+        touches_data_edge=False,
+    )
+
+
+def model_bundle(bundle: Bundle) -> BuildingResult:
+    """The building of a bundle, modelled again; raises MemoryError where memory runs out."""
+    from pipeline.reconstruct import reconstruct_building  # as above
+
+    return reconstruct_building(bundle.candidate, bundle.method, bundle.settings)
+
+
+@functools.cache
+def load_once(method: str) -> None:
+    """Load what modelling by one method needs, once per process."""
+    load(method)
+
+
+def load(*methods: str) -> None:
+    """Load the libraries and compiled kernels for modelling, by modelling roofs of many and of few points.
+
+    Parameters
+    ----------
+    *methods : str
+        Their names; all methods by default.
+    """
+    from pipeline.reconstruct import reconstruct_building  # as above
+
+    lattice = np.arange(-4.5, 15.0)
+    east, north = (axis.ravel() for axis in np.meshgrid(lattice, lattice, indexing="ij"))
+    outline = shapely.box(0.0, 0.0, 16.0, 10.0)  # partly without points, which only given outlines can be
+    for spacing_m, slope, footprint in ((0.5, 0.6, None), (0.5, 0.0, outline), (1.0, 0.6, None)):
+        places = np.arange(0.5 * spacing_m, 10.0, spacing_m)
+        x, y = (axis.ravel() for axis in np.meshgrid(places, places, indexing="ij"))
+        candidate = Candidate(
+            building_id="",
+            origin=(0.0, 0.0, 0.0),
+            points=np.rint(np.column_stack((x, y, 9.0 - slope * np.abs(y - 5.0))) * 1e3) / 1e3,
+            ground=np.column_stack((east, north, np.zeros(len(east)))),
+            ground_z_m=0.0,
+            footprint=footprint,
+        )
+        for method in methods or METHODS:
+            reconstruct_building(candidate, method, ReconstructSettings())

@@ -1,0 +1,121 @@
+"""Sites: where the points of candidates and of rejected objects lie in scratch."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+
+from shapely import MultiPolygon, Polygon
+
+from pipeline.runtime.overrides.overrides_file import Override
+from pipeline.terrain.candidates import Verdict
+from pipeline.tiling import MM, Tile, TileGrid, Window
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
+class PointRange:
+    """A run of points in the sorted points of one tile."""
+
+    tile: Tile
+    start: int
+    stop: int
+    folder: str = "tiles"
+    """Folder of the scratch that holds the tile's points."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
+class CandidateSite:
+    """Where the points of one candidate lie."""
+
+    building_id: str
+    """As in the records."""
+    owner: Tile
+    """The tile of its smallest point, which publishes it."""
+    ranges: tuple[PointRange, ...]
+    """Its points in scratch."""
+    points: int
+    """Number of its points."""
+    footprint: Polygon | MultiPolygon | None = None
+    """Given footprint in metres; None where none was given."""
+    source_id: str | None = None
+    """Its own id."""
+    source_attributes: str | None = None
+    """The given footprint's columns as the text of a JSON object; None where none was given."""
+    block: str | None = None
+    """The id of the candidate from which the unit was divided; None where it was not divided."""
+    outline: MultiPolygon | None = None
+    """Its part of the outline drawn around touching units, in metres; None where it touches no other unit."""
+    override: Override | None = None
+    """The override of this building, as far as it took effect; None where there is none."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
+class RejectedSite:
+    """An object that was judged not to be a building."""
+
+    object_id: str
+    """Made like a building_id."""
+    owner: Tile
+    """The tile of its smallest point."""
+    verdict: Verdict
+    """Why."""
+    box_mm: tuple[int, int, int, int]
+    """xmin, ymin, xmax, ymax of its facets."""
+    area_m2: float
+    """Plan area of its facets."""
+    height_m: float
+    """Mean height above the terrain."""
+    points: int
+    """Number of its points."""
+    ranges: tuple[PointRange, ...] = ()
+    """Its points in scratch, should an override accept it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Joined:
+    """The candidates of a run."""
+
+    candidates: tuple[CandidateSite, ...]
+    """Largest first, then by id."""
+    rejected: tuple[RejectedSite, ...]
+    """By id."""
+    small_fragments: int
+    """Surfaces below the size of an object: counted, not listed."""
+    keys: Mapping[Tile, str] = dataclasses.field(default_factory=dict)
+    """Digest of what lies in and around each tile: equal where later stages see no difference."""
+
+    def around(self, sites: Sequence[CandidateSite], grid: TileGrid) -> list[str]:
+        """Digests of what lies in and around the tiles of some candidates."""
+        tiles = {part.tile for site in sites for part in site.ranges}
+        for site in sites:
+            for area in (site.footprint, site.outline):
+                if area is not None and not area.is_empty:
+                    x0, y0, x1, y1 = (round(value * MM) for value in area.bounds)
+                    tiles.update(grid.tiles_over(Window(x0_mm=x0, y0_mm=y0, x1_mm=x1 + 1, y1_mm=y1 + 1)))
+        return [self.keys.get(tile, "") for tile in sorted(tiles)]
+
+
+def object_id(crs_name: str, lowest_point_mm: Sequence[int]) -> str:
+    """Identity of an object: base32 of a sha256 over the CRS and its lexicographically smallest point in mm.
+
+    >>> object_id("EPSG:28992", (84900123, 447500000, 7000))
+    'gjjf4vlm6iovpli7yu4hjko4'
+    """
+    text = f"{crs_name}|{lowest_point_mm[0]}|{lowest_point_mm[1]}|{lowest_point_mm[2]}"
+    digest = hashlib.sha256(text.encode()).digest()
+    return base64.b32encode(digest[:15]).decode().lower()
+
+
+def by_owner(sites: Sequence[CandidateSite]) -> dict[Tile, list[CandidateSite]]:
+    """Candidates by the tile that publishes them, in their order."""
+    found: dict[Tile, list[CandidateSite]] = {}
+    for site in sites:
+        found.setdefault(site.owner, []).append(site)
+    return found
+
+
+def largest_first(sites: Iterable[CandidateSite]) -> tuple[CandidateSite, ...]:
+    """Candidates by their number of points, then by id."""
+    return tuple(sorted(sites, key=lambda site: (-site.points, site.building_id)))
