@@ -18,8 +18,10 @@ from pipeline.roof.partition import RoofPartition
 from pipeline.roof.solid import SolidPart, solid_parts
 
 _MIN_HEIGHT_M = 0.1
+"""Height of the lowest block: it must be a solid."""
 _DRAWN_BACK_MM = (2.0, 20.0, 100.0)
 _SHARES_OF_TOLERANCE = (0.0, 0.5, 1.0)
+"""Forms of an outline that touches itself, the nearest to it first."""
 
 
 def block_plane(points: FloatArray, ground_z_m: float, percentile: float) -> Plane:
@@ -51,8 +53,8 @@ def block_forms(
 ) -> Iterator[Callable[[], list[SolidPart]]]:
     """Ways to draw one block for every part of a footprint, the nearest to it first.
 
-    First on the very footprint; then opened by a few centimetres where it pinches, drawn back so far that parts and
-    holes do not touch, more and more simplified; in the last resort on its convex hull.
+    First on the footprint itself; then opened by a few centimetres where it pinches, drawn back until parts and holes
+    do not touch, more and more simplified; at last on its convex hull.
 
     Parameters
     ----------

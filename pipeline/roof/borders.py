@@ -3,7 +3,7 @@
 The borders of a partition are arcs between nodes, where three or more borders meet. An arc is cut into runs; one along
 which the two planes cross takes their line of intersection, another the line of least squares through it, turned to
 the building's dominant direction where it is near. Nodes move to where their lines meet, along the outline where they
-lie on it. What breaks is put back arc by arc: the result is a coverage again.
+lie on it. Arcs of broken faces are put back: the result is a coverage again.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import RoofSettings
 
 _ROUNDS = 4
+"""Most rounds in which arcs of broken faces are put back; then nothing is straightened."""
 _MERGE = 1.3
 """Runs are one while a single line passes within this many tolerances of all their vertices."""
 _MIN_SLOPE = 0.05
-"""Planes whose slopes differ by less cross nowhere exactly."""
+"""Planes whose slopes differ by less cross nowhere exactly: their noise moves the line."""
 
 
 @dataclasses.dataclass

@@ -22,11 +22,12 @@ from pipeline.roof.lines import Point, Run, corners, merge, split
 from pipeline.roof.settings import RoofSettings
 
 _FACTORS = (1.0, 0.6, 0.35)
-"""Times the tolerance: what cannot be drawn with few lines is tried with more."""
-
+"""Multiples of the tolerance: a ring that cannot be drawn with few lines is tried with more."""
 _FIRST_SHARE = 0.4
 _OTHER_SHARE = 0.2
+"""Least share of the squared lengths for a dominant direction: see `dominant_directions`."""
 _SURELY_SQUARE = math.radians(2.0)
+"""A long line this near to a dominant direction takes it: its direction is not known better."""
 _MOVED = 0.4
 """Most area between the raw outline and the lines: this part of the tolerance times the outline's length."""
 
@@ -45,7 +46,7 @@ def straighten(
     settings : RoofSettings
         `eave_tolerance_spacings`, `square_within_deg`.
     points : EdgePoints, optional
-        The roof points. With them every line long enough is put where they tell that the edge is, and the outline is
+        The roof points. With them every line that is long enough moves to the edge that they show, and the outline is
         drawn back by what mixed pulses add; without them lines stay amid the raw zigzag.
 
     Returns
@@ -90,7 +91,7 @@ def _drawn_back(outline_mm: MultiPolygon, reach_mm: float) -> MultiPolygon:
 def _straight_rings(
     polygon: Polygon, spacing_m: float, settings: RoofSettings, points: EdgePoints | None, reach_mm: float
 ) -> list[FloatArray]:
-    """The rings of one part with straight lines; a ring that will not be drawn so stays raw."""
+    """The rings of one part with straight lines; a ring that cannot be drawn so stays raw."""
     borders = _rings(polygon)
     rings: list[FloatArray | None] = [None] * len(borders)
     within = math.radians(settings.square_within_deg)
@@ -163,7 +164,7 @@ def _take_directions(runs: Sequence[Run], dominant: Sequence[float], within: flo
 
 
 def _take_positions(ring: FloatArray, runs: Sequence[Run], points: EdgePoints, reach_mm: float) -> None:
-    """Move runs to where the points along them put the edge; those too short to tell stay."""
+    """Move runs to where the points along them put the edge; runs that are too short stay."""
     for run in runs:
         shift = outward_shift_mm(ring, run, points, reach_mm)
         if shift is not None:

@@ -1,17 +1,16 @@
 """Where the edge of a roof lies, from the points along it.
 
 The outermost points of a sampled edge lie within it. In strips square to the edge the way from the outermost point of a
-strip to the edge is distributed as the way from any line within the roof to the next point inwards: an edge knows
-nothing of the points. That way follows from the distances V of successive points in the strips, as the age of a renewal
-process does: its mean is E[V^2] / (2 E[V]) (Cox 1962), half a distance where the points are regular, a whole one where
-they are strewn at random. So the correction follows the density, the pattern and its direction, measured at the edge
-itself.
+strip to the edge is distributed as the way from any line within the roof to the next point inwards: edge and points are
+independent. That way follows from the distances V of successive points in the strips, as the age of a renewal process:
+its mean is E[V^2] / (2 E[V]) (Cox 1962), half a distance where the points are regular, a whole one where they are
+random. So the correction follows the density, the pattern and its direction, measured at the edge itself.
 
-What is sampled so is the roof as the scanner sees it: larger than the roof, since a pulse that meets it with a part of
-its beam gives a point of the roof too. Such a pulse goes on and comes back from below as well, and that tells it: split
-pulses lie on a band along the edge as wide to the outside as to the inside. Their number over the length of the edge
-and the density of the points is the width of the band; half of it is the reach of the mixed pulses, by which the edge
-is drawn back. Where the returns are not told, nothing is drawn back.
+The points sample the roof as the scanner sees it, which is larger than the roof: a pulse that meets it with a part of
+its beam also gives a point of the roof. Such a pulse goes on and comes back from below as well, which identifies it:
+split pulses lie in a band along the edge, as wide outside as inside. Their number, over the length of the edge and the
+density of the points, is the width of the band; half of it is the reach of the mixed pulses, by which the edge is drawn
+back. Nothing is drawn back where the file does not record the number of returns.
 """
 
 from __future__ import annotations
@@ -37,15 +36,14 @@ _GAP_SPACINGS = 2.5
 """A longer distance is a gap in the roof, not sampling."""
 _PRIOR_COUNT = 8.0
 _PRIOR_AGE = 0.75
-"""What is expected of a few distances, in mean distances: between a lattice (0.5) and strewn points (1)."""
+"""Prior for few distances, in mean distances: between a lattice (0.5) and random points (1)."""
 _LONGEST_REACH_M = 0.5
 _BAND_SPACINGS = 0.25
-"""Split pulses are taken for an edge's own up to twice the longest reach within what is seen of the roof, and what the
-line may be off by."""
+"""Split pulses belong to an edge up to twice the longest reach within the visible roof, plus the error of the line."""
 _PRIOR_SPLITS = 4.0
-"""So many split pulses must be expected on an edge before its own count stands above the whole building's."""
+"""With this many expected split pulses an edge's own count weighs as much as that of the whole building."""
 _STRAY_AGES = 4.0
-"""A strip whose outermost point lies this many mean ways off the median strip is not of this edge."""
+"""A strip whose outermost point lies this many mean ways off the median strip does not belong to this edge."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -76,7 +74,7 @@ class EdgePoints:
         xy_mm : (n, 2) int64
             At least one point, millimetres.
         split : (n,) bool
-            True where the pulse went on to a lower return; all False where the file does not tell.
+            True where the pulse went on to a lower return; all False where the file does not record it.
         spacing_m : float
             Typical distance of neighbours.
         """
@@ -99,7 +97,7 @@ class EdgePoints:
 
     @property
     def band_mm(self) -> float:
-        """How far within a line split pulses are taken for those of its edge."""
+        """How far within a line split pulses belong to its edge."""
         return 2e3 * _LONGEST_REACH_M + _BAND_SPACINGS * self.spacing_mm
 
     def along(self, run: Run, first_mm: float, last_mm: float) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -146,7 +144,7 @@ def mixed_pulse_reach_mm(outline_mm: shapely.Geometry, points: EdgePoints) -> fl
     border = simple.boundary
     shapely.prepare(border)
     near = shapely.dwithin(border, shapely.points(points.xy_mm[points.split].astype(np.float64)), points.band_mm)
-    # split pulses are also those at chimneys and skylights: as many an area along the edge as amid the roof
+    # chimneys and skylights split pulses too: as many per area along the edge as amid the roof
     middle_mm2 = shapely.buffer(simple, -points.band_mm).area
     usual = int((~near).sum()) / middle_mm2 if middle_mm2 > 0.0 else 0.0
     count = int(near.sum()) - usual * (simple.area - middle_mm2)
@@ -173,8 +171,8 @@ def outward_shift_mm(border: FloatArray, run: Run, points: EdgePoints, reach_mm:
     -------
     float or None
         Millimetres, negative inwards: the mean over the strips of the outermost point's place, plus the mean way from
-        there to the edge, less the reach of the mixed pulses. None where the stretch is too short to tell, or has too
-        few points.
+        there to the edge, less the reach of the mixed pulses. None where the stretch is too short, or has too few
+        points.
     """
     spacing = points.spacing_mm
     ux, uy = math.cos(run.direction), math.sin(run.direction)
@@ -207,7 +205,7 @@ def outward_shift_mm(border: FloatArray, run: Run, points: EdgePoints, reach_mm:
 
 
 def _own_reach(off: FloatArray, split: BoolArray, points_a_mm: float, band_mm: float, reach_mm: float) -> float:
-    """The reach of mixed pulses at one edge, from its split pulses and those expected of the whole building's reach."""
+    """The reach of mixed pulses at one edge, from its split pulses and the reach of the whole building, millimetres."""
     if reach_mm <= 0.0:
         return 0.0
     near = np.abs(off) <= band_mm

@@ -1,14 +1,14 @@
 """Outlines at the facades: the eaves drawn back to where points beneath them put the walls.
 
-A scanner that looks aslant meets walls beneath the eaves. Such facade points lie in one upright sheet along a line of
-the outline, from the ground up to the eave. Where a sheet stands out, the line is moved there. Walls that look away
-from the scanner have none: a line with open ground before it is then drawn back by the mean overhang of those lines of
-the same outline whose walls are known, by a told usual overhang where none is. A line without open ground before it, as
-along a neighbour, stays.
+An oblique scan meets walls beneath the eaves. Such facade points lie in one upright sheet along a line of the outline,
+from the ground up to the eave. Where a sheet stands out, the line is moved there. Walls that face away from the scanner
+have none: a line with open ground before it is then drawn back by the mean overhang of the lines of the same outline
+whose walls are known, else by a usual overhang from the settings. A line without open ground before it, as along a
+neighbour, stays.
 
-A pulse that was split at the eave met the wall with that part of its beam that passed the edge, but its last return is
-told on the axis of the beam: too far inside, by about the reach of the mixed pulses. So last of several returns are
-moved outwards by that reach before a sheet is looked for.
+A pulse that was split at the eave met the wall with the part of its beam that passed the edge, but its last return is
+recorded on the axis of the beam: too far inside, by about the reach of the mixed pulses. Therefore the last of several
+returns are moved outwards by that reach before a sheet is looked for.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.roof.footprint import polygons_of
 from pipeline.roof.lines import Run, corners
 
+# The thresholds below describe what walls, eaves and their surroundings look like in a survey; `outline = "walls"` is
+# one switch, and they are not known for a tile.
 _MIN_LENGTH_M = 2.0
 """A shorter line takes the mean overhang."""
 _STRIP_M = 1.0
@@ -37,13 +39,13 @@ _END_M = 0.3
 _WIDEST_M = 1.0
 """The widest overhang."""
 _OUTSIDE_M = 0.5
-"""Points as far outside the eave are looked at too: where most are there, they are plants and no wall."""
+"""Points as far outside the eave are looked at too: where most are there, they are plants, not a wall."""
 _SHEET_M = 0.3
 """Thickness of a facade with its reliefs, as several strips of a survey show it."""
 _UNDER_EAVE_M = 0.5
 """Gutters and soffits hang no lower."""
 _ABOVE_GROUND_M = 1.0
-"""What lies lower are steps, fences and bonnets."""
+"""Lower points are steps, fences and cars."""
 _SPREAD_M = 1.5
 """Least height of a sheet."""
 _FEWEST = 8
@@ -57,22 +59,23 @@ _SLACK_M = 0.1
 _BEFORE_M = (0.2, 1.5)
 """Where open ground before a line is looked for."""
 _OPEN_HEIGHT_M = 1.5
-"""Points as low above the terrain are of open ground."""
+"""Points as low above the terrain are open ground."""
 _OPEN_SHARE = 0.5
 """Least share of the strips with such points."""
 _CORNER_REACH_M = 2.0
 """Lines that meet farther than this from their corner at the eaves are joined by a step there."""
 _MAX_MOVED = 1.5
-"""Most area between eaves and walls: so many times what the lines sweep."""
+"""Most area between eaves and walls, as a multiple of what the lines sweep."""
 _ROUNDING_MM2 = 1e4
+"""Added to it: what rounding to 1 mm changes along 10 m."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FacadePoints:
-    """What tells of the walls beneath a roof."""
+    """Points that may show the walls beneath a roof."""
 
     xyz: FloatArray
-    """(n, 3) float64, points around and beneath the roof, none of its own, local metres."""
+    """(n, 3) float64, points around and beneath the roof, without its own, local metres."""
     height_m: FloatArray
     """(n,) float64, theirs above the terrain."""
     later: BoolArray
@@ -100,7 +103,7 @@ class FacadePoints:
         ground : (j, 3) float64
             The terrain at the middles of cells of 1 m, local metres.
         ground_z_m : float
-            The terrain where no cell tells.
+            The terrain where there is no cell.
         """
         xyz = np.concatenate((single, later))
         cells, wanted = _cells(ground), _cells(xyz)
@@ -134,20 +137,20 @@ class Eave:
     length_m: float
     """From corner to corner."""
     is_open: bool
-    """Whether open ground lies before it; taken for granted of a short line."""
+    """Whether open ground lies before it; assumed for a short line."""
     overhang_m: float | None
-    """How far inside the line its wall stands; None where no sheet of points tells."""
+    """How far inside the line its wall is; None where there is no sheet of points."""
 
 
 def eave_of(start: FloatArray, end: FloatArray, points: FacadePoints, reach_m: float) -> Eave:
-    """What the points tell of the wall beneath one line of an outline.
+    """The wall beneath one line of an outline, as far as points show it.
 
     Parameters
     ----------
     start, end : (2,) float64
         Ends of the line, local metres, the roof on its left.
     points : FacadePoints
-        Of the building.
+        Those of the building.
     reach_m : float
         Reach of the mixed pulses, see `mixed_pulse_reach_mm`.
 
@@ -192,7 +195,7 @@ def eave_of(start: FloatArray, end: FloatArray, points: FacadePoints, reach_m: f
 
 
 def _overhang_of_sheet(off: FloatArray, strip: IntArray, z: FloatArray, strips: int) -> float | None:
-    """How far inside a line the sheet stands that holds most of the points; None where it is none.
+    """How far inside a line the sheet with most of the points is; None where it is not a wall.
 
     `off` is the points' distance to the right of the line, `strip` where along it they are.
     """
@@ -227,7 +230,7 @@ def at_walls(outline_mm: MultiPolygon, points: FacadePoints, reach_m: float, usu
     outline_mm : MultiPolygon
         At the eaves, with straight lines, integer millimetres.
     points : FacadePoints
-        What tells of the walls.
+        Points that may show the walls.
     reach_m : float
         Reach of the mixed pulses, see `mixed_pulse_reach_mm`.
     usual_m : float

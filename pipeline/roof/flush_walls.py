@@ -12,23 +12,15 @@ from pipeline.model import FaceKind, FloatArray, Solid, SolidFace
 from pipeline.roof.solid import SolidPart
 
 _FLUSH_M = 1.5e-3
-"""Farthest that a corner may lie from the line of its neighbours: what rounding to 1 mm does to a point on it."""
+"""Largest distance of a corner from the line of its neighbours: rounding to 1 mm moves a point on it as far."""
 
 Ring = tuple[int, ...]
 
 
 def unite_flush_walls(part: SolidPart) -> SolidPart:
-    """Unite neighbouring outer walls that lie in one plane, and drop the corner of the floor between them.
+    """Unite neighbouring outer walls of a closed solid that lie in one plane, and drop the floor's corner between them.
 
-    Parameters
-    ----------
-    part : SolidPart
-        A closed solid.
-
-    Returns
-    -------
-    SolidPart
-        The same solid with fewer walls and vertices; as it was where no two walls are flush.
+    The same object comes back where no two walls are flush.
     """
     solid = part.solid
     faces = list(solid.faces)

@@ -1,4 +1,4 @@
-"""Footprints: what is given is cleaned, what is missing is drawn around the roof."""
+"""Footprints: given ones are cleaned, outlines of partitions are drawn, partitions are clipped."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from pipeline.model import FloatArray, IntArray, Reason
 from pipeline.roof.partition import RoofPartition
 
 _REPEATED_MM = 10.0
+"""Vertices this near to the one before repeat it: below the accuracy of any footprint."""
 _STRAIGHT_MM = 1.5
 """Vertices this near to the line through their neighbours are not corners."""
 _ROUND_MM = (5.0, 20.0)
-"""How far the simpler forms of an outline with many short edges go from it."""
+"""How far simpler forms of an outline with many short edges deviate from it; measured in docs/methods/solids.md."""
 
 
 def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
@@ -55,7 +56,7 @@ def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
 
 
 def _has_repeated(polygons: list[Polygon], distance_mm: float) -> bool:
-    """Whether a vertex is as near to the one before it."""
+    """Whether a vertex is within a distance of the one before it."""
     xy, ring = shapely.get_coordinates(shapely.get_rings(polygons), return_index=True)
     steps = xy[1:] - xy[:-1]
     squares = steps[:, 0] * steps[:, 0] + steps[:, 1] * steps[:, 1]
@@ -63,7 +64,7 @@ def _has_repeated(polygons: list[Polygon], distance_mm: float) -> bool:
 
 
 def without_repeated(polygon: Polygon, distance_mm: float) -> list[Polygon]:
-    """The polygon without vertices that repeat the one before; holes that vanish go, and so does the whole."""
+    """The polygon without repeated vertices and vanishing holes; an empty list where it vanishes itself."""
     paths, number = shapely.get_coordinates(shapely.get_rings(polygon), return_index=True)
     thinned = shapely.remove_repeated_points(shapely.linestrings(paths, indices=number), distance_mm)
     rings = [shapely.get_coordinates(line) for line in thinned]
@@ -75,19 +76,11 @@ def without_repeated(polygon: Polygon, distance_mm: float) -> list[Polygon]:
 def simpler_outlines(outline_mm: MultiPolygon) -> Iterator[MultiPolygon]:
     """Outlines of fewer vertices: without those within 5 mm of the line between others, then within 20 mm.
 
-    Over the edge of a round tower, drawn with edges of a decimetre, the corners of a sloping roof rise and fall by less
-    than the millimetre that heights are rounded to: triangles of such corners point anywhere. With fewer corners they
-    do not. Those that are left between two chords go outward to where these enclose the area of the arc between them.
+    The corners of a sloping roof over a round tower, drawn with edges of a decimetre, rise and fall by less than the
+    rounding of heights to 1 mm: triangles of such corners point anywhere. With fewer corners they do not. The vertices
+    left between two chords move outward until these enclose the area of the arc between them.
 
-    Parameters
-    ----------
-    outline_mm : MultiPolygon
-        Valid, integer millimetres.
-
-    Yields
-    ------
-    MultiPolygon
-        Valid, integer millimetres. None where it would have the same vertices, or as many as the one before.
+    All outlines are valid, in integer millimetres; one with as many vertices as the one before is not yielded.
     """
     count = shapely.get_num_coordinates(outline_mm)
     oriented = shapely.orient_polygons(outline_mm)
@@ -119,8 +112,8 @@ def _rings_of_area(before: Polygon, after: Polygon) -> tuple[FloatArray, list[Fl
 def _of_same_area(ring: FloatArray, kept: FloatArray) -> FloatArray:
     """Some vertices of a ring, moved outward (to its right) or inward by the areas that their edges cut off.
 
-    Vertices between two edges of the ring itself stay where they are, and so do those at its corners of 90 degrees and
-    more; those of one arc move alike.
+    Vertices between two edges of the ring itself stay, and so do those at its corners of 90 degrees and more; those of
+    one arc move by the same distance.
     """
     number = {xy: k for k, xy in enumerate(map(tuple, ring.tolist()))}
     first = [number[xy] for xy in map(tuple, kept.tolist())]
@@ -225,8 +218,8 @@ def _absorb_small(pieces: list[Polygon], labels: list[int], min_area_mm2: float)
 def outline(partition: RoofPartition) -> MultiPolygon:
     """The area of a partition in integer millimetres.
 
-    Also of one in which rounding to millimetres let a border cross itself: such a partition makes no solid, but has an
-    outline all the same.
+    It may have a border that crosses itself since it was rounded: such a partition cannot become a solid, but has an
+    outline.
     """
     polygons = np.array(partition.polygons, dtype=object)
     if shapely.is_valid(polygons).all():

@@ -10,10 +10,12 @@ from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 
 _MAX_CELLS = 4_000_000
+"""Of a raster: bounds the memory for points strewn over a wide area."""
 _FARTHEST = 2**63 - 1
-
+_CONTINUATIONS = 12
+"""Most rounds of `continue_crossings`: labels spread by one vertex per round, over gaps of a few."""
 SAME_ROOF_M = 0.15
-"""Planes that differ by less than this at a point are equally good for it."""
+"""Planes that differ by less than this at a point are equally good for it: within the noise of points and planes."""
 
 
 @kernel
@@ -32,7 +34,7 @@ def _bucket(x: IntArray, y: IntArray, cell: int) -> tuple[LabelArray, LabelArray
 
 @kernel
 def _filled_beside(starts: LabelArray, columns: int, rows: int) -> tuple[LabelArray, LabelArray]:
-    """Of every cell the first column from it on, to the west and to the east, whose cell holds points; -1 for none."""
+    """The nearest column to the west and to the east of every cell, itself included, that holds points; -1 for none."""
     west, east = np.full(columns * rows, -1, np.int32), np.full(columns * rows, -1, np.int32)
     for r in range(rows):
         before, after = -1, -1
@@ -49,7 +51,7 @@ def _filled_beside(starts: LabelArray, columns: int, rows: int) -> tuple[LabelAr
 
 @kernel
 def _nearest(x: IntArray, y: IntArray, query_x: IntArray, query_y: IntArray, cell: int) -> tuple[LabelArray, IntArray]:
-    """The nearest point of every query and its squared distance; ties by index."""
+    """The nearest point of every query (q,) and its squared distance, mm2; the lowest of equally near ones."""
     starts, order, columns, rows, low_x, low_y = _bucket(x, y, cell)
     west, east = _filled_beside(starts, columns, rows)
     n = len(query_x)
@@ -97,7 +99,7 @@ def _nearest(x: IntArray, y: IntArray, query_x: IntArray, query_y: IntArray, cel
 
 
 def _cell_size(xy_mm: IntArray) -> int:
-    """Cell in mm that holds about two points, and not more than the allowed cells in all."""
+    """Side in mm of a cell that holds about two points, without exceeding `_MAX_CELLS`."""
     width, depth = (int(v) + 1 for v in xy_mm.max(axis=0) - xy_mm.min(axis=0))
     cell = max(50, int((2.0 * width * depth / len(xy_mm)) ** 0.5))
     while (width // cell + 1) * (depth // cell + 1) > _MAX_CELLS:
@@ -148,7 +150,7 @@ def empty_samples(
 ) -> tuple[IntArray, LabelArray, FloatArray]:
     """Lattice samples around and between the points, where no point is near.
 
-    The lattice hangs on its lower left corner: tied to the points, it moves with them.
+    The lattice starts at its lower left corner, so it moves with the points.
 
     Parameters
     ----------
@@ -248,10 +250,9 @@ def continue_crossings(
 ) -> LabelArray:
     """Labels in which borders of two planes that cross run straight, also where there are no points.
 
-    A place without points, or with a point that no plane explains, has the label of the nearest point that has one;
-    there a ridge would leave its line. Whether two planes meet in a ridge (the lower one is the roof) or a valley (the
-    upper one) is told by the edges between their points; a vertex whose label contradicts it takes the label of the
-    neighbour that does not.
+    A place without points, or with a point that no plane explains, has the label of the nearest labelled point; a ridge
+    would leave its line there. The edges between the points of two planes show whether they meet in a ridge (the lower
+    one is the roof) or a valley (the upper one); a vertex whose label contradicts this takes that of the neighbour.
 
     Parameters
     ----------
@@ -262,7 +263,7 @@ def continue_crossings(
     labels : (n,) int32
         Planes; -1 outside.
     known : (n,) bool
-        True for points whose label comes from the segmentation: they change only where both planes are equally good.
+        True for labels from the segmentation: they change only where both planes are equally good.
     planes : (k, 3) float64
         Coefficients in metres.
 
@@ -276,7 +277,7 @@ def continue_crossings(
     if len(pair_keys) == 0:
         return labels
     k = len(planes)
-    for _ in range(12):
+    for _ in range(_CONTINUATIONS):
         changed = False
         for t in range(len(facets)):
             for e in range(6):

@@ -20,6 +20,7 @@ from pipeline.model import FloatArray
 Point = tuple[float, float]
 
 _PARALLEL = math.sin(math.radians(20.0))
+"""Lines that meet at a smaller angle have no certain corner: their noise moves it by several tolerances."""
 
 
 @dataclasses.dataclass
@@ -42,19 +43,14 @@ class Run:
 
 
 def fitted_run(border: FloatArray, first: int, last: int) -> Run:
-    """The line of least squares through the stretch between two vertices, every piece by its length.
+    """The line of least squares through the stretch between two vertices, every piece weighted by its length.
 
     Parameters
     ----------
     border : (n, 2) float64
-        Vertices; of a closed border the first is not repeated.
+        Vertices; the first of a closed border is not repeated.
     first, last : int
         Indices, `last` greater than `first`; taken modulo n.
-
-    Returns
-    -------
-    Run
-        Not exact.
     """
     x, y, direction, length = _fit(border, first, last)
     return Run(first=first, last=last, x=x, y=y, direction=direction, length=length)
@@ -62,7 +58,7 @@ def fitted_run(border: FloatArray, first: int, last: int) -> Run:
 
 @kernel
 def _fit(border: FloatArray, first: int, last: int) -> tuple[float, float, float, float]:
-    """Centroid, direction and chord of a stretch: second moments of its pieces' middles and of their own extent."""
+    """Centroid x, y, direction and chord of a stretch, from second moments of its pieces' middles and extents."""
     n = len(border)
     x0, y0 = border[first % n, 0], border[first % n, 1]
     total = 0.0
@@ -100,7 +96,7 @@ def _fit(border: FloatArray, first: int, last: int) -> tuple[float, float, float
 
 @kernel
 def _off_line(border: FloatArray, first: int, last: int, x: float, y: float, direction: float) -> float:
-    """Largest distance of a stretch's vertices from a line."""
+    """Largest distance of a stretch's vertices from a line, in the unit of the coordinates."""
     ux, uy = math.cos(direction), math.sin(direction)
     largest = 0.0
     for i in range(first, last + 1):
@@ -115,16 +111,11 @@ def split(border: FloatArray, tolerance: float, *, closed: bool) -> list[Run]:
     Parameters
     ----------
     border : (n, 2) float64
-        Vertices; of a closed border the first is not repeated, and a run starts there.
+        Vertices; the first of a closed border is not repeated, and a run starts there.
     tolerance : float
         In the unit of the coordinates.
     closed : bool
-        Whether the last vertex is joined to the first.
-
-    Returns
-    -------
-    list of Run
-        In order; of a closed border none where it has fewer than three.
+        Whether the last vertex is joined to the first; such a border has at least three runs, or none.
     """
     path = np.vstack((border, border[:1])) if closed else border
     kept = shapely.get_coordinates(shapely.simplify(shapely.linestrings(path), tolerance, preserve_topology=False))
@@ -153,11 +144,6 @@ def merge(border: FloatArray, runs: Sequence[Run], tolerance: float, *, closed: 
         In the unit of the coordinates.
     closed : bool
         Whether the last run is followed by the first; then at least three runs stay.
-
-    Returns
-    -------
-    list of Run
-        In order.
     """
     merged = list(runs)
     least = 3 if closed else 1
@@ -242,7 +228,7 @@ def corners(border: FloatArray, runs: Sequence[Run], reach: float, *, closed: bo
     """Where neighbouring lines meet.
 
     Lines that meet nowhere, or farther than `reach` from the vertex between their runs, are joined there by a short
-    piece square to them. Of a closed border the first corner is that of the last run and the first.
+    piece square to them. The first corner of a closed border is that of the last run and the first.
     """
     pairs = list(itertools.pairwise(runs))
     if closed:

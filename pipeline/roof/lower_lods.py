@@ -2,7 +2,7 @@
 
 LoD1.3 unites roof faces with no step, or a low one, between them, and gives each level part the height at a percentile
 of its points; LoD1.2 is one such part (Biljecki, Ledoux and Stoter 2016, An improved LOD specification for 3D building
-models). Every level stands on the borders of roof faces that are there already, so nothing is cut anew.
+models). Every level part consists of existing roof faces: nothing is cut again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pipeline.roof.solid import SolidPart, solid_parts
 XY = tuple[int, int]
 
 _MAX_FORMS = 8
-"""Of a part's levels; what is not sound then is one level."""
+"""Most ways to draw the levels of a part: bounds the work. Then the part becomes one level."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ class LodParts:
     parts: list[SolidPart]
     """Its separate parts."""
     planes: list[Plane]
-    """What the labels of the parts' faces number."""
+    """The planes that the labels of the parts' faces number."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ def lower_lods(
     lods: Sequence[str],
     is_sound: Callable[[Solid], bool],
 ) -> list[LodParts]:
-    """A building at the levels of detail that are asked for.
+    """A building at the requested levels of detail.
 
     Parameters
     ----------
@@ -140,12 +140,12 @@ def block_forms(part: SolidPart, level: Plane, ground_z_m: float) -> Iterator[Le
 def level_forms(
     part: SolidPart, points: FloatArray, level: Plane, ground_z_m: float, settings: RoofSettings
 ) -> Iterator[LevelPart]:
-    """Ways to draw one part of a building in levels (LoD1.3), the one that is wanted first.
+    """Ways to draw one part of a building in levels (LoD1.3), the best first.
 
-    Roof faces whose common border has a mean step below `level_step_m` belong to one level part, however far this goes
-    on; then neighbouring parts whose heights differ by less, those that differ least first. So neighbours differ by
+    Roof faces whose common border has a mean step below `level_step_m` belong to one level part, transitively; then
+    neighbouring parts whose heights differ by less are united, those that differ least first. So neighbours differ by
     that step at least. Parts without points, and those smaller than `min_part_area_m2`, join the neighbour that
-    differs least. Behind that wanted form come those in which ever more neighbours are joined, up to one level.
+    differs least. In the further forms more and more neighbours are joined, up to one level.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def _heights_over(polygons: Sequence[shapely.Polygon], points: FloatArray) -> li
 
 
 class _Regions:
-    """Groups of roof faces that will be level parts; each is named by its lowest face."""
+    """Groups of roof faces that will be level parts; the number of each is that of its lowest face."""
 
     def __init__(
         self,
@@ -262,7 +262,7 @@ class _Regions:
                     region[face] = into
 
     def unite_closest(self, step_m: float, min_area_m2: float) -> bool:
-        """Unite the two neighbours that ask for it most; False where none does."""
+        """Unite the two neighbours that differ least, small ones first; False if none differ by less than the step."""
         best: tuple[bool, float, int, int] | None = None
         for a, b in self._pairs:
             difference = abs(self._level[a] - self._level[b])
@@ -303,7 +303,7 @@ class _Regions:
 def _drawn(
     regions: Sequence[Sequence[shapely.Polygon]], planes: Sequence[Plane], ground_z_m: float
 ) -> Iterator[LevelPart]:
-    """Level parts as one closed solid: without the vertices that no border needs, then with all."""
+    """Level parts as one closed solid: without idle vertices, then with all."""
     polygons: list[shapely.Polygon] = []
     labels: list[int] = []
     for label, faces in enumerate(regions):

@@ -1,9 +1,9 @@
-"""The plan cut into one piece a roof plane: marching triangles over a labelled TIN.
+"""The plan cut into one piece per roof plane: marching triangles over a labelled TIN.
 
 Every facet is cut into one piece for each label around its vertices: a facet of two labels by one segment between the
 cut points of its two mixed edges, a facet of three by three segments that meet inside it. A cut point lies inside its
-edge and joins exactly two facets, a meeting point joins exactly three pieces, so the pieces cannot overlap and no
-border can pinch (Lorensen and Cline 1987 in the plane, with many labels).
+edge and joins exactly two facets, a meeting point joins exactly three pieces. Therefore pieces cannot overlap and
+borders cannot pinch (Lorensen and Cline 1987 in the plane, with many labels).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -24,7 +25,19 @@ from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason, Tin
 from pipeline.prepared_cloud import SHADING_HEIGHT_M
 
 OUTSIDE = -1
-"""The label of what is no roof."""
+"""The label of places without roof."""
+_ABSORPTIONS = 50
+"""Most rounds in which small regions join a neighbour: a guard, since a round without a change is the last."""
+_MAX_MISFIT_M = 1.0
+"""Points farther from a plane all count as this far: outliers do not decide."""
+_NEAR_END = 0.03
+"""Share of an edge within which a border keeps away from its ends; numerical guard."""
+_JUST_BEYOND = 0.3
+"""A crossing this share of an edge beyond its end still counts as on it: the noise of the planes moves it so far."""
+_PARALLEL = 1e-3
+"""Determinant of three planes' slopes below which they do not meet in one point; numerical guard."""
+_INSIDE_MM = 5.0
+"""How far the meeting point keeps from the sides of its facet; numerical guard."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -36,12 +49,19 @@ class RoofPartition:
     labels: LabelArray
     """(p,) int32, the plane of each polygon."""
     planes: tuple[Plane, ...] | None = None
-    """What the labels number; None for the planes of the segmentation."""
+    """The planes that the labels number; None for those of the segmentation."""
+
+
+class MinAreas(NamedTuple):
+    """Smaller regions of a labelled plan are absorbed; square metres."""
+
+    face_m2: float
+    void_m2: float
 
 
 @kernel
 def connected_regions(facets: LabelArray, labels: LabelArray) -> tuple[LabelArray, int]:
-    """Components of equally labelled vertices along TIN edges, numbered by their lowest vertex."""
+    """Components of equally labelled vertices along TIN edges, (n,) numbered by their lowest vertex; their number."""
     n = len(labels)
     parent = np.arange(n)
     for t in range(len(facets)):
@@ -57,7 +77,7 @@ def connected_regions(facets: LabelArray, labels: LabelArray) -> tuple[LabelArra
 def _region_areas(
     x: IntArray, y: IntArray, facets: LabelArray, regions: LabelArray, count: int, counted: LabelArray
 ) -> FloatArray:
-    """Plan area of every region in m2: a third of each facet to each of its vertices that counts."""
+    """Plan area of every region, (count,) m2: a third of each facet to each of its vertices that counts."""
     areas = np.zeros(count)
     for t in range(len(facets)):
         a, b, c = facets[t, 0], facets[t, 1], facets[t, 2]
@@ -70,27 +90,8 @@ def _region_areas(
 
 
 @kernel
-def absorb_small_regions(
-    x: IntArray,
-    y: IntArray,
-    z: FloatArray,
-    facets: LabelArray,
-    labels: LabelArray,
-    counted: LabelArray,
-    planes: FloatArray,
-    min_area_m2: float,
-    min_void_m2: float,
-) -> LabelArray:
-    """Labels in which no region is smaller than it may be: small ones join a neighbour, smallest first.
-
-    A roof region joins the adjacent plane that fits its points best, a vertex of common border counting for a better
-    fit; the outside only where no plane is adjacent. A small void joins the plane with the longest border.
-    Distances are capped at 1 m. The region of the last vertex, the surroundings, stays.
-    """
-    labels = labels.copy()
-    n_planes = len(planes)
-    n = len(labels)
-    # adjacency of vertices in compressed rows, both directions of every edge (inner edges twice, which does not matter)
+def _adjacency(facets: LabelArray, n: int) -> tuple[LabelArray, LabelArray]:
+    """The neighbours of n vertices in compressed rows: starts (n + 1,) and vertices; those over inner edges twice."""
     corners = np.empty(6 * len(facets), np.int32)
     for t in range(len(facets)):
         for k in range(6):
@@ -99,110 +100,165 @@ def absorb_small_regions(
     for s in range(len(adjacent)):
         t, k = adjacent[s] // 6, adjacent[s] % 6
         adjacent[s] = facets[t, (k // 2 + 1 + k % 2) % 3]
-    border = np.zeros(n_planes + 1, np.int64)
-    for _ in range(50):
+    return starts, adjacent
+
+
+@kernel
+def _best_label(
+    x: IntArray,
+    y: IntArray,
+    z: FloatArray,
+    members: LabelArray,
+    label: int,
+    counted: LabelArray,
+    planes: FloatArray,
+    border: IntArray,
+) -> int:
+    """The label that suits the members of a small region best, from the length of its border with each label plus 1."""
+    total = 0
+    for k in range(len(border)):
+        total += border[k]
+    if total == 0:
+        return label
+    n_members = 0
+    for v in members:
+        n_members += counted[v]
+    best = OUTSIDE
+    best_cost = math.inf
+    for k in range(len(planes)):
+        if border[k + 1] == 0:
+            continue
+        cost = 0.0
+        if label >= 0:
+            for v in members:
+                if counted[v] != 0:
+                    fit = planes[k, 0] * x[v] * 1e-3 + planes[k, 1] * y[v] * 1e-3 + planes[k, 2]
+                    cost += min(abs(z[v] - fit), _MAX_MISFIT_M)
+            cost /= max(1, n_members)
+        cost -= border[k + 1] / total
+        if cost < best_cost:
+            best_cost = cost
+            best = k
+    return best
+
+
+@kernel
+def absorb_small_regions(
+    x: IntArray,
+    y: IntArray,
+    z: FloatArray,
+    facets: LabelArray,
+    labels: LabelArray,
+    counted: LabelArray,
+    planes: FloatArray,
+    min_areas: MinAreas,
+) -> LabelArray:
+    """Labels (n,) in which no region is too small: small ones join a neighbour, smallest first.
+
+    A roof region joins the adjacent plane that fits its points best, where a larger common border counts as a better
+    fit; the outside only if no plane is adjacent. A small void joins the plane with the longest border. The region of
+    the last vertex, the surroundings, stays. `x`, `y` are millimetres, `z` metres, all (n,).
+    """
+    labels = labels.copy()
+    n = len(labels)
+    starts, adjacent = _adjacency(facets, n)
+    border = np.zeros(len(planes) + 1, np.int64)
+    for _ in range(_ABSORPTIONS):
         regions, count = connected_regions(facets, labels)
         areas = _region_areas(x, y, facets, regions, count, counted)
-        first, members = counting_sort(regions, count)
+        first, by_region = counting_sort(regions, count)
         touched = np.zeros(count, np.uint8)
         changed = False
         for r in ascending_order(areas):
-            label = labels[members[first[r]]]
-            if areas[r] >= max(min_area_m2, min_void_m2):
+            if areas[r] >= max(min_areas.face_m2, min_areas.void_m2):
                 break
-            if areas[r] >= (min_void_m2 if label < 0 else min_area_m2) or r == regions[n - 1]:
+            members = by_region[first[r] : first[r + 1]]
+            label = labels[members[0]]
+            if areas[r] >= (min_areas.void_m2 if label < 0 else min_areas.face_m2) or r == regions[n - 1]:
                 continue
             if touched[r] != 0:
                 continue  # it grew since its area was taken: the next round judges it
             border[:] = 0
-            n_members = 0
-            for m in range(first[r], first[r + 1]):
-                v = members[m]
-                n_members += counted[v]
+            for v in members:
                 for s in range(starts[v], starts[v + 1]):
-                    w = adjacent[s]
-                    if labels[w] != label:
-                        border[labels[w] + 1] += 1
-            total = 0
-            for k in range(n_planes + 1):
-                total += border[k]
-            if total == 0:
-                continue
-            best = OUTSIDE
-            best_cost = 1e30
-            for k in range(n_planes):
-                if border[k + 1] == 0:
-                    continue
-                cost = 0.0
-                if label >= 0:
-                    for m in range(first[r], first[r + 1]):
-                        v = members[m]
-                        if counted[v] != 0:
-                            fit = planes[k, 0] * x[v] * 1e-3 + planes[k, 1] * y[v] * 1e-3 + planes[k, 2]
-                            cost += min(abs(z[v] - fit), 1.0)
-                    cost /= max(1, n_members)
-                cost -= border[k + 1] / total
-                if cost < best_cost:
-                    best_cost = cost
-                    best = k
-            touched[r] = 1
+                    other = labels[adjacent[s]]
+                    if other != label:
+                        border[other + 1] += 1
+            best = _best_label(x, y, z, members, label, counted, planes, border)
             if best == label:
                 continue
-            for m in range(first[r], first[r + 1]):
-                for s in range(starts[members[m]], starts[members[m] + 1]):
+            for v in members:
+                for s in range(starts[v], starts[v + 1]):
                     if labels[adjacent[s]] == best:
                         touched[regions[adjacent[s]]] = 1
-                labels[members[m]] = best
+                labels[v] = best
             changed = True
         if not changed:
             break
     return labels
 
 
+class _Labelled(NamedTuple):
+    """A labelled TIN and where its edges are cut."""
+
+    x: IntArray
+    """(n,) int64, millimetres."""
+    y: IntArray
+    """(n,) int64, millimetres."""
+    labels: LabelArray
+    """(n,) int32, plane of every vertex; -1 outside."""
+    planes: FloatArray
+    """(k, 3) float64, coefficients a, b, c; metres."""
+    outside_fraction: float
+    """Where on the way from a roof vertex to an outside one the border lies."""
+    step_offset_m: float
+    """Distance of a high step edge from the points of its upper face."""
+
+
 @kernel
-def _cut_fraction(
-    x0: int,
-    y0: int,
-    x1: int,
-    y1: int,
-    label0: int,
-    label1: int,
-    planes: FloatArray,
-    outside_fraction: float,
-    step_offset_m: float,
-) -> float:
-    """Where on the edge from 0 to 1 the label changes."""
-    if label0 < 0:
-        return 1.0 - outside_fraction
-    if label1 < 0:
-        return outside_fraction
-    da = planes[label0, 0] - planes[label1, 0]
-    db = planes[label0, 1] - planes[label1, 1]
-    dc = planes[label0, 2] - planes[label1, 2]
+def _cut_fraction(tin: _Labelled, p: int, q: int) -> float:
+    """Where on the edge from p to q the label changes, 0 to 1."""
+    planes, label_p, label_q = tin.planes, tin.labels[p], tin.labels[q]
+    x0, y0, x1, y1 = tin.x[p], tin.y[p], tin.x[q], tin.y[q]
+    if label_p < 0:
+        return 1.0 - tin.outside_fraction
+    if label_q < 0:
+        return tin.outside_fraction
+    da = planes[label_p, 0] - planes[label_q, 0]
+    db = planes[label_p, 1] - planes[label_q, 1]
+    dc = planes[label_p, 2] - planes[label_q, 2]
     d0 = (da * x0 + db * y0) * 1e-3 + dc
     d1 = (da * x1 + db * y1) * 1e-3 + dc
     if (d0 < 0.0 < d1) or (d1 < 0.0 < d0):
         fraction: float = d0 / (d0 - d1)
-        return min(max(fraction, 0.03), 0.97)
+        return min(max(fraction, _NEAR_END), 1.0 - _NEAR_END)
     # the planes cross shortly beyond one end: the border hugs that end; a step lies in the middle
     length = math.sqrt(float((x1 - x0) ** 2 + (y1 - y0) ** 2)) * 1e-3
-    if min(abs(d0), abs(d1)) < 0.3 * math.sqrt(da * da + db * db) * length:
-        return 0.03 if abs(d0) < abs(d1) else 0.97
+    if min(abs(d0), abs(d1)) < _JUST_BEYOND * math.sqrt(da * da + db * db) * length:
+        return _NEAR_END if abs(d0) < abs(d1) else 1.0 - _NEAR_END
     if min(abs(d0), abs(d1)) > SHADING_HEIGHT_M:
-        # lower points within the shading radius of the upper face were left out: the step stands near to the latter
-        near = min(max(step_offset_m / max(length, 1e-3), 0.05), 0.5)
+        # lower points within the shading radius of the upper face were left out: the step is close to the latter
+        near = min(max(tin.step_offset_m / max(length, 1e-3), 0.05), 0.5)
         return near if d0 > 0.0 else 1.0 - near
     return 0.5
 
 
 @kernel
-def _meeting_point(
-    vx: FloatArray, vy: FloatArray, mx: FloatArray, my: FloatArray, lab: LabelArray, planes: FloatArray
-) -> tuple[float, float]:
+def _cut_point(tin: _Labelled, a: int, b: int) -> tuple[float, float]:
+    """Where the edge between two vertices is cut, millimetres; the same for both directions."""
+    p, q = (a, b) if a < b else (b, a)
+    f = _cut_fraction(tin, p, q)
+    return tin.x[p] + f * (tin.x[q] - tin.x[p]), tin.y[p] + f * (tin.y[q] - tin.y[p])
+
+
+@kernel
+def _meeting_point(tin: _Labelled, corners: LabelArray) -> tuple[float, float]:
     """Where the three pieces of a facet meet: at the three planes' common point if it fits, else amid the cuts.
 
-    `vx`, `vy` are the corners, `mx`, `my` the cuts after each corner.
+    `corners` are the facet's vertices, (3,); the result is in millimetres.
     """
+    planes = tin.planes
+    lab = (tin.labels[corners[0]], tin.labels[corners[1]], tin.labels[corners[2]])
     if min(lab[0], lab[1], lab[2]) >= 0:
         a1 = planes[lab[0], 0] - planes[lab[1], 0]
         b1 = planes[lab[0], 1] - planes[lab[1], 1]
@@ -211,96 +267,67 @@ def _meeting_point(
         b2 = planes[lab[0], 1] - planes[lab[2], 1]
         c2 = planes[lab[0], 2] - planes[lab[2], 2]
         determinant = a1 * b2 - a2 * b1
-        if abs(determinant) > 1e-3:
+        if abs(determinant) > _PARALLEL:
             px = (b1 * c2 - b2 * c1) / determinant * 1e3
             py = (a2 * c1 - a1 * c2) / determinant * 1e3
             inside = True
             for k in range(3):
-                j = (k + 1) % 3
-                # at least 5 mm off every side
-                cross = (vx[j] - vx[k]) * (py - vy[k]) - (vy[j] - vy[k]) * (px - vx[k])
-                if cross < 5.0 * np.hypot(vx[j] - vx[k], vy[j] - vy[k]):
+                ax, ay = float(tin.x[corners[k]]), float(tin.y[corners[k]])
+                bx, by = float(tin.x[corners[(k + 1) % 3]]), float(tin.y[corners[(k + 1) % 3]])
+                cross = (bx - ax) * (py - ay) - (by - ay) * (px - ax)
+                if cross < _INSIDE_MM * np.hypot(bx - ax, by - ay):
                     inside = False
             if inside:
                 return px, py
-    return (mx[0] + mx[1] + mx[2]) / 3.0, (my[0] + my[1] + my[2]) / 3.0
+    (x0, y0), (x1, y1) = _cut_point(tin, corners[0], corners[1]), _cut_point(tin, corners[1], corners[2])
+    x2, y2 = _cut_point(tin, corners[2], corners[0])
+    return (x0 + x1 + x2) / 3.0, (y0 + y1 + y2) / 3.0
 
 
 @kernel
 def _march(
-    x: IntArray,
-    y: IntArray,
-    facets: LabelArray,
-    neighbours: LabelArray,
-    labels: LabelArray,
-    regions: LabelArray,
-    planes: FloatArray,
-    outside_fraction: float,
-    step_offset_m: float,
+    tin: _Labelled, facets: LabelArray, neighbours: LabelArray, regions: LabelArray
 ) -> tuple[FloatArray, LabelArray, LabelArray]:
-    """Rings around all roof regions: node coordinates in mm ring after ring, ring starts, region of each ring.
+    """Rings around all roof regions: nodes (m, 2) in mm, first node (r + 1,) and region (r,) of each ring.
 
     A ring keeps its region on the left. The state of the walk is a half-edge a -> b of a facet with a inside the
     region and b not; it leaves the facet across b -> third where third is inside too, else across third -> a.
     """
-    m = len(facets)
-    visited = np.zeros((m, 3), np.uint8)
-    capacity = 1024
-    nodes = np.empty((capacity, 2))
+    labels = tin.labels
+    mixed = 0
+    for t in range(len(facets)):
+        for k in range(3):
+            a, b = facets[t, (k + 1) % 3], facets[t, (k + 2) % 3]
+            mixed += labels[a] >= 0 and labels[a] != labels[b]
+    visited = np.zeros((len(facets), 3), np.uint8)
+    nodes = np.empty((2 * mixed, 2))
+    ring_starts = np.zeros(mixed + 1, np.int32)
+    ring_regions = np.empty(mixed, np.int32)
     count = 0
-    ring_starts = [0]
-    ring_regions = [np.int32(0)]
-    ring_regions.pop()
-    vx = np.empty(3)
-    vy = np.empty(3)
-    mx = np.empty(3)
-    my = np.empty(3)
-    lab = np.empty(3, np.int32)
-    for start in range(m):
+    rings = 0
+    for start in range(len(facets)):
         for start_edge in range(3):
             a = facets[start, (start_edge + 1) % 3]
             b = facets[start, (start_edge + 2) % 3]
             if visited[start, start_edge] != 0 or labels[a] < 0 or labels[a] == labels[b]:
                 continue
+            ring_regions[rings] = regions[a]
             t = start
             k = start_edge
             while visited[t, k] == 0:
                 visited[t, k] = 1
                 a = facets[t, (k + 1) % 3]
                 b = facets[t, (k + 2) % 3]
-                w = facets[t, k]
-                if count + 2 > capacity:
-                    grown = np.empty((2 * capacity, 2))
-                    for c in range(count):
-                        grown[c, 0], grown[c, 1] = nodes[c, 0], nodes[c, 1]
-                    nodes = grown
-                    capacity *= 2
-                p, q = (a, b) if a < b else (b, a)
-                f = _cut_fraction(x[p], y[p], x[q], y[q], labels[p], labels[q], planes, outside_fraction, step_offset_m)
-                nodes[count, 0] = np.rint(x[p] + f * (x[q] - x[p]))
-                nodes[count, 1] = np.rint(y[p] + f * (y[q] - y[p]))
+                third = facets[t, k]
+                x, y = _cut_point(tin, a, b)
+                nodes[count, 0], nodes[count, 1] = np.rint(x), np.rint(y)
                 count += 1
-                if labels[w] == labels[a]:
-                    side = (k + 1) % 3
-                else:
+                side = (k + 1) % 3
+                if labels[third] != labels[a]:
                     side = (k + 2) % 3
-                    if labels[w] != labels[b]:
-                        for j in range(3):
-                            p = facets[t, j]
-                            q = facets[t, (j + 1) % 3]
-                            vx[j] = x[p]
-                            vy[j] = y[p]
-                            lab[j] = labels[p]
-                            if p > q:
-                                p, q = q, p
-                            f = _cut_fraction(
-                                x[p], y[p], x[q], y[q], labels[p], labels[q], planes, outside_fraction, step_offset_m
-                            )
-                            mx[j] = x[p] + f * (x[q] - x[p])
-                            my[j] = y[p] + f * (y[q] - y[p])
-                        px, py = _meeting_point(vx, vy, mx, my, lab, planes)
-                        nodes[count, 0] = np.rint(px)
-                        nodes[count, 1] = np.rint(py)
+                    if labels[third] != labels[b]:
+                        x, y = _meeting_point(tin, facets[t])
+                        nodes[count, 0], nodes[count, 1] = np.rint(x), np.rint(y)
                         count += 1
                 # step over the side opposite to vertex `side`; find the same side in the neighbour
                 u = neighbours[t, side]
@@ -309,15 +336,15 @@ def _march(
                     back += 1
                 t = u
                 k = back
-            ring_starts.append(count)
-            ring_regions.append(regions[facets[start, (start_edge + 1) % 3]])
-    return nodes[:count].copy(), np.array(ring_starts, np.int32), np.array(ring_regions, np.int32)
+            rings += 1
+            ring_starts[rings] = count
+    return nodes[:count].copy(), ring_starts[: rings + 1].copy(), ring_regions[:rings].copy()
 
 
 def march(
     xy_mm: IntArray, tin: Tin, labels: LabelArray, planes: FloatArray, outside_fraction: float, step_offset_m: float
 ) -> RoofPartition:
-    """Cut the plan into one polygon a connected region of equal labels.
+    """Cut the plan into one polygon per connected region of equal labels.
 
     Parameters
     ----------
@@ -354,17 +381,9 @@ def march(
     202500.0
     """
     regions, _ = connected_regions(tin.facets, labels)
-    nodes, ring_starts, ring_regions = _march(
-        np.ascontiguousarray(xy_mm[:, 0]),
-        np.ascontiguousarray(xy_mm[:, 1]),
-        tin.facets,
-        tin.neighbours,
-        labels,
-        regions,
-        planes,
-        outside_fraction,
-        step_offset_m,
-    )
+    x, y = np.ascontiguousarray(xy_mm[:, 0]), np.ascontiguousarray(xy_mm[:, 1])
+    labelled = _Labelled(x, y, labels, planes, outside_fraction, step_offset_m)
+    nodes, ring_starts, ring_regions = _march(labelled, tin.facets, tin.neighbours, regions)
     if len(ring_regions) == 0:
         raise BuildingError(Reason.NO_PARTITION, "no point with a plane lies inside the triangulation")
     label_of_region = np.full(int(regions.max()) + 1, OUTSIDE, np.int32)

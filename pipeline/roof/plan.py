@@ -23,6 +23,7 @@ from pipeline.roof.footprint import clip_partition, footprint_in_mm, in_footprin
 from pipeline.roof.labelling import continue_crossings, empty_samples, fill_labels
 from pipeline.roof.partition import (
     OUTSIDE,
+    MinAreas,
     RoofPartition,
     absorb_small_regions,
     march,
@@ -191,7 +192,8 @@ def partition_roof(roof: RoofPoints, planes: Sequence[Plane], settings: RoofSett
     area = min_face_area(roof, settings)
     step_offset_m = settings.step_offset_spacings * roof.spacing_m
     labels = continue_crossings(x, y, tin.facets, labels, known, coefficients)
-    labels = absorb_small_regions(x, y, z, tin.facets, labels, counted, coefficients, area, settings.min_void_m2)
+    min_areas = MinAreas(area, settings.min_void_m2)
+    labels = absorb_small_regions(x, y, z, tin.facets, labels, counted, coefficients, min_areas)
     partition = march(xy_mm, tin, labels, coefficients, settings.outside_fraction, step_offset_m)
     if given is not None:
         return RoofPlan(planes=tuple(planes), faces=partition, outline_mm=given, raw=None)

@@ -35,11 +35,11 @@ class BuildingPrimitive:
     """
 
     roof_type: RoofType
-    """gable: vertices 1 and 2 are the ridge's, 3 to 6 the eaves'. pent: 1 and 2 the upper edge's, 3 and 4 the eave's.
-    flat: 1 to 4 in any order around."""
+    """gable: vertices 1 and 2 are on the ridge, 3 to 6 on the eaves; pent: 1 and 2 on the upper edge, 3 and 4 on the
+    eave; flat: 1 to 4 in any order around."""
     corners: tuple[tuple[float, float], ...]
-    """Positions of the roof's vertices in plan, local metres, in the order of their numbers. Of a gable's six, 3, 4, 5
-    and 6 run counter-clockwise, 3 and 6 beside 1, 4 and 5 beside 2; the four of a box run counter-clockwise."""
+    """Positions of the roof's vertices in plan, local metres, in the order of their numbers. Vertices 3 to 6 of a gable
+    run counter-clockwise, 3 and 6 beside 1, 4 and 5 beside 2; the four of a box run counter-clockwise."""
     top_z_m: float
     """Elevation of vertices 1 and 2: z1 of the paper."""
     eave_z_m: float
@@ -67,7 +67,7 @@ class BuildingPrimitive:
 
     @property
     def faces(self) -> tuple[PlanFace, ...]:
-        """The roof faces in plan, counter-clockwise: of a gable first that to the right of 1 -> 2."""
+        """The roof faces in plan, counter-clockwise; the first of a gable is to the right of 1 -> 2."""
         corners = self.corners
         if self.roof_type is not RoofType.GABLE:
             return (PlanFace(plane=0, polygon=shapely.Polygon(corners)),)
@@ -110,23 +110,15 @@ class GableFit:
     eave_z_m: tuple[float, float]
     """Elevation of either plane over its eave, half way along: their mean becomes that of the model."""
     is_valley: bool
-    """True where the planes rise from the line: no roof of this kind."""
+    """True where the planes rise from the line: not a roof of this kind."""
     model: BuildingPrimitive
     """The building."""
 
 
 def primitive_partition(faces: Sequence[PlanFace]) -> RoofPartition:
-    """The partition of a primitive's faces, to be extruded.
+    """A primitive's faces, in local metres, as a partition in integer millimetres.
 
-    Parameters
-    ----------
-    faces : sequence of PlanFace
-        In local metres; faces that touch share their vertices to the millimetre.
-
-    Returns
-    -------
-    RoofPartition
-        The same in integer millimetres.
+    Faces that touch must share their vertices to the millimetre.
     """
     polygons = tuple(shapely.transform(face.polygon, lambda xy: np.rint(xy * 1e3)) for face in faces)
     return RoofPartition(polygons=polygons, labels=np.array([face.plane for face in faces], np.int32))
@@ -170,7 +162,7 @@ def fit_gable(
     """
     line = line_of_intersection(planes[1], planes[0])
     if line is None:
-        raise BuildingError(Reason.NO_PARTITION, "the two planes are parallel: they meet in no line")
+        raise BuildingError(Reason.NO_PARTITION, "the two planes are parallel: they do not meet in a line")
     left = line.frame(points[:, :2])[:, 1]
     members = (labels == 0, labels == 1)
     shares = float(np.mean(left[members[0]] <= 0.0)), float(np.mean(left[members[1]] >= 0.0))

@@ -104,7 +104,7 @@ def line_of_intersection(first: Plane, second: Plane) -> PlanLine | None:
 
 
 def convex_hull(xy_mm: IntArray) -> FloatArray:
-    """The convex hull of positions on whole millimetres, exactly.
+    """The exact convex hull of positions on whole millimetres.
 
     Parameters
     ----------

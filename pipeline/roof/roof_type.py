@@ -1,9 +1,9 @@
 """Roof type from the delivered planes, their areas and their ridges.
 
 Flat is below 7 degrees, a gable has two opposite sides "whose inclinations must not be the same", a hip roof two such
-pairs (Hofmann, Maas and Streilein 2003). Faces of one direction and similar slope count as one side, and so do those
-that meet in a bend with the steeper one above: the flatter foot of a bent hip. Where a flatter face lies above a
-steeper one (gambrel, mansard) the roof is a combination.
+pairs (Hofmann, Maas and Streilein 2003). Faces of one direction and similar slope count as one side. So do those that
+meet in a bend with the steeper one above: the flatter foot of a bent hip. Where a flatter face lies above a steeper one
+(gambrel, mansard) the roof is a combination.
 """
 
 from __future__ import annotations
@@ -41,23 +41,9 @@ def _turn(a_deg: float, b_deg: float) -> float:
 def roof_type(
     planes: Sequence[Plane], faces: Sequence[RoofFace], solids: Sequence[Solid], settings: RoofTypeSettings
 ) -> RoofType:
-    """The type of a delivered roof.
+    """The type of a delivered roof; `solids` show where its faces meet.
 
-    Parameters
-    ----------
-    planes : sequence of Plane
-        The roof planes.
-    faces : sequence of RoofFace
-        The roof faces.
-    solids : sequence of Solid
-        Where faces meet.
-    settings : RoofTypeSettings
-        Thresholds.
-
-    Returns
-    -------
-    RoofType
-        `none` without faces, `combination` for what has no simpler name.
+    It is `none` without faces and `combination` for a roof without a simpler name.
     """
     areas: dict[int, float] = {}
     for face, area in zip(
@@ -109,9 +95,9 @@ def _sides(planes: Sequence[Plane], areas: dict[int, float], bends: Folds, setti
 
 
 def folds(planes: Sequence[Plane], solids: Sequence[Solid], sliver_height_m: float) -> tuple[Folds, Folds]:
-    """Where planes meet and fall away from there on both sides (ridges, hips), and where they do not (bends, valleys).
+    """Where planes meet and fall away on both sides (ridges, hips), and where they do not (bends, valleys).
 
-    They meet in a common edge, or across a wall that is nowhere higher than a sliver.
+    Planes meet in a common edge, or across a wall that is nowhere higher than a sliver.
     """
     ridges: Folds = {}
     bends: Folds = {}
@@ -158,12 +144,12 @@ def _opposite(a: _Side, b: _Side, settings: RoofTypeSettings) -> bool:
 
 
 def _length(a: _Side, b: _Side, met: Folds) -> float:
-    """Over which the faces of two sides meet."""
+    """Length over which the faces of two sides meet."""
     return math.fsum(met.get((p, q), 0.0) for p in sorted(a.planes) for q in sorted(b.planes))
 
 
 def _is_hip(sides: list[_Side], ridges: Folds, bends: Folds, settings: RoofTypeSettings) -> bool:
-    """Two opposite pairs, square to one another, with a hip at each corner; slopes may differ.
+    """Whether two opposite pairs, square to one another, have a hip at each corner; slopes may differ.
 
     Valleys as long as the hips are those of a courtyard; short ones are those of dormers.
     """

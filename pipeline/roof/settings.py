@@ -7,8 +7,9 @@ import dataclasses
 from pipeline.parameters import Parameters, parameter
 
 _CELL_SPACINGS = 1.2
+"""A cell of dense points then holds one or two of them."""
 _MIN_CELL_M = 0.25
-"""A superstructure of a metre has four such cells a side."""
+"""A superstructure of a metre has four such cells per side."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -17,11 +18,11 @@ class RoofSettings(Parameters):
 
     min_points: int = parameter(10, "A candidate with fewer roof points is not modelled.", minimum=3, maximum=1000)
     min_points_in_footprint: int = parameter(
-        4, "The same where the footprint is given: few points then tell a simple roof.", minimum=3, maximum=1000
+        4, "The same where the footprint is given: a few points then show a simple roof.", minimum=3, maximum=1000
     )
     max_points: int = parameter(4_000_000, "A candidate with more points is refused as too complex.", minimum=1000)
     min_roof_height_m: float = parameter(
-        1.5, "Points lower than this above the floor are no roof points.", unit="m", minimum=0.2, maximum=10.0
+        1.5, "Points lower than this above the floor are not roof points.", unit="m", minimum=0.2, maximum=10.0
     )
     gap_spacings: float = parameter(
         1.5,
@@ -50,7 +51,7 @@ class RoofSettings(Parameters):
     )
     usual_overhang_m: float = parameter(
         0.0,
-        "With outline = walls: how far eaves hang over where no point tells of any wall of a building.",
+        "With outline = walls: overhang of the eaves where no points show a wall of the building.",
         unit="m",
         minimum=0.0,
         maximum=1.0,
@@ -89,7 +90,7 @@ class RoofSettings(Parameters):
     )
     void_distance_m: float = parameter(
         4.0,
-        "Inside a given footprint a place farther than this from every roof point is no roof.",
+        "Inside a given footprint a place farther than this from every roof point is not roof.",
         unit="m",
         minimum=0.5,
         maximum=100.0,
@@ -152,7 +153,7 @@ class RoofSettings(Parameters):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ArrangementSettings(Parameters):
-    """What a roof face costs against what it explains."""
+    """Costs of roof faces against the points that they explain."""
 
     residual_cap_m: float = parameter(
         0.3,
@@ -180,14 +181,14 @@ class ArrangementSettings(Parameters):
     )
     face_points: float = parameter(
         18.0,
-        "So many points are enough where a roof face explains all its own; a place of about four by four spacings.",
+        "This many points are enough for a roof face that explains all its own: about four by four spacings.",
         unit="points",
         minimum=0.0,
         maximum=10_000.0,
     )
     raster_cell_m: float = parameter(
         0.35,
-        "Cell of the coarse labels; at least one point spacing. Of dense points 1.2 spacings, at least 0.25 m.",
+        "Cell of the coarse labels, at least one point spacing; for dense points 1.2 spacings, at least 0.25 m.",
         unit="m",
         minimum=0.1,
         maximum=5.0,
@@ -216,11 +217,11 @@ class ArrangementSettings(Parameters):
         return max(min(self.raster_cell_m, max(_CELL_SPACINGS * spacing_m, _MIN_CELL_M)), spacing_m)
 
     def costs_of_face(self, points_per_m2: float) -> tuple[float, float]:
-        """Misfitting points that a face must save that explains all its own points, and one that explains half.
+        """Misfitting points that a face must save: one that explains all its own points, and one that explains half.
 
-        Evidence is counted in points, but what misfits a roof lies in heaps: a pipe, a crown, a parapet has the more
-        points the denser they lie. So the cost of a face grows with the density as long as that is all there is to
-        say; dense points say more, for they tell a plane from a heap.
+        Evidence is counted in points, but points that misfit a roof lie in heaps: a pipe, a crown or a parapet has more
+        points where they are denser. So the cost of a face grows with the density. A face that explains all its points
+        needs no more than `face_points`, since dense points distinguish a plane from a heap.
 
         Examples
         --------
@@ -260,7 +261,7 @@ class RoofTypeSettings(Parameters):
     )
     minor_share_together: float = parameter(
         0.20,
-        "Where all that does not decide has this share of the roof's area the roof is a combination.",
+        "If all faces that do not decide have this share of the roof's area, the roof is a combination.",
         minimum=0.0,
         maximum=1.0,
     )

@@ -15,7 +15,7 @@ from pipeline.roof.footprint import without_repeated
 from pipeline.roof.partition import RoofPartition
 
 _STRAIGHT_MM = 2.0
-"""A vertex that bends no border by more is idle: what rounding to 1 mm does to a point on a line."""
+"""A vertex that bends borders by less is idle: rounding to 1 mm moves a point on a line as far."""
 
 XY = tuple[int, int]
 
@@ -57,17 +57,17 @@ def simplify_partition(partition: RoofPartition, tolerance_m: float, *, outline_
 
 
 def unite_close_vertices(partition: RoofPartition, distance_mm: float) -> RoofPartition:
-    """Make one of border vertices that lie closer than a distance, the same in every polygon.
+    """Unite border vertices that lie closer than a distance, the same in every polygon.
 
     Where a clipped border passes close by a corner of the footprint, two vertices can lie a millimetre apart: distinct
-    here, the same for whoever reads the model with a tolerance.
+    here, the same for a reader with a tolerance.
 
     Parameters
     ----------
     partition : RoofPartition
         A coverage in integer millimetres.
     distance_mm : float
-        Vertices at most this far apart are one; the leftmost of a group stands for it.
+        Vertices at most this far apart become the leftmost of them.
 
     Returns
     -------
@@ -105,20 +105,10 @@ def unite_close_vertices(partition: RoofPartition, distance_mm: float) -> RoofPa
 
 
 def without_idle_vertices(polygons: Sequence[shapely.Polygon]) -> list[shapely.Polygon]:
-    """Polygons that share borders, without vertices that lie on a straight border between two others.
+    """A coverage in integer millimetres without vertices that lie on a straight border between two others.
 
     Where roof faces are united, the ends of the borders between them are left over. A vertex goes where it joins two
-    edges only and all that went between its neighbours is within 2 mm of the line between them.
-
-    Parameters
-    ----------
-    polygons : sequence of Polygon
-        A coverage in integer millimetres.
-
-    Returns
-    -------
-    list of Polygon
-        The same in the same order.
+    edges only and all vertices that went between its neighbours are within 2 mm of the line between them.
 
     Examples
     --------

@@ -1,9 +1,9 @@
 """A closed solid over a partition of the plan: roof faces on their planes, walls between levels, a floor.
 
 Everything is done on the millimetre grid: plan vertices are integers, heights are rounded before faces are made.
-A vertical line through a plan vertex has one solid vertex a level: heights of the adjacent roof faces, those within a
-tolerance united, and the floor at the outline. Walls run between levels; levels of other faces on the way are inserted
-into their rings, so that every edge of the solid belongs to exactly two faces.
+A vertical line through a plan vertex has one solid vertex per level: the heights of the adjacent roof faces, united
+within a tolerance, and the floor at the outline. Walls run between levels; levels of other faces on the way are
+inserted into their rings. Thus every edge of the solid belongs to exactly two faces.
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ from pipeline.model import FaceKind, FloatArray, Plane, Reason, RoofFace, Solid,
 from pipeline.roof.partition import RoofPartition
 
 SAME_HEIGHT_MM = 2
-"""Levels of one plan vertex that are closer than this are one."""
-
+"""Levels of one plan vertex that are closer than this are one: twice the rounding."""
 MIN_SPAN_MM = 5
-"""A crossing of two planes nearer than this to the end of its edge is moved to that end."""
+"""A crossing of two planes nearer than this to the end of its edge is moved to that end; numerical guard."""
 
 Ring = list[int]
 
@@ -59,7 +58,7 @@ def solid_parts(partition: RoofPartition, planes: Sequence[Plane], ground_z_m: f
     partition : RoofPartition
         A valid coverage in integer millimetres.
     planes : sequence of Plane
-        What the partition's labels number; must lie above the floor over their polygons.
+        The planes that the labels number; they must lie above the floor over their polygons.
     ground_z_m : float
         Elevation of the floor, local metres.
 
@@ -154,7 +153,7 @@ def _insert_crossings(mesh: _Mesh, planes: Sequence[Plane]) -> dict[tuple[int, i
 
 
 def _connected(mesh: _Mesh, edges: dict[tuple[int, int], int]) -> list[list[int]]:
-    """Faces of every part that hangs together by edges."""
+    """Faces of every part that is connected by edges."""
     left = np.fromiter(edges.values(), np.int64)
     right = np.fromiter((edges.get((b, a), face) for (a, b), face in edges.items()), np.int64)
     parts: dict[int, list[int]] = {}

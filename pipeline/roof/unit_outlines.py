@@ -1,7 +1,7 @@
-"""Outlines of touching units, drawn together: what two of them share is one line.
+"""Outlines of touching units, drawn together: two of them share one line.
 
-Drawn one by one, each unit ends at its own outermost points, and a slit stays open between two houses of a row. So the
-outline is drawn around all units of a candidate, as if they were one building, and divided among them as a roof is
+Drawn one by one, each unit ends at its own outermost points, which leaves a slit between two houses of a row. Therefore
+the outline is drawn around all units of a candidate, as if they were one building, and divided among them as a roof is
 divided among its planes: amid the points on either side, in straight lines.
 """
 
@@ -36,8 +36,8 @@ def unit_outlines(candidate: Candidate, units: LabelArray, settings: RoofSetting
     Returns
     -------
     list of MultiPolygon or None
-        One a unit, local metres on the millimetre grid; they share borders and do not overlap. None for a unit that has
-        no part of the plan, and for all where no plan can be drawn: such units are drawn one by one.
+        One per unit, local metres on the millimetre grid; they share borders and do not overlap. None for a unit
+        without a part of the plan, and for all where no plan can be drawn: such units are drawn one by one.
     """
     count = int(units.max(initial=-1)) + 1
     try:

@@ -17,8 +17,7 @@ from pipeline.export.records import SCHEMAS
 from pipeline.io import SpatialReference
 from pipeline.methods.settings import FuzzySartSettings
 from pipeline.model import REASONS, Reason, RoofType, Status
-from pipeline.roof.roof_type import RoofTypeSettings
-from pipeline.roof.settings import RoofSettings
+from pipeline.roof.settings import RoofSettings, RoofTypeSettings
 from pipeline.ruler.epochs.settings import DiffSettings, read_settings
 from pipeline.runtime.overrides.overrides_file import overrides_of
 from pipeline.settings import RunSettings

@@ -9,6 +9,7 @@ import pytest
 import shapely
 
 from pipeline.model import IntArray, LabelArray
+from pipeline.roof.arrangement.candidate_lines import CandidateLines
 from pipeline.roof.arrangement.cells import (
     cell_areas_m2,
     cells_of_points,
@@ -17,8 +18,8 @@ from pipeline.roof.arrangement.cells import (
     unite_faces,
 )
 from pipeline.roof.arrangement.faces import rings_of_faces
-from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
-from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, _settle
+from pipeline.roof.arrangement.minimum_cut import Allowed, every_label, expand_labels, neighbour_lists
+from pipeline.roof.arrangement.raster_labels import _SETTLING_ROUNDS, Raster, _settle
 from pipeline.roof.arrangement.subdivision import (
     FACE,
     NEXT,
@@ -47,7 +48,7 @@ def cost(costs: IntArray, pairs: LabelArray, weights: IntArray, labels: LabelArr
 
 def expanded(costs: IntArray, pairs: LabelArray, weights: IntArray, labels: LabelArray) -> LabelArray:
     labels = labels.copy()
-    expand_labels(costs, *every_label(*costs.shape), *neighbour_lists(len(costs), pairs, weights), labels, 20)
+    expand_labels(costs, every_label(*costs.shape), neighbour_lists(len(costs), pairs, weights), labels, 20)
     return labels
 
 
@@ -78,7 +79,7 @@ def test_only_allowed_nodes_take_a_label() -> None:
     costs = np.array([[9, 0], [9, 0]])
     labels = np.zeros(2, np.int32)
     lists = neighbour_lists(2, np.zeros((0, 2), np.int32), np.zeros(0, np.int64))
-    expand_labels(costs, np.array([0, 1, 1], np.int32), np.array([0, 2, 3], np.int32), *lists, labels, 5)
+    expand_labels(costs, Allowed(np.array([0, 1, 1], np.int32), np.array([0, 2, 3], np.int32)), lists, labels, 5)
     assert labels.tolist() == [0, 1]
 
 
@@ -88,10 +89,10 @@ def test_of_expansions_that_cost_the_same_the_one_that_changes_least_is_taken(se
     costs, pairs, weights = random_graph(seed, 9, 2)
     costs, weights = costs // 12, weights // 12 + 1  # many ties
     before = rng.integers(0, 2, 9).astype(np.int32)
-    allowed, allowed_starts = np.arange(9, dtype=np.int32), np.array([0, 0, 9], np.int32)  # only label 1 expands
+    allowed = Allowed(np.arange(9, dtype=np.int32), np.array([0, 0, 9], np.int32))  # only label 1 expands
     lists = neighbour_lists(9, pairs, weights)
     labels = before.copy()
-    expand_labels(costs, allowed, allowed_starts, *lists, labels, 1)
+    expand_labels(costs, allowed, lists, labels, 1)
     moves = [np.where(taken, 1, before).astype(np.int32) for taken in itertools.product((False, True), repeat=9)]
     least = min(cost(costs, pairs, weights, one) for one in moves)
     best = [one for one in moves if cost(costs, pairs, weights, one) == least]
@@ -121,7 +122,9 @@ def test_cells_settle_as_if_all_were_looked_at_in_every_round(seed: int) -> None
             least, best = min((value, label) for label, value in total.items())
             if least < total[expected[cell]]:
                 expected[cell] = best
-    _settle(costs, place, columns, rows, 7, 5, labels)
+    number = np.full(columns * rows, -1, np.int32)
+    number[place] = np.arange(len(place))
+    _settle(costs, Raster(0.0, 0.0, 1.0, columns, rows, number, place), 7, 5, labels)
     assert labels.tolist() == [expected[cell] for cell in place.tolist()]
 
 
@@ -246,7 +249,7 @@ def test_any_lines_leave_a_planar_graph_that_fills_the_outline(seed: int) -> Non
     lines = np.column_stack((-np.sin(angles), np.cos(angles), np.zeros(n)))
     lines[:, 2] = -(lines[:, :2] * through).sum(axis=1)
     scores, numbers = rng.uniform(0.0, 1.0, n), np.arange(n).astype(np.int32)
-    subdivide(plan, lines, scores, np.zeros(n, np.int32), numbers, through, 1.0, 1.0)
+    subdivide(plan, CandidateLines(lines, scores, np.zeros(n, np.int32), through, numbers), 1.0, 1.0)
     xy, graph = plan.xy, plan.graph
     n_vertices, n_edges, n_cells = plan.counts.tolist()
     assert n_cells > 4

@@ -17,6 +17,7 @@ from pipeline.roof.arrangement.far_corners import (
     heights_raster,
     with_level_planes,
 )
+from pipeline.roof.arrangement.limits import limits_at
 from pipeline.roof.arrangement.subdivision import FACE, insert_chord, insert_vertex, subdivision_of
 from pipeline.roof.settings import ArrangementSettings
 
@@ -28,6 +29,7 @@ LOW = (0.0, 0.0, 3.0)
 """Meets it at the west end only."""
 SPACING_M = 0.4
 FAR_M = 0.5
+LIMITS = limits_at(SPACING_M, ArrangementSettings())
 
 
 def grid(west: float, east: float, plane: tuple[float, float, float], depth: float = 6.0) -> FloatArray:
@@ -44,15 +46,14 @@ class Hall:
         self.plan = subdivision_of(ring, np.array([0, 4]), np.zeros(1, np.int64), 40)
         self.planes = np.array(planes)
         self.labels = np.zeros(1, np.int32)
-        self.raster = heights_raster(self.points, SPACING_M)
-        self.around = heights_around(self.plan, self.raster)
+        self.look_around()
+
+    def look_around(self) -> None:
+        self.around = heights_around(self.plan, heights_raster(self.points, SPACING_M))
 
     def cut(self) -> int:
         cells = cells_of_points(self.plan, self.points)
-        return cut_off_far_corners(
-            self.plan, self.points, cells, self.planes, self.labels, self.around, self.raster,
-            FAR_M, 0.3, 0, 1.0,
-        )  # fmt: skip
+        return cut_off_far_corners(self.plan, self.points, cells, self.planes, self.labels, self.around, LIMITS, 0)
 
     def areas(self) -> list[float]:
         return sorted(cell_areas_m2(self.plan).tolist())
@@ -60,7 +61,8 @@ class Hall:
 
 def test_heights_are_those_of_the_points_around_a_place() -> None:
     hall = Hall(LOW, [RISING, LOW])
-    lowest, highest, within, side = hall.around
+    lowest, highest, within, raster = hall.around
+    side = raster.side
     assert side == 0.75
     assert (within[:4] == side).all()
     assert lowest[1] == highest[1] == 3.0
@@ -94,8 +96,7 @@ def test_a_plane_below_the_points_is_cut_off_too() -> None:
     sinking = (-0.5, 0.0, 9.0)
     hall = Hall((0.0, 0.0, 9.0), [sinking, (0.0, 0.0, 9.0)])
     hall.points[hall.points[:, 0] < 8.0, 2] = 9.0 - 0.5 * hall.points[hall.points[:, 0] < 8.0, 0]
-    hall.raster = heights_raster(hall.points, SPACING_M)
-    hall.around = heights_around(hall.plan, hall.raster)
+    hall.look_around()
     assert hall.cut() == 1
     east, west = hall.areas()
     assert 6.0 * 1.5 < east < 6.0 * 4.0
@@ -124,8 +125,7 @@ def test_both_cells_beside_an_edge_are_cut(*, swapped: bool) -> None:
     hall.points[rising, 2] = 3.0 + 0.5 * hall.points[rising, 0]
     hall.labels = np.zeros(2, np.int32)
     hall.planes = np.array([RISING, FALLING])
-    hall.raster = heights_raster(hall.points, SPACING_M)
-    hall.around = heights_around(hall.plan, hall.raster)
+    hall.look_around()
     assert hall.cut() == 1
     assert hall.areas() == pytest.approx([12.0, 24.0, 36.0], abs=0.01)
 

@@ -18,7 +18,7 @@ from pipeline.errors import BuildingError
 from pipeline.model import Candidate, IntArray, LabelArray, Plane, Reason, Solid, Tin
 from pipeline.prepared_cloud import prepare_cloud
 from pipeline.quality.validity import check_solid
-from pipeline.roof.partition import RoofPartition, absorb_small_regions, connected_regions, march
+from pipeline.roof.partition import MinAreas, RoofPartition, absorb_small_regions, connected_regions, march
 from pipeline.roof.plan import level_unsupported_faces, partition_roof, plan_forms, roof_points
 from pipeline.roof.settings import RoofSettings
 from pipeline.roof.simplification import simplify_partition, unite_close_vertices
@@ -124,10 +124,10 @@ def test_a_lone_vertex_in_a_roof_is_absorbed_and_a_courtyard_stays() -> None:
     counted = np.ones(len(xy), np.int32)
     z = np.full(len(xy), 5.0)
     planes = np.array([[0.0, 0.0, 5.0], [0.0, 0.0, 6.0]])
-    cleaned = absorb_small_regions(x, y, z, tin.facets, labels, counted, planes, 1.0, 4.0)
+    cleaned = absorb_small_regions(x, y, z, tin.facets, labels, counted, planes, MinAreas(1.0, 4.0))
     assert (cleaned == 1).sum() == 0
     assert (cleaned[: 12 * 12] == -1).sum() == 25
-    filled = absorb_small_regions(x, y, z, tin.facets, labels, counted, planes, 1.0, 40.0)
+    filled = absorb_small_regions(x, y, z, tin.facets, labels, counted, planes, MinAreas(1.0, 40.0))
     assert (filled[: 12 * 12] == 0).all()
     assert (filled[12 * 12 :] == -1).all()
 
@@ -139,7 +139,7 @@ def test_any_number_of_gaps_in_one_roof_is_closed() -> None:
     xy, tin, labels = labelled(60, values)
     counted = np.ones(len(xy), np.int32)
     x, y, z = xy[:, 0].copy(), xy[:, 1].copy(), np.full(len(xy), 5.0)
-    closed = absorb_small_regions(x, y, z, tin.facets, labels, counted, np.array([[0.0, 0.0, 5.0]]), 1.0, 4.0)
+    closed = absorb_small_regions(x, y, z, tin.facets, labels, counted, np.array([[0.0, 0.0, 5.0]]), MinAreas(1.0, 4.0))
     assert (closed[: 60 * 60] == 0).all()
 
 
@@ -151,7 +151,9 @@ def test_a_small_region_joins_the_plane_that_fits_it() -> None:
     z = np.where(labels == 0, 3.0, 9.0)
     planes = np.array([[0.0, 0.0, 3.0], [0.0, 0.0, 9.0], [0.0, 0.0, 6.0]])
     counted = np.ones(len(xy), np.int32)
-    cleaned = absorb_small_regions(xy[:, 0].copy(), xy[:, 1].copy(), z, tin.facets, labels, counted, planes, 5.0, 5.0)
+    cleaned = absorb_small_regions(
+        xy[:, 0].copy(), xy[:, 1].copy(), z, tin.facets, labels, counted, planes, MinAreas(5.0, 5.0)
+    )
     assert (cleaned[np.flatnonzero(labels == 2)] == 1).all()
 
 

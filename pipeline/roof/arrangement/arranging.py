@@ -12,28 +12,32 @@ from shapely import MultiPolygon, Polygon
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.model import FloatArray, IntArray, LabelArray, Plane, Reason
-from pipeline.roof.arrangement.candidate_lines import border_places, candidate_lines
+from pipeline.roof.arrangement.candidate_lines import CandidateLines, border_places, candidate_lines
 from pipeline.roof.arrangement.cells import cell_borders, cell_costs, cells_of_points, points_per_cell, unite_faces
 from pipeline.roof.arrangement.faces import corners_of_borders, part_crossings, rings_of_faces, trace_faces
 from pipeline.roof.arrangement.far_corners import (
+    HeightsAround,
     add_costs_of_far_planes,
     cut_off_far_corners,
     heights_around,
     heights_raster,
     with_level_planes,
 )
+from pipeline.roof.arrangement.limits import Limits, limits_at
 from pipeline.roof.arrangement.minimum_cut import every_label, expand_labels, neighbour_lists
 from pipeline.roof.arrangement.plane_refit import labels_of_points, refitted_planes, support_of_planes
-from pipeline.roof.arrangement.raster_labels import COST_SCALE, raster_labels
+from pipeline.roof.arrangement.raster_labels import raster_labels
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, VERTICES, Subdivision, subdivide, subdivision_of
 from pipeline.roof.partition import RoofPartition
 from pipeline.roof.settings import ArrangementSettings
 
 _EDGES_PER_LINE = 24
 _SPARE_EDGES = 256
+"""Room for new edges; lines that find none left are not drawn."""
 _ROUNDS = 5
+"""Most turns of the expansion: bounds the work; it ends as soon as no label changes."""
 _CUTS = 3
-"""How often cells are cut whose plane leaves the points."""
+"""How often cells are cut whose plane leaves the points: bounds the work."""
 
 
 class _Outline(NamedTuple):
@@ -42,21 +46,6 @@ class _Outline(NamedTuple):
     xy: IntArray
     starts: IntArray
     polygons: IntArray
-
-
-class _Weights(NamedTuple):
-    """Costs and lengths: `ArrangementSettings` at a density of points."""
-
-    cell_m: float
-    points_per_m2: float
-    cap_m: float
-    cost_per_m: float
-    face_cost: int
-    doubtful_cost: int
-    line_length_m: float
-    line_reach_m: float
-    overshoot_m: float
-    clearance: float
 
 
 class _Arranged(NamedTuple):
@@ -71,13 +60,9 @@ class _Arranged(NamedTuple):
 
 
 @kernel
-def _arranged(
-    points: FloatArray, labels: LabelArray, planes: FloatArray, outline: _Outline, weights: _Weights
-) -> _Arranged:
-    """Kernel of `arrange`."""
-    cap_m, overshoot_m, clearance = weights.cap_m, weights.overshoot_m, weights.clearance
-    n_outline = len(outline.xy)
-    edges = np.empty((n_outline, 4))
+def _outline_edges(outline: _Outline) -> FloatArray:
+    """Edges x0, y0, x1, y1 of all rings, (n, 4), metres."""
+    edges = np.empty((len(outline.xy), 4))
     for r in range(len(outline.starts) - 1):
         first, last = outline.starts[r], outline.starts[r + 1]
         for v in range(first, last):
@@ -85,73 +70,97 @@ def _arranged(
             for axis in range(2):
                 edges[v, axis] = outline.xy[v, axis] * 1e-3
                 edges[v, 2 + axis] = outline.xy[after, axis] * 1e-3
-    k = len(planes)
+    return edges
 
-    lines, scores = np.empty((0, 3)), np.empty(0)
-    crossing, line_of = np.empty(0, np.int32), np.empty(0, np.int32)
-    places = np.empty((0, 2))
-    label_of_point = np.zeros(len(points), np.int32)
+
+@kernel
+def _planes_and_lines(
+    points: FloatArray, planes: FloatArray, edges: FloatArray, limits: Limits
+) -> tuple[FloatArray, CandidateLines]:
+    """The planes refitted to the points of their coarse labels, (k, 3), and lines along the borders of those."""
+    k, cap_m = len(planes), limits.cap_m
     if k == 1:
-        planes = refitted_planes(points, label_of_point, planes, cap_m)
-    else:
-        raster, place, low_x, low_y, columns = raster_labels(
-            points, planes, edges, weights.cell_m, cap_m, weights.cost_per_m
-        )
-        half = 0.5 * weights.cell_m
-        label_of_point = labels_of_points(points, raster, place, low_x, low_y, half, columns)
-        planes = refitted_planes(points, label_of_point, planes, cap_m)
-        places, pairs = border_places(raster, place, low_x, low_y, half, columns, k)
-        lines, scores, crossing, line_of = candidate_lines(
-            places, pairs, points, planes, edges, half, cap_m, weights.line_length_m
-        )
+        nowhere = np.empty(0, np.int32)
+        lines = CandidateLines(np.empty((0, 3)), np.empty(0), nowhere, np.empty((0, 2)), nowhere)
+        return refitted_planes(points, np.zeros(len(points), np.int32), planes, cap_m), lines
+    labels, raster = raster_labels(points, planes, edges, limits.cell_m, cap_m, limits.cost_per_m)
+    planes = refitted_planes(points, labels_of_points(points, labels, raster), planes, cap_m)
+    places, pairs = border_places(labels, raster, k)
+    lines = candidate_lines(places, pairs, points, planes, edges, raster.cell_m, cap_m, limits.line_length_m)
+    return planes, lines
 
-    plan = subdivision_of(outline.xy, outline.starts, outline.polygons, _SPARE_EDGES + _EDGES_PER_LINE * len(lines))
+
+@kernel
+def _label_cells(
+    plan: Subdivision,
+    points: FloatArray,
+    labels: LabelArray,
+    planes: FloatArray,
+    limits: Limits,
+    around: HeightsAround,
+    is_again: bool,
+    chosen: LabelArray,
+) -> IntArray:
+    """Give every cell its plane, in place of those `chosen` before, -1 for none; the cell of each point, (n,).
+
+    `labels` are the planes of the points. From the second time on planes that are far from the points cost more.
+    """
+    n_cells = plan.counts[CELLS]
+    cells = cells_of_points(plan, points)
+    costs, misfits = cell_costs(plan, points, labels, planes, cells, limits)
+    if is_again:
+        add_costs_of_far_planes(plan, planes, around, limits.overshoot_m, costs, misfits)
+    borders, weights = cell_borders(plan, limits.cost_per_m)
+    for i in range(n_cells):
+        if chosen[i] < 0:
+            chosen[i] = np.argmin(costs[i])
+    neighbours = neighbour_lists(n_cells, borders, weights)
+    expand_labels(costs, every_label(n_cells, len(planes)), neighbours, chosen, _ROUNDS)
+    held = points_per_cell(cells, n_cells)
+    unite_faces(misfits, held, borders, weights, chosen, limits.face_cost, limits.doubtful_cost)
+    return cells
+
+
+@kernel
+def _arranged(
+    points: FloatArray, labels: LabelArray, planes: FloatArray, outline: _Outline, limits: Limits
+) -> _Arranged:
+    """Kernel of `arrange`."""
+    planes, lines = _planes_and_lines(points, planes, _outline_edges(outline), limits)
+    n_lines = len(lines.lines)
+    plan = subdivision_of(outline.xy, outline.starts, outline.polygons, _SPARE_EDGES + _EDGES_PER_LINE * n_lines)
     counts = plan.counts
-    subdivide(plan, lines, scores, crossing, line_of, places, weights.line_reach_m, clearance)
+    subdivide(plan, lines, limits.line_reach_m, limits.clearance)
 
-    spacing_m = 1.0 / math.sqrt(weights.points_per_m2)
-    raster_of_heights = heights_raster(points, spacing_m)
+    raster_of_heights = heights_raster(points, 1.0 / math.sqrt(limits.points_per_m2))
+    label_of_point = np.zeros(len(points), np.int32)
     cell_labels = np.zeros(counts[CELLS] + len(plan.xy), np.int32)
     known = 0
-    for attempt in range(_CUTS + 1):
-        n_cells = counts[CELLS]
-        before, cell_labels = cell_labels, np.zeros(n_cells + len(plan.xy), np.int32)
-        if k == 1:
-            break
-        chosen = cell_labels[:n_cells]
-        cells = cells_of_points(plan, points)
-        costs, misfits = cell_costs(plan, points, labels, planes, cells, cap_m, weights.points_per_m2, overshoot_m)
-        around = heights_around(plan, raster_of_heights)
-        if attempt > 0:
-            add_costs_of_far_planes(plan, planes, around, overshoot_m, costs, misfits)
-        borders, border_weights = cell_borders(plan, weights.cost_per_m)
-        for i in range(n_cells):
-            chosen[i] = before[i] if i < known else np.argmin(costs[i])
+    for attempt in range(_CUTS + 1 if len(planes) > 1 else 0):
+        n_cells, k = counts[CELLS], len(planes)
+        before, cell_labels = cell_labels, np.full(n_cells + len(plan.xy), -1, np.int32)
+        for i in range(known):
+            cell_labels[i] = before[i]
         known = n_cells
-        starts, others, border_costs = neighbour_lists(n_cells, borders, border_weights)
-        allowed, allowed_starts = every_label(n_cells, k)
-        expand_labels(costs, allowed, allowed_starts, starts, others, border_costs, chosen, _ROUNDS)
-        held = points_per_cell(cells, n_cells)
-        unite_faces(misfits, held, borders, border_weights, chosen, weights.face_cost, weights.doubtful_cost)
+        chosen = cell_labels[:n_cells]
+        around = heights_around(plan, raster_of_heights)
+        cells = _label_cells(plan, points, labels, planes, limits, around, attempt > 0, chosen)
         for i in range(len(points)):
             label_of_point[i] = chosen[cells[i]] if cells[i] >= 0 else -1
         if attempt == _CUTS:
             break
-        planes = with_level_planes(plan, planes, chosen, around, overshoot_m)
-        is_more, k = len(planes) > k, len(planes)
-        line = len(lines) + attempt * len(plan.graph)
-        found = cut_off_far_corners(
-            plan, points, cells, planes, chosen, around, raster_of_heights, overshoot_m, cap_m, line, clearance
-        )
-        if found == 0 or (attempt > 0 and counts[CELLS] == n_cells and not is_more):
+        planes = with_level_planes(plan, planes, chosen, around, limits.overshoot_m)
+        line = n_lines + attempt * len(plan.graph)
+        found = cut_off_far_corners(plan, points, cells, planes, chosen, around, limits, line)
+        if found == 0 or (attempt > 0 and counts[CELLS] == n_cells and len(planes) == k):
             break
-    support = support_of_planes(points, label_of_point, planes, cap_m)
+    support = support_of_planes(points, label_of_point, planes, limits.cap_m)
 
-    faces, n_faces = part_crossings(plan, cell_labels, planes, clearance)
+    faces, n_faces = part_crossings(plan, cell_labels, planes, limits.clearance)
     plane_of_face = np.empty(n_faces, np.int32)
     for i in range(counts[CELLS]):
         plane_of_face[faces[i]] = cell_labels[i]
-    vertices, ring_starts, owner = trace_faces(plan, faces, corners_of_borders(plan, n_outline, faces))
+    vertices, ring_starts, owner = trace_faces(plan, faces, corners_of_borders(plan, len(outline.xy), faces))
     rings = rings_of_faces(plan.xy, vertices, ring_starts, owner, n_faces)
     used = Subdivision(plan.xy[: counts[VERTICES]].copy(), plan.graph[: counts[EDGES]].copy(), counts)
     return _Arranged(used, rings, plane_of_face, faces, planes, support)
@@ -170,7 +179,7 @@ def _rings_of(outline_mm: MultiPolygon) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _polygons(nodes: FloatArray, ring_of: IntArray, owner: LabelArray) -> tuple[Polygon, ...] | None:
-    """The faces, from `rings_of_faces`; None where they are no coverage."""
+    """The faces, from `rings_of_faces`; None where they are not a coverage."""
     polygons = shapely.polygons(shapely.linearrings(nodes, indices=ring_of), indices=owner)
     if not shapely.is_valid(polygons).all() or not shapely.coverage_is_valid(polygons):
         return None
@@ -189,16 +198,16 @@ def arrange(
     """Fill an outline with the roof faces that explain the points best for their number and their borders' length.
 
     Coarse labels of a raster give candidate lines along their borders; the lines cut the outline into cells where
-    they have support; the cells get the labels of least cost; cells of one label are a face. Before the lines are
-    drawn every plane is fitted anew to the points of its places. Cells whose plane leaves the points around them are
-    cut once more (`far_corners`).
+    they have support; the cells get the labels of least cost; cells of one label are a face. Every plane is refitted to
+    the points of its coarse labels before the lines are drawn. Cells whose plane leaves the points around them are cut
+    once more (`far_corners`).
 
     Parameters
     ----------
     points : (n, 3) float64
         Roof points that see the sky, local metres, in a canonical order.
     labels : (n,) int32
-        Plane of each, -1 for none; they tell how high each plane reaches.
+        Plane of each, -1 for none; they show how high each plane reaches.
     planes : (k, 3) float64
         Coefficients a, b, c of z = a x + b y + c.
     outline_mm : MultiPolygon
@@ -208,20 +217,20 @@ def arrange(
     settings : ArrangementSettings
         Costs and lengths.
     clearance : float
-        Times the usual distances that vertices keep from each other: more where planes meet nearly in one point and no
-        solid is sound.
+        Times the usual distances that vertices keep from each other; more where planes nearly meet in one point and no
+        solid is valid.
 
     Returns
     -------
     RoofPartition
         A valid coverage of the whole outline: polygons in integer millimetres that share their borders exactly. A
-        place without points belongs to a neighbour's plane. With its planes: the given ones in their order, behind
-        them horizontal ones for places where none of them fits.
+        place without points belongs to a neighbour's plane. Its planes are the given ones in their order, then
+        horizontal ones for places where none of them fits.
 
     Raises
     ------
     BuildingError
-        `no_plane` without planes; `no_partition` where the outline is empty or the faces are no coverage.
+        `no_plane` without planes; `no_partition` where the outline is empty or the faces are not a coverage.
     """
     if len(planes) == 0:
         raise BuildingError(Reason.NO_PLANE, "there is no plane to arrange")
@@ -233,21 +242,8 @@ def arrange(
     shift = np.array([low[0] * 1e-3, low[1] * 1e-3, 0.0])
     moved = np.ascontiguousarray(planes, dtype=np.float64).copy()
     moved[:, 2] += moved[:, 0] * shift[0] + moved[:, 1] * shift[1]
-    points_per_m2 = 1.0 / spacing_m**2
-    face_cost, doubtful_cost = settings.costs_of_face(points_per_m2)
-    weights = _Weights(
-        cell_m=settings.raster_cell_of(spacing_m),
-        points_per_m2=points_per_m2,
-        cap_m=settings.residual_cap_m,
-        cost_per_m=settings.border_cost / spacing_m,
-        face_cost=round(face_cost * COST_SCALE),
-        doubtful_cost=round(doubtful_cost * COST_SCALE),
-        line_length_m=settings.line_length_m,
-        line_reach_m=max(settings.line_reach_m, spacing_m),
-        overshoot_m=max(settings.overshoot_m, spacing_m),
-        clearance=clearance,
-    )
-    found = _arranged(points - shift, labels, moved, _Outline(ring_xy - low, ring_starts, polygon_of_ring), weights)
+    limits = limits_at(spacing_m, settings, clearance)
+    found = _arranged(points - shift, labels, moved, _Outline(ring_xy - low, ring_starts, polygon_of_ring), limits)
     nodes, ring_of, owner, is_sound = found.rings
     polygons = _polygons(nodes + low, ring_of, owner) if is_sound else None
     if polygons is None:
@@ -258,7 +254,7 @@ def arrange(
         )
         polygons = _polygons(nodes + low, ring_of, owner) if is_sound else None
     if polygons is None:
-        raise BuildingError(Reason.NO_PARTITION, "the cells of the outline make no coverage")
+        raise BuildingError(Reason.NO_PARTITION, "the cells of the outline do not make a coverage")
     fitted = found.planes
     fitted[:, 2] -= fitted[:, 0] * shift[0] + fitted[:, 1] * shift[1]
     described = tuple(

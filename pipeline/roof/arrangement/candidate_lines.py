@@ -1,42 +1,62 @@
 """Candidate lines from the borders of coarse labels: where planes cross, else steps along the building's directions.
 
-A border between two labels is a set of places, each amid two neighbouring cells. Those near to the line in which the
-two planes cross are a ridge, hip or valley and support that line exactly. What is left is cut into steps: lines with a
-direction of the outline, of a contour or of a fall line of one of the planes, as long as they find enough places;
-each is then moved to where it parts the points of the two planes at the least cost.
+A border between two labels is a set of places, each amid two neighbouring cells. Those near the line in which the two
+planes cross are a ridge, hip or valley and support that line exactly. The others are cut into steps: lines with a
+direction of the outline, of a contour or of a fall line of one of the planes, as long as they find enough places. Each
+is then moved to where it parts the points of the two planes at the least cost.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.roof.arrangement.raster_labels import vertical_distance_m
+from pipeline.roof.arrangement.raster_labels import Raster, vertical_distance_m
 
 _MIN_SLOPE = 0.08
-"""Planes whose slopes differ by less cross nowhere exactly."""
+"""Difference of slopes below which two planes cross nowhere exactly: their noise moves the line by metres."""
 _NEAR_CROSSING_CELLS = 1.2
 _NEAR_CROSSING_M = 0.1
-"""A place this near to the planes' crossing belongs to it."""
+"""A place this near to the planes' crossing belongs to it: labels are no finer than a cell."""
 _BAND_CELLS = 1.1
-"""Width of the band in which the places of one step lie."""
+"""Width of the band in which the places of one step lie, by the resolution of the labels."""
 _CROSSING_BONUS = 1.5
-"""A crossing comes before a step with as many places: its position is exact."""
+"""A crossing comes before a step with as many places, since its position is exact. Decides only an order."""
 _MIN_EDGE_M = 1.0
+"""Shorter edges of the outline do not give a direction."""
 _SAME_DIRECTION_RAD = math.radians(3.0)
+"""Directions closer than this are one: over a few metres they differ by less than a cell."""
 _SEARCH_M = 1.0
 """How far from a step the points are that decide its position."""
 _MIN_POINTS = 4
+"""Fewer points do not show where a step is."""
 _MAX_DIRECTIONS = 24
+"""Bounds the work for outlines with very many edges; the longest come first."""
+
+
+class CandidateLines(NamedTuple):
+    """Lines that may cut an outline, with the places on the borders of coarse labels that support them."""
+
+    lines: FloatArray
+    """(l, 3) float64, nx x + ny y + offset = 0 with unit normals, metres."""
+    scores: FloatArray
+    """(l,) float64, places on each; more for crossings."""
+    crossing: LabelArray
+    """(l,) int32, 1 where two planes cross, 0 for a step."""
+    places: FloatArray
+    """(m, 2) float64, metres."""
+    line_of: LabelArray
+    """(m,) int32, line that each place supports, or -1."""
 
 
 @kernel
 def _outline_directions(edges: FloatArray) -> FloatArray:
-    """Directions of the long edges of the outline and those square to them, longest first, in [0, pi)."""
+    """Directions of the long edges (e, 4) of an outline and those square to them, longest first, in [0, pi), (n,)."""
     shortness = np.empty(len(edges))
     for e in range(len(edges)):
         shortness[e] = -np.hypot(edges[e, 2] - edges[e, 0], edges[e, 3] - edges[e, 1])
@@ -53,7 +73,7 @@ def _outline_directions(edges: FloatArray) -> FloatArray:
 
 @kernel
 def _with_direction(found: FloatArray, n: int, angle: float) -> int:
-    """Append a direction unless a like one is there; the new number of them."""
+    """Append a direction in [0, pi) unless a similar one is among the first n; the new number of them."""
     for q in range(n):
         apart = abs(found[q] - angle)
         if min(apart, math.pi - apart) < _SAME_DIRECTION_RAD:
@@ -65,9 +85,17 @@ def _with_direction(found: FloatArray, n: int, angle: float) -> int:
 
 
 @kernel
-def border_places(
-    labels: LabelArray, place: LabelArray, low_x: float, low_y: float, cell_m: float, columns: int, n_planes: int
-) -> tuple[FloatArray, IntArray]:
+def _with_directions_of(plane: FloatArray, directions: FloatArray, n: int) -> int:
+    """Append the directions of a plane's fall line and contour; the new number of directions."""
+    if math.hypot(plane[0], plane[1]) > _MIN_SLOPE:
+        fall = math.atan2(plane[1], plane[0])
+        n = _with_direction(directions, n, fall % math.pi)
+        n = _with_direction(directions, n, (fall + math.pi / 2) % math.pi)
+    return n
+
+
+@kernel
+def border_places(labels: LabelArray, raster: Raster, n_planes: int) -> tuple[FloatArray, IntArray]:
     """Places amid neighbouring cells of different labels, ordered by their pair of labels.
 
     Returns
@@ -77,22 +105,20 @@ def border_places(
     pairs : (m,) int64
         low * n_planes + high, ascending.
     """
-    number = np.full(place[-1] + columns + 2 if len(place) > 0 else 1, -1, np.int32)
-    for i in range(len(place)):
-        number[place[i]] = i
+    place, columns = raster.place, raster.columns
     places = np.empty((2 * len(place), 2))
     pairs = np.empty(2 * len(place), np.int64)
     m = 0
     for i in range(len(place)):
         r, c = place[i] // columns, place[i] % columns
         for step in range(2):
-            if step == 0 and c + 1 >= columns:
+            if (c + 1 >= columns) if step == 0 else (r + 1 >= raster.rows):
                 continue
-            j = number[place[i] + (1 if step == 0 else columns)]
+            j = raster.number[place[i] + (1 if step == 0 else columns)]
             if j < 0 or labels[j] == labels[i]:
                 continue
-            places[m, 0] = low_x + (c + 0.5 + 0.5 * (step == 0)) * cell_m
-            places[m, 1] = low_y + (r + 0.5 + 0.5 * (step == 1)) * cell_m
+            places[m, 0] = raster.west + (c + 0.5 + 0.5 * (step == 0)) * raster.cell_m
+            places[m, 1] = raster.south + (r + 0.5 + 0.5 * (step == 1)) * raster.cell_m
             pairs[m] = np.int64(min(labels[i], labels[j])) * n_planes + max(labels[i], labels[j])
             m += 1
     order = ascending_order(pairs[:m])
@@ -107,7 +133,7 @@ def border_places(
 def _best_band(
     places: FloatArray, first: int, last: int, line_of: LabelArray, directions: FloatArray, n: int, band_m: float
 ) -> tuple[int, float, float]:
-    """The direction and offset whose band holds most of the places first..last that have no line yet."""
+    """How many places, the direction and offset of the band that holds most of first..last without a line yet."""
     most, best_angle, best_offset = 0, 0.0, 0.0
     offsets = np.empty(last - first)
     for d in range(n):
@@ -132,18 +158,17 @@ def _best_band(
 @kernel
 def _parting_shift(
     points: FloatArray,
-    planes: FloatArray,
-    a: int,
-    b: int,
+    one: FloatArray,
+    other: FloatArray,
     line: FloatArray,
     low: float,
     high: float,
     cap_m: float,
     reach_m: float,
 ) -> float:
-    """How far to shift a step so that it parts the points of its two planes at the least capped cost.
+    """How far to shift a step, in metres, to part the points of its two planes at the least sum of capped residuals.
 
-    `low` and `high` bound the step along its direction (-ny, nx). nan where too few points tell.
+    `low` and `high` bound the step along its direction (-ny, nx). nan where too few points show it.
     """
     offsets = np.empty(len(points))
     gains = np.empty(len(points))
@@ -155,11 +180,11 @@ def _parting_shift(
         along = -line[1] * points[i, 0] + line[0] * points[i, 1]
         if along < low or along > high:
             continue
-        to_a, to_b = vertical_distance_m(points[i], planes[a]), vertical_distance_m(points[i], planes[b])
-        if to_a >= cap_m and to_b >= cap_m:
+        to_one, to_other = vertical_distance_m(points[i], one), vertical_distance_m(points[i], other)
+        if to_one >= cap_m and to_other >= cap_m:
             continue
         offsets[m] = off
-        gains[m] = (min(to_a, cap_m) - min(to_b, cap_m)) / cap_m
+        gains[m] = (min(to_one, cap_m) - min(to_other, cap_m)) / cap_m
         m += 1
     if m < _MIN_POINTS:
         return math.nan
@@ -175,12 +200,25 @@ def _parting_shift(
         shift = 0.5 * (offsets[order[q]] + offsets[order[q + 1]])
         if abs(shift) > reach_m:
             continue
-        # plane a below the line and b above it, or the other way round
+        # one plane below the line and the other above it, or the other way round
         cost = min(below, total - below)
         if cost < least - 1e-9 or (cost <= least + 1e-9 and abs(shift) < abs(best)):
             least = cost
             best = shift
     return best
+
+
+@kernel
+def _take_places(
+    places: FloatArray, first: int, last: int, line: FloatArray, near_m: float, line_of: LabelArray, number: int
+) -> int:
+    """Give the places first..last nearer to a line than a distance its number; how many there are."""
+    taken = 0
+    for q in range(first, last):
+        if abs(line[0] * places[q, 0] + line[1] * places[q, 1] + line[2]) < near_m:
+            line_of[q] = number
+            taken += 1
+    return taken
 
 
 @kernel
@@ -193,7 +231,7 @@ def candidate_lines(
     cell_m: float,
     cap_m: float,
     min_length_m: float,
-) -> tuple[FloatArray, FloatArray, LabelArray, LabelArray]:
+) -> CandidateLines:
     """Lines along the borders of coarse labels.
 
     Parameters
@@ -212,17 +250,6 @@ def candidate_lines(
         Residual from which a point is unexplained.
     min_length_m : float
         Shorter borders give no line.
-
-    Returns
-    -------
-    lines : (l, 3) float64
-        nx x + ny y + offset = 0 with unit normals.
-    scores : (l,) float64
-        Places on each; more for crossings.
-    crossing : (l,) int32
-        1 where two planes cross, 0 for a step.
-    line_of : (m,) int32
-        Line that each place supports, or -1.
     """
     k = len(planes)
     m = len(places)
@@ -233,26 +260,25 @@ def candidate_lines(
     line_of = np.full(m, -1, np.int32)
     outline = _outline_directions(edges)
     directions = np.empty(len(outline) + 4)
+    difference = np.empty(3)
     n_lines = 0
     first = 0
     while first < m:
         last = first
         while last < m and pairs[last] == pairs[first]:
             last += 1
-        a, b = int(pairs[first] // k), int(pairs[first] % k)
+        one, other = planes[pairs[first] // k], planes[pairs[first] % k]
         free = last - first
-        da, db, dc = planes[a, 0] - planes[b, 0], planes[a, 1] - planes[b, 1], planes[a, 2] - planes[b, 2]
-        turn = math.hypot(da, db)
+        for axis in range(3):
+            difference[axis] = one[axis] - other[axis]
+        turn = math.hypot(difference[0], difference[1])
         if turn > _MIN_SLOPE:
-            # where the planes differ by less than the cap the points cannot tell on which side they are
+            # where the planes differ by less than the cap the points do not show on which side they are
             near_m = max(_NEAR_CROSSING_CELLS * cell_m + _NEAR_CROSSING_M, min(cap_m / turn, 4.0 * cell_m))
-            on_line = 0
-            for q in range(first, last):
-                if abs(da * places[q, 0] + db * places[q, 1] + dc) < near_m * turn:
-                    line_of[q] = n_lines
-                    on_line += 1
+            on_line = _take_places(places, first, last, difference, near_m * turn, line_of, n_lines)
             if on_line >= least:
-                lines[n_lines, 0], lines[n_lines, 1], lines[n_lines, 2] = da / turn, db / turn, dc / turn
+                for axis in range(3):
+                    lines[n_lines, axis] = difference[axis] / turn
                 scores[n_lines] = _CROSSING_BONUS * on_line
                 crossing[n_lines] = 1
                 free -= on_line
@@ -262,11 +288,8 @@ def candidate_lines(
         n = len(outline)
         for q in range(n):
             directions[q] = outline[q]
-        for plane in (a, b):
-            if math.hypot(planes[plane, 0], planes[plane, 1]) > _MIN_SLOPE:
-                fall = math.atan2(planes[plane, 1], planes[plane, 0])
-                n = _with_direction(directions, n, fall % math.pi)
-                n = _with_direction(directions, n, (fall + math.pi / 2) % math.pi)
+        n = _with_directions_of(one, directions, n)
+        n = _with_directions_of(other, directions, n)
         while free >= least:
             most, angle, offset = _best_band(places, first, last, line_of, directions, n, _BAND_CELLS * cell_m)
             if most < least:
@@ -283,14 +306,15 @@ def candidate_lines(
                     low, high = min(low, along), max(high, along)
             reach_m = 0.6 * cell_m + _NEAR_CROSSING_M
             half = 0.5 * cell_m
-            shift = _parting_shift(points, planes, a, b, line, low - half, high + half, cap_m, reach_m)
+            shift = _parting_shift(points, one, other, line, low - half, high + half, cap_m, reach_m)
             if not math.isnan(shift):
                 line[2] -= shift
             elif turn > _MIN_SLOPE:
-                # a border in a gap of the points lies anywhere: the planes themselves tell where they meet
-                line[0], line[1], line[2] = da / turn, db / turn, dc / turn
+                # a border in a gap of the points lies anywhere: it is where the planes themselves meet
+                for axis in range(3):
+                    line[axis] = difference[axis] / turn
                 crossing[n_lines] = 1
             scores[n_lines] = most
             n_lines += 1
         first = last
-    return lines[:n_lines].copy(), scores[:n_lines].copy(), crossing[:n_lines].copy(), line_of
+    return CandidateLines(lines[:n_lines].copy(), scores[:n_lines].copy(), crossing[:n_lines].copy(), places, line_of)

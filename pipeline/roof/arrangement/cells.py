@@ -1,9 +1,9 @@
 """Which plane each cell of the subdivision belongs to: the points in it against borders and faces.
 
 The cost of a cell's label is the sum of its points' capped residuals, in unexplained points; a border costs by its
-length, a face as such: a short description of the roof (minimum description length) with the points as its data.
-Whether a face earns its cost is another question than where it ends: there only the points count that misfit the plane
-next door. A few points are evidence enough where they lie on its plane; where part of them misfit it too, as
+length, a face by its existence: a short description of the roof (minimum description length) with the points as its
+data. Whether a face earns its cost is another question than where it ends: only the points that misfit the neighbouring
+plane count for it. A few points are enough evidence where they lie on its plane; where part of them misfit it too, as
 in a crown above the roof, the face has to be larger.
 """
 
@@ -18,14 +18,16 @@ from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import ascending_order
 from pipeline.kernels.union_find import numbered_sets, unite
 from pipeline.model import FloatArray, IntArray, LabelArray
+from pipeline.roof.arrangement.limits import Limits
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
 from pipeline.roof.arrangement.subdivision import CELLS, EDGES, FACE, ORIGIN, Subdivision, between_vertices
 
 _MIN_BEYOND = 3.0
 """Points that a cell counts for at least where a plane leaves the heights of its own: splinters hold none."""
 _ROW_MM = 500.0
+"""Height of the rows by which edges are sorted; changes the speed only."""
 _TOLERANCE = 0.5
-"""Of the cap: points nearer than this to a plane fit it; from there to the cap they misfit more and more."""
+"""Share of the cap: points nearer than this to a plane fit it; from there to the cap they misfit more and more."""
 _DOUBTFUL_SHARE = 0.5
 """Share of a face's points that misfit its own plane from which on it costs the most: a plane amid points that fill a
 space, as a crown does, is met by about half of them."""
@@ -33,10 +35,7 @@ space, as a crown does, is met by about half of them."""
 
 @kernel
 def cells_of_points(plan: Subdivision, points: FloatArray) -> IntArray:
-    """The cell in which each point lies, (n,) int64; -1 outside.
-
-    Points on a border belong to the cell east of it; `points` are in metres.
-    """
+    """The cell of each point (n, 3), metres, as (n,) int64; -1 outside. Borders belong to the cell east of them."""
     xy, graph, n_edges = plan.xy, plan.graph, plan.counts[EDGES]
     low, high = math.inf, -math.inf
     for h in range(n_edges):
@@ -92,53 +91,56 @@ def cell_areas_m2(plan: Subdivision) -> FloatArray:
 
 
 @kernel
+def _heights_of_planes(points: FloatArray, labels: LabelArray, planes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest point of each plane, (k,) metres; for a level plane without points its own height."""
+    k = len(planes)
+    lowest, highest = np.full(k, math.inf), np.full(k, -math.inf)
+    for i in range(len(points)):
+        if labels[i] >= 0:
+            lowest[labels[i]] = min(lowest[labels[i]], points[i, 2])
+            highest[labels[i]] = max(highest[labels[i]], points[i, 2])
+    for label in range(k):
+        if lowest[label] > highest[label] and planes[label, 0] == 0.0 == planes[label, 1]:
+            lowest[label] = highest[label] = planes[label, 2]
+    return lowest, highest
+
+
+@kernel
 def cell_costs(
-    plan: Subdivision,
-    points: FloatArray,
-    labels: LabelArray,
-    planes: FloatArray,
-    cells: IntArray,
-    cap_m: float,
-    points_per_m2: float,
-    overshoot_m: float,
+    plan: Subdivision, points: FloatArray, labels: LabelArray, planes: FloatArray, cells: IntArray, limits: Limits
 ) -> tuple[IntArray, IntArray]:
     """Cost of every plane in every cell.
 
-    A plane that leaves the heights of its own points at corners of a cell costs as if that share of the cell, or a few
-    points, were not explained: planes are not continued far above or below their data where no points speak. That share
-    of the points that the cell lacks for its area misfits, or a few.
+    Where a plane leaves the heights of its own points at corners of a cell, it costs as if that share of the cell, or a
+    few points, were not explained: planes are not continued far above or below their data without points. That share of
+    the points that the cell lacks for its area misfits, or a few points.
 
     Returns
     -------
     costs : (c, k) int64
         By the capped residuals, in thousandths of an unexplained point.
     misfits : (c, k) int64
-        The same without what lies within half the cap.
+        The same without residuals within half the cap.
     """
     xy, graph, n_cells = plan.xy, plan.graph, plan.counts[CELLS]
     k = len(planes)
     costs, misfits = np.zeros((n_cells, k), np.int64), np.zeros((n_cells, k), np.int64)
     expected, lacking = cell_areas_m2(plan), np.empty(n_cells)
     for cell in range(n_cells):
-        expected[cell] *= points_per_m2
+        expected[cell] *= limits.points_per_m2
         lacking[cell] = expected[cell]
-    lowest, highest = np.full(k, math.inf), np.full(k, -math.inf)
     for i in range(len(points)):
-        if labels[i] >= 0:
-            lowest[labels[i]] = min(lowest[labels[i]], points[i, 2])
-            highest[labels[i]] = max(highest[labels[i]], points[i, 2])
         cell = cells[i]
         if cell < 0:
             continue
         lacking[cell] -= 1.0
         for label in range(k):
-            share = min(vertical_distance_m(points[i], planes[label]) / cap_m, 1.0)
+            share = min(vertical_distance_m(points[i], planes[label]) / limits.cap_m, 1.0)
             costs[cell, label] += int(COST_SCALE * share)
             if share > _TOLERANCE:
                 misfits[cell, label] += int(COST_SCALE * (share - _TOLERANCE) / (1.0 - _TOLERANCE))
-    for label in range(k):
-        if lowest[label] > highest[label] and planes[label, 0] == 0.0 == planes[label, 1]:
-            lowest[label] = highest[label] = planes[label, 2]
+    lowest, highest = _heights_of_planes(points, labels, planes)
+    overshoot_m = limits.overshoot_m
     beyond = np.zeros((n_cells, k), np.int64)
     corners = np.zeros(n_cells, np.int64)
     for h in range(plan.counts[EDGES]):
@@ -164,7 +166,7 @@ def cell_costs(
 
 @kernel
 def cell_borders(plan: Subdivision, cost_per_m: float) -> tuple[IntArray, IntArray]:
-    """Pairs of cells that share an edge, and what a border of faces there costs."""
+    """Pairs of cells that share an edge, (m, 2), and what a border there costs, (m,), thousandths of points."""
     xy, graph, n_edges = plan.xy, plan.graph, plan.counts[EDGES]
     pairs = np.empty((n_edges // 2, 2), np.int64)
     weights = np.empty(n_edges // 2, np.int64)
@@ -183,7 +185,7 @@ def cell_borders(plan: Subdivision, cost_per_m: float) -> tuple[IntArray, IntArr
 
 @kernel
 def connected_faces(labels: LabelArray, pairs: IntArray) -> tuple[LabelArray, int]:
-    """The face of every cell: cells of one label that hang together by edges, numbered by their lowest cell."""
+    """The face of every cell, numbered by its lowest cell, and their number: cells of one label connected by edges."""
     parent = np.arange(len(labels))
     for e in range(len(pairs)):
         if labels[pairs[e, 0]] == labels[pairs[e, 1]]:
@@ -202,6 +204,22 @@ def points_per_cell(cells: IntArray, n_cells: int) -> LabelArray:
 
 
 @kernel
+def _borders_of_faces(faces: LabelArray, count: int, pairs: IntArray, weights: IntArray) -> tuple[IntArray, IntArray]:
+    """Borders of faces by keys face * count + neighbour, ascending, and the cost of each of their edges."""
+    keys = np.empty(2 * len(pairs), np.int64)
+    between = np.empty(2 * len(pairs), np.int64)
+    m = 0
+    for e in range(len(pairs)):
+        f, g = faces[pairs[e, 0]], faces[pairs[e, 1]]
+        if f != g:
+            keys[m], keys[m + 1] = np.int64(f) * count + g, np.int64(g) * count + f
+            between[m] = between[m + 1] = weights[e]
+            m += 2
+    order = ascending_order(keys[:m])
+    return keys[order], between[order]
+
+
+@kernel
 def unite_faces(
     misfits: IntArray,
     held: LabelArray,
@@ -213,8 +231,8 @@ def unite_faces(
 ) -> None:
     """Give whole faces the label of a neighbour while that saves more than it costs, the best first.
 
-    It saves their common border, and a face for every neighbour with that label; it costs the points that misfit then.
-    The more of its own points misfit it, the more a face costs.
+    This saves their common border, and a face for every neighbour with that label; it costs the points that misfit
+    then. A face costs more the more of its own points misfit it.
 
     Parameters
     ----------
@@ -242,40 +260,31 @@ def unite_faces(
             for label in range(k):
                 data[faces[i], label] += misfits[i, label]
             inside[faces[i]] += held[i]
-        keys = np.empty(2 * len(pairs), np.int64)
-        between = np.empty(2 * len(pairs), np.int64)
-        m = 0
-        for e in range(len(pairs)):
-            f, g = faces[pairs[e, 0]], faces[pairs[e, 1]]
-            if f != g:
-                keys[m], keys[m + 1] = np.int64(f) * count + g, np.int64(g) * count + f
-                between[m] = between[m + 1] = weights[e]
-                m += 2
-        order = ascending_order(keys[:m])
+        keys, between = _borders_of_faces(faces, count, pairs, weights)
         best = np.int64(0)
         best_face, best_label = -1, -1
         saved = np.zeros(k, np.int64)
         s = 0
-        while s < m:
-            f = keys[order[s]] // count
+        while s < len(keys):
+            f = keys[s] // count
             first = s
-            while s < m and keys[order[s]] // count == f:
-                label = label_of[keys[order[s]] % count]
-                saved[label] += between[order[s]]
-                if s == first or keys[order[s]] != keys[order[s - 1]]:
+            while s < len(keys) and keys[s] // count == f:
+                label = label_of[keys[s] % count]
+                saved[label] += between[s]
+                if s == first or keys[s] != keys[s - 1]:
                     saved[label] += face_cost
                 s += 1
             own = data[f, label_of[f]]
             doubt = min(own / (_DOUBTFUL_SHARE * COST_SCALE * inside[f]), 1.0) if inside[f] > 0 else 1.0
             own += int(doubt * (doubtful_cost - face_cost))
             for q in range(first, s):
-                label = label_of[keys[order[q]] % count]
+                label = label_of[keys[q] % count]
                 change = data[f, label] - own - saved[label]
                 if change < best:
                     best = change
                     best_face, best_label = f, label
             for q in range(first, s):
-                saved[label_of[keys[order[q]] % count]] = 0
+                saved[label_of[keys[q] % count]] = 0
         if best_face < 0:
             return
         for i in range(len(labels)):

@@ -1,12 +1,13 @@
 """Roof faces from labelled cells: borders that cross are parted, cells united, rings traced.
 
-Where two borders cross, walls of four faces can meet in one vertical edge, or one face can touch itself: no solid has
-such an edge (val3dity's 303). There a small corner of one face goes to its neighbour, which parts the borders.
+Where two borders cross, walls of four faces can meet in one vertical edge, or one face can touch itself: a solid with
+such an edge is not valid (val3dity's 303). A small corner of one face then goes to its neighbour, which parts them.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,24 +31,42 @@ from pipeline.roof.arrangement.subdivision import (
 )
 
 _CORNER_MM = 120.0
-"""Size of the corner that goes to a neighbour."""
+"""Size of the corner that goes to a neighbour: well above the rounding to 1 mm, below the size of details."""
 _MIN_CORNER_MM = 20.0
+"""Where there is room for less only, the border is not parted here; numerical guard."""
 _STRAIGHT_MM = 2.0
-"""A vertex that was put on a line and bends it by less goes again."""
+"""A vertex that was put on a line and bends it by less goes again: this is what rounding to 1 mm does."""
 _MAX_BORDERS = 32
+"""Room for the borders that meet in one vertex; further ones are not looked at."""
 _LARGE_COST = 100.0
 """Metres: more than heights differ by."""
 
 
+class _Star(NamedTuple):
+    """The borders between faces at one vertex, turning left, and what lies to the left of each, with room for 32."""
+
+    borders: IntArray
+    """int64, half-edges."""
+    faces: IntArray
+    """int64, -1 outside."""
+    planes: IntArray
+    """int64, -1 outside."""
+    heights: FloatArray
+    """Of the planes at the vertex, metres; -inf outside."""
+    refused: BoolArray
+    """(64,), corners that cannot be given to the left and to the right."""
+
+
 @kernel
 def _face_left(graph: IntArray, h: int, faces: LabelArray) -> int:
+    """The face to the left of a half-edge; -1 outside."""
     cell = graph[h, FACE]
     return int(faces[cell]) if cell >= 0 else -1
 
 
 @kernel
 def _borders_at(graph: IntArray, h: int, faces: LabelArray, borders: IntArray) -> int:
-    """The borders between faces that leave the origin of h, turning left; their number."""
+    """Fill in the borders between faces that leave the origin of h, turning left; their number."""
     m = 0
     g = h
     while True:
@@ -61,12 +80,13 @@ def _borders_at(graph: IntArray, h: int, faces: LabelArray, borders: IntArray) -
 
 
 @kernel
-def _crosses(around: IntArray, heights: FloatArray, m: int) -> bool:
-    """Whether a face meets itself at a vertex, or walls of four faces meet above it."""
+def _crosses(star: _Star, m: int) -> bool:
+    """Whether a face meets itself at a vertex of m borders, or walls of four faces meet above it."""
     for i in range(m):
         for j in range(i):
-            if around[i] == around[j]:
+            if star.faces[i] == star.faces[j]:
                 return True
+    heights = star.heights
     for k in range(m):
         changes = 0
         for i in range(m):
@@ -112,6 +132,7 @@ def _give_corner(plan: Subdivision, labels: LabelArray, first: int, last: int, l
 
 @kernel
 def _height_m(plane: FloatArray, x_mm: float, y_mm: float) -> float:
+    """Height of a plane over a place."""
     height: float = plane[0] * x_mm * 1e-3 + plane[1] * y_mm * 1e-3 + plane[2]
     return height
 
@@ -122,8 +143,8 @@ def _corner_cost(
 ) -> float:
     """How much heights change where a corner takes its neighbour's plane, metres; much where planes would then cross.
 
-    Along `edge` the neighbour's plane meets that beyond the corner: where they cross close to the vertex, the solid
-    would get vertices too close to one another.
+    Along `edge` the neighbour's plane meets that beyond the corner: if they cross close to the vertex, the solid would
+    get vertices too close to one another.
     """
     xy, graph = plan.xy, plan.graph
     v, w = graph[edge, ORIGIN], graph[edge ^ 1, ORIGIN]
@@ -140,10 +161,32 @@ def _corner_cost(
 
 
 @kernel
+def _cheapest_corner(plan: Subdivision, planes: FloatArray, star: _Star, m: int, corner_mm: float) -> int:
+    """The corner i of m that costs least to give to its left (2 i) or right neighbour (2 i + 1); -1 for none."""
+    faces, plane_of = star.faces, star.planes
+    least, choice = math.inf, -1
+    for i in range(m):
+        for side in range(2):
+            j, beyond = ((i + 1) % m, (i - 1) % m) if side == 0 else ((i - 1) % m, (i + 1) % m)
+            if faces[i] < 0 or faces[j] < 0 or star.refused[2 * i + side]:
+                continue
+            edge = star.borders[i] if side == 0 else star.borders[(i + 1) % m]
+            cost = _corner_cost(plan, planes, plane_of[i], plane_of[j], plane_of[beyond], edge, corner_mm)
+            if faces[j] == faces[beyond]:
+                cost -= _LARGE_COST
+            elif plane_of[j] == plane_of[beyond]:
+                # a neck would make two faces one
+                cost += _LARGE_COST
+            if cost < least:
+                least, choice = cost, 2 * i + side
+    return choice
+
+
+@kernel
 def part_crossings(
     plan: Subdivision, labels: LabelArray, planes: FloatArray, clearance: float
 ) -> tuple[LabelArray, int]:
-    """Part borders that cross such that no solid could stand on them.
+    """Part borders that cross in a way that no solid can have.
 
     Parameters
     ----------
@@ -165,11 +208,14 @@ def part_crossings(
     """
     xy, graph, counts = plan.xy, plan.graph, plan.counts
     corner_mm = clearance * _CORNER_MM
-    borders = np.empty(_MAX_BORDERS, np.int64)
-    around = np.empty(_MAX_BORDERS, np.int64)
-    plane_of = np.empty(_MAX_BORDERS, np.int64)
-    refused = np.empty(2 * _MAX_BORDERS, np.bool_)
-    heights = np.empty(_MAX_BORDERS)
+    star = _Star(
+        np.empty(_MAX_BORDERS, np.int64),
+        np.empty(_MAX_BORDERS, np.int64),
+        np.empty(_MAX_BORDERS, np.int64),
+        np.empty(_MAX_BORDERS),
+        np.empty(2 * _MAX_BORDERS, np.bool_),
+    )
+    borders = star.borders
     pairs, _ = cell_borders(plan, 0.0)
     faces, n_faces = connected_faces(labels[: counts[CELLS]], pairs)
     leaving = np.full(len(xy), -1, np.int64)
@@ -182,40 +228,25 @@ def part_crossings(
             if m < 4:
                 break
             for i in range(m):
-                around[i] = _face_left(graph, borders[i], faces)
-                heights[i] = -math.inf
-                plane_of[i] = -1
-                if around[i] >= 0:
-                    plane_of[i] = labels[graph[borders[i], FACE]]
-                    heights[i] = _height_m(planes[plane_of[i]], float(xy[v, 0]), float(xy[v, 1]))
-            if not _crosses(around, heights, m):
+                star.faces[i] = _face_left(graph, borders[i], faces)
+                star.heights[i] = -math.inf
+                star.planes[i] = -1
+                if star.faces[i] >= 0:
+                    star.planes[i] = labels[graph[borders[i], FACE]]
+                    star.heights[i] = _height_m(planes[star.planes[i]], float(xy[v, 0]), float(xy[v, 1]))
+            if not _crosses(star, m):
                 break
-            refused[:] = False
+            star.refused[:] = False
             given = False
             while not given:
-                least = math.inf
-                corner, giver, choice = -1, -1, -1
-                for i in range(m):
-                    for side in range(2):
-                        j, beyond = ((i + 1) % m, (i - 1) % m) if side == 0 else ((i - 1) % m, (i + 1) % m)
-                        if around[i] < 0 or around[j] < 0 or refused[2 * i + side]:
-                            continue
-                        edge = borders[i] if side == 0 else borders[(i + 1) % m]
-                        cost = _corner_cost(plan, planes, plane_of[i], plane_of[j], plane_of[beyond], edge, corner_mm)
-                        if around[j] == around[beyond]:
-                            cost -= _LARGE_COST
-                        elif plane_of[j] == plane_of[beyond]:
-                            # a neck would make two faces one
-                            cost += _LARGE_COST
-                        if cost < least:
-                            least = cost
-                            corner, giver, choice = i, j, 2 * i + side
-                if corner < 0:
+                choice = _cheapest_corner(plan, planes, star, m, corner_mm)
+                if choice < 0:
                     break
+                corner = choice // 2
+                giver = (corner + 1) % m if choice % 2 == 0 else (corner - 1) % m
                 label = labels[graph[borders[giver], FACE]]
-                first, last = borders[corner], borders[(corner + 1) % m]
-                given = _give_corner(plan, labels, first, last, label, corner_mm)
-                refused[choice] = not given
+                given = _give_corner(plan, labels, borders[corner], borders[(corner + 1) % m], label, corner_mm)
+                star.refused[choice] = not given
             pairs, _ = cell_borders(plan, 0.0)
             faces, n_faces = connected_faces(labels[: counts[CELLS]], pairs)
             if not given:

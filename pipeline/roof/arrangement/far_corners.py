@@ -1,10 +1,9 @@
 """Corners where a roof plane leaves all points around it: cut off, and given to a plane that does not.
 
 Where two lines meet far beyond the end of a ridge, or a slope runs on into a part of the outline that holds something
-else, one cell spans what a plane explains and what it does not, and the few points there are too weak a voice: the roof
-gets a fin. Such a cell is cut once more, along the line in which its plane meets that of the part beyond, else where
-its edges come near the points again. Then a plane costs in every cell at whose corners it is farther from the points
-than another.
+else, one cell spans an explained and an unexplained part, and the few points there count too little: the roof gets a
+fin. Such a cell is cut once more, along the line in which its plane meets that of the part beyond, else where its
+edges come near the points again. Then a plane costs in every cell at whose corners another is nearer to the points.
 
 Down an eave or up to the top of a pent roof a plane may go on beyond its last points: by its slope, up to 1, over the
 distance within which points are looked for; down an eave also over the distance of the next ones where there are none.
@@ -19,6 +18,7 @@ import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
+from pipeline.roof.arrangement.limits import Limits
 from pipeline.roof.arrangement.raster_labels import COST_SCALE, vertical_distance_m
 from pipeline.roof.arrangement.subdivision import (
     CELLS,
@@ -46,7 +46,7 @@ class HeightsRaster(NamedTuple):
     west: float
     south: float
     side: float
-    """Of a cell, 0.75 m or a spacing."""
+    """Of a cell: 0.75 m or a spacing, the larger."""
 
 
 class HeightsAround(NamedTuple):
@@ -58,23 +58,23 @@ class HeightsAround(NamedTuple):
     """(v,), -inf where there is none."""
     within: FloatArray
     """(v,), how far from the vertex they were looked for."""
-    side: float
-    """Of the raster's cells."""
+    raster: HeightsRaster
+    """Where they come from."""
 
 
 _AROUND_M = 0.75
-"""Points at least so near to a corner tell how high a roof may be there."""
+"""Points at least this near to a corner count as around it: they show how high a roof may be there."""
 _FAR_SIDES = 3.0
 """Sides of a cell of the raster within which points are looked for where there are none nearer."""
 _STEEPEST = 1.0
 """Planes that are steeper go on no farther beyond their points than one of this slope."""
 _COST_PER_M = 20.0
 _MAX_COST = 40.0
-"""Points that a plane costs by the metre, and at most: more than a face, less than what a large cell holds."""
+"""Points that a plane costs per metre, and at most: more than a face, less than a large cell holds."""
 _STEP_MM = 250.0
-"""A third of the raster's cells: its heights say no more."""
+"""Step along an edge: a third of the raster's cells, which have no finer heights."""
 _MAX_LEVEL = 8
-"""Horizontal planes that are added at a time: more places where nothing fits are no roof that planes can tell."""
+"""Horizontal planes added at a time: a roof with more places where nothing fits is not made of planes."""
 
 
 @kernel
@@ -98,10 +98,10 @@ def heights_raster(points: FloatArray, spacing_m: float) -> HeightsRaster:
 
 @kernel
 def _heights_at(raster: HeightsRaster, x_mm: float, y_mm: float) -> tuple[float, float, float]:
-    """Lowest and highest point around a place, and within what distance of it they were looked for, metres.
+    """Lowest and highest point around a place, and the distance within which they were looked for, metres.
 
-    All within the side of a cell count, none at three times that distance, but where there are none those up to as far
-    again; the lowest is above the highest where there are none either.
+    All points within the side of a cell count, none at three times that distance; where there are none, those up to as
+    far again. The lowest is above the highest where there are none either.
     """
     low, high, side = raster.lowest, raster.highest, raster.side
     r, c = math.floor((y_mm * 1e-3 - raster.south) / side), math.floor((x_mm * 1e-3 - raster.west) / side)
@@ -118,10 +118,10 @@ def _heights_at(raster: HeightsRaster, x_mm: float, y_mm: float) -> tuple[float,
 
 
 @kernel
-def _add_heights(plan: Subdivision, first: int, raster: HeightsRaster, around: HeightsAround) -> None:
-    """The heights around vertices from `first` on."""
+def _add_heights(plan: Subdivision, first: int, around: HeightsAround) -> None:
+    """Fill in the heights around the vertices from `first` on."""
     for v in range(first, plan.counts[VERTICES]):
-        lowest, highest, within = _heights_at(raster, float(plan.xy[v, 0]), float(plan.xy[v, 1]))
+        lowest, highest, within = _heights_at(around.raster, float(plan.xy[v, 0]), float(plan.xy[v, 1]))
         around.lowest[v], around.highest[v], around.within[v] = lowest, highest, within
 
 
@@ -131,8 +131,8 @@ def heights_around(plan: Subdivision, raster: HeightsRaster) -> HeightsAround:
     room = len(plan.xy)
     lowest, highest, within = np.empty(room), np.empty(room), np.empty(room)
     lowest[:], highest[:], within[:] = math.inf, -math.inf, raster.side
-    around = HeightsAround(lowest, highest, within, raster.side)
-    _add_heights(plan, 0, raster, around)
+    around = HeightsAround(lowest, highest, within, raster)
+    _add_heights(plan, 0, around)
     return around
 
 
@@ -140,7 +140,7 @@ def heights_around(plan: Subdivision, raster: HeightsRaster) -> HeightsAround:
 def _outside_m(
     plane: FloatArray, x_mm: float, y_mm: float, lowest: float, highest: float, within: float, side: float
 ) -> float:
-    """How far a plane lies above (or, negative, below) what the heights around a place allow; 0 without heights."""
+    """By how many metres a plane exceeds the heights around a place, negative below them; 0 without heights."""
     if lowest > highest:
         return 0.0
     z = plane[0] * x_mm * 1e-3 + plane[1] * y_mm * 1e-3 + plane[2]
@@ -153,7 +153,7 @@ def _outside_m(
 def _vertex_outside_m(plane: FloatArray, plan: Subdivision, v: int, around: HeightsAround) -> float:
     """The same at a vertex."""
     x, y = float(plan.xy[v, 0]), float(plan.xy[v, 1])
-    return _outside_m(plane, x, y, around.lowest[v], around.highest[v], around.within[v], around.side)
+    return _outside_m(plane, x, y, around.lowest[v], around.highest[v], around.within[v], around.raster.side)
 
 
 @kernel
@@ -165,7 +165,7 @@ def add_costs_of_far_planes(
     costs: IntArray,
     misfits: IntArray,
 ) -> None:
-    """Make planes dearer in the cells at whose corners they are farther from the points than another.
+    """Raise the cost of planes in the cells at whose corners they are farther from the points than another.
 
     Parameters
     ----------
@@ -248,9 +248,9 @@ def _plane_beyond(
     up: float,
     cap_m: float,
 ) -> int:
-    """Of the planes that fit all far corners, the one that explains most points where the cell's own plane is above it.
+    """The plane, among those that fit all far corners, that explains most points below the cell's own plane.
 
-    Where `up` is negative: below it; -1 where none fits, or none explains them better than the cell's own.
+    Above it if `up` is negative; -1 where none fits, or none explains them better than the cell's own.
     """
     best, saved = -1, 0.0
     for k in range(len(planes)):
@@ -293,7 +293,7 @@ def _cut_where_planes_meet(
 def _end_of_chord(
     plan: Subdivision, edge: int, is_far_first: bool, plane: FloatArray, raster: HeightsRaster, far_m: float
 ) -> int:
-    """The vertex where an edge from what is far to what is not gets near enough: a new one, else its near end."""
+    """The vertex where an edge with one far end gets near the points: a new one, else its near end."""
     xy, counts = plan.xy, plan.counts
     u, w = plan.graph[edge, ORIGIN], plan.graph[edge ^ 1, ORIGIN]
     if not is_far_first:
@@ -317,14 +317,7 @@ def _end_of_chord(
 
 @kernel
 def _cut_by_chord(
-    plan: Subdivision,
-    cell: int,
-    plane: FloatArray,
-    around: HeightsAround,
-    raster: HeightsRaster,
-    far_m: float,
-    first: int,
-    line: int,
+    plan: Subdivision, cell: int, plane: FloatArray, around: HeightsAround, far_m: float, first: int, line: int
 ) -> None:
     """Cut corners that are too far off, where the edges beside them get near enough; from the corner `first` on."""
     graph = plan.graph
@@ -334,8 +327,8 @@ def _cut_by_chord(
         while g != first and abs(_vertex_outside_m(plane, plan, graph[g, ORIGIN], around)) > far_m:
             last, g = g, graph[g, NEXT]
         if last != h:
-            start = _end_of_chord(plan, h, False, plane, raster, far_m)
-            end = _end_of_chord(plan, last, True, plane, raster, far_m)
+            start = _end_of_chord(plan, h, False, plane, around.raster, far_m)
+            end = _end_of_chord(plan, last, True, plane, around.raster, far_m)
             has_room = start != end and plan.counts[EDGES] + 2 <= len(graph)
             if has_room and insert_chord(plan, start, end, cell, line) >= 0:
                 return
@@ -352,11 +345,8 @@ def cut_off_far_corners(
     planes: FloatArray,
     labels: LabelArray,
     around: HeightsAround,
-    raster: HeightsRaster,
-    far_m: float,
-    cap_m: float,
+    limits: Limits,
     line: int,
-    clearance: float,
 ) -> int:
     """Cut corners of cells off where the plane of the cell leaves the heights of all points around.
 
@@ -370,29 +360,26 @@ def cut_off_far_corners(
         Coefficients a, b, c.
     labels : (c,) int32
         Plane of every cell.
-    around, raster : tuples
-        From `heights_around` and `heights_raster`.
-    far_m : float
-        How far a plane may go above or below the points.
-    cap_m : float
-        A point farther than this from a plane is not explained by it.
+    around : HeightsAround
+        From `heights_around`.
+    limits : Limits
+        How far a plane may go above or below the points, and the cap of residuals.
     line : int
         Number of the first line that is drawn.
-    clearance : float
-        Times the usual distance within which a line passes through a vertex.
 
     Returns
     -------
     int
         Cells that have such corners, cut or not.
     """
+    far_m = limits.overshoot_m
     graph, counts = plan.graph, plan.counts
     n_cells, known = counts[CELLS], counts[VERTICES]
     found = 0
     fits = np.empty(len(planes), np.bool_)
     for cell in range(n_cells):
         # cuts of other cells put vertices on the borders of this one
-        _add_heights(plan, known, raster, around)
+        _add_heights(plan, known, around)
         known = counts[VERTICES]
         plane = planes[labels[cell]]
         farthest, far_corner = 0.0, -1
@@ -420,10 +407,11 @@ def cut_off_far_corners(
         if near_corner == far_corner:
             continue
         n_before = counts[CELLS]
-        other = _plane_beyond(points, cells, planes, cell, labels[cell], fits, math.copysign(1.0, farthest), cap_m)
+        up = math.copysign(1.0, farthest)
+        other = _plane_beyond(points, cells, planes, cell, labels[cell], fits, up, limits.cap_m)
         if other >= 0:
-            snap_mm = clearance * SNAP_CROSSING_MM
+            snap_mm = limits.clearance * SNAP_CROSSING_MM
             _cut_where_planes_meet(plan, cell, plane, planes[other], line + found, snap_mm)
         if counts[CELLS] == n_before:
-            _cut_by_chord(plan, cell, plane, around, raster, far_m, near_corner, line + found)
+            _cut_by_chord(plan, cell, plane, around, far_m, near_corner, line + found)
     return found

@@ -3,10 +3,12 @@
 The cost of labels is a sum over nodes and over edges whose ends differ (the Potts model). An expansion lets every node
 keep its label or take alpha, at the least cost of all such moves (Boykov, Veksler and Zabih 2001); the move is a
 minimum cut of a graph with two terminals (Kolmogorov and Zabih 2004), found by Dinic's maximum flow (1970).
-Costs are integers: sums and cuts are exact and do not depend on the order of anything.
+Costs are integers: sums and cuts are exact and do not depend on any order.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,28 +17,57 @@ from pipeline.kernels.counting_sort import counting_sort
 from pipeline.model import IntArray, LabelArray
 
 
+class Neighbours(NamedTuple):
+    """The edges of every node of a graph of n nodes and m edges, in compressed rows."""
+
+    starts: LabelArray
+    """(n + 1,) int32, first entry of every node."""
+    others: LabelArray
+    """(2 m,) int32, the node at the other end."""
+    weights: IntArray
+    """(2 m,) int64, cost of the edge."""
+
+
+class Allowed(NamedTuple):
+    """The nodes that can take each of k labels."""
+
+    nodes: LabelArray
+    """(m,) int32, label after label, ascending in each."""
+    starts: LabelArray
+    """(k + 1,) int32, first entry of every label."""
+
+
+class _Flow(NamedTuple):
+    """A graph with capacities: n nodes, the source n and the sink n + 1. Arcs a and a ^ 1 are each other's reverse."""
+
+    first: LabelArray
+    """(n + 2,) int32, first arc of every node."""
+    following: LabelArray
+    """(a,) int32, the next arc of the same node, or -1."""
+    target: LabelArray
+    """(a,) int32, the node that each arc leads to."""
+    capacity: IntArray
+    """(a,) int64, what each arc can still take."""
+    distance: LabelArray
+    """(n + 2,) int32, arcs from the source; after `_cut` 0 at nodes from which the sink can be reached, else -1."""
+
+
+class _Moves(NamedTuple):
+    """Working space of an expansion, (n,) for n nodes."""
+
+    number: LabelArray
+    """int32, number among the nodes that may change; -1 for the others."""
+    change: IntArray
+    """int64, by how much the cost of a node changes with its label."""
+    queue: LabelArray
+    """int32."""
+    bound: IntArray
+    """int64, sum of the weights at each node."""
+
+
 @kernel
-def neighbour_lists(n: int, edges: IntArray, weights: IntArray) -> tuple[LabelArray, LabelArray, IntArray]:
-    """The edges of every node in compressed rows.
-
-    Parameters
-    ----------
-    n : int
-        Number of nodes.
-    edges : (m, 2) int64
-        Pairs of nodes.
-    weights : (m,) int64
-        Cost of every pair.
-
-    Returns
-    -------
-    starts : (n + 1,) int32
-        First entry of every node.
-    others : (2 m,) int32
-        The node at the other end.
-    costs : (2 m,) int64
-        Its pair's cost.
-    """
+def neighbour_lists(n: int, edges: IntArray, weights: IntArray) -> Neighbours:
+    """The edges of n nodes in compressed rows, from pairs (m, 2) int64 and their costs (m,) int64."""
     nodes = np.empty(2 * len(edges), np.int32)
     for e in range(len(edges)):
         nodes[2 * e], nodes[2 * e + 1] = edges[e, 0], edges[e, 1]
@@ -46,14 +77,13 @@ def neighbour_lists(n: int, edges: IntArray, weights: IntArray) -> tuple[LabelAr
     for s in range(len(ends)):
         others[s] = nodes[ends[s] ^ 1]
         costs[s] = weights[ends[s] // 2]
-    return starts, others, costs
+    return Neighbours(starts, others, costs)
 
 
 @kernel
-def _distances(
-    first: LabelArray, following: LabelArray, target: LabelArray, capacity: IntArray, distance: LabelArray, n: int
-) -> bool:
-    """Breadth-first distances from the source (node n) over arcs with capacity; whether the sink (n + 1) is reached."""
+def _distances(flow: _Flow, n: int) -> bool:
+    """Breadth-first distances from the source over arcs with capacity; whether the sink is reached."""
+    distance = flow.distance
     distance[: n + 2] = -1
     queue = np.empty(n + 2, np.int32)
     queue[0] = n
@@ -63,29 +93,28 @@ def _distances(
     while head < tail:
         node = queue[head]
         head += 1
-        arc = first[node]
+        arc = flow.first[node]
         while arc >= 0:
-            other = target[arc]
-            if capacity[arc] > 0 and distance[other] < 0:
+            other = flow.target[arc]
+            if flow.capacity[arc] > 0 and distance[other] < 0:
                 distance[other] = distance[node] + 1
                 queue[tail] = other
                 tail += 1
-            arc = following[arc]
+            arc = flow.following[arc]
     return bool(distance[n + 1] >= 0)
 
 
 @kernel
-def _cut(
-    first: LabelArray, following: LabelArray, target: LabelArray, capacity: IntArray, distance: LabelArray, n: int
-) -> None:
-    """Saturate the graph; afterwards `distance` is 0 at the nodes from which the sink can still be reached, else -1.
+def _cut(flow: _Flow, n: int) -> None:
+    """Saturate the graph by Dinic's algorithm; afterwards `distance` is 0 on the sink's side of a minimum cut, else -1.
 
-    Arc a and a ^ 1 are each other's reverse. Of several minimum cuts this is the one nearest to the sink: no node
-    takes a new label that costs the same as its own.
+    Of several minimum cuts this is the one nearest to the sink: no node takes a new label that costs the same as its
+    own.
     """
+    first, following, target, capacity, distance = flow
     current = np.empty(n + 2, np.int32)
     path = np.empty(n + 2, np.int32)
-    while _distances(first, following, target, capacity, distance, n):
+    while _distances(flow, n):
         for k in range(n + 2):
             current[k] = first[k]
         node = n
@@ -136,27 +165,17 @@ def _cut(
 
 
 @kernel
-def _number_those_that_may_change(
-    costs: IntArray,
-    nodes: LabelArray,
-    starts: LabelArray,
-    others: LabelArray,
-    weights: IntArray,
-    labels: LabelArray,
-    alpha: int,
-    number: LabelArray,
-    least: IntArray,
-    queue: LabelArray,
-    bound: IntArray,
+def _mark_movable(
+    costs: IntArray, nodes: LabelArray, neighbours: Neighbours, labels: LabelArray, alpha: int, moves: _Moves
 ) -> None:
-    """Mark in `number`, by 0, the nodes that can take alpha in a minimum cut; all others keep -1.
+    """Give the number 0 to the nodes, among those given, that can take alpha in a minimum cut.
 
-    A node that alpha does not make cheaper even if all its neighbours that are still open take it keeps its label: of
-    minimum cuts the one is sought in which the fewest nodes change. So do then, perhaps, its neighbours. Nearly every
-    node is settled so, without a flow.
-
-    `least` and `queue` are room for as many numbers as there are nodes; `bound` is the sum of the weights at each.
+    A node keeps its label if alpha does not make it cheaper even where all its neighbours that may still change take
+    it: the minimum cut wanted is the one in which the fewest nodes change. This can settle its neighbours in turn.
+    Nearly every node is settled without a flow. `moves.number` is -1 everywhere before.
     """
+    starts, others, weights = neighbours
+    number, change, queue, bound = moves
     for p in nodes:
         if labels[p] != alpha and costs[p, alpha] - costs[p, labels[p]] < bound[p]:
             number[p] = 0
@@ -173,7 +192,7 @@ def _number_those_that_may_change(
                 cost -= weights[e]  # it differs from the node's own label
             elif labels[r] == labels[p]:
                 cost += weights[e]
-        least[p] = cost
+        change[p] = cost
         if cost >= 0:
             queue[tail] = p
             tail += 1
@@ -188,133 +207,135 @@ def _number_those_that_may_change(
             if number[r] < 0:
                 continue
             # it counted on the neighbour's change: instead of w less, w more, or nothing where the labels differ anyway
-            least[r] += weights[e] if labels[p] != labels[r] else 2 * weights[e]
-            if least[r] >= 0:
+            change[r] += weights[e] if labels[p] != labels[r] else 2 * weights[e]
+            if change[r] >= 0:
                 number[r] = -1
                 queue[tail] = r
                 tail += 1
 
 
+@kernel(inline="always")
+def _add_arc(flow: _Flow, arc: int, tail: int, head: int, capacity: int) -> None:
+    """Add an arc from node to node, and its reverse without capacity."""
+    flow.target[arc] = head
+    flow.capacity[arc] = capacity
+    flow.following[arc] = flow.first[tail]
+    flow.first[tail] = arc
+    flow.target[arc + 1] = tail
+    flow.capacity[arc + 1] = 0
+    flow.following[arc + 1] = flow.first[head]
+    flow.first[head] = arc + 1
+
+
 @kernel
-def expand_labels(
+def _build_flow(
     costs: IntArray,
-    allowed: LabelArray,
-    allowed_starts: LabelArray,
-    starts: LabelArray,
-    others: LabelArray,
-    weights: IntArray,
+    nodes: LabelArray,
+    neighbours: Neighbours,
     labels: LabelArray,
-    rounds: int,
-) -> None:
+    alpha: int,
+    moves: _Moves,
+    active: int,
+    flow: _Flow,
+) -> bool:
+    """The graph whose minimum cut is the best expansion of alpha (Kolmogorov and Zabih 2004); whether one can gain."""
+    starts, others, weights = neighbours
+    number, unary = moves.number, moves.change
+    flow.first[: active + 2] = -1
+    arcs = 0
+    unary[:active] = 0
+    for p in nodes:
+        i = number[p]
+        if i < 0:
+            continue
+        cost = costs[p, alpha] - costs[p, labels[p]]
+        for e in range(starts[p], starts[p + 1]):
+            r = others[e]
+            j = number[r]
+            if j < 0:
+                cost += (weights[e] if labels[r] != alpha else 0) - (weights[e] if labels[r] != labels[p] else 0)
+            elif p < r:
+                # E(keep, keep) = apart, E(keep, alpha) = E(alpha, keep) = w, E(alpha, alpha) = 0
+                apart = weights[e] if labels[p] != labels[r] else 0
+                cost += weights[e] - apart
+                unary[j] -= weights[e]
+                _add_arc(flow, arcs, i, j, 2 * weights[e] - apart)
+                arcs += 2
+        unary[i] += cost
+    gain = False
+    for i in range(active):
+        if unary[i] != 0:
+            # a positive cost of alpha binds the node to the source: it keeps its label; a negative one to the sink
+            tail, head = (active, i) if unary[i] > 0 else (i, active + 1)
+            gain = gain or unary[i] < 0
+            _add_arc(flow, arcs, tail, head, abs(unary[i]))
+            arcs += 2
+    return gain
+
+
+@kernel
+def expand_labels(costs: IntArray, allowed: Allowed, neighbours: Neighbours, labels: LabelArray, rounds: int) -> None:
     """Lower the cost of labels by expansions of every label in turn until none helps.
 
     Parameters
     ----------
     costs : (n, k) int64
         Cost of every label at every node.
-    allowed, allowed_starts : (m,), (k + 1,) int32
-        The nodes that can take each label, ascending, label after label.
-    starts, others, weights : arrays
-        The edges, from `neighbour_lists`.
+    allowed : Allowed
+        The nodes that can take each label.
+    neighbours : Neighbours
+        The edges.
     labels : (n,) int32
         Changed in place.
     rounds : int
         At most so many turns through all labels.
     """
     n, k = costs.shape
-    n_arcs = 2 * (len(others) // 2 + n)
-    first = np.empty(n + 2, np.int32)
-    following = np.empty(n_arcs, np.int32)
-    target = np.empty(n_arcs, np.int32)
-    capacity = np.empty(n_arcs, np.int64)
-    distance = np.empty(n + 2, np.int32)
-    number = np.full(n, -1, np.int32)
-    unary = np.empty(n, np.int64)
-    queue = np.empty(n, np.int32)
-    bound = np.zeros(n, np.int64)
+    n_arcs = 2 * (len(neighbours.others) // 2 + n)
+    flow = _Flow(
+        np.empty(n + 2, np.int32),
+        np.empty(n_arcs, np.int32),
+        np.empty(n_arcs, np.int32),
+        np.empty(n_arcs, np.int64),
+        np.empty(n + 2, np.int32),
+    )
+    moves = _Moves(np.full(n, -1, np.int32), np.empty(n, np.int64), np.empty(n, np.int32), np.zeros(n, np.int64))
     for i in range(n):
-        for e in range(starts[i], starts[i + 1]):
-            bound[i] += weights[e]
+        for e in range(neighbours.starts[i], neighbours.starts[i + 1]):
+            moves.bound[i] += neighbours.weights[e]
     quiet = 0
     turn = 0
     while quiet < k and turn < rounds * k:
         alpha = turn % k
         turn += 1
         quiet += 1
-        _number_those_that_may_change(
-            costs, allowed[allowed_starts[alpha] : allowed_starts[alpha + 1]], starts, others, weights, labels, alpha,
-            number, unary, queue, bound,
-        )  # fmt: skip
+        nodes = allowed.nodes[allowed.starts[alpha] : allowed.starts[alpha + 1]]
+        _mark_movable(costs, nodes, neighbours, labels, alpha, moves)
         active = 0
-        for s in range(allowed_starts[alpha], allowed_starts[alpha + 1]):
-            if number[allowed[s]] >= 0:
-                number[allowed[s]] = active
+        for p in nodes:
+            if moves.number[p] >= 0:
+                moves.number[p] = active
                 active += 1
         if active == 0:
             continue
-        first[: active + 2] = -1
-        arcs = 0
-        gain = False
-        unary[:active] = 0
-        for s in range(allowed_starts[alpha], allowed_starts[alpha + 1]):
-            p = allowed[s]
-            i = number[p]
-            if i < 0:
-                continue
-            cost = costs[p, alpha] - costs[p, labels[p]]
-            for e in range(starts[p], starts[p + 1]):
-                r = others[e]
-                j = number[r]
-                if j < 0:
-                    cost += (weights[e] if labels[r] != alpha else 0) - (weights[e] if labels[r] != labels[p] else 0)
-                elif p < r:
-                    # E(keep, keep) = apart, E(keep, alpha) = E(alpha, keep) = w, E(alpha, alpha) = 0
-                    apart = weights[e] if labels[p] != labels[r] else 0
-                    cost += weights[e] - apart
-                    unary[j] -= weights[e]
-                    target[arcs] = j
-                    capacity[arcs] = 2 * weights[e] - apart
-                    following[arcs] = first[i]
-                    first[i] = arcs
-                    target[arcs + 1] = i
-                    capacity[arcs + 1] = 0
-                    following[arcs + 1] = first[j]
-                    first[j] = arcs + 1
-                    arcs += 2
-            unary[i] += cost
-        for i in range(active):
-            if unary[i] == 0:
-                continue
-            # a positive cost of alpha binds the node to the source, who keeps; a negative one to the sink
-            tail, head = (active, i) if unary[i] > 0 else (i, active + 1)
-            gain = gain or unary[i] < 0
-            target[arcs] = head
-            capacity[arcs] = abs(unary[i])
-            following[arcs] = first[tail]
-            first[tail] = arcs
-            target[arcs + 1] = tail
-            capacity[arcs + 1] = 0
-            following[arcs + 1] = first[head]
-            first[head] = arcs + 1
-            arcs += 2
+        gain = _build_flow(costs, nodes, neighbours, labels, alpha, moves, active, flow)
         if gain:
-            _cut(first, following, target, capacity, distance, active)
-        for s in range(allowed_starts[alpha], allowed_starts[alpha + 1]):
-            p = allowed[s]
-            if gain and number[p] >= 0 and distance[number[p]] == 0:
+            _cut(flow, active)
+        for p in nodes:
+            if gain and moves.number[p] >= 0 and flow.distance[moves.number[p]] == 0:
                 labels[p] = alpha
                 quiet = 0
-            number[p] = -1
+            moves.number[p] = -1
 
 
 @kernel(inline="always")
-def every_label(n: int, k: int) -> tuple[LabelArray, LabelArray]:
+def every_label(n: int, k: int) -> Allowed:
     """The lists of `expand_labels` where every node can take every label."""
-    allowed = np.empty(n * k, np.int32)
+    nodes = np.empty(n * k, np.int32)
     starts = np.empty(k + 1, np.int32)
     for label in range(k + 1):
         starts[label] = label * n
     for label in range(k):
         for i in range(n):
-            allowed[label * n + i] = i
-    return allowed, starts
+            nodes[label * n + i] = i
+    return Allowed(nodes, starts)

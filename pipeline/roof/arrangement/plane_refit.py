@@ -9,34 +9,33 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.normal_equations import moments_of, solve_plane_moments
 from pipeline.model import FloatArray, LabelArray
-from pipeline.roof.arrangement.raster_labels import vertical_distance_m
+from pipeline.roof.arrangement.raster_labels import Raster, vertical_distance_m
 
 _ROUNDS = 3
+"""Most refits of a plane: bounds the work; they end when the cost no longer falls."""
 _FEWEST_POINTS = 6
-"""Planes with fewer points keep their coefficients."""
+"""Planes with fewer points keep their coefficients: twice as many as there are coefficients."""
 _MIN_WIDTH_M = 0.2
-"""Standard deviation across the longest direction of the points, below which they tell no slope across it."""
+"""Standard deviation of the points across their longest direction below which they do not determine that slope."""
 
 
 @kernel
-def labels_of_points(
-    points: FloatArray, labels: LabelArray, place: LabelArray, low_x: float, low_y: float, cell_m: float, columns: int
-) -> LabelArray:
+def labels_of_points(points: FloatArray, labels: LabelArray, raster: Raster) -> LabelArray:
     """The label of the raster cell in which each point lies, (n,) int32; -1 outside."""
-    cells = np.full(place[-1] + 1 if len(place) > 0 else 1, -1, np.int32)
-    for i in range(len(place)):
-        cells[place[i]] = labels[i]
     found = np.full(len(points), -1, np.int32)
     for i in range(len(points)):
-        c, r = math.floor((points[i, 0] - low_x) / cell_m), math.floor((points[i, 1] - low_y) / cell_m)
-        if 0 <= c < columns and r >= 0 and r * columns + c < len(cells):
-            found[i] = cells[r * columns + c]
+        c = math.floor((points[i, 0] - raster.west) / raster.cell_m)
+        r = math.floor((points[i, 1] - raster.south) / raster.cell_m)
+        if 0 <= c < raster.columns and 0 <= r < raster.rows:
+            cell = raster.number[r * raster.columns + c]
+            if cell >= 0:
+                found[i] = labels[cell]
     return found
 
 
 @kernel
 def _fit(points: FloatArray, chosen: LabelArray, plane: FloatArray, cap_m: float, fitted: FloatArray) -> bool:
-    """Least squares over the chosen points nearer than the cap to a plane; whether they tell one."""
+    """Least squares over the chosen points nearer than the cap to a plane; whether they determine one."""
     near = np.empty(len(chosen), np.int32)
     n = 0
     for i in chosen:
@@ -56,9 +55,9 @@ def _fit(points: FloatArray, chosen: LabelArray, plane: FloatArray, cap_m: float
 
 @kernel
 def refitted_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, cap_m: float) -> FloatArray:
-    """Every plane by least squares over the points of its places that it explains, while that lowers their cost.
+    """Every plane refitted by least squares to the points of its places that it explains.
 
-    The cost is the sum of capped residuals.
+    This is repeated while it lowers the sum of capped residuals.
 
     Parameters
     ----------
@@ -74,7 +73,7 @@ def refitted_planes(points: FloatArray, labels: LabelArray, planes: FloatArray, 
     Returns
     -------
     (k, 3) float64
-        Coefficients.
+        New coefficients.
     """
     better = planes.copy()
     fitted = np.empty(3)

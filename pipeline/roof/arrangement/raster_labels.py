@@ -1,28 +1,46 @@
 """Coarse labels of an outline: a raster, every cell with the plane that explains its points and suits its neighbours.
 
-They are no result: their borders tell where lines are worth trying. A coarse raster is labelled by alpha expansion,
+They are not a result: their borders show where lines are worth trying. A coarse raster is labelled by alpha expansion;
 a raster of half the cell starts from it and settles by iterated conditional modes (Besag 1986).
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.merge_sort import in_order
 from pipeline.model import FloatArray, IntArray, LabelArray
-from pipeline.roof.arrangement.minimum_cut import expand_labels, neighbour_lists
+from pipeline.roof.arrangement.minimum_cut import Allowed, expand_labels, neighbour_lists
 
 COST_SCALE = 1000
 """Integer cost of one unexplained point."""
 _SIDE = math.pi / 8.0
 _DIAGONAL = math.pi / (8.0 * math.sqrt(2.0))
-"""Length of border, in cells, for which a pair of neighbours over a side, over a corner stands: with eight neighbours
-these measure borders of any direction nearly alike (Boykov and Kolmogorov 2003, Cauchy-Crofton)."""
+"""Length of border, in cells, that a pair of neighbours over a side or a corner represents: with eight neighbours
+borders of any direction measure nearly alike (Boykov and Kolmogorov 2003, Cauchy-Crofton)."""
 _ROUNDS = 3
 _SETTLING_ROUNDS = 8
+"""Most turns of either method: they bound the work, and the labels only propose lines."""
+
+
+class Raster(NamedTuple):
+    """Square cells, row by row from the lower left corner; those with their centre inside an outline are numbered."""
+
+    west: float
+    """Left border, metres."""
+    south: float
+    """Lower border, metres."""
+    cell_m: float
+    columns: int
+    rows: int
+    number: LabelArray
+    """(rows * columns,) int32, number of every cell; -1 outside."""
+    place: LabelArray
+    """(n,) int32, row * columns + column of each numbered cell, ascending."""
 
 
 @kernel
@@ -33,31 +51,14 @@ def vertical_distance_m(point: FloatArray, plane: FloatArray) -> float:
 
 
 @kernel
-def raster_cells(
-    edges: FloatArray, low_x: float, low_y: float, cell_m: float, columns: int, rows: int
-) -> tuple[LabelArray, LabelArray]:
-    """The cells whose centres lie inside an outline.
-
-    Parameters
-    ----------
-    edges : (e, 4) float64
-        Edges x0, y0, x1, y1 of all its rings, metres.
-    low_x, low_y, cell_m, columns, rows
-        The raster.
-
-    Returns
-    -------
-    number : (rows * columns,) int32
-        Number of every cell, row by row; -1 outside.
-    place : (n,) int32
-        Where in the raster each numbered cell lies, ascending.
-    """
+def raster_cells(edges: FloatArray, west: float, south: float, cell_m: float, columns: int, rows: int) -> Raster:
+    """Number the cells of a raster inside an outline, from the edges of its rings: x0, y0, x1, y1, (e, 4), metres."""
     number = np.full(rows * columns, -1, np.int32)
     place = np.empty(rows * columns, np.int32)
     crossings = np.empty(len(edges))
     n = 0
     for r in range(rows):
-        y = low_y + (r + 0.5) * cell_m
+        y = south + (r + 0.5) * cell_m
         found = 0
         for e in range(len(edges)):
             if (edges[e, 1] > y) != (edges[e, 3] > y):
@@ -66,40 +67,32 @@ def raster_cells(
                 found += 1
         ordered = in_order(crossings[:found])
         for k in range(0, found - 1, 2):
-            first = max(math.ceil((ordered[k] - low_x) / cell_m - 0.5), 0)
-            last = min(math.floor((ordered[k + 1] - low_x) / cell_m - 0.5), columns - 1)
+            first = max(math.ceil((ordered[k] - west) / cell_m - 0.5), 0)
+            last = min(math.floor((ordered[k + 1] - west) / cell_m - 0.5), columns - 1)
             for c in range(first, last + 1):
                 if number[r * columns + c] < 0:
                     number[r * columns + c] = n
                     place[n] = r * columns + c
                     n += 1
-    return number, place[:n].copy()
+    return Raster(west, south, cell_m, columns, rows, number, place[:n].copy())
 
 
 @kernel
 def _cell_costs(
-    points: FloatArray,
-    planes: FloatArray,
-    cap_m: float,
-    number: LabelArray,
-    n: int,
-    low_x: float,
-    low_y: float,
-    cell_m: float,
-    columns: int,
-    rows: int,
+    points: FloatArray, planes: FloatArray, cap_m: float, raster: Raster
 ) -> tuple[IntArray, LabelArray, LabelArray]:
-    """Cost of every plane in every cell, points in each, and whether one of them is explained by each plane."""
+    """Cost of k planes in n cells, (n, k); points in each, (n,); whether a plane explains one of them, (n, k)."""
+    n = len(raster.place)
     k = len(planes)
     costs = np.zeros((n, k), np.int64)
     count = np.zeros(n, np.int32)
     near = np.zeros((n, k), np.int32)
     for i in range(len(points)):
-        c = int((points[i, 0] - low_x) / cell_m)
-        r = int((points[i, 1] - low_y) / cell_m)
-        if c < 0 or r < 0 or c >= columns or r >= rows:
+        c = int((points[i, 0] - raster.west) / raster.cell_m)
+        r = int((points[i, 1] - raster.south) / raster.cell_m)
+        if c < 0 or r < 0 or c >= raster.columns or r >= raster.rows:
             continue
-        cell = number[r * columns + c]
+        cell = raster.number[r * raster.columns + c]
         if cell < 0:
             continue
         count[cell] += 1
@@ -114,10 +107,9 @@ def _cell_costs(
 
 
 @kernel
-def _first_labels(
-    costs: IntArray, count: LabelArray, number: LabelArray, place: LabelArray, columns: int, rows: int
-) -> LabelArray:
-    """The best label of every cell with points; from there outwards over those without."""
+def _first_labels(costs: IntArray, count: LabelArray, raster: Raster) -> LabelArray:
+    """The best label of every cell with points, (n,); from there outwards over those without."""
+    number, place, columns, rows = raster.number, raster.place, raster.columns, raster.rows
     n = len(place)
     labels = np.full(n, -1, np.int32)
     queue = np.empty(n, np.int32)
@@ -148,10 +140,9 @@ def _first_labels(
 
 
 @kernel
-def _raster_edges(
-    number: LabelArray, place: LabelArray, columns: int, rows: int, side: int, diagonal: int
-) -> tuple[IntArray, IntArray]:
-    """Pairs of neighbouring cells, over sides and corners, and what a border between them costs."""
+def _raster_edges(raster: Raster, side: int, diagonal: int) -> tuple[IntArray, IntArray]:
+    """Pairs of neighbouring cells, over sides and corners, (m, 2), and the cost of a border between them, (m,)."""
+    number, place, columns, rows = raster.number, raster.place, raster.columns, raster.rows
     edges = np.empty((4 * len(place), 2), np.int64)
     weights = np.empty(4 * len(place), np.int64)
     m = 0
@@ -171,10 +162,9 @@ def _raster_edges(
 
 
 @kernel
-def _near_own_points(
-    near: LabelArray, labels: LabelArray, number: LabelArray, place: LabelArray, columns: int, rows: int
-) -> tuple[LabelArray, LabelArray]:
+def _near_own_points(near: LabelArray, labels: LabelArray, raster: Raster) -> Allowed:
     """For every label the cells within two cells of a point that it explains, and those that start with it."""
+    number, place, columns, rows = raster.number, raster.place, raster.columns, raster.rows
     n, k = near.shape
     allowed = np.zeros((k, n), np.uint8)
     for i in range(n):
@@ -197,24 +187,28 @@ def _near_own_points(
                 nodes[m] = i
                 m += 1
         starts[label + 1] = m
-    return nodes[:m], starts
+    return Allowed(nodes[:m], starts)
+
+
+@kernel(inline="always")
+def _border_cost(framed: LabelArray, here: int, around: IntArray, weight: IntArray, label: int) -> int:
+    """Cost of the borders of a cell with eight neighbours, if it has a label."""
+    cost = 0
+    for q in range(8):
+        other = framed[here + around[q]]
+        if other >= 0 and other != label:
+            cost += weight[q]
+    return cost
 
 
 @kernel
-def _settle(
-    costs: IntArray,
-    place: LabelArray,
-    columns: int,
-    rows: int,
-    side: int,
-    diagonal: int,
-    labels: LabelArray,
-) -> None:
-    """Give every cell the best label among its own and its neighbours', until none changes.
+def _settle(costs: IntArray, raster: Raster, side: int, diagonal: int, labels: LabelArray) -> None:
+    """Give every cell the best label among its own and its neighbours', until none changes (Besag 1986).
 
-    A cell that has chosen chooses alike until a neighbour changes, so after the first round only those are looked at
-    again of which one has.
+    After the first round a cell is looked at again only if a neighbour has changed: else it would choose the same.
+    `labels` (n,) change in place; `side` and `diagonal` are the costs of a border over a side and over a corner.
     """
+    place, columns, rows = raster.place, raster.columns, raster.rows
     # a frame of cells without a label spares all tests of the raster's border
     width = columns + 2
     around = np.array([-width - 1, -width, -width + 1, -1, 1, width - 1, width, width + 1])
@@ -241,22 +235,14 @@ def _settle(
             if not mixed:
                 continue
             best = own
-            least = costs[i, best]
-            for q in range(8):
-                label = framed[here + around[q]]
-                if label >= 0 and label != best:
-                    least += weight[q]
+            least = costs[i, best] + _border_cost(framed, here, around, weight, own)
             tried = own
             for s in range(8):
                 label = framed[here + around[s]]
                 if label < 0 or label in (own, tried):
                     continue
                 tried = label
-                cost = costs[i, label]
-                for q in range(8):
-                    other = framed[here + around[q]]
-                    if other >= 0 and other != label:
-                        cost += weight[q]
+                cost = costs[i, label] + _border_cost(framed, here, around, weight, label)
                 if cost < least or (cost == least and label < best and best != own):
                     best = label
                     least = cost
@@ -273,8 +259,8 @@ def _settle(
 @kernel
 def raster_labels(
     points: FloatArray, planes: FloatArray, edges: FloatArray, cell_m: float, cap_m: float, cost_per_m: float
-) -> tuple[LabelArray, LabelArray, float, float, int]:
-    """Labels of the cells of a raster of half the given cell.
+) -> tuple[LabelArray, Raster]:
+    """The labels of a raster of half the given cell, (n,) int32, and that raster.
 
     Parameters
     ----------
@@ -290,51 +276,36 @@ def raster_labels(
         Residual from which a point is unexplained.
     cost_per_m : float
         Unexplained points that a metre of border must save.
-
-    Returns
-    -------
-    labels : (n,) int32
-        Plane of every fine cell inside.
-    place : (n,) int32
-        Row * columns + column of each.
-    low_x, low_y : float
-        Lower left corner of the raster.
-    columns : int
-        Its columns; the cell is half of `cell_m`.
     """
-    low_x, low_y, high_x, high_y = math.inf, math.inf, -math.inf, -math.inf
+    west, south, east, north = math.inf, math.inf, -math.inf, -math.inf
     for e in range(len(edges)):
         for end in range(0, 4, 2):
-            low_x, low_y = min(low_x, edges[e, end]), min(low_y, edges[e, end + 1])
-            high_x, high_y = max(high_x, edges[e, end]), max(high_y, edges[e, end + 1])
-    columns, rows = int((high_x - low_x) / cell_m) + 1, int((high_y - low_y) / cell_m) + 1
-    number, place = raster_cells(edges, low_x, low_y, cell_m, columns, rows)
-    costs, count, near = _cell_costs(points, planes, cap_m, number, len(place), low_x, low_y, cell_m, columns, rows)
-    coarse = _first_labels(costs, count, number, place, columns, rows)
+            west, south = min(west, edges[e, end]), min(south, edges[e, end + 1])
+            east, north = max(east, edges[e, end]), max(north, edges[e, end + 1])
+    columns, rows = int((east - west) / cell_m) + 1, int((north - south) / cell_m) + 1
+    raster = raster_cells(edges, west, south, cell_m, columns, rows)
+    costs, count, near = _cell_costs(points, planes, cap_m, raster)
+    coarse = _first_labels(costs, count, raster)
     side = int(COST_SCALE * cost_per_m * cell_m * _SIDE)
     diagonal = int(COST_SCALE * cost_per_m * cell_m * _DIAGONAL)
     if len(planes) > 1:
-        _settle(costs, place, columns, rows, side, diagonal, coarse)
-        pairs, weights = _raster_edges(number, place, columns, rows, side, diagonal)
-        starts, others, border = neighbour_lists(len(place), pairs, weights)
-        allowed, allowed_starts = _near_own_points(near, coarse, number, place, columns, rows)
-        expand_labels(costs, allowed, allowed_starts, starts, others, border, coarse, _ROUNDS)
+        _settle(costs, raster, side, diagonal, coarse)
+        pairs, weights = _raster_edges(raster, side, diagonal)
+        neighbours = neighbour_lists(len(raster.place), pairs, weights)
+        expand_labels(costs, _near_own_points(near, coarse, raster), neighbours, coarse, _ROUNDS)
 
-    half = 0.5 * cell_m
-    fine_number, fine_place = raster_cells(edges, low_x, low_y, half, 2 * columns, 2 * rows)
-    labels = np.full(len(fine_place), -1, np.int32)
-    for i in range(len(fine_place)):
-        r, c = fine_place[i] // (4 * columns), fine_place[i] % (2 * columns) // 2
+    fine = raster_cells(edges, west, south, 0.5 * cell_m, 2 * columns, 2 * rows)
+    labels = np.full(len(fine.place), -1, np.int32)
+    for i in range(len(fine.place)):
+        r, c = fine.place[i] // (4 * columns), fine.place[i] % (2 * columns) // 2
         # a fine cell at the outline can lie in a coarse one that does not count: then beside it
         for reach in range(2):
             for rr in range(max(r - reach, 0), min(r + reach + 1, rows)):
                 for cc in range(max(c - reach, 0), min(c + reach + 1, columns)):
-                    if labels[i] < 0 and number[rr * columns + cc] >= 0:
-                        labels[i] = coarse[number[rr * columns + cc]]
+                    if labels[i] < 0 and raster.number[rr * columns + cc] >= 0:
+                        labels[i] = coarse[raster.number[rr * columns + cc]]
         labels[i] = max(labels[i], 0)
     if len(planes) > 1:
-        costs, _, _ = _cell_costs(
-            points, planes, cap_m, fine_number, len(fine_place), low_x, low_y, half, 2 * columns, 2 * rows
-        )
-        _settle(costs, fine_place, 2 * columns, 2 * rows, side // 2, diagonal // 2, labels)
-    return labels, fine_place, low_x, low_y, 2 * columns
+        costs, _, _ = _cell_costs(points, planes, cap_m, fine)
+        _settle(costs, fine, side // 2, diagonal // 2, labels)
+    return labels, fine

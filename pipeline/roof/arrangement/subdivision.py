@@ -2,9 +2,9 @@
 
 The cells are faces of a planar graph of half-edges (Muller and Preparata 1978). A line cuts only the cells in which it
 has support, each along a chord from border to border. A chord ends at a vertex, or at a new one that is rounded to
-1 mm and belongs to the edges of both cells beside it, so cells share their borders exactly by construction and there
-is nothing to snap afterwards. Every chord, and every edge that a rounded vertex bends, is tested with exact integers
-against what is there; one that would touch it is not drawn.
+1 mm and belongs to the edges of both cells beside it. Cells therefore share their borders exactly by construction and
+nothing is snapped afterwards. Every chord, and every edge that a rounded vertex bends, is tested with exact integers
+against all other edges; one that would touch them is not drawn.
 
 Half-edges h and h ^ 1 are twins. `face` is the cell left of a half-edge, -1 outside.
 """
@@ -19,7 +19,8 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.merge_sort import ascending_order, in_order
 from pipeline.kernels.orientation import lies_between, same_ray, segments_meet, turn_of
-from pipeline.model import FloatArray, IntArray, LabelArray
+from pipeline.model import FloatArray, IntArray
+from pipeline.roof.arrangement.candidate_lines import CandidateLines
 
 
 class Subdivision(NamedTuple):
@@ -38,19 +39,20 @@ ORIGIN, NEXT, PREVIOUS, FACE, LINE = 0, 1, 2, 3, 4
 VERTICES, EDGES, CELLS = 0, 1, 2
 """Places of `counts`."""
 _SNAP_MM = 60.0
-"""A line passes through vertices nearer to it than this."""
+"""A line passes through vertices nearer to it than this: steps are known to a few centimetres."""
 SNAP_CROSSING_MM = 35.0
 """The same where planes cross: there the line is exact."""
 _CLEARANCE_MM = 25.0
-"""Chords keep this far from vertices."""
+"""Chords keep this far from vertices; numerical guard of solids, whose vertices must stay distinct."""
 _APART_MM = 10.0
-"""New vertices keep this far from edges."""
+"""New vertices keep this far from edges; the same guard."""
 _MIN_SUPPORT_MM = 10.0
+"""A line that a cell supports over less does not cut it; numerical guard."""
 
 
 @kernel
 def _is_clear(plan: Subdivision, a: int, b: int, skipped: int) -> bool:
-    """Whether a segment touches no edge but at its own end vertices; the edge `skipped` and its twin do not count."""
+    """Whether segment a b touches edges only at its own ends; the edge `skipped` and its twin do not count."""
     xy, graph = plan.xy, plan.graph
     low_x, high_x = min(xy[a, 0], xy[b, 0]), max(xy[a, 0], xy[b, 0])
     low_y, high_y = min(xy[a, 1], xy[b, 1]), max(xy[a, 1], xy[b, 1])
@@ -75,7 +77,7 @@ def _is_clear(plan: Subdivision, a: int, b: int, skipped: int) -> bool:
 
 @kernel
 def _has_clearance(plan: Subdivision, a: int, b: int, face: int) -> bool:
-    """Whether no vertex of a cell comes too near to a chord."""
+    """Whether all vertices of a cell keep their distance from the chord a b."""
     xy, graph = plan.xy, plan.graph
     dx, dy = float(xy[b, 0] - xy[a, 0]), float(xy[b, 1] - xy[a, 1])
     length = math.hypot(dx, dy)
@@ -94,7 +96,7 @@ def _has_clearance(plan: Subdivision, a: int, b: int, face: int) -> bool:
 
 @kernel
 def _is_apart(plan: Subdivision, w: int, skipped: int) -> bool:
-    """Whether a new vertex keeps away from all edges but the one that it lies on, also where two meet narrowly."""
+    """Whether a new vertex keeps away from all edges except its own (`skipped`), also where two meet narrowly."""
     xy, graph = plan.xy, plan.graph
     for h in range(0, plan.counts[EDGES], 2):
         if h == skipped or h == skipped ^ 1:
@@ -113,7 +115,7 @@ def _is_apart(plan: Subdivision, w: int, skipped: int) -> bool:
 def insert_vertex(plan: Subdivision, h: int, x: int, y: int) -> bool:
     """Cut half-edge h and its twin at a new vertex, unless that would touch other edges.
 
-    The new vertex and half-edges are the last ones: of the latter the even one goes on from the new vertex.
+    The new vertex and half-edges are the last ones; the even half-edge starts at the new vertex.
     """
     xy, graph, counts = plan.xy, plan.graph, plan.counts
     w = counts[VERTICES]
@@ -145,7 +147,7 @@ def insert_vertex(plan: Subdivision, h: int, x: int, y: int) -> bool:
 
 @kernel
 def _corner(plan: Subdivision, v: int, towards: int, face: int) -> int:
-    """The half-edge that leaves v in the corner of a cell into which `towards` lies; -1 for none."""
+    """The half-edge that leaves v in the corner of the cell in which the vertex `towards` lies; -1 for none."""
     xy, graph = plan.xy, plan.graph
     for h in range(plan.counts[EDGES]):
         if graph[h, ORIGIN] != v or graph[h, FACE] != face:
@@ -205,7 +207,7 @@ def _set_face(graph: IntArray, start: int, face: int) -> None:
 
 @kernel
 def insert_chord(plan: Subdivision, u: int, v: int, face: int, line: int) -> int:
-    """Join two vertices of a cell by an edge, the last one then, unless it would touch anything between.
+    """Join two vertices of a cell by an edge, which is the last one then, unless it would touch anything.
 
     Returns
     -------
@@ -269,7 +271,7 @@ def cell_at(plan: Subdivision, x: float, y: float) -> int:
     face = -1
     for h in range(plan.counts[EDGES]):
         p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
-        # of each edge the half that runs down has the places to the right of it on its left side
+        # the half of an edge that runs down has the places to the right of it on its left side
         if xy[p, 1] > y >= xy[q, 1]:
             at = xy[p, 0] + (y - xy[p, 1]) * (xy[q, 0] - xy[p, 0]) / (xy[q, 1] - xy[p, 1])
             if nearest < at <= x:
@@ -280,7 +282,7 @@ def cell_at(plan: Subdivision, x: float, y: float) -> int:
 
 @kernel
 def subdivision_of(ring_xy: IntArray, ring_starts: IntArray, polygon_of_ring: IntArray, room: int) -> Subdivision:
-    """An outline, one cell a polygon.
+    """An outline with one cell per polygon.
 
     Parameters
     ----------
@@ -313,21 +315,28 @@ def subdivision_of(ring_xy: IntArray, ring_starts: IntArray, polygon_of_ring: In
     return Subdivision(xy, graph, counts)
 
 
-@kernel
-def cut_by_line(plan: Subdivision, line: FloatArray, number: int, snap_mm: float, spans: FloatArray, only: int) -> None:
-    """Cut the cells in which a line has support, or `only` one of them; -1 for all.
+class _Passages(NamedTuple):
+    """Where a line passes vertices and crosses edges of a subdivision, (m,) each."""
 
-    `spans` are the stretches of the line with support, in mm along it. `line` is in mm.
-    """
-    xy, graph, counts = plan.xy, plan.graph, plan.counts
-    n_vertices, n_edges = counts[VERTICES], counts[EDGES]
+    along: FloatArray
+    """float64, millimetres along the line."""
+    vertex: IntArray
+    """int64, the vertex, or -1."""
+    crossed: IntArray
+    """int64, the half-edge, or -1."""
+
+
+@kernel
+def _passages(plan: Subdivision, line: FloatArray, snap_mm: float) -> _Passages:
+    """Vertices nearer to a line than a distance, and edges that it crosses."""
+    xy, graph = plan.xy, plan.graph
+    n_vertices, n_edges = plan.counts[VERTICES], plan.counts[EDGES]
     nx, ny = line[0], line[1]
     off = np.empty(n_vertices)
     for v in range(n_vertices):
         off[v] = nx * xy[v, 0] + ny * xy[v, 1] + line[2]
         if abs(off[v]) < snap_mm:
             off[v] = 0.0
-    # where the line passes vertices and crosses edges, in order along it
     along = np.empty(n_vertices + n_edges // 2)
     vertex = np.empty(n_vertices + n_edges // 2, np.int64)
     crossed = np.empty(n_vertices + n_edges // 2, np.int64)
@@ -338,7 +347,7 @@ def cut_by_line(plan: Subdivision, line: FloatArray, number: int, snap_mm: float
             vertex[m] = v
             crossed[m] = -1
             m += 1
-    for h in range(0, plan.counts[EDGES], 2):
+    for h in range(0, n_edges, 2):
         p, q = graph[h, ORIGIN], graph[h ^ 1, ORIGIN]
         if (off[p] > 0.0 > off[q]) or (off[p] < 0.0 < off[q]):
             fraction = off[p] / (off[p] - off[q])
@@ -348,8 +357,20 @@ def cut_by_line(plan: Subdivision, line: FloatArray, number: int, snap_mm: float
             vertex[m] = -1
             crossed[m] = h
             m += 1
-    order = ascending_order(along[:m])
-    for k in range(m - 1):
+    return _Passages(along[:m], vertex[:m], crossed[:m])
+
+
+@kernel
+def cut_by_line(plan: Subdivision, line: FloatArray, number: int, snap_mm: float, spans: FloatArray, only: int) -> None:
+    """Cut the cells in which a line has support, or `only` one of them; -1 for all.
+
+    `spans` (s, 2) are the stretches of the line with support, in mm along it. `line` (3,) is in mm.
+    """
+    xy, graph, counts = plan.xy, plan.graph, plan.counts
+    nx, ny = line[0], line[1]
+    along, vertex, crossed = _passages(plan, line, snap_mm)
+    order = ascending_order(along)
+    for k in range(len(along) - 1):
         i, j = order[k], order[k + 1]
         low, high = along[i], along[j]
         if high - low < 2.0 * _CLEARANCE_MM:
@@ -376,10 +397,9 @@ def cut_by_line(plan: Subdivision, line: FloatArray, number: int, snap_mm: float
 
 
 @kernel
-def _supported_spans(
-    line: FloatArray, number: int, line_of: LabelArray, places: FloatArray, half_m: float
-) -> FloatArray:
+def _supported_spans(candidates: CandidateLines, number: int, half_m: float) -> FloatArray:
     """The stretches of a line near its supporting places, (s, 2) mm along it."""
+    line, line_of, places = candidates.lines[number], candidates.line_of, candidates.places
     n = 0
     for q in range(len(places)):
         n += line_of[q] == number
@@ -402,32 +422,24 @@ def _supported_spans(
 
 
 @kernel
-def subdivide(
-    plan: Subdivision,
-    lines: FloatArray,
-    scores: FloatArray,
-    crossing: LabelArray,
-    line_of: LabelArray,
-    places: FloatArray,
-    reach_m: float,
-    clearance: float,
-) -> None:
+def subdivide(plan: Subdivision, candidates: CandidateLines, reach_m: float, clearance: float) -> None:
     """Cut an outline by candidate lines, those with the highest scores first.
 
     Parameters
     ----------
     plan : Subdivision
         From `subdivision_of`; changed in place.
-    lines, scores, crossing, line_of, places : arrays
-        From `candidate_lines` and `border_places`, metres.
+    candidates : CandidateLines
+        From `candidate_lines`.
     reach_m : float
         How far beyond its supporting places a line cuts.
     clearance : float
         Times the usual distance within which a line passes through a vertex.
     """
     in_mm = np.empty(3)
-    for number in ascending_order(-scores):
-        spans = _supported_spans(lines[number], number, line_of, places, reach_m)
-        in_mm[0], in_mm[1], in_mm[2] = lines[number, 0], lines[number, 1], lines[number, 2] * 1e3
-        snap_mm = SNAP_CROSSING_MM if crossing[number] != 0 else _SNAP_MM
+    for number in ascending_order(-candidates.scores):
+        spans = _supported_spans(candidates, number, reach_m)
+        line = candidates.lines[number]
+        in_mm[0], in_mm[1], in_mm[2] = line[0], line[1], line[2] * 1e3
+        snap_mm = SNAP_CROSSING_MM if candidates.crossing[number] != 0 else _SNAP_MM
         cut_by_line(plan, in_mm, number, clearance * snap_mm, spans, -1)

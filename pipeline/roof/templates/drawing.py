@@ -17,10 +17,11 @@ from pipeline.roof.simplification import unite_close_vertices
 from pipeline.roof.templates.shapes import MAX_PLANES, height
 
 _MARGIN_M = 1.0
-"""By how much parts go beyond the outline before it cuts them."""
+"""By how much parts exceed the outline before it cuts them; any length does."""
 _UNITE_MM = 10.0
+"""Vertices closer than this are united, as in the first form of a traced plan."""
 _MAX_PAIRED = 500
-"""Vertices; of more not all pairs are looked at, which takes memory."""
+"""More vertices are not compared pair by pair, which takes memory."""
 
 
 def lower_piece(region: FloatArray, planes: FloatArray, number: int) -> FloatArray:
@@ -138,19 +139,19 @@ def draw_parts(
     if len(vertices) > _MAX_PAIRED or _min_distance_mm(vertices) <= _UNITE_MM:
         partition = unite_close_vertices(partition, _UNITE_MM)
     if not shapely.is_valid(partition.polygons).all() or not shapely.coverage_is_valid(partition.polygons):
-        raise BuildingError(Reason.NO_PARTITION, "the faces of the templates make no coverage")
+        raise BuildingError(Reason.NO_PARTITION, "the faces of the templates do not make a coverage")
     return partition
 
 
 def _min_distance_mm(vertices: FloatArray) -> float:
-    """Between any two of the places, (n, 2), along x or y, whichever is more; infinite for fewer than two."""
+    """The least distance of two of the places (n, 2), by the larger of x and y; infinite for fewer than two."""
     apart = np.abs(vertices[:, None] - vertices[None]).max(axis=2) + np.diag(np.full(len(vertices), np.inf))
     return float(apart.min())
 
 
 @kernel
 def _label_at(u: float, v: float, regions: FloatArray, counts: LabelArray, planes: FloatArray) -> int:
-    """Part and plane over a place."""
+    """Number of the part and plane over a place, `MAX_PLANES` p + k."""
     for p in range(len(regions)):
         if regions[p, 0] <= u < regions[p, 1] and regions[p, 2] <= v < regions[p, 3]:
             return MAX_PLANES * p + height(planes[p], counts[p], u, v)[1]

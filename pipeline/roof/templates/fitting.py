@@ -1,4 +1,4 @@
-"""Templates fitted to the roof points of one outline, and held against other roof faces by BIC."""
+"""Templates fitted to the roof points of one outline, and compared with other roof faces by BIC."""
 
 from __future__ import annotations
 
@@ -24,17 +24,19 @@ SIGMA_M = 0.1
 _REACH_M = CAP_SIGMAS * SIGMA_M
 """A point farther from a template is not explained by it."""
 MIN_POINTS = 4
-"""Of an outline: a level takes one parameter, and some points that bear it out."""
+"""Least points of an outline: a level has one parameter, the others confirm it."""
 MAX_POINTS = 500
-"""More are not few: the arrangement has all it needs, and the cuts that are tried take time."""
+"""With more points the arrangement has all it needs, and trying cuts takes time."""
 _POINTS_OF_PART = 3
+"""Least points of a part: one more than a pent shape has parameters."""
 _MIN_EXPLAINED = 0.5
-"""Share of the points within three standard deviations without which no template is a model of them."""
+"""Share of the points within three standard deviations below which templates are not a model of them."""
 _SPARE_POINTS = 2
-"""By how many the explained points must outnumber the parameters: many small shapes meet any points."""
+"""By how many the explained points must outnumber the parameters: many small shapes fit any points."""
 _MIN_FACE_M2 = 1.0
+"""A smaller face holds fewer than three points at the densities of templates."""
 _STEP_M = 0.3
-"""Faces that part by more along a border meet in a step."""
+"""Faces that differ by more along a border meet in a step: three standard deviations of their points."""
 _PARAMETERS_OF_PLANE = 3
 _PARAMETERS_OF_STEP = 2
 
@@ -70,7 +72,7 @@ class Templates:
     planes: FloatArray
     """(p, 4, 3) float64, (a, b, c) of z = a u + b v + c; the roof of a part is the lowest of its planes."""
     parameters: float
-    """Of shapes and cuts."""
+    """Number of parameters of shapes and cuts."""
     residuals_m: FloatArray
     """(n,) float64, height of every point above its roof."""
     plane_of_point: LabelArray
@@ -97,7 +99,7 @@ class Templates:
         return RankedFaces(partition=partition, planes=planes, labels=labels, bic_margin=bic_margin)
 
     def _plane(self, number: int, residuals_m: FloatArray) -> Plane:
-        """A plane in local metres, with what its points say about it."""
+        """A plane in local metres, with the number and residuals of its points."""
         a, b, c = self.planes[number // MAX_PLANES, number % MAX_PLANES].tolist()
         cos, sin = math.cos(self.direction), math.sin(self.direction)
         x_slope, y_slope = a * cos - b * sin, a * sin + b * cos
@@ -200,7 +202,7 @@ def margin_of_templates(
     partition : RoofPartition
         The other faces, a coverage in integer millimetres.
     planes : sequence of Plane
-        What their labels number.
+        The planes that its labels number.
     """
     others = np.full(len(points), np.inf)
     x_mm, y_mm = points[:, 0] * 1e3, points[:, 1] * 1e3
@@ -219,14 +221,14 @@ def margin_of_templates(
 
 
 def parameters_of(partition: RoofPartition, planes: Sequence[Plane]) -> float:
-    """Free parameters of roof faces: three a plane, two (direction and place) a pair of faces that meets in a step.
+    """Free parameters of roof faces: three per plane, two (direction and place) per pair of faces that meets in a step.
 
     Parameters
     ----------
     partition : RoofPartition
         A coverage: faces share their vertices.
     planes : sequence of Plane
-        What its labels number.
+        The planes that its labels number.
     """
     beside: dict[tuple[float, ...], int] = {}
     steps: set[tuple[int, int]] = set()

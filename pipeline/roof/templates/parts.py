@@ -16,29 +16,31 @@ from pipeline.model import FloatArray, LabelArray
 from pipeline.roof.templates.shapes import CAP_SIGMAS, MAX_PLANES, best_shape, copy_planes, height
 
 MAX_PARTS = 6
+"""Bounds the work."""
 _EVERYWHERE_M = 1e6
 _CUT_PARAMETERS = 3.0
-"""Direction and place of a cut between points."""
+"""Price of a cut between points: its direction and place."""
 _CORNER_CUT_PARAMETERS = 2.0
-"""Of a cut at a corner of the outline: which one."""
+"""Price of a cut at a corner of the outline: which one."""
 _MIN_SIDE_M = 1.0
-"""Width of a part."""
+"""Least width of a part: a narrower one is a detail."""
 _PLACES = 12
-"""Cuts between points that are tried in each direction."""
+"""Cuts between points that are tried in each direction; `_settled_place` refines the best."""
 _CORNERS_APART_M = 0.3
+"""Corners closer than this give one cut."""
 _LONGEST_EDGES = 64
-"""Of an outline, which tell its direction."""
+"""Edges of an outline that decide its direction: bounds the work, which is quadratic."""
 _LESS = 1e-9
-"""Sums that differ by less are equal."""
+"""Sums that differ by less are equal; numerical guard."""
 _FINALISTS = 3
-"""Cuts whose sides are fitted thoroughly."""
+"""Cuts whose sides are fitted thoroughly: bounds the work."""
 
 
 @kernel
 def main_direction(edges: FloatArray) -> float:
     """The direction along which, or across which, most of an outline runs; radians, -pi/4 to pi/4.
 
-    Of an outline with very many edges the longest ones tell: each is held against every other.
+    In an outline with very many edges the longest ones decide, since each is compared with every other.
 
     Parameters
     ----------
@@ -112,7 +114,7 @@ def _box_of(edges: FloatArray, region: FloatArray) -> FloatArray:
 
 @kernel
 def _cuts(points: FloatArray, edges: FloatArray, box: FloatArray) -> tuple[FloatArray, int]:
-    """Cuts worth a trial: their axis, place and price in parameters; their number."""
+    """Cuts to try, (c, 3): axis, place in metres and price in parameters; how many of the rows are used."""
     m, e = len(points), len(edges)
     cuts = np.empty((2 * (m + e), 3))
     count = 0
@@ -165,9 +167,9 @@ def _settled_place(
     sigma_m: float,
     fewest: int,
 ) -> float:
-    """The place between points where a cut leaves the least misfit to the shapes on both sides as they are.
+    """The place of a cut between points with the least misfit to given shapes, between its place and the next tried.
 
-    Of all places not farther from the given one than the next that was tried.
+    `planes` (2, 4, 3) and `counts` (2,) are the shapes on both sides.
     """
     m = len(points)
     own = np.empty(m)
@@ -268,7 +270,7 @@ def _best_cut(
 def fit_parts(
     points: FloatArray, edges: FloatArray, sigma_m: float, fewest: int
 ) -> tuple[float, int, FloatArray, LabelArray, FloatArray, FloatArray, LabelArray]:
-    """Parts of an outline and their shapes, of least BIC as far as single cuts find it.
+    """Parts of an outline and their shapes, of the least BIC that single cuts find.
 
     Parameters
     ----------
@@ -286,7 +288,7 @@ def fit_parts(
     parameters : float
         All parameters of shapes and cuts.
     parts : int
-        Number p of parts; rows behind it are of no use.
+        Number p of parts; further rows are unused.
     regions : (6, 4) float64
         Least and largest u, least and largest v of each part.
     counts : (6,) int32

@@ -15,24 +15,29 @@ from pipeline.compiler import kernel
 from pipeline.model import FloatArray
 
 MAX_PLANES = 4
-"""Of a shape: those of a hip."""
+"""Planes of a hip, the shape with most of them."""
 CAP_SIGMAS = 3.0
-"""A point farther than this from a shape is not explained by it."""
+"""A point farther than this from a shape is not explained by it: the usual bound of 3 standard deviations."""
 _STEPS = 5
-"""Refits of a line: what counts as far halves each time."""
+"""Refits of a line: the distance that counts as far halves each time, from 16 times the last."""
 _MIN_SLOPE = math.tan(math.radians(7.0))
 _MAX_SLOPE = math.tan(math.radians(70.0))
+"""Slopes of the sides of a gable or hip: below it is flat, as in Hofmann et al. (2003), above it is a wall."""
 _RIDGE_PLACES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
-"""Where a ridge may lie, as shares of the part's width; the first in the middle."""
+"""Where a ridge may lie, as shares of the part's width; the first in the middle. Planes that go free refine it."""
 _BOTH_ENDS = 3
 """Bits of the ends of a ridge with hips."""
 _RIDGES = _BOTH_ENDS + len(_RIDGE_PLACES)
 """Ridges that are tried in each direction: without hips, with them at either end, at both, and off the middle."""
+_FIRST_RIDGED = 3
+"""Trials before the ridged shapes: level, pent in two directions."""
 _MIN_PENT = 0.02
-"""A pent roof of less slope is flat."""
+"""A pent roof of less slope is flat: over 10 m it falls by two standard deviations of the points."""
 _BEYOND_M = 0.3
-"""By how much a shape may leave the heights of its points within the part, beside what it falls over one spacing."""
+"""By how much a shape may leave the heights of its points within the part, besides its fall over one spacing: three
+standard deviations of the points."""
 _REFITS = 4
+"""Refits of free planes: the first two with wider reaches, then two with the last one."""
 
 
 @kernel
@@ -49,7 +54,7 @@ def robust_line(t: FloatArray, z: FloatArray, reach_m: float, level: bool) -> tu
     reach_m : float
         The last reach.
     level : bool
-        Whether the slope is to be 0.
+        Whether the slope is 0.
 
     Returns
     -------
@@ -101,7 +106,7 @@ def misfit(planes: FloatArray, count: int, points: FloatArray, sigma_m: float) -
 
 @kernel
 def _stays_near(planes: FloatArray, count: int, points: FloatArray, box: FloatArray) -> bool:
-    """Whether slopes are those of a roof, and the envelope stays near the heights of the points within the box."""
+    """Whether slopes are possible for a roof, and the envelope stays near the heights of the points within the box."""
     steepest = 0.0
     for k in range(count):
         steepest = max(steepest, abs(planes[k, 0]) + abs(planes[k, 1]))
@@ -146,7 +151,7 @@ def _refit(planes: FloatArray, count: int, points: FloatArray, reach_m: float) -
     Returns
     -------
     bool
-        False where a plane is left with too few points; the planes are then of no use.
+        False where a plane is left with too few points; the planes are then undefined.
     """
     sums = np.empty((count, 6))
     for step in range(_REFITS):
@@ -182,7 +187,7 @@ def _refit(planes: FloatArray, count: int, points: FloatArray, reach_m: float) -
 
 @kernel
 def _drop(u: float, v: float, axis: int, ridge: float, box: FloatArray, ends: int) -> float:
-    """How far, in plan, a place lies below the ridge of a roof of equal pitch.
+    """Distance in plan of a place from the ridge of a roof of equal pitch, along the fall; metres.
 
     The ridge runs across `axis`; where bits of `ends` say so, it ends half the box's width before the box.
     """
@@ -202,7 +207,7 @@ def _drop(u: float, v: float, axis: int, ridge: float, box: FloatArray, ends: in
 
 @kernel
 def _ridged(planes: FloatArray, axis: int, ridge: float, box: FloatArray, ends: int, c: float, slope: float) -> int:
-    """The planes of that roof, from its ridge's elevation and its slope; their number."""
+    """Fill in the planes of such a roof (see `_drop`) from its ridge's elevation c and its slope; their number."""
     along = 1 - axis
     planes[0, axis], planes[0, along], planes[0, 2] = -slope, 0.0, c + slope * ridge
     planes[1, axis], planes[1, along], planes[1, 2] = slope, 0.0, c - slope * ridge
@@ -224,6 +229,33 @@ def copy_planes(planes: FloatArray, to: FloatArray) -> None:
     for k in range(len(planes)):
         for q in range(3):
             to[k, q] = planes[k, q]
+
+
+@kernel
+def _fit_of_least_freedom(
+    points: FloatArray, heights: FloatArray, box: FloatArray, trial: int, reach_m: float, planes: FloatArray
+) -> int:
+    """Fit a shape by one line: 0 level, 1 and 2 pent along u and v, else ridged; its planes, 0 if it does not fit."""
+    axis, ends, ridge = max(trial - 1, 0), 0, 0.0
+    if trial >= _FIRST_RIDGED:
+        axis, variant = (trial - _FIRST_RIDGED) // _RIDGES, (trial - _FIRST_RIDGED) % _RIDGES
+        ends, place = (variant, 0) if variant <= _BOTH_ENDS else (0, variant - _BOTH_ENDS)
+        ridge = box[2 * axis] + _RIDGE_PLACES[place] * (box[2 * axis + 1] - box[2 * axis])
+    t = np.empty(len(points))
+    for i in range(len(points)):
+        if trial >= _FIRST_RIDGED:
+            t[i] = _drop(points[i, 0], points[i, 1], axis, ridge, box, ends)
+        else:
+            t[i] = points[i, axis]
+    c, s = robust_line(t, heights, reach_m, trial == 0)
+    if trial >= _FIRST_RIDGED:
+        return 0 if -s < _MIN_SLOPE else _ridged(planes, axis, ridge, box, ends, c, -s)
+    planes[0, 0], planes[0, 1], planes[0, 2] = 0.0, 0.0, c
+    if trial > 0:
+        planes[0, axis] = s
+        if abs(s) < _MIN_PENT:
+            return 0
+    return 1
 
 
 @kernel
@@ -265,56 +297,36 @@ def best_shape(
     start_count = 0
     start = np.zeros((MAX_PLANES, 3))
     planes = np.zeros((MAX_PLANES, 3))
-    z, t = np.empty(m), np.empty(m)
+    heights = np.empty(m)
     for i in range(m):
-        z[i] = points[i, 2]
-    ridges = 3 + 2 * _RIDGES
-    for trial in range(ridges + MAX_PLANES - 1 if thorough else ridges):
-        axis, place, ends, count = trial - 1, 0, 0, 1
+        heights[i] = points[i, 2]
+    free = _FIRST_RIDGED + 2 * _RIDGES
+    for trial in range(free + MAX_PLANES - 1 if thorough else free):
+        variant = (trial - _FIRST_RIDGED) % _RIDGES
         parameters = 1 if trial == 0 else 2
-        if trial >= 3:
-            axis, variant = (trial - 3) // _RIDGES, (trial - 3) % _RIDGES
-            if variant <= _BOTH_ENDS:
-                ends = variant
-            else:
-                place, parameters = variant - _BOTH_ENDS, 3
-            if not thorough and variant > 0:
-                continue
-        if trial >= ridges:
-            count = trial - ridges + 2
+        count = 1
+        if trial >= free:
+            # the best ridged shape so far, every plane free
+            count = trial - free + 2
             parameters = 2 * count
             if count > start_count or (start_count == MAX_PLANES and count == 3):
                 continue
-        if m < parameters + (1 if trial < 3 else 2) or best <= parameters * cost_of_parameter:
+        elif trial >= _FIRST_RIDGED:
+            if not thorough and variant > 0:
+                continue
+            parameters = 2 if variant <= _BOTH_ENDS else 3
+        if m < parameters + (1 if trial < _FIRST_RIDGED else 2) or best <= parameters * cost_of_parameter:
             continue
-        if trial >= ridges:
+        if trial >= free:
             copy_planes(start, planes)
             if not _refit(planes, count, points, reach_m):
                 continue
         else:
-            ridge = 0.0
-            if trial >= 3:
-                ridge = box[2 * axis] + _RIDGE_PLACES[place] * (box[2 * axis + 1] - box[2 * axis])
-            for i in range(m):
-                if trial >= 3:
-                    t[i] = _drop(points[i, 0], points[i, 1], axis, ridge, box, ends)
-                else:
-                    t[i] = points[i, max(axis, 0)]
-            c, s = robust_line(t, z, reach_m, trial == 0)
-            if trial >= 3:
-                if -s < _MIN_SLOPE:
-                    continue
-                count = _ridged(planes, axis, ridge, box, ends, c, -s)
-            else:
-                planes[0, 0], planes[0, 1], planes[0, 2] = 0.0, 0.0, c
-                if trial > 0:
-                    planes[0, axis] = s
-                    if abs(s) < _MIN_PENT:
-                        continue
-        if trial > 0 and not _stays_near(planes, count, points, box):
+            count = _fit_of_least_freedom(points, heights, box, trial, reach_m, planes)
+        if count == 0 or (trial > 0 and not _stays_near(planes, count, points, box)):
             continue
         own = misfit(planes, count, points, sigma_m)
-        if 3 <= trial < ridges and own < ridged:
+        if _FIRST_RIDGED <= trial < free and own < ridged:
             ridged, start_count = own, count
             copy_planes(planes, start)
         cost = own + parameters * cost_of_parameter
