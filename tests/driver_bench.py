@@ -58,7 +58,7 @@ class Engine:
 
 
 class Script:
-    """A run that does what the test says; by default it tells some progress and succeeds."""
+    """A run that does what the test says; by default it reports some progress and succeeds."""
 
     def __init__(self) -> None:
         self.runs = 0

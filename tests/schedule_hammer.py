@@ -20,13 +20,13 @@ def main(url: str, start: dt.datetime, step: dt.timedelta, ticks: int, lap: int)
         for number in range(ticks):
             if number % lap == 0 and not sys.stdin.readline():
                 sys.exit("the test has ended")
-            told = store.schedules.tick(now=start + number * step, max_queued=10**6, max_queued_per_key=10**6)
-            for run in told:
+            entries = store.schedules.tick(now=start + number * step, max_queued=10**6, max_queued_per_key=10**6)
+            for run in entries:
                 if run.outcome is Outcome.SUBMITTED and run.job_id is not None:
                     print(run.job_id, flush=True)
             # every second tick, so that some slots come while a job is under way
             if number % 2:
-                for run in told:
+                for run in entries:
                     if run.job_id is not None:
                         store.dismiss(run.job_id)
 

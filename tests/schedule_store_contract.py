@@ -164,7 +164,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert runs_of(store, made) == []
 
     @pytest.mark.parametrize("schedule_id", ["", "x", "0" * 32, "0" * 31 + "\0", "\ud800" * 32])
-    def test_a_schedule_that_does_not_exist_is_told(self, store: JobStore, schedule_id: str) -> None:
+    def test_a_schedule_that_does_not_exist_is_reported(self, store: JobStore, schedule_id: str) -> None:
         book = store.schedules
         for ask in (book.get, book.remove, book.runs):
             with pytest.raises(NoSuchScheduleError, match="no schedule"):
@@ -233,7 +233,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         with pytest.raises(ChangedMeanwhileError, match="has version 2, the change is for version 1"):
             book.change(made.schedule_id, made.definition, version=1)
 
-    def test_other_times_count_from_the_change_on_and_what_nobody_saw_before_is_told(self, store: JobStore) -> None:
+    def test_other_times_count_from_the_change_on_and_undecided_slots_are_missed(self, store: JobStore) -> None:
         full_hour = store.now().replace(minute=0, second=0, microsecond=0)
         made = make(store, at=full_hour - 3 * HOUR)
         # by other words than its times nothing is decided
@@ -322,7 +322,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert found.counts[Outcome.SUBMITTED] == 1
         assert claim(store).job_id == job.job_id
 
-    def test_a_job_without_a_schedule_tells_none(self, store: JobStore) -> None:
+    def test_a_job_without_a_schedule_names_none(self, store: JobStore) -> None:
         job = submit(store)
         assert job.schedule_id is None
         assert store.list(JobFilter(schedule_id="a\0b")) == []
@@ -336,7 +336,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert [run.number for run in runs_of(store, made)] == [5, 4, 3, 2, 1]
         assert [run.number for run in store.schedules.runs(made.schedule_id, limit=2, offset=1)] == [4, 3]
 
-    def test_a_slot_that_comes_while_a_job_is_under_way_is_skipped_and_told(self, store: JobStore) -> None:
+    def test_a_slot_that_comes_while_a_job_is_under_way_is_skipped(self, store: JobStore) -> None:
         made = make(store)
         tick(store, NOON + HOUR)
         (job,) = jobs_of(store, made)
@@ -384,7 +384,7 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert "paused" in missed.message
         assert store.schedules.get(made.schedule_id).counts[Outcome.MISSED] == 1
 
-    def test_what_passed_while_no_driver_was_there_is_told_and_the_latest_is_run_once(self, store: JobStore) -> None:
+    def test_slots_without_a_driver_are_missed_and_the_latest_is_run_once(self, store: JobStore) -> None:
         made = make(store)
         assert tick(store, NOON + 30 * HOUR + 20 * MINUTE) == [
             (Outcome.MISSED, NOON + 29 * HOUR, 29),
@@ -401,26 +401,26 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         assert submitted.message == "1200 s after its time"
         assert store.schedules.get(made.schedule_id).counts[Outcome.MISSED] == 29
 
-    def test_a_full_line_is_told_and_leaves_no_half_a_job(self, store: JobStore) -> None:
+    def test_a_full_queue_is_reported_and_leaves_no_half_a_job(self, store: JobStore) -> None:
         made = make(store, owner="k")
         submit(store, owner="k")
-        told = store.schedules.tick(now=NOON + HOUR, max_queued=10, max_queued_per_key=1)
-        assert [(run.outcome, run.job_id) for run in told] == [(Outcome.FAILED, None)]
-        assert "1 jobs of this key wait and 1 may" in told[0].message
-        assert runs_of(store, made) == told
+        entries = store.schedules.tick(now=NOON + HOUR, max_queued=10, max_queued_per_key=1)
+        assert [(run.outcome, run.job_id) for run in entries] == [(Outcome.FAILED, None)]
+        assert "1 jobs of this key wait and 1 may" in entries[0].message
+        assert runs_of(store, made) == entries
         assert jobs_of(store, made) == []
         assert store.counts()[JobStatus.ACCEPTED] == 1
         # the next slot is tried again
         assert tick(store, NOON + 2 * HOUR) == [(Outcome.SUBMITTED, NOON + 2 * HOUR, 1)]
 
-    def test_an_upload_that_is_gone_against_all_rules_is_told_and_leaves_no_half_a_job(self, store: JobStore) -> None:
+    def test_an_upload_that_is_gone_is_reported_and_leaves_no_half_a_job(self, store: JobStore) -> None:
         sent = upload(store)
         made = make(store, request=request(sent.upload_id, "upload"))
         with store._database.write() as connection:
             connection.execute(sa.delete(UPLOADS))
-        (told,) = store.schedules.tick(now=NOON + HOUR, **LIMITS)
-        assert (told.outcome, told.job_id) == (Outcome.FAILED, None)
-        assert sent.upload_id in told.message
+        (entry,) = store.schedules.tick(now=NOON + HOUR, **LIMITS)
+        assert (entry.outcome, entry.job_id) == (Outcome.FAILED, None)
+        assert sent.upload_id in entry.message
         assert jobs_of(store, made) == []
         assert store.schedules.get(made.schedule_id).counts[Outcome.FAILED] == 1
 
@@ -431,27 +431,27 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
         tick(store, NOON + HOUR)
         end(store, jobs_of(store, made)[0])
         store.revoke_key(key.key_id)
-        (told,) = store.schedules.tick(now=NOON + 2 * HOUR, **LIMITS)
-        assert told.outcome is Outcome.FAILED
-        assert "'old'" in told.message
-        assert "was revoked" in told.message
+        (entry,) = store.schedules.tick(now=NOON + 2 * HOUR, **LIMITS)
+        assert entry.outcome is Outcome.FAILED
+        assert "'old'" in entry.message
+        assert "was revoked" in entry.message
         assert len(jobs_of(store, made)) == 1
 
-    def test_a_zone_that_this_machine_does_not_know_is_told_and_blocks_no_other_schedule(self, store: JobStore) -> None:
+    def test_an_unknown_time_zone_is_reported_and_blocks_no_other_schedule(self, store: JobStore) -> None:
         bad, good = make(store, overlap=Overlap.WAIT), make(store)
         with store._database.write() as connection:
             one = sa.update(SCHEDULES).where(SCHEDULES.c.schedule_id == bad.schedule_id)
             connection.execute(one.values(time_zone="Mars/Olympus"))
-        told = {run.schedule_id: run for run in store.schedules.tick(now=NOON + HOUR, **LIMITS)}
-        assert (told[bad.schedule_id].outcome, told[bad.schedule_id].slot) == (Outcome.FAILED, NOON + HOUR)
-        assert "Mars/Olympus" in told[bad.schedule_id].message
-        assert told[good.schedule_id].outcome is Outcome.SUBMITTED
+        entries = {run.schedule_id: run for run in store.schedules.tick(now=NOON + HOUR, **LIMITS)}
+        assert (entries[bad.schedule_id].outcome, entries[bad.schedule_id].slot) == (Outcome.FAILED, NOON + HOUR)
+        assert "Mars/Olympus" in entries[bad.schedule_id].message
+        assert entries[good.schedule_id].outcome is Outcome.SUBMITTED
         assert tick(store, NOON + HOUR + MINUTE) == []
         with pytest.raises(SettingsError, match="Mars/Olympus"):
             store.schedules.get(bad.schedule_id)
         with store._database.write() as connection:
             connection.execute(one.values(time_zone="UTC"))
-        # known again: what passed meanwhile is told, the latest is run
+        # known again: slots in the meantime are missed, the latest is run
         assert (Outcome.MISSED, NOON + 3 * HOUR, 2) in tick(store, NOON + 4 * HOUR)
         store.schedules.remove(bad.schedule_id)
 
@@ -474,9 +474,9 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
     def test_a_run_by_hand_is_refused_while_a_job_is_under_way(self, store: JobStore) -> None:
         made = make(store, overlap=Overlap.WAIT)
         job = store.schedules.run_now(made.schedule_id, **LIMITS)
-        with pytest.raises(ScheduleBusyError, match=job.job_id) as told:
+        with pytest.raises(ScheduleBusyError, match=job.job_id) as raised:
             store.schedules.run_now(made.schedule_id, **LIMITS)
-        assert told.value.job_id == job.job_id
+        assert raised.value.job_id == job.job_id
         assert tick(store, NOON + HOUR) == [(Outcome.WAITING, NOON + HOUR, 1)]
         end(store, job)
         store.schedules.run_now(made.schedule_id, **LIMITS)
@@ -620,9 +620,9 @@ class ScheduleStoreContract(ScheduleContract, DatabaseContract):
                 for row in rows
                 if row.first_slot is not None
             ]
-            told = Counter([*singles, *(at for stretch in stretches for at in stretch)])
-            assert set(told) == expected
-            assert max(told.values()) == 1
+            decided = Counter([*singles, *(at for stretch in stretches for at in stretch)])
+            assert set(decided) == expected
+            assert max(decided.values()) == 1
             jobs = [row.job_id for row in rows if row.outcome == Outcome.SUBMITTED]
             assert len(set(jobs)) == len(jobs) == len(jobs_of(store, schedule))
             counts = store.schedules.get(schedule.schedule_id).counts

@@ -66,7 +66,7 @@ def claim(store: JobStore, driver: str = "a", *, lease_s: float = HOUR_S, max_at
     return job
 
 
-def told(kind: str = "warning", **values: Any) -> JobEvent:
+def happened(kind: str = "warning", **values: Any) -> JobEvent:
     return JobEvent(sequence=0, at=dt.datetime(2020, 1, 1, tzinfo=dt.UTC), kind=kind, **values)
 
 
@@ -109,7 +109,7 @@ class StoreContract(DatabaseContract):
 
     # --- the tables
 
-    def test_a_database_without_tables_is_told(self, url: str) -> None:
+    def test_a_database_without_tables_is_reported(self, url: str) -> None:
         with JobStore(url) as store, pytest.raises(StoreError, match=r"start the service|does not exist"):
             store.check()
 
@@ -176,7 +176,7 @@ class StoreContract(DatabaseContract):
         assert abs((after - dt.datetime.now(dt.UTC)).total_seconds()) < HOUR_S
 
     @pytest.mark.parametrize("job_id", ["", "x", "0" * 32, "0" * 31 + "\0", "../../etc", "\ud800" * 32])
-    def test_a_job_that_does_not_exist_is_told(self, store: JobStore, job_id: str) -> None:
+    def test_a_job_that_does_not_exist_is_reported(self, store: JobStore, job_id: str) -> None:
         for ask in (store.get, store.dismiss):
             with pytest.raises(NoSuchJobError, match="no job"):
                 ask(job_id)
@@ -194,7 +194,7 @@ class StoreContract(DatabaseContract):
     def test_text_that_a_database_would_refuse_is_stored_without_its_odd_characters(self, store: JobStore) -> None:
         submit(store, title="a\0b\ud800")
         held = claim(store)
-        store.record(held, [told(message="nul \0 and surrogate \ud800", stage="s" * 100)])
+        store.record(held, [happened(message="nul \0 and surrogate \ud800", stage="s" * 100)])
         store.fail(held, JobFailure(fault=Fault.INPUT, detail="bad \0 value"))
         failure = store.get(held.job_id).failure
         assert failure is not None
@@ -309,7 +309,7 @@ class StoreContract(DatabaseContract):
         assert held.lease_until is not None
         assert renewed.lease_until > held.lease_until + dt.timedelta(minutes=30)
 
-    def test_a_lease_that_nobody_took_can_still_be_renewed(self, store: JobStore) -> None:
+    def test_a_lease_that_was_not_taken_can_still_be_renewed(self, store: JobStore) -> None:
         submit(store)
         held = claim(store, lease_s=SOON_S)
         until(lambda: held.lease_until is not None and store.now() > held.lease_until)
@@ -324,7 +324,7 @@ class StoreContract(DatabaseContract):
         assert second.started_at == first.started_at
         for write in (
             lambda: store.renew(first, lease_s=1.0),
-            lambda: store.record(first, [told()]),
+            lambda: store.record(first, [happened()]),
             lambda: store.succeed(first, message="", summary={}),
             lambda: store.fail(first, JobFailure(fault=Fault.INPUT, detail="x")),
             lambda: store.dismissed(first),
@@ -467,7 +467,7 @@ class StoreContract(DatabaseContract):
             store.remove(job.job_id)
         assert store.events(job.job_id) == []
 
-    def test_the_attempts_of_jobs_are_told_for_those_that_exist(self, store: JobStore) -> None:
+    def test_the_attempts_of_jobs_are_known_for_those_that_exist(self, store: JobStore) -> None:
         job, waiting = submit(store, priority=1), submit(store)
         claim(store)
         many = [uuid4().hex for _ in range(1100)]
@@ -482,9 +482,10 @@ class StoreContract(DatabaseContract):
         submit(store)
         held = claim(store)
         store.record(
-            held, [told("stage", stage="split"), told("progress", stage="split", done=1, total=4, progress=20)]
+            held,
+            [happened("stage", stage="split"), happened("progress", stage="split", done=1, total=4, progress=20)],
         )
-        store.record(held, [told("progress", progress=10, message="two workers are back")])
+        store.record(held, [happened("progress", progress=10, message="two workers are back")])
         job = store.get(held.job_id)
         assert (job.progress, job.stage, job.message) == (20, "split", "two workers are back")
         last = store.events(held.job_id)[-1]
@@ -494,7 +495,7 @@ class StoreContract(DatabaseContract):
     def test_progress_starts_again_with_the_next_attempt(self, store: JobStore) -> None:
         submit(store)
         held = claim(store)
-        store.record(held, [told("progress", stage="split", progress=60)])
+        store.record(held, [happened("progress", stage="split", progress=60)])
         store.release(held, lost=False)
         again = claim(store)
         assert (again.progress, again.stage) == (0, "")
@@ -504,7 +505,7 @@ class StoreContract(DatabaseContract):
         held = claim(store)
         for done in range(1, 6):
             for stage in ("ingest", "split"):
-                store.record(held, [told("progress", stage=stage, done=done, total=5, progress=done)])
+                store.record(held, [happened("progress", stage=stage, done=done, total=5, progress=done)])
         kept = [(event.stage, event.done) for event in store.events(held.job_id) if event.kind == "progress"]
         assert kept == [("ingest", 5), ("split", 5)]
         assert [event.sequence for event in store.events(held.job_id)] == [1, 2, 11, 12]
@@ -513,7 +514,7 @@ class StoreContract(DatabaseContract):
         submit(store)
         held = claim(store)
         for number in range(5):
-            store.record(held, [told(message=f"{number}.{k}") for k in range(MAX_KEPT // 2)])
+            store.record(held, [happened(message=f"{number}.{k}") for k in range(MAX_KEPT // 2)])
         kept = store.events(held.job_id, limit=10 * MAX_KEPT)
         assert [event.kind for event in kept[:2]] == ["status", "status"]
         assert len(kept) == 2 + MAX_KEPT
@@ -522,7 +523,7 @@ class StoreContract(DatabaseContract):
     def test_events_are_read_on_from_a_number_and_in_pages(self, store: JobStore) -> None:
         submit(store)
         held = claim(store)
-        store.record(held, [told(message=str(n)) for n in range(5)])
+        store.record(held, [happened(message=str(n)) for n in range(5)])
         assert [event.sequence for event in store.events(held.job_id, after=3, limit=2)] == [4, 5]
         assert store.events(held.job_id, after=7) == []
         assert store.events(held.job_id, after=10**30) == []
@@ -532,7 +533,9 @@ class StoreContract(DatabaseContract):
         submit(store)
         held = claim(store)
         with ThreadPoolExecutor(12) as crew:
-            list(crew.map(lambda n: store.record(held, [told(message=f"{n}"), told(message=f"{n}")]), range(60)))
+            list(
+                crew.map(lambda n: store.record(held, [happened(message=f"{n}"), happened(message=f"{n}")]), range(60))
+            )
         found = store.events(held.job_id)
         assert [event.sequence for event in found] == list(range(1, 123))
         # what was recorded together stands together

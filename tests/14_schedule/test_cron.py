@@ -156,8 +156,8 @@ def test_times_strictly_increase_and_from_each_the_next_is_found(fields: Fields,
 
 
 def test_every_minute_of_a_plain_day_is_hit_once() -> None:
-    told = times_of("* * * * *", "Europe/Amsterdam", "2026-06-01")
-    assert told == [f"{hour:02}:{minute:02}+0200" for hour in range(24) for minute in range(60)]
+    minutes = times_of("* * * * *", "Europe/Amsterdam", "2026-06-01")
+    assert minutes == [f"{hour:02}:{minute:02}+0200" for hour in range(24) for minute in range(60)]
 
 
 # --- the days when clocks are shifted, in figures
@@ -252,7 +252,7 @@ def test_words_names_and_letters_are_understood() -> None:
 
 
 @pytest.mark.parametrize(
-    ("expression", "told"),
+    ("expression", "fault"),
     [
         ("61 * * * *", "minute is '61', use 0 to 59"),
         ("* 25 0 13 9", "hour is '25'"),
@@ -271,14 +271,14 @@ def test_words_names_and_letters_are_understood() -> None:
         ("9" * 150 + " * * * *", "minute is"),
     ],
 )
-def test_a_bad_expression_is_told_with_its_field_and_the_fix(expression: str, told: str) -> None:
-    with pytest.raises(SettingsError, match=told):
+def test_a_bad_expression_is_reported_with_its_field_and_the_fix(expression: str, fault: str) -> None:
+    with pytest.raises(SettingsError, match=fault):
         Cron(expression, "UTC")
 
 
 @given(st.text(max_size=40) | st.from_regex(r"([0-9*,/#LW-]{1,6} ){4}[0-9*,/#L-]{1,6}", fullmatch=True))
 @settings(max_examples=examples(120), deadline=None)
-def test_any_text_is_an_expression_or_a_told_fault(text: str) -> None:
+def test_any_text_is_an_expression_or_a_reported_fault(text: str) -> None:
     faults = expression_faults(text)
     if faults:
         assert all(fault.startswith("cron is") for fault in faults)
@@ -304,7 +304,7 @@ def test_any_text_is_an_expression_or_a_told_fault(text: str) -> None:
         "x" * 300,
     ],
 )
-def test_a_zone_that_is_not_known_is_told(name: str) -> None:
+def test_a_zone_that_is_not_known_is_reported(name: str) -> None:
     with pytest.raises(SettingsError, match=r"time zone is .* not known: (did you mean|use a name)"):
         Cron("@daily", name)
 
@@ -314,10 +314,10 @@ def test_the_likely_zone_is_named() -> None:
         time_zone("europe/amstedam")
 
 
-def test_expression_and_zone_are_told_at_once() -> None:
-    with pytest.raises(SettingsError) as told:
+def test_expression_and_zone_are_reported_at_once() -> None:
+    with pytest.raises(SettingsError) as raised:
         Cron("61 * * * *", "Mars/Olympus")
-    assert len(told.value.faults) == 2
+    assert len(raised.value.faults) == 2
 
 
 def test_without_a_database_of_zones_utc_works_and_the_others_tell_what_to_install() -> None:

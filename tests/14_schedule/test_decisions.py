@@ -133,9 +133,9 @@ def test_nothing_runs_beside_a_run_and_no_slot_is_lost(
     found = decided(passed, waiting=old, is_busy=is_busy, missed=missed, overlap=overlap)
     assert not (is_busy and found.run is not None)
     fates = [found.run, found.waits, found.skipped, found.replaced, found.late]
-    told = sorted(at for at in fates if at is not None)
-    assert told == sorted(at for at in (slot, old) if at is not None)
+    decided_slots = sorted(at for at in fates if at is not None)
+    assert decided_slots == sorted(at for at in (slot, old) if at is not None)
 
 
-def test_policies_are_told_by_the_words_that_documents_use() -> None:
+def test_policies_have_the_names_that_documents_use() -> None:
     assert [list(Missed), list(Overlap)] == [["run-latest", "skip"], ["skip", "wait"]]

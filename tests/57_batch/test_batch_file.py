@@ -1,4 +1,4 @@
-"""The batch file: paths are the file's own, and all faults are told at once."""
+"""The batch file: paths are the file's own, and all faults are reported at once."""
 
 from __future__ import annotations
 
@@ -83,22 +83,22 @@ def test_all_that_can_be_said_reaches_the_engine(tmp_path: Path) -> None:
     assert (request.meshes, request.overwrite) == ("glb", True)
 
 
-@pytest.mark.parametrize(("told", "workers"), [('"auto"', None), ("0", 0), ("3", 3)])
-def test_workers_are_a_number_or_left_to_the_estimate(tmp_path: Path, told: str, workers: int | None) -> None:
-    batch = read_batch(written(tmp_path, f"{LEAST}[cluster]\nworkers = {told}\n"))
+@pytest.mark.parametrize(("given", "workers"), [('"auto"', None), ("0", 0), ("3", 3)])
+def test_workers_are_a_number_or_left_to_the_estimate(tmp_path: Path, given: str, workers: int | None) -> None:
+    batch = read_batch(written(tmp_path, f"{LEAST}[cluster]\nworkers = {given}\n"))
     assert batch.workers == batch.request().resources.workers == workers
 
 
-@pytest.mark.parametrize("told", ['"many"', '"3"', "1025", "1.5", "true"])
-def test_workers_that_are_no_number_are_named_with_what_to_use(tmp_path: Path, told: str) -> None:
+@pytest.mark.parametrize("given", ['"many"', '"3"', "1025", "1.5", "true"])
+def test_workers_that_are_no_number_are_named_with_what_to_use(tmp_path: Path, given: str) -> None:
     with pytest.raises(SettingsError) as raised:
-        read_batch(written(tmp_path, f"{LEAST}[cluster]\nworkers = {told}\n"))
+        read_batch(written(tmp_path, f"{LEAST}[cluster]\nworkers = {given}\n"))
     (fault,) = raised.value.faults
-    value = told.replace('"', "'").replace("true", "True")
+    value = given.replace('"', "'").replace("true", "True")
     assert f"workers is {value}: use 'auto' or a whole number from 0 to 1024" in fault
 
 
-def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
+def test_all_faults_are_reported_at_once(tmp_path: Path) -> None:
     text = """
     [inputs]
     path = "tiles"
@@ -114,7 +114,7 @@ def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
     """
     with pytest.raises(SettingsError) as raised:
         read_batch(written(tmp_path, text))
-    told = "\n".join(raised.value.faults)
+    faults = "\n".join(raised.value.faults)
     for words in (
         "[inputs] paths is missing",
         "[inputs] bbox is [1, 2]",
@@ -125,7 +125,7 @@ def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
         "magic",
         "[sttings] is no table of a batch file",
     ):
-        assert words in told
+        assert words in faults
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A batch that runs at its times: every time is told once, no two runs meet, and nothing is forgotten at an end."""
+"""A batch that runs at its times: no two runs overlap, and an end forgets nothing."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def record_of(file: Path) -> ScheduleRecord:
     return state
 
 
-def test_runs_follow_one_another_and_are_told_with_their_codes(file: Path) -> None:
+def test_runs_follow_one_another_and_are_recorded_with_their_codes(file: Path) -> None:
     days = Days([])
     days._steps = [
         lambda: days.later(0.5),
@@ -202,7 +202,7 @@ def test_an_end_interrupts_the_run_and_the_next_start_goes_on(file: Path) -> Non
     assert (record_of(file).running, record_of(file).counts) == (None, {"interrupted": 1, "ran": 1})
 
 
-def test_a_run_by_hand_is_not_met(file: Path) -> None:
+def test_a_run_by_hand_is_not_overlapped(file: Path) -> None:
     days = Days([])
     days._steps = [lambda: days.later(0.5), lambda: days.later(1.0)]
     with locked_work(str(file.with_suffix(".work"))):
@@ -267,7 +267,7 @@ def test_other_times_of_a_schedule_that_was_down_count_from_its_start_on(file: P
     assert (days.runs, record_of(file).entries) == ([], ())
 
 
-def test_a_broken_file_runs_nothing_and_every_time_is_told_until_it_is_mended(file: Path) -> None:
+def test_a_broken_file_runs_nothing_and_fails_every_slot_until_it_is_fixed(file: Path) -> None:
     days = Days([])
     days._steps = [
         write(days, file, FILE.replace("0 *", "77 *")),
@@ -335,7 +335,7 @@ def test_a_full_disk_starts_nothing_and_ends_nothing(file: Path, monkeypatch: py
     assert any("cannot be written, so no run is started" in event.message for event in days.events)
 
 
-def test_a_run_that_cannot_be_started_is_told(file: Path) -> None:
+def test_a_run_that_cannot_be_started_is_recorded(file: Path) -> None:
     class Poor(Days):
         def start(self, batch: Batch) -> FakeRun:
             assert batch.schedule.cron
@@ -360,7 +360,7 @@ def test_a_run_that_outlived_the_process_before_is_waited_for(file: Path) -> Non
     assert (again.runs, record_of(file).running) == ([], AT)
 
 
-def test_a_run_that_does_not_end_is_killed_where_the_end_is_asked_for_once_more(file: Path) -> None:
+def test_a_run_that_does_not_end_is_killed_by_a_second_request(file: Path) -> None:
     class Deaf(FakeRun):
         def send_signal(self, sig: int, /) -> None:
             self.signals.append(sig)
@@ -399,7 +399,7 @@ def test_a_work_folder_that_is_removed_is_made_and_held_again(file: Path) -> Non
         pass  # a run of the batch takes it for a work folder
 
 
-def test_a_time_that_waited_is_told_as_missed_where_other_times_came_meanwhile(file: Path) -> None:
+def test_a_time_that_waited_is_missed_if_the_times_changed_meanwhile(file: Path) -> None:
     file.write_text(FILE + 'overlap = "wait"\n')
     with locked_work(str(file.with_suffix(".work"))):
         days = Days([])
@@ -413,7 +413,7 @@ def test_a_time_that_waited_is_told_as_missed_where_other_times_came_meanwhile(f
     assert (again.runs, record_of(file).state.waiting, record_of(file).counts) == ([], None, {"missed": 1})
 
 
-def test_a_time_that_comes_while_a_broken_file_keeps_a_run_from_going_on_is_no_overlap(file: Path) -> None:
+def test_a_time_that_comes_while_a_broken_file_keeps_a_run_from_going_on_is_not_an_overlap(file: Path) -> None:
     days = Days([])
     days._steps = [lambda: days.later(0.5)]
     days.go(file)
@@ -427,7 +427,7 @@ def test_a_time_that_comes_while_a_broken_file_keeps_a_run_from_going_on_is_no_o
     assert record_of(file).counts == {"interrupted": 1, "failed": 1}
 
 
-def test_an_end_is_told_also_while_somebody_sleeps_by_it() -> None:
+def test_an_end_is_noticed_during_a_wait() -> None:
     ending = Ending()
     before = signal.signal(signal.SIGUSR1, lambda *_: ending.set())
     try:

@@ -1,4 +1,4 @@
-"""The status of a run: what it tells, and that it tells when nobody runs any more."""
+"""The status of a run: its content, and the state dead after the run died."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PLANNED = {"ingest": 10.0, "split": 20.0, "reconstruct": 100.0, "publish": 10.0}
 
 
 class Clock:
-    """A clock that goes when it is told to."""
+    """A clock that the test moves."""
 
     def __init__(self) -> None:
         self.s = 0.0
@@ -45,7 +45,7 @@ def writer(tmp_path: Path, clock: Clock) -> StatusWriter:
     return found
 
 
-def test_it_tells_buildings_rate_and_what_is_left(writer: StatusWriter, clock: Clock, tmp_path: Path) -> None:
+def test_it_shows_buildings_rate_and_what_is_left(writer: StatusWriter, clock: Clock, tmp_path: Path) -> None:
     writer.on_event(Event(kind="stage", stage="reconstruct", total=100))
     for k in range(10):
         clock.s += 1.0
@@ -66,14 +66,14 @@ def test_what_was_kept_is_no_speed(writer: StatusWriter, clock: Clock) -> None:
     writer.on_event(Event(kind="progress", stage="split", done=900, total=1000, kept=900))
     clock.s += 10.0
     writer.on_event(Event(kind="progress", stage="split", done=910, total=1000))
-    told = writer.end("running")
-    assert told.rate_per_s == pytest.approx(1.0)
-    assert told.stages["split"]["kept"] == 900
-    assert told.remaining_s is not None
-    assert told.remaining_s[1] > 90.0
+    status = writer.end("running")
+    assert status.rate_per_s == pytest.approx(1.0)
+    assert status.stages["split"]["kept"] == 900
+    assert status.remaining_s is not None
+    assert status.remaining_s[1] > 90.0
 
 
-def test_workers_that_are_missing_are_told_until_they_are_back(writer: StatusWriter, clock: Clock) -> None:
+def test_workers_that_are_missing_are_shown_until_they_are_back(writer: StatusWriter, clock: Clock) -> None:
     writer.on_event(Event(kind="stage", stage="split", total=2))
     writer.on_event(Event(kind="waiting", stage="split", message="no worker has been there for 5 s"))
     assert writer.end("running").waiting == "no worker has been there for 5 s"
@@ -81,7 +81,7 @@ def test_workers_that_are_missing_are_told_until_they_are_back(writer: StatusWri
     assert writer.end("running").waiting == ""
 
 
-def test_a_run_that_nobody_holds_is_dead(writer: StatusWriter, tmp_path: Path) -> None:
+def test_a_run_without_a_process_is_dead(writer: StatusWriter, tmp_path: Path) -> None:
     writer.on_event(Event(kind="stage", stage="split", total=2))
     with locked_work(str(tmp_path)):
         assert read_status(str(tmp_path)).state == "running"
@@ -192,6 +192,6 @@ def test_the_first_buildings_of_a_stage_do_not_tell_how_long_it_takes() -> None:
 
 @pytest.mark.parametrize("damage", [{"buildings": 7}, {"buildings": {"total": None}}, {"points": "many"}])
 def test_an_odd_status_stops_no_run(writer: StatusWriter, tmp_path: Path, damage: dict[str, object]) -> None:
-    told = dataclasses.asdict(writer.end("finished"))
-    (tmp_path / NAME).write_text(json.dumps(told | damage))
+    status = dataclasses.asdict(writer.end("finished"))
+    (tmp_path / NAME).write_text(json.dumps(status | damage))
     assert buildings_before(str(tmp_path)) == (0, 0)

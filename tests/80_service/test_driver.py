@@ -245,8 +245,8 @@ def test_a_lost_cluster_is_replaced_and_the_job_tried_again(bench: Bench, monkey
     done = bench.over(job)
     assert (done.status, done.attempt, done.lost_attempts) == (JobStatus.SUCCESSFUL, 2, 1)
     assert Engine.started == 2
-    told = [event.message for event in bench.store.events(job.job_id) if event.status is JobStatus.ACCEPTED]
-    assert told[1] == "waiting: the scheduler was lost; tried again in 0.05 s"
+    messages = [event.message for event in bench.store.events(job.job_id) if event.status is JobStatus.ACCEPTED]
+    assert messages[1] == "waiting: the scheduler was lost; tried again in 0.05 s"
 
 
 def test_a_cluster_that_is_lost_again_and_again_fails_the_job(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,7 +262,7 @@ def test_a_cluster_that_is_lost_again_and_again_fails_the_job(bench: Bench, monk
     assert "lost 3 times" in failed.failure.detail
 
 
-def test_a_scheduler_that_is_away_is_told_and_waited_for(bench: Bench) -> None:
+def test_a_scheduler_that_is_away_is_reported_and_waited_for(bench: Bench) -> None:
     job = bench.submit()
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
@@ -358,7 +358,7 @@ def test_a_driver_outlives_a_database_that_is_away_for_a_while(bench: Bench, mon
     bench.runs()
     flaky.away.set()
     until(lambda: flaky.refused > 5, "refusals")
-    # the run comes to its end while nobody can write it down
+    # the run comes to its end while it cannot be written
     bench.script.go_on.set()
     until(lambda: bench.folder.outputs(job.job_id, 1).exists(), "outputs")
     flaky.refused = 0
@@ -367,7 +367,7 @@ def test_a_driver_outlives_a_database_that_is_away_for_a_while(bench: Bench, mon
     done = bench.over(job)
     assert (done.status, done.attempt) == (JobStatus.SUCCESSFUL, 1)
     assert bench.over(next_job).status is JobStatus.SUCCESSFUL
-    # what was told meanwhile was not lost
+    # events in the meantime are not lost
     assert "outputs" in [event.stage for event in bench.store.events(job.job_id)]
 
 
@@ -496,7 +496,7 @@ def test_a_job_whose_workers_broke_leaves_the_new_ones_of_another_job_alone(benc
     assert Engine.stopped == stopped
 
 
-def test_a_slot_outlives_a_fault_that_nobody_thought_of(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slot_outlives_a_fault_that_is_unexpected(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     plain, faults = JobStore.claim, []
 
     def broken(store: JobStore, *values: Any, **named: Any) -> Job | None:

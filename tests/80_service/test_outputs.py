@@ -115,9 +115,9 @@ def test_work_that_is_stopped_leaves_no_file(run_dir: Path, tmp_path: Path) -> N
 
 
 def test_progress_counts_the_tiles(run_dir: Path, tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
-    write_outputs(run_dir, tmp_path, None, lambda done, total: told.append((done, total)))
-    assert told == [(done, 4) for done in range(5)]
+    steps: list[tuple[int, int]] = []
+    write_outputs(run_dir, tmp_path, None, lambda done, total: steps.append((done, total)))
+    assert steps == [(done, 4) for done in range(5)]
 
 
 @pytest.mark.parametrize("status", [RunStatus.RUNNING, RunStatus.FAILED])
@@ -127,7 +127,7 @@ def test_a_run_that_did_not_end_is_refused(tmp_path: Path, status: RunStatus) ->
         write_outputs(run_dir, tmp_path / "out")
 
 
-def test_a_damaged_tile_is_told_by_its_file(tmp_path: Path) -> None:
+def test_a_damaged_tile_is_named_by_its_file(tmp_path: Path) -> None:
     run_dir = runs.write_run(tmp_path / "run")
     (run_dir / "planes/tile=x850_y4471/part-0.parquet").write_bytes(b"PAR1 and no more")
     with pytest.raises(RunError, match=r"planes/tile=x850_y4471/part-0\.parquet cannot be read"):
@@ -146,8 +146,8 @@ def test_what_an_unfinished_tile_left_is_in_no_output(tmp_path: Path) -> None:
         assert lost not in output_file(tmp_path / "out", name).read_text()
     assert lost not in pq.read_table(tmp_path / "out/buildings.parquet")["building_id"].to_pylist()
     assert all(lost not in name for name in zipfile.ZipFile(tmp_path / "out/meshes.zip").namelist())
-    told = json.loads(output_file(tmp_path / "out", "report").read_text())["tiles"]
-    assert told == {"planned": 4, "failed": [{"tile": "x851_y4470", "reason": "OSError: disk full"}]}
+    report = json.loads(output_file(tmp_path / "out", "report").read_text())["tiles"]
+    assert report == {"planned": 4, "failed": [{"tile": "x851_y4470", "reason": "OSError: disk full"}]}
 
 
 def test_tiles_come_along_a_curve_that_keeps_neighbours_together(tmp_path: Path) -> None:
@@ -273,10 +273,10 @@ def test_the_city_objects_of_all_tiles_stand_where_they_stood_under_one_header(
 def test_cjio_reads_the_merged_city_objects(out_dir: Path) -> None:
     command = [sys.executable, "-c", "from cjio.cjio import cli; cli()", "stdin", "info"]
     with output_file(out_dir, "cityjson").open() as stream:
-        told = subprocess.run(command, stdin=stream, capture_output=True, text=True, check=False)
-    assert told.returncode == 0, told.stderr
-    assert "Building" in told.stdout
-    assert "7415" in told.stdout
+        checked = subprocess.run(command, stdin=stream, capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stderr
+    assert "Building" in checked.stdout
+    assert "7415" in checked.stdout
 
 
 def test_city_objects_tell_what_a_viewer_colours_by(out_dir: Path) -> None:
@@ -291,7 +291,7 @@ def test_city_objects_tell_what_a_viewer_colours_by(out_dir: Path) -> None:
 # --- GeoJSON ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_footprints_are_rfc_7946_with_all_columns_and_nobody_missing(out_dir: Path) -> None:
+def test_the_footprints_are_rfc_7946_with_all_columns_and_all_buildings(out_dir: Path) -> None:
     found = json.loads(output_file(out_dir, "geojson").read_text())
     table = pq.read_table(output_file(out_dir, "buildings"))
     assert found["type"] == "FeatureCollection"
@@ -330,8 +330,8 @@ def test_a_known_point_lies_where_the_survey_says(tmp_path: Path) -> None:
     (feature,) = json.loads(output_file(tmp_path / "out", "geojson").read_text())["features"]
     west, south, _, _ = shapely.geometry.shape(feature["geometry"]).bounds
     assert (west, south) == (pytest.approx(5.38721, abs=2e-5), pytest.approx(52.15517, abs=2e-5))
-    told = read_catalogue(tmp_path / "out").crs
-    assert told.uri == "http://www.opengis.net/def/crs/EPSG/0/28992"
+    crs = read_catalogue(tmp_path / "out").crs
+    assert crs.uri == "http://www.opengis.net/def/crs/EPSG/0/28992"
 
 
 def test_a_crs_that_names_northing_first_is_read_easting_first(tmp_path: Path) -> None:
@@ -364,7 +364,7 @@ def test_a_footprint_without_a_place_on_earth_is_a_feature_without_geometry(tmp_
     assert json.loads(output_file(tmp_path / "out", "report").read_text())["buildings"]["without_footprint"] == 1
 
 
-def test_an_unknown_crs_is_told_and_the_coordinates_stay_the_tiles_own(tmp_path: Path) -> None:
+def test_an_unknown_crs_is_reported_and_the_coordinates_stay_the_tiles_own(tmp_path: Path) -> None:
     write_outputs(runs.write_run(tmp_path / "run", epsg=None), tmp_path / "out")
     found = json.loads(output_file(tmp_path / "out", "geojson").read_text())
     assert found["coordRefSys"] is None
@@ -403,29 +403,29 @@ def test_a_run_without_meshes_offers_none(tmp_path: Path) -> None:
 
 
 def test_the_report_accounts_for_every_candidate_and_object(out_dir: Path) -> None:
-    told = json.loads(output_file(out_dir, "report").read_text())
-    assert told["buildings"]["candidates"] == 6
-    assert told["buildings"]["by_status"] == {"ok": 4, "fallback": 1, "failed": 1}
-    assert told["buildings"]["by_reason"] == {"invalid_solid": 1, "too_few_points": 1}
-    assert told["buildings"]["by_roof_type"] == {"gable": 3, "flat": 1, "none": 1, "pent": 1}
-    assert told["buildings"]["by_lod"] == {"2.2": 4, "1.2": 1}
-    assert told["buildings"]["by_method"] == {"fuzzy-sart": 6}
-    assert (told["buildings"]["roof_planes"], told["buildings"]["without_footprint"]) == (10, 1)
-    assert told["rejected"] == {"objects": 4, "by_reason": {"too_small": 4}}
-    assert told["content_sha256"] == "ee" * 32
-    assert told["settings"] == {"general": {"method": "fuzzy-sart"}}
-    assert told["timings_s"] == {"split": 1.5, "total": 3.0}
-    assert told["largest_process_bytes"] == 5_000_000
-    assert told["crs"]["uri"] == "http://www.opengis.net/def/crs/EPSG/0/28992"
+    report = json.loads(output_file(out_dir, "report").read_text())
+    assert report["buildings"]["candidates"] == 6
+    assert report["buildings"]["by_status"] == {"ok": 4, "fallback": 1, "failed": 1}
+    assert report["buildings"]["by_reason"] == {"invalid_solid": 1, "too_few_points": 1}
+    assert report["buildings"]["by_roof_type"] == {"gable": 3, "flat": 1, "none": 1, "pent": 1}
+    assert report["buildings"]["by_lod"] == {"2.2": 4, "1.2": 1}
+    assert report["buildings"]["by_method"] == {"fuzzy-sart": 6}
+    assert (report["buildings"]["roof_planes"], report["buildings"]["without_footprint"]) == (10, 1)
+    assert report["rejected"] == {"objects": 4, "by_reason": {"too_small": 4}}
+    assert report["content_sha256"] == "ee" * 32
+    assert report["settings"] == {"general": {"method": "fuzzy-sart"}}
+    assert report["timings_s"] == {"split": 1.5, "total": 3.0}
+    assert report["largest_process_bytes"] == 5_000_000
+    assert report["crs"]["uri"] == "http://www.opengis.net/def/crs/EPSG/0/28992"
 
 
 def test_the_report_names_inputs_and_warnings_without_the_servers_folders(run_dir: Path, out_dir: Path) -> None:
     text = output_file(out_dir, "report").read_text()
-    told = json.loads(text)
-    assert [entry["name"] for entry in told["inputs"]] == ["tile.laz", "outlines.gpkg"]
-    assert told["inputs"][0]["sha256"] == "ab" * 32
-    assert told["warnings"] == ["tile.laz: no GPS time", "something else"]
-    assert told["tiles"] == {
+    report = json.loads(text)
+    assert [entry["name"] for entry in report["inputs"]] == ["tile.laz", "outlines.gpkg"]
+    assert report["inputs"][0]["sha256"] == "ab" * 32
+    assert report["warnings"] == ["tile.laz: no GPS time", "something else"]
+    assert report["tiles"] == {
         "planned": 5,
         "failed": [{"tile": "x852_y4470", "reason": "OSError: scratch/a is gone"}],
     }

@@ -59,8 +59,8 @@ def test_a_slot_that_waits_is_run_when_the_drivers_job_is_over(bench: Bench) -> 
     bench.becomes(job, JobStatus.RUNNING)
     slot = schedule.next_at
     assert slot is not None
-    (told,) = bench.store.schedules.tick(now=slot, max_queued=10, max_queued_per_key=10)
-    assert told.outcome is Outcome.WAITING
+    (entry,) = bench.store.schedules.tick(now=slot, max_queued=10, max_queued_per_key=10)
+    assert entry.outcome is Outcome.WAITING
     bench.script.go_on.set()
     bench.over(job)
     until(lambda: len(jobs_of(bench.store, schedule)) == 2, "the job that waited")

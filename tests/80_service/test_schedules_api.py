@@ -44,27 +44,32 @@ def kept_files(service) -> list[Path]:
 # --- made
 
 
-def test_a_schedule_is_made_and_tells_when_it_runs(local_service) -> None:
+def test_a_schedule_is_made_and_says_when_it_runs(local_service) -> None:
     asked = body(local_service.upload(), title="every night", overlap="wait", missed="skip", graceSeconds=60)
     answer = local_service.client.post("/schedules", json=asked)
     assert answer.status_code == 201, answer.text
-    told = answer.json()
-    assert answer.headers["location"].endswith(f"/schedules/{told['scheduleID']}")
+    shown = answer.json()
+    assert answer.headers["location"].endswith(f"/schedules/{shown['scheduleID']}")
     assert answer.headers["etag"] == '"1"'
-    assert (told["state"], told["title"], told["overlap"], told["missed"]) == ("active", "every night", "wait", "skip")
-    assert (told["graceSeconds"], told["processID"], told["version"]) == (60.0, "reconstruct", 1)
-    assert told["execute"]["inputs"]["tiles"][0]["href"].endswith(asked["execute"]["inputs"]["tiles"][0]["href"])
-    assert told["execute"]["outputs"] == {"report": {}}
-    assert told["counts"] == {"submitted": 0, "skipped": 0, "missed": 0, "failed": 0}
-    times = [dt.datetime.fromisoformat(text) for text in told["nextTimes"]]
+    assert (shown["state"], shown["title"], shown["overlap"], shown["missed"]) == (
+        "active",
+        "every night",
+        "wait",
+        "skip",
+    )
+    assert (shown["graceSeconds"], shown["processID"], shown["version"]) == (60.0, "reconstruct", 1)
+    assert shown["execute"]["inputs"]["tiles"][0]["href"].endswith(asked["execute"]["inputs"]["tiles"][0]["href"])
+    assert shown["execute"]["outputs"] == {"report": {}}
+    assert shown["counts"] == {"submitted": 0, "skipped": 0, "missed": 0, "failed": 0}
+    times = [dt.datetime.fromisoformat(text) for text in shown["nextTimes"]]
     cron = Cron("30 2 * * *", "Europe/Amsterdam")
-    assert times == cron.next_times(dt.datetime.fromisoformat(told["created"]), 5)
-    again = local_service.client.get(f"/schedules/{told['scheduleID']}")
-    assert again.json() == told
+    assert times == cron.next_times(dt.datetime.fromisoformat(shown["created"]), 5)
+    again = local_service.client.get(f"/schedules/{shown['scheduleID']}")
+    assert again.json() == shown
     assert again.headers["etag"] == '"1"'
 
 
-def test_what_a_schedule_tells_of_its_request_makes_the_same_schedule_again(local_service) -> None:
+def test_the_request_that_a_schedule_shows_makes_the_same_schedule_again(local_service) -> None:
     made = make(local_service)
     copied = {name: made[name] for name in ("cron", "timeZone", "execute", "missed", "overlap", "graceSeconds")}
     answer = local_service.client.post("/schedules", json=copied)
@@ -74,7 +79,7 @@ def test_what_a_schedule_tells_of_its_request_makes_the_same_schedule_again(loca
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("values", "fault"),
     [
         ({"cron": "61 * * * *"}, "its minute is '61', use 0 to 59"),
         ({"cron": 5}, "cron is 5: use a text"),
@@ -95,18 +100,18 @@ def test_what_a_schedule_tells_of_its_request_makes_the_same_schedule_again(loca
         ({"execute": {"inputs": {"tiles": {"href": "/uploads/x"}, "colour": 1}}}, 'execute: "colour" is no input'),
     ],
 )
-def test_a_schedule_that_does_not_fit_is_refused_with_the_fix(local_service, values, told) -> None:
+def test_a_schedule_that_does_not_fit_is_refused_with_the_fix(local_service, values, fault) -> None:
     answer = local_service.client.post("/schedules", json=body("0" * 32, **values))
     assert answer.status_code == 400, answer.text
-    assert any(told in fault for fault in answer.json()["errors"]), answer.text
+    assert any(fault in found for found in answer.json()["errors"]), answer.text
     assert local_service.client.get("/schedules").json()["schedules"] == []
 
 
-def test_every_fault_is_told_at_once(local_service) -> None:
+def test_every_fault_is_reported_at_once(local_service) -> None:
     answer = local_service.client.post("/schedules", json={"timeZone": "Mars/Olympus", "paused": 1, "colour": 2})
     assert answer.status_code == 400
-    told = " ".join(answer.json()["errors"])
-    assert all(word in told for word in ("cron is missing", "Mars/Olympus", "paused", "colour", "execute is missing"))
+    faults = " ".join(answer.json()["errors"])
+    assert all(word in faults for word in ("cron is missing", "Mars/Olympus", "paused", "colour", "execute is missing"))
 
 
 @pytest.mark.parametrize("number", ["Infinity", "NaN"])
@@ -233,7 +238,7 @@ def test_the_request_of_a_schedule_is_changed_as_a_whole_and_its_old_upload_may_
 
 
 @pytest.mark.parametrize(
-    ("values", "told"),
+    ("values", "fault"),
     [
         ({}, "nothing is given"),
         ({"cron": "every night"}, "with 2 fields"),
@@ -243,11 +248,11 @@ def test_the_request_of_a_schedule_is_changed_as_a_whole_and_its_old_upload_may_
         ({"paused": None}, "use true or false"),
     ],
 )
-def test_a_change_that_does_not_fit_changes_nothing(local_service, values, told) -> None:
+def test_a_change_that_does_not_fit_changes_nothing(local_service, values, fault) -> None:
     made = make(local_service)
     answer = patch(local_service, made, **values)
     assert answer.status_code == 400, answer.text
-    assert told in answer.json()["detail"]
+    assert fault in answer.json()["detail"]
     assert local_service.client.get(f"/schedules/{made['scheduleID']}").json() == made
 
 
@@ -279,9 +284,9 @@ def test_a_run_by_hand_is_a_job_that_names_its_schedule(local_service) -> None:
     local_service.waiting()
     of_schedule = next(link["href"] for link in made["links"] if link["rel"] == "jobs")
     assert [one["jobID"] for one in local_service.client.get(of_schedule).json()["jobs"]] == [job["jobID"]]
-    told = local_service.client.get(place).json()
-    assert (told["lastRun"]["trigger"], told["lastRun"]["jobID"]) == ("hand", job["jobID"])
-    assert told["counts"]["submitted"] == 1
+    shown = local_service.client.get(place).json()
+    assert (shown["lastRun"]["trigger"], shown["lastRun"]["jobID"]) == ("hand", job["jobID"])
+    assert shown["counts"]["submitted"] == 1
 
 
 def test_a_run_by_hand_names_the_job_that_is_under_way(local_service) -> None:
@@ -304,7 +309,7 @@ def test_a_run_by_hand_waits_in_line_like_any_job(starting) -> None:
     assert service.client.post(f"/schedules/{made['scheduleID']}/run").status_code == 429
 
 
-def test_what_became_of_the_slots_is_told(local_service) -> None:
+def test_the_history_of_the_slots_is_shown(local_service) -> None:
     made = make(local_service, cron="0 * * * *", timeZone="UTC")
     store = local_service.store
     start = store.schedules.get(made["scheduleID"]).next_at
@@ -324,8 +329,8 @@ def test_what_became_of_the_slots_is_told(local_service) -> None:
     page = local_service.client.get(f"/schedules/{made['scheduleID']}/runs?limit=1&offset=1").json()
     assert [one["number"] for one in page["runs"]] == [2]
     assert {link["rel"] for link in page["links"]} == {"self", "next", "prev", "up"}
-    told = local_service.client.get(f"/schedules/{made['scheduleID']}").json()
-    assert told["counts"] == {"submitted": 1, "skipped": 1, "missed": 5, "failed": 0}
+    shown = local_service.client.get(f"/schedules/{made['scheduleID']}").json()
+    assert shown["counts"] == {"submitted": 1, "skipped": 1, "missed": 5, "failed": 0}
     figures = local_service.client.get("/metrics").text
     assert 'gablework_schedules{state="active"} 1.0' in figures
     assert 'gablework_schedules{state="paused"} 0.0' in figures
@@ -351,7 +356,7 @@ def test_a_schedule_that_is_removed_is_gone_and_its_job_goes_on(local_service) -
     assert local_service.store.get(job).status is JobStatus.ACCEPTED
 
 
-def test_who_may_read_may_not_write_and_nobody_sees_the_schedules_of_others(local_service) -> None:
+def test_who_may_read_may_not_write_and_no_key_sees_the_schedules_of_others(local_service) -> None:
     mine, other = local_service.key(Scope.SUBMIT), local_service.key(Scope.SUBMIT)
     reader, admin = local_service.key(Scope.READ), local_service.key(Scope.ADMIN)
     made = make(local_service, mine)
@@ -376,7 +381,7 @@ def test_who_may_read_may_not_write_and_nobody_sees_the_schedules_of_others(loca
     for who, expected in ((reader, 403), (other, 404)):
         assert client.post(f"{place}/run", headers=who).status_code == expected
         assert client.delete(place, headers=who).status_code == expected
-    # whoever starts it, the job is its maker's
+    # no matter who starts it, the job is its maker's
     job = client.post(f"{place}/run", headers=admin).json()["jobID"]
     assert client.get(f"/jobs/{job}", headers=mine).status_code == 200
     assert client.delete(place, headers=mine).status_code == 204
@@ -396,7 +401,7 @@ def test_the_landing_page_leads_to_the_schedules(local_service) -> None:
     assert local_service.client.get(found).json()["schedules"] == []
 
 
-def test_the_next_time_is_stored_as_it_is_told(local_service) -> None:
+def test_the_next_time_is_stored_as_it_is_shown(local_service) -> None:
     made = make(local_service)
     with local_service.store._database.read() as connection:
         (row,) = connection.execute(sa.select(SCHEDULES)).all()

@@ -72,16 +72,16 @@ def test_readers_do_not_wait_for_a_writer(tmp_path: Path) -> None:
         other.close()
 
 
-def test_a_file_that_is_no_database_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_database_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.db").write_bytes(b"no database at all" * 100)
     with JobStore(f"sqlite:///{tmp_path / 'a.db'}") as store, pytest.raises(StoreError, match=r"a\.db.*not a database"):
         store.migrate()
 
 
 def test_messages_name_no_folder_of_the_machine(tmp_path: Path) -> None:
-    with JobStore(f"sqlite:///{tmp_path / 'a.db'}") as store, pytest.raises(StoreError) as told:
+    with JobStore(f"sqlite:///{tmp_path / 'a.db'}") as store, pytest.raises(StoreError) as raised:
         store.check()
-    assert str(tmp_path) not in str(told.value)
+    assert str(tmp_path) not in str(raised.value)
 
 
 @pytest.mark.parametrize("url", ["sqlite://", "sqlite:///:memory:", "mysql://a/b", "nonsense", "sqlite:///"])
@@ -90,7 +90,7 @@ def test_a_database_that_cannot_serve_is_refused(url: str) -> None:
         JobStore(url)
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with JobStore(f"sqlite:///{tmp_path / 'file' / 'a.db'}") as store, pytest.raises(StoreError, match=r"a\.db"):
         store.migrate()

@@ -120,7 +120,7 @@ def test_a_killed_drivers_job_is_finished_once_by_another(site: Site) -> None:
 
 
 @pytest.mark.parametrize("site", ["sqlite"], indirect=True)
-def test_a_driver_that_is_told_to_end_gives_its_job_back_and_another_takes_it_at_once(site: Site) -> None:
+def test_a_driver_that_is_ended_gives_its_job_back_and_another_takes_it_at_once(site: Site) -> None:
     job = site.submit()
     first = site.driver("first", held=True, drain_s="0", lease_s="600")
     site.held(first)

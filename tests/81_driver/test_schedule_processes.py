@@ -66,8 +66,8 @@ def test_a_schedule_of_every_minute_runs_by_hand_and_by_the_clock_and_survives_i
 
         def over(job_id: str) -> dict[str, Any]:
             def found() -> dict[str, Any] | None:
-                told = client.get(f"/jobs/{job_id}").json()
-                return told if told["status"] not in {"accepted", "running"} else None
+                job = client.get(f"/jobs/{job_id}").json()
+                return job if job["status"] not in {"accepted", "running"} else None
 
             return served.wait_for(found, "the end of the job")
 

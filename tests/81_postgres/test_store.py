@@ -20,7 +20,7 @@ class TestOnPostgres(StoreContract):
         return postgres_server.create_database(with_tables="store" in request.fixturenames)
 
 
-def test_a_server_that_is_away_is_told_without_the_password_and_is_found_again(
+def test_a_server_that_is_away_is_reported_without_the_password_and_is_found_again(
     postgres_server: PostgresServer, postgres_url: str
 ) -> None:
     with JobStore(postgres_url) as store:
@@ -28,9 +28,9 @@ def test_a_server_that_is_away_is_told_without_the_password_and_is_found_again(
         held = (submit(store), claim(store))[1]
         postgres_server.stop()
         try:
-            with pytest.raises(StoreError, match="does not answer") as told:
+            with pytest.raises(StoreError, match="does not answer") as raised:
                 store.renew(held, lease_s=60.0)
-            assert postgres_server.password not in str(told.value)
+            assert postgres_server.password not in str(raised.value)
         finally:
             postgres_server.start()
         # connections of the pool are stale now, and nothing of that shows
@@ -39,7 +39,7 @@ def test_a_server_that_is_away_is_told_without_the_password_and_is_found_again(
         store.succeed(held, message="done", summary={})
 
 
-def test_a_wrong_password_is_told(postgres_server: PostgresServer, postgres_url: str) -> None:
+def test_a_wrong_password_is_reported(postgres_server: PostgresServer, postgres_url: str) -> None:
     url = postgres_url.replace(postgres_server.password, "wrong")
     with JobStore(url) as store, pytest.raises(StoreError, match="password authentication failed"):
         store.migrate()

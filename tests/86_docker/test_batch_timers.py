@@ -1,4 +1,4 @@
-"""The CronJob and the systemd timer of a batch run, and the page that tells of them and of the service's schedules."""
+"""The CronJob and the systemd timer of a batch run, and the page about them and of the service's schedules."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def page(root: Path) -> str:
 
 
 def unit(root: Path, name: str) -> configparser.ConfigParser:
-    """A unit of systemd; its options are told apart by their letters' case."""
+    """A unit of systemd; its options are case-sensitive."""
     parser = configparser.ConfigParser(interpolation=None)
     parser.optionxform = str  # type: ignore[assignment,method-assign]
     parser.read_string((root / "docker" / "systemd" / name).read_text())
@@ -107,7 +107,7 @@ def test_the_timer_starts_its_unit_also_after_the_machine_was_off(root: Path, pa
     assert dict(shown["Timer"]) == dict(timer["Timer"])
 
 
-def test_the_page_tells_every_outcome_and_policy_with_the_defaults_of_the_code(page: str) -> None:
+def test_the_page_lists_every_outcome_and_policy_with_the_defaults_of_the_code(page: str) -> None:
     row = r"^\| `(\w+)` \| (.*) \|$"
     fields, outcomes = page.split("| outcome | what it means |")
     rows = dict(re.findall(row, fields, re.MULTILINE))
@@ -131,8 +131,8 @@ def test_the_expressions_of_the_page_do_what_it_says(page: str) -> None:
         inside = [at for at in times if (at.month, at.day) == (month, day) and at.hour in {2, 3}]
         return [f"{at:%H:%M}" for at in inside if at.hour == 2 or at.minute == 0]
 
-    told = {expression: (night(expression, 29, 3), night(expression, 25, 10)) for expression, _, _ in rows}
-    assert told == {
+    nights = {expression: (night(expression, 29, 3), night(expression, 25, 10)) for expression, _, _ in rows}
+    assert nights == {
         "30 2 * * *": (["03:00"], ["02:30"]),
         "*/30 * * * *": (["03:00"], ["02:00", "02:30", "02:00", "02:30", "03:00"]),
         "*/30 2 * * *": ([], ["02:00", "02:30", "02:00", "02:30"]),

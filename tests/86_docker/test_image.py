@@ -233,12 +233,12 @@ def test_a_password_goes_from_its_file_into_the_url(entrypoint: ModuleType, tmp_
         entrypoint.environment_of({**given, "GABLEWORK_DATABASE_PASSWORD_FILE": str(tmp_path / "none")})
 
 
-def test_certificates_are_told_to_dask_in_its_own_words(entrypoint: ModuleType) -> None:
+def test_certificates_are_passed_to_dask_in_its_own_variables(entrypoint: ModuleType) -> None:
     given = {VARIABLES[name]: f"/run/secrets/{name}" for name in VARIABLES}
-    told = entrypoint.environment_of(given)
+    environment = entrypoint.environment_of(given)
     for name, theirs in DASK_VARIABLES.items():
-        assert {told[variable] for variable in theirs} == {f"/run/secrets/{name}"}
-    assert told["DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION"] == "True"
+        assert {environment[variable] for variable in theirs} == {f"/run/secrets/{name}"}
+    assert environment["DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION"] == "True"
     own = {"DASK_DISTRIBUTED__COMM__TLS__CA_FILE": "/mine"}
     assert entrypoint.environment_of({**given, **own})["DASK_DISTRIBUTED__COMM__TLS__CA_FILE"] == "/mine"
 

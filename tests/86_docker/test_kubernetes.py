@@ -200,18 +200,18 @@ def test_a_pod_has_no_rights_and_no_more_than_it_needs(name: str, spec: Document
 
 
 @pytest.mark.parametrize(("name", "container"), OURS, ids=[name for name, _ in OURS])
-def test_what_a_container_is_told_are_settings_and_files_that_it_has(name: str, container: Document) -> None:
-    told = variables(container)
+def test_the_variables_of_a_container_are_settings_and_files_that_it_has(name: str, container: Document) -> None:
+    given = variables(container)
     known = {f"GABLEWORK_{setting.upper()}" for setting in ServiceSettings.model_fields} | set(VARIABLES.values())
-    assert {v for v in told if v.startswith("GABLEWORK_")} - known <= {"GABLEWORK_DATABASE_PASSWORD_FILE"}
+    assert {v for v in given if v.startswith("GABLEWORK_")} - known <= {"GABLEWORK_DATABASE_PASSWORD_FILE"}
     folders = tuple(mount["mountPath"] for mount in container["volumeMounts"])
-    files = [value for value in told.values() if value.startswith("/run/secrets/")]
+    files = [value for value in given.values() if value.startswith("/run/secrets/")]
     # the nightly batch has workers of its own and says all in its file
     assert files or "/etc/gablework" in folders
     assert [path for path in files if not path.startswith(folders)] in ([], ["/run/secrets/s3/credentials"])
     if files and name in {"worker", "driver", "gablework-batch"}:
         assert "/run/secrets/s3" in folders
-    assert not any(re.search(r"://[^/@]*:[^/@]*@", value) for value in told.values())
+    assert not any(re.search(r"://[^/@]*:[^/@]*@", value) for value in given.values())
 
 
 def test_every_secret_is_made_by_a_command_of_the_page() -> None:
@@ -253,9 +253,9 @@ def test_all_name_the_scheduler_of_the_operator_over_tls() -> None:
     (cluster,) = of_kind("DaskCluster")
     name = f"{cluster['metadata']['name']}-scheduler.{cluster['metadata']['namespace']}.svc"
     address = f"tls://{name}:8786"
-    (told,) = (one["data"] for one in of_kind("ConfigMap") if one["metadata"]["name"] == "gablework-cluster")
+    (data,) = (one["data"] for one in of_kind("ConfigMap") if one["metadata"]["name"] == "gablework-cluster")
     (worker,) = (container for name, container in CONTAINERS if name == "worker")
-    assert told["GABLEWORK_SCHEDULER"] == address
+    assert data["GABLEWORK_SCHEDULER"] == address
     assert f"--scheduler={address}" in worker["args"]
     assert of_kind("DaskAutoscaler")[0]["spec"]["cluster"] == cluster["metadata"]["name"]
     ports = {port["name"]: port["port"] for port in cluster["spec"]["scheduler"]["service"]["ports"]}

@@ -217,8 +217,8 @@ def send(address: str, key: str, tile: Path, driver: Program) -> list[str]:
         job_url = answer.headers["location"]
 
         def over() -> dict[str, Any] | None:
-            told: dict[str, Any] = client.get(job_url).json()
-            return told if told["status"] in {"successful", "failed", "dismissed"} else None
+            job: dict[str, Any] = client.get(job_url).json()
+            return job if job["status"] in {"successful", "failed", "dismissed"} else None
 
         status = driver.wait_for(over, "the end of the job", 3 * LONG_S)
         assert status["status"] == "successful", status
@@ -227,7 +227,7 @@ def send(address: str, key: str, tile: Path, driver: Program) -> list[str]:
 
 
 def test_the_documented_way_leads_from_nothing_to_models(composed: Composed, root: Path, tmp_path: Path) -> None:
-    # without keys the API refuses what the image tells it: to listen to everybody
+    # without keys the API refuses the image's default: to listen on all addresses
     refused = composed.start("api", "api-without-keys", GABLEWORK_HOST="0.0.0.0")
     assert refused.ended() != 0
     assert "gablework keys create" in refused.text
@@ -275,8 +275,8 @@ def test_the_same_services_work_over_tls(composed_tls: Composed, root: Path, tmp
     running["worker"].wait_for_text(f"is at the scheduler tls://127.0.0.1:{port}")
     for name in ("api", "scheduler"):
         running[name].wait_for(lambda name=name: composed_tls.healthy(name, f"{name}-tls"), "good health")
-    told = explain_failure(f"tcp://127.0.0.1:{port}", None)
-    assert "it speaks TLS" in told
+    explained = explain_failure(f"tcp://127.0.0.1:{port}", None)
+    assert "it speaks TLS" in explained
     assert "it wants a certificate of ours" in explain_failure(f"tls://127.0.0.1:{port}", None)
 
     tile = simulate("gable", tmp_path / "scene").laz
