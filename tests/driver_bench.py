@@ -17,8 +17,8 @@ from pipeline.runtime.compare import CompareRequest, CompareSummary
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.run import RunSummary
 from service.driver.attempt import Tools
-from service.driver.clusters import SharedCluster
 from service.driver.process import Driver
+from service.driver.shared_cluster import SharedCluster
 from service.fetching import Fetched
 from service.files import StateFolder
 from service.jobs import InputReference, Job, JobRequest, JobStatus

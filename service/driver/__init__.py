@@ -1,4 +1,4 @@
-"""The driver: claims jobs, runs them on one cluster, and tells how they go. A process of its own."""
+"""The driver: claims jobs, runs them on one cluster and records their progress. A process of its own."""
 
 from service.driver.process import Driver, run_driver
 

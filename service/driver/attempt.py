@@ -18,9 +18,9 @@ from pipeline.runtime.request import RunRequest
 from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from pipeline.settings import RunSettings
-from service.driver.clusters import SharedCluster
-from service.driver.held import HeldJob
-from service.driver.wording import comparison_digest, comparison_outcome, digest_of, outcome
+from service.driver.leased_job import LeasedJob
+from service.driver.messages import comparison_digest, comparison_outcome, digest_of, outcome
+from service.driver.shared_cluster import SharedCluster
 from service.errors import RequestError
 from service.fetching import Fetched, gather
 from service.files import StateFolder
@@ -90,7 +90,7 @@ class WriteComparison(Protocol):
 def compare(
     request: CompareRequest, on_event: Listener, executor: Executor | None, cancelled: Callable[[], bool]
 ) -> CompareSummary:
-    """`report.compare_files.compare_files` without a reference; it loads the library that draws, so late."""
+    """`report.compare_files.compare_files` without a reference; imported late: it loads matplotlib."""
     from pipeline.ruler.report.compare_files import compare_files
 
     return compare_files(request, on_event=on_event, executor=executor, cancelled=cancelled).summary
@@ -98,7 +98,7 @@ def compare(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tools:
-    """What an attempt is made of; tests put in their own."""
+    """The steps of an attempt; tests replace them."""
 
     gather: Gather = gather
     run: Run = run
@@ -108,8 +108,8 @@ class Tools:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Workshop:
-    """What all attempts of a driver share."""
+class DriverParts:
+    """The parts of a driver that its attempts use."""
 
     settings: ServiceSettings
     folder: StateFolder
@@ -118,40 +118,40 @@ class Workshop:
     tools: Tools = Tools()
 
 
-def perform(held: HeldJob, shop: Workshop) -> tuple[str, dict[str, Any]]:
+def perform(held: LeasedJob, shop: DriverParts) -> tuple[str, dict[str, Any]]:
     """Do all the work of a job.
 
     Parameters
     ----------
-    held : HeldJob
-        The job; learns how it goes, and may call it off.
-    shop : Workshop
+    held : LeasedJob
+        The job; records the progress, and may be cancelled.
+    shop : DriverParts
         Store, folder, cluster.
 
     Returns
     -------
     tuple of str and dict
-        What came out in one sentence, and the summary to be stored. The results lie in the attempt's folder.
+        The result in one sentence, and the summary to store. The files are in the attempt's folder.
 
     Raises
     ------
     RunCancelledError
-        It was called off.
+        The job was cancelled.
     Exception
-        Whatever ends the attempt: `faults` tells what comes of it.
+        Ends the attempt; `failures` describes it.
     """
     job, folder = held.job, shop.folder
     begin = WORK.get(job.request.process_id)
     if begin is None:
         raise RequestError([f"this driver knows no process {job.request.process_id}: it knows {', '.join(WORK)}"])
     attempt = folder.attempt(job.job_id, job.attempt)
-    # an attempt's number is given once; what lies there was left by a database that was put back
+    # the number of an attempt is unique; files there are from before a backup of the database was restored
     shutil.rmtree(attempt, ignore_errors=True)
     attempt.mkdir(parents=True)
     scrub = held.scrub
-    # a folder whose name has blanks would not be seen as one path
+    # the scrubber would not recognise a folder with blanks in its name as one path
     scrub.name(f"{folder.root}/", "/state/")
-    held.tell(Event(kind="stage", stage="inputs"))
+    held.record(Event(kind="stage", stage="inputs"))
     target = folder.inputs(job.job_id, job.attempt)
     tiles, outlines = shop.tools.gather(
         job.request,
@@ -165,9 +165,9 @@ def perform(held: HeldJob, shop: Workshop) -> tuple[str, dict[str, Any]]:
         scrub.name(str(fetched.path), fetched.path.name)
     work = begin(held, shop, tiles, outlines)
     shop.cluster.wait_until_there(held)
-    held.tell(Event(kind="stage", stage="plan"))
+    held.record(Event(kind="stage", stage="plan"))
     held.engine = shop.cluster.engine()
-    # its jobs are interactive traffic: they go before batch runs on the same scheduler
+    # jobs are interactive: they go before batch runs on the same scheduler
     done = work(held.engine.executor(job.priority))
     _check(held)
     shutil.rmtree(target, ignore_errors=True)
@@ -175,51 +175,51 @@ def perform(held: HeldJob, shop: Workshop) -> tuple[str, dict[str, Any]]:
 
 
 _Work = Callable[[Executor], tuple[str, dict[str, Any]]]
-"""All that needs the workers; gives what came out in one sentence, and the summary."""
+"""The work that needs the workers; returns the result in one sentence, and the summary."""
 
 
-def _reconstruct(held: HeldJob, shop: Workshop, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
+def _reconstruct(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
     """The process `reconstruct`."""
     job, folder = held.job, shop.folder
     run_dir, out_dir = folder.run(job.job_id, job.attempt), folder.outputs(job.job_id, job.attempt)
     request = run_request(job.request, tiles, outlines, run_dir, shop.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = shop.tools.run(request, held.tell, executor, held.cancelled)
+        summary = shop.tools.run(request, held.record, executor, held.cancelled)
         shop.tools.write_outputs(Path(request.out), out_dir, job.request.outputs, _outputs_begin(held))
         return outcome(summary), digest_of(summary, held.scrub, __version__)
 
     return work
 
 
-def _compare(held: HeldJob, shop: Workshop, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
+def _compare(held: LeasedJob, shop: DriverParts, tiles: Sequence[Fetched], outlines: Fetched | None) -> _Work:
     """The process `compare`."""
     job, folder = held.job, shop.folder
     place, out_dir = folder.comparison(job.job_id, job.attempt), folder.outputs(job.job_id, job.attempt)
     request = compare_request(job.request, tiles, outlines, place, shop.settings)
 
     def work(executor: Executor) -> tuple[str, dict[str, Any]]:
-        summary = shop.tools.compare(request, held.tell, executor, held.cancelled)
+        summary = shop.tools.compare(request, held.record, executor, held.cancelled)
         shop.tools.write_comparison(place, list(summary.runs), out_dir, job.request.outputs, _outputs_begin(held))
         return comparison_outcome(summary), comparison_digest(summary, held.scrub, __version__)
 
     return work
 
 
-WORK: Mapping[str, Callable[[HeldJob, Workshop, Sequence[Fetched], Fetched | None], _Work]] = MappingProxyType(
+WORK: Mapping[str, Callable[[LeasedJob, DriverParts, Sequence[Fetched], Fetched | None], _Work]] = MappingProxyType(
     {"reconstruct": _reconstruct, "compare": _compare}
 )
-"""What a driver does for each process: checks the request with the inputs where they lie, and gives back the work."""
+"""The work of each process: checks the request with the fetched inputs, and returns the rest of the work."""
 
 
-def _outputs_begin(held: HeldJob) -> Callable[[int, int], None]:
-    """Tell that outputs are assembled now; what comes back tells how far that is."""
+def _outputs_begin(held: LeasedJob) -> Callable[[int, int], None]:
+    """Record that outputs are assembled now; returns a function that records the progress."""
     _check(held)
-    held.tell(Event(kind="stage", stage="outputs"))
+    held.record(Event(kind="stage", stage="outputs"))
 
     def written(done: int, total: int) -> None:
         _check(held)
-        held.tell(Event(kind="progress", stage="outputs", done=done, total=total))
+        held.record(Event(kind="progress", stage="outputs", done=done, total=total))
 
     return written
 
@@ -227,7 +227,7 @@ def _outputs_begin(held: HeldJob) -> Callable[[int, int], None]:
 def run_request(
     request: JobRequest, tiles: Sequence[Fetched], outlines: Fetched | None, out: Path, settings: ServiceSettings
 ) -> RunRequest:
-    """A job's request as a run's, with the inputs where they lie now.
+    """The request of a run, with the fetched inputs.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def run_request(
     """
     return RunRequest(
         inputs=tuple(str(tile.path) for tile in tiles),
-        only_files=True,  # a tile of a stranger that reads as a tile index would else be followed wherever it leads
+        only_files=True,  # a tile of a stranger that is really a tile index must not be followed
         out=str(out),
         settings=RunSettings.from_mapping(request.settings),
         footprints=None if outlines is None else str(outlines.path),
@@ -256,7 +256,7 @@ def run_request(
 def compare_request(
     request: JobRequest, tiles: Sequence[Fetched], outlines: Fetched | None, out: Path, settings: ServiceSettings
 ) -> CompareRequest:
-    """A job's request as a comparison's.
+    """The request of a comparison, with the fetched inputs.
 
     Raises
     ------
@@ -270,6 +270,6 @@ def compare_request(
     )
 
 
-def _check(held: HeldJob) -> None:
+def _check(held: LeasedJob) -> None:
     if held.cancelled():
         raise RunCancelledError("the job was called off")

@@ -1,4 +1,4 @@
-"""Tidies the state folder: what no job and no upload needs any more. Never what a live lease may use."""
+"""Removes files that no job and no upload needs any longer, and never what a live lease may use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ATTEMPT = re.compile(r"attempt-([0-9]+)")
 
 
 def tidy(store: JobStore, folder: StateFolder) -> list[Path]:
-    """Remove what is left over of jobs and uploads.
+    """Remove the files that jobs and uploads left behind.
 
     Several drivers may do so at once.
 
@@ -29,12 +29,12 @@ def tidy(store: JobStore, folder: StateFolder) -> list[Path]:
     store : JobStore
         Knows the jobs and the uploads.
     folder : StateFolder
-        Where they lie.
+        Has their files.
 
     Returns
     -------
     list of Path
-        What was removed.
+        The removed folders.
     """
     return [*tidy_jobs(store, folder), *tidy_uploads(store, folder)]
 
@@ -42,8 +42,8 @@ def tidy(store: JobStore, folder: StateFolder) -> list[Path]:
 def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
     """Remove the folders of jobs that are gone or dismissed, and of attempts that are over.
 
-    Folders are listed before the database is asked, and a job is in the database before it has a folder: one that
-    the database does not know is of a job that was removed.
+    Folders are listed before the database is read, and a job is in the database before it has a folder. A folder that
+    the database does not know therefore belongs to a job that was removed.
     """
     found = sorted(path.name for path in _entries(folder.jobs) if is_id(path.name))
     known = store.attempts(found)
@@ -56,7 +56,7 @@ def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
             removed.append(folder.job(job_id))
             continue
         status, attempt = known[job_id]
-        # of a job that waits or failed no attempt counts, of one that runs or succeeded only the last one
+        # a job that waits or failed needs no attempt, one that runs or succeeded only its last
         last = attempt if status in {JobStatus.ACCEPTED, JobStatus.FAILED} else attempt - 1
         for path in _entries(folder.job(job_id)):
             number = _ATTEMPT.fullmatch(path.name)
@@ -68,7 +68,7 @@ def tidy_jobs(store: JobStore, folder: StateFolder) -> list[Path]:
 
 
 def tidy_uploads(store: JobStore, folder: StateFolder) -> list[Path]:
-    """Remove uploads whose time is over, and the files of uploads that no record knows."""
+    """Remove expired uploads, and the files of uploads without a record."""
     removed = []
     for upload in store.expired_uploads(store.now()):
         try:
@@ -98,7 +98,7 @@ def _entries(folder: Path) -> list[Path]:
 
 
 def _is_stale(path: Path, now_s: float) -> bool:
-    """A folder gets its record soon after its name; where that has not happened in a day, it never will."""
+    """Whether a folder is a day old: it would have its record by now."""
     try:
         return now_s - path.stat().st_mtime > STALE_S
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The process: slots that claim and work, the clock of the schedules, signals, draining, the janitor."""
+"""The driver's process: slots that claim and work, the clock of the schedules, signals, draining, the janitor."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from types import FrameType
 
 from pipeline.errors import ClusterError
 from pipeline.schedule import Outcome
-from service.driver.attempt import Tools, Workshop
-from service.driver.clusters import SharedCluster
-from service.driver.endings import FIRST_PAUSE_S, LONGEST_PAUSE_S, Attempts
-from service.driver.held import LOG, HeldJob, Stop
+from service.driver.attempt import DriverParts, Tools
+from service.driver.attempts import FIRST_PAUSE_S, LONGEST_PAUSE_S, Attempts
 from service.driver.janitor import tidy
+from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.driver.logs import configure, quieten
+from service.driver.shared_cluster import SharedCluster
 from service.errors import LeaseLostError, StoreError
 from service.files import StateFolder
 from service.settings import ServiceSettings
@@ -29,25 +29,25 @@ from service.store import JobStore
 TIDY_S = 180.0
 """Seconds between two rounds of the janitor."""
 GRACE_S = 20.0
-"""Seconds that a run which was called off gets to end."""
+"""Seconds that a cancelled run gets to end."""
 _TICK_S = 0.1
 
 
 class Driver:
-    """Claims jobs and runs them, `driver_jobs` at once, until it is told to stop.
+    """Claims jobs and runs them, `driver_jobs` at once, until it is stopped.
 
     Parameters
     ----------
     settings : ServiceSettings
         Database, state folder, cluster, lease.
     name : str, optional
-        Name of this process, another for each; made up by default.
+        Unique name of this process; made up by default.
     parent_pipe : int, optional
         A file descriptor: when its other end closes, the parent is gone and the driver ends at once.
     tools : Tools, optional
-        What an attempt is made of.
+        The steps of an attempt.
     cluster : SharedCluster, optional
-        Where runs run.
+        Runs the runs.
     """
 
     def __init__(
@@ -65,16 +65,16 @@ class Driver:
         self._store = JobStore(settings.database)
         self._cluster = cluster or SharedCluster(settings)
         folder = StateFolder(settings.state.resolve())
-        self._shop = Workshop(
+        self._shop = DriverParts(
             settings=settings, folder=folder, store=self._store, cluster=self._cluster, tools=tools or Tools()
         )
-        self._held: dict[str, HeldJob] = {}
+        self._held: dict[str, LeasedJob] = {}
         self._busy = 0
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._at_once = threading.Event()
         self._attempts = Attempts(self._shop, name=self.name, at_once=self._at_once)
-        # counted by the signal handler, which must not take a lock
+        # the signal handler counts here, since it must not take a lock
         self._stops = 0
         self._parent_gone = False
         self._broken = False
@@ -82,26 +82,25 @@ class Driver:
     # --- from outside
 
     def stop(self, *, at_once: bool = False) -> None:
-        """End: no new jobs; those that run get `drain_s`, or nothing where it is to end at once."""
+        """End: no new jobs; those that run get `drain_s`, or no time if it must end at once."""
         self._stops += 2 if at_once else 1
 
     def signalled(self) -> None:
-        """A signal says to end: the second one at once, but where there is a parent only the first counts.
+        """End on a signal, and at once on the second one; with a parent only the first counts.
 
-        A terminal and a service manager send theirs to all processes of a service, and the parent hands it on besides.
-        It is also the parent that ends a driver at once.
+        A terminal and a service manager send signals to all processes of a service, and the parent passes them on, too.
+        The parent also ends a driver at once if needed.
         """
         if self._parent_pipe is None or self._stops == 0:
             self.stop()
 
     def run(self) -> int:
-        """Work until told to stop.
+        """Work until stopped.
 
         Returns
         -------
         int
-            0 when all jobs are done or given back; 1 where a run did not end when it was called off, or nothing could
-            be started.
+            0 if all jobs are done or given back; 1 if a cancelled run did not end, or nothing could be started.
         """
         LOG.info("the driver starts", extra=self._facts)
         slots = [
@@ -152,7 +151,7 @@ class Driver:
             time.sleep(_TICK_S)
 
     def _drain(self) -> bool:
-        """Let the jobs that run come to their end, or give them back; whether all did."""
+        """Let running jobs finish, or give them back; whether all ended."""
         began_s = time.monotonic()
         held = self._all_held()
         LOG.info("the driver ends: %d jobs run, they get %g s", len(held), self._settings.drain_s, extra=self._facts)
@@ -180,7 +179,7 @@ class Driver:
         with self._lock:
             return self._busy > 0
 
-    def _all_held(self) -> list[HeldJob]:
+    def _all_held(self) -> list[LeasedJob]:
         with self._lock:
             return list(self._held.values())
 
@@ -200,7 +199,7 @@ class Driver:
         pause = FIRST_PAUSE_S
         while True:
             with self._lock:
-                # under the lock, so that who ends the driver sees every claim
+                # under the lock: the end of the driver must see every claim
                 if self._stopping.is_set():
                     return
                 self._busy += 1
@@ -220,7 +219,7 @@ class Driver:
             self._stopping.wait(wait_s)
 
     def _claim_and_work(self) -> bool:
-        """One job, if there is one; whether there was.
+        """Work on one job; whether there was one.
 
         Raises
         ------
@@ -228,17 +227,17 @@ class Driver:
             The database does not answer.
         """
         if any(held.overdue for held in self._all_held()):
-            # this machine slept: our own leases come first, or we would take our own jobs for lost
+            # this machine slept: our own leases are renewed first, or our own jobs would count as lost
             return False
         settings, claimed_s = self._settings, time.monotonic()
         job = self._store.claim(self.name, lease_s=settings.lease_s, max_attempts=settings.max_attempts)
         if job is None:
             return False
-        held = HeldJob(self._store, job, lease_s=settings.lease_s, poll_s=settings.poll_s, claimed_s=claimed_s)
+        held = LeasedJob(self._store, job, lease_s=settings.lease_s, poll_s=settings.poll_s, claimed_s=claimed_s)
         with self._lock:
             self._held[job.job_id] = held
         try:
-            # claimed while the driver began to end: nobody told this job
+            # it was claimed while the driver began to end, and was not stopped with the others
             if self._at_once.is_set():
                 held.stop(Stop.RELEASED)
             self._attempts.work(held)
@@ -250,7 +249,7 @@ class Driver:
     # --- the clock of the schedules
 
     def _keep_time(self) -> None:
-        """Look which schedules are due, again and again; every driver does so, and each slot is one driver's."""
+        """Look again and again for schedules that are due. Every driver does so; one of them decides a slot."""
         pause = FIRST_PAUSE_S
         while not self._stopping.is_set():
             try:
@@ -267,7 +266,7 @@ class Driver:
             pause = min(LONGEST_PAUSE_S, 2.0 * pause)
 
     def _tick(self) -> None:
-        """Decide what is due, and log it.
+        """Decide what is due and log it.
 
         Raises
         ------
@@ -279,9 +278,9 @@ class Driver:
             max_queued=settings.max_queued, max_queued_per_key=settings.max_queued_per_key
         ):
             level = logging.WARNING if run.outcome in {Outcome.MISSED, Outcome.FAILED} else logging.INFO
-            told = "schedule %s, %d slots up to %s: %s: %s"
+            line = "schedule %s, %d slots up to %s: %s: %s"
             facts = self._facts | {"schedule": run.schedule_id, "job": run.job_id}
-            LOG.log(level, told, run.schedule_id, run.slots, run.slot, run.outcome, run.message, extra=facts)
+            LOG.log(level, line, run.schedule_id, run.slots, run.slot, run.outcome, run.message, extra=facts)
 
     # --- the janitor
 
@@ -298,7 +297,7 @@ class Driver:
                 return
 
     def _until_done(self, action: Callable[[], None], complaint: str) -> bool:
-        """Try again until the database is there; False where the driver is to end."""
+        """Try again until the database is there; False if the driver must end."""
         pause = FIRST_PAUSE_S
         while not self._stopping.is_set():
             try:
@@ -324,7 +323,7 @@ def run_driver(settings: ServiceSettings, *, name: str | None = None, parent_pip
     settings : ServiceSettings
         Database, state folder, cluster, lease.
     name : str, optional
-        Name of this process, another for each; made up by default.
+        Unique name of this process; made up by default.
     parent_pipe : int, optional
         A file descriptor: when its other end closes, the parent is gone and the driver ends at once.
 

@@ -1,4 +1,4 @@
-"""From what a run tells of its stages to a percentage of the whole job, and to a sentence."""
+"""Turns the progress of a stage into a percentage of the whole job, and its name into a sentence."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WEIGHTS = MappingProxyType(
         "outputs": 8,
     }
 )
-"""The stages of a job in their order, and what share of the time each takes, in percent: measured on city blocks."""
+"""The stages of a job in their order, with their share of the time in percent; measured on city blocks."""
 
 WORDS = MappingProxyType(
     {
@@ -36,7 +36,7 @@ WORDS = MappingProxyType(
         "outputs": "outputs are assembled",
     }
 )
-"""What a stage does, for people; those without a weight are of a comparison, and short."""
+"""Descriptions of stages. Those without a weight belong to a comparison and are short."""
 
 _LAST = 99
 

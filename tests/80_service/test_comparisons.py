@@ -196,7 +196,7 @@ def test_a_running_comparison_that_is_dismissed_stops_and_leaves_no_file(bench: 
 
 
 def test_a_comparison_whose_cluster_is_lost_is_tried_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.driver.endings.pause_s", lambda _losses: 0.0)
+    monkeypatch.setattr("service.driver.attempts.pause_s", lambda _losses: 0.0)
     job = bench.submit(COMPARISON)
     bench.script.raises(ClusterError("the scheduler was lost"))
     bench.driver()

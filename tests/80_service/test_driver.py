@@ -15,8 +15,8 @@ from driver_bench import DEADLINE_S, Bench, Engine, until
 
 from pipeline.errors import ClusterError, UnreadableInputError
 from pipeline.runtime.monitoring.events import Event
-from service.driver import endings, process
-from service.driver.clusters import SharedCluster, answers
+from service.driver import attempts, process
+from service.driver.shared_cluster import SharedCluster, answers
 from service.errors import StoreError
 from service.jobs import Fault, InputReference, Job, JobRequest, JobStatus
 from service.store import JobStore
@@ -237,7 +237,7 @@ def test_bad_settings_fail_before_the_run(bench: Bench) -> None:
 
 
 def test_a_lost_cluster_is_replaced_and_the_job_tried_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(endings, "pause_s", lambda _losses: 0.05)
+    monkeypatch.setattr(attempts, "pause_s", lambda _losses: 0.05)
     monkeypatch.setattr(Engine, "started", 0)
     job = bench.submit()
     bench.script.raises(ClusterError("the scheduler tcp://127.0.0.1:5 was lost"))
@@ -250,7 +250,7 @@ def test_a_lost_cluster_is_replaced_and_the_job_tried_again(bench: Bench, monkey
 
 
 def test_a_cluster_that_is_lost_again_and_again_fails_the_job(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(endings, "pause_s", lambda _losses: 0.01)
+    monkeypatch.setattr(attempts, "pause_s", lambda _losses: 0.01)
     job = bench.submit()
     for _ in range(3):
         bench.script.raises(ClusterError("gone"))

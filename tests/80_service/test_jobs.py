@@ -25,9 +25,9 @@ from pipeline.errors import (
     VersionMismatchError,
 )
 from pipeline.runtime.monitoring.logs import formatter
-from service.driver.faults import failure_of, pause_s, tried_again
+from service.driver.failures import failure_of, pause_s, tried_again
+from service.driver.messages import Scrubber, outcome
 from service.driver.progress import WEIGHTS, WORDS, percent
-from service.driver.wording import Scrubber, outcome
 from service.errors import (
     InputRefusedError,
     NoSpaceError,

@@ -190,7 +190,7 @@ def test_numbers_of_workers_that_cannot_be_are_refused_as_option_and_in_the_envi
 def test_the_embedded_cluster_has_a_worker_per_core_with_memory_for_each_unless_a_number_is_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str | None, gib: int, started: int
 ) -> None:
-    from service.driver import clusters
+    from service.driver import shared_cluster
 
     counts: list[int] = []
 
@@ -204,10 +204,10 @@ def test_the_embedded_cluster_has_a_worker_per_core_with_memory_for_each_unless_
     monkeypatch.delenv("GABLEWORK_WORKERS", raising=False)
     if told is not None:
         monkeypatch.setenv("GABLEWORK_WORKERS", told)
-    monkeypatch.setattr(clusters, "cores", lambda: 7)
-    monkeypatch.setattr(clusters, "memory_bytes", lambda: gib * 2**30)
-    monkeypatch.setattr(clusters, "Cluster", Engine)
-    clusters.SharedCluster(ServiceSettings(state=tmp_path)).engine()
+    monkeypatch.setattr(shared_cluster, "cores", lambda: 7)
+    monkeypatch.setattr(shared_cluster, "memory_bytes", lambda: gib * 2**30)
+    monkeypatch.setattr(shared_cluster, "Cluster", Engine)
+    shared_cluster.SharedCluster(ServiceSettings(state=tmp_path)).engine()
     assert counts == [started]
 
 

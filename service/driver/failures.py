@@ -1,4 +1,4 @@
-"""What comes of an exception in an attempt: a failure with its kind and its sentence, or another try."""
+"""Turns an exception in an attempt into a failure with its kind and a sentence, or into another try."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def pause_s(losses: int) -> float:
     return min(_LONGEST_PAUSE_S, _FIRST_PAUSE_S * 2.0 ** min(losses, 30))
 
 
-def tried_again(error: BaseException, job: Job, max_attempts: int) -> bool:
-    """Whether the job goes back to the line: its cluster or the database was lost, and not too often yet."""
+def is_tried_again(error: BaseException, job: Job, max_attempts: int) -> bool:
+    """Whether the job goes back to the queue: its cluster or the database was lost, and not too often yet."""
     if isinstance(error, StoreError):
         return True
     lost = isinstance(error, ClusterError) and not isinstance(error, VersionMismatchError)
@@ -40,43 +40,43 @@ def tried_again(error: BaseException, job: Job, max_attempts: int) -> bool:
 
 
 def failure_of(error: BaseException, *, scrub: Callable[[str], str], reference: str, attempts: int) -> JobFailure:
-    """The failure that the client reads.
+    """The failure that the client sees.
 
     Parameters
     ----------
     error : exception
-        What ended the attempt.
+        It ended the attempt.
     scrub : callable
-        Takes the paths of this machine out of a message.
+        Removes the paths of this machine from a message.
     reference : str
-        Under what the log holds the exception.
+        The log holds the exception under this reference.
     attempts : int
-        Attempts with a lost cluster, this one included.
+        Attempts with a lost cluster, including this one.
 
     Returns
     -------
     JobFailure
-        An exception that was not raised on purpose shows its type alone, never its message.
+        An exception that was not raised on purpose shows only its type, never its message.
     """
-    told = scrub(str(error))
+    message = scrub(str(error))
     if isinstance(error, SettingsError):
-        return JobFailure(fault=Fault.SETTINGS, detail=told)
+        return JobFailure(fault=Fault.SETTINGS, detail=message)
     if isinstance(error, NoSpaceError) or (isinstance(error, OSError) and error.errno in _NO_SPACE):
         detail = f"the service's disk is full (reference {reference}): its operator must make room, then submit again"
         return JobFailure(fault=Fault.INTERNAL, detail=detail)
     if isinstance(error, InputRefusedError | LimitError):
-        return JobFailure(fault=Fault.REFUSED, detail=told)
+        return JobFailure(fault=Fault.REFUSED, detail=message)
     if isinstance(error, InputError | NoSuchUploadError | RequestError | NoSuchOutputError):
-        return JobFailure(fault=Fault.INPUT, detail=told)
+        return JobFailure(fault=Fault.INPUT, detail=message)
     if isinstance(error, VersionMismatchError):
-        return JobFailure(fault=Fault.CLUSTER, detail=told)
+        return JobFailure(fault=Fault.CLUSTER, detail=message)
     if isinstance(error, ClusterError):
         times = "once" if attempts == 1 else f"{attempts} times"
         return JobFailure(
-            fault=Fault.CLUSTER, detail=f"the cluster was lost {times} over this job; the last time {told}"
+            fault=Fault.CLUSTER, detail=f"the cluster was lost {times} over this job; the last time {message}"
         )
     if isinstance(error, RunError):
-        return JobFailure(fault=Fault.INTERNAL, detail=f"{told} (reference {reference})")
+        return JobFailure(fault=Fault.INTERNAL, detail=f"{message} (reference {reference})")
     detail = (
         f"an unexpected fault of the service, {type(error).__name__} (reference {reference}): "
         "its operator finds it in the driver's log under this reference"

@@ -1,4 +1,4 @@
-"""What comes of an attempt: success, failure, another try, dismissal; written however long the database is away."""
+"""Runs attempts and writes their outcome: success, failure, another try or dismissal."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from collections.abc import Callable
 from typing import Any
 
 from pipeline.errors import ClusterError, GableworkError, RunCancelledError
-from service.driver.attempt import Workshop, perform
-from service.driver.faults import failure_of, pause_s, tried_again
-from service.driver.held import LOG, HeldJob, Stop
+from service.driver.attempt import DriverParts, perform
+from service.driver.failures import failure_of, is_tried_again, pause_s
+from service.driver.leased_job import LOG, LeasedJob, Stop
 from service.errors import LeaseLostError, ServiceError, StoreError
 from service.jobs import JobStatus
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 15.0
-"""Seconds between two tries to reach a database that is away: doubled from the one to the other."""
+"""Seconds between two tries to reach a database that is away; they double from the first to the longest."""
 
 
 class Attempts:
-    """Brings attempts to their end.
+    """Runs attempts to their end.
 
     Parameters
     ----------
-    shop : Workshop
+    shop : DriverParts
         Store, folder, cluster.
     name : str
-        The driver's, for messages.
+        Name of the driver, for messages.
     at_once : threading.Event
-        Set when the driver is to end without waiting for the database any longer.
+        Set when the driver must end without waiting for the database any longer.
     """
 
-    def __init__(self, shop: Workshop, *, name: str, at_once: threading.Event) -> None:
+    def __init__(self, shop: DriverParts, *, name: str, at_once: threading.Event) -> None:
         self._shop = shop
         self._name = name
         self._at_once = at_once
 
-    def work(self, held: HeldJob) -> None:
-        """One attempt, and what comes of it."""
+    def work(self, held: LeasedJob) -> None:
+        """Run one attempt and write its outcome."""
         LOG.info("the job runs", extra=held.facts)
         with held:
             try:
@@ -48,7 +48,7 @@ class Attempts:
                     raise RunCancelledError("the job was called off")  # noqa: TRY301
                 message, summary = perform(held, self._shop)
             except BaseException as error:  # noqa: BLE001 - whatever ends an attempt must become the job's end
-                self._ended(held, error)
+                self._end_early(held, error)
                 return
             done = self._settle(
                 held,
@@ -61,8 +61,8 @@ class Attempts:
         elif done is False:
             self._forget(held)
 
-    def _ended(self, held: HeldJob, error: BaseException) -> None:
-        """An attempt that did not come to its end: dismissed, given back, tried again or failed."""
+    def _end_early(self, held: LeasedJob, error: BaseException) -> None:
+        """Write the outcome of an attempt that did not succeed: dismissed, given back, tried again or failed."""
         job, reason = held.job, held.stopped_for
         if reason is not None:
             level = "called off" if isinstance(error, RunCancelledError) else f"ended with {type(error).__name__}"
@@ -73,9 +73,9 @@ class Attempts:
             return
         if reason is not None:
             self._forget(held)
-            told = f"driver {self._name} ended; the job waits for another" if reason is Stop.RELEASED else ""
+            message = f"driver {self._name} ended; the job waits for another" if reason is Stop.RELEASED else ""
             lost = reason is Stop.LOST
-            self._settle(held, lambda: self._shop.store.release(job, lost=lost, message=told), JobStatus.ACCEPTED)
+            self._settle(held, lambda: self._shop.store.release(job, lost=lost, message=message), JobStatus.ACCEPTED)
             return
         reference = secrets.token_hex(4)
         facts: dict[str, Any] = {**held.facts, "reference": reference}
@@ -84,24 +84,24 @@ class Attempts:
         if isinstance(error, ClusterError) and held.engine is not None:
             self._shop.cluster.replace(held.engine)
         self._forget(held)
-        if tried_again(error, job, self._shop.settings.max_attempts):
+        if is_tried_again(error, job, self._shop.settings.max_attempts):
             pause = pause_s(job.lost_attempts)
-            told = f"waiting: {held.scrub(str(error))}; tried again in {pause:g} s"
+            message = f"waiting: {held.scrub(str(error))}; tried again in {pause:g} s"
             lost = isinstance(error, ClusterError)
             self._settle(
                 held,
-                lambda: self._shop.store.release(job, lost=lost, message=told, retry_after_s=pause),
+                lambda: self._shop.store.release(job, lost=lost, message=message, retry_after_s=pause),
                 JobStatus.ACCEPTED,
             )
             return
         failure = failure_of(error, scrub=held.scrub, reference=reference, attempts=job.lost_attempts + 1)
         self._settle(held, lambda: self._shop.store.fail(job, failure), JobStatus.FAILED)
 
-    def _settle(self, held: HeldJob, write: Callable[[], None], status: JobStatus) -> bool | None:
-        """Write the end of an attempt, however long the database is away; False where the lease is lost.
+    def _settle(self, held: LeasedJob, write: Callable[[], None], status: JobStatus) -> bool | None:
+        """Write the outcome of an attempt, however long the database is away; False if the lease is lost.
 
-        A commit whose answer was lost on the way did happen: then the job has the status, at this very attempt. None
-        where the driver must end before it is known: then a janitor decides over the files, when the database is back.
+        A commit whose answer was lost did happen: the job then has the status at this very attempt. None if the driver
+        must end before the outcome is known: a janitor decides about the files when the database is back.
         """
         pause = FIRST_PAUSE_S
         while True:
@@ -124,8 +124,8 @@ class Attempts:
             else:
                 return True
 
-    def _forget(self, held: HeldJob, *, whole: bool = False, before: bool = False) -> None:
-        """Remove this attempt's folder, the whole job's, or those of the attempts before this one."""
+    def _forget(self, held: LeasedJob, *, whole: bool = False, before: bool = False) -> None:
+        """Remove the folder of this attempt, of the whole job, or of the attempts before this one."""
         job, folder = held.job, self._shop.folder
         if whole:
             shutil.rmtree(folder.job(job.job_id), ignore_errors=True)

@@ -1,4 +1,4 @@
-"""A job that this driver holds: a thread keeps the lease, looks for a dismissal, and writes down what happens."""
+"""A job that this driver holds: a thread renews the lease, looks for a dismissal and writes events."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Protocol, Self
 
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.events import Event
+from service.driver.messages import Scrubber
 from service.driver.progress import WORDS, percent
-from service.driver.wording import Scrubber
 from service.errors import LeaseLostError, StoreError
 from service.jobs import Job, JobEvent
 from service.store import JobStore
@@ -20,9 +20,9 @@ from service.store import JobStore
 LOG = logging.getLogger("gablework.driver")
 
 _FLUSH_S = 0.5
-"""Progress is written at most so often."""
+"""Least seconds between two writes of progress."""
 _MAX_PENDING = 500
-"""Events that wait while the database is away; the oldest go first."""
+"""Most events that wait while the database is away; the oldest are dropped first."""
 
 
 class Engine(Protocol):
@@ -41,28 +41,28 @@ class Engine(Protocol):
 
 
 class Stop(IntEnum):
-    """Why an attempt is to end before its time; a higher reason wins."""
+    """Why an attempt must end early; a higher reason wins."""
 
     RELEASED = 1
-    """The driver ends: the job goes back to the line."""
+    """The driver ends: the job goes back to the queue."""
     DISMISSED = 2
-    """The client does not want it any more."""
+    """The client dismissed it."""
     LOST = 3
-    """The job belongs to another driver, or may by now."""
+    """The job belongs to another driver, or may belong to one by now."""
 
 
-class HeldJob:
-    """Keeps a claimed job while it is worked on; a context manager.
+class LeasedJob:
+    """Keeps a claimed job while the driver works on it; a context manager.
 
-    The lease is renewed from a thread of its own, three times within its length, whatever the run does. (The run's
-    heavy work is in other processes; what it does in this one lets other threads run at least every few
-    milliseconds, as numpy and pyarrow give up the interpreter's lock.) When the database does not answer for as long as
-    the lease counts, another driver may have the job: then the attempt ends.
+    A thread renews the lease three times within its length, whatever the run does. (The run's heavy work is in other
+    processes. Its work in this process releases the interpreter's lock at least every few milliseconds, as numpy and
+    pyarrow do.) If the database does not answer for the length of the lease, another driver may have the job: the
+    attempt ends.
 
     Parameters
     ----------
     store : JobStore
-        Where the job is.
+        Has the job.
     job : Job
         As it was claimed.
     lease_s : float
@@ -92,7 +92,7 @@ class HeldJob:
         self._pulse = threading.Thread(target=self._keep, name=f"lease-{job.job_id[:8]}", daemon=True)
         self.scrub = Scrubber()
         self.engine: Engine | None = None
-        """The workers on which the attempt runs; None until it does."""
+        """The workers that run the attempt; None before it runs."""
 
     def __enter__(self) -> Self:
         """Start the thread."""
@@ -102,56 +102,56 @@ class HeldJob:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the thread; the lease is left as it is."""
+        """End the thread; the lease stays as it is."""
         self._over.set()
         self._pulse.join()
 
     @property
     def stopped_for(self) -> Stop | None:
-        """Why the attempt is to end; None while it is not."""
+        """Why the attempt must end; None while it may go on."""
         return self._stop
 
     def cancelled(self) -> bool:
-        """Whether the attempt is to end; also where the database keeps the heartbeat waiting for too long."""
+        """Whether the attempt must end; also if the database keeps the heartbeat waiting for too long."""
         if not self._stopped.is_set() and time.monotonic() - self._renewed_s >= self._lease_s:
             self.stop(Stop.LOST)
         return self._stopped.is_set()
 
     @property
     def overdue(self) -> bool:
-        """Whether the lease should have been renewed long ago by the wall clock, which counts a machine's sleep too."""
+        """Whether the lease is overdue by the wall clock, which also counts the time that the machine slept."""
         return not self.cancelled() and time.time() - self._renewed_at_s > self._lease_s / 2.0
 
     def wait(self, seconds: float) -> bool:
-        """Wait, but not longer than the attempt may go on; whether it is to end."""
+        """Wait, at most until the attempt must end; whether it must."""
         return self._stopped.wait(seconds)
 
     def stop(self, reason: Stop) -> None:
-        """Let the attempt end."""
+        """Request the end of the attempt."""
         with self._lock:
             if self._stop is None or reason > self._stop:
                 self._stop = reason
         self._stopped.set()
 
-    def tell(self, event: Event) -> None:
-        """Take what a run tells; it is written down soon, by another thread, so that the run never waits for it."""
+    def record(self, event: Event) -> None:
+        """Take an event of the run. Another thread writes it soon, and the run never waits for that."""
         with self._lock:
-            told = self._told(event)
-            if told is None:
+            shown = self._job_event(event)
+            if shown is None:
                 return
-            if told.kind == "progress":
-                self._pending = [e for e in self._pending if (e.kind, e.stage) != ("progress", told.stage)]
-            self._pending = [*self._pending, told][-_MAX_PENDING:]
+            if shown.kind == "progress":
+                self._pending = [e for e in self._pending if (e.kind, e.stage) != ("progress", shown.stage)]
+            self._pending = [*self._pending, shown][-_MAX_PENDING:]
 
     def write(self) -> None:
-        """Write down what waits.
+        """Write the events that wait.
 
         Raises
         ------
         LeaseLostError
-            The job is not held any more.
+            The job is no longer held.
         StoreError
-            The database does not answer; what waits goes on waiting.
+            The database does not answer; the events continue to wait.
         """
         with self._writing:
             with self._lock:
@@ -166,11 +166,11 @@ class HeldJob:
                 raise
             self._written_s = time.monotonic()
 
-    def _told(self, event: Event) -> JobEvent | None:
-        """An event of a run in the words of the service; None for what clients need not know."""
+    def _job_event(self, event: Event) -> JobEvent | None:
+        """An event of a run in the words of the service; None if clients do not need it."""
         if event.kind == "finished" or (event.kind == "run" and not self._waited):
             return None
-        # where nothing more is known, the stage itself says what happens; after a pause it says so again
+        # without a message, the stage is described; after a pause it is described again
         words = WORDS.get(event.stage, "") if event.kind == "stage" or self._waited else ""
         if event.kind == "stage" and event.message and words:
             # one of several methods, by its label
@@ -193,7 +193,7 @@ class HeldJob:
         )
 
     def _keep(self) -> None:
-        """Renew, look and write, until the attempt is over."""
+        """Renew, look and write until the attempt is over."""
         while not self._over.wait(self._poll_s):
             try:
                 self._look()
@@ -206,13 +206,13 @@ class HeldJob:
                     LOG.warning("%s", error, extra=self.facts)
                 return
             except StoreError as error:
-                # the thread goes on: should nobody have taken the job, it can still be given back
+                # the thread goes on: if no other driver took the job, it can still be given back
                 if not self.cancelled():
                     silent_s = time.monotonic() - self._renewed_s
                     LOG.warning("no heartbeat for %.0f s: %s", silent_s, error, extra=self.facts)
 
     def _look(self) -> None:
-        """Renew the lease where it is time, else look whether the job is to be dismissed."""
+        """Renew the lease if it is time, otherwise look for a dismissal."""
         now_s = time.monotonic()
         if now_s - self._renewed_s >= self._lease_s / 3.0 - self._poll_s:
             wanted = self._store.renew(self.job, lease_s=self._lease_s)
@@ -224,5 +224,5 @@ class HeldJob:
 
     @property
     def facts(self) -> dict[str, object]:
-        """What a line of the log tells beside its message."""
+        """Fields of a log line beside its message."""
         return {"job": self.job.job_id, "attempt": self.job.attempt}

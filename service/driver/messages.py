@@ -1,4 +1,4 @@
-"""Sentences that clients read: what a run found, and messages without the paths of this machine."""
+"""Sentences for clients: the result of a run, and messages without the paths of this machine."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ if TYPE_CHECKING:
 _ABSOLUTE = re.compile(r"(?<![\w:/.\\])/(?:[^\s/:;,'\"()<>|]+/)+([^\s/:;,'\"()<>|]*)")
 _ADDRESS = re.compile(r" ?\b(?:tcp|tls|ucx|inproc)://(?:\[[^\]\s]*\]|[^\s/:]*)(?::[0-9]+)?(?:/[^\s:]*)?")
 _WARNINGS = 100
-"""Warnings that a job's summary keeps; `run.json` has all."""
+"""Most warnings in the summary of a job; `run.json` has all."""
 
 
 class Scrubber:
-    """Takes the paths of this machine, and the addresses of the cluster, out of messages.
+    """Removes the paths of this machine and the addresses of the cluster from messages.
 
     Parameters
     ----------
     names : mapping of str to str, optional
-        What stands for a path instead; other absolute paths are cut to their last component.
+        Names by the path that they replace; other absolute paths are cut to their last component.
     """
 
     def __init__(self, names: Mapping[str, str] | None = None) -> None:
         self._names = dict(names or {})
 
     def name(self, path: str, name: str) -> None:
-        """Let a name stand for a path."""
+        """Replace a path by a name."""
         self._names[path] = name
 
     def __call__(self, message: str) -> str:
@@ -48,18 +48,18 @@ class Scrubber:
 
 
 def outcome(summary: RunSummary) -> str:
-    """What came out, in one sentence."""
-    told = f"{_buildings(summary)}: {_by_status(summary)}"
+    """The result of a run, in one sentence."""
+    sentence = f"{_buildings(summary)}: {_by_status(summary)}"
     rejected = sum(summary.rejected.values())
     if rejected:
-        told += f"; {rejected} {'object' if rejected == 1 else 'objects'} rejected"
+        sentence += f"; {rejected} {'object' if rejected == 1 else 'objects'} rejected"
     if summary.failed_tiles:
         count = len(summary.failed_tiles)
-        told += f"; {count} {'tile' if count == 1 else 'tiles'} could not be published: "
-        told += "its buildings are missing" if count == 1 else "their buildings are missing"
+        sentence += f"; {count} {'tile' if count == 1 else 'tiles'} could not be published: "
+        sentence += "its buildings are missing" if count == 1 else "their buildings are missing"
     if summary.warnings:
-        told += f"; {len(summary.warnings)} {'warning' if len(summary.warnings) == 1 else 'warnings'}"
-    return told
+        sentence += f"; {len(summary.warnings)} {'warning' if len(summary.warnings) == 1 else 'warnings'}"
+    return sentence
 
 
 def _buildings(summary: RunSummary) -> str:
@@ -72,22 +72,22 @@ def _by_status(summary: RunSummary) -> str:
 
 
 def comparison_outcome(summary: CompareSummary) -> str:
-    """What came out of every method, in one sentence."""
+    """The result of every method, in one sentence."""
     first = next(iter(summary.runs.values()))
     parts = [f"{label} {_by_status(run)}" for label, run in summary.runs.items()]
-    told = f"{len(summary.runs)} methods on {_buildings(first)}: {'; '.join(parts)}"
+    sentence = f"{len(summary.runs)} methods on {_buildings(first)}: {'; '.join(parts)}"
     broken = [label for label, run in summary.runs.items() if run.failed_tiles]
-    return f"{told}; tiles are missing of {', '.join(broken)}" if broken else told
+    return f"{sentence}; tiles are missing of {', '.join(broken)}" if broken else sentence
 
 
 def comparison_digest(summary: CompareSummary, scrub: Scrubber, engine_version: str) -> dict[str, Any]:
-    """What is kept of a comparison beside its files: that of every run by its label."""
+    """The stored summary of a comparison: that of every run by its label."""
     runs = {label: digest_of(run, scrub, engine_version) for label, run in summary.runs.items()}
     return {"engine_version": engine_version, "runs": runs}
 
 
 def digest_of(summary: RunSummary, scrub: Scrubber, engine_version: str) -> dict[str, Any]:
-    """What is kept of a run beside its files: plain JSON values."""
+    """The stored summary of a run: plain JSON values."""
     return {
         "digest": summary.digest,
         "engine_version": engine_version,

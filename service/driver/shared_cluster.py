@@ -1,4 +1,4 @@
-"""The one cluster of a driver: started when it is needed, again when it broke, and waited for when it is elsewhere."""
+"""The one cluster of a driver: started on first use, restarted after it broke, waited for if it is elsewhere."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from pipeline.runtime.engine import workers_that_fit
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.machine import cores, memory_bytes
 from pipeline.runtime.plan import LARGEST_TASK_BYTES
-from service.driver.held import LOG, Engine, HeldJob
+from service.driver.leased_job import LOG, Engine, LeasedJob
 from service.settings import ServiceSettings
 
 _CONNECT_S = 2.0
 _AGAIN_S = 1.0
-"""A scheduler that does not answer is tried again after so long."""
-_TELL_S = 30.0
-"""That the job waits is told again after so long."""
+"""Seconds between two tries of a scheduler that does not answer."""
+_REPORT_S = 30.0
+"""Seconds between two reports that the job waits."""
 
 
 def _as_many_as_fit() -> int:
-    """A worker per core, as long as each has memory for the largest task that plans make; two in any case."""
+    """A worker per core if each has memory for the largest task of a plan; at least two."""
     return min(cores(), max(2, workers_that_fit(cores(), memory_bytes(), LARGEST_TASK_BYTES)))
 
 
 class SharedCluster:
-    """Safe to share between the threads of a driver.
+    """The workers that all jobs of a driver use; safe to share between threads.
 
     Parameters
     ----------
     settings : ServiceSettings
-        How many workers are embedded, or where the scheduler is.
+        The number of embedded workers, or the address of a scheduler.
     make : callable, optional
         Makes a cluster that is not started yet.
 
@@ -57,7 +57,7 @@ class SharedCluster:
         self._closed = False
 
     def engine(self) -> Engine:
-        """The workers that are there; starts them unless they are.
+        """The workers; started if there are none.
 
         Raises
         ------
@@ -72,9 +72,9 @@ class SharedCluster:
             return self._engine
 
     def replace(self, broken: Engine) -> None:
-        """Stop workers that broke, so that the next run starts new ones; a scheduler elsewhere is left alone.
+        """Stop workers that broke; the next run starts new ones. A scheduler elsewhere is left alone.
 
-        Another job may have done so before, and may be at work on the new ones by now: these are left alone, too.
+        Another job may have replaced them before and may use the new ones by now: these are left alone, too.
         """
         if self._scheduler is not None:
             return
@@ -92,34 +92,34 @@ class SharedCluster:
         if engine is not None:
             engine.__exit__(None, None, None)
 
-    def wait_until_there(self, held: HeldJob) -> None:
-        """Wait for a scheduler that is elsewhere, and tell the job that it waits.
+    def wait_until_there(self, held: LeasedJob) -> None:
+        """Wait for a scheduler that is elsewhere, and record that the job waits.
 
         Raises
         ------
         RunCancelledError
-            The job was called off while it waited.
+            The job was cancelled while it waited.
         """
         if self._scheduler is None or answers(self._scheduler):
             return
         since_s = time.monotonic()
-        told_s: float | None = None
+        reported_s: float | None = None
         while not answers(self._scheduler):
             waited_s = time.monotonic() - since_s
-            if told_s is None or waited_s - told_s >= _TELL_S:
-                told_s = waited_s
+            if reported_s is None or waited_s - reported_s >= _REPORT_S:
+                reported_s = waited_s
                 message = (
                     f"waiting: the cluster's scheduler does not answer, for {waited_s:.0f} s now; "
                     "the job goes on as soon as it does"
                 )
                 LOG.warning("the scheduler %s does not answer", self._scheduler, extra=held.facts)
-                held.tell(Event(kind="waiting", message=message))
+                held.record(Event(kind="waiting", message=message))
             if held.wait(_AGAIN_S) or held.cancelled():
                 raise RunCancelledError("the job was called off")
 
 
 def answers(address: str) -> bool:
-    """Whether somebody listens at the address of a scheduler; an address that is no host and port is not asked."""
+    """Whether a scheduler listens at an address; one without a host and a port is not tried and counts as yes."""
     parts = urlsplit(address if "://" in address else f"tcp://{address}")
     try:
         host, port = parts.hostname, parts.port
