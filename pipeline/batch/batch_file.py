@@ -1,4 +1,4 @@
-"""The batch file: one TOML document that says all of a batch run.
+"""The batch file: one TOML document that describes a batch run completely.
 
 ```toml
 [inputs]
@@ -11,7 +11,7 @@ method = "arrangement"
 path = "models"
 ```
 
-Paths are relative to the file's folder. All faults are told at once.
+Paths are relative to the file's folder. All faults are reported at once.
 """
 
 from __future__ import annotations
@@ -36,40 +36,42 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class InputsTable(Parameters):
-    """`[inputs]`: what is read."""
+    """`[inputs]`: data to read."""
 
-    crs: str = parameter("", "The inputs' CRS, where their header has none or a wrong one.")
-    vertical_unit: str = parameter("", "Unit of elevations: m, ft or us-ft; empty as the header says.")
+    crs: str = parameter("", "CRS of the inputs, if their header has none or a wrong one.")
+    vertical_unit: str = parameter("", "Unit of elevations: m, ft or us-ft; empty takes it from the header.")
     footprints: str = parameter("", "Building outlines to model; empty finds the buildings in the points.")
-    overrides: str = parameter("", "What to do with single buildings.")
-    aoi: str = parameter("", "Only what lies inside the polygons of this vector file.")
+    overrides: str = parameter("", "File with manual overrides for single buildings.")
+    aoi: str = parameter("", "Vector file with polygons; only points inside them are used.")
     licence: str = parameter("", "Licence of the source data, written into the results.")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OutputTable(Parameters):
-    """`[output]`: what is written."""
+    """`[output]`: files to write."""
 
     path: str = parameter("", "The run directory.")
-    meshes: str = parameter("building", "One OBJ a building, one OBJ a tile, one GLB a tile, or none.", choices=MESHES)
-    overwrite: bool = parameter(False, "Replace a run that is already there and is not of this batch.")
+    meshes: str = parameter(
+        "building", "One OBJ per building, one OBJ per tile, one GLB per tile, or none.", choices=MESHES
+    )
+    overwrite: bool = parameter(False, "Replace an existing run that does not belong to this batch.")
     report: bool = parameter(True, "Write run.html, the page about the run, when it is over.")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class WorkTable(Parameters):
-    """`[work]`: what is remembered."""
+    """`[work]`: intermediate results."""
 
     path: str = parameter(
         "",
         "The work folder, on a file system that all workers share; empty takes the batch file's name with the ending "
-        ".work beside it.",
+        ".work.",
     )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ClusterTable(Parameters):
-    """`[cluster]`: who does it."""
+    """`[cluster]`: processes that do the work."""
 
     workers: int | str = parameter(
         "auto",
@@ -77,27 +79,27 @@ class ClusterTable(Parameters):
         minimum=0,
         maximum=1024,
     )
-    scheduler: str = parameter("", "A Dask scheduler to use in place of the embedded cluster; without workers.")
+    scheduler: str = parameter(
+        "", "A Dask scheduler to use in place of the embedded cluster; not together with workers."
+    )
     tls_ca: str = parameter("", "Certificate of the CA of all the cluster's processes, PEM; with tls_cert.")
     tls_cert: str = parameter("", "The driver's certificate, PEM.")
-    tls_key: str = parameter("", "The driver's private key, PEM; empty where it lies with the certificate.")
-    performance_report: str = parameter("", "A page about the time of the workers, HTML; empty writes none.")
+    tls_key: str = parameter("", "The driver's private key, PEM; empty if the certificate file has it, too.")
+    performance_report: str = parameter("", "HTML page about the time of the workers; empty writes none.")
     metrics_port: int = parameter(
-        0, "Shows the run's figures to Prometheus on this port of 127.0.0.1; 0 shows none.", minimum=0, maximum=65535
+        0, "Port of 127.0.0.1 for the run's figures in the format of Prometheus; 0 for none.", minimum=0, maximum=65535
     )
-    isolate: bool = parameter(
-        True, "Model buildings in supervised processes of their own, so that a bad one costs only itself."
-    )
+    isolate: bool = parameter(True, "Model buildings in supervised child processes: a bad building costs only itself.")
     building_timeout_s: float = parameter(
         IsolationLimits.timeout_s,
-        "Seconds that a building may take in its child process.",
+        "Most seconds per building in its child process.",
         unit="s",
         minimum=1.0,
         maximum=86_400.0,
     )
     building_memory_gib: float = parameter(
         IsolationLimits.memory_bytes / 2**30,
-        "Memory that a building's child process may take.",
+        "Most memory of the child process of a building.",
         unit="GiB",
         minimum=0.5,
         maximum=4096.0,
@@ -106,18 +108,18 @@ class ClusterTable(Parameters):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ScheduleTable(Parameters):
-    """`[schedule]`: when it is done, by `gablework batch schedule`."""
+    """`[schedule]`: when `gablework batch schedule` runs it."""
 
-    cron: str = parameter("", "Minute, hour, day, month, day of the week, such as 30 2 * * *; empty has no times.")
-    time_zone: str = parameter("UTC", "The zone of these times, such as Europe/Amsterdam.")
+    cron: str = parameter("", "Minute, hour, day, month, day of the week, such as 30 2 * * *; empty for no schedule.")
+    time_zone: str = parameter("UTC", "Time zone of these times, such as Europe/Amsterdam.")
     missed: str = parameter(
         Missed.RUN_LATEST.value,
-        "Of times that nobody saw, the latest is run once, or none is.",
+        "Times that passed while the schedule was not running: run the latest once, or none.",
         choices=tuple(one.value for one in Missed),
     )
     overlap: str = parameter(
         Overlap.SKIP.value,
-        "A time that comes while a run is under way is skipped, or run when that is over.",
+        "A time that comes while a run is under way is skipped, or waits until that run is over.",
         choices=tuple(one.value for one in Overlap),
     )
     grace_s: float = parameter(
@@ -127,7 +129,7 @@ class ScheduleTable(Parameters):
         minimum=1.0,
         maximum=86_400.0,
     )
-    paused: bool = parameter(False, "Leave the clock alone.")
+    paused: bool = parameter(False, "Ignore the clock.")
 
     @property
     def rules(self) -> Rules:
@@ -158,24 +160,24 @@ class Batch:
     path: Path
     """The file."""
     inputs: InputsTable
-    """What is read, but for the paths."""
+    """Table `[inputs]`, without paths and bbox."""
     paths: tuple[str, ...]
     """Files, folders or patterns, absolute."""
     bbox: tuple[float, float, float, float] | None
     """x_min, y_min, x_max, y_max in the CRS's units."""
     output: OutputTable
-    """What is written."""
+    """Table `[output]`."""
     work: WorkTable
-    """What is remembered."""
+    """Table `[work]`."""
     cluster: ClusterTable
-    """Who does it."""
+    """Table `[cluster]`."""
     schedule: ScheduleTable
-    """When it is done."""
+    """Table `[schedule]`."""
     settings: RunSettings
     """All settings."""
 
     def whole(self, name: str) -> str:
-        """A path of the file as an absolute one; addresses with a scheme stay."""
+        """A path of the file made absolute; URLs stay."""
         return name if "://" in name else str((self.path.parent / name).resolve())
 
     @property
@@ -194,8 +196,8 @@ class Batch:
         return self.cluster.workers if isinstance(self.cluster.workers, int) else None
 
     def request(self) -> RunRequest:
-        """What the engine is asked to do."""
-        # loads all that a run needs, which a status does not need
+        """The request of a run."""
+        # imported late: a status does not need it
         from pipeline.runtime.request import RunRequest
         from pipeline.runtime.resources import Resources
 
@@ -235,7 +237,7 @@ def read_batch(path: str | Path) -> Batch:
     Raises
     ------
     SettingsError
-        It cannot be read or parsed, or holds faults, all of which are listed.
+        It cannot be read or parsed, or has faults; all are listed.
     """
     file = Path(path).resolve()
     try:
@@ -243,11 +245,13 @@ def read_batch(path: str | Path) -> Batch:
     except OSError as error:
         raise SettingsError([f"batch file {path} cannot be read: {error.strerror or error}"]) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise SettingsError([f"batch file {path} is no TOML: {error}"]) from error
+        raise SettingsError([f"batch file {path} is not TOML: {error}"]) from error
     faults: list[str] = []
     known = (*TABLES, "settings")
     faults.extend(
-        f"[{name}] is no table of a batch file: use one of {', '.join(known)}" for name in document if name not in known
+        f"[{name}] is not a table of a batch file: use one of {', '.join(known)}"
+        for name in document
+        if name not in known
     )
     tables = {name: document.get(name, {}) for name in known}
     faults.extend(
@@ -264,10 +268,10 @@ def read_batch(path: str | Path) -> Batch:
         faults.append('[output] path is missing: give the run directory, such as path = "models"')
     work = built["work"]
     if work is not None and "://" in work.path:
-        faults.append(f"[work] path is {work.path!r}: use a folder of a file system that all workers share, no URL")
+        faults.append(f"[work] path is {work.path!r}: use a folder of a file system that all workers share, not a URL")
     if tables["cluster"].get("scheduler") and "workers" in tables["cluster"]:
         faults.append(
-            "[cluster] has both scheduler and workers: leave out workers, which the scheduler has of its own, or "
+            "[cluster] has both scheduler and workers: leave out workers, since the scheduler has its own, or "
             "scheduler for an embedded cluster"
         )
     faults.extend(f"{where} holds a NUL character: use a path of this system" for where in _with_nul(document))
@@ -284,7 +288,7 @@ def read_batch(path: str | Path) -> Batch:
 
 
 def _with_nul(value: Any, where: str = "batch file") -> list[str]:
-    """Where a document holds a character that no path can have."""
+    """The places of a document with a character that no path can have."""
     if isinstance(value, Mapping):
         return [fault for name, entry in value.items() for fault in _with_nul(entry, name)]
     if isinstance(value, list):
@@ -305,8 +309,8 @@ def _times_faults(table: ScheduleTable | None) -> list[str]:
 def _paths(value: Any, faults: list[str]) -> tuple[str, ...]:
     if isinstance(value, list) and value and all(isinstance(entry, str) and entry for entry in value):
         return tuple(value)
-    told = "missing" if value is None else repr(value)
-    faults.append(f'[inputs] paths is {told}: give a list of files, folders or patterns, such as ["tiles/*.laz"]')
+    shown = "missing" if value is None else repr(value)
+    faults.append(f'[inputs] paths is {shown}: give a list of files, folders or patterns, such as ["tiles/*.laz"]')
     return ()
 
 

@@ -15,8 +15,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.batch.batch_file import Batch
-from pipeline.batch.eta import duration
-from pipeline.batch.wording import as_keys, said_in_keys
+from pipeline.batch.keys import as_keys, errors_with_keys
+from pipeline.batch.remaining_time import duration
 from pipeline.errors import EmptyInputError, InputError, RunError
 from pipeline.inspection import inspect
 from pipeline.io import shown
@@ -107,7 +107,7 @@ def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Es
     ClusterError
         The scheduler does not answer.
     """
-    with said_in_keys():
+    with errors_with_keys():
         return _estimated(batch, read, known)
 
 

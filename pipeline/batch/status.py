@@ -1,4 +1,4 @@
-"""The status of a batch run: a small file in its work folder that anyone may read while it runs, and after it died."""
+"""The status of a batch run: a small file in its work folder, to be read while it runs and after it died."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.batch.eta import StageProgress, duration, remaining_s
+from pipeline.batch.remaining_time import StageProgress, duration, remaining_s
 from pipeline.errors import RunError
 from pipeline.io import LocalStorage
 from pipeline.runtime.monitoring.events import Event
@@ -23,9 +23,9 @@ from pipeline.runtime.scratch.work_folder import is_at_work
 
 NAME = "status.json"
 _EVERY_S = 1.0
-"""A status is written at most so often."""
+"""Least seconds between two writes of a status."""
 _WARNINGS = 20
-"""Newest warnings that a status tells; run.json has all."""
+"""Newest warnings in a status; run.json has all."""
 _RATE_WINDOW_S = 60.0
 _BUILDINGS = "reconstruct"
 _TILES = "publish"
@@ -33,24 +33,24 @@ _TILES = "publish"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Status:
-    """How far a batch run is."""
+    """The state and progress of a batch run."""
 
     state: str
-    """running, finished, incomplete (tiles failed), interrupted, failed; or dead: it was cut off without a word."""
+    """running, finished, incomplete (tiles failed), interrupted, failed; or dead: its process vanished."""
     batch: str
     """The batch file."""
     out: str
     """The run directory."""
     process: str
-    """Which process runs it, and where."""
+    """Its process, and the machine."""
     started_at: str
     """ISO 8601, UTC."""
     updated_at: str
-    """Of this status."""
+    """Time of this status, ISO 8601, UTC."""
     points: int = 0
-    """Of all inputs, by their headers."""
+    """Points of all inputs, by their headers."""
     stage: str = ""
-    """Under way, or the last one."""
+    """The stage that is under way, or the last one."""
     stages: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     """done, total, kept and seconds by stage."""
     buildings: Mapping[str, int] = dataclasses.field(default_factory=dict)
@@ -58,30 +58,30 @@ class Status:
     tiles: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """published and total; empty until they are known."""
     rate_per_s: float | None = None
-    """Units of the stage a second, over the last minute."""
+    """Units of the stage per second, over the last minute."""
     remaining_s: tuple[float, float] | None = None
-    """Least and most seconds that are likely still to come."""
+    """Least and most seconds that the run will probably still take."""
     waiting: str = ""
-    """Why nothing goes on, such as that there are no workers."""
+    """Why the run does not advance, such as missing workers."""
     warnings: tuple[str, ...] = ()
-    """The newest."""
+    """The newest warnings."""
     message: str = ""
-    """How it ended."""
+    """How the run ended."""
 
 
 class StatusWriter:
-    """Listens to a run and keeps its status file.
+    """Listens to a run and writes its status file.
 
     Parameters
     ----------
     work_folder : str
-        Where the file is.
+        The folder of the file.
     batch, out : str
-        What is run, and whereto.
+        The batch file, and the run directory.
     clock : callable
         Seconds, monotonic; replaced in tests.
     now : callable
-        The time of day with a time zone; replaced in tests.
+        Returns the present, with a time zone; replaced in tests.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class StatusWriter:
         self._began_s: dict[str, float] = {}
         self._recent: deque[tuple[float, int]] = deque()
         self._written_s = -1e9
-        self._is_unsaid = False
+        self._is_unwritten = False
         self._lock = threading.RLock()
         self._failed = 0
         started = self._now().isoformat(timespec="seconds")
@@ -113,31 +113,31 @@ class StatusWriter:
         )
 
     def begin(self) -> None:
-        """Say that the run is planned."""
+        """Record that the run is being planned."""
         with self._lock:
             self.status = dataclasses.replace(self.status, stage="plan")
             self._write()
 
     def plan(self, planned: Mapping[str, float], points: int) -> None:
-        """Take in what the run will take: seconds by stage, and points by the inputs' headers."""
+        """Record the plan: seconds by stage, and points by the headers of the inputs."""
         with self._lock:
             self._planned = dict(planned)
             self.status = dataclasses.replace(self.status, points=points)
             self._write()
 
     def on_event(self, event: Event) -> None:
-        """Take an event in; the file is written once a second at most, the rest by `tick`."""
+        """Record an event. The file is written once per second at most; `tick` writes the rest."""
         with self._lock:
             self._take(event)
-            self._is_unsaid = True
+            self._is_unwritten = True
             if self._clock() - self._written_s >= _EVERY_S:
                 self._write()
 
     def tick(self) -> None:
-        """Write what the last events changed, where nothing has happened since; may be called from another thread."""
+        """Write the last events if no later one did; may be called from another thread."""
         with self._lock:
-            if self._is_unsaid and self._clock() - self._written_s >= _EVERY_S:
-                # a disk that is full is told by the next event, in the thread of the run
+            if self._is_unwritten and self._clock() - self._written_s >= _EVERY_S:
+                # the next event reports a full disk, in the thread of the run
                 with contextlib.suppress(OSError, RunError):
                     self._write()
 
@@ -180,7 +180,7 @@ class StatusWriter:
     def _write(self) -> None:
         self._written_s = self._clock()
         self._storage.put(NAME, (json.dumps(dataclasses.asdict(self._whole()), indent=1) + "\n").encode())
-        self._is_unsaid = False
+        self._is_unwritten = False
 
     def _whole(self) -> Status:
         buildings, tiles = self._seen.get(_BUILDINGS), self._seen.get(_TILES)
@@ -206,11 +206,11 @@ class StatusWriter:
             remaining_s=remaining_s(self._planned, self._seen) if self.status.state == "running" else None,
         )
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """Rate, failures and what is still to come, in a few words."""
         with self._lock:
             whole = self._whole()
-        words = [] if whole.rate_per_s is None else [f"{whole.rate_per_s:.3g} a second"]
+        words = [] if whole.rate_per_s is None else [f"{whole.rate_per_s:.3g} per second"]
         if whole.stage == _BUILDINGS:
             words.append(f"{whole.buildings['failed']} failed, {whole.buildings['queued']} queued")
         if whole.remaining_s is not None:
@@ -226,7 +226,7 @@ class StatusWriter:
 
 
 def read_status(work_folder: str) -> Status:
-    """The status of the run of a work folder; `dead` where it says running and nobody works there.
+    """The status of the run of a work folder; `dead` if it says running and no process holds the folder.
 
     Raises
     ------
@@ -243,15 +243,15 @@ def read_status(work_folder: str) -> Status:
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise RunError(f"{path} cannot be read: {error}. Run the batch again: it writes a new one") from error
     if status.state == "running" and not is_at_work(work_folder):
-        message = f"cut off after {status.updated_at}: run the batch again, and it goes on from there"
+        message = f"cut off after {status.updated_at}: run the batch again, and it continues from there"
         return dataclasses.replace(status, state="dead", remaining_s=None, waiting="", message=message)
     return status
 
 
 def buildings_before(work_folder: str) -> tuple[int, int]:
-    """How many buildings the run before had, and of how many points; zeros where nobody knows."""
+    """Buildings and points of the run before; zeros if unknown."""
     try:
         status = read_status(work_folder)
         return int(status.buildings.get("total", 0)), int(status.points)
-    except (RunError, AttributeError, TypeError, ValueError):  # there is none, or a damaged one
+    except (RunError, AttributeError, TypeError, ValueError):  # missing or damaged
         return 0, 0

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.batch.eta import duration
+from pipeline.batch.remaining_time import duration
 from pipeline.cli.modelling import show_summary
 from pipeline.cli.options import AsJson, Quiet
 from pipeline.console import Console, ExitCode
@@ -49,7 +49,7 @@ def run(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
     """Run a batch; one that was cut off goes on where it stopped, and what did not change is not done again."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.batch.batch_file import read_batch
-        from pipeline.batch.running import run_batch
+        from pipeline.batch.run import run_batch
 
         # whoever ends services by SIGTERM, as systemd and Kubernetes do, finds a run that can go on
         signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -123,7 +123,7 @@ def test_all_faults_are_reported_at_once(tmp_path: Path) -> None:
         "workers is -1: use 'auto' or a whole number from 0 to 1024",
         "scheduler is 8786: use a text in quotes",
         "magic",
-        "[sttings] is no table of a batch file",
+        "[sttings] is not a table of a batch file",
     ):
         assert words in faults
 
@@ -132,8 +132,8 @@ def test_all_faults_are_reported_at_once(tmp_path: Path) -> None:
     ("text", "words"),
     [
         (None, "cannot be read"),
-        ("[inputs", "is no TOML"),
-        (f"deep = {'[' * 5000}{']' * 5000}", "is no TOML"),
+        ("[inputs", "is not TOML"),
+        (f"deep = {'[' * 5000}{']' * 5000}", "is not TOML"),
         (r'inputs = {paths = ["a\u0000b"]}', "paths holds a NUL character"),
         ('[work]\npath = "s3://bucket/work"', r"path is 's3://bucket/work': use a folder of a file system"),
     ],

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.batch.eta import StageProgress, remaining_s
+from pipeline.batch.remaining_time import StageProgress, remaining_s
 from pipeline.batch.status import NAME, StatusWriter, buildings_before, read_status
 from pipeline.errors import RunError
 from pipeline.runtime.monitoring.events import Event

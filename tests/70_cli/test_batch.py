@@ -127,11 +127,11 @@ def test_the_report_is_that_of_the_last_run_or_none(
     def fails(run_dir: str) -> str:
         raise RunError(f"{run_dir} is full")
 
-    monkeypatch.setattr("pipeline.batch.running.write_run_page", fails)
+    monkeypatch.setattr("pipeline.batch.run.write_run_page", fails)
     file.write_text(text)
     code, _, error = call("run", file)
     assert code == 0
-    assert "the run is whole, its report could not be written" in error
+    assert "the run is complete, its report could not be written" in error
 
 
 def test_a_batch_of_other_points_is_looked_at_again(folder: Path, tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_who_comes_second_says_nothing_in_the_status_of_who_came_first(
     make_work(work)
     (work / "status.json").write_text("of the first")
     # both looked before either held the folder
-    monkeypatch.setattr("pipeline.batch.running.refuse_locked", lambda _: None)
+    monkeypatch.setattr("pipeline.batch.run.refuse_locked", lambda _: None)
     with locked_file(work, DRIVER_LOCK):
         code, _, error = call("run", file)
     assert code == 4
@@ -347,5 +347,5 @@ def test_a_batch_file_with_faults_is_a_usage_error(tmp_path: Path, words: Sequen
     file.write_text("[input]\n")
     code, _, error = call(*words, file)
     assert code == 2
-    assert "[input] is no table of a batch file" in error
+    assert "[input] is not a table of a batch file" in error
     assert "[inputs] paths is missing" in error

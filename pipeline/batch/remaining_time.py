@@ -1,4 +1,4 @@
-"""How long a run will still take, as a range: what was seen of its stages, and what was planned of the others."""
+"""The remaining time of a run, as a range: from the progress of its stages and the plan of the others."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ import math
 from collections.abc import Mapping
 
 _UNSEEN = 2.0
-"""What nothing was seen of yet may take half as long as planned, or twice."""
+"""A stage that has not begun may take half as long as planned, or twice."""
 _SEEN = 1.25
-"""What was planned is off by this much even where stages before went as planned: buildings differ."""
+"""Factor by which the plan is off even if earlier stages went as planned: buildings differ. Measured."""
 _KNOWN = 0.05
-"""Of a stage of which less was done the plan still counts: of 6,565 buildings ten took 2 s, the others 28 s."""
+"""Share of a stage below which its plan still counts. Measured: of 6,565 buildings ten took 2 s, the others 28 s."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StageProgress:
-    """How far a stage is."""
+    """The progress of a stage."""
 
     done: int
     """Units done."""
     total: int
     """Units of the stage."""
     kept: int = 0
-    """Of those done, how many were done before and took no time now."""
+    """Units of `done` that an earlier run did and that took no time now."""
     seconds: float = 0.0
-    """Since the stage began; of one that is over, all that it took."""
+    """Time since the stage began; its total time if it is over."""
     over: bool = False
     """Whether it is over."""
 
@@ -38,16 +38,16 @@ def remaining_s(planned: Mapping[str, float], seen: Mapping[str, StageProgress])
     planned : mapping
         Planned seconds of all stages, by name, in their order.
     seen : mapping
-        Progress of those that began.
+        Progress of the stages that began.
 
     Returns
     -------
     (float, float) or None
-        None where nothing was planned.
+        None if nothing was planned.
 
     Examples
     --------
-    Half of the only stage took 50 s, by 100 tasks; and nothing was seen of another yet.
+    Half of the only stage took 50 s, in 100 tasks; another one has not begun.
 
     >>> [round(s) for s in remaining_s({"split": 80.0}, {"split": StageProgress(done=100, total=200, seconds=50.0)})]
     [45, 55]
@@ -58,7 +58,7 @@ def remaining_s(planned: Mapping[str, float], seen: Mapping[str, StageProgress])
         return None
     low = high = 0.0
     spent = expected = 0.0
-    # of stages that no rate is known of, what was seen of them counts all the same
+    # stages without a plan count by their progress
     for name, seconds in {**dict.fromkeys(seen, 0.0), **planned}.items():
         stage = seen.get(name)
         if stage is None:
@@ -72,11 +72,11 @@ def remaining_s(planned: Mapping[str, float], seen: Mapping[str, StageProgress])
         left = stage.total - stage.done
         if worked > 0:
             own = stage.seconds / worked * left
-            # of n tasks of like kind the mean is known to one part in the root of n
+            # the relative error of the mean of n similar tasks is 1 / sqrt(n)
             spread = 1.0 / math.sqrt(worked)
             least, most = own / (1.0 + spread), own * (1.0 + spread)
             if seconds > 0.0 and worked < _KNOWN * (stage.total - stage.kept):
-                # the first to come tell of workers that warm up, not of the stage: the plan counts, too
+                # the first tasks measure workers that warm up, not the stage: the plan counts, too
                 share = left / max(1, stage.total)
                 least, most = min(least, seconds * share / _UNSEEN), max(most, seconds * share * _UNSEEN)
             low += least

@@ -1,4 +1,4 @@
-"""A batch run: estimated, refused where it cannot work, run in its work folder, told while it runs."""
+"""A batch run: estimated, refused if it cannot work, run in its work folder, with a status file."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pipeline.batch.batch_file import Batch
 from pipeline.batch.estimates import estimate, places_refused, refuse
+from pipeline.batch.keys import as_keys, errors_with_keys
 from pipeline.batch.status import StatusWriter, buildings_before
-from pipeline.batch.wording import as_keys, said_in_keys
 from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.report.run_page import write_run_page
 from pipeline.runtime.cluster.run_metrics import RunMetrics, both, serve_metrics
@@ -20,7 +20,7 @@ from pipeline.runtime.run import RunSummary, run
 from pipeline.runtime.scratch.work_folder import DRIVER_LOCK, locked_file, make_work, refuse_locked
 
 _READ = 1
-"""Inputs that are read in whole for the estimate of a run: it is to begin soon."""
+"""Inputs that are read completely for the estimate of a run; few, since the run should begin soon."""
 
 
 def run_batch(
@@ -29,32 +29,32 @@ def run_batch(
     executor: Executor | None = None,
     cancelled: Callable[[], bool] = never,
 ) -> RunSummary:
-    """Run a batch, or go on with one that was cut off; what did not change since an earlier run is not done again.
+    """Run a batch, or continue one that was cut off. Parts that did not change since an earlier run are not done again.
 
     Parameters
     ----------
     batch : Batch
-        What is to be done.
+        The batch to run.
     on_event : callable
         Gets an `Event` for every stage, step and warning.
     executor : Executor, optional
-        Where tasks run; by default what the batch asks for.
+        Runs the tasks; by default the one that the batch file names.
     cancelled : callable
-        Asked several times a second, from another thread; once it is true the run ends as soon as it can.
+        Called several times per second, from another thread; once it returns True the run ends as soon as possible.
 
     Raises
     ------
     BatchRefusedError
-        It cannot work as it is planned.
+        It cannot work as planned.
     RunError
         Another process runs it, or its folders cannot be used.
     InputError, SettingsError, ClusterError, RunCancelledError
-        As `pipeline.runtime.run.run`.
+        As in `pipeline.runtime.run.run`.
     """
     refuse_locked(batch.work_folder)
     refuse(places_refused(batch))
-    with contextlib.ExitStack() as shown, said_in_keys():
-        # who comes second says nothing in the status of who came first
+    with contextlib.ExitStack() as shown, errors_with_keys():
+        # a second run must not write into the status of the first
         work = Path(batch.work_folder).resolve()
         make_work(work)
         shown.enter_context(locked_file(work, DRIVER_LOCK))
@@ -63,10 +63,10 @@ def run_batch(
         if batch.cluster.metrics_port:
             shown.callback(serve_metrics(batch.cluster.metrics_port))
             on_event = both(RunMetrics(), on_event)
-        return _told(batch, status, on_event, executor, cancelled, known)
+        return _run_with_status(batch, status, on_event, executor, cancelled, known)
 
 
-def _told(
+def _run_with_status(
     batch: Batch,
     status: StatusWriter,
     on_event: Listener,
@@ -74,27 +74,27 @@ def _told(
     cancelled: Callable[[], bool],
     known: tuple[int, int],
 ) -> RunSummary:
-    """Plan and run a batch, and keep its status."""
+    """Plan and run a batch, and write its status."""
 
     def listen(event: Event) -> None:
         event = dataclasses.replace(event, message=as_keys(event.message))
         status.on_event(event)
-        told = event.kind == "progress" and not event.message
-        on_event(dataclasses.replace(event, message=status.told()) if told else event)
+        is_plain = event.kind == "progress" and not event.message
+        on_event(dataclasses.replace(event, message=status.summary()) if is_plain else event)
 
-    def asked() -> bool:
+    def tick() -> bool:
         status.tick()
         return cancelled()
 
     try:
-        # of thousands of inputs elsewhere the headers alone take minutes
+        # the headers of thousands of remote inputs take minutes
         status.begin()
         planned = estimate(batch, _READ, known)
         refuse(planned.refusals)
         status.plan(planned.stage_s, planned.points)
-        summary = run(batch.request(), listen, executor, asked)
+        summary = run(batch.request(), listen, executor, tick)
     except (KeyboardInterrupt, RunCancelledError):
-        status.end("interrupted", "run the batch again, and it goes on from here")
+        status.end("interrupted", "run the batch again, and it continues from here")
         raise
     except BaseException as error:
         status.end("failed", as_keys(f"{type(error).__name__}: {error}".removesuffix(": ")))
@@ -106,10 +106,10 @@ def _told(
 
 
 def _write_report(summary: RunSummary, on_event: Listener) -> None:
-    """Write the page about a run; a run that is whole does not fail for it."""
+    """Write the page about a run; a complete run does not fail because of it."""
     on_event(Event(kind="stage", stage="report"))
     try:
         write_run_page(summary.run_dir)
     except (GableworkError, OSError) as error:
-        message = f"the run is whole, its report could not be written: {error}. Write it by gablework report"
+        message = f"the run is complete, its report could not be written: {error}. Write it with gablework report"
         on_event(Event(kind="warning", stage="report", message=message))

@@ -1,4 +1,4 @@
-"""What the engine says in options of the command line, said in keys of the batch file."""
+"""Rewrites messages of the engine: keys of the batch file in place of options of the command line."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KEYS: Mapping[str, str] = {
     "--building-timeout": "[cluster] building_timeout_s",
     "--building-memory": "[cluster] building_memory_gib",
 }
-"""Keys by option. `--scheduler` is not among them: the engine names it for workers, which have no batch file."""
+"""Keys by option. `--scheduler` is missing: the engine names it for workers, which have no batch file."""
 
 _OPTION = re.compile("|".join(rf"{re.escape(option)}(?![\w-])" for option in sorted(KEYS, key=len, reverse=True)))
 
@@ -42,8 +42,8 @@ def as_keys(text: str) -> str:
 
 
 @contextlib.contextmanager
-def said_in_keys() -> Iterator[None]:
-    """Errors of the block name keys in place of options."""
+def errors_with_keys() -> Iterator[None]:
+    """Rewrite the errors of the block: they name keys in place of options."""
     try:
         yield
     except InputError as error:
