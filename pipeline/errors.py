@@ -9,7 +9,7 @@ GableworkError
 │   └── CrsError                 geographic, contradictory or unknown coordinate reference system
 ├── SettingsError         one or more settings are out of range: lists all faults at once
 ├── RunError              a run directory, in a folder or an object store, that cannot be written, read or resumed
-│   ├── RunCancelledError        whoever started the run called it off
+│   ├── RunCancelledError        the user cancelled the run
 │   └── ClusterError             the scheduler does not answer, or was lost while the run was under way
 │       └── VersionMismatchError     client, scheduler and workers do not run the same versions
 └── BuildingError         one building could not be modelled; becomes its record's status and reason
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pipeline.model import Reason
 
 
-_TOLD = 9
+_NAMED = 9
 """Inputs at fault that are named beside the first one; the others are counted."""
 
 
@@ -75,14 +75,14 @@ def all_at_fault(faults: Sequence[InputError]) -> InputError:
     first, others = faults[0], faults[1:]
     if not others:
         return first
-    told = [f"{fault.path}: {fault.problem}" for fault in others[:_TOLD]]
-    if len(others) > _TOLD:
-        told.append(f"and {len(others) - _TOLD} more")
+    named = [f"{fault.path}: {fault.problem}" for fault in others[:_NAMED]]
+    if len(others) > _NAMED:
+        named.append(f"and {len(others) - _NAMED} more")
     inputs = "input" if len(others) == 1 else "inputs"
     return type(first)(
         first.path,
         first.problem,
-        f"{first.fix.rstrip('.')}. {len(others)} more {inputs} cannot be used: {'; '.join(told)}",
+        f"{first.fix.rstrip('.')}. {len(others)} more {inputs} cannot be used: {'; '.join(named)}",
     )
 
 
@@ -108,7 +108,7 @@ class SettingsError(GableworkError):
     Parameters
     ----------
     faults : sequence of str
-        One sentence a fault, each naming the setting, its value and what is allowed.
+        One sentence per fault, each naming the setting, its value and what is allowed.
     """
 
     def __init__(self, faults: Sequence[str]) -> None:
@@ -125,7 +125,7 @@ class RunError(GableworkError):
 
 
 class RunCancelledError(RunError):
-    """Whoever started the run called it off; what is in the run directory is not to be used."""
+    """The user cancelled the run; do not use the content of the run directory."""
 
 
 class ClusterError(RunError):

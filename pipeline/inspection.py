@@ -61,6 +61,7 @@ class Inspection:
     def rows(self) -> list[tuple[str, str]]:
         """The facts as pairs of name and value, for people."""
         info, reference = self.info, self.info.reference
+        assumed = " (assumed: the file states none; --vertical-unit sets it)" if reference.vertical_unit_assumed else ""
         x0, y0, _, x1, y1, _ = info.bounds_m
         kept_out = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in self.dropped.items() if n)
         pulses = ", ".join(f"{n}: {100.0 * k / self.used_points:.0f} %" for n, k in self.returns.items())
@@ -74,7 +75,10 @@ class Inspection:
                 f"{self.used_points} used of {info.point_count}" + (f" (left out: {kept_out})" if kept_out else ""),
             ),
             ("CRS", reference.name if reference.epsg is None else f"{reference.name} (EPSG:{reference.epsg})"),
-            ("units", f"horizontal {reference.horizontal_unit_m:g} m, vertical {reference.vertical_unit_m:g} m"),
+            (
+                "units",
+                f"horizontal {reference.horizontal_unit_m:g} m, vertical {reference.vertical_unit_m:g} m{assumed}",
+            ),
             ("extent", f"{x1 - x0:.1f} x {y1 - y0:.1f} m"),
             ("elevation", f"{self.elevation_m[0]:.2f} to {self.elevation_m[1]:.2f} m"),
             ("density", f"{self.density_per_m2:.2f} points/m2 where there are points"),

@@ -1,4 +1,4 @@
-"""CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature a building, a BuildingPart with semantics a solid.
+"""CityJSONSeq 2.0: a line of metadata, then one CityJSONFeature per building, with one BuildingPart per solid.
 
 Coarser levels of detail are further geometries of the same parts, each with its `lod`.
 """
@@ -29,7 +29,7 @@ def cityjson_lines(
 ) -> Iterable[str]:
     """The lines of a CityJSONSeq file.
 
-    Vertices are integers: the transform's scale is 0.001 in metres (finer in other units, so that 1 mm is kept), its
+    Vertices are integers: the transform's scale is 0.001 in metres (finer in other units, to keep 1 mm), its
     translation whole units at the lower corner of all solids.
 
     Parameters
@@ -38,7 +38,7 @@ def cityjson_lines(
         Each building with its record (`building_row`), which becomes its attributes; buildings without a solid are
         features without geometry.
     reference : SpatialReference
-        Gives the units and, where an EPSG code is known, the referenceSystem.
+        Gives the units and, if it has an EPSG code, the referenceSystem.
     title : str
         Goes into the metadata.
     """
@@ -82,7 +82,7 @@ def cityjson_lines(
 
 
 def _json(value: Mapping[str, Any]) -> str:
-    """One line of JSON without idle spaces."""
+    """One line of JSON without spaces."""
     return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
@@ -94,7 +94,7 @@ def _solids(result: BuildingResult) -> list[Solid]:
 def _feature(
     result: BuildingResult, row: Mapping[str, Any], vertices: Sequence[np.ndarray[Any, np.dtype[np.int64]]]
 ) -> dict[str, Any]:
-    """The CityJSONFeature of one building; each solid has its own vertices, each part a solid a level of detail."""
+    """The CityJSONFeature of one building; each solid has its own vertices, each part one solid per level of detail."""
     parts = [part_id(result, part) for part in range(len(result.solids))]
     building: dict[str, Any] = {"type": "Building", "attributes": _attributes(row)}
     if parts:
@@ -121,9 +121,9 @@ def _feature(
 
 
 def _attributes(row: Mapping[str, Any]) -> dict[str, Any]:
-    """The record as attributes: without geometry and id, without what is unknown, times as ISO 8601.
+    """The record as attributes: without geometry, id and unknown values, times as ISO 8601.
 
-    The columns of the given footprint are an object of their own, so that no name of theirs meets one of ours.
+    The columns of the given footprint form an object, so their names cannot clash with ours.
     """
     attributes: dict[str, Any] = {}
     for name, value in row.items():
@@ -137,9 +137,9 @@ def _attributes(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _solid(solid: Solid, planes: Sequence[Plane], lod: str, first: int) -> dict[str, Any]:
-    """The geometry of one part: one semantic surface a roof plane, one for the walls, one for the ground.
+    """The geometry of one part: one semantic surface per roof plane, one for the walls, one for the ground.
 
-    Without planes, those of level parts are told as level surfaces that are none of the table `planes`.
+    Without planes, roof surfaces are level and have no `plane_id`.
     """
     surfaces: list[dict[str, Any]] = []
     index: dict[tuple[FaceKind, int], int] = {}
@@ -159,7 +159,7 @@ def _solid(solid: Solid, planes: Sequence[Plane], lod: str, first: int) -> dict[
 
 
 def _surface(kind: FaceKind, plane_id: int, planes: Sequence[Plane]) -> dict[str, Any]:
-    """A semantic surface; those of roof planes tell slope and aspect as the `planes` table does."""
+    """A semantic surface; roof planes have slope and aspect as in the `planes` table."""
     surface: dict[str, Any] = {"type": SURFACES[kind]}
     if plane_id >= 0 and not planes:
         surface["slope_deg"] = surface["aspect_deg"] = 0.0

@@ -19,15 +19,15 @@ class CandidateFacts:
     input_hash: str | None = None
     """Digest of the candidate's ordered points and ground."""
     acquired_from: dt.datetime | None = None
-    """Time of the candidate's earliest point, with a time zone; None where the file tells no absolute time."""
+    """Time of the candidate's earliest point, with a time zone; None if the file has no absolute time."""
     acquired_to: dt.datetime | None = None
     """Time of the candidate's latest point."""
     source_attributes: str | None = None
     """The given footprint's columns as the text of a JSON object; None without one."""
     overridden: str | None = None
-    """What the user's overrides did to this building, such as `accept, method`; None where they did nothing."""
+    """Changes by the user's overrides, such as `accept, method`; None without any."""
     settings_hash: str | None = None
-    """Of the settings of this building alone; None where they are the run's."""
+    """Hash of this building's own settings; None if it uses the run's."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ class RejectedObject:
     origin: tuple[float, float, float]
     """Absolute easting, northing, elevation in metres of the local origin."""
     reason: Reason
-    """Why it is no building."""
+    """Why it is not a building."""
     reason_detail: str
     """The measured figure and the threshold."""
     outline: Polygon | MultiPolygon | None

@@ -1,7 +1,7 @@
 """GeoParquet 1.1: the tables of a run directory, written and read.
 
 Geometries are ISO WKB with planar edges and counter-clockwise exterior rings; an unknown coordinate reference system is
-told as `crs: null`, since a missing key would mean WGS 84. A `bbox` column covers the geometries, so that a reader can
+written as `crs: null`, since a missing key would mean WGS 84. A `bbox` column covers the geometries, so a reader can
 skip row groups. In `buildings` the footprint is the primary geometry; the solids are further ones.
 """
 
@@ -56,24 +56,24 @@ def geo_metadata(
         The coordinate reference system; None where it is unknown.
     solids : mapping of arrays of shapely geometries, optional
         Those of the columns of solids by their names. Their rings run outward round the solid, not counter-clockwise
-        in plan, and nothing is told of their orientation. The footprint is the outline of the solids, so that the
-        `bbox` column covers both. Coarser solids are told of where there are any; rows may lack them, so `bbox` is not
-        told to cover them.
+        in plan, so no orientation is stated. The footprint is the outline of the solids, so that the
+        `bbox` column covers both. Coarser solids are listed if there are any; rows may lack them, so `bbox` does not
+        cover them.
     """
     column = _column_metadata(geometries, projjson)
     column["orientation"] = "counterclockwise"
     columns = {"geometry": column}
     for name, faces in (solids or {}).items():
-        told = _column_metadata(faces, projjson)
+        metadata = _column_metadata(faces, projjson)
         if name == SOLIDS[0]:
-            columns[name] = told
+            columns[name] = metadata
         elif not shapely.is_missing(faces).all():
-            columns[name] = {key: value for key, value in told.items() if key != "covering"}
+            columns[name] = {key: value for key, value in metadata.items() if key != "covering"}
     return {"version": VERSION, "primary_column": "geometry", "columns": columns}
 
 
 def _column_metadata(geometries: Any, projjson: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What every column of geometry tells: encoding, types, CRS, bounds."""
+    """The metadata of a geometry column: encoding, types, CRS, bounds."""
     present = geometries[~shapely.is_missing(geometries)]
     has_z = shapely.has_z(present)
     names = {
@@ -153,7 +153,7 @@ def table_files(
     if tiles is not None:
         return [f"{folder}/tile={tile}/part-0.parquet" for tile in tiles]
     if filesystem.get_file_info(folder).type != pafs.FileType.Directory:
-        raise RunError(f"{folder} is no folder: give the directory that a run wrote")
+        raise RunError(f"{folder} is not a folder: give the directory that a run wrote")
     found = [
         info.path
         for info in filesystem.get_file_info(pafs.FileSelector(folder, recursive=True))
@@ -195,7 +195,7 @@ def table_batches(
     Raises
     ------
     RunError
-        The folder does not exist, or holds what is no Parquet.
+        The folder does not exist, or holds a file that is not Parquet.
     """
     schema = stored_schema(table_name)
     try:

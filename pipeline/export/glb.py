@@ -1,9 +1,9 @@
-"""glTF 2.0 in one binary file (GLB): a node a building with its record, a material a semantic surface.
+"""glTF 2.0 in one binary file (GLB): one node per building with its record, one material per semantic surface.
 
-glTF knows metres, 32-bit floats and a y axis that points up. So every building has a node of its own, whose
+glTF uses metres, 32-bit floats and a y axis that points up. So every building has its own node, whose
 translation is whole metres from the file's origin, and vertices in metres from there: x is easting, y elevation, z
-minus northing. Millimetres survive that way, and `asset.extras` tells the origin and the units, which lead back to the
-CRS. The models are taken from CityJSONSeq, so both files always tell the same.
+minus northing. This keeps millimetres. `asset.extras` holds the origin and the units, which lead back to the CRS.
+The models come from CityJSONSeq, so both files always agree.
 
 The rules are those of the Khronos Group's glTF 2.0 specification (ISO/IEC 12113:2022).
 """
@@ -32,7 +32,7 @@ MATERIALS: Mapping[str, tuple[float, float, float]] = {
     "WallSurface": (0.71, 0.66, 0.58),
     "GroundSurface": (0.25, 0.25, 0.25),
 }
-"""A material a semantic surface of CityJSON, by its name, with its colour in linear RGB."""
+"""One material per semantic surface of CityJSON, by its name, with its colour in linear RGB."""
 PLANE_ID = "_PLANE_ID"
 """Vertex attribute: `plane_id` of the roof plane, -1 on walls and ground."""
 
@@ -85,7 +85,7 @@ def glb_bytes(
     Returns
     -------
     bytes
-        The file; empty where no building has a solid, since glTF has no empty scene of meshes.
+        The file; empty if no building has a solid, since glTF has no empty scene of meshes.
 
     Raises
     ------
@@ -140,7 +140,7 @@ class _Frame:
 def _mesh(feature: Mapping[str, Any], frame: _Frame, lod: str | None) -> _Mesh | None:
     """The triangles of a feature's solids at the finest level up to `lod`; None where it has none."""
     corners, ring_starts, face_starts = [], [0], [0]
-    told: list[tuple[str, str]] = []
+    face_keys: list[tuple[str, str]] = []
     planes: list[int] = []
     levels = {g["lod"] for entry in feature["CityObjects"].values() for g in entry.get("geometry", ())}
     level = max((name for name in levels if lod is None or name <= lod), default="")
@@ -155,7 +155,7 @@ def _mesh(feature: Mapping[str, Any], frame: _Frame, lod: str | None) -> _Mesh |
                     ring_starts.append(len(corners))
                 face_starts.append(len(ring_starts) - 1)
                 surface = semantics["surfaces"][value]
-                told.append((part, surface["type"]))
+                face_keys.append((part, surface["type"]))
                 planes.extend([surface.get("plane_id", -1)] * (len(corners) - len(planes)))
     if not corners:
         return None
@@ -163,14 +163,14 @@ def _mesh(feature: Mapping[str, Any], frame: _Frame, lod: str | None) -> _Mesh |
     low_mm = xyz_mm.min(axis=0) // _MM * _MM
     local_mm = xyz_mm - low_mm
     triangles, counts, normals = _triangulated(local_mm, np.array(ring_starts), np.array(face_starts))
-    if len(counts) < len(told):
-        part, surface_type = told[len(counts)]
+    if len(counts) < len(face_keys):
+        part, surface_type = face_keys[len(counts)]
         raise ValueError(f"face {len(counts)} of {part}, a {surface_type}, cannot be cut into triangles")
-    of_face = np.repeat(np.arange(len(told)), counts)
+    of_face = np.repeat(np.arange(len(face_keys)), counts)
     groups: dict[tuple[str, str], list[int]] = {}
-    for index, key in enumerate(told):
+    for index, key in enumerate(face_keys):
         groups.setdefault(key, []).append(index)
-    parts = list(dict.fromkeys(part for part, _ in told))
+    parts = list(dict.fromkeys(part for part, _ in face_keys))
     wanted = [(part, name) for part in parts for name in MATERIALS if (part, name) in groups]
     return _Mesh(
         lod=level,
@@ -282,9 +282,9 @@ class _Scene:
         """The whole file."""
         views, start = [], 0
         for view in self._views:
-            told = {"buffer": 0, "byteOffset": start, "byteLength": view.size}
+            span = {"buffer": 0, "byteOffset": start, "byteLength": view.size}
             layout = {"target": _INDICES} if view.stride is None else {"byteStride": view.stride, "target": _VERTICES}
-            views.append({**told, **layout})
+            views.append({**span, **layout})
             start += view.size
         root = {"name": title, "children": list(range(1, len(self._nodes) + 1)), "extras": dict(place)}
         document = {

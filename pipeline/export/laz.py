@@ -1,6 +1,6 @@
 """LAZ 1.4 in point formats 6, 7 and 8: records of every older format, converted without loss, and the file around them.
 
-Source: ASPRS, LAS Specification 1.4 R15, tables 3, 4, 7 to 17, 22; LASzip as of lazrs.
+Source: ASPRS, LAS Specification 1.4 R15, tables 3, 4, 7 to 17, 22; LASzip as implemented by lazrs.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def header_of(
     older : bytes
         Header to take over source id, encoding, GUID, system and day of creation from.
     wkt : bool
-        Set the bit that says that the CRS is told by WKT.
+        Set the bit that says that the CRS is stored as WKT.
     """
     header = bytearray(HEADER_SIZE)
     header[:90] = older[:90]  # signature, source id, encoding, GUID, version, system, software

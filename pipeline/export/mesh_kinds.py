@@ -1,4 +1,4 @@
 """What meshes a run can write."""
 
 MESHES = ("building", "tile", "glb", "none")
-"""One OBJ a building, one OBJ a tile, one GLB a tile, none."""
+"""One OBJ per building, one OBJ per tile, one GLB per tile, none."""

@@ -1,7 +1,7 @@
-"""Wavefront OBJ: full coordinates, one `o` a closed solid, groups roof, wall and ground, one material a roof plane.
+"""Wavefront OBJ: full coordinates, one `o` per closed solid, groups roof, wall and ground, one material per roof plane.
 
-There is no `mtllib`: a material's name says which roof plane a face belongs to (`roof_3` is plane_id 3), its colour is
-the viewer's business. Programs that know no such file make a default material of each name.
+There is no `mtllib`: a material's name says which roof plane a face belongs to (`roof_3` is plane_id 3), and
+the viewer chooses its colour. Programs make a default material of each name.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _KINDS = (FaceKind.ROOF, FaceKind.WALL, FaceKind.GROUND)
 def obj_text(results: Iterable[BuildingResult], reference: SpatialReference, lod: str | None = None) -> str:
     """The solids of one or more buildings as one OBJ file.
 
-    Every solid has its own vertices, so that it is closed by itself. Faces without holes stay polygons, those with
+    Every solid has its own vertices, so it is closed. Faces without holes stay polygons, those with
     holes become triangles on the same vertices.
 
     Parameters
@@ -29,7 +29,7 @@ def obj_text(results: Iterable[BuildingResult], reference: SpatialReference, lod
     reference : SpatialReference
         Gives the units of the coordinates.
     lod : str, optional
-        A coarser level of detail in the place of the records' own (`model_at`).
+        A coarser level of detail in place of the records' own (`model_at`).
     """
     unit = f"{reference.horizontal_unit_m:.12g} m horizontally, {reference.vertical_unit_m:.12g} m vertically"
     lines = [f"# coordinates are easting, northing, elevation; one unit is {unit}"]

@@ -1,8 +1,8 @@
-"""Solids as columns of a table: one MultiPolygon Z a building, a polygon a face, and what each face is.
+"""Solids as columns of a table: one MultiPolygon Z per building, one polygon per face, and the kind of each face.
 
-Readers of GeoParquet know no solids: PolyhedralSurface is none of the types of GeoParquet 1.1, and GEOS (shapely,
-geopandas) cannot read it. A MultiPolygon Z of the boundary's faces reaches all of them. Its polygons are oriented as
-the solid's faces, outward, and so bound the same solid again; in plan it is no valid polygon, since walls are upright.
+GeoParquet 1.1 has no PolyhedralSurface, and GEOS (shapely, geopandas) cannot read it. Every reader understands a
+MultiPolygon Z of the boundary's faces. Its polygons are oriented like the solid's faces, outward, and so bound the
+same solid; in plan it is not a valid polygon, since walls are upright.
 """
 
 from __future__ import annotations
@@ -62,14 +62,16 @@ def solid_columns(result: BuildingResult, reference: SpatialReference) -> dict[s
     """
     columns: dict[str, Any] = dict.fromkeys(SOLID_COLUMNS)
     if result.solids:
-        columns.update(zip(SOLID_COLUMNS, _told(result.solids, result.origin, reference), strict=False))
+        columns.update(zip(SOLID_COLUMNS, _columns_of(result.solids, result.origin, reference), strict=False))
     for model in result.coarser:
-        columns.update(zip(_COARSER_COLUMNS[model.lod], _told(model.solids, result.origin, reference), strict=False))
+        columns.update(
+            zip(_COARSER_COLUMNS[model.lod], _columns_of(model.solids, result.origin, reference), strict=False)
+        )
     return columns
 
 
 def model_at(result: BuildingResult, lod: str | None) -> LodModel | None:
-    """The finest model of a building that is no finer than `lod`; its own for None, None where there is none.
+    """The finest model of a building that is not finer than `lod`; its own model for None; None if there is none.
 
     A building that fell back to a block has that at every level.
     """
@@ -78,7 +80,7 @@ def model_at(result: BuildingResult, lod: str | None) -> LodModel | None:
     return max(known, key=lambda model: model.lod, default=None)
 
 
-def _told(
+def _columns_of(
     solids: Sequence[Solid], origin: tuple[float, float, float], reference: SpatialReference
 ) -> tuple[bytes, list[int], list[str], list[int]]:
     """Solids as the values of the columns."""

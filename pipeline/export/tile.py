@@ -52,7 +52,7 @@ def mesh_path(tile_key: str, building_id: str, meshes: str, lod: str | None = No
 def mesh_files(
     tile_key: str, results: Sequence[BuildingResult], lines: Sequence[str], context: RecordContext, meshes: str
 ) -> Iterator[tuple[str, bytes]]:
-    """The mesh files of a tile as path and content: one set with the records' models, one a coarser level of detail.
+    """The mesh files of a tile as path and content: one set with the records' models, one per coarser level of detail.
 
     Parameters
     ----------
@@ -94,12 +94,12 @@ def write_tile(
     """Publish one tile's buildings, planes, rejected objects, meshes and city objects.
 
     Every file is put atomically and depends on the arguments only, so a task may run twice, also at the same time.
-    The tables are written also where they have no row.
+    Tables without rows are written, too.
 
     Parameters
     ----------
     run_dir : str or Path
-        The local run directory; only told in messages where `put` is given.
+        The local run directory; used only in messages if `put` is given.
     tile_key : str
         The hive key, such as x85_y447; never a bare integer, which readers would take for a number.
     results : sequence of BuildingResult

@@ -16,13 +16,13 @@ from pipeline.io.urls import filesystem_of
 Result = TypeVar("Result")
 
 
-class ObjectHandler(pafs.FSSpecHandler):  # type: ignore[misc]  # pyarrow tells no types
+class ObjectHandler(pafs.FSSpecHandler):  # type: ignore[misc]  # pyarrow has no types
     """Answers Arrow's questions about objects.
 
     Parameters
     ----------
     url : str
-        Any URL of the store; tells the scheme.
+        Any URL of the store; gives the scheme.
     """
 
     def __init__(self, url: str) -> None:
@@ -52,7 +52,7 @@ class ObjectHandler(pafs.FSSpecHandler):  # type: ignore[misc]  # pyarrow tells 
         try:
             return pa.PythonFile(file.open("rb"), mode="r")
         except InputError as error:
-            kind = FileNotFoundError if GONE.told in error.problem else OSError
+            kind = FileNotFoundError if GONE.words in error.problem else OSError
             raise kind(f"{file}: {error.problem}. {error.fix}") from None
 
 

@@ -3,7 +3,7 @@
 Columns are parted by white space, commas or semicolons, decimals by points. Rows that begin with `#`, `//` or `%` are
 comments; lines of words above the first row of numbers are a header, and where the last of them names as many columns
 as the rows have, the names are used. The form with two echoes, `x1 y1 z1 [i1] x2 y2 z2 [i2]`, is recognised by what a
-pulse can do, or told by `ascii_columns`.
+pulse can do, or set by `ascii_columns`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ COLUMN_NAMES = {
 SAMPLE_ROWS = 20_000
 HEADER_LINES = 50
 LINE_LIMIT = 65_536
-"""Bytes; a longer line is no row of points."""
+"""Bytes; a longer line is not a row of points."""
 BYTES_A_ROW = 24
 """A short row: blocks of the file are as many times this as rows are wanted."""
 BLOCK_LIMIT = 1 << 24
@@ -184,7 +184,7 @@ class AsciiFile:
         return None
 
     def _choose(self, wanted: str | None, names: list[str], sample: FloatArray) -> dict[str, int]:
-        """Column by field: as told, else as the header names them, else x y z, else a row of two echoes."""
+        """Column by field: as set, else as the header names them, else x y z, else a row of two echoes."""
         if wanted is not None:
             columns = _columns_of(wanted.lower().replace(",", " ").split())
             count = len(wanted.replace(",", " ").split())
@@ -251,7 +251,7 @@ class AsciiFile:
         classified = "classification" in at and not bool(
             np.isin(sample[:, at["classification"]], UNSORTED_CLASSES).all()
         )
-        told = ("rows hold the first and last echo of a pulse, read as two returns",) if self._is_pairs else ()
+        warnings = ("rows hold the first and last echo of a pulse, read as two returns",) if self._is_pairs else ()
         x_min, y_min, z_min, x_max, y_max, z_max = (float(value) for value in (*low, *high))
         return FileFacts(
             format="ascii",
@@ -262,7 +262,7 @@ class AsciiFile:
             has_gps_time=kind is not GpsTimeKind.NONE,
             gps_time_kind=kind,
             gps_time_range=None if kind is GpsTimeKind.NONE else times,
-            warnings=told,
+            warnings=warnings,
         )
 
 

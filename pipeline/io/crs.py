@@ -27,10 +27,10 @@ UNITS_M = {
     "mm": 0.001,
     "km": 1000.0,
 }
-"""Metres a unit, by the words that `--vertical-unit` understands."""
+"""Metres per unit, by the words that `--vertical-unit` understands."""
 
 EPSG_UNITS_M = {9001: 1.0, 9002: INTERNATIONAL_FOOT_M, 9003: US_SURVEY_FOOT_M}
-"""Metres a unit, by the EPSG codes that GeoTIFF keys use."""
+"""Metres per unit, by the EPSG codes that GeoTIFF keys use."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,19 +38,21 @@ class SpatialReference:
     """Where coordinates live and in which units."""
 
     wkt: str | None = None
-    """WKT2:2019 of the CRS, compound where it is; None where unknown."""
+    """WKT2:2019 of the CRS, compound if it is; None if unknown."""
     name: str = "unknown"
     """The CRS's own name."""
     epsg: int | None = None
-    """EPSG code of the whole CRS, compound where it is; None where it has none."""
+    """EPSG code of the whole CRS, compound where it is; None if it has none."""
     horizontal_unit_m: float = 1.0
-    """Metres a unit of easting and northing."""
+    """Metres per unit of easting and northing."""
     vertical_unit_m: float = 1.0
-    """Metres a unit of elevation."""
+    """Metres per unit of elevation."""
+    vertical_unit_assumed: bool = dataclasses.field(default=False, compare=False)
+    """True if nothing states the vertical unit and it is taken from the horizontal one."""
 
     @property
     def crs(self) -> pyproj.CRS | None:
-        """The CRS as a pyproj object; None where unknown."""
+        """The CRS as a pyproj object; None if unknown."""
         if self.wkt is None:
             return None
         import pyproj
@@ -59,13 +61,13 @@ class SpatialReference:
 
     @property
     def projjson(self) -> dict[str, Any] | None:
-        """PROJJSON of the whole CRS, compound where it is; None where unknown (GeoParquet's `crs: null`)."""
+        """PROJJSON of the whole CRS, compound if it is; None if unknown (GeoParquet's `crs: null`)."""
         crs = self.crs
         return None if crs is None else dict(crs.to_json_dict())
 
     @property
     def horizontal_crs(self) -> pyproj.CRS | None:
-        """The horizontal part as a pyproj object; None where unknown."""
+        """The horizontal part as a pyproj object; None if unknown."""
         crs = self.crs
         return None if crs is None else horizontal_part(crs)
 
@@ -75,7 +77,7 @@ UNKNOWN_REFERENCE = SpatialReference()
 
 
 def unit_in_metres(word: str, *, path: str) -> float:
-    """Metres a unit, from a word such as m, ft or us-ft.
+    """Metres per unit, from a word such as m, ft or us-ft.
 
     Raises
     ------
@@ -171,7 +173,7 @@ def resolve_reference(
     crs: str | None = None,
     vertical_unit: str | None = None,
 ) -> tuple[SpatialReference, tuple[str, ...]]:
-    """The reference of a file from its header and the user's overrides, and what is worth telling.
+    """The reference of a file from its header and the user's overrides, and warnings.
 
     Parameters
     ----------
@@ -180,11 +182,11 @@ def resolve_reference(
     header_crs : pyproj.CRS, optional
         As the header has it.
     header_horizontal_unit_m, header_vertical_unit_m : float, optional
-        Metres a unit, where the header tells a unit beside the CRS (GeoTIFF keys).
+        Metres per unit, if the header has a unit beside the CRS (GeoTIFF keys).
     crs : str, optional
-        The user's CRS; stands above the header's.
+        The user's CRS; overrides the header's.
     vertical_unit : str, optional
-        The user's vertical unit, a word of `UNITS_M`; stands above all else.
+        The user's vertical unit, a word of `UNITS_M`; overrides everything else.
 
     Returns
     -------
@@ -198,40 +200,43 @@ def resolve_reference(
     CrsError
         If the CRS is geographic or not understood, or the unit is not known.
     """
-    told: list[str] = []
+    warnings: list[str] = []
     chosen = header_crs
     if crs is not None:
         chosen = parse_crs(crs, path=path)
         if header_crs is not None and not horizontal_part(chosen).equals(
             horizontal_part(header_crs), ignore_axis_order=True
         ):
-            told.append(f"the given CRS {chosen.name!r} stands in place of the header's {header_crs.name!r}")
+            warnings.append(f"the given CRS {chosen.name!r} replaces the header's {header_crs.name!r}")
     vertical_m = None if vertical_unit is None else unit_in_metres(vertical_unit, path=path)
     if chosen is None:
         horizontal_m = 1.0 if header_horizontal_unit_m is None else header_horizontal_unit_m
-        told.append(
+        warnings.append(
             f"no usable CRS in the file: unknown, horizontal unit taken as {horizontal_m:g} m; give --crs EPSG:n"
         )
         if vertical_m is None:
             vertical_m = horizontal_m if header_vertical_unit_m is None else header_vertical_unit_m
-        return SpatialReference(horizontal_unit_m=horizontal_m, vertical_unit_m=vertical_m), tuple(told)
+        return SpatialReference(horizontal_unit_m=horizontal_m, vertical_unit_m=vertical_m), tuple(warnings)
 
     horizontal_m = horizontal_unit_of(chosen, path=path)
     if vertical_m is None:
         vertical_m = vertical_unit_of(chosen)
     if vertical_m is None and crs is None:
         vertical_m = header_vertical_unit_m
+    assumed = vertical_m is None
     if vertical_m is None:
         vertical_m = horizontal_m
-        told.append(
-            f"no vertical unit in CRS {chosen.name!r}: taken from the horizontal one ({horizontal_m:g} m); "
-            "give --vertical-unit where it is another"
-        )
+        if horizontal_m != 1.0:  # elevations in metres are common beside feet, so the user must decide
+            warnings.append(
+                f"no vertical unit in CRS {chosen.name!r}: taken from the horizontal one ({horizontal_m:g} m); "
+                "give --vertical-unit if it differs"
+            )
     reference = SpatialReference(
         wkt=chosen.to_wkt("WKT2_2019"),
         name=chosen.name,
         epsg=_epsg_of(chosen.srs),
         horizontal_unit_m=horizontal_m,
         vertical_unit_m=vertical_m,
+        vertical_unit_assumed=assumed,
     )
-    return reference, tuple(told)
+    return reference, tuple(warnings)

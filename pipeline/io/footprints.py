@@ -52,9 +52,9 @@ PROBLEMS = {
     "no_area": "invalid and without area",
     "invalid": "invalid",
 }
-"""What can be wrong with a footprint, and how several of them are told."""
+"""What can be wrong with a footprint, and how a message counts it."""
 ACCURACY_LIMIT_M = 0.5
-"""A coarser reprojection is told."""
+"""A coarser reprojection gives a warning."""
 AROUND_M = 100.0
 """How far off an area footprints are still read: more than its edges bend, and operations differ, between two CRS."""
 
@@ -114,7 +114,7 @@ def read_footprints(
 ) -> Footprints:
     """Footprints of a vector file, reprojected where its CRS is not the run's.
 
-    A feature that cannot be used stops nothing: it is left out, or repaired, and told among the issues.
+    A feature that cannot be used stops nothing: it is left out or repaired, and listed among the issues.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def read_footprints(
     area : Geometry, optional
         Where footprints are wanted, in metres of the run's CRS. Of a file that covers a country all others are passed
         over unread, but for features whose place is not known. The boxes around its parts decide, 100 m wider: who
-        needs its very border cuts there. Whether a column of ids serves is told from what was read.
+        needs its very border cuts there. Whether an id column is usable is decided by the features that were read.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def read_footprints(
         If its coordinates are degrees and the run's CRS is unknown, or a CRS is not understood.
     """
     name = shown(str(path))
-    told: list[str] = []
+    warnings: list[str] = []
 
     def boxes(own: str | None) -> npt.NDArray[np.float64] | None:
         return None if area is None else _boxes(area, own if crs is None else crs, reference, name)
@@ -159,7 +159,7 @@ def read_footprints(
         lost = f"none of the {len(found.geometries)} features is a polygon"
         raise EmptyInputError(name, lost, "Give polygons of buildings")
     polygons = shapely.force_2d(geometries[kept])
-    polygons = _in_metres(name, polygons, found.crs if crs is None else crs, reference, told)
+    polygons = _in_metres(name, polygons, found.crs if crs is None else crs, reference, warnings)
     whole = np.isfinite(shapely.bounds(polygons)).all(axis=1)
     for row in kept[~whole].tolist():
         problems[row] = ("outside_crs", "it cannot be reprojected to the run's CRS")
@@ -187,7 +187,7 @@ def read_footprints(
         ids=ids,
         polygons=tuple(polygons.tolist()),
         attributes=tuple({field: table[field][row] for field in table} for row in kept.tolist()),
-        warnings=(*told, *_summary(issues)),
+        warnings=(*warnings, *_summary(issues)),
         issues=issues,
         elsewhere=found.elsewhere,
     )
@@ -196,7 +196,7 @@ def read_footprints(
 def _boxes(
     area: shapely.Geometry, crs: str | None, reference: SpatialReference, name: str
 ) -> npt.NDArray[np.float64] | None:
-    """Boxes around the parts of an area in a layer's CRS, (k, 4); None where they cannot be told there."""
+    """Boxes around the parts of an area in a layer's CRS, (k, 4); None if they cannot be computed there."""
     own, target = None if crs is None else horizontal_part(parse_crs(crs, path=name)), reference.horizontal_crs
     around = shapely.bounds(shapely.get_parts(area)) + AROUND_M * np.array([-1.0, -1.0, 1.0, 1.0])
     boxes: npt.NDArray[np.float64] = around / reference.horizontal_unit_m
@@ -212,7 +212,7 @@ def _boxes(
 
 
 def _polygons_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> npt.NDArray[np.object_]:
-    """Geometries, None where a feature is no polygon; why goes to the problems, by row."""
+    """Geometries, None if a feature is not a polygon; the reason goes to the problems, by row."""
     geometries = layer.geometries.copy()
     kinds = shapely.get_type_id(geometries)
     polygonal = np.isin(kinds, (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON))
@@ -235,23 +235,23 @@ def _polygons_only(layer: VectorLayer, problems: dict[int, tuple[str, str]]) -> 
 def _summary(issues: Sequence[FootprintIssue]) -> list[str]:
     """What was left out and repaired, in one sentence each."""
     left_out = Counter(issue.problem for issue in issues if issue.action == "left out")
-    told = []
+    warnings = []
     if left_out:
         reasons = ", ".join(f"{count} {PROBLEMS[problem]}" for problem, count in left_out.items())
-        told.append(f"{left_out.total()} features are left out: {reasons}")
+        warnings.append(f"{left_out.total()} features are left out: {reasons}")
     n_repaired = len(issues) - left_out.total()
     if n_repaired:
-        told.append(f"{n_repaired} footprints are invalid and were repaired")
-    return told
+        warnings.append(f"{n_repaired} footprints are invalid and were repaired")
+    return warnings
 
 
 def _in_metres(
-    name: str, polygons: npt.NDArray[np.object_], crs: str | None, reference: SpatialReference, told: list[str]
+    name: str, polygons: npt.NDArray[np.object_], crs: str | None, reference: SpatialReference, warnings: list[str]
 ) -> npt.NDArray[np.object_]:
     """The polygons in metres of the run's CRS."""
     own, target = None if crs is None else horizontal_part(parse_crs(crs, path=name)), reference.horizontal_crs
     if own is None:
-        told.append("the footprints have no CRS: that of the points is assumed")
+        warnings.append("the footprints have no CRS: that of the points is assumed")
     elif target is None:
         # Raises where the footprints are in degrees: metres and degrees cannot meet.
         if not math.isclose(horizontal_unit_of(own, path=name), reference.horizontal_unit_m, rel_tol=1e-9):
@@ -260,9 +260,9 @@ def _in_metres(
                 f"the footprints are in {own.name!r} and the points' CRS is unknown, with another unit",
                 "Give --crs for the points",
             )
-        told.append(f"the points' CRS is unknown: that of the footprints, {own.name!r}, is assumed to be the same")
+        warnings.append(f"the points' CRS is unknown: that of the footprints, {own.name!r}, is assumed to be the same")
     elif len(polygons) and not own.equals(target, ignore_axis_order=True):
-        polygons = _reprojected(name, polygons, own, target, told)
+        polygons = _reprojected(name, polygons, own, target, warnings)
     if reference.horizontal_unit_m == 1.0:
         return polygons
     scaled: npt.NDArray[np.object_] = shapely.transform(polygons, lambda xy: xy * reference.horizontal_unit_m)
@@ -270,7 +270,7 @@ def _in_metres(
 
 
 def _reprojected(
-    name: str, polygons: npt.NDArray[np.object_], own: pyproj.CRS, target: pyproj.CRS, told: list[str]
+    name: str, polygons: npt.NDArray[np.object_], own: pyproj.CRS, target: pyproj.CRS, warnings: list[str]
 ) -> npt.NDArray[np.object_]:
     """The polygons in another CRS, with a word on how well that can be done."""
     import pyproj
@@ -293,9 +293,9 @@ def _reprojected(
         good_to = (
             "an unknown accuracy" if accuracy_m is None or accuracy_m < 0.0 else f"an accuracy of {accuracy_m:g} m"
         )
-        told.append(f"the footprints are reprojected from {own.name!r} to {target.name!r} with {good_to}")
+        warnings.append(f"the footprints are reprojected from {own.name!r} to {target.name!r} with {good_to}")
     else:
-        told.append(f"the footprints are reprojected from {own.name!r} to {target.name!r}")
+        warnings.append(f"the footprints are reprojected from {own.name!r} to {target.name!r}")
     return moved
 
 

@@ -1,7 +1,7 @@
 """GeoParquet as input: what its `geo` metadata say of a geometry column, and the column as WKB.
 
 Read are versions 1.0 and 1.1 (https://geoparquet.org/releases/v1.1.0/) with WKB, and 1.1's own encodings of polygons.
-A missing `crs` means OGC:CRS84, longitude and latitude; `null` means that nobody knows.
+A missing `crs` means OGC:CRS84, longitude and latitude; `null` means unknown.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class GeometryColumn:
 
 
 def geometry_column(path: Path, schema: pa.Schema, column: str | None = None) -> GeometryColumn:
-    """What a file's schema tells of a geometry column; None for the primary one.
+    """The facts about a geometry column in a file's schema; None for the primary one.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def read_geoparquet(
     column : str, optional
         The geometry column; None for the primary one.
     boxes : callable, optional
-        Where features are wanted: as of `pipeline.io.vector_layer.read_layer`.
+        Where features are wanted: as in `pipeline.io.vector_layer.read_layer`.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def read_geoparquet(
     Raises
     ------
     UnreadableInputError
-        It is no Parquet, says nothing of geometry, or encodes it in a way that is not read.
+        It is not Parquet, has no geometry, or encodes it in a way that is not supported.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -111,13 +111,13 @@ def _files_at(url: str, cut: Cut) -> list[str]:
     if pattern or url.endswith("/"):
         if not lists:
             raise UnreadableInputError(
-                shown(url), "a web server tells no list of its files", "Name the files, or a tile index that names them"
+                shown(url), "a web server does not list its files", "Name the files, or a tile index that names them"
             )
         return _listed(url, pattern=pattern)
     file = RemoteFile(url)
     if is_index(file):
         return list(cut(read_tile_index(url)))
-    file.stat()  # told now, not when its turn comes
+    file.stat()  # fails now, not when its turn comes
     return [url]
 
 

@@ -1,7 +1,7 @@
 """LAS 1.2 to 1.4 and LAZ, streamed. COPC is LAZ too; a window of it is read through its octree.
 
 laspy knows the header, the records and their bit fields; decompression goes to lazrs directly, because only then the
-fields that nobody uses can be left out, and because errors must be told by file and fix.
+unused fields can be left out, and because errors must name file and fix.
 """
 
 from __future__ import annotations
@@ -157,19 +157,17 @@ class LasFile:
         if item_size != self._block.point_size:
             raise InconsistentInputError(
                 str(self._path),
-                f"the header has {self._block.point_size} bytes a point, its point format and extra fields {item_size}",
+                f"the header has {self._block.point_size} bytes per point, its format and extra fields {item_size}",
                 REWRITE,
             )
         return header
 
     def _read_laszip_record(self) -> bytes:
-        """The LAZ record, which tells how the points are compressed."""
+        """The LAZ VLR, which describes the compression."""
         try:
             return bytes(self._header.vlrs[self._header.vlrs.index("LasZipVlr")].record_data)
         except ValueError as fault:
-            raise UnreadableInputError(
-                str(self._path), "compressed, but without the LAZ record that tells how", REWRITE
-            ) from fault
+            raise UnreadableInputError(str(self._path), "the file is compressed but has no LAZ VLR", REWRITE) from fault
 
     def _check_room(self) -> None:
         """Hold the promised count against the bytes of an uncompressed file."""
@@ -304,7 +302,7 @@ class LasFile:
         )
 
     def _bounds(self) -> tuple[float, float, float, float, float, float]:
-        """The header's bounds; where they cannot be, those of a pass over the points."""
+        """The header's bounds; if they are impossible, those of a pass over the points."""
         lows, highs = np.array(self._header.mins), np.array(self._header.maxs)
         if not (np.isfinite(lows).all() and np.isfinite(highs).all() and (lows <= highs).all()):
             self._warnings.append(

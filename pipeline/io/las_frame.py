@@ -1,4 +1,4 @@
-"""What a LAS file has beside its points, byte for byte, for whoever writes the file anew.
+"""Everything in a LAS file except its points, byte for byte, for writing the file again.
 
 Source: ASPRS, LAS Specification 1.4 R15, tables 3, 4 and 22.
 """

@@ -27,7 +27,7 @@ EVLR_LIMIT = 10_000
 """Extended records looked at: files have a handful, and a damaged count is in the billions."""
 WKT_RECORD_ID = 2112
 WKT_SIZE_LIMIT = 1 << 20
-"""A longer text is no CRS."""
+"""A longer text is not a CRS."""
 COMPRESSED_BIT = 0x80
 
 GEOKEY_MODEL_TYPE = 1024
@@ -198,10 +198,10 @@ class HeaderCrs:
 
 
 def header_crs(path: Readable, header: laspy.LasHeader, block: HeaderBlock) -> HeaderCrs:
-    """The CRS from WKT, which stands above GeoTIFF keys where a file has both."""
+    """The CRS from WKT, which overrides GeoTIFF keys if a file has both."""
     import pyproj
 
-    told: list[str] = []
+    warnings: list[str] = []
     texts = [vlr.string for vlr in header.vlrs.get("WktCoordinateSystemVlr")]
     if block.evlr_count:
         with path.open("rb") as stream:
@@ -218,11 +218,11 @@ def header_crs(path: Readable, header: laspy.LasHeader, block: HeaderBlock) -> H
             try:
                 crs = pyproj.CRS.from_wkt(text)
             except pyproj.exceptions.CRSError as fault:
-                told.append(f"the header's WKT is not understood ({str(fault)[:120]})")
+                warnings.append(f"the header's WKT is not understood ({str(fault)[:120]})")
     if crs is None and keys:
         crs, more = _crs_of_geokeys(header, keys)
-        told.extend(more)
-    return HeaderCrs(crs=crs, horizontal_unit_m=horizontal_m, vertical_unit_m=vertical_m, warnings=tuple(told))
+        warnings.extend(more)
+    return HeaderCrs(crs=crs, horizontal_unit_m=horizontal_m, vertical_unit_m=vertical_m, warnings=tuple(warnings))
 
 
 def _crs_of_geokeys(header: laspy.LasHeader, keys: dict[int, int]) -> tuple[pyproj.CRS | None, list[str]]:

@@ -64,7 +64,7 @@ def read_chunk_table(path: Readable, stream: BinaryIO, block: HeaderBlock, laszi
         raise UnreadableInputError(name, f"the LAZ record in the header is damaged ({fault})", FIX) from fault
     if item_size != block.point_size:
         raise InconsistentInputError(
-            name, f"the header has {block.point_size} bytes a point, its LAZ record {item_size}", FIX
+            name, f"the header has {block.point_size} bytes per point, its LAZ record {item_size}", FIX
         )
     table_at = _table_offset(stream, block)
     if not start + 8 < table_at <= block.file_size - 8:

@@ -1,4 +1,4 @@
-"""Which features of a large vector file lie near the data, told batch by batch from their bounds alone."""
+"""Which features of a large vector file lie near the data, found batch by batch from their bounds alone."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BATCH = 16_384
 
 Boxes = Callable[[str | None], npt.NDArray[np.float64] | None]
 """From a layer's CRS, as the file has it, to boxes in that CRS, (k, 4) float64: xmin, ymin, xmax, ymax. None where
-they cannot be told there."""
+they cannot be computed there."""
 
 
 class Nearby:

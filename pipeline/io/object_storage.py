@@ -79,7 +79,7 @@ class ObjectStorage:
             self._tried("written", key, lambda fs: fs.put_file(str(temporary), path))
 
     def put(self, key: str, content: bytes) -> None:
-        """Put bytes under a key, in place of what stood there."""
+        """Put bytes under a key and replace what was there."""
         self._put(key, content, lambda: None)
 
     def _put(self, key: str, content: bytes, check: Callable[[], None]) -> None:
@@ -104,7 +104,7 @@ class ObjectStorage:
         return content
 
     def has(self, key: str) -> bool:
-        """Whether an object stands under the key; asks for it by name, never by a listing."""
+        """Whether there is an object under the key; asks for it by name, never by a listing."""
         return self._info(key) is not None
 
     def size(self, key: str) -> int:
@@ -147,7 +147,7 @@ class ObjectStorage:
         return "/".join((self._root, *parts_of_key(key)))
 
     def _info(self, key: str) -> dict[str, Any] | None:
-        """What the store tells of an object; None where there is none."""
+        """The store's facts about an object; None if there is none."""
         path = self._path(key)
         try:
             info: dict[str, Any] = self._tried("looked for", key, lambda fs: fs.info(path))
@@ -175,13 +175,13 @@ class ObjectStorage:
         try:
             return persistently(lambda: work(filesystem), self.policy, check=check)
         except GaveUpError as error:
-            told = f"{self.url}/{key}" if key else self.url
+            label = f"{self.url}/{key}" if key else self.url
             kind = _NotThereError if error.cause is GONE else RunError
-            raise kind(f"{told} cannot be {done}: {error.problem}. {error.cause.fix}") from None
+            raise kind(f"{label} cannot be {done}: {error.problem}. {error.cause.fix}") from None
 
 
 class _NotThereError(RunError):
-    """There is no such object; that there is no such bucket is another matter."""
+    """There is no such object. A missing bucket is a different error."""
 
 
 class _Window:

@@ -54,7 +54,7 @@ LINE_LIMIT = 65_536
 NUMBER_LIMIT = 64
 """Characters of a number; no row of numbers is longer than this allows, which bounds what is held at once."""
 SINGLE_PRECISION_FAULT = 0.01
-"""Units of the CRS; single precision coarser than this is told."""
+"""Units of the CRS; coarser single precision gives a warning."""
 FIX = "Get the file again, or write it again"
 
 
@@ -136,7 +136,7 @@ class PlyFile:
         for element in self._elements[:index]:
             if element.has_lists:
                 raise UnreadableInputError(
-                    name, f"element {element.name} with lists stands before the vertices", "Write the vertices first"
+                    name, f"element {element.name} with lists comes before the vertices", "Write the vertices first"
                 )
             at += element.count * element.dtype(self._byte_order).itemsize
         itemsize = self._vertex.dtype(self._byte_order).itemsize
@@ -255,12 +255,14 @@ class PlyFile:
         if not self._byte_order:
             return ()
         kinds = dict(self._vertex.properties)
-        told = []
+        warnings = []
         for axis, value in zip("xyz", largest.tolist(), strict=True):
             step = float(np.spacing(np.float32(value)))
             if SCALARS[kinds[axis]] == "f4" and step > SINGLE_PRECISION_FAULT:
-                told.append(f"{axis} is in single precision: at {value:.0f} its steps are {step:g} units; write double")
-        return tuple(told)
+                warnings.append(
+                    f"{axis} is in single precision: at {value:.0f} its steps are {step:g} units; write double"
+                )
+        return tuple(warnings)
 
 
 def _with_property(element: Element, name: str, kind: str) -> Element:

@@ -15,7 +15,7 @@ class FileStatus(Protocol):
 
     @property
     def st_mtime_ns(self) -> int:
-        """When it was last written, nanoseconds since 1970; 0 where nobody knows."""
+        """When it was last written, nanoseconds since 1970; 0 if unknown."""
 
 
 class Readable(Protocol):
@@ -30,7 +30,7 @@ class Readable(Protocol):
         """The ending of the name, with its dot."""
 
     def stat(self) -> FileStatus:
-        """Size and time; raises OSError where there is no such file."""
+        """Size and time; raises OSError if there is no such file."""
 
     def open(self, mode: Literal["rb"], /) -> io.BufferedReader:
         """Its bytes."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pyproj
 
 UNSORTED_CLASSES = (0, 1)
-"""ASPRS classes of points that nobody classified: never classified, unassigned."""
+"""ASPRS classes of unclassified points: never classified, unassigned."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -75,11 +75,11 @@ class FileFacts:
     bounds: tuple[float, float, float, float, float, float]
     """x_min, y_min, z_min, x_max, y_max, z_max."""
     crs: pyproj.CRS | None = None
-    """As in the header; None where there is none or it cannot be understood (then a warning tells)."""
+    """As in the header; None if there is none, or if it cannot be understood (then there is a warning)."""
     horizontal_unit_m: float | None = None
-    """Metres a horizontal unit, where the header tells it beside the CRS."""
+    """Metres per horizontal unit, if the header has it beside the CRS."""
     vertical_unit_m: float | None = None
-    """Metres a vertical unit, where the header tells it beside the CRS."""
+    """Metres per vertical unit, if the header has it beside the CRS."""
     has_returns: bool = False
     """Whether any pulse has more than one return."""
     has_classes: bool = False

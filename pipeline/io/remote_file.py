@@ -30,21 +30,21 @@ BLOCKS_KEPT = 64
 MAX_AHEAD = 32
 """Blocks that are read at once where a file is read on and on: 8 MiB."""
 PIECE_BYTES = 1 << 24
-"""Fetched by one request: what a cut connection costs at most."""
+"""Fetched by one request: the most that a broken connection costs."""
 _FETCHES = 2
 """A file that changes while it is fetched is fetched once more."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RemoteStatus:
-    """What a server tells of a file."""
+    """A server's facts about a file."""
 
     st_size: int
     """Bytes."""
     st_mtime_ns: int
-    """When it was last written, nanoseconds since 1970; 0 where it is not told."""
+    """When it was last written, nanoseconds since 1970; 0 if unknown."""
     etag: str
-    """Changes with the content; empty where it is not told."""
+    """Changes with the content; empty if unknown."""
 
 
 class RemoteFile:
@@ -55,7 +55,7 @@ class RemoteFile:
     url : str
         `s3://`, `https://` or `http://`, with its query.
     policy : RetryPolicy
-        How often and how long requests are made again.
+        How often and how long requests are repeated.
     """
 
     def __init__(self, url: str, policy: RetryPolicy = POLICY) -> None:
@@ -88,7 +88,7 @@ class RemoteFile:
         Raises
         ------
         UnreadableInputError
-            The server does not tell it.
+            The server does not report them.
         """
         if self._status is None:
             self._status = self._asked()
@@ -98,13 +98,13 @@ class RemoteFile:
         info = self._tried(lambda: self._filesystem.info(self.url))
         if info.get("type", "file") != "file":
             raise UnreadableInputError(str(self), "a folder, not a file", "End its name with / to take what is in it")
-        told = info.get("size")
-        # a server that makes a file as it sends it tells no size
-        size = Path(self._held()).stat().st_size if told is None else int(told)
+        sent = info.get("size")
+        # a server that makes a file as it sends it gives no size
+        size = Path(self._held()).stat().st_size if sent is None else int(sent)
         return RemoteStatus(st_size=size, st_mtime_ns=_time_ns(info), etag=str(info.get("ETag") or ""))
 
     def open(self, mode: Literal["rb"] = "rb", /) -> io.BufferedReader:
-        """Its bytes; whoever reads on and on reads larger pieces.
+        """Its bytes; sequential reading uses larger pieces.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class RemoteFile:
         Raises
         ------
         UnreadableInputError
-            They cannot be had.
+            They cannot be read.
         """
         end = min(begin + length, self.stat().st_size)
         parts = []
@@ -180,7 +180,7 @@ class RemoteFile:
             return stream.read(end - begin)
 
     def _held(self) -> str:
-        """A whole copy in a temporary file, which goes when this object goes: of a server that knows no ranges."""
+        """A whole copy in a temporary file, removed with this object; for servers without range requests."""
         if self._whole is None:
             # closed by its own finaliser
             copy = tempfile.NamedTemporaryFile(prefix="gablework-")  # noqa: SIM115
@@ -205,7 +205,7 @@ class RemoteFile:
         Raises
         ------
         UnreadableInputError
-            It cannot be had, or changes again and again.
+            It cannot be read, or changes again and again.
         OSError
             This machine's disk does not take it.
         """
@@ -223,10 +223,12 @@ class RemoteFile:
             self._status, self._handle = None, None
             if self.stat() == before:
                 return
-        raise UnreadableInputError(str(self), "it changes while it is read", "Try again when nobody writes it any more")
+        raise UnreadableInputError(
+            str(self), "it changes while it is read", "Try again when it is no longer being written"
+        )
 
     def _tried(self, work: Callable[[], Any]) -> Any:
-        """What a request gives, tried again where that may help.
+        """The result of a request, repeated if that may help.
 
         Raises
         ------
@@ -277,16 +279,16 @@ class _Ranges(io.RawIOBase):
 
 
 def _time_ns(info: dict[str, Any]) -> int:
-    """When a file was written, by what S3 or HTTP tell."""
-    told = info.get("LastModified") or info.get("Last-Modified")
-    if isinstance(told, str):
+    """When a file was written, from the fields of S3 or HTTP."""
+    written = info.get("LastModified") or info.get("Last-Modified")
+    if isinstance(written, str):
         from email.utils import parsedate_to_datetime  # most runs read no file of a server
 
         try:
-            told = parsedate_to_datetime(told)
+            written = parsedate_to_datetime(written)
         except ValueError:
             return 0
-    return int(told.timestamp()) * 1_000_000_000 if isinstance(told, dt.datetime) else 0
+    return int(written.timestamp()) * 1_000_000_000 if isinstance(written, dt.datetime) else 0
 
 
 def file_at(location: str | Path) -> Readable:
@@ -296,7 +298,7 @@ def file_at(location: str | Path) -> Readable:
 
 @contextlib.contextmanager
 def on_this_machine(location: str | Path, folder: Path | None = None) -> Iterator[Path]:
-    """A file as a path of this machine, for libraries that know nothing else: fetched where it lies behind a URL.
+    """A file as a path of this machine, for libraries that need one; fetched if it is behind a URL.
 
     Parameters
     ----------

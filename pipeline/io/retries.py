@@ -1,7 +1,7 @@
-"""Which faults of a storage or server are worth another attempt, and after how long: tables and pure functions.
+"""Faults of a storage or server that are worth another attempt, and the wait before it: tables and pure functions.
 
-Waits double from attempt to attempt up to a bound, and each is drawn between half of it and all of it, so that
-workers that failed together do not come back together. Only `persistently` looks at a clock and sleeps.
+Waits double from attempt to attempt up to a bound. Each is drawn between half of it and all of it, so workers that
+failed together do not return together. Only `persistently` looks at a clock and sleeps.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ _LONGEST_DETAIL = 300
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RetryPolicy:
-    """How often and how long something is tried."""
+    """How often and how long a request is tried."""
 
     attempts: int = 6
-    """At most; waits of 15 s together lie between them, longer than a storage server takes to fail over."""
+    """Largest number; the waits between them add up to 15 s, longer than a storage server takes to fail over."""
     first_wait_s: float = 0.5
-    """At most, after the first failure; it doubles with each further one."""
+    """Longest wait after the first failure; it doubles with each further one."""
     longest_wait_s: float = 20.0
-    """No wait is longer."""
+    """Longest wait of all."""
     patience_s: float = 300.0
-    """No attempt begins later than this after the first one: attempts that time out take a minute each."""
+    """Time after the first attempt when no other begins: attempts that time out take a minute each."""
 
     def wait_s(self, failures: int, elapsed_s: float, draw: float) -> float | None:
-        """Seconds to wait before the next attempt; None where there is to be none.
+        """Seconds to wait before the next attempt; None if there is none.
 
         Parameters
         ----------
@@ -63,19 +63,19 @@ class RetryPolicy:
 
 
 POLICY = RetryPolicy()
-"""What is used unless told otherwise."""
+"""The default policy."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cause:
     """Why a request failed."""
 
-    told: str
-    """In words."""
+    words: str
+    """The cause in words."""
     again: bool
     """Whether another attempt may succeed."""
     fix: str
-    """What the user can do."""
+    """The user's way out."""
 
 
 _LATER = "Try again later"
@@ -83,26 +83,26 @@ _RIGHTS = "Check the credentials, and what they are allowed to do"
 _NAME = "Check the name"
 _NETWORK = "Check the network and the name of the server"
 
-GONE = Cause(told="there is no such thing", again=False, fix=_NAME)
-"""Nothing is there; a store, and whoever asks, may find that in order."""
-_BUSY = Cause(told="the server is busy", again=True, fix=_LATER)
-_BROKEN = Cause(told="the server is in trouble", again=True, fix=_LATER)
-_FORBIDDEN = Cause(told="access is denied", again=False, fix=_RIGHTS)
-_LATE = Cause(told="no answer in time", again=True, fix=_NETWORK)
-_CUT = Cause(told="the connection broke", again=True, fix=_NETWORK)
-_CHANGED = Cause(told="it changed while it was read", again=False, fix="Try again when nobody writes it any more")
+GONE = Cause(words="there is no such thing", again=False, fix=_NAME)
+"""Nothing is there; the caller may accept that."""
+_BUSY = Cause(words="the server is busy", again=True, fix=_LATER)
+_BROKEN = Cause(words="the server is in trouble", again=True, fix=_LATER)
+_FORBIDDEN = Cause(words="access is denied", again=False, fix=_RIGHTS)
+_LATE = Cause(words="no answer in time", again=True, fix=_NETWORK)
+_CUT = Cause(words="the connection broke", again=True, fix=_NETWORK)
+_CHANGED = Cause(words="it changed while it was read", again=False, fix="Try again when it is no longer being written")
 
 CODES: Mapping[str, Cause] = MappingProxyType(
     {
-        "NoSuchBucket": Cause(told="there is no such bucket", again=False, fix="Make the bucket, or check its name"),
+        "NoSuchBucket": Cause(words="there is no such bucket", again=False, fix="Make the bucket, or check its name"),
         "NoSuchKey": GONE,
         "AccessDenied": _FORBIDDEN,
         "InvalidAccessKeyId": _FORBIDDEN,
         "SignatureDoesNotMatch": _FORBIDDEN,
-        "ExpiredToken": Cause(told="the credentials have expired", again=False, fix="Get new credentials"),
-        "RequestTimeTooSkewed": Cause(told="the clocks differ", again=False, fix="Set this machine's clock"),
+        "ExpiredToken": Cause(words="the credentials have expired", again=False, fix="Get new credentials"),
+        "RequestTimeTooSkewed": Cause(words="the clocks differ", again=False, fix="Set this machine's clock"),
         "PermanentRedirect": Cause(
-            told="the bucket is in another region", again=False, fix="Set AWS_REGION to the bucket's region"
+            words="the bucket is in another region", again=False, fix="Set AWS_REGION to the bucket's region"
         ),
         "PreconditionFailed": _CHANGED,
         "RequestTimeout": _LATE,
@@ -114,7 +114,7 @@ CODES: Mapping[str, Cause] = MappingProxyType(
         "BandwidthLimitExceeded": _BUSY,
         "ServiceUnavailable": _BUSY,
         "InternalError": _BROKEN,
-        "OperationAborted": Cause(told="another request got in the way", again=True, fix=_LATER),
+        "OperationAborted": Cause(words="another request got in the way", again=True, fix=_LATER),
         # what was sent is not what arrived
         "BadDigest": _CUT,
         "IncompleteBody": _CUT,
@@ -124,7 +124,7 @@ CODES: Mapping[str, Cause] = MappingProxyType(
 """By the code of the S3 protocol."""
 STATUSES: Mapping[int, Cause] = MappingProxyType(
     {
-        401: Cause(told="the server asks for credentials", again=False, fix=_RIGHTS),
+        401: Cause(words="the server asks for credentials", again=False, fix=_RIGHTS),
         403: _FORBIDDEN,
         404: GONE,
         408: _LATE,
@@ -140,12 +140,12 @@ STATUSES: Mapping[int, Cause] = MappingProxyType(
 )
 """By the status of an answer; others of 500 and above are worth another attempt, too, those below are not."""
 _CREDENTIALS = Cause(
-    told="there are no credentials",
+    words="there are no credentials",
     again=False,
     fix="Set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE, or AWS_NO_SIGN_REQUEST=YES for open data",
 )
 _CERTIFICATE = Cause(
-    told="the server's certificate is not trusted",
+    words="the server's certificate is not trusted",
     again=False,
     fix="Name the authority's certificate in AWS_CA_BUNDLE (s3://) or SSL_CERT_FILE (https://)",
 )
@@ -158,9 +158,9 @@ KINDS: Mapping[str, Cause] = MappingProxyType(
         "SSLError": _CERTIFICATE,
         "NoCredentialsError": _CREDENTIALS,
         "PartialCredentialsError": _CREDENTIALS,
-        "ProfileNotFound": Cause(told="there is no such profile", again=False, fix="Check AWS_PROFILE"),
-        "InvalidURL": Cause(told="this is no URL", again=False, fix="Check the URL"),
-        "TooManyRedirects": Cause(told="the server redirects in circles", again=False, fix="Check the URL"),
+        "ProfileNotFound": Cause(words="there is no such profile", again=False, fix="Check AWS_PROFILE"),
+        "InvalidURL": Cause(words="this is not a URL", again=False, fix="Check the URL"),
+        "TooManyRedirects": Cause(words="the server redirects in circles", again=False, fix="Check the URL"),
         "TimeoutError": _LATE,
         "ConnectTimeoutError": _LATE,
         "ReadTimeoutError": _LATE,
@@ -181,7 +181,7 @@ KINDS: Mapping[str, Cause] = MappingProxyType(
 )
 """By the name of an exception's class or of one that it derives from: the libraries that raise them load only where
 they are used. In the order in which they are looked for."""
-UNKNOWN = Cause(told="it failed", again=False, fix="See what the error says")
+UNKNOWN = Cause(words="it failed", again=False, fix="See what the error says")
 """What is not in the tables: another attempt would hide a fault of the program."""
 LOCAL_FAULTS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EMFILE, errno.ENFILE})
 """Errors of this machine's own disk, which have nothing to do with the storage that is talked to."""
@@ -192,7 +192,7 @@ class ShortReadError(OSError):
 
 
 class GaveUpError(Exception):
-    """No attempt succeeded; whoever asked tells it in its own words.
+    """No attempt succeeded; the caller adds the context.
 
     Parameters
     ----------
@@ -212,13 +212,13 @@ class GaveUpError(Exception):
 
     @property
     def problem(self) -> str:
-        """The cause, what was said, and how often it was tried, in a line."""
+        """The cause, the detail, and the number of attempts, in one line."""
         tries = f" at all of {self.attempts} attempts" if self.attempts > 1 else ""
-        return f"{self.cause.told}{tries} ({self.detail})"
+        return f"{self.cause.words}{tries} ({self.detail})"
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
-    """An error and what it came of."""
+    """An error and its causes."""
     at: BaseException | None = error
     seen: set[int] = set()
     while at is not None and id(at) not in seen:
@@ -228,7 +228,7 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def _answer(error: BaseException) -> tuple[str, int]:
-    """Code and status of the answer that an error tells of, empty and 0 where it tells none."""
+    """Code and status of the answer in an error; empty and 0 without one."""
     response: Any = getattr(error, "response", None)
     if isinstance(response, Mapping):
         code = str(response.get("Error", {}).get("Code", ""))
@@ -238,9 +238,9 @@ def _answer(error: BaseException) -> tuple[str, int]:
 
 
 def cause_of(error: BaseException) -> Cause:
-    """Why a request failed, by the tables: what the server said counts before what a library made of it.
+    """Why a request failed, by the tables: the server's answer counts before the library's error.
 
-    >>> cause_of(TimeoutError()).again, cause_of(PermissionError()).again, cause_of(ValueError("x")).told
+    >>> cause_of(TimeoutError()).again, cause_of(PermissionError()).again, cause_of(ValueError("x")).words
     (True, False, 'it failed')
     """
     chain = list(_chain(error))
@@ -252,7 +252,7 @@ def cause_of(error: BaseException) -> Cause:
         if status in STATUSES:
             return STATUSES[status]
         if status >= 400:
-            return dataclasses.replace(UNKNOWN, told=f"the server answers {status}", again=status >= 500)
+            return dataclasses.replace(UNKNOWN, words=f"the server answers {status}", again=status >= 500)
     names = {kind.__name__ for link in chain for kind in type(link).__mro__}
     return next((cause for name, cause in KINDS.items() if name in names), UNKNOWN)
 
@@ -263,7 +263,7 @@ def is_local(error: BaseException) -> bool:
 
 
 def without_secrets(text: str) -> str:
-    """A text whose URLs have no user, password or query any more: signatures and tokens stand there.
+    """A text with user, password and query removed from its URLs, as they may hold signatures and tokens.
 
     >>> without_secrets("GET https://me:pw@host/a.laz?X-Amz-Signature=1f, then 403")
     'GET https://host/a.laz?…, then 403'
@@ -276,12 +276,12 @@ def without_secrets(text: str) -> str:
 
 
 def detail_of(error: BaseException) -> str:
-    """What an error says, in a line without secrets, with the status of the answer where it has one."""
+    """An error's text in one line, without secrets, with the status of the answer if it has one."""
     deepest = next((link for link in _chain(error) if _answer(link) != ("", 0)), error)
     status = _answer(deepest)[1]
     text = " ".join(without_secrets(str(deepest)).split()) or type(deepest).__name__
-    told = text if not status or str(status) in text else f"status {status}: {text}"
-    return told if len(told) <= _LONGEST_DETAIL else f"{told[:_LONGEST_DETAIL]}…"
+    detail = text if not status or str(status) in text else f"status {status}: {text}"
+    return detail if len(detail) <= _LONGEST_DETAIL else f"{detail[:_LONGEST_DETAIL]}…"
 
 
 def persistently(
@@ -293,7 +293,7 @@ def persistently(
     sleep: Callable[[float], None] = time.sleep,
     draw: Callable[[], float] = random.random,
 ) -> Result:
-    """The result of some work that may be done twice, tried again where that may help.
+    """The result of repeatable work, tried again if that may help.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ def persistently(
         try:
             return work()
         except GableworkError:
-            raise  # told already, after attempts of its own
+            raise  # already reported, after its own attempts
         except Exception as error:
             if is_local(error):
                 raise
@@ -328,6 +328,6 @@ def persistently(
             cause = cause_of(error)
             wait_s = policy.wait_s(failures, clock() - began_s, draw()) if cause.again else None
             if wait_s is None:
-                # what the libraries raise may hold secrets, and would be told with it
+                # the libraries' error may hold secrets and would be shown with it
                 raise GaveUpError(cause, detail_of(error), failures) from None
         sleep(wait_s)

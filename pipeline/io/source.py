@@ -36,9 +36,9 @@ class ReadOptions:
     """What the user says about the inputs and wants of them."""
 
     crs: str | None = None
-    """EPSG code, WKT or PROJ string that stands above the header's CRS."""
+    """EPSG code, WKT or PROJ string that overrides the header's CRS."""
     vertical_unit: str | None = None
-    """Unit of elevation that stands above the header's: m, ft, us-ft or another word of `crs.UNITS_M`."""
+    """Unit of elevation that overrides the header's: m, ft, us-ft or another word of `crs.UNITS_M`."""
     bbox: tuple[float, float, float, float] | None = None
     """x_min, y_min, x_max, y_max in the units of the CRS; closed."""
     aoi: Polygon | MultiPolygon | None = None
@@ -79,7 +79,7 @@ class ReadOptions:
 
     @property
     def window(self) -> Window | None:
-        """The rectangle outside which no point is wanted; None where there is no limit."""
+        """The rectangle outside which no point is wanted; None without a limit."""
         boxes = [box for box in (self.bbox, None if self.aoi is None else self.aoi.bounds) if box is not None]
         if not boxes:
             return None
@@ -106,7 +106,7 @@ class SourceInfo:
     reference: SpatialReference
     """CRS and units."""
     density_per_m2: float
-    """Points a square metre of the bounds: too low where the data do not fill them; nan where they have no area."""
+    """Points per square metre of the bounds: too low if the data do not fill them; nan if they have no area."""
     has_returns: bool
     """Whether any pulse has more than one return."""
     has_classes: bool
@@ -134,7 +134,7 @@ class SourceInfo:
         """Whether a file is still the one that was looked at, by its size and its time."""
         try:
             now = path.stat()
-        except OSError:  # whoever opens it tells
+        except OSError:  # opening it reports the fault
             return False
         return (now.st_size, now.st_mtime_ns) == (self.file_size, self.modified_ns)
 
@@ -260,7 +260,7 @@ class Source:
 
     @property
     def crs_given(self) -> bool:
-        """Whether the user's CRS stands in place of another one in the header, or of none."""
+        """Whether the user's CRS replaces that of the header, or a missing one."""
         own, used = self._file.facts.crs, self._info.reference.crs
         return self._options.crs is not None and (own is None or own != used)
 
@@ -354,7 +354,7 @@ def open_source(
 def _info_of(path: Readable, file: PointFile, options: ReadOptions) -> SourceInfo:
     """The facts of a file in metres, with the user's overrides."""
     facts = file.facts
-    reference, told = resolve_reference(
+    reference, warnings = resolve_reference(
         path=str(path),
         header_crs=facts.crs,
         header_horizontal_unit_m=facts.horizontal_unit_m,
@@ -384,7 +384,7 @@ def _info_of(path: Readable, file: PointFile, options: ReadOptions) -> SourceInf
         acquired_from=acquired[0] if acquired else None,
         acquired_to=acquired[1] if acquired else None,
         created=facts.created,
-        warnings=facts.warnings + told,
+        warnings=facts.warnings + warnings,
         file_size=now.st_size,
         modified_ns=now.st_mtime_ns,
         facts=facts,

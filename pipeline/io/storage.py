@@ -1,6 +1,6 @@
-"""Storage: what is there is complete. In a folder a thing gets its name only after its last byte is on the disk.
+"""Storage of complete things only: in a folder, a file gets its name after its last byte is on the disk.
 
-`Storage` is what a run directory stands on, in a folder (`LocalStorage`) or in an object store
+`Storage` holds a run directory, in a folder (`LocalStorage`) or in an object store
 (`pipeline.io.object_storage`). `pipeline.io.storage_at` gives the one that a path or URL means.
 """
 
@@ -21,7 +21,7 @@ from pipeline.errors import RunError
 
 BLOCK_BYTES = 1 << 20
 TEMPORARY_SUFFIX = ".part"
-"""Ends the names of what is being written; `keys` does not tell them."""
+"""Ending of unfinished files; `keys` does not list them."""
 
 
 def sha256_of(path: str | Path) -> str:
@@ -43,7 +43,7 @@ def parts_of_key(key: str) -> tuple[str, ...]:
     """
     parts = PurePosixPath(key)
     if not parts.parts or parts.is_absolute() or ".." in parts.parts or "\\" in key:
-        raise RunError(f"{key!r} is no key: use a relative path with forward slashes and without ..")
+        raise RunError(f"{key!r} is not a key: use a relative path with forward slashes and without ..")
     return parts.parts
 
 
@@ -51,16 +51,16 @@ class Puts(Protocol):
     """Several things on their way into a storage."""
 
     def put(self, key: str, content: bytes) -> None:
-        """Put bytes under a key now or soon; raises what became of earlier ones."""
+        """Put bytes under a key now or soon; raises the errors of earlier ones."""
 
     def wait(self) -> None:
-        """Return when all that was put so far is there; raises what became of it."""
+        """Return when everything put so far is there; raises its errors."""
 
 
 class Storage(Protocol):
     """Things by key, each whole or not there. All methods may be called twice, from several threads and processes.
 
-    They raise RunError, naming the key and the cause; local ones also OSError, as the disk tells it.
+    They raise RunError, naming the key and the cause; local ones also OSError, from the disk.
     """
 
     @property
@@ -71,10 +71,10 @@ class Storage(Protocol):
         """Make the folder, where the storage has such."""
 
     def putting(self, key: str) -> AbstractContextManager[Path]:
-        """A temporary path, to be written by whoever writes best; put under the key when the block ends."""
+        """A temporary path for the caller to write; put under the key when the block ends."""
 
     def put(self, key: str, content: bytes) -> None:
-        """Put bytes under a key, in place of what stood there."""
+        """Put bytes under a key and replace what was there."""
 
     def several(self, check: Callable[[], None]) -> AbstractContextManager[Puts]:
         """Many puts, as fast as the storage takes them; all are there when the block ends.
@@ -86,10 +86,10 @@ class Storage(Protocol):
         """The bytes under a key."""
 
     def has(self, key: str) -> bool:
-        """Whether something complete stands under the key."""
+        """Whether something complete is stored under the key."""
 
     def size(self, key: str) -> int:
-        """Bytes of what stands under the key."""
+        """Bytes stored under the key."""
 
     def names(self) -> list[str]:
         """The first parts of all keys, sorted; for people, since a listing may lag behind what was put."""
@@ -98,7 +98,7 @@ class Storage(Protocol):
         """The keys in a folder and below, sorted; none where the folder is not there. It may lag, too."""
 
     def delete(self, key: str) -> None:
-        """Remove what stands under a key, if anything does."""
+        """Remove what is stored under a key, if anything is."""
 
     def clear(self, names: Iterable[str]) -> None:
         """Remove some things, and all in folders of these names."""
@@ -138,7 +138,7 @@ class LocalStorage:
 
     @contextlib.contextmanager
     def putting(self, key: str) -> Iterator[Path]:
-        """A temporary path beside the final one, to be written by whoever writes best; renamed when the block ends.
+        """A temporary path beside the final one, for the caller to write; renamed when the block ends.
 
         When the block raises, the temporary file is removed and what stood under the key stays.
 
@@ -165,7 +165,7 @@ class LocalStorage:
         _sync_folder(final.parent)
 
     def put(self, key: str, content: bytes) -> None:
-        """Put bytes under a key, in place of what stood there."""
+        """Put bytes under a key and replace what was there."""
         with self.putting(key) as temporary:
             temporary.write_bytes(content)
 
@@ -188,7 +188,7 @@ class LocalStorage:
             raise RunError(f"{key!r} is not in {self.root}") from None
 
     def size(self, key: str) -> int:
-        """Bytes of what stands under the key.
+        """Bytes stored under the key.
 
         Raises
         ------
@@ -201,7 +201,7 @@ class LocalStorage:
             raise RunError(f"{key!r} is not in {self.root}") from None
 
     def has(self, key: str) -> bool:
-        """Whether something complete stands under the key."""
+        """Whether something complete is stored under the key."""
         return self.path(key).is_file()
 
     def keys(self, folder: str = "") -> list[str]:
@@ -218,7 +218,7 @@ class LocalStorage:
         return sorted(path.name for path in self.root.iterdir()) if self.root.is_dir() else []
 
     def delete(self, key: str) -> None:
-        """Remove what stands under a key, if anything does."""
+        """Remove what is stored under a key, if anything is."""
         self.path(key).unlink(missing_ok=True)
 
     def clear(self, names: Iterable[str]) -> None:

@@ -1,9 +1,9 @@
 """Tile indexes: files that name point files, as survey offices publish them.
 
-Two kinds. A text file has one path or URL a line; blank lines and those that begin with # are passed over. A vector
-file (GeoPackage, GeoJSON, Shapefile, GeoParquet) has a feature a tile, its outline, and a column that names the file.
-That column is the first of `COLUMNS` that is there, in any case; else the one column of which every value names a point
-file or is a URL. Relative names begin at the index.
+There are two kinds. A text file has one path or URL per line; blank lines and comments (#) are skipped. A vector file
+(GeoPackage, GeoJSON, Shapefile, GeoParquet) has one feature per tile, its outline, and a column that names the file:
+the first of `COLUMNS` that exists (in any case), else the only column in which every value names a point file or is a
+URL. Relative names begin at the index.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class TileIndex:
         return tuple(location for location, there in zip(self.locations, near.tolist(), strict=True) if there)
 
     def _boxes_in(self, reference: SpatialReference) -> npt.NDArray[np.object_]:
-        """The boxes around the outlines in the inputs' CRS; None where they cannot be told."""
+        """The boxes around the outlines in the inputs' CRS; None if they cannot be computed."""
         assert self.outlines is not None
         bounds = shapely.bounds(self.outlines)
         own: pyproj.CRS | None = None if self.crs is None else horizontal_part(parse_crs(self.crs, path=self.path))
@@ -110,7 +110,7 @@ def is_index(file: Readable) -> bool:
     try:
         with file.open("rb") as stream:
             head = stream.read(_FIRST_LINES)
-    except OSError:  # whoever reads it tells
+    except OSError:  # reading it reports the fault
         return False
     line = next(iter(_lines(head.decode("utf-8-sig", errors="replace"))), "")
     return names_points(line)
@@ -135,7 +135,7 @@ def read_tile_index(location: str) -> TileIndex:
     UnreadableInputError
         It cannot be read, names nothing, or does not say which column names the files.
     """
-    told = shown(location)
+    label = shown(location)
     if PurePosixPath(name_in(location)).suffix.lower() in VECTOR_SUFFIXES:
         names, outlines, crs = _of_layer(location)
     else:
@@ -144,9 +144,9 @@ def read_tile_index(location: str) -> TileIndex:
     first = {name: k for k, name in reversed(list(enumerate(whole)))}
     rows = sorted(first.values())
     if not rows:
-        raise UnreadableInputError(told, "the tile index names no files", "Check the index")
+        raise UnreadableInputError(label, "the tile index names no files", "Check the index")
     return TileIndex(
-        path=told,
+        path=label,
         locations=tuple(whole[k] for k in rows),
         outlines=None if outlines is None else outlines[rows],
         crs=crs,
@@ -164,7 +164,7 @@ def _of_text(location: str) -> list[str]:
             str(file), f"cannot be read ({fault.strerror or fault})", "Check the path and its permissions"
         ) from fault
     except UnicodeDecodeError as fault:
-        raise UnreadableInputError(str(file), f"a tile index must be UTF-8 ({fault})", "Write it anew") from fault
+        raise UnreadableInputError(str(file), f"a tile index must be UTF-8 ({fault})", "Write it again") from fault
     lines = _lines(text)
     strange = next((line for line in lines if not names_points(line)), None)
     if strange is not None:
@@ -184,7 +184,7 @@ def _of_layer(location: str) -> tuple[list[str], npt.NDArray[np.object_], str | 
     return [str(layer.columns[column][k]).strip() for k in rows], layer.geometries[rows], layer.crs
 
 
-def _column(told: str, columns: Mapping[str, Sequence[Any]]) -> str:
+def _column(label: str, columns: Mapping[str, Sequence[Any]]) -> str:
     """The column that names the files."""
     of_name = {str(name).lower(): str(name) for name in columns}
     for name in COLUMNS:
@@ -195,7 +195,7 @@ def _column(told: str, columns: Mapping[str, Sequence[Any]]) -> str:
         return found[0]
     what = f"{len(found)} columns name files ({', '.join(found)})" if found else "no column names point files"
     raise UnreadableInputError(
-        told,
+        label,
         f"{what}; its columns are {', '.join(map(str, columns)) or '(none)'}",
         f"Name the column that counts {COLUMNS[0]}, or write the files into a text file, one a line",
     )

@@ -1,7 +1,7 @@
 """URLs of files, and the fsspec file system that answers for each.
 
 What a store needs to know (endpoint, profile, region, keys) comes from the environment, as botocore reads it, and is
-never part of a URL, a task or `run.json`. Of a URL nothing is told that could be secret.
+never part of a URL, a task or `run.json`. No secret part of a URL is ever shown.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _http_options() -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scheme:
-    """What stands before `://`."""
+    """A URL scheme."""
 
     options: Callable[[], dict[str, Any]]
     """Of the file system, made when it is used."""
@@ -87,15 +87,15 @@ def scheme_of(url: str) -> Scheme:
     """
     name = url.partition("://")[0].lower()
     if name not in SCHEMES:
-        raise RunError(f"{shown(url)}: {name}:// is not understood. Use {', '.join(SCHEMES)}://, or a path")
+        raise RunError(f"{shown(url)}: {name}:// is not supported. Use {', '.join(SCHEMES)}://, or a path")
     return SCHEMES[name]
 
 
 def shown(location: str) -> str:
     """A path as it is; a URL without user and password, and with a mark in place of its query.
 
-    The query of a signed URL is a secret, that of a download service tells its files apart: the mark does so, too,
-    and tells nothing.
+    The query of a signed URL is a secret; the query of a download service identifies the file. The mark identifies it
+    and reveals nothing.
 
     >>> shown("tiles/a.laz"), shown("s3://bucket/a.laz"), shown("https://me:pw@host/a.laz")
     ('tiles/a.laz', 's3://bucket/a.laz', 'https://host/a.laz')
@@ -115,7 +115,7 @@ def shown(location: str) -> str:
 
 
 def has_mark(location: str) -> bool:
-    """Whether a told URL had a query, and so cannot be opened again."""
+    """Whether a shown URL had a query, and so cannot be opened again."""
     return is_url(location) and "?query-" in location
 
 

@@ -1,4 +1,4 @@
-"""One layer of a vector file as it stands there: GeoPackage, GeoJSON, Shapefile or GeoParquet.
+"""One layer of a vector file, unchanged: GeoPackage, GeoJSON, Shapefile or GeoParquet.
 
 Of a file that covers a country, only what lies near the data is kept: its geometries go by in batches, and the columns
 of the others are never read (GDAL), or let go batch by batch (GeoParquet).
@@ -26,7 +26,7 @@ VALID = (
     "and GeoParquet (.parquet)"
 )
 DRIVERS = {b"SQLi": "GPKG:", b"\0\0\x27\x0a": ""}
-"""How GDAL is told the format, by a file's first bytes; text in braces is GeoJSON. Left to itself GDAL goes by content,
+"""The format that GDAL gets, by a file's first bytes; text in braces is GeoJSON. Left to itself GDAL goes by content,
 and there are formats that name other files and servers to read. Shapefiles have no such prefix and no such twins."""
 PARQUET_MAGIC = b"PAR1"
 
@@ -66,14 +66,14 @@ def read_layer(path: str | Path, layer: str | None, boxes: Boxes | None = None) 
     UnreadableInputError
         The file cannot be read as vector data, or the layer is not there.
     """
-    told = shown(str(path))
-    if is_url(path) and told.lower().endswith(".shp"):
-        raise UnreadableInputError(told, "a Shapefile is several files", "Give a GeoPackage, or fetch its files first")
+    label = shown(str(path))
+    if is_url(path) and label.lower().endswith(".shp"):
+        raise UnreadableInputError(label, "a Shapefile is several files", "Give a GeoPackage, or fetch its files first")
     with on_this_machine(path) as file:
         try:
             return _read(file, layer, boxes)
         except InputError as fault:
-            raise fault.of(told, str(file)) from fault
+            raise fault.of(label, str(file)) from fault
 
 
 def _read(path: Path, layer: str | None, boxes: Boxes | None) -> VectorLayer:
@@ -84,7 +84,7 @@ def _read(path: Path, layer: str | None, boxes: Boxes | None) -> VectorLayer:
 
         crs, feature_ids, geometry_bytes, columns, elsewhere = read_geoparquet(path, layer, boxes)
     else:
-        crs, feature_ids, geometry_bytes, columns, elsewhere = _by_gdal(path, _told_apart(path, head), layer, boxes)
+        crs, feature_ids, geometry_bytes, columns, elsewhere = _by_gdal(path, _driver_of(path, head), layer, boxes)
     geometries: npt.NDArray[np.object_] = np.asarray(shapely.from_wkb(geometry_bytes, on_invalid="ignore"), object)
     there = np.array([data is not None for data in geometry_bytes], np.bool_)
     return VectorLayer(
@@ -97,7 +97,7 @@ def _read(path: Path, layer: str | None, boxes: Boxes | None) -> VectorLayer:
     )
 
 
-def _told_apart(path: Path, head: bytes) -> str:
+def _driver_of(path: Path, head: bytes) -> str:
     """The path as GDAL is given it: with the one format that it may be.
 
     Raises
@@ -142,7 +142,7 @@ def _by_gdal(
             layer=found[0],
             return_fids=True,
             fids=None if none else near,
-            max_features=1 if none else None,  # of no feature at all GDAL tells no columns
+            max_features=1 if none else None,  # without any feature GDAL gives no columns
         )
     except (DataSourceError, DataLayerError, FeatureError, FieldError, GeometryError, OSError) as fault:
         raise UnreadableInputError(str(path), f"cannot be read as vector data ({str(fault)[:160]})", VALID) from fault

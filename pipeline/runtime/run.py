@@ -524,4 +524,5 @@ def _crs_facts(reference: SpatialReference) -> dict[str, object]:
         "wkt": reference.wkt,
         "horizontal_unit_m": reference.horizontal_unit_m,
         "vertical_unit_m": reference.vertical_unit_m,
+        "vertical_unit_assumed": reference.vertical_unit_assumed,
     }

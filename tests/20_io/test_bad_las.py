@@ -188,7 +188,7 @@ def test_a_geographic_crs_names_the_fix_and_a_projected_override_helps(tmp_path,
             open_source(path)
         info = open_source(path, ReadOptions(crs="EPSG:28992")).info
         assert info.reference.epsg == 28992
-        assert any("in place of the header's" in warning for warning in info.warnings)
+        assert any("replaces the header's" in warning for warning in info.warnings)
 
 
 def test_counts_that_contradict_each_other_in_las_14_are_told(tmp_path, points, write_las):

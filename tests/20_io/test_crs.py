@@ -25,7 +25,7 @@ def resolve(in_header=None, **more):
 
 
 @pytest.mark.parametrize(
-    ("crs", "epsg", "horizontal_m", "vertical_m", "warns"),
+    ("crs", "epsg", "horizontal_m", "vertical_m", "assumed"),
     [
         ("EPSG:28992", 28992, 1.0, 1.0, True),
         ("EPSG:7415", 7415, 1.0, 1.0, False),
@@ -36,11 +36,13 @@ def resolve(in_header=None, **more):
         ("EPSG:2154+5720", None, 1.0, 1.0, False),
     ],
 )
-def test_units_of_plan_and_elevation_come_from_their_own_axes(crs, epsg, horizontal_m, vertical_m, warns):
+def test_units_of_plan_and_elevation_come_from_their_own_axes(crs, epsg, horizontal_m, vertical_m, assumed):
     reference, reported = resolve(crs)
     assert reference.horizontal_unit_m == pytest.approx(horizontal_m, rel=1e-9)
     assert reference.vertical_unit_m == pytest.approx(vertical_m, rel=1e-9)
-    assert any("no vertical unit" in warning for warning in reported) == warns
+    assert reference.vertical_unit_assumed == assumed
+    # a user must decide only if the horizontal unit is not the metre
+    assert any("no vertical unit" in warning for warning in reported) == (assumed and horizontal_m != 1.0)
     if epsg is not None:
         assert reference.epsg == epsg
 

@@ -158,7 +158,7 @@ def test_what_is_not_in_a_bucket_is_told(bucket):
         (f"{bucket}/t/", "none of the 1 files in the folder is a point file"),
         (f"{bucket}/nothing/", "there is no such thing|the folder is empty"),
         ("s3://no-such-bucket/t/", "there is no such bucket"),
-        ("https://host/folder/", "tells no list of its files.*a tile index"),
+        ("https://host/folder/", "does not list its files.*a tile index"),
         ("ftp://host/a.laz", "ftp:// is not understood"),
     ):
         with pytest.raises(UnreadableInputError, match=reported):

@@ -141,7 +141,7 @@ def test_errors_of_the_libraries_are_in_the_table():
     for error in (exceptions.NoCredentialsError(), exceptions.ProfileNotFound(profile="p"), PermissionError("no")):
         assert not cause_of(error).again, error
     assert "AWS_ACCESS_KEY_ID" in cause_of(exceptions.NoCredentialsError()).fix
-    assert "certificate" in cause_of(exceptions.SSLError(endpoint_url="https://host", error="self-signed")).told
+    assert "certificate" in cause_of(exceptions.SSLError(endpoint_url="https://host", error="self-signed")).words
 
 
 def test_texts_lose_users_passwords_and_queries_of_their_urls():

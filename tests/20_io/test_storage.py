@@ -153,7 +153,7 @@ def test_a_thing_that_is_not_there_can_be_removed(storage):
 @pytest.mark.parametrize("key", ["", ".", "/etc/passwd", "../a", "a/../../b", "a\\b"])
 @pytest.mark.parametrize("make", [lambda folder: LocalStorage(root=folder), lambda _: ObjectStorage(url="s3://b/c")])
 def test_keys_that_lead_out_of_the_storage_are_refused(make, key, tmp_path):
-    with pytest.raises(RunError, match="is no key"):
+    with pytest.raises(RunError, match="is not a key"):
         make(tmp_path).put(key, b"")
 
 
