@@ -1,4 +1,4 @@
-"""The digest of a run: one sha256 over its content, whatever the workers, the tiles, the files or the Parquet writer.
+"""The digest of a run: one sha256 over its content, independent of workers, tiles, files and the Parquet writer.
 
 Content is all columns of buildings, planes and rejected except `NOT_CONTENT`, in the order of the rows' keys. Of
 `reason_detail` only the figures count, so a better wording changes no digest. Every row is hashed by itself in a
@@ -26,11 +26,11 @@ from pipeline.export.records import KEYS
 from pipeline.io import arrow_at
 
 NOT_CONTENT = frozenset({"tile", "mesh_path", "input_hash", "settings_hash", "engine_version"})
-"""Columns that may differ between two runs with one result: by tiling, or by the names of settings and the version."""
+"""Columns that may differ between runs with equal results: by tiling, names of settings, or the version."""
 FIGURES_ONLY = "reason_detail"
-"""The column of which only the figures count, not the words."""
+"""The column whose figures count and whose words do not."""
 ROWS_A_BATCH = 8192
-"""Rows that are held at once."""
+"""Rows in memory at once."""
 
 _FIGURE = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?!\w)")
 _NULL, _PRESENT = b"\x00", b"\x01"
@@ -47,9 +47,9 @@ def run_digest(run_dir: str, filesystem: pafs.FileSystem | None = None, tiles: S
     run_dir : str
         The run directory: a path or URL, or a path of `filesystem`.
     filesystem : pyarrow.fs.FileSystem, optional
-        Where the run lies; by default as `run_dir` says.
+        Storage of the run; by default as `run_dir` says.
     tiles : sequence of str, optional
-        Keys of the tiles that have tables, which are then not looked for.
+        Keys of the tiles that have tables; by default the run directory is listed.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def _key_values(column: pa.Array, folder: str, name: str) -> npt.NDArray[Any]:
 
 
 def _check_unique(name: str, key: tuple[str, ...], keys: list[npt.NDArray[Any]], order: npt.NDArray[Any]) -> None:
-    """Refuse a table with two rows of one key: the order, and so the digest, would be open."""
+    """Refuse a table with two rows of one key, since their order, and with it the digest, would be undefined."""
     if len(order) < 2:
         return
     same = np.ones(len(order) - 1, dtype=bool)
@@ -106,14 +106,14 @@ def _check_unique(name: str, key: tuple[str, ...], keys: list[npt.NDArray[Any]],
         same &= ordered[1:] == ordered[:-1]
     if same.any():
         row = order[int(np.argmax(same))]
-        told = [column[row].item() for column in keys]
-        texts = [value.decode() if isinstance(value, bytes) else value for value in told]
+        found = [column[row].item() for column in keys]
+        texts = [value.decode() if isinstance(value, bytes) else value for value in found]
         found = ", ".join(f"{column} {text!r}" for column, text in zip(key, texts, strict=True))
         raise RunError(f"{name} has more than one row of {found}: files of two runs lie in one directory")
 
 
 def canonical_rows(batch: pa.RecordBatch) -> Iterator[bytes]:
-    """Every row of a batch as bytes that depend on names and values only, not on how Arrow holds them."""
+    """Every row of a batch as bytes that depend only on names and values, not on Arrow's representation."""
     names = sorted(batch.schema.names)
     cells = [_cells(batch.column(name), name) for name in names]
     heading = "\x1f".join(names).encode()
@@ -163,7 +163,7 @@ def _cells(column: pa.Array, name: str) -> list[bytes]:
 
 
 def _sized(data: bytes) -> bytes:
-    """Bytes with their length before them, so that neighbours cannot run together."""
+    """Bytes preceded by their length, so that neighbours cannot run together."""
     return _PRESENT + struct.pack("<Q", len(data)) + data
 
 
@@ -182,7 +182,7 @@ def _fixed_cells(column: pa.Array, name: str) -> list[bytes]:
     dtype = np.dtype("<f8") if pa.types.is_floating(column.type) else np.dtype("<i8")
     values = column.fill_null(0).to_numpy(zero_copy_only=False).astype(dtype)
     if dtype.kind == "f":
-        # One zero and one nan, whatever their bits.
+        # one zero and one nan, whatever their bits
         values = np.where(np.isnan(values), np.nan, values + 0.0)
     data = values.tobytes()
     return [_PRESENT + data[8 * i : 8 * i + 8] if there else _NULL for i, there in enumerate(present.tolist())]

@@ -1,4 +1,4 @@
-"""Which engine runs a job: this process alone, its children, or a Dask cluster."""
+"""The engine of a job: this process alone, its child processes, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def executor_for(
     )
     if engine == "serial":
         if resources.performance_report is not None:
-            raise SettingsError(["a performance report tells the time of workers, and there are none: use --workers 1"])
+            raise SettingsError(["a performance report needs workers; this run has none: use --workers 1"])
         return SerialExecutor()
     if engine == "local":
         from pipeline.runtime.cluster.local_executor import LocalExecutor

@@ -1,8 +1,8 @@
-"""What a run is expected to cost, by its plan: the one place of measured rates.
+"""The expected cost of a run, from its plan; the only place for measured rates.
 
-Rates were measured by hand on two cores of a shared x86_64 machine: the stage times that `run.json` tells of serial
-runs in one process, kernels compiled and loaded, so that wall time stands for CPU time; `docs/how_to/plan_a_run.md`
-names the surveys. Machines and scenes differ by a factor of two either way.
+The rates are stage times in `run.json` of serial runs, on two cores of a shared x86_64 machine, with kernels compiled
+and loaded, so wall time equals CPU time; `docs/how_to/plan_a_run.md` names the surveys. Machines and scenes differ by a
+factor of two either way.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from pipeline.tiling import MM, Tile, Window
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rates:
-    """Measured on real tiles; docs/how_to/plan_a_run.md tells how."""
+    """Rates measured on real tiles, as docs/how_to/plan_a_run.md describes."""
 
     start_s: float = 1.5
     """Wall seconds before the first point is read: libraries, kernels, child processes."""
     cluster_start_s: float = 3.0
-    """Wall seconds that an embedded cluster takes to start and to end, on top."""
+    """Additional wall seconds to start and end an embedded cluster."""
     ingest_per_million: float = 0.5
-    """CPU seconds a million points."""
+    """CPU seconds per million points."""
     split_per_million: float = 1.0
-    """A million points of windows, halos and all."""
+    """CPU seconds per million points of windows, halos included."""
     join_per_million: float = 0.3
-    """A million points; the driver's own, not shared among workers."""
+    """CPU seconds per million points, spent by the driver and not shared among workers."""
     reconstruct_each: float = 0.017
-    """A building, its outline included."""
+    """CPU seconds per building, its outline included."""
     publish_each: float = 0.003
-    """A building."""
+    """CPU seconds per building."""
     buildings_per_million: float = 300.0
-    """To be expected in a million points where nothing else tells."""
+    """Buildings per million points where no better estimate exists."""
     compiling_s: float = 45.0
-    """Wall seconds of the first run, which compiles the kernels that it calls, over those of the next."""
+    """Additional wall seconds of the first run, which compiles its kernels."""
     process_gib: float = 0.3
-    """Memory of a process with its libraries and kernels; the largest task of the plan comes on top."""
+    """Memory of a process with its libraries and kernels, without the largest task of the plan."""
 
 
 RATES = Rates()
@@ -46,17 +46,17 @@ RATES = Rates()
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Expected:
-    """What a run has to do, by the headers of its inputs."""
+    """The work of a run, estimated from the headers of its inputs."""
 
     points_by_file: Mapping[str, int]
-    """Points in the window that is wanted, as if those of a file were spread evenly over its bounds; without the files
-    that lie off it."""
+    """Points in the requested window, as if those of a file were spread evenly over its bounds; without the files off
+    the window."""
     tiles: int
-    """Of the lattice, that these meet."""
+    """Tiles of the lattice that these files meet."""
     seen_points: float
-    """Points of the tiles' windows, halos and all."""
+    """Points of the tiles' windows, halos included."""
     buildings: int
-    """How many."""
+    """Number of buildings."""
     task_bytes: int = 0
     """Memory of its largest task, above the process's own size."""
     models: bool = True
@@ -79,7 +79,7 @@ class Expected:
         }
 
     def wall_s(self, hands: int) -> dict[str, float]:
-        """Wall seconds by stage where so many processes work."""
+        """Wall seconds by stage with so many processes."""
         at_once = {"ingest": len(self.points_by_file), "split": self.tiles, "join": 1, "publish": self.tiles}
         return {
             stage: seconds / max(1, min(hands, at_once.get(stage, hands))) for stage, seconds in self.cpu_s().items()
@@ -87,15 +87,7 @@ class Expected:
 
 
 def expected(plan: Plan, buildings: int | None = None) -> Expected:
-    """What a plan has to do.
-
-    Parameters
-    ----------
-    plan : Plan
-        Its files and its lattice.
-    buildings : int, optional
-        How many there will be; by default as many as so many points hold as a rule.
-    """
+    """The work of a plan; by default with as many buildings as so many points usually have."""
     tiles: set[Tile] = set()
     points: dict[str, int] = {}
     for info in plan.sources:
@@ -118,7 +110,7 @@ def expected(plan: Plan, buildings: int | None = None) -> Expected:
     return Expected(
         points_by_file=points,
         tiles=len(tiles),
-        # tiles at the edge of the data see less: no window sees more than there is
+        # tiles at the edge of the data see less, and no window sees more points than there are
         seen_points=total * min(halo_share, max(1.0, len(tiles))),
         buildings=round(total / 1e6 * RATES.buildings_per_million) if buildings is None else buildings,
         task_bytes=plan.window_bytes,

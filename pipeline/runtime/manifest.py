@@ -1,8 +1,8 @@
-"""The manifest of a run, `run.json`: what was asked, from which inputs, what came out, how long and how large.
+"""The manifest of a run, `run.json`: request, inputs, results, durations and memory.
 
-The driver writes it at the start with status `running` and again at the end; a reader that finds `running` sees a run
-that is under way or was cut off. Times of day and durations are here and nowhere in the tables, so that the content of
-a run does not depend on them.
+The driver writes it at the start with status `running` and again at the end; `running` means that a run is under way or
+was interrupted. Times of day and durations are only here and not in the tables, so a run's content does not depend on
+them.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 NAME = "run.json"
 """File name of the manifest in the run directory."""
 PAGE = "run.html"
-"""File name of the page about the run, where one was written: it tells of the manifest beside it and no other."""
+"""File name of the page about the run, which describes the manifest beside it; not every run has one."""
 SLOWEST = 50
-"""Buildings whose seconds the manifest keeps: those that took longest."""
+"""Number of slowest buildings in the manifest."""
 FORMAT = 1
 """Version of the run directory's layout; a reader refuses others."""
 
@@ -39,15 +39,15 @@ class RunStatus(StrEnum):
     """How far a run is."""
 
     RUNNING = "running"
-    """Under way, or cut off."""
+    """Under way, or interrupted."""
     FINISHED = "finished"
     """All tiles are published."""
     INCOMPLETE = "incomplete"
     """Ended, but some tiles failed."""
     FAILED = "failed"
-    """Ended with an error, told in `warnings`; what is there is not to be used."""
+    """Ended with the last error in `warnings`; its results must not be used."""
     CANCELLED = "cancelled"
-    """Called off, or interrupted from the keyboard; what is there is not to be used."""
+    """Cancelled, or interrupted from the keyboard; its results must not be used."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,7 @@ class InputFile:
     size_bytes: int
     """Its size."""
     n_points: int | None = None
-    """Points that were read from it; None until then, and for files that are no point clouds."""
+    """Points read from it; None before that, and for files that are not point clouds."""
     bounds_m: tuple[float, float, float, float] | None = None
     """Smallest easting and northing, largest easting and northing of these points in metres; None without points."""
 
@@ -73,7 +73,7 @@ class SlowBuilding:
     building_id: str
     """Its id."""
     seconds: float
-    """Of the clock, to model it; of the run that modelled it, where it was taken from an earlier one."""
+    """Wall-clock seconds to model it, in the run that did so."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -99,9 +99,9 @@ class RunManifest:
     inputs: tuple[InputFile, ...] = ()
     """Point clouds and footprints."""
     request: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """How the inputs were to be read and the outputs written, beside the settings: what `gablework rerun` goes by."""
+    """How to read the inputs and write the outputs, beside the settings; `gablework rerun` uses it."""
     source_licence: str | None = None
-    """Licence of the source data in the user's words; None where none was given."""
+    """Licence of the source data in the user's words; None if unknown."""
     lattice: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """tile_size_m, origin_x_m, origin_y_m: where the tiles lie, in metres."""
     tiles: tuple[str, ...] = ()
@@ -115,9 +115,9 @@ class RunManifest:
     peak_memory_bytes: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Largest resident memory by process."""
     slowest: tuple[SlowBuilding, ...] = ()
-    """Those that took longest, the slowest first."""
+    """The buildings that took longest, the slowest first."""
     warnings: tuple[str, ...] = ()
-    """What was told while running."""
+    """The warnings of the run."""
     content_sha256: str | None = None
     """`gablework digest` of the finished run; None where it was not computed."""
 
@@ -129,7 +129,7 @@ class RunManifest:
                 raise RunError(f"{name} is {value.isoformat()}: give a time zone")
 
     def squares(self, keys: Iterable[str]) -> list[Any]:
-        """The tiles of some keys as squares in metres, in their order; none where the lattice is not known."""
+        """The tiles of some keys as squares in metres, in their order; none where the lattice is unknown."""
         if not self.lattice:
             return []
         grid = TileGrid(
@@ -152,22 +152,22 @@ class RunManifest:
         Parameters
         ----------
         text : str
-            As `to_json` writes it; entries that are not known are left out.
+            As `to_json` writes it; unknown entries are ignored.
         source : str
             Name of the file, for messages.
 
         Raises
         ------
         RunError
-            The text is no manifest, or one of another format.
+            The text is not a manifest, or has another format.
         """
         try:
             found = json.loads(text)
         except json.JSONDecodeError as error:
             raise RunError(f"{source} is no JSON ({error}): the run directory is damaged") from error
         if not isinstance(found, dict) or found.get("format") != FORMAT:
-            told = found.get("format") if isinstance(found, dict) else type(found).__name__
-            raise RunError(f"{source} has format {told!r}, this version reads {FORMAT}: use the version that wrote it")
+            form = found.get("format") if isinstance(found, dict) else type(found).__name__
+            raise RunError(f"{source} has format {form!r}, this version reads {FORMAT}: use the version that wrote it")
         names = {field.name for field in dataclasses.fields(cls)}
         values = {name: value for name, value in found.items() if name in names}
         try:
@@ -191,7 +191,7 @@ def _input_file(entry: Mapping[str, Any]) -> InputFile:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON knows it: dataclasses become objects, times ISO 8601."""
+    """A value for JSON: dataclasses become objects, times ISO 8601."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""The plan of a run: what will be read, on which lattice, and whether it can fit. Pure data, made before any work."""
+"""The plan of a run, made before any work: its inputs, its lattice, and whether it fits into memory."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from pipeline.tiling import MM, Tile, TileGrid
 _TILE_SIZES_M = (1000.0, 500.0, 250.0, 125.0, 62.5)
 _POINTS_PER_WINDOW = 12_000_000
 _ASKED_AT_ONCE = 8
-"""Files elsewhere whose headers are read together: a header takes some ten requests, tens of milliseconds each."""
+"""Remote files whose headers are read at once: a header takes some ten requests of tens of milliseconds each."""
 _BYTES_PER_POINT = 220
-"""Measured peak of a split above the size of its process, bytes a point of the window, at 3 and 5 million points."""
+"""Bytes per point of the window: measured peak of a split above the size of its process, at 3 and 5 million points."""
 LARGEST_TASK_BYTES = _POINTS_PER_WINDOW * _BYTES_PER_POINT
-"""Of the plans that choose their tiles."""
+"""Peak of the largest task of plans that choose their tile size."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What a run is going to do."""
+    """What a run will read, and how it is cut into tiles."""
 
     sources: tuple[SourceInfo, ...]
     """The inputs, in the order of their names."""
@@ -38,9 +38,9 @@ class Plan:
     options: ReadOptions
     """How the inputs are read."""
     points: int
-    """Points that the headers promise."""
+    """Number of points in the headers."""
     density_per_m2: float
-    """Points a square metre, the densest input's."""
+    """Points per square metre of the densest input."""
     window_bytes: int
     """Estimated peak of the largest task above the process's own size."""
     warnings: tuple[str, ...]
@@ -59,10 +59,9 @@ class Plan:
 
 
 def tile_size_m(density_per_m2: float, halo_m: float, area_m2: float) -> float:
-    """The largest usual tile whose window, halo and all, fits a worker, and that leaves work for several of them.
+    """The largest usual tile whose window fits a worker, and that leaves work for several workers.
 
-    Large tiles waste less on halos. Up to 250 m they are taken whatever the area; larger ones only where the
-    area holds eight of them.
+    Large tiles waste less on halos. Sizes up to 250 m suit any area; larger ones need an area of eight tiles.
 
     >>> tile_size_m(1.0, 100.0, 1e8), tile_size_m(14.0, 100.0, 5e4), tile_size_m(50.0, 100.0, 1e6)
     (1000.0, 250.0, 250.0)
@@ -75,7 +74,7 @@ def tile_size_m(density_per_m2: float, halo_m: float, area_m2: float) -> float:
 
 
 def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings) -> Plan:
-    """Look at every input's header and lay out the lattice.
+    """Read every input's header and lay out the lattice.
 
     Parameters
     ----------
@@ -97,7 +96,7 @@ def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings)
     for info in sources:
         for text in info.warnings:
             odd.setdefault(text, []).append(info.path)
-    # once for all: a city has thousands of inputs, and what is odd in one is so in the others
+    # one warning for all inputs: a city has thousands of them, all with the same oddity
     warnings = [
         f"{of[0]}{f' and {len(of) - 1} more inputs' if len(of) > 1 else ''}: {text}" for text, of in odd.items()
     ]
@@ -139,7 +138,7 @@ def make_plan(paths: Sequence[str], options: ReadOptions, settings: RunSettings)
 
 
 def _looked_at(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, ...]:
-    """What the inputs say of themselves; of those elsewhere some are asked at once, since that is mostly waiting."""
+    """The headers of all inputs; remote ones are read concurrently, since that is mostly waiting."""
 
     def look(path: str) -> SourceInfo:
         return open_source(path, options).info
@@ -159,24 +158,12 @@ def _looked_at(paths: Sequence[str], options: ReadOptions) -> tuple[SourceInfo, 
 
 
 def without_far_files(plan: Plan, paths: Sequence[str]) -> tuple[Plan, list[str]]:
-    """The plan without files elsewhere that lie off --bbox and --aoi by their headers: they need not be fetched.
-
-    Parameters
-    ----------
-    plan : Plan
-        Of all files.
-    paths : sequence of str
-        These.
-
-    Returns
-    -------
-    tuple of Plan and list of str
-        Those that are left; files of this machine always are.
+    """The plan and paths without remote files that lie off --bbox and --aoi by their headers: no need to fetch them.
 
     Raises
     ------
     EmptyInputError
-        None is left.
+        No file is left.
     """
     window = plan.options.window
     if window is None:
@@ -188,7 +175,7 @@ def without_far_files(plan: Plan, paths: Sequence[str]) -> tuple[Plan, list[str]
     for path in paths:
         info = of_path[shown(path)]
         x_min, y_min, _, x_max, y_max, _ = (value / unit for value in info.bounds_m)
-        # headers are believed to a unit; a file of this machine costs a read and no more
+        # headers are exact to a unit; a file of this machine costs only a read
         if not is_url(path) or shapely.box(x_min - 1.0, y_min - 1.0, x_max + 1.0, y_max + 1.0).intersects(wanted):
             near.append(path)
     if not near:
@@ -202,19 +189,12 @@ def without_far_files(plan: Plan, paths: Sequence[str]) -> tuple[Plan, list[str]
 
 
 def check_memory(plan: Plan, limit_bytes: int | None) -> None:
-    """Refuse a plan whose largest task cannot fit into a worker, before the first task.
-
-    Parameters
-    ----------
-    plan : Plan
-        The plan.
-    limit_bytes : int or None
-        A worker's memory limit; None where there is none.
+    """Refuse a plan whose largest task does not fit into a worker with this memory limit, before the first task.
 
     Raises
     ------
     InputError
-        Naming the tile size that would fit.
+        The task does not fit; the message names the tile size and the fix.
     """
     if limit_bytes is None or plan.window_bytes <= limit_bytes:
         return
@@ -227,9 +207,9 @@ def check_memory(plan: Plan, limit_bytes: int | None) -> None:
 
 
 def split_grid(plan: Plan, settings: RunSettings, classes: ClassesInUse, *, footprints: bool) -> TileGrid:
-    """The plan's lattice with the windows that its tiles are split in: no wider than what is known makes them.
+    """The plan's lattice with the halo that the split needs, given which classes are believed.
 
-    Classes are known when the points are read, so the plan reckons with the widest. A halo that the user set stays.
+    Classes are known only after the points are read, so the plan assumes the widest halo. A halo set by the user stays.
 
     Parameters
     ----------
@@ -249,16 +229,16 @@ def split_grid(plan: Plan, settings: RunSettings, classes: ClassesInUse, *, foot
 
 
 def check_windows(plan: Plan, grid: TileGrid, points_by_tile: Mapping[Tile, int], limit_bytes: int | None) -> None:
-    """Refuse tiles whose windows hold more points than a worker can, now that the points are counted.
+    """Refuse tiles whose windows have more points than fit into a worker, now that the points are counted.
 
-    Headers can claim wide bounds and hide dense corners, so the plan's own check is not the last word.
+    Headers can claim wide bounds and hide dense corners, so the plan's own check does not suffice.
 
     Parameters
     ----------
     plan : Plan
         The plan.
     grid : TileGrid
-        Its lattice with the windows that the tiles are split in, of `split_grid`.
+        Its lattice from `split_grid`.
     points_by_tile : mapping
         Points of each tile.
     limit_bytes : int or None
@@ -283,17 +263,7 @@ def check_windows(plan: Plan, grid: TileGrid, points_by_tile: Mapping[Tile, int]
 
 
 def window_bytes(grid: TileGrid, tile: Tile, points_by_tile: Mapping[Tile, int]) -> int:
-    """What a process that splits a tile comes to take, its own size included.
-
-    Parameters
-    ----------
-    grid : TileGrid
-        The lattice with the windows that the tiles are split in.
-    tile : Tile
-        The tile.
-    points_by_tile : mapping
-        Points of each tile.
-    """
+    """Estimated peak memory of a process that splits a tile of a lattice from `split_grid`."""
     return WINDOW_BASE_BYTES + int(_points_in_window(grid, tile, points_by_tile) * _BYTES_PER_POINT)
 
 

@@ -26,12 +26,12 @@ _OF_THE_RUN = ("geometry", "acquired_from", "acquired_to", "mesh_path", "input_h
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Replayed:
-    """What became of a building this time."""
+    """The outcome of a building this time."""
 
     result: BuildingResult
-    """As a run would have it."""
+    """The result, as in a run."""
     loss: Loss | None = None
-    """What it did to its process; None where it did no harm."""
+    """How it ended its process; None where it did not."""
 
 
 def replay(bundle: Bundle, limits: IsolationLimits | None) -> Replayed:
@@ -42,8 +42,8 @@ def replay(bundle: Bundle, limits: IsolationLimits | None) -> Replayed:
     bundle : Bundle
         The building.
     limits : IsolationLimits or None
-        Of the child process that it is modelled in; None models it in this process, where a debugger can see it and
-        where it may do all that it did.
+        Limits of the child process that models it; None models it in this process, where a debugger sees it and a crash
+        ends the process.
 
     Raises
     ------

@@ -88,7 +88,7 @@ def plan_inputs(request: RunRequest, progress: Progress) -> tuple[Plan, list[str
     for warning in plan.warnings:
         progress.warn("plan", warning)
     if not any(info.has_returns for info in plan.sources):
-        progress.warn("plan", "the inputs have one return a pulse: vegetation is told by its roughness alone")
+        progress.warn("plan", "the inputs have one return per pulse: vegetation is recognized by its roughness alone")
     return plan, paths
 
 

@@ -21,7 +21,7 @@ from slow_join import WholeSplit, whole_join, whole_surfaces
 from pipeline.kernels.union_find import united
 from pipeline.model import IntArray, Tin
 from pipeline.ruler.simulation.dataset import simulate
-from pipeline.runtime.stages.border_facets import facet_names, telling_facets, united_by_name
+from pipeline.runtime.stages.border_facets import facet_names, shared_facets, united_by_name
 from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.open_fragments import open_fragments
 from pipeline.runtime.stages.sites import Joined
@@ -448,7 +448,7 @@ def facet_at(x: int, y: int) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    ("x", "y", "seen", "told"),
+    ("x", "y", "seen", "named"),
     [
         (10_000, 10_000, [False], [False]),  # the middle of its tile
         (19_300, 10_000, [True], [True]),  # reaches over the border: sure, and alone in the strip
@@ -456,19 +456,19 @@ def facet_at(x: int, y: int) -> list[int]:
         (19_300, 19_300, [True], [True]),  # a corner
     ],
 )
-def test_a_facet_alone_is_told_wherever_another_tile_may_see_it(
-    x: int, y: int, seen: list[bool], told: list[bool]
+def test_a_facet_alone_is_named_wherever_another_tile_may_see_it(
+    x: int, y: int, seen: list[bool], named: list[bool]
 ) -> None:
-    assert told_of([facet_at(x, y)]) == (seen, told)
+    assert shared([facet_at(x, y)]) == (seen, named)
 
 
-def told_of(
+def shared(
     facets: list[list[int]], kinds: list[int] | None = None, tile: Tile = TILES[3]
 ) -> tuple[list[bool], list[bool]]:
     keys: IntArray = np.array(facets, np.int64)
     kind = np.full(len(keys), FacetKind.OBJECT, np.int8) if kinds is None else np.array(kinds, np.int8)
-    seen, told = telling_facets(keys, facet_names(keys), kind, tile, CORNER, CUT)
-    return seen.tolist(), told.tolist()
+    seen, named = shared_facets(keys, facet_names(keys), kind, tile, CORNER, CUT)
+    return seen.tolist(), named.tolist()
 
 
 def along_border(x: int, count: int) -> list[list[int]]:
@@ -482,17 +482,17 @@ def along_border(x: int, count: int) -> list[list[int]]:
     return facets
 
 
-def test_of_connected_facets_along_a_border_both_tiles_tell_the_same_one() -> None:
+def test_both_tiles_name_the_same_one_of_connected_facets_along_a_border() -> None:
     band = along_border(19_800, 6)
-    here, there = told_of(band), told_of(band, tile=Tile(1, 0))
+    here, there = shared(band), shared(band, tile=Tile(1, 0))
     assert here == there
     assert here[0] == [True] * 12
     assert sum(here[1]) == 1
     # without one facet of the band two pieces are left
-    assert sum(told_of(band[:5] + band[6:])[1]) == 2
+    assert sum(shared(band[:5] + band[6:])[1]) == 2
     # nor are facets of two kinds connected
-    assert sum(told_of(band, [3] * 4 + [5] * 4 + [3] * 4)[1]) == 3
+    assert sum(shared(band, [3] * 4 + [5] * 4 + [3] * 4)[1]) == 3
 
 
-def test_facets_that_only_one_of_two_tiles_is_sure_to_see_are_all_told() -> None:
-    assert all(told_of(along_border(17_500, 6))[1])
+def test_facets_that_only_one_of_two_tiles_certainly_sees_are_all_named() -> None:
+    assert all(shared(along_border(17_500, 6))[1])

@@ -158,7 +158,7 @@ def test_one_return_only_and_no_classes_are_used_and_told(tmp_path: Path, suburb
     summary = reconstruct(path, crs="EPSG:25832")
     # a tree over a roof hides it from first returns: one house may go
     assert summary.statuses["ok"] >= reconstruct(suburb).statuses["ok"] - 1
-    assert any("one return a pulse" in warning for warning in summary.warnings)
+    assert any("one return per pulse" in warning for warning in summary.warnings)
     assert any("no classes" in warning for warning in summary.warnings)
 
 

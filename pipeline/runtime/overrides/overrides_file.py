@@ -2,7 +2,7 @@
 
 An entry names its building by `building_id` (also the id of a rejected object), by `source_id`, or by a `point` inside
 it, and says what is to be done: `action = "accept"` or `"reject"`, another `footprint`, another `method`, `preset` or
-`settings`. All faults of a file are told at once.
+`settings`. All faults of a file are reported at once.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class Override:
     @property
     def effects(self) -> str:
         """What it does, as the records say it: such as `accept, footprint, method`."""
-        told = [self.action, "footprint" if self.footprint is not None else None, "method" if self.remodels else None]
-        return ", ".join(word for word in told if word)
+        words = [self.action, "footprint" if self.footprint is not None else None, "method" if self.remodels else None]
+        return ", ".join(word for word in words if word)
 
     @property
     def fingerprint(self) -> str:

@@ -1,10 +1,10 @@
-"""Where a run keeps what is neither input nor result: points by tile, fragments, terrain, models to be published.
+"""The scratch folder of a run: points by tile, fragments, terrain, models to publish.
 
-Plain files of fixed records under one folder that all workers see. Every file is written under a
-temporary name and renamed, so a task may run twice or die half way.
+It has plain files of fixed records and is visible to all workers. Every file is written under a temporary name and
+renamed, so a task may run twice or die half way.
 
-The folder may outlive a run. Then each attempt at a run has a mark of its own there, and takes that of the one before
-away: tasks of a driver that died, which may still run somewhere, find theirs gone and write nothing any more.
+The folder may outlive a run. Each attempt at a run then has a mark of its own there, and removes the mark of the one
+before. Tasks of a driver that died may still run somewhere; without their mark they write nothing.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ POINT = np.dtype(
 _CANCELLED = "cancelled"
 _ATTEMPTS = "attempts"
 _LONGEST_HEADER_BYTES = 256
-"""Of the arrays that are stored here: numbers of up to three dimensions."""
+"""Enough for the arrays stored here, numbers of up to three dimensions."""
 
 
 def _layout(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...], Literal["C", "F"], int]:
@@ -55,7 +55,7 @@ def _layout(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...], Literal["C", "
 
 @functools.lru_cache(maxsize=256)
 def _parsed(header: bytes) -> tuple[np.dtype[Any], tuple[int, ...], Literal["C", "F"], int]:
-    """The same of a whole header; numpy's reader of it takes longer than the array, and few headers differ."""
+    """As `_layout`, from a whole header; cached, since numpy takes longer for it than for the array."""
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(io.BytesIO(header[8:]))
     return dtype, shape, "F" if fortran else "C", len(header)
 
@@ -67,17 +67,17 @@ class Scratch:
     root: str
     """Path of the folder; a string, so that tasks stay small and picklable."""
     attempt: str = ""
-    """Names the attempt at a run in a folder that outlives it; empty where the folder ends with the run."""
+    """Name of the attempt at a run in a folder that outlives it; empty where the folder ends with the run."""
 
     @property
     def name(self) -> str:
-        """What logs call the run: the attempt, or the folder's own name."""
+        """Name of the run in logs: the attempt, or the folder's own name."""
         return self.attempt or Path(self.root).name
 
     def create(self) -> None:
-        """Make the folder, once, by whoever starts the run; no task ever makes it again.
+        """Make the folder, once, when the run starts; no task ever makes it again.
 
-        Of a folder that outlives its runs: take it over from the attempts before.
+        A folder that outlives its runs is taken over from the attempts before.
         """
         Path(self.root).mkdir(parents=True, exist_ok=True)
         if self.attempt:
@@ -93,7 +93,7 @@ class Scratch:
         Raises
         ------
         RunCancelledError
-            The scratch itself is gone, and with it the run.
+            The scratch itself is gone, and the run with it.
         """
         path = Path(self.root, *parts)
         try:
@@ -153,7 +153,7 @@ class Scratch:
         Raises
         ------
         RunCancelledError
-            The run was called off, or another took its place.
+            The run was cancelled, or another took its place.
         """
         target = self.path(name)
         temporary = target.with_name(f".{target.name}.{uuid4().hex}")
@@ -165,9 +165,9 @@ class Scratch:
             temporary.unlink(missing_ok=True)
 
     def cancel(self) -> None:
-        """Tell all tasks of the run to end: they look for this mark wherever they can stop.
+        """Mark the run as cancelled; its tasks look for the mark wherever they can stop.
 
-        Where it cannot be set, because the folder is gone or the disk is full, the folder's removal tells them.
+        Where the mark cannot be set, because the folder is gone or the disk is full, the folder's removal ends them.
         """
         with contextlib.suppress(OSError):
             if self.attempt:
@@ -181,19 +181,13 @@ class Scratch:
 
     @property
     def cancelled(self) -> bool:
-        """Whether the run was called off, or is over: then there is no folder any more, or another took it over."""
+        """Whether the run was cancelled, or is over: then its folder is gone, or another attempt took it over."""
         if self.attempt:
             return not self._mark.exists()
         root = Path(self.root)
         return (root / _CANCELLED).exists() or not root.exists()
 
     def check_cancelled(self) -> None:
-        """End a task of a run that was called off.
-
-        Raises
-        ------
-        RunCancelledError
-            It was called off.
-        """
+        """Raise `RunCancelledError` in a task of a run that was cancelled."""
         if self.cancelled:
             raise RunCancelledError("the run was called off")

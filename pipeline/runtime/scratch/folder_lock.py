@@ -1,7 +1,7 @@
-"""Folders that are held by the process that works in them: scratch that several make side by side, and results.
+"""Folders locked by the process that works in them: scratch that several processes make side by side, and results.
 
-A process that is killed cannot clean up. It holds its folder by a lock of the system, which ends with the process
-whatever ended it, so whoever comes next can tell a folder that nobody holds from one that is in use.
+A killed process cannot clean up. It locks its folder by a lock of the system, which ends with the process, however it
+ends. The next process can then distinguish an abandoned folder from one in use.
 """
 
 from __future__ import annotations
@@ -23,25 +23,16 @@ _NAME = re.compile(r"\.?[0-9a-f]{32}")
 
 @contextlib.contextmanager
 def locked_folder(parent: Path) -> Iterator[Path]:
-    """A new folder in `parent`, held until the block ends; removed then, and `parent` with it where it is empty.
+    """A new folder in `parent`, locked until the block ends; then removed, and `parent` with it where it is empty.
 
-    Where the file system knows no locks the folder is made all the same, and nobody else's is removed there.
-
-    Parameters
-    ----------
-    parent : Path
-        A folder for nothing else; made where it is not there.
-
-    Yields
-    ------
-    Path
-        The folder.
+    On a file system without locks the folder is made all the same, and no other folder is removed there. `parent` is a
+    folder for nothing else; it is made where it does not exist.
     """
     folder, handle = _made(parent)
     try:
         yield folder
     finally:
-        # by another name first, so that no late task finds it and fills it again
+        # renamed first, so that no late task finds it and fills it again
         doomed = folder.with_name(f".{folder.name}")
         try:
             folder.rename(doomed)
@@ -54,14 +45,14 @@ def locked_folder(parent: Path) -> Iterator[Path]:
 
 
 def _made(parent: Path) -> tuple[Path, int]:
-    """A folder and the handle that holds it."""
+    """A folder and the handle that locks it."""
     while True:
         folder = parent / uuid4().hex
         folder.mkdir(parents=True)
         try:
             handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except FileNotFoundError:
-            continue  # taken for an abandoned one before it was held
+            continue  # removed as abandoned before it was locked
         with contextlib.suppress(OSError):
             fcntl.flock(handle, fcntl.LOCK_EX)
         if folder.is_dir():
@@ -71,19 +62,14 @@ def _made(parent: Path) -> tuple[Path, int]:
 
 @contextlib.contextmanager
 def locked_results(run_dir: str) -> Iterator[None]:
-    """Hold a run directory while it is written, so that no other run on this file system writes it, too.
+    """Lock a run directory while it is written, so that no other run on this file system writes it too.
 
-    Nothing lies in it for that. In an object store, and where the file system cannot lock folders, nothing is held.
-
-    Parameters
-    ----------
-    run_dir : str
-        The folder, which is there, or a URL.
+    The lock needs no file in it. Object stores, and file systems that cannot lock folders, are not locked.
 
     Raises
     ------
     RunError
-        Another run holds it.
+        Another run has locked the directory.
     """
     if is_url(run_dir):
         yield
@@ -102,16 +88,10 @@ def locked_results(run_dir: str) -> Iterator[None]:
 
 
 def remove_abandoned(parent: Path) -> list[str]:
-    """Remove those folders of `locked_folder` that no living process holds; their names.
-
-    Parameters
-    ----------
-    parent : Path
-        Where `locked_folder` makes them; need not be there.
-    """
+    """Remove the folders of `locked_folder` in `parent` that no living process locks; their names."""
     removed = []
     found = parent.iterdir() if parent.is_dir() else ()
-    for folder in sorted(path for path in found if _NAME.fullmatch(path.name)):  # what else lies there is not ours
+    for folder in sorted(path for path in found if _NAME.fullmatch(path.name)):  # other folders there are not ours
         with contextlib.suppress(OSError):
             handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:

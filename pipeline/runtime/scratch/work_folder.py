@@ -1,7 +1,7 @@
-"""A folder that keeps what the tasks of a run found: a run that was cut off goes on there, a later one begins there.
+"""The work folder, which stores the outcomes of tasks: an interrupted run resumes there, and a later run starts there.
 
-One process at a time works in it. It holds the folder by a lock of the system, which ends with the process whatever
-ended it, so nothing needs to be cleared away after a crash.
+One process at a time works in it. It locks the folder by a lock of the system, which ends with the process, however it
+ends, so a crash leaves nothing to clean up.
 """
 
 from __future__ import annotations
@@ -25,40 +25,35 @@ from pipeline.runtime.scratch.outcomes import FOLDER
 
 _LOCK = "lock"
 DRIVER_LOCK = "driver.lock"
-"""Held by who drives a batch, from before its first word about it; tasks are kept under `_LOCK`, later."""
-_OF_WHO_WORKS = (DRIVER_LOCK, _LOCK)
+"""Locked by the driver of a batch before it reports anything; `_LOCK` protects the tasks' outcomes, later."""
+_LOCKS = (DRIVER_LOCK, _LOCK)
 _SCRATCH = "scratch"
 _MARK = "work.json"
 _BESIDE = {_LOCK, "status.json"}
-"""What a batch may have written before the folder was made."""
+"""Files that a batch may have written before the folder was made."""
 _PATIENCE_S, _PAUSE_S = 0.5, 0.01
-"""Whoever asks whether a lock is held holds it for microseconds: it is tried again for so long, so often."""
+"""How long, and how often, a lock is tried again: a process that only checks a lock holds it for microseconds."""
 _FORMAT = 1
 _BOOT = "boot"
 _DISTRUSTED_S = 300.0
-"""Ten times as long as systems keep what is not on the disk yet."""
+"""Outcomes this young may be incomplete after a loss of power: ten times as long as systems delay writes."""
 _OF_A_RUN = ("dask", "fetched")
-"""Folders of scratch that a process leaves behind only where it was killed."""
+"""Folders of scratch that only a killed process leaves behind."""
 
 
 @contextlib.contextmanager
 def locked_work(folder: str) -> Iterator[Scratch]:
-    """Hold a work folder, made where it is not there, until the block ends.
-
-    Parameters
-    ----------
-    folder : str
-        On a file system that all workers share.
+    """Lock a work folder until the block ends; made where it does not exist, on a file system that all workers share.
 
     Yields
     ------
     Scratch
-        Where tasks keep what they find, taken over from all earlier attempts.
+        Stores the outcomes of tasks; taken over from all earlier attempts.
 
     Raises
     ------
     RunError
-        Another process works there, or the folder is none of ours, or cannot be written.
+        Another process works there, or the folder is not a work folder, or cannot be written.
     """
     root = Path(folder).resolve()
     make_work(root)
@@ -72,15 +67,14 @@ def locked_work(folder: str) -> Iterator[Scratch]:
 
 
 def _distrust_the_last(root: Path, scratch: Scratch) -> None:
-    """Forget what was kept shortly before this machine was started anew.
+    """Remove outcomes stored shortly before this machine was restarted.
 
-    What a process wrote outlives it, but not a loss of power: the system writes to the disk up to half a minute later
-    (`vm.dirty_expire_centisecs`), names before contents. So of an outcome that was kept within minutes of the end
-    nobody knows whether it is whole. Where another machine goes on, the folder lies on a server of files, which has
-    what was closed.
+    What a process wrote survives the process, but not a loss of power: the system writes to the disk up to half a
+    minute later (`vm.dirty_expire_centisecs`), names before contents. An outcome stored within minutes of the end may
+    therefore be incomplete. Where another machine resumes, the folder is on a file server, which has all closed files.
     """
     file, host, now = root / _BOOT, socket.gethostname(), boot_id()
-    # of a folder that does not tell nobody knows; a new one has nothing that could be distrusted
+    # a folder without the file is new, and has no outcomes yet
     before = file.read_text(errors="replace").split() if file.is_file() else [host]
     if before[:1] == [host] and before[1:] != [now]:
         kept = [path for path in Path(scratch.root, FOLDER).glob("*/*/*") if path.name[0] != "."]
@@ -92,7 +86,7 @@ def _distrust_the_last(root: Path, scratch: Scratch) -> None:
 
 
 def boot_id() -> str:
-    """What differs each time that this machine is started; `unknown` where the system does not tell it."""
+    """An id that differs each time this machine starts; `unknown` where the system has none."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -100,12 +94,12 @@ def boot_id() -> str:
 
 
 def make_work(root: Path) -> None:
-    """Make a work folder where it is not there.
+    """Make a work folder where it does not exist.
 
     Raises
     ------
     RunError
-        The folder is none of ours, or cannot be written.
+        The folder is not a work folder, or cannot be written.
     """
     try:
         root.mkdir(parents=True, exist_ok=True)
@@ -116,12 +110,12 @@ def make_work(root: Path) -> None:
 
 @contextlib.contextmanager
 def locked_file(root: Path, name: str) -> Iterator[None]:
-    """Hold a file in a work folder until the block ends.
+    """Lock a file in a work folder until the block ends.
 
     Raises
     ------
     RunError
-        Another process holds it, or the folder cannot be written or knows no locks.
+        Another process has locked it, or the folder cannot be written or has no locks.
     """
     try:
         handle = os.open(root / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -148,12 +142,12 @@ def locked_file(root: Path, name: str) -> Iterator[None]:
 
 
 def take_lock(handle: int) -> None:
-    """Lock an open file until all who have it open closed it, or ended.
+    """Lock an open file until all processes that have it open close it or end.
 
     Raises
     ------
     BlockingIOError
-        Another process holds it.
+        Another process has locked it.
     OSError
         It is on a file system without locks.
     """
@@ -168,30 +162,24 @@ def take_lock(handle: int) -> None:
 
 
 def refuse_locked(folder: str) -> None:
-    """Say early that another process works in a folder; `locked_work` has the last word.
-
-    Raises
-    ------
-    RunError
-        One does.
-    """
-    for name in _OF_WHO_WORKS:
+    """Raise `RunError` early where another process works in a folder; `locked_work` decides."""
+    for name in _LOCKS:
         if is_locked(folder, name):
             raise RunError(f"{folder} is at work already ({_holder(Path(folder, name))}): wait for it, or end it first")
 
 
 def is_at_work(folder: str) -> bool:
     """Whether some process works in a folder."""
-    return any(is_locked(folder, name) for name in _OF_WHO_WORKS)
+    return any(is_locked(folder, name) for name in _LOCKS)
 
 
 def refuse_foreign(folder: str) -> None:
-    """Say early that a work folder cannot be one; nothing is made.
+    """Refuse early a folder that cannot be a work folder; makes nothing.
 
     Raises
     ------
     RunError
-        It is a file, holds other people's files, or was made by another version.
+        It is a file, has files of others, or was made by another version.
     """
     root = Path(folder)
     try:
@@ -202,7 +190,7 @@ def refuse_foreign(folder: str) -> None:
 
 
 def _holder(lock: Path) -> str:
-    """Who holds a lock, as the holder says."""
+    """The process that holds a lock, as written in it."""
     try:
         return lock.read_text(errors="replace").strip() or "by another process"
     except OSError:
@@ -210,7 +198,7 @@ def _holder(lock: Path) -> str:
 
 
 def is_locked(folder: str, lock: str) -> bool:
-    """Whether some process of this machine, or of one that shares the folder's locks, works there just now."""
+    """Whether a process of this machine, or of one that shares the folder's locks, has locked a file there."""
     try:
         handle = os.open(Path(folder, lock), os.O_RDWR | os.O_CLOEXEC)
     except OSError:
@@ -227,13 +215,13 @@ def is_locked(folder: str, lock: str) -> bool:
 
 
 def _check_mark(root: Path) -> None:
-    """Refuse a folder with other people's files, or of another format; mark it as ours."""
+    """Refuse a folder with files of others, or of another format; mark it as ours."""
     if not _is_marked(root):
         (root / _MARK).write_text(json.dumps({"format": _FORMAT}) + "\n")
 
 
 def _is_marked(root: Path) -> bool:
-    """Whether a folder is ours already; one with other people's files, or of another format, is refused."""
+    """Whether a folder is ours already; raises `RunError` for one with files of others, or of another format."""
     mark = root / _MARK
     if mark.is_file():
         try:

@@ -68,7 +68,7 @@ class EntryOutcome:
             "settings": self.override.settings,
             "footprint": None if self.override.footprint is None else self.override.footprint.wkt,
             "note": self.override.note,
-            "told": self.fault,
+            "fault": self.fault,
             "fingerprint": None if self.effective is None else self.effective.fingerprint,
         }
 

@@ -1,12 +1,11 @@
-"""Facets that several tiles see: by them the fragments of one surface find each other across the borders.
+"""Facets that several tiles see: through them the fragments of one surface find each other across tile borders.
 
-A facet is the same in all tiles that see it, so its vertices name it. The name that travels is a hash of 128 bits. Two
-of n facets get one name by chance with a probability below n^2 / 2^129: 10^-22 for the 10^8 facets of ten million
-buildings.
+A facet is the same in all tiles that see it, so its vertices name it. The name is a hash of 128 bits. Two of n facets
+get the same name by chance with a probability below n^2 / 2^129: 10^-22 for the 10^8 facets of ten million buildings.
 
-Of most facets no name needs to travel. Along a border, far from a third tile, both tiles are sure to see the facets
-that reach into a strip around it, and what is connected there is connected for both: one facet of each connected piece
-tells as much as all of them. Both tiles take the one of the smallest name.
+Most facets need not be named to other tiles. Along a border, far from a third tile, both tiles certainly see the facets
+that reach into a strip around it, and connected facets are connected for both. One facet per connected piece therefore
+suffices; both tiles choose the one with the smallest name.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from pipeline.terrain.settings import SurfaceSettings
 from pipeline.tiling import Tile, TileGrid
 
 _SLACK_MM = 2
-"""Circumradii are compared as floats; a facet may be wider than twice the largest by less than this."""
+"""Numerical guard in mm: circumradii are compared as floats, so a facet may be this much wider than allowed."""
 _OTHER = np.uint64(0xD1B54A32D192ED03)
-"""Where the second word begins: any number but 0, where the first does."""
+"""Start of the second word: any number except 0, where the first starts."""
 
 
 @kernel
 def facet_names(keys: IntArray) -> npt.NDArray[np.uint64]:
-    """Names (j, 2) uint64 of facets, from their keys (j, 6) as of `facet_keys`."""
+    """Names of facets (j, 2) uint64, two independent hashes of their keys (j, 6) int64 from `facet_keys`."""
     names = np.empty((keys.shape[0], 2), np.uint64)
     for i in range(keys.shape[0]):
         first, second = np.uint64(0), _OTHER
@@ -43,23 +42,23 @@ def facet_names(keys: IntArray) -> npt.NDArray[np.uint64]:
 
 
 def united_by_name(count: int, names: npt.NDArray[np.uint64], holders: IntArray) -> IntArray:
-    """Smallest member (count,) int64 of the set of each of `count` elements, where those with one name are one set.
+    """Smallest member (count,) int64 of the set of each element, where elements that share a name are in one set.
 
     Parameters
     ----------
     count : int
-        How many elements there are.
+        Number of elements.
     names : (j, 2) uint64
         Names.
     holders : (j,) int
-        The element that holds each.
+        The element with each name.
     """
     order = np.lexsort((names[:, 1], names[:, 0]))
     same = np.flatnonzero((names[order[1:]] == names[order[:-1]]).all(axis=1))
     return united(count, holders[order[same]], holders[order[same + 1]])
 
 
-def telling_facets(
+def shared_facets(
     keys: IntArray,
     names: npt.NDArray[np.uint64],
     kinds: KindArray,
@@ -67,28 +66,28 @@ def telling_facets(
     grid: TileGrid,
     settings: SurfaceSettings,
 ) -> tuple[BoolArray, BoolArray]:
-    """Which facets another tile may see, and which of them need to be told for the same sets of fragments.
+    """Which facets another tile may see, and which of them suffice to connect the same fragments.
 
     Parameters
     ----------
     keys : (j, 6) int64
-        All facets of some kinds that the tile sees and another may see, as of `facet_keys`.
+        Keys from `facet_keys` of all facets of some kinds that the tile sees and another may see.
     names : (j, 2) uint64
         Their names.
     kinds : (j,) int8
-        Their FacetKind: only what is of one kind is connected.
+        Their FacetKind: only facets of one kind are connected.
     tile, grid : Tile, TileGrid
         The tile and its lattice.
     settings : SurfaceSettings
-        Those that the facets were made with.
+        The settings that made the facets.
 
     Returns
     -------
-    (j,) bool
-        May be seen by another tile.
-    (j,) bool
-        Has to be told: all of the former, but of those that are connected in a strip that two tiles are sure to see,
-        and no third may, only the one of the smallest name.
+    seen : (j,) bool
+        Another tile may see the facet.
+    named : (j,) bool
+        The facet is named to other tiles: all of the former, except that facets connected in a strip which exactly two
+        tiles see are represented by the one with the smallest name.
     """
     x, y = keys[:, 0::2], keys[:, 1::2]
     # a tile sees a facet if a vertex is near its core, or in another facet that reaches into the core
@@ -106,22 +105,22 @@ def telling_facets(
         both = (values.min(axis=1) < border + settings.far_mm) & (values.max(axis=1) >= border - settings.far_mm)
         # both borders of a tile along one axis: two strips
         sure[two & both] = 2 * axis + (high == (tile.column, tile.row)[axis])[two & both]
-    told = seen.copy()
+    named = seen.copy()
     strip = np.flatnonzero(seen & (sure >= 0))
     piece = _connected(keys[strip], sure[strip] * len(FacetKind) + kinds[strip])
     order = np.lexsort((names[strip, 1], names[strip, 0], piece))
-    told[strip] = False
+    named[strip] = False
     _, first = np.unique(piece[order], return_index=True)
-    told[strip[order[first]]] = True
-    return seen, told
+    named[strip[order[first]]] = True
+    return seen, named
 
 
 def _connected(keys: IntArray, layer: IntArray) -> IntArray:
-    """Smallest member (j,) of the set of each facet, where those of one layer that share an edge are one set."""
+    """Smallest member (j,) of the set of each facet, where facets of one layer that share an edge are in one set."""
     if len(keys) == 0:
         return np.empty(0, np.int64)
     x, y = keys[:, 0::2].ravel(), keys[:, 1::2].ravel()
-    # vertices are few and near each other: both coordinates fit one integer, and so do the numbers of two of them
+    # vertices are few and near each other: both coordinates fit into one integer, and so do the numbers of two vertices
     _, vertex = np.unique(((x - x.min()) << 32) | (y - y.min()), return_inverse=True)
     a = vertex.reshape(-1, 3).astype(np.int64)
     b = np.roll(a, -1, axis=1)

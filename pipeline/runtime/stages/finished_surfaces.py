@@ -1,8 +1,8 @@
 """Whole surfaces are judged and grouped to candidates and rejected objects: columns in, columns out.
 
-What no neighbour can see of is finished by the task of its tile, all else by the join: with one function, so that
-nobody can tell who did it. It gives for each connected set of surfaces what it gives for all of them together, since
-judging looks at one surface, and uniting only along steps.
+The task of a tile finishes the surfaces that no neighbour sees, and the join all others, with the same function. The
+result for a connected set of surfaces does not depend on the others, since judging looks at one surface, and uniting
+only along steps.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pipeline.terrain.settings import CandidateSettings
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Finished:
-    """Candidates and rejected objects, by columns; c and r of them."""
+    """c candidates and r rejected objects, by columns."""
 
     candidate_points_mm: IntArray
-    """(c, 3) smallest point of each candidate."""
+    """(c, 3) int64, smallest point of each candidate in mm."""
     candidate_ranges: IntArray
     """(p, 4) candidate, tile, start, stop: points in the sorted points of a tile; tiles are numbered by the caller."""
     kind: KindArray
@@ -33,7 +33,7 @@ class Finished:
     lowest_point_mm: IntArray
     """(r, 3) smallest point."""
     rejected_ranges: IntArray
-    """(q, 4) rejected object, tile, start, stop: the user may know better and want its points."""
+    """(q, 4) rejected object, tile, start, stop: an override may accept it and then needs its points."""
     small: int
     """Surfaces below the size of an object: counted, not listed."""
 
@@ -44,7 +44,7 @@ def finished(surfaces: Surfaces, ranges: IntArray, settings: CandidateSettings) 
     Parameters
     ----------
     surfaces : Surfaces
-        All of one or more sets that no step connects with any other surface.
+        One or more complete sets; no step connects them with any other surface.
     ranges : (p, 4) int64
         Surface, tile, start, stop of runs of their points.
     settings : CandidateSettings
@@ -72,7 +72,7 @@ def finished(surfaces: Surfaces, ranges: IntArray, settings: CandidateSettings) 
 
 
 def _ranges_of(ranges: IntArray, members: IntArray, site: IntArray, count: int) -> IntArray:
-    """The ranges of some of `count` surfaces, with the number of each one's site in place of its own."""
+    """The ranges of some of `count` surfaces, with the number of the site in place of the surface's."""
     site_of = np.full(count, -1, np.int64)
     site_of[members] = site
     found = site_of[ranges[:, 0]]

@@ -163,7 +163,7 @@ def gather(
     around = surroundings_of(scratch, grid, view)
     roof = np.zeros(around.occupied.shape, np.bool_)
     roof[columns_mm[1] // CELL_MM - around.row0, columns_mm[0] // CELL_MM - around.column0] = True
-    # terrain far from all points may lie in a tile that nobody made
+    # terrain far from all points may lie in a tile without points, which is never made
     points_near = _grown(around.occupied, _EMPTY_CELLS)
     known = (around.elevation_mm != NO_DATA) & points_near
     outline = _grown(roof, _OUTLINE_CELLS) & ~roof & known

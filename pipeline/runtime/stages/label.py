@@ -1,7 +1,7 @@
 """Labelling: the class of every point of a tile, in the order in which ingest bucketed each input's points.
 
-A bucket holds the points of one input that lie in one tile, in the order of the file. Whoever reads the file again
-meets each tile's points in that order, so that a class a point is all that has to be stored: no index, no sorting.
+A bucket has the points of one input in one tile, in the order of the file. A second pass over the file meets them in
+the same order, so one class per point is all that is stored: no index, no sorting.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ def label(task: LabelTask) -> Labelled:
     Returns
     -------
     Labelled
-        Counts; the classes are in scratch under `classes/<tile>/<input>.bin`, a byte a point of the bucket.
+        Counts; the classes are in scratch under `classes/<tile>/<input>.bin`, one byte per point of the bucket.
 
     Raises
     ------
     RunCancelledError
-        The run was called off.
+        The run was cancelled.
     """
     task.scratch.check_cancelled()
     window = neighbourhood(task.tile, task.grid, task.settings)

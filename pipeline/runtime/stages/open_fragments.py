@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from pipeline.kernels.union_find import united
 from pipeline.model import BoolArray, IntArray, KindArray, LabelArray
-from pipeline.runtime.stages.border_facets import facet_names, telling_facets
+from pipeline.runtime.stages.border_facets import facet_names, shared_facets
 from pipeline.runtime.stages.finished_surfaces import Finished, finished
 from pipeline.terrain.candidates import SOLID, Fault, Surfaces, judge_surfaces, may_join
 from pipeline.terrain.facets import FacetKind
@@ -33,17 +33,17 @@ class BorderFacets:
     """Facets by which the fragments of several tiles find each other."""
 
     names: npt.NDArray[np.uint64]
-    """(j, 2) uint64, as of `facet_names`."""
+    """(j, 2) uint64, from `facet_names`."""
     holders: LabelArray
-    """(j,) int32, the fragment or step that holds each."""
+    """(j,) int32, the fragment or step of each facet."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TileSurfaces:
-    """The surfaces of one tile, by columns: those that are finished, and k fragments that wait for other tiles."""
+    """The surfaces of one tile, by columns: finished ones, and k fragments that wait for other tiles."""
 
     done: Finished
-    """Of what no other tile can change; its tiles are numbered 0."""
+    """Sites that no other tile can change; their tile has number 0."""
     kind: KindArray
     """(k,) int8, FacetKind: OBJECT, BUILDING or CROWN."""
     sums: IntArray
@@ -51,17 +51,17 @@ class TileSurfaces:
     boxes_mm: IntArray
     """(k, 4) int64, xmin, ymin, xmax, ymax; xmin > xmax where no facet is owned."""
     lowest_point_mm: IntArray
-    """(k, 3) int64, smallest assigned point; NOWHERE where there is none."""
+    """(k, 3) int64, smallest assigned point in mm; NOWHERE where there is none."""
     ranges: IntArray
     """(k, 2) int64, start and stop of each one's points in the tile's sorted points; equal where there are none."""
     facets: BorderFacets
-    """Of the fragments."""
+    """Facets of the fragments."""
     steps: int
-    """How many steps lie along them or cross the tile's border."""
+    """Number of steps that lie along the fragments or cross the tile's border."""
     step_facets: BorderFacets
-    """Of the steps."""
+    """Facets of the steps."""
     along_steps: LabelArray
-    """(s, 2) int32, fragment and step; one row a pair."""
+    """(s, 2) int32, fragment and step; one row per pair."""
 
 
 def open_fragments(
@@ -73,7 +73,7 @@ def open_fragments(
     cut: SurfaceSettings,
     settings: CandidateSettings,
 ) -> TileSurfaces:
-    """Finish what a tile can, and keep of its other fragments what a join needs.
+    """Finish what a tile can, and pass on the part of its other fragments that a join needs.
 
     Parameters
     ----------
@@ -86,12 +86,12 @@ def open_fragments(
     tile, grid : Tile, TileGrid
         The tile and its lattice.
     cut : SurfaceSettings
-        Those that the fragments were made with.
+        The settings that made the fragments.
     settings : CandidateSettings
         What makes a surface a candidate.
     """
     kind, count = fragments.kind, len(fragments.kind)
-    opened, holders, names = _told_facets(fragments, tile, grid, cut)
+    opened, holders, names = _shared_facets(fragments, tile, grid, cut)
     is_open = np.zeros(count, np.bool_)
     is_open[opened] = True
     solid, step = np.isin(kind, SOLID), kind == FacetKind.STEP
@@ -102,14 +102,14 @@ def open_fragments(
     waits = waits[piece]
     linked = np.zeros(count, np.bool_)
     linked[pairs.ravel()] = True
-    # a step that nothing lies along here matters only where it holds several facets together, for other tiles
+    # a step without a surface along it matters only where it connects several facets for other tiles
     facets_of = np.bincount(holders, minlength=count)
-    kept_steps = step & waits & (linked | (facets_of > 1))
-    kept = solid & waits
+    waiting_steps = step & waits & (linked | (facets_of > 1))
+    waiting = solid & waits
     ranges = np.zeros((count, 2), np.int64)
     ranges[keys, 0], ranges[keys, 1] = starts[:-1], starts[1:]
     pair_waits = waits[pairs[:, 0]]
-    chosen = np.flatnonzero(kept)
+    chosen = np.flatnonzero(waiting)
     return TileSurfaces(
         done=_finished(fragments, solid & ~waits, pairs[~pair_waits], ranges, settings),
         kind=kind[chosen],
@@ -117,41 +117,41 @@ def open_fragments(
         boxes_mm=fragments.boxes_mm[chosen],
         lowest_point_mm=fragments.lowest_point_mm[chosen],
         ranges=ranges[chosen],
-        facets=_held_by(kept, holders, names),
-        steps=int(kept_steps.sum()),
-        step_facets=_held_by(kept_steps, holders, names),
+        facets=_facets_of(waiting, holders, names),
+        steps=int(waiting_steps.sum()),
+        step_facets=_facets_of(waiting_steps, holders, names),
         along_steps=np.column_stack(
-            (_numbers(kept)[pairs[pair_waits, 0]], _numbers(kept_steps)[pairs[pair_waits, 1]])
+            (_numbers(waiting)[pairs[pair_waits, 0]], _numbers(waiting_steps)[pairs[pair_waits, 1]])
         ).astype(np.int32),
     )
 
 
 def _numbers(mask: BoolArray) -> IntArray:
-    """The place of each set element among those that are set."""
+    """The rank of each True element among the True ones."""
     return np.cumsum(mask, dtype=np.int64) - 1
 
 
-def _held_by(kept: BoolArray, holders: IntArray, names: npt.NDArray[np.uint64]) -> BorderFacets:
-    """The facets of the fragments that are kept, with these numbered anew."""
-    held = kept[holders]
-    return BorderFacets(names=names[held], holders=_numbers(kept)[holders[held]].astype(np.int32))
+def _facets_of(chosen: BoolArray, holders: IntArray, names: npt.NDArray[np.uint64]) -> BorderFacets:
+    """The facets of the chosen fragments, which are numbered from 0."""
+    own = chosen[holders]
+    return BorderFacets(names=names[own], holders=_numbers(chosen)[holders[own]].astype(np.int32))
 
 
-def _told_facets(
+def _shared_facets(
     fragments: Fragments, tile: Tile, grid: TileGrid, cut: SurfaceSettings
 ) -> tuple[IntArray, IntArray, npt.NDArray[np.uint64]]:
-    """Fragments that another tile may see; and of the facets that have to be told their fragments and names."""
+    """Fragments that another tile may see; and the fragments and names of the facets that are named to other tiles."""
     kinds = fragments.kind[fragments.crossing_fragment]
     above = np.flatnonzero(kinds != FacetKind.GROUND)
     keys = fragments.crossing_keys[above]
     holders = fragments.crossing_fragment[above].astype(np.int64)
     names = facet_names(keys)
-    seen, told = telling_facets(keys, names, kinds[above], tile, grid, cut)
-    return np.unique(holders[seen]), holders[told], names[told]
+    seen, named = shared_facets(keys, names, kinds[above], tile, grid, cut)
+    return np.unique(holders[seen]), holders[named], names[named]
 
 
 def _linking_pairs(fragments: Fragments, is_open: BoolArray, settings: CandidateSettings) -> IntArray:
-    """Pairs (s, 2) of a surface that may lead or join along a step, as far as the tile can know, and the step."""
+    """Pairs (s, 2) of a step and a surface that may lead or join along it, as far as the tile can know."""
     count = len(fragments.kind)
     may_link = is_open & np.isin(fragments.kind, (FacetKind.OBJECT, FacetKind.BUILDING))
     beside = np.zeros(count, np.bool_)

@@ -1,12 +1,12 @@
-"""What points a tile holds, as a few sums: equal sums mean equal points, whatever files they came from, in any order.
+"""The content of a tile as a few sums: equal sums mean equal points, from whatever files, in any order.
 
-A tile's neighbours see only the points near their common border, so the sums are told by zone: a tile is cut at the
-halo's width from each side into three by three zones. What a neighbour's window holds of the tile is then named by the
-zones that face it; a change elsewhere in the tile is none for the neighbour.
+A tile's neighbours see only the points near their common border, so there is one sum per zone: a tile is cut at the
+halo's width from each side into three by three zones. A neighbour's window depends only on the zones that face it, so a
+change elsewhere in the tile does not concern it.
 
 The sum of a zone is a multiset hash: every point is mixed to two words of 64 bits, and the words of all points are
 added. Adding is blind to order and lets files be summed apart (Bellare and Micciancio 1997, AdHash). It guards against
-chance (2^-128), not against points that someone chose to collide.
+chance (2^-128), not against points chosen to collide.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _S32, _S40, _S48, _S56 = np.uint64(32), np.uint64(40), np.uint64(48), np.uint64(
 
 @kernel
 def mixed(state: np.uint64, word: np.uint64) -> np.uint64:
-    """A state of 64 bits after one more word; for each state another permutation of the words."""
+    """A 64-bit state mixed with one more word; each state permutes the words differently."""
     z = (state ^ word) + _GAMMA
     z = (z ^ (z >> _S30)) * _MIX_1
     z = (z ^ (z >> _S27)) * _MIX_2
@@ -45,7 +45,7 @@ def mixed(state: np.uint64, word: np.uint64) -> np.uint64:
 def zone_sums(
     records: npt.NDArray[np.void], gps_bits: npt.NDArray[np.uint64], x0: int, y0: int, x1: int, y1: int, halo: int
 ) -> ZoneSums:
-    """Sums of the points of one tile, by zone.
+    """Number and two 64-bit hash sums of the points of one tile, by zone: (3, 3, 3) uint64.
 
     Parameters
     ----------
@@ -86,21 +86,21 @@ def zone_sums_of(stored: bytes) -> ZoneSums:
 
 
 def are_apart(grid: TileGrid) -> bool:
-    """Whether the zones of a tile do not overlap; else neighbours hang on the whole of it."""
+    """Whether the zones of a tile do not overlap; else neighbours depend on the whole tile."""
     return 2 * grid.halo_mm <= grid.size_mm
 
 
 def content_of_window(sums: Mapping[Tile, ZoneSums], grid: TileGrid, window: Window, tile: Tile) -> list[object]:
-    """What a tile's window holds, for its key: the tile's own sums, and of each neighbour those that face it.
+    """The content of a tile's window, for its key: the tile's own sums, and those of each neighbour that face it.
 
     Parameters
     ----------
     sums : mapping
-        Of all tiles with points, over all inputs; made with the halo of `grid`.
+        Sums of all tiles with points, over all inputs; made with the halo of `grid`.
     grid : TileGrid
         The lattice of the plan.
     window : Window
-        What the tile sees: its core and a halo that is at most that of the lattice.
+        The tile's core and a halo at most as wide as that of the lattice.
     tile : Tile
         The tile.
     """

@@ -231,8 +231,8 @@ def _las_plan(source: Source) -> _Plan:
     point_format = NEWER_FORMAT[block.point_format]
     kept = [r for r in frame.records if r.user_id not in {b"copc", b"laszip encoded"}]
     extended = tuple(r for r in frame.extended if r.user_id != b"copc")
-    told = {(r.user_id, r.record_id) for r in kept} | {(r.user_id, r.record_id) for r in extended}
-    header_wkt = (PROJECTION, WKT_RECORD_ID) in told
+    present = {(r.user_id, r.record_id) for r in kept} | {(r.user_id, r.record_id) for r in extended}
+    header_wkt = (PROJECTION, WKT_RECORD_ID) in present
     warnings: list[str] = []
     geotiff = {(PROJECTION, number) for number in GEOTIFF_RECORDS}
     if source.crs_given:
@@ -329,7 +329,7 @@ def new_size(point_format: int) -> int:
 
 
 def wkt_record(reference: SpatialReference) -> tuple[bytes, int, bytes, bytes]:
-    """The record that tells the CRS.
+    """The record with the CRS.
 
     The standard means WKT 1; where the CRS does not survive it, WKT 2 is written, which newer readers know.
     """
