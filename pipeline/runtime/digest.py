@@ -106,8 +106,8 @@ def _check_unique(name: str, key: tuple[str, ...], keys: list[npt.NDArray[Any]],
         same &= ordered[1:] == ordered[:-1]
     if same.any():
         row = order[int(np.argmax(same))]
-        found = [column[row].item() for column in keys]
-        texts = [value.decode() if isinstance(value, bytes) else value for value in found]
+        cells = [column[row].item() for column in keys]
+        texts = [value.decode() if isinstance(value, bytes) else value for value in cells]
         found = ", ".join(f"{column} {text!r}" for column, text in zip(key, texts, strict=True))
         raise RunError(f"{name} has more than one row of {found}: files of two runs lie in one directory")
 

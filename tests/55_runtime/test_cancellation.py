@@ -122,7 +122,7 @@ def results_of(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_run_is_called_off_in_any_stage(
+def test_a_run_is_cancelled_in_any_stage(
     stage: str, start: Callable[..., RunSummary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reached = threading.Event()
@@ -148,7 +148,7 @@ def test_a_run_is_called_off_in_any_stage(
     assert "scratch" not in {path.name.lstrip(".").split(".")[0] for path in (tmp_path / "run").iterdir()}
 
 
-def test_a_run_that_was_called_off_can_be_started_again(start: Callable[..., RunSummary]) -> None:
+def test_a_run_that_was_cancelled_can_be_started_again(start: Callable[..., RunSummary]) -> None:
     whole = start("whole")
     with pytest.raises(RunCancelledError):
         start(cancelled=lambda: True)

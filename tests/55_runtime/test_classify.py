@@ -77,7 +77,7 @@ def rich(true_suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     header.scales, header.offsets = source.header.scales, source.header.offsets
     header.add_extra_dims([laspy.ExtraBytesParams(name="amplitude", type=np.float64)])
     header.add_crs(pyproj.CRS.from_epsg(7415))
-    header.vlrs.append(laspy.VLR("somebody", 42, "theirs", b"\1\2\3"))
+    header.vlrs.append(laspy.VLR("someone", 42, "theirs", b"\1\2\3"))
     las = laspy.LasData(header)
     n = len(source.points)
     for name in ("X", "Y", "Z", "return_number", "number_of_returns", "gps_time", "point_source_id"):
@@ -92,7 +92,7 @@ def rich(true_suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     las.classification = np.where(rng.random(n) < 0.01, 18, rng.integers(0, 7, n))
     las.withheld = rng.random(n) < 0.01
     path = tmp_path_factory.mktemp("rich") / "rich.laz"
-    las.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("somebody", 43, "long", b"x" * 100_000)])
+    las.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("someone", 43, "long", b"x" * 100_000)])
     las.write(path)
     return path
 
@@ -127,10 +127,10 @@ def test_every_record_of_the_header_is_kept_byte_for_byte(rich: Path, run_classi
     path = run_classify(rich).files[0].path
     kept = {(r.user_id, r.record_id): r.data for r in read_frame(rich).records if r.user_id != b"laszip encoded"}
     found = {(r.user_id, r.record_id): r.data for r in read_frame(Path(path)).records}
-    assert {(b"somebody", 42), (b"LASF_Spec", 4), (b"LASF_Projection", 2112)} == set(kept)
+    assert {(b"someone", 42), (b"LASF_Spec", 4), (b"LASF_Projection", 2112)} == set(kept)
     assert {key: found[key] for key in kept} == kept
     (extended,) = laspy.read(path).evlrs
-    assert (extended.user_id, extended.record_id) == ("somebody", 43)
+    assert (extended.user_id, extended.record_id) == ("someone", 43)
     assert extended.record_data_bytes() == b"x" * 100_000
 
 
@@ -268,10 +268,10 @@ def test_the_classes_of_the_file_stand_where_they_are_trusted(true_suburb: Path,
 
 
 @pytest.mark.parametrize(
-    ("change", "told"), [(1000, r"more points in tile .* than when it was first read"), (-1000, r"points are left")]
+    ("change", "fault"), [(1000, r"more points in tile .* than when it was first read"), (-1000, r"points are left")]
 )
-def test_a_file_that_changes_meanwhile_is_told(
-    change: int, told: str, true_suburb: Path, run_classify: Classify, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_file_that_changes_meanwhile_is_reported(
+    change: int, fault: str, true_suburb: Path, run_classify: Classify, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "changing.laz"
     las = laspy.read(true_suburb)
@@ -288,19 +288,19 @@ def test_a_file_that_changes_meanwhile_is_told(
         other.write(path)
 
     monkeypatch.setattr(module, "_label_all", then_change)
-    with pytest.raises(InconsistentInputError, match=told):
+    with pytest.raises(InconsistentInputError, match=fault):
         run_classify(path, out=str(tmp_path / "out"))
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_a_cell_of_rasters_that_nobody_asked_for_is_an_error(true_suburb: Path, tmp_path: Path) -> None:
+def test_a_cell_of_rasters_without_a_request_is_an_error(true_suburb: Path, tmp_path: Path) -> None:
     request = ClassifyRequest(inputs=(str(true_suburb),), out=str(tmp_path / "out"), raster_cell=2.0, resources=SERIAL)
     with pytest.raises(SettingsError, match=r"raster_cell is 2 where no rasters are asked for: give --rasters too"):
         classify(request)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_classification_that_is_called_off_leaves_no_file(true_suburb: Path, tmp_path: Path) -> None:
+def test_a_classification_that_is_cancelled_leaves_no_file(true_suburb: Path, tmp_path: Path) -> None:
     request = ClassifyRequest(inputs=(str(true_suburb),), out=str(tmp_path / "out"), resources=SERIAL)
     with pytest.raises(RunCancelledError):
         classify(request, cancelled=lambda: True)
@@ -358,14 +358,14 @@ def shared_copc() -> Callable[[Path, Path], Path]:
     return make
 
 
-def test_what_a_killed_command_left_is_removed_and_told_by_the_next_into_the_same_folder(
+def test_what_a_killed_command_left_is_removed_and_reported_by_the_next_into_the_same_folder(
     true_suburb: Path, run_classify: Classify, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     code = (
         "import os, signal, sys; from pathlib import Path; from pipeline.runtime.classify import *; "
-        "told = lambda event: event.stage == 'ingest' and os.kill(os.getpid(), signal.SIGKILL); "
-        "classify(ClassifyRequest(inputs=(sys.argv[1],), out=sys.argv[2], workers=0), told)"
+        "listen = lambda event: event.stage == 'ingest' and os.kill(os.getpid(), signal.SIGKILL); "
+        "classify(ClassifyRequest(inputs=(sys.argv[1],), out=sys.argv[2], workers=0), listen)"
     )
     killed = subprocess.run([sys.executable, "-c", code, str(true_suburb), str(out)], check=False)
     assert killed.returncode == -signal.SIGKILL

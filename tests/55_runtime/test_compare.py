@@ -41,7 +41,7 @@ def request(suburb: Path, out: Path, **fields: object) -> CompareRequest:
 
 @pytest.fixture(scope="module")
 def compared(suburb: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[CompareSummary, list[Event]]:
-    """Both presets of Fuzzy SART on the suburb, and what was told meanwhile."""
+    """Both presets of Fuzzy SART on the suburb, and the events meanwhile."""
     events: list[Event] = []
     return compare(request(suburb, tmp_path_factory.mktemp("compared") / "out"), events.append), events
 
@@ -91,7 +91,7 @@ def test_nothing_but_the_runs_is_left(compared: tuple[CompareSummary, list[Event
     assert sorted(entry.name for entry in (out / "runs").iterdir()) == ["fuzzy-sart", "fuzzy-sart-faithful"]
 
 
-def test_a_comparison_that_is_called_off_says_so_in_every_run(suburb: Path, tmp_path: Path) -> None:
+def test_a_comparison_that_is_cancelled_says_so_in_every_run(suburb: Path, tmp_path: Path) -> None:
     seen: list[str] = []
 
     def listen(event: Event) -> None:
@@ -134,7 +134,7 @@ def test_what_only_looks_like_a_broken_comparison_is_never_replaced(suburb: Path
     assert (tmp_path / "runs" / "of-mine" / "run.json").exists()
 
 
-def test_no_page_of_an_earlier_comparison_stands_beside_runs_that_were_called_off(suburb: Path, tmp_path: Path) -> None:
+def test_no_page_of_an_earlier_comparison_stands_beside_runs_that_were_cancelled(suburb: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     (out / "runs").mkdir(parents=True)
     for name in (SUMMARY, BUILDINGS, REPORT, PAGE):
@@ -180,7 +180,7 @@ def test_a_run_by_one_method_loads_nothing_ahead(suburb: Path, tmp_path: Path, m
 
 
 @pytest.mark.parametrize(
-    ("texts", "told"),
+    ("texts", "fault"),
     [
         (["magic,fuzzy-sart"], "method is 'magic': use one of"),
         (["fuzzy-sart:bold,fuzzy-sart"], "preset is 'bold': use one of robust, faithful"),
@@ -189,8 +189,8 @@ def test_a_run_by_one_method_loads_nothing_ahead(suburb: Path, tmp_path: Path, m
         ([""], "method is ''"),
     ],
 )
-def test_variants_that_make_no_sense_are_told(texts: list[str], told: str) -> None:
-    with pytest.raises(SettingsError, match=told):
+def test_senseless_variants_are_refused(texts: list[str], fault: str) -> None:
+    with pytest.raises(SettingsError, match=fault):
         parse_variants(texts)
 
 

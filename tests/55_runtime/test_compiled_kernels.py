@@ -37,7 +37,7 @@ def test_a_kernel_is_compiled_once_it_was_called_here_and_no_more_when_source_or
     assert says(tmp_path, ASKED + "print(told((half,)))") == ["False"]
 
 
-def test_an_empty_cache_is_told_and_stays_empty_and_without_numba_nothing_need_be_compiled(tmp_path: Path) -> None:
+def test_an_empty_cache_is_reported_and_stays_empty_and_without_numba_nothing_need_be_compiled(tmp_path: Path) -> None:
     asked = "from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled as told; print(told())"
     assert says(tmp_path, asked) == ["False"]
     assert list((tmp_path / "cache").rglob("*.kernel")) == []

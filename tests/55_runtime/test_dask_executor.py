@@ -192,7 +192,7 @@ def test_the_content_is_that_of_children_of_this_process(cluster: Cluster, subur
 # --- called off ------------------------------------------------------------------------------------------------------
 
 
-def test_a_run_that_is_called_off_tells_its_tasks_and_waits_for_them(cluster: Cluster, tmp_path: Path) -> None:
+def test_a_run_that_is_cancelled_ends_its_tasks_and_waits_for_them(cluster: Cluster, tmp_path: Path) -> None:
     off = threading.Event()
     watch = Watch(cancelled=off.is_set, stop=Path(tmp_path, "go").touch)
     tasks = [(str(tmp_path), f"task{k}") for k in range(30)]
@@ -228,7 +228,7 @@ def test_tasks_of_a_map_that_is_closed_do_not_begin(cluster: Cluster, tmp_path: 
     assert len(list(tmp_path.glob("started-*"))) < len(tasks)
 
 
-def test_serial_tasks_are_called_off_between_two() -> None:
+def test_serial_tasks_are_cancelled_between_two() -> None:
     found: list[int] = []
     watch = Watch(cancelled=lambda: len(found) == 2)
     with pytest.raises(RunCancelledError):
@@ -278,7 +278,7 @@ class Lookouts:
             self.monitor.look("split", Watch(listener=self.events.append))
 
 
-def test_waiting_for_workers_is_told_with_the_time_and_the_fix_and_so_is_their_return() -> None:
+def test_waiting_for_workers_is_reported_with_the_time_and_the_fix_and_so_is_their_return() -> None:
     world = Lookouts()
     world.pass_time(70)
     assert [event.kind for event in world.events] == ["waiting"] * 3
@@ -313,7 +313,7 @@ def test_a_scheduler_that_is_silent_is_lost_after_a_while_and_not_before() -> No
         world.pass_time(3)
 
 
-def test_a_broken_connection_to_the_scheduler_is_told_at_once() -> None:
+def test_a_broken_connection_to_the_scheduler_is_reported_at_once() -> None:
     world = Lookouts()
     world.client.status = "connecting"
     with pytest.raises(ClusterError, match="connection to it broke"):
@@ -345,13 +345,13 @@ def test_a_task_of_another_version_is_refused_before_it_is_unpacked() -> None:
     assert measure_packed(fingerprint(), packed(chores.double, 4)).result == 8
 
 
-def test_a_fingerprint_tells_every_version() -> None:
+def test_a_fingerprint_covers_every_version() -> None:
     assert versions_of(fingerprint()) == dict(versions_here())
     assert {"python", "numpy", "numba", "distributed", "pyarrow", "shapely", ENGINE} <= set(versions_here())
     assert "none" not in versions_here().values()
 
 
-def test_all_that_differs_is_told() -> None:
+def test_all_that_differs_is_reported() -> None:
     ours = {"numpy": "2.1", "numba": "0.63", "scipy": "1.16"}
     told = differences(ours, {"numpy": "2.0", "scipy": "1.16", "pandas": "3"})
     assert told == ["numpy 2.0 where the client has 2.1", "no numba where the client has 0.63"]

@@ -118,7 +118,7 @@ def test_more_points_buildings_and_halos_cost_more() -> None:
     assert cost() < cost(buildings=200)
 
 
-def test_a_plan_tells_points_tiles_and_buildings(suburb: Path) -> None:
+def test_a_plan_has_points_tiles_and_buildings(suburb: Path) -> None:
     plan = make_plan([str(suburb)], ReadOptions(), RunSettings())
     found = expected(plan)
     assert found.points == plan.points
@@ -139,11 +139,11 @@ def test_one_file_is_not_read_by_several_hands() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "most"), [("150000 100000", 1), ("50000 100000", 1), ("max 100000", None), (None, None)]
+    ("quota", "most"), [("150000 100000", 1), ("50000 100000", 1), ("max 100000", None), (None, None)]
 )
-def test_a_quota_of_the_control_group_bounds_the_cores(tmp_path: Path, told: str | None, most: int | None) -> None:
-    if told is not None:
-        (tmp_path / "cpu.max").write_text(told)
+def test_a_quota_of_the_control_group_bounds_the_cores(tmp_path: Path, quota: str | None, most: int | None) -> None:
+    if quota is not None:
+        (tmp_path / "cpu.max").write_text(quota)
     free = machine.cores(tmp_path / "nowhere")
     assert machine.cores(tmp_path) == (free if most is None else min(free, most))
 

@@ -105,7 +105,7 @@ def test_a_server_is_there_before_anybody_asks_for_a_child(ask: Callable[..., An
     assert ask("__import__('loaded_by_a_test').LOADED_BY") == server.pid
 
 
-def test_what_a_server_cannot_load_is_told_by_the_child(ask: Callable[..., Any]) -> None:
+def test_what_a_server_cannot_load_is_reported_by_the_child(ask: Callable[..., Any]) -> None:
     child_pool.preload(["loaded_by_a_test:fail"])
     assert ask("1 + 1") == 2
     with pytest.raises(RunError, match=r"(?s)3 times in a row.*OSError: not loaded"):
@@ -156,7 +156,7 @@ def test_children_of_a_server_that_is_killed_die_and_the_work_is_done_by_others(
     assert [other.pid for other in servers()] != [server.pid]
 
 
-def test_a_service_that_is_told_to_end_keeps_its_server(ask: Callable[..., Any]) -> None:
+def test_a_service_that_must_end_keeps_its_server(ask: Callable[..., Any]) -> None:
     server = ask("os.getppid()")
     os.kill(server, signal.SIGTERM)
     child_pool._children._idle[0].end()
@@ -184,7 +184,7 @@ def test_where_nothing_can_be_forked_children_are_executed(
     assert servers() == []
 
 
-def test_a_child_that_is_called_off_before_its_server_has_loaded_never_begins(
+def test_a_child_that_is_cancelled_before_its_server_has_loaded_never_begins(
     ask: Callable[..., Any], tmp_path: Path
 ) -> None:
     fifo = tmp_path / "fifo"

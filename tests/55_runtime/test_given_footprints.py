@@ -1,4 +1,4 @@
-"""Given footprints end to end: every fault is told, none stops a run, ids and attributes come out again."""
+"""Given footprints end to end: every fault is reported, none stops a run, ids and attributes come out again."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_attributes_and_ids_come_out_again(
         "x-2": {"id": "x-2", "status": None, "year": 1955, "Größe": 2.5},
     }
     assert {name: json.loads(row["source_attributes"]) for name, row in found.items()} == wanted
-    assert {name: told["source_attributes"] for name, told in features(summary.run_dir).items()} == wanted
+    assert {name: found["source_attributes"] for name, found in features(summary.run_dir).items()} == wanted
     # a column of the file with the name of one of ours stays apart from it
     assert features(summary.run_dir)["x-1"]["status"] == "ok"
     report = json.loads((Path(summary.run_dir) / "footprints.json").read_text())
@@ -80,7 +80,7 @@ def test_attributes_and_ids_come_out_again(
     }
 
 
-def test_every_fault_is_told_by_its_id_and_none_stops_the_run(
+def test_every_fault_is_reported_by_its_id_and_none_stops_the_run(
     suburb: Path, houses: list[Polygon], reconstruct: Any, tmp_path: Path
 ) -> None:
     far = shapely.box(0, 0, 10, 10)
@@ -161,8 +161,8 @@ def test_the_footprints_of_delft_model_their_buildings_with_their_attributes(
         inside = known[known.intersects(shapely.box(*window))].set_index("bgt_id")
         assert set(found) == set(inside.index)
         for name, row in found.items():
-            told = json.loads(row["source_attributes"])
-            assert (told["bgt_id"], told["status"]) == (name, inside.loc[name, "status"])
-        # values of dates are told in the writer's own way; all else is the same
+            columns = json.loads(row["source_attributes"])
+            assert (columns["bgt_id"], columns["status"]) == (name, inside.loc[name, "status"])
+        # dates are written in the writer's own way; all else is the same
         digests.add(tuple(sorted((name, row["status"], row["geometry"]) for name, row in found.items())))
     assert len(digests) == 1

@@ -180,7 +180,7 @@ def test_a_child_that_keeps_much_memory_is_replaced(orders: Callable[[str], str]
 
 
 @pytest.mark.slow
-def test_the_same_fault_is_told_in_the_same_words(orders: Callable[[str], str]) -> None:
+def test_the_same_fault_is_reported_in_the_same_words(orders: Callable[[str], str]) -> None:
     limits = IsolationLimits(timeout_s=1.0, memory_bytes=2**29)
     faults = ["os.abort()", "while True: pass", "held = [b'1' * 2**25 for _ in range(10**6)]"]
     first, again = outcomes(orders, faults, limits), outcomes(orders, faults[::-1], limits)[::-1]
@@ -259,12 +259,12 @@ def test_threads_have_children_of_their_own(orders: Callable[[str], str], tmp_pa
     assert len(child_processes()) == 2
 
 
-def test_a_new_child_calls_what_it_is_told_to_load_with_its_argument(tmp_path: Path) -> None:
+def test_a_new_child_calls_what_it_must_load_with_its_argument(tmp_path: Path) -> None:
     (outcome,) = supervise(os.path.abspath, ["."], LIMITS, loads=(f"os:chdir:{tmp_path}",))
     assert outcome == (0, str(tmp_path.resolve()))
 
 
-def test_children_that_cannot_start_are_an_error_that_tells_what_they_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_children_that_cannot_start_are_an_error_with_what_they_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(child_pool, "_LOADS", ("no_such_module:load",))
     with pytest.raises(RunError, match=r"(?s)3 times in a row.*No module named 'no_such_module'"):
         outcomes(len, ["abc"])
@@ -377,7 +377,7 @@ def test_a_building_that_meets_a_fault_of_ours_is_kept_with_and_without_a_child(
 
 
 @pytest.mark.slow
-def test_every_fault_costs_its_building_alone_and_is_told_and_kept(
+def test_every_fault_costs_its_building_alone_and_is_reported_and_stored(
     town: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = reconstruct(town)

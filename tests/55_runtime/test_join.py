@@ -50,7 +50,7 @@ EASY = CandidateSettings(
     min_top_share=0.4,
     unite_share=0.2,
 )
-"""Small patches become candidates, join, and are rejected, about as often as they are too small to be told."""
+"""Small patches become candidates, join, and are rejected, about as often as they are too small to be listed."""
 
 
 def handed_on(whole: WholeSplit, grid: TileGrid, cut: SurfaceSettings, judging: CandidateSettings) -> Split:
@@ -229,10 +229,10 @@ def test_the_patches_have_what_the_join_is_for() -> None:
         seen["reasons"] += len({site.verdict.reason for site in found.rejected})
         seen["small"] += found.small_fragments
         seen["finished in their tile"] += sum(len(s.surfaces.done.kind) for s in handed if s.surfaces)
-        told = sum(len(s.surfaces.facets.names) for s in handed if s.surfaces)
+        named = sum(len(s.surfaces.facets.names) for s in handed if s.surfaces)
         kinds = [w.fragments.kind[w.fragments.crossing_fragment] for w in wholes]
-        seen["facets that need not be told"] += (
-            sum(int(((kind != FacetKind.GROUND) & (kind != FacetKind.STEP)).sum()) for kind in kinds) - told
+        seen["facets that need not be named"] += (
+            sum(int(((kind != FacetKind.GROUND) & (kind != FacetKind.STEP)).sum()) for kind in kinds) - named
         )
     assert min(seen.values()) >= 6, seen
 
@@ -322,7 +322,7 @@ def test_fragments_of_any_sums_and_links_are_joined_as_by_the_slow_join(
 
 
 def by_hand(tile: Tile, kinds: list[int], facets: list[tuple[int, int]], along: list[tuple[int, int]]) -> WholeSplit:
-    """Steps, and roofs whose size is told by the tile's column; facets (number, fragment) around the origin."""
+    """Steps, and roofs whose size depends on the tile's column; facets (number, fragment) around the origin."""
     count = len(kinds)
     roof = {Sum.FACETS: 100, Sum.VERTICES: 50, Sum.HEIGHT: 50 * 6000, Sum.PLANAR: 50, Sum.BOUNDARY: 20_000}
     roof |= {Sum.AREA2: 60_000_000 + 1000 * tile.column, Sum.WALL: 20_000, Sum.WALL_TOP: 20_000, Sum.STEP: 15_000}
@@ -387,7 +387,7 @@ def test_towns_in_tiny_tiles_are_joined_as_by_the_slow_join(
     points = WindowPoints(x_mm=x, y_mm=y, z_mm=z, return_number=number, return_count=count, classification=codes)
     scene = SceneSettings()
     halo = math.ceil(1000 * scene.support_with(classes, footprints=False))
-    told = []
+    sites = []
     for size_mm, origin in ((22_000, 3_700), (38_000, -9_100)):
         grid = TileGrid(size_mm=size_mm, halo_mm=halo, origin_x_mm=origin, origin_y_mm=-origin)
         columns, rows = grid.columns_rows(x, y)
@@ -402,8 +402,8 @@ def test_towns_in_tiny_tiles_are_joined_as_by_the_slow_join(
         assert new == slow
         assert len(new.candidates) > 5
         assert any(len({part.tile for part in site.ranges}) > 2 for site in new.candidates)
-        told.append([(c.building_id, c.points) for c in new.candidates])
-    assert told[0] == told[1]
+        sites.append([(c.building_id, c.points) for c in new.candidates])
+    assert sites[0] == sites[1]
 
 
 # -- facets ------------------------------------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ def test_tasks_of_other_threads_pay_for_themselves() -> None:
     assert measured.cpu_s < 0.2
 
 
-def test_when_a_task_began_is_told() -> None:
+def test_when_a_task_began_is_reported() -> None:
     before = time.time()
     measured = measure(spin, 0.01)
     assert before <= measured.began_s <= time.time()

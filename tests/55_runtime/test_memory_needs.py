@@ -125,7 +125,7 @@ def test_giants_go_to_the_worker_that_has_room_for_them(bench: Bench) -> None:
     assert len(processes) == 1
 
 
-def test_where_nobody_announces_memory_all_run_and_it_is_told(bench: Bench) -> None:
+def test_where_no_worker_announces_memory_all_run_with_a_warning(bench: Bench) -> None:
     add_worker(bench, None)
     bench.go()
     assert sorted(bench.run([bench.task(f"giant{k}", 3 * GIB) for k in range(3)])) == ["giant0", "giant1", "giant2"]
@@ -135,7 +135,7 @@ def test_where_nobody_announces_memory_all_run_and_it_is_told(bench: Bench) -> N
     assert "--resources MEMORY=" in told.message
 
 
-def test_a_need_that_no_worker_has_runs_where_most_is_and_it_is_told(bench: Bench) -> None:
+def test_a_need_that_no_worker_has_runs_where_most_is_and_is_reported(bench: Bench) -> None:
     add_worker(bench, 2 * GIB)
     bench.go()
     assert bench.run([bench.task("giant", 64 * GIB)]) == ["giant"]

@@ -51,7 +51,7 @@ def tile(suburb, bucket, s3):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Many failures take no time: nobody sleeps between attempts."""
+    """Many failures take no time: no sleep between attempts."""
     monkeypatch.setitem(persistently.__kwdefaults__, "sleep", lambda _: None)
 
 
@@ -62,7 +62,7 @@ def request(tile, bucket, scratch=None, **more):
 
 
 def files(place):
-    """Keys and content of a run but for run.json, which tells times."""
+    """Keys and content of a run, without run.json, which has times."""
     storage = storage_at(place)
     names = storage.keys()
     return {key: storage.get(key) for key in names if key != "run.json"}
@@ -95,7 +95,7 @@ def test_readers_of_a_run_take_its_url(local, tile, bucket):
 
 def test_states_come_after_their_files_and_run_json_is_first_and_last(tile, bucket, s3):
     run(request(tile, bucket))
-    puts = [r.path.partition("/run/")[2] for r, told in s3.seen if r.method == "PUT" and told == "pass"]
+    puts = [r.path.partition("/run/")[2] for r, answer in s3.seen if r.method == "PUT" and answer == "pass"]
     assert puts[0] == puts[-1] == "run.json"
     for state in (name for name in puts if name.startswith("state/")):
         key = state.removeprefix("state/").removesuffix(".json")
@@ -132,7 +132,7 @@ def test_a_run_that_is_there_is_only_replaced_when_asked(local, tile, bucket):
         run(RunRequest(inputs=(tile,), out=f"{bucket}/other", resources=SERIAL, overwrite=True))
 
 
-def test_whoever_reads_while_a_run_is_replaced_sees_that_it_is_not_finished(tile, bucket, s3):
+def test_a_reader_sees_while_a_run_is_replaced_that_it_is_not_finished(tile, bucket, s3):
     run(request(tile, bucket))
     met = []
 
@@ -250,7 +250,7 @@ def test_workers_elsewhere_need_a_scratch_that_they_see(bucket):
         run(RunRequest(inputs=("a.laz",), out=f"{bucket}/run", resources=Resources(scratch=f"{bucket}/scratch")))
 
 
-def test_an_input_that_vanishes_after_the_plan_is_told_by_its_url(tile, bucket, s3, quick):
+def test_an_input_that_vanishes_after_the_plan_is_reported_by_its_url(tile, bucket, s3, quick):
     def script(asked):
         begun = any("run.json" in r.path for r, _ in s3.seen)
         return "denied" if begun and asked.method == "GET" and "suburb.laz" in asked.path else "pass"

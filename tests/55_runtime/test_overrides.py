@@ -1,4 +1,4 @@
-"""What the user says of single buildings is done, told, and done to them alone."""
+"""Overrides of single buildings take effect, are reported, and change no other building."""
 
 from __future__ import annotations
 
@@ -218,9 +218,9 @@ def test_a_point_names_the_building_around_it_and_far_ones_name_the_nearest(plai
     """
     summary = overridden(text)
     assert set(before) - set(rows(summary.run_dir, "buildings")) == {name}
-    told = [warning for warning in summary.warnings if warning.startswith("overrides: ")]
-    assert "it is in no building; the nearest is" in told[0]
-    assert "there is no rejected object within 50 m" in told[1]
+    found = [warning for warning in summary.warnings if warning.startswith("overrides: ")]
+    assert "it is in no building; the nearest is" in found[0]
+    assert "there is no rejected object within 50 m" in found[1]
     outcomes = json.loads((Path(summary.run_dir) / "overrides.json").read_text())
     assert [entry["building_id"] for entry in outcomes] == [name, None, None]
     assert [entry["effects"] for entry in outcomes] == ["reject", "", ""]
@@ -233,7 +233,7 @@ def test_ids_that_are_none_are_warned_of_with_the_nearest(plain: Any, overridden
     assert any(f"the nearest is {name}" in warning for warning in summary.warnings)
 
 
-def test_what_changes_nothing_is_told(plain: Any, overridden: Any) -> None:
+def test_what_changes_nothing_is_reported(plain: Any, overridden: Any) -> None:
     building, thing = min(rows(plain.run_dir, "buildings")), min(rows(plain.run_dir, "rejected"))
     text = f"""
         [[building]]
@@ -245,9 +245,9 @@ def test_what_changes_nothing_is_told(plain: Any, overridden: Any) -> None:
     """
     summary = overridden(text)
     assert summary.digest == plain.digest
-    told = " ".join(summary.warnings)
-    assert f"{building} is a building already" in told
-    assert f"{thing} is rejected already" in told
+    found = " ".join(summary.warnings)
+    assert f"{building} is a building already" in found
+    assert f"{thing} is rejected already" in found
     summary = overridden(f'[[building]]\nbuilding_id = "{thing}"\nmethod = "kmeans"')
     assert any('give action = "accept", too' in warning for warning in summary.warnings)
 
@@ -287,7 +287,7 @@ def test_given_footprints_are_overridden_by_their_own_id(plain: Any, overridden:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "fault"),
     [
         ("buildings = 1", r"buildings is no table of overrides: use \[\[building\]\]"),
         ("[building]\nbuilding_id = 'a'", r"building is no array of tables"),
@@ -317,13 +317,13 @@ def test_given_footprints_are_overridden_by_their_own_id(plain: Any, overridden:
         (2 * "[[building]]\nbuilding_id = 'a'\naction = 'accept'\n", "entry 2: names the same building as entry 1"),
     ],
 )
-def test_faults_of_an_entry_are_told_with_the_fix(tmp_path: Path, text: str, told: str) -> None:
+def test_faults_of_an_entry_are_reported_with_the_fix(tmp_path: Path, text: str, fault: str) -> None:
     (tmp_path / "o.toml").write_text(text)
-    with pytest.raises(SettingsError, match=told):
+    with pytest.raises(SettingsError, match=fault):
         read_overrides(tmp_path / "o.toml", METRES, RunSettings())
 
 
-def test_all_faults_are_told_at_once_and_before_anything_is_touched(
+def test_all_faults_are_reported_at_once_and_before_anything_is_touched(
     plain: Any, suburb: Path, reconstruct: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "o.toml").write_text("[[building]]\naction = 'x'\n[[building]]\nbuilding_id = 'a'\nmethod = 'y'")
@@ -412,11 +412,11 @@ def test_a_rerun_leaves_what_a_whole_run_with_these_overrides_writes(
     done = again(first.run_dir, overrides=str(tmp_path / "overrides.toml"))
     assert done.digest == whole.digest != first.digest
     assert files(first.run_dir) == files(whole.run_dir)
-    told, expected = (json.loads((Path(run) / "run.json").read_text()) for run in (first.run_dir, whole.run_dir))
-    slow = [{one["building_id"] for one in which["slowest"]} for which in (told, expected)]
+    found, expected = (json.loads((Path(run) / "run.json").read_text()) for run in (first.run_dir, whole.run_dir))
+    slow = [{one["building_id"] for one in which["slowest"]} for which in (found, expected)]
     assert slow[0] == slow[1] != set()
     times = ("started_at", "finished_at", "timings_s", "peak_memory_bytes", "slowest")
-    assert {k: v for k, v in told.items() if k not in times} == {k: v for k, v in expected.items() if k not in times}
+    assert {k: v for k, v in found.items() if k not in times} == {k: v for k, v in expected.items() if k not in times}
     assert len(done.buildings) == 4
     for path in (Path(first.run_dir) / "state").glob("*.json"):
         for name, digest in json.loads(path.read_text())["files"].items():
@@ -507,7 +507,7 @@ def test_a_rerun_with_given_footprints_is_a_whole_run_too(
     known = [outline(row) for _, row in sorted(rows(plain.run_dir, "buildings").items())]
     given = write_outlines(tmp_path / "given.geojson", {str(k): polygon for k, polygon in enumerate(known)})
     text = "[[building]]\nsource_id = '3'\naction = 'reject'\n[[building]]\nsource_id = '5'\nmethod = 'kmeans'"
-    (tmp_path / "area").mkdir()  # of the same name, to be told apart by the whole path
+    (tmp_path / "area").mkdir()  # the same name, distinguished by the whole path
     area = write_outlines(tmp_path / "area" / given.name, {"area": shapely.union_all(known).envelope.buffer(20.0)})
     whole = overridden(text, footprints=str(given), aoi=str(area))
     first = reconstruct(suburb, settings=TILES, footprints=str(given), aoi=str(area))
@@ -522,7 +522,7 @@ def test_a_rerun_with_given_footprints_is_a_whole_run_too(
         path.write_text(text)
 
 
-def test_a_rerun_that_is_called_off_leaves_the_run_as_it_was(plain: Any, copied: Any, tmp_path: Path) -> None:
+def test_a_rerun_that_is_cancelled_leaves_the_run_as_it_was(plain: Any, copied: Any, tmp_path: Path) -> None:
     first = copied()
     before = files(first.run_dir) | {"run.json": (Path(first.run_dir) / "run.json").read_bytes()}
     name = min(rows(first.run_dir, "buildings"))
@@ -588,9 +588,9 @@ def test_a_rerun_that_fails_among_the_files_says_so(copied: Any, monkeypatch: py
         patch.setattr("pipeline.runtime.rerun._put_state", full)
         with pytest.raises(OSError, match="no space left"):
             again(first.run_dir, only=(name,))
-    told = json.loads((Path(first.run_dir) / "run.json").read_text())
-    assert (told["status"], told["content_sha256"]) == ("failed", None)
-    assert told["warnings"][-1] == "OSError: no space left"
+    found = json.loads((Path(first.run_dir) / "run.json").read_text())
+    assert (found["status"], found["content_sha256"]) == ("failed", None)
+    assert found["warnings"][-1] == "OSError: no space left"
     with pytest.raises(RunError, match="is failed, not finished"):
         again(first.run_dir, only=(name,))
 
@@ -604,14 +604,14 @@ def test_runs_that_cannot_be_continued_are_refused_with_the_reason(
     name = min(rows(first.run_dir, "buildings"))
     manifest = Path(first.run_dir) / "run.json"
     text = manifest.read_text()
-    told = json.loads(text)
+    found = json.loads(text)
     for change, message in (
         ({"status": "running"}, "is running, not finished"),
         ({"engine_version": "0.0.0"}, r"made by gablework 0\.0\.0"),
         ({"request": {}}, "does not tell how the run was asked for"),
         ({"settings_hash": "ab"}, "changed by hand"),
     ):
-        manifest.write_text(json.dumps({**told, **change}))
+        manifest.write_text(json.dumps({**found, **change}))
         with pytest.raises(RunError, match=message):
             again(first.run_dir, only=(name,))
     manifest.write_text(text)

@@ -48,10 +48,10 @@ def test_of_many_inputs_that_cannot_be_used_some_are_named_and_the_others_counte
     paths = [str(tmp_path / f"{number:02}.laz") for number in range(25)]
     for path in paths:
         Path(path).write_bytes(b"<html>not found</html>")
-    told = str(_refused(paths))
-    assert [path for path in paths if path in told] == paths[:10]
-    assert "24 more inputs cannot be used" in told
-    assert told.endswith("; and 15 more")
+    message = str(_refused(paths))
+    assert [path for path in paths if path in message] == paths[:10]
+    assert "24 more inputs cannot be used" in message
+    assert message.endswith("; and 15 more")
 
 
 def test_inputs_of_another_crs_are_named_together(tmp_path: Path) -> None:

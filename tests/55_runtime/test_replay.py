@@ -217,7 +217,7 @@ def test_what_is_no_bundle_is_exit_code_3_and_named(path: Path, tmp_path: Path) 
         assert name in said
 
 
-def test_replay_tells_the_record_and_writes_the_model(path: Path, tmp_path: Path) -> None:
+def test_replay_shows_the_record_and_writes_the_model(path: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     code, said, _ = invoke("replay", str(path), "--no-isolate", "--out", str(out), "--json")
     told = json.loads(said)

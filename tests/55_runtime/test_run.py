@@ -99,12 +99,12 @@ def test_points_on_one_line_are_refused(tmp_path: Path, reconstruct: Any) -> Non
         reconstruct(path)
 
 
-def test_a_box_without_points_is_refused_and_told(suburb: Path, reconstruct: Any) -> None:
+def test_a_box_without_points_is_refused_and_reported(suburb: Path, reconstruct: Any) -> None:
     with pytest.raises(EmptyInputError, match=r"no usable point is left .*outside"):
         reconstruct(suburb, bbox=(0.0, 0.0, 10.0, 10.0))
 
 
-def test_an_earlier_run_is_kept_unless_told_otherwise(suburb: Path, reconstruct: Any, tmp_path: Path) -> None:
+def test_an_earlier_run_is_kept_without_overwrite(suburb: Path, reconstruct: Any, tmp_path: Path) -> None:
     out = str(tmp_path / "run")
     first = reconstruct(suburb, out=out)
     with pytest.raises(RunError, match="is not empty"):
@@ -135,7 +135,7 @@ def test_a_folder_that_is_no_run_is_never_replaced(suburb: Path, reconstruct: An
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
 
 
-def test_progress_is_told_by_stage_and_never_runs_backwards(suburb: Path, tmp_path: Path) -> None:
+def test_progress_is_reported_by_stage_and_never_runs_backwards(suburb: Path, tmp_path: Path) -> None:
     events: list[Event] = []
     settings = RunSettings.from_mapping({"tile_size_m": 40.0})
     run(
@@ -150,7 +150,7 @@ def test_progress_is_told_by_stage_and_never_runs_backwards(suburb: Path, tmp_pa
     assert events[-1].kind == "finished"
 
 
-def test_one_return_only_and_no_classes_are_used_and_told(tmp_path: Path, suburb: Path, reconstruct: Any) -> None:
+def test_one_return_only_and_no_classes_are_used_and_reported(tmp_path: Path, suburb: Path, reconstruct: Any) -> None:
     las = laspy.read(suburb)
     first = np.asarray(las.return_number) == 1
     path = tmp_path / "first.xyz"
@@ -162,7 +162,7 @@ def test_one_return_only_and_no_classes_are_used_and_told(tmp_path: Path, suburb
     assert any("no classes" in warning for warning in summary.warnings)
 
 
-def test_gross_outliers_are_left_out_and_told(tmp_path: Path, suburb: Path, reconstruct: Any) -> None:
+def test_gross_outliers_are_left_out_and_reported(tmp_path: Path, suburb: Path, reconstruct: Any) -> None:
     las = laspy.read(suburb)
     xyz = np.column_stack((las.x, las.y, las.z))
     centre = xyz.mean(axis=0)
@@ -200,7 +200,7 @@ def test_stray_class_codes_are_not_believed(suburb: Path, tmp_path: Path, recons
     assert any("1 of 1 inputs are not classified" in warning for warning in stray.warnings)
 
 
-def test_footprints_outside_the_box_are_left_out_and_told(suburb: Path, tmp_path: Path, reconstruct: Any) -> None:
+def test_footprints_outside_the_box_are_left_out_and_reported(suburb: Path, tmp_path: Path, reconstruct: Any) -> None:
     found = [shapely.from_wkb(row["geometry"]) for row in rows(reconstruct(suburb).run_dir, "buildings")]
     x0, y0, x1, y1 = found[0].bounds
     far = [outline for outline in found[1:] if not outline.intersects(shapely.box(x0 - 2, y0 - 2, x1 + 2, y1 + 2))]

@@ -55,7 +55,7 @@ def test_some_rows_come_back_without_the_others(tmp_path: Path, name: str) -> No
         assert np.array_equal(found, array[start:stop])
 
 
-def test_rows_that_a_file_does_not_hold_are_told(tmp_path: Path) -> None:
+def test_rows_that_a_file_does_not_hold_are_reported(tmp_path: Path) -> None:
     scratch = Scratch(str(tmp_path))
     scratch.put_arrays("tiles/a", {"one": ARRAYS["lattice"]})
     with pytest.raises(ValueError, match="reshape"):

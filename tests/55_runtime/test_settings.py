@@ -13,7 +13,7 @@ from pipeline.parameters import RENAMED
 from pipeline.settings import SECTIONS, RunSettings
 
 
-def test_all_faults_are_told_at_once() -> None:
+def test_all_faults_are_reported_at_once() -> None:
     with pytest.raises(SettingsError) as caught:
         RunSettings.from_mapping(
             {
@@ -46,9 +46,9 @@ OF_PAPERS = [name for name, entry in METHODS.items() if entry.faithful is not No
 
 
 def test_a_method_of_our_own_has_no_preset_that_keeps_to_a_paper() -> None:
-    told = "preset is 'faithful', and arrangement follows no paper: use robust"
+    fault = "preset is 'faithful', and arrangement follows no paper: use robust"
     for table in ({}, {"arrangement": {"min_points": 9}}):
-        with pytest.raises(SettingsError, match=told):
+        with pytest.raises(SettingsError, match=fault):
             RunSettings.from_mapping({"method": "arrangement", "preset": "faithful", **table})
 
 
@@ -62,7 +62,7 @@ def test_a_preset_is_where_the_settings_of_a_method_start(name: str) -> None:
     assert changed.building.method == dataclasses.replace(METHODS[name].faithful, **{field.name: field.default})
 
 
-def test_an_unknown_preset_is_told_with_the_known_ones() -> None:
+def test_an_unknown_preset_is_reported_with_the_known_ones() -> None:
     with pytest.raises(SettingsError, match="preset is 'bold': use one of robust, faithful"):
         RunSettings.from_mapping({"preset": "bold", "fuzzy-sart": {"vigilance": 0.8}})
 

@@ -59,7 +59,7 @@ def nothing_given(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
-def test_files_that_can_be_used_are_told_to_dask_for_every_role(authority: Authority) -> None:
+def test_files_that_can_be_used_are_passed_to_dask_for_every_role(authority: Authority) -> None:
     files = authority.files()
     told = files.security
     assert told["require_encryption"] is True
@@ -74,7 +74,7 @@ def test_a_key_may_lie_in_the_file_of_its_certificate(authority: Authority, tmp_
     assert TlsFiles(ca=files.ca, cert=str(both)).security["tls_worker_key"] == str(both)
 
 
-def test_every_file_that_is_missing_is_told_at_once(authority: Authority) -> None:
+def test_every_file_that_is_missing_is_reported_at_once(authority: Authority) -> None:
     with pytest.raises(SettingsError) as told:
         TlsFiles(ca="/nowhere/ca.pem", cert="/nowhere/one.pem", key=authority.files().key)
     assert [fault.split(":")[0] for fault in told.value.faults] == [
@@ -84,7 +84,7 @@ def test_every_file_that_is_missing_is_told_at_once(authority: Authority) -> Non
     assert all("No such file" in fault and "--tls-ca" in fault for fault in told.value.faults)
 
 
-def test_files_that_are_something_else_are_told(authority: Authority, tmp_path: Path) -> None:
+def test_files_that_are_something_else_are_reported(authority: Authority, tmp_path: Path) -> None:
     files, other = authority.files(), authority.files("two")
     text = tmp_path / "notes.txt"
     text.write_text("no certificate")
@@ -181,7 +181,7 @@ def doors() -> Iterator[list[Door]]:
         door.close()
 
 
-def test_a_look_at_the_port_tells_why_a_connection_failed(
+def test_a_look_at_the_port_shows_why_a_connection_failed(
     authority: Authority, tmp_path: Path, doors: list[Door]
 ) -> None:
     ours, theirs = authority.files(), Authority(tmp_path, "theirs").files()

@@ -144,7 +144,7 @@ def test_the_outline_is_part_of_what_a_model_is_made_of(row: npt.NDArray[np.void
     assert facts.input_hash != alone.input_hash
 
 
-def test_a_block_that_cannot_be_drawn_costs_its_outlines_and_is_told(
+def test_a_block_that_cannot_be_drawn_costs_only_its_outlines_and_is_reported(
     row: npt.NDArray[np.void], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     site, scratch = stored(row, ONE_TILE, tmp_path, 1)

@@ -108,7 +108,7 @@ def test_what_a_process_sent_and_worked_off_become_figures() -> None:
     assert found["gablework_peak_memory_bytes"] > 2**20
 
 
-def test_figures_are_served_and_a_taken_port_is_told() -> None:
+def test_figures_are_served_and_a_taken_port_is_reported() -> None:
     port = free_port()
     end = serve_metrics(port)
     try:
@@ -166,7 +166,7 @@ def test_a_task_that_fails_logs_its_run_stage_and_tile(lines: io.StringIO) -> No
     assert set(told(lines)[-1]) == {"at", "level", "logger", "message"}
 
 
-def test_a_fault_of_the_input_has_no_traceback_and_a_run_that_is_called_off_no_line(lines: io.StringIO) -> None:
+def test_a_fault_of_the_input_has_no_traceback_and_a_run_that_is_cancelled_no_line(lines: io.StringIO) -> None:
     for error in (RunError("disk full: make room"), RunCancelledError("called off")):
 
         def broken(_: object, error: Exception = error) -> None:
@@ -217,7 +217,7 @@ raise KeyError("lost")
 """
 
 
-def test_all_that_a_process_of_ours_says_is_json_also_what_libraries_say_and_what_nobody_caught() -> None:
+def test_all_that_a_process_of_ours_says_is_json_also_what_libraries_say_and_uncaught_errors() -> None:
     environment = {**os.environ, logs.VARIABLE: "1"}
     ended = subprocess.run([sys.executable, "-c", SPEAKS], env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
@@ -229,7 +229,7 @@ def test_all_that_a_process_of_ours_says_is_json_also_what_libraries_say_and_wha
     assert "KeyError: 'lost'" in lost["exception"]
 
 
-def test_a_command_that_fails_tells_it_in_json_and_leaves_the_loggers_as_they_were(
+def test_a_command_that_fails_reports_it_in_json_and_leaves_the_loggers_as_they_were(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv(logs.VARIABLE, "1")
@@ -260,7 +260,7 @@ def took(seconds: float, began_s: float, process: str = "host:1") -> Measured[in
     return Measured(result=0, seconds=seconds, cpu_s=seconds, process=process, peak_bytes=2**28, began_s=began_s)
 
 
-def test_the_page_tells_stages_processes_and_the_longest_tasks(tmp_path: Path) -> None:
+def test_the_page_shows_stages_processes_and_the_longest_tasks(tmp_path: Path) -> None:
     now_s = [1000.0]
     path = tmp_path / "time.html"
     with PerformanceReport(str(path), clock=lambda: now_s[0]) as report:
@@ -296,7 +296,7 @@ def test_the_page_is_written_also_where_the_run_breaks_off(tmp_path: Path) -> No
     assert "No task came to its end" in path.read_text()
 
 
-def test_a_place_where_no_page_can_be_written_is_told_before_anything_runs(tmp_path: Path) -> None:
+def test_a_place_where_no_page_can_be_written_is_reported_before_anything_runs(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="make the folder"):
         Cluster(scheduler="tcp://127.0.0.1:9").executor(performance_report=str(tmp_path / "none" / "time.html"))
     with pytest.raises(SettingsError, match="there are none: use --workers 1"):

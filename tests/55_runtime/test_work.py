@@ -1,4 +1,4 @@
-"""A work folder: a run that was cut off goes on, a later one does again only what changed, and nobody can tell."""
+"""A work folder: an interrupted run resumes, a later one repeats only what changed, and the results stay the same."""
 
 from __future__ import annotations
 
@@ -255,7 +255,7 @@ def test_another_run_directory_is_published_without_modelling_again(used: Place,
     assert files_of(used.folder / "second") == files_of(used.folder / "run")
 
 
-def test_what_somebody_removed_from_the_run_directory_is_published_again(used: Place, finished: Finished) -> None:
+def test_what_a_user_removed_from_the_run_directory_is_published_again(used: Place, finished: Finished) -> None:
     before = files_of(used.folder / "run")
     shutil.rmtree(used.folder / "run" / "state")
     shutil.rmtree(used.folder / "run" / "buildings")
@@ -305,7 +305,7 @@ def test_another_machine_goes_on_with_all_that_was_kept(
     assert not used.tasks
 
 
-def test_who_only_asks_whether_a_folder_is_held_refuses_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_check_whether_a_folder_is_locked_refuses_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with locked_work(str(tmp_path / "work")):
         pass
     asking = os.open(tmp_path / "work" / "lock", os.O_RDWR)

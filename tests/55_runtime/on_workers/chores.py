@@ -44,7 +44,7 @@ def wait_for_mark(task: tuple[str, str]) -> str:
     end = time.monotonic() + DEADLINE_S
     while not Path(folder, "go").exists():
         if time.monotonic() > end:
-            raise TimeoutError(f"nobody let {name} go")
+            raise TimeoutError(f"{name} was not let go")
         time.sleep(0.02)
     return name
 
