@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import ipaddress
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import platformdirs
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.errors import StartUpError
+
+if TYPE_CHECKING:
+    from pipeline.runtime.resources import Resources
 
 _GIB = 2**30
 
@@ -110,6 +114,26 @@ class ServiceSettings(BaseSettings):
     def database(self) -> str:
         """The SQLAlchemy URL."""
         return self.database_url or f"sqlite:///{(self.state / 'service.db').resolve()}"
+
+    @functools.cached_property
+    def resources(self) -> Resources:
+        """What jobs run with; `workers` is None where the driver chooses.
+
+        Raises
+        ------
+        SettingsError
+            Certificates cannot be used.
+        """
+        from pipeline.runtime.cluster.tls import given_tls
+        from pipeline.runtime.resources import Resources
+
+        return Resources(
+            workers=None if self.workers == "auto" else self.workers,
+            scheduler=self.scheduler,
+            tls=given_tls(self.tls_ca, self.tls_cert, self.tls_key),
+            building_timeout_s=self.building_timeout_s,
+            building_memory_bytes=self.building_memory_bytes,
+        )
 
     @property
     def is_loopback(self) -> bool:

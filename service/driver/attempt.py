@@ -15,7 +15,6 @@ from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.compare import CompareRequest, CompareSummary, own_tables, parse_variants
 from pipeline.runtime.monitoring.events import Event, Listener
 from pipeline.runtime.request import RunRequest
-from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import RunSummary, run
 from pipeline.settings import RunSettings
 from service.driver.leased_job import LeasedJob
@@ -243,11 +242,7 @@ def run_request(
         crs=request.crs,
         vertical_unit=request.vertical_unit,
         bbox=request.bbox,
-        resources=Resources(
-            scheduler=settings.scheduler,
-            building_timeout_s=settings.building_timeout_s,
-            building_memory_bytes=settings.building_memory_bytes,
-        ),
+        resources=settings.resources,
         meshes=request.meshes,
         licence=request.licence,
     )

@@ -11,7 +11,6 @@ from urllib.parse import urlsplit
 
 from pipeline.errors import ClusterError, RunCancelledError
 from pipeline.runtime.cluster.dask_executor import Cluster
-from pipeline.runtime.cluster.tls import given_tls
 from pipeline.runtime.engine import workers_that_fit
 from pipeline.runtime.monitoring.events import Event
 from pipeline.runtime.monitoring.machine import cores, memory_bytes
@@ -48,10 +47,10 @@ class SharedCluster:
     """
 
     def __init__(self, settings: ServiceSettings, make: Callable[[], Engine] | None = None) -> None:
-        self._scheduler = settings.scheduler
-        tls = given_tls(settings.tls_ca, settings.tls_cert, settings.tls_key)
-        workers = _as_many_as_fit() if settings.workers == "auto" else settings.workers
-        self._make = make or (lambda: Cluster(workers=workers, scheduler=settings.scheduler, tls=tls))
+        resources = settings.resources
+        self._scheduler = resources.scheduler
+        workers = resources.workers or _as_many_as_fit()
+        self._make = make or (lambda: Cluster(workers=workers, scheduler=self._scheduler, tls=resources.tls))
         self._lock = threading.Lock()
         self._engine: Engine | None = None
         self._closed = False

@@ -1,4 +1,4 @@
-"""Gather: the points and the terrain of one candidate, from all tiles that hold some of it."""
+"""Gather: the points and the terrain of one candidate, from all its tiles."""
 
 from __future__ import annotations
 
@@ -25,13 +25,21 @@ from pipeline.tiling import MM, TileGrid, Window
 
 Area = TypeVar("Area", Polygon, MultiPolygon, Polygon | MultiPolygon)
 
+# None of these is a setting: they define the terms of the docs, in metres or in cells of the 1 m lattice.
 _GROUND_MARGIN_M = 4
+"""Terrain within this distance of the roof is sampled."""
 _VIEW_MARGIN_M = 14
+"""Width of the view around a candidate: reaches all cells that the masks below look at."""
 _OUTLINE_CELLS = 2
+"""Terrain within these cells of the roof gives the ground elevation."""
 _EMPTY_CELLS = 4
+"""Half the side of a square without points that counts as the edge of the data."""
 _EDGE_CELLS = 5
+"""A roof this near to such a square touches the edge of the data."""
 _BESIDE_CELLS = 2
+"""Points within these cells of the roof lie beside it."""
 _HEIGHT_WITHOUT_TERRAIN_MM = 2500
+"""Assumed height of the lowest point above ground where no terrain is known."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,7 +60,7 @@ def surroundings_of(scratch: Scratch, grid: TileGrid, view: Window) -> Surroundi
     columns, rows = -(-view.x1_mm // CELL_MM) - column0, -(-view.y1_mm // CELL_MM) - row0
     elevation = np.full((rows, columns), NO_DATA, np.int32)
     occupied = np.zeros((rows, columns), np.bool_)
-    # a cell belongs to the tile of its centre, so the neighbours of the view's own tiles may hold its border cells
+    # a cell belongs to the tile of its centre, so neighbours of the view's own tiles may have its border cells
     for tile in grid.tiles_over(view.grown(CELL_MM)):
         name = f"tiles/{tile.key}"
         if not scratch.has(name):
@@ -84,7 +92,7 @@ def _grown(mask: BoolArray, cells: int) -> BoolArray:
 
 
 def _touches_data_edge(roof: BoolArray, empty_around: BoolArray) -> bool:
-    """Whether a square of 9 m without any point, by the mask of their middles, begins within 5 m of the roof."""
+    """Whether a 9 m square without points, by the mask of such squares' centres, begins within 5 m of the roof."""
     return bool(empty_around.any()) and bool((empty_around & _grown(roof, _EDGE_CELLS + _EMPTY_CELLS)).any())
 
 
@@ -105,10 +113,10 @@ def stored_points(scratch: Scratch, site: CandidateSite) -> npt.NDArray[np.void]
 
 
 def canonical_order(points: npt.NDArray[np.void]) -> IntArray:
-    """The order of points that does not depend on files and tiles: X, Y, Z, return, GPS time, source; (n,) int64."""
+    """Order of points by X, Y, Z, return, GPS time, source, independent of files and tiles; (n,) int64."""
     x, y = (np.ascontiguousarray(points[name]) for name in "xy")
     steps = np.diff(x), np.diff(y)
-    # one tile's points come from the split by x and y: a stable sort would leave them as they are
+    # the split sorted one tile's points by x and y: a stable sort would not move them
     if bool(((steps[0] > 0) | ((steps[0] == 0) & (steps[1] >= 0))).all()):
         order = np.arange(len(points))
     else:
@@ -138,20 +146,20 @@ def gather(
     Parameters
     ----------
     scratch, grid : Scratch, TileGrid
-        Where the tiles' points and terrain are.
+        Points and terrain of the tiles.
     site : CandidateSite
         Which points.
     gps_kind : GpsTimeKind
-        Whether GPS times tell dates.
+        Whether GPS times can be converted to dates.
     beside : bool
-        Whether the points around and beneath are wanted too; a candidate whose outline is known has none.
+        Whether to add the points around and beneath it; a candidate with a known outline has none.
     """
     points = points_of(scratch, site)
     footprint = site.footprint
     columns_mm = [points[name].astype(np.int64) for name in "xyz"]
     xyz = np.column_stack(columns_mm)
     if len(xyz):
-        # of columns: numpy takes many times longer along the first axis of three
+        # by columns: numpy takes many times longer along the first axis of an (n, 3) array
         low, high = (np.array([extreme(column) for column in columns_mm]) for extreme in (np.min, np.max))
     else:
         x0, y0, x1, y1 = footprint.bounds if footprint is not None else (0.0, 0.0, 0.0, 0.0)
@@ -178,15 +186,7 @@ def gather(
             around.elevation_mm[rows, columns].astype(np.int64),
         )
     )
-    ground_z: int | None
-    if outline.any():
-        ground_z = int(around.elevation_mm[outline].min())
-    elif len(ground_mm):
-        ground_z = int(ground_mm[:, 2].min())
-    elif len(xyz):
-        ground_z = int(low[2]) - _HEIGHT_WITHOUT_TERRAIN_MM
-    else:
-        ground_z = None
+    ground_z = _ground_mm(around.elevation_mm[outline], ground_mm[:, 2], xyz[:, 2])
     digest = hashlib.sha256(points.tobytes())
     digest.update(np.ascontiguousarray(ground_mm).tobytes())
     beside_mm = later_mm = np.empty((0, 3), np.int64)
@@ -214,12 +214,20 @@ def gather(
     return candidate, CandidateFacts(input_hash=digest.hexdigest(), acquired_from=first, acquired_to=last)
 
 
+def _ground_mm(outline_mm: IntArray, terrain_mm: IntArray, points_mm: IntArray) -> int | None:
+    """Ground elevation: lowest of the terrain around the outline, else of all terrain, else below the points."""
+    for elevations in (outline_mm, terrain_mm):
+        if len(elevations):
+            return int(elevations.min())
+    return int(points_mm.min()) - _HEIGHT_WITHOUT_TERRAIN_MM if len(points_mm) else None
+
+
 def _beside(
     scratch: Scratch, grid: TileGrid, own_mm: IntArray, cells: BoolArray, around: Surroundings
 ) -> tuple[IntArray, IntArray]:
-    """Points in some cells of the surroundings that are none of a candidate's: each (n, 3) int64, sorted.
+    """Points in some cells of the surroundings that do not belong to a candidate: each (n, 3) int64, sorted.
 
-    The first are of pulses with one return, the second the last of several.
+    The first come from pulses with one return; the second are the last of several returns.
     """
     rows, columns = np.nonzero(cells)
     single, later = [own_mm], [own_mm]
@@ -260,7 +268,7 @@ def _moved(area: Area, origin_mm: IntArray) -> Area:
 
 
 def _acquired(points: npt.NDArray[np.void], kind: GpsTimeKind) -> tuple[dt.datetime | None, dt.datetime | None]:
-    """First and last time of the points where GPS times tell dates."""
+    """First and last time of the points; None unless GPS times can be converted to dates."""
     if kind is not GpsTimeKind.ADJUSTED or len(points) == 0:
         return None, None
     return utc_of(float(points["gps_time"].min())), utc_of(float(points["gps_time"].max()))
