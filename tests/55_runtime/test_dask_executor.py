@@ -132,7 +132,7 @@ def test_tasks_under_suspicion_are_tried_alone_and_none_is_lost(cluster: Cluster
 
 @pytest.mark.slow
 def test_a_keeper_stays_while_it_starts_its_worker_anew_and_one_that_gave_up_is_replaced(tmp_path: Path) -> None:
-    # Dask would end it where nobody of the worker's name is there at the time
+    # Dask would end it where no process of the worker's name is there at the time
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 ms"}):
         with Cluster(workers=1) as one, one.executor() as executor:
             keeper = one._embedded.workers[0]
@@ -353,5 +353,5 @@ def test_a_fingerprint_covers_every_version() -> None:
 
 def test_all_that_differs_is_reported() -> None:
     ours = {"numpy": "2.1", "numba": "0.63", "scipy": "1.16"}
-    told = differences(ours, {"numpy": "2.0", "scipy": "1.16", "pandas": "3"})
-    assert told == ["numpy 2.0 where the client has 2.1", "no numba where the client has 0.63"]
+    found = differences(ours, {"numpy": "2.0", "scipy": "1.16", "pandas": "3"})
+    assert found == ["numpy 2.0 where the client has 2.1", "no numba where the client has 0.63"]

@@ -188,7 +188,7 @@ def test_a_child_that_is_cancelled_before_its_server_has_loaded_never_begins(
     ask: Callable[..., Any], tmp_path: Path
 ) -> None:
     fifo = tmp_path / "fifo"
-    os.mkfifo(fifo)  # who opens it waits for somebody who writes
+    os.mkfifo(fifo)  # who opens it waits for a writer
     with (
         pytest.raises(RunCancelledError),
         child_pool.borrowed_child(lambda: True, fresh=False, loads=(f"loaded_by_a_test:read:{fifo}",)),

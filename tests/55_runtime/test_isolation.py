@@ -1,4 +1,4 @@
-"""Supervised children: each building can cost only itself, and nobody outlives whom they work for."""
+"""Supervised children: each building can only harm itself, and no child outlives its owner."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def test_an_item_that_never_ends_is_ended_also_where_it_holds_the_interpreter(
     assert loss.reason is Reason.TIMED_OUT
     assert "1.5 s" in loss.detail
     assert loss.seconds >= 1.5
-    assert "in do" in loss.stderr, "the place where it hung is told"
+    assert "in do" in loss.stderr, "the place where it hung is named"
 
 
 def test_one_that_only_fails_in_company_is_no_loss(orders: Callable[[str], str], tmp_path: Path) -> None:
@@ -203,8 +203,8 @@ def test_what_a_child_writes_does_not_pile_up(orders: Callable[[str], str]) -> N
 def test_an_error_of_the_function_is_raised_here(orders: Callable[[str], str]) -> None:
     with pytest.raises(PermissionError, match="not yours"):
         outcomes(orders, ["1", "raise PermissionError('not yours')"])
-    with pytest.raises(RunError, match="Own: told"):  # a class that this process cannot know
-        outcomes(orders, ["class Own(Exception): pass\nraise Own('told')"])
+    with pytest.raises(RunError, match="Own: fault"):  # a class that this process cannot know
+        outcomes(orders, ["class Own(Exception): pass\nraise Own('fault')"])
 
 
 def test_a_large_result_arrives_whole(tmp_path: Path, orders: Callable[[str], str]) -> None:
@@ -299,7 +299,7 @@ def test_bytes_that_are_no_message_are_noticed() -> None:
     assert [list(frames.feed(whole[i : i + 1])) for i in range(len(whole))][-1] == [{"a": 1}]
 
 
-# --- nobody outlives whom they work for -------------------------------------------------------------------------------
+# --- no child outlives its owner --------------------------------------------------------------------------------------
 
 WORKER = """
 import signal, sys, time
@@ -324,8 +324,8 @@ time.sleep(1000)
 def test_a_child_is_gone_when_its_worker_is_killed(
     orders: Callable[[str], str], tmp_path: Path, order: str, sign: signal.Signals
 ) -> None:
-    told = f"open('{tmp_path}/reached', 'w').close()\n{order}"
-    with subprocess.Popen([sys.executable, "-c", WORKER, str(tmp_path), told], stderr=subprocess.DEVNULL) as worker:
+    program = f"open('{tmp_path}/reached', 'w').close()\n{order}"
+    with subprocess.Popen([sys.executable, "-c", WORKER, str(tmp_path), program], stderr=subprocess.DEVNULL) as worker:
         wait_for(lambda: (tmp_path / "reached").exists() or worker.poll() is not None, "the item")
         family = psutil.Process(worker.pid).children(recursive=True)
         (busy,) = child_processes(worker.pid)

@@ -123,15 +123,15 @@ def test_an_error_of_a_task_is_raised_here_and_says_where_it_happened() -> None:
 
 @pytest.mark.slow
 def test_cancellation_ends_the_tasks_that_run(tmp_path: Path) -> None:
-    told = threading.Event()
+    stopped = threading.Event()
 
     def begun() -> bool:
         return bool(list(tmp_path.glob("started-*")))
 
-    watch = Watch(cancelled=begun, stop=told.set)
+    watch = Watch(cancelled=begun, stop=stopped.set)
     with pytest.raises(RunCancelledError):
         results(LocalExecutor(2), chores.wait_for_mark, [(str(tmp_path), name) for name in "abcd"], watch)
-    assert told.is_set()
+    assert stopped.is_set()
     assert len(list(tmp_path.glob("started-*"))) <= 2, "no other task began"
 
 
@@ -142,10 +142,10 @@ def test_the_content_is_that_of_a_serial_run(suburb: Path, reconstruct: Any) -> 
     one = reconstruct(suburb, settings={"tile_size_m": 40.0}, executor=LocalExecutor(1), workers=None)
     assert local.digest == one.digest == serial.digest
     assert serial.statuses["ok"] >= 1
-    told = read_manifest(local.run_dir)
-    assert set(told.timings_s) == set(read_manifest(serial.run_dir).timings_s)
-    assert len(told.peak_memory_bytes) >= 2, "this process, and children"
-    assert all(peak > 0 for peak in told.peak_memory_bytes.values())
+    manifest = read_manifest(local.run_dir)
+    assert set(manifest.timings_s) == set(read_manifest(serial.run_dir).timings_s)
+    assert len(manifest.peak_memory_bytes) >= 2, "this process, and children"
+    assert all(peak > 0 for peak in manifest.peak_memory_bytes.values())
 
 
 def test_a_building_that_crashes_costs_itself_alone(

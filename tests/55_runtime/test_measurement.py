@@ -1,4 +1,4 @@
-"""What a task took: its own thread's CPU time and that of the children that worked for it, and nobody else's."""
+"""The cost of a task: the CPU time of its own thread and of the children that worked for it, and no other."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def wait_for(condition: Any, what: str) -> None:
 
 @dataclasses.dataclass
 class Bench:
-    """A scheduler, workers that announce what a test says, and what a run on them tells."""
+    """A scheduler, workers that announce what a test says, and the events of a run on them."""
 
     local: LocalCluster
     folder: Path
@@ -129,18 +129,18 @@ def test_where_no_worker_announces_memory_all_run_with_a_warning(bench: Bench) -
     add_worker(bench, None)
     bench.go()
     assert sorted(bench.run([bench.task(f"giant{k}", 3 * GIB) for k in range(3)])) == ["giant0", "giant1", "giant2"]
-    (told,) = bench.events
-    assert told.kind == "warning"
-    assert "3 tasks of weigh need much memory (up to 3.0 GiB) and no worker announces" in told.message
-    assert "--resources MEMORY=" in told.message
+    (event,) = bench.events
+    assert event.kind == "warning"
+    assert "3 tasks of weigh need much memory (up to 3.0 GiB) and no worker announces" in event.message
+    assert "--resources MEMORY=" in event.message
 
 
 def test_a_need_that_no_worker_has_runs_where_most_is_and_is_reported(bench: Bench) -> None:
     add_worker(bench, 2 * GIB)
     bench.go()
     assert bench.run([bench.task("giant", 64 * GIB)]) == ["giant"]
-    (told,) = bench.events
-    assert "need up to 64.0 GiB of memory, the largest worker has 2.0 GiB" in told.message
+    (event,) = bench.events
+    assert "need up to 64.0 GiB of memory, the largest worker has 2.0 GiB" in event.message
 
 
 @pytest.mark.slow

@@ -220,15 +220,15 @@ def test_what_is_no_bundle_is_exit_code_3_and_named(path: Path, tmp_path: Path) 
 def test_replay_shows_the_record_and_writes_the_model(path: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     code, said, _ = invoke("replay", str(path), "--no-isolate", "--out", str(out), "--json")
-    told = json.loads(said)
+    document = json.loads(said)
     assert code == 0
-    assert told["incident"]["reason"] == "crashed"
-    assert told["record"]["roof_type"] == "gable"
-    assert told["record"]["ridge_z"] == pytest.approx((30.0 + 9.0) / 0.3048, abs=0.4)
+    assert document["incident"]["reason"] == "crashed"
+    assert document["record"]["roof_type"] == "gable"
+    assert document["record"]["ridge_z"] == pytest.approx((30.0 + 9.0) / 0.3048, abs=0.4)
     names = {".json", ".obj", ".city.jsonl"}
     assert {entry.name for entry in out.iterdir()} == {f"abcdefghijklmnopqrstuvwx{suffix}" for suffix in names}
-    assert sorted(told["written"]) == sorted(str(entry) for entry in out.iterdir())
-    assert json.loads((out / "abcdefghijklmnopqrstuvwx.json").read_text()) == told["record"]
+    assert sorted(document["written"]) == sorted(str(entry) for entry in out.iterdir())
+    assert json.loads((out / "abcdefghijklmnopqrstuvwx.json").read_text()) == document["record"]
     lines = (out / "abcdefghijklmnopqrstuvwx.city.jsonl").read_text().splitlines()
     assert json.loads(lines[1])["id"] == "abcdefghijklmnopqrstuvwx"
 
@@ -252,10 +252,10 @@ def test_a_building_that_kills_again_kills_only_the_child(
     child_pool.kill_children()
     code, said, _ = invoke("replay", str(path), "--building-memory", "1", "--json")
     child_pool.kill_children()
-    told = json.loads(said)
+    document = json.loads(said)
     assert code == 1
-    assert told["record"]["reason"] == {"crash": "crashed", "eat_memory": "out_of_memory"}[fault]
-    assert ("Segmentation fault" in told["stderr"]) == (fault == "crash")
+    assert document["record"]["reason"] == {"crash": "crashed", "eat_memory": "out_of_memory"}[fault]
+    assert ("Segmentation fault" in document["stderr"]) == (fault == "crash")
 
 
 def test_limits_of_a_replay_are_checked(path: Path) -> None:

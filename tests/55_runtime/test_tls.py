@@ -1,4 +1,4 @@
-"""Certificates: what cannot be used is told with the file and the fix, before anything is tried."""
+"""Certificates: a file that cannot be used is named with the fix, before anything is tried."""
 
 from __future__ import annotations
 
@@ -61,10 +61,10 @@ def nothing_given(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_files_that_can_be_used_are_passed_to_dask_for_every_role(authority: Authority) -> None:
     files = authority.files()
-    told = files.security
-    assert told["require_encryption"] is True
-    assert {told[f"tls_{role}_cert"] for role in ("scheduler", "worker", "client")} == {files.cert}
-    assert {told[f"tls_{role}_key"] for role in ("scheduler", "worker", "client")} == {files.key}
+    options = files.security
+    assert options["require_encryption"] is True
+    assert {options[f"tls_{role}_cert"] for role in ("scheduler", "worker", "client")} == {files.cert}
+    assert {options[f"tls_{role}_key"] for role in ("scheduler", "worker", "client")} == {files.key}
 
 
 def test_a_key_may_lie_in_the_file_of_its_certificate(authority: Authority, tmp_path: Path) -> None:
@@ -75,13 +75,13 @@ def test_a_key_may_lie_in_the_file_of_its_certificate(authority: Authority, tmp_
 
 
 def test_every_file_that_is_missing_is_reported_at_once(authority: Authority) -> None:
-    with pytest.raises(SettingsError) as told:
+    with pytest.raises(SettingsError) as caught:
         TlsFiles(ca="/nowhere/ca.pem", cert="/nowhere/one.pem", key=authority.files().key)
-    assert [fault.split(":")[0] for fault in told.value.faults] == [
+    assert [fault.split(":")[0] for fault in caught.value.faults] == [
         "TLS_CA is /nowhere/ca.pem",
         "TLS_CERT is /nowhere/one.pem",
     ]
-    assert all("No such file" in fault and "--tls-ca" in fault for fault in told.value.faults)
+    assert all("No such file" in fault and "--tls-ca" in fault for fault in caught.value.faults)
 
 
 def test_files_that_are_something_else_are_reported(authority: Authority, tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ class Door:
                     continue
 
     def close(self) -> None:
-        """Let nobody in any more."""
+        """Let no client in any more."""
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         self._thread.join()
@@ -193,7 +193,7 @@ def test_a_look_at_the_port_shows_why_a_connection_failed(
     mixed = TlsFiles(ca=ours.ca, cert=theirs.cert, key=theirs.key)
     assert "it does not accept our certificate" in explain_failure(f"tls://{secure}", mixed)
     assert "it wants a certificate of ours" in explain_failure(f"tls://{secure}", None)
-    # nothing to tell: it is as it should be, or nobody is there
+    # nothing to report: all is well, or no process is there
     assert explain_failure(f"tls://{secure}", ours) == explain_failure(f"tcp://{plain}", None) == ""
     assert explain_failure("tls://127.0.0.1:9", ours) == explain_failure("inproc://somewhere", None) == ""
 
@@ -214,6 +214,6 @@ def test_a_worker_goes_on_looking_where_the_port_explains_why_it_did_not_start(
     plain = WorkerOptions(scheduler=f"tls://127.0.0.1:{doors[0].port}", tls=files)
     with pytest.raises(ConnectionError, match="does not speak TLS: write tcp://"):
         asyncio.run(_start(Unwilling(), plain))
-    nobody = WorkerOptions(scheduler="tls://127.0.0.1:9", tls=files)
+    alone = WorkerOptions(scheduler="tls://127.0.0.1:9", tls=files)
     with pytest.raises(ClusterError, match="does not start: IOStream is not idle"):
-        asyncio.run(_start(Unwilling(), nobody))
+        asyncio.run(_start(Unwilling(), alone))

@@ -140,7 +140,7 @@ def lines() -> Iterator[io.StringIO]:
     logger.setLevel(level)
 
 
-def told(lines: io.StringIO) -> list[dict[str, object]]:
+def entries_of(lines: io.StringIO) -> list[dict[str, object]]:
     return [json.loads(line) for line in lines.getvalue().splitlines()]
 
 
@@ -155,7 +155,7 @@ def test_a_task_that_fails_logs_its_run_stage_and_tile(lines: io.StringIO) -> No
     with pytest.raises(ZeroDivisionError):
         measure(broken, task, "split")
     ids = {"run": "ab12", "stage": "split", "tile": "x85_y447"}
-    inside, failed = told(lines)
+    inside, failed = entries_of(lines)
     assert inside.items() >= {**ids, "building": "b1", "level": "info", "message": "from deep inside"}.items()
     assert failed.items() >= {**ids, "level": "error", "message": "the task failed"}.items()
     assert "ZeroDivisionError: of True" in str(failed["exception"])
@@ -163,7 +163,7 @@ def test_a_task_that_fails_logs_its_run_stage_and_tile(lines: io.StringIO) -> No
     assert TALLIES.worked["split", "failed"] == before.get(("split", "failed"), 0) + 1
     # nothing sticks to the thread
     logs.LOG.info("later")
-    assert set(told(lines)[-1]) == {"at", "level", "logger", "message"}
+    assert set(entries_of(lines)[-1]) == {"at", "level", "logger", "message"}
 
 
 def test_a_fault_of_the_input_has_no_traceback_and_a_run_that_is_cancelled_no_line(lines: io.StringIO) -> None:
@@ -174,7 +174,7 @@ def test_a_fault_of_the_input_has_no_traceback_and_a_run_that_is_cancelled_no_li
 
         with pytest.raises(type(error)):
             measure(broken, None, "publish")
-    (line,) = told(lines)
+    (line,) = entries_of(lines)
     assert line["message"] == "the task failed: disk full: make room"
     assert "exception" not in line
 
@@ -246,8 +246,8 @@ def test_a_command_that_fails_reports_it_in_json_and_leaves_the_loggers_as_they_
         serve()
     assert (root.handlers, sys.excepthook) == (before, hook)
     said = capsys.readouterr()
-    library, told, fault = (json.loads(line) for line in said.err.splitlines())
-    assert (said.out, told["message"]) == ("", "listening")
+    library, entry, fault = (json.loads(line) for line in said.err.splitlines())
+    assert (said.out, entry["message"]) == ("", "listening")
     assert library["logger"] == "a.library"
     assert (fault["level"], fault["message"]) == ("error", "by nought")
     assert "ZeroDivisionError: by nought" in fault["exception"]
@@ -299,7 +299,7 @@ def test_the_page_is_written_also_where_the_run_breaks_off(tmp_path: Path) -> No
 def test_a_place_where_no_page_can_be_written_is_reported_before_anything_runs(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="make the folder"):
         Cluster(scheduler="tcp://127.0.0.1:9").executor(performance_report=str(tmp_path / "none" / "time.html"))
-    with pytest.raises(SettingsError, match="there are none: use --workers 1"):
+    with pytest.raises(SettingsError, match="this run has none: use --workers 1"):
         executor_for(Resources(workers=0, performance_report=str(tmp_path / "time.html")), local_directory="")
 
 
