@@ -365,7 +365,7 @@ def test_what_a_killed_command_left_is_removed_and_reported_by_the_next_into_the
     code = (
         "import os, signal, sys; from pathlib import Path; from pipeline.runtime.classify import *; "
         "listen = lambda event: event.stage == 'ingest' and os.kill(os.getpid(), signal.SIGKILL); "
-        "classify(ClassifyRequest(inputs=(sys.argv[1],), out=sys.argv[2], workers=0), listen)"
+        "classify(ClassifyRequest(inputs=(sys.argv[1],), out=sys.argv[2], resources=Resources(workers=0)), listen)"
     )
     killed = subprocess.run([sys.executable, "-c", code, str(true_suburb), str(out)], check=False)
     assert killed.returncode == -signal.SIGKILL

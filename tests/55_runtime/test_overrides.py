@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import re
 import shutil
@@ -464,11 +465,12 @@ def test_a_named_building_is_modelled_again_and_comes_out_the_same(plain: Any, c
 def test_a_unit_without_a_digest_of_its_inputs_is_sought_in_all_tiles() -> None:
     record = Record(points=5, box=None, source_id=None, status="failed", input_hash=None)
     alone = CandidateSite(building_id="a", owner=Tile(0, 0), ranges=(), points=5)
-    stages: Any = None
-    assert pipeline.runtime.rerun._same(stages, record, alone)
-    assert not pipeline.runtime.rerun._same(stages, record, dataclasses.replace(alone, points=6))
-    # its outline hangs on units that the split tiles may cut off
-    assert not pipeline.runtime.rerun._same(stages, record, dataclasses.replace(alone, block="b"))
+    search: Any = None
+    same = functools.partial(pipeline.runtime.rerun._Search._same, search, record)
+    assert same(alone)
+    assert not same(dataclasses.replace(alone, points=6))
+    # its outline depends on units that the split tiles may cut off
+    assert not same(dataclasses.replace(alone, block="b"))
 
 
 @pytest.mark.slow
