@@ -1,1 +1,1 @@
-"""What a run found, for people: tables and pictures."""
+"""The results of a run for people: its page, maps, pictures and statistics."""

@@ -43,17 +43,7 @@ class MapClass:
 
 
 class ClassMap:
-    """Gathers what a map shows.
-
-    Parameters
-    ----------
-    title : str
-        Of the map.
-    ordinary : MapClass
-        The class that lies beneath.
-    others : sequence of MapClass
-        The classes that are drawn over it, the most important one last.
-    """
+    """Gathers what a map shows."""
 
     def __init__(self, title: str, ordinary: MapClass, others: Sequence[MapClass]) -> None:
         self._title, self._ordinary, self._others = title, ordinary, tuple(others)
@@ -94,13 +84,7 @@ class ClassMap:
         return table.take(order[:MAX_DRAWN])
 
     def map(self, unit_m: float) -> Map | None:
-        """The map; None where nothing has geometry.
-
-        Parameters
-        ----------
-        unit_m : float
-            Metres a unit of the geometries.
-        """
+        """The map; None where nothing has geometry."""
         layers = []
         if self.ordinary:
             layers.append(_layer(self._ordinary, self._cells_or_footprints(), self.ordinary, unit_m))

@@ -83,19 +83,7 @@ def face_normal(rings: Sequence[FloatArray]) -> FloatArray:
 
 
 def draw_view(axes: Axes, buildings: Sequence[Sequence[ViewedFace]], view: View, *, shadows: bool = True) -> None:
-    """Draw buildings.
-
-    Parameters
-    ----------
-    axes : matplotlib axes
-        Become a frameless picture of equal scale.
-    buildings : sequence of sequences of ViewedFace
-        The faces of each building.
-    view : View
-        Where one looks from.
-    shadows : bool
-        Throw them onto the ground.
-    """
+    """Draw buildings."""
     right, up, towards = _basis(view)
     centres = [np.mean(np.vstack([face.rings[0] for face in faces]), axis=0) for faces in buildings]
     order = sorted(range(len(buildings)), key=lambda i: (float(centres[i][:2] @ towards[:2]), i))

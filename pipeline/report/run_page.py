@@ -54,16 +54,6 @@ _STATUSES = {
 def write_run_page(run_dir: str) -> str:
     """Write `run.html` into a run directory.
 
-    Parameters
-    ----------
-    run_dir : str
-        A path, or a URL.
-
-    Returns
-    -------
-    str
-        Where the page is; images, styles and scripts are in it.
-
     Raises
     ------
     RunError

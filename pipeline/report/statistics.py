@@ -24,13 +24,6 @@ _COLUMNS = ("status", "reason", "roof_type", "lod", "validity_codes", "touches_d
 def run_statistics(run_dir: str, filesystem: pafs.FileSystem | None = None) -> dict[str, Any]:
     """The figures of a finished run as plain JSON values.
 
-    Parameters
-    ----------
-    run_dir : str
-        The run directory: a path or URL, or a path of `filesystem`.
-    filesystem : pyarrow.fs.FileSystem, optional
-        Where the run lies; by default as `run_dir` says.
-
     Returns
     -------
     dict

@@ -148,7 +148,7 @@ def test_what_cannot_be_read_is_told_with_what_can(tmp_path: Path) -> None:
         with pytest.raises(InputError) as caught:
             read_models(path)
         assert told in caught.value.problem
-        assert all(reader.told in caught.value.fix for reader in READERS)
+        assert all(reader.description in caught.value.fix for reader in READERS)
 
 
 def test_a_path_may_be_given_as_text(tmp_path: Path) -> None:

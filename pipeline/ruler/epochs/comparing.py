@@ -1,4 +1,4 @@
-"""The comparison of two epochs from end to end: match, lay the roofs over one another, judge, part by part."""
+"""The comparison of two epochs from end to end, part by part: match buildings, compare their roofs, judge."""
 
 from __future__ import annotations
 
@@ -35,29 +35,30 @@ from pipeline.ruler.epochs.roof_raster import (
 from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.epochs.sides import Side, side_of
 
-GROUPS_A_PART = 10_000
-"""Groups whose models are held at once, about."""
+GROUPS_PER_PART = 10_000
+"""Groups whose models are in memory at once, about."""
 ALIKE_IOU = 0.4
-"""A rejected object is told by its box alone: from this overlap of the boxes on it may be the building."""
+"""Only the box of a rejected object is known: from this overlap of the boxes on it may be the building."""
 ALIKE_TIMES = 2.0
-"""And where area and height are at most this many times, and at least this part, of the building's."""
+"""Its area and height must also be at most this many times, and at least 1 / this, of those of the building."""
 _DIGITS = 3
+"""Decimals of the table: millimetres."""
 
 OnPart = Callable[[int, int], None]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Members:
-    """Buildings of an epoch that a part of the groups looks at."""
+    """Buildings of an epoch that belong to a part of the groups or reach into it."""
 
     buildings: Buildings
-    """The groups' own, and neighbours that reach into them."""
+    """The groups' own buildings, and neighbours that reach into them."""
     own: IntArray
     """(m,) int64, places of the groups' own buildings among them."""
     own_group: IntArray
     """(m,) int64, their groups within the part."""
     guests: IntArray
-    """(k,) int64, places of the neighbours, a building once for each group that it reaches into."""
+    """(k,) int64, places of the neighbours; a building occurs once per group that it reaches into."""
     guest_group: IntArray
     """(k,) int64, these groups."""
 
@@ -68,17 +69,17 @@ def compare_epochs(old: Epoch, new: Epoch, settings: DiffSettings, on_part: OnPa
     Parameters
     ----------
     old, new : Epoch
-        Of one CRS; `pipeline.ruler.epochs.agreement` says whether they are.
+        With one CRS, as `pipeline.ruler.epochs.agreement` checks.
     settings : DiffSettings
-        What counts as a change.
+        The thresholds of a change.
     on_part : callable
-        Told the groups done and all groups, after every part.
+        Called with the groups done and all groups after every part.
 
     Yields
     ------
     pa.Table
-        Of the schema of `records`, without `bbox`; parts of the plan one after the other, `change_id` ascending within
-        each. What has no geometry comes last.
+        With the schema of `records`; one part of the plan after the other, `change_id` ascending within each. Rows
+        without geometry come last.
     """
     pairs, old_m2, new_m2 = all_pairs(old, new)
     groups = grouped(pairs, old_m2, new_m2, settings)
@@ -86,7 +87,7 @@ def compare_epochs(old: Epoch, new: Epoch, settings: DiffSettings, on_part: OnPa
     by_group = tuple(np.argsort(of, kind="stable") for of in (groups.of_old, groups.of_new))
     coverages = tuple(epoch.coverage.shrunk(settings.edge_m) for epoch in (old, new))
     done = 0
-    for part in parts_of(middles(boxes), GROUPS_A_PART):
+    for part in parts_of(middles(boxes), GROUPS_PER_PART):
         sides = [_members(epoch, k, groups, by_group[k], part) for k, epoch in enumerate((old, new))]
         before, after = (
             side_of(_own(one), one.own_group, len(part), epoch.reference.vertical_unit_m)
@@ -102,7 +103,7 @@ def compare_epochs(old: Epoch, new: Epoch, settings: DiffSettings, on_part: OnPa
 
 
 def _boxes(groups: Groups, old: FloatArray, new: FloatArray) -> FloatArray:
-    """Bounds (g, 4) of all groups; nan where nothing has geometry."""
+    """Bounds (g, 4) of all groups; nan without geometry."""
     low, high = np.full((groups.count, 2), np.inf), np.full((groups.count, 2), -np.inf)
     for of, boxes in ((groups.of_old, old), (groups.of_new, new)):
         known = np.isfinite(boxes).all(axis=1)
@@ -114,7 +115,7 @@ def _boxes(groups: Groups, old: FloatArray, new: FloatArray) -> FloatArray:
 
 
 def _members(epoch: Epoch, which: int, groups: Groups, by_group: IntArray, part: IntArray) -> _Members:
-    """The buildings of one epoch (0 the earlier, 1 the later) that a part of the groups (ascending) looks at."""
+    """The buildings of one epoch (0 the earlier, 1 the later) for a part of the groups (ascending)."""
     of = (groups.of_old, groups.of_new)[which]
     starts, ends = (np.searchsorted(of, part, side=side, sorter=by_group) for side in ("left", "right"))
     counts = ends - starts
@@ -164,7 +165,7 @@ def _figures(
     limit: Limits,
     settings: DiffSettings,
 ) -> FloatArray:
-    """The figures of `compare_roofs`; those of groups that stand in one epoch alone are of nothing."""
+    """The figures of `compare_roofs`; groups that exist in one epoch alone are compared as empty."""
     both = (before.count > 0) & (after.count > 0)
     found = [epoch.roofs(one.buildings) for epoch, one in zip((old, new), sides, strict=True)]
     columns: list[list[npt.NDArray[Any]]] = [[], [], [], []]
@@ -217,9 +218,9 @@ def _joined(old: RoofFaces, new: RoofFaces) -> RoofFaces:
 def _circumstances(
     old: Epoch, new: Epoch, before: Side, after: Side, coverages: tuple[Any, ...], groups: Groups, part: IntArray
 ) -> Circumstances:
-    """What each epoch can tell where the other one alone has a building."""
+    """What each epoch knows about the buildings that only the other one has."""
     count = len(part)
-    told: dict[str, Any] = {}
+    known: dict[str, Any] = {}
     for name, epoch, coverage, side, missing in (
         ("old", old, coverages[0], after, before.count == 0),
         ("new", new, coverages[1], before, after.count == 0),
@@ -229,7 +230,7 @@ def _circumstances(
         covered[alone] = coverage.share(side.footprints[alone])
         failed[alone] = coverage.touches_failed(side.footprints[alone])
         rejected[alone] = _rejected_alike(epoch, side.footprints[alone], side.area_m2[alone], side.height_m[alone])
-        told |= {f"covered_by_{name}": covered, f"failed_tile_of_{name}": failed, f"rejected_in_{name}": rejected}
+        known |= {f"covered_by_{name}": covered, f"failed_tile_of_{name}": failed, f"rejected_in_{name}": rejected}
     pairs = groups.pairs
     overlap = np.zeros(count)
     first, second = groups.of_old[pairs.old], groups.of_new[pairs.new]
@@ -239,11 +240,11 @@ def _circumstances(
         overlap += np.bincount(place[kept], weights=pairs.common_m2[kept], minlength=count)
     area_m2 = np.nan_to_num(before.area_m2) + np.nan_to_num(after.area_m2)
     overlapped = np.divide(overlap, area_m2, out=np.zeros(count), where=area_m2 > 0.0)
-    return Circumstances(overlapped=overlapped, **told)
+    return Circumstances(overlapped=overlapped, **known)
 
 
 def _rejected_alike(epoch: Epoch, footprints: Any, area_m2: FloatArray, height_m: FloatArray) -> BoolArray:
-    """Where an epoch judged an object of like extent and height to be no building."""
+    """Where an epoch rejected an object of similar extent and height as a building."""
     found = np.zeros(len(footprints), np.bool_)
     rejected = epoch.rejected
     if len(footprints) == 0 or len(rejected.boxes) == 0:
@@ -279,15 +280,17 @@ def _table(
     compared = both & ~(before.has_failed | after.has_failed)
     is_new, is_gone = verdicts.change == Change.NEW.value, verdicts.change == Change.GONE.value
     union = np.nan_to_num(before.area_m2) + np.nan_to_num(after.area_m2) - common_m2
+    iou = np.where(both & (union > 0.0), common_m2 / np.where(union > 0.0, union, 1.0), np.nan)
 
     def of_parts(column: int, alone: BoolArray, whole: FloatArray) -> FloatArray:
-        """A figure of the raster where both epochs have a model; the whole of a building that is new or gone."""
+        """A figure of the raster if both epochs have a model; the whole building if it is new or gone."""
         values = np.where(compared, figures[:, column], np.where(is_new | is_gone, 0.0, np.nan))
         return np.where(alone, whole, values)
 
     def where(mask: BoolArray, values: FloatArray) -> FloatArray:
         return np.where(mask, values, np.nan)
 
+    no_building = np.zeros_like(both)
     columns: dict[str, Any] = {
         "change": verdicts.change,
         "is_raised": verdicts.is_raised,
@@ -300,7 +303,7 @@ def _table(
         "new_ids": after.ids,
         "old_source_ids": before.source_ids,
         "new_source_ids": after.source_ids,
-        "iou": _rounded(where(both & (union > 0.0), common_m2 / np.where(union > 0.0, union, 1.0)), 4),
+        "iou": _rounded(iou, 4),
         "old_area_m2": before.area_m2,
         "new_area_m2": after.area_m2,
         "area_change_m2": _difference(before.area_m2, after.area_m2, is_new, is_gone),
@@ -314,8 +317,8 @@ def _table(
         "volume_change_m3": _difference(before.volume_m3, after.volume_m3, is_new, is_gone),
         "added_m2": of_parts(ADDED_M2, is_new, after.area_m2),
         "removed_m2": of_parts(REMOVED_M2, is_gone, before.area_m2),
-        "raised_m2": of_parts(RAISED_M2, np.zeros_like(both), figures[:, RAISED_M2]),
-        "lowered_m2": of_parts(LOWERED_M2, np.zeros_like(both), figures[:, LOWERED_M2]),
+        "raised_m2": of_parts(RAISED_M2, no_building, figures[:, RAISED_M2]),
+        "lowered_m2": of_parts(LOWERED_M2, no_building, figures[:, LOWERED_M2]),
         "gained_m3": of_parts(GAINED_M3, is_new, after.volume_m3),
         "lost_m3": of_parts(LOST_M3, is_gone, before.volume_m3),
         "max_raise_m": where(compared & (figures[:, MAX_RAISE_M] > 0.0), figures[:, MAX_RAISE_M]),
@@ -329,26 +332,29 @@ def _table(
         "old_acquired": before.acquired_to,
         "new_acquired": after.acquired_from,
         "geometry": _wkb(before, after, epoch.reference.horizontal_unit_m),
+        "change_id": _change_ids(before, after),
     }
-    columns["change_id"] = _change_ids(before, after)
-    arrays = [
-        _rounded(columns[name], _DIGITS)
-        if isinstance(columns[name], np.ndarray) and columns[name].dtype.kind == "f"
-        else columns[name]
-        for name in SCHEMA.names
-    ]
-    made = [pa.array(one, type=kind) for one, kind in zip(arrays, SCHEMA.types, strict=True)]
-    return pa.table(made, schema=SCHEMA).sort_by("change_id")
+    return _sorted_table(columns)
+
+
+def _sorted_table(columns: dict[str, Any]) -> pa.Table:
+    """Columns as a table with rounded figures, `change_id` ascending."""
+    rounded = {
+        name: _rounded(values, _DIGITS) if isinstance(values, np.ndarray) and values.dtype.kind == "f" else values
+        for name, values in columns.items()
+    }
+    arrays = [pa.array(rounded[field.name], type=field.type) for field in SCHEMA]
+    return pa.table(arrays, schema=SCHEMA).sort_by("change_id")
 
 
 def _difference(before: FloatArray, after: FloatArray, is_new: BoolArray, is_gone: BoolArray) -> FloatArray:
-    """Later less earlier; what stands in one epoch alone counts from nothing where it is new or gone."""
+    """Later less earlier; a new or gone building counts as 0 in the other epoch."""
     difference: FloatArray = np.where(is_gone, 0.0, after) - np.where(is_new, 0.0, before)
     return difference
 
 
 def _rounded(values: FloatArray, digits: int) -> pa.Array:
-    """Figures as the table holds them: null where there are none, no negative zero."""
+    """Figures as the table holds them: null if unknown, no negative zero."""
     return pa.array(np.round(values, digits) + 0.0, mask=~np.isfinite(values))
 
 
@@ -363,7 +369,7 @@ def _doubts(verdicts: Verdicts) -> pa.ListArray:
 
 
 def _change_ids(before: Side, after: Side) -> npt.NDArray[np.object_]:
-    """A name of each group: of its first building in the later epoch, else in the earlier one."""
+    """The name of each group: from its first building in the later epoch, else in the earlier one."""
     found = np.full(len(before.count), None, object)
     for prefix, side, of in (("o-", before, before.count > 0), ("n-", after, after.count > 0)):
         starts = side.ids.offsets.to_numpy()[:-1][of]
@@ -373,7 +379,7 @@ def _change_ids(before: Side, after: Side) -> npt.NDArray[np.object_]:
 
 
 def _wkb(before: Side, after: Side, unit_m: float) -> Any:
-    """The geometries of the rows in the CRS's own units, one canonical form of each."""
+    """The geometries of the rows in units of the CRS, in one canonical form."""
     geometry = np.where(after.count > 0, after.footprints, before.footprints)
     if unit_m != 1.0:
         geometry = shapely.transform(geometry, lambda xy: np.round(xy / unit_m, decimals(unit_m)))

@@ -132,13 +132,6 @@ class Epoch:
 def open_epoch(name: str, run_dir: str) -> Epoch:
     """Open a run that is to be compared.
 
-    Parameters
-    ----------
-    name : str
-        OLD or NEW, for messages.
-    run_dir : str
-        The run directory, a path or a URL.
-
     Raises
     ------
     RunError

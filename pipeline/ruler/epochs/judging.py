@@ -95,21 +95,7 @@ def limits(old: Side, new: Side, settings: DiffSettings) -> Limits:
 def judge(
     old: Side, new: Side, figures: FloatArray, limit: Limits, seen: Circumstances, settings: DiffSettings
 ) -> Verdicts:
-    """Judge every group.
-
-    Parameters
-    ----------
-    old, new : Side
-        What each epoch has of the groups.
-    figures : (g, 16) float64
-        Of `compare_roofs`.
-    limit : Limits
-        What counts as a change.
-    seen : Circumstances
-        What the epochs can tell.
-    settings : DiffSettings
-        The thresholds.
-    """
+    """Judge every group."""
     only_old, only_new = new.count == 0, old.count == 0
     both = ~only_old & ~only_new
     shift_m, form_m3 = figures[:, SHIFT_M], figures[:, FORM_M3]

@@ -147,17 +147,7 @@ def all_pairs(old: Epoch, new: Epoch) -> tuple[Pairs, FloatArray, FloatArray]:
 
 
 def grouped(pairs: Pairs, old_m2: FloatArray, new_m2: FloatArray, settings: DiffSettings) -> Groups:
-    """Buildings that belong together.
-
-    Parameters
-    ----------
-    pairs : Pairs
-        All pairs that share area.
-    old_m2, new_m2 : (o,), (n,) float64
-        Areas of all footprints of the two epochs.
-    settings : DiffSettings
-        Says how much is enough.
-    """
+    """Buildings that belong together."""
     smaller = np.minimum(old_m2[pairs.old], new_m2[pairs.new])
     kept = pairs.common_m2 >= settings.min_overlap_share * smaller
     count, labels = _components(pairs, kept, len(old_m2), len(new_m2))

@@ -95,13 +95,6 @@ class DiffSettings(Parameters):
 def read_settings(path: str | None, options: Mapping[str, Any]) -> DiffSettings:
     """The settings of a TOML file under those of the command line.
 
-    Parameters
-    ----------
-    path : str or None
-        A file with a `[diff]` table; None for the defaults.
-    options : mapping
-        Settings by name that stand above the file's; those that are None do not.
-
     Raises
     ------
     SettingsError

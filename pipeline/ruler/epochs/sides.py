@@ -60,19 +60,7 @@ class Side:
 
 
 def side_of(buildings: Buildings, group: IntArray, count: int, vertical_unit_m: float) -> Side:
-    """Bring the buildings of an epoch together by group.
-
-    Parameters
-    ----------
-    buildings : Buildings
-        Those of the groups and no others.
-    group : (n,) int64
-        The group of each, 0 to count - 1.
-    count : int
-        Number of groups.
-    vertical_unit_m : float
-        Metres a unit of elevation.
-    """
+    """Bring the buildings of an epoch together by group."""
     table = buildings.table
     by_name = pc.sort_indices(
         pa.table({"group": pa.array(group), "name": table["building_id"].combine_chunks()}),

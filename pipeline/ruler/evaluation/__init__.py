@@ -1,1 +1,6 @@
-"""The ruler: models of any origin measured against true models or against classified points."""
+"""Models of any program measured against a reference: simulated truth, or classified points with or without footprints.
+
+`reading/` turns files into `models.py`; `reference_truth.py` and `reference_points.py` read what they are measured
+against. Begin with `evaluate.py`, which calls one module per group of measures; `matching.py` decides which model
+stands for which building, `bootstrap.py` computes the intervals, `writing.py` writes tables and Markdown.
+"""

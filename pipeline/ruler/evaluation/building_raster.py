@@ -149,13 +149,7 @@ def _fill(
 
 
 class PlanRaster:
-    """Polygons as a raster, window by window.
-
-    Parameters
-    ----------
-    polygons : sequence of shapely Polygon or MultiPolygon
-        Metres; together they are one set of cells.
-    """
+    """Polygons as a raster, window by window."""
 
     def __init__(self, polygons: Sequence[Polygon | MultiPolygon]) -> None:
         parts, owner = shapely.get_parts(np.asarray(polygons, dtype=object), return_index=True)

@@ -114,13 +114,6 @@ def chapters(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEF
     """The measures of an evaluation by chapter, in the order of `Group`.
 
     Chapters without measures are left out, and subsets without anything in them.
-
-    Parameters
-    ----------
-    evaluation : Evaluation
-        What was found.
-    definitions : mapping of name to Definition
-        Of all measures.
     """
     by_group: dict[Group, dict[str, list[Measure]]] = {group: {} for group in Group}
     filled = {measure.subset for measure in evaluation.measures if measure.n > 0} | {"all"}
@@ -165,13 +158,6 @@ def unit_sign(unit: str) -> str:
 
 def supported_decimals(low: float, high: float, unit: str) -> int:
     """Decimals of a figure as printed: those of its unit, but no more than two digits of half its interval.
-
-    Parameters
-    ----------
-    low, high : float
-        The interval in the measure's own unit (a share from 0 to 1); nan where there is none.
-    unit : str
-        Of the measure.
 
     Examples
     --------

@@ -115,13 +115,7 @@ def _ground(table: pa.Table) -> list[CountTable]:
 
 
 def breakdowns(tables: Tables) -> tuple[CountTable, ...]:
-    """Where buildings are lost: by shape, by what makes them hard, by size; edge buildings are left out.
-
-    Returns
-    -------
-    tuple of CountTable
-        Empty where there is no table of buildings. Columns whose measure was not possible are left out.
-    """
+    """Where buildings are lost: by shape, by what makes them hard, by size; edge buildings are left out."""
     table = tables.get("buildings")
     if table is None or table.num_rows == 0:
         return ()

@@ -95,22 +95,7 @@ class Delivery:
 
 
 def score_delivery(models: Sequence[RoofModel], reference: Reference, matching: Matching) -> Delivery:
-    """What the reference buildings got, and where the models stand.
-
-    Parameters
-    ----------
-    models : sequence of RoofModel
-        Those that were matched.
-    reference : Reference
-        What they were matched to.
-    matching : Matching
-        From `match_footprints`.
-
-    Returns
-    -------
-    Delivery
-        A row a reference building and a row a model, in their orders.
-    """
+    """What the reference buildings got, and where the models stand."""
     pairs = matching.overlaps
     cut = np.array([building.touches_data_edge for building in reference.buildings], np.bool_)
     covering = pairs.common_m2 >= (MIN_SHARE - _ROUNDING) * matching.reference_m2[pairs.first]

@@ -115,20 +115,7 @@ class Detection:
 
 
 def detect(models: Sequence[RoofModel], reference: Reference) -> Detection:
-    """Compare where models stand with where buildings are.
-
-    Parameters
-    ----------
-    models : sequence of RoofModel
-        With footprints.
-    reference : Reference
-        Any. Given footprints need the points for the measures by area: one pass over them.
-
-    Returns
-    -------
-    Detection
-        Rows for `detection_measures`.
-    """
+    """Compare where models stand with where buildings are."""
     buildings, right = _objects(models, reference)
     return Detection(
         blocks=_blocks(models, reference),

@@ -157,22 +157,7 @@ def compared(true: Planes, made: Planes) -> Compared:
 
 
 def match_faces(models: Sequence[RoofModel], reference: Sequence[RoofModel]) -> FaceMatch:
-    """Match all faces of all models to all true faces, one to one, the largest common area first.
-
-    Parameters
-    ----------
-    models : sequence of RoofModel
-        What was made.
-    reference : sequence of RoofModel
-        The true buildings.
-
-    Returns
-    -------
-    FaceMatch
-        Single faces and pieces of groups are matched first. A group is found where its matched pieces hold at least
-        half of its area; else where a model face that is free, or matches one of its pieces, matches its union and
-        mean plane.
-    """
+    """Match all faces of all models to all true faces, one to one, the largest common area first."""
     true, made = flattened(reference), flattened(models)
     unit = _units(reference)
     units = int(unit.max()) + 1 if len(unit) else 0

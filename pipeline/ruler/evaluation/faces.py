@@ -143,22 +143,7 @@ class FaceScore:
 
 
 def score_faces(models: Sequence[RoofModel], reference: Reference) -> FaceScore:
-    """Match all faces of all models to all true faces, and say what each counts as.
-
-    Parameters
-    ----------
-    models : sequence of RoofModel
-        Those with a footprint.
-    reference : Reference
-        With faces; without (`has_faces` false) the score is empty.
-
-    Returns
-    -------
-    FaceScore
-        A model face is judged where it matches a true face of a building that is not cut by the data edge, else as
-        `where_judged` says, but not where it lies on a cut building, or on none as part of a model that the edge of
-        the data excuses (`excused_models`). A cut model may still find faces.
-    """
+    """Match all faces of all models to all true faces, and say what each counts as."""
     if not reference.has_faces:
         return FaceScore(reference=(), models=(), components=())
     match = match_faces(models, reference.buildings)

@@ -67,11 +67,6 @@ class EvaluationRequest:
 def read_reference(request: EvaluationRequest) -> Reference | None:
     """What a request measures against; None where it names nothing.
 
-    Parameters
-    ----------
-    request : EvaluationRequest
-        Its models are not looked at.
-
     Raises
     ------
     InputError
@@ -91,15 +86,6 @@ def evaluate_files(
     reference: Reference | None = None,
 ) -> Evaluation:
     """Read and measure.
-
-    Parameters
-    ----------
-    request : EvaluationRequest
-        What, against what.
-    on_step : callable
-        Told the name of each step as it begins.
-    reference : Reference, optional
-        From `read_reference` of the same request, where it serves several models.
 
     Raises
     ------

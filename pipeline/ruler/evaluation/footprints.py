@@ -51,23 +51,7 @@ class FootprintRow:
 
 
 def score_footprints(models: Sequence[RoofModel], reference: Reference, matching: Matching) -> tuple[FootprintRow, ...]:
-    """One row a reference building, in their order.
-
-    Parameters
-    ----------
-    models : sequence of RoofModel
-        Those that were matched.
-    reference : Reference
-        What they were matched to.
-    matching : Matching
-        From `match_footprints`.
-
-    Returns
-    -------
-    tuple of FootprintRow
-        The offset is the difference of areas over the mean of both perimeters: exact for an outline whose edges were
-        all moved by one distance, since area grows by the perimeter half way.
-    """
+    """One row a reference building, in their order."""
     true = sound_polygons([building.footprint for building in reference.buildings])
     made = sound_polygons([model.footprint for model in models])
     true_m, made_m = shapely.length(true), shapely.length(made)

@@ -93,20 +93,7 @@ class TileGround:
 
 
 def ground_blocks(reference: Reference, found: FoundGround) -> list[GroundBlock]:
-    """Count right and wrong points of every tile, block by block; one tile in memory.
-
-    Parameters
-    ----------
-    reference : Reference
-        With ground classes.
-    found : callable
-        `GroundOfFiles` or `GroundOfRun`, or any other.
-
-    Returns
-    -------
-    list of GroundBlock
-        In the order of the tiles; empty where the reference knows no ground.
-    """
+    """Count right and wrong points of every tile, block by block; one tile in memory."""
     if not reference.has_ground:
         return []
     rows: list[GroundBlock] = []
@@ -266,13 +253,6 @@ class GroundOfRun:
     Made in one pass over the points: the lowest last return of each cell of 1 m, then the terrain window by window
     with all the halo that the filter looks at, so that it does not depend on the tiles. Classes of the file are never
     believed here, whatever the run did. Gross outliers are searched tile by tile.
-
-    Parameters
-    ----------
-    reference : Reference
-        With points.
-    settings : SceneSettings
-        The run's.
     """
 
     def __init__(self, reference: Reference, settings: SceneSettings) -> None:

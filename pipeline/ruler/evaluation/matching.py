@@ -96,18 +96,7 @@ def sound_polygons(polygons: Sequence[shapely.Geometry]) -> Geometries:
 
 
 def overlapping(first: Geometries, second: Geometries) -> Overlaps:
-    """All pairs of two sets of polygons that share area, with the common area.
-
-    Parameters
-    ----------
-    first, second : arrays of (multi)polygons
-        Valid ones, from `sound_polygons`. Empty ones overlap nothing.
-
-    Returns
-    -------
-    Overlaps
-        Found by a tree over the second set, so work grows with the number of pairs whose bounds overlap.
-    """
+    """All pairs of two sets of polygons that share area, with the common area."""
     if len(first) == 0 or len(second) == 0:
         none = np.zeros(0, np.int64)
         return Overlaps(first=none, second=none, common_m2=np.zeros(0), middle=np.zeros((0, 2)))
@@ -155,20 +144,7 @@ def one_to_one(first: IntArray, second: IntArray, weight: FloatArray) -> BoolArr
 
 
 def match_footprints(models: Sequence[RoofModel], reference: Reference) -> Matching:
-    """Match the footprints of models to those of a reference.
-
-    Parameters
-    ----------
-    models : sequence of RoofModel
-        Those with a footprint.
-    reference : Reference
-        Its buildings may touch, but should not overlap.
-
-    Returns
-    -------
-    Matching
-        Deterministic: ties in IoU go to the smaller index.
-    """
+    """Match the footprints of models to those of a reference."""
     made = sound_polygons([model.footprint for model in models])
     true = sound_polygons([building.footprint for building in reference.buildings])
     model_m2, reference_m2 = shapely.area(made), shapely.area(true)

@@ -29,11 +29,11 @@ from pipeline.ruler.evaluation.reference import Reference, ReferencePoints
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS
 
 MIN_BUILDING_POINTS = 11
-"""A given footprint with fewer points of class 6 is no reference building: nothing was measured of it."""
+"""A given footprint with fewer points of class 6 is not a reference building: it was not measured."""
 MIN_OUTLINE_M2 = 10.0
-"""Smaller outlines of the raster are specks, not buildings: they need not be found, but their points count."""
+"""Smaller outlines of the raster are specks: they need not be found, but their points count."""
 _SEAM_M = 1.0
-"""Gap between the bounds of adjacent tiles that is no edge of the data."""
+"""A gap between the bounds of adjacent tiles up to this is not an edge of the data."""
 
 Area: TypeAlias = Polygon | MultiPolygon
 Counts: TypeAlias = npt.NDArray[np.int64]
@@ -52,20 +52,20 @@ def read_points_reference(
     Parameters
     ----------
     tiles : sequence of str or Path
-        Point files of one CRS; they may abut, points in two of them count twice.
+        Point files of one CRS. They may abut; points in two files count twice.
     footprints : str or Path, optional
-        Outlines of buildings. Those with at least 11 points of class 6 are the reference buildings; as the file may
-        cover a part only, nothing is known elsewhere. Without it the buildings are what hangs together on the raster
-        of class 6 (see `building_raster`).
+        Outlines of buildings. Those with at least 11 points of class 6 are the reference buildings. The file may cover
+        only a part of the tiles, so nothing is known elsewhere. Without it, the buildings are the connected areas of
+        the raster of class 6 (see `building_raster`).
     crs, vertical_unit : str, optional
-        Stand above those of the files.
+        Override those of the files.
     read_options : ReadOptions, optional
-        Anything else about reading.
+        All other options of reading.
 
     Returns
     -------
     Reference
-        Of kind points; without class 6 it has no buildings and serves the ground measures only.
+        Its kind is points. Without class 6 it has no buildings and serves the ground measures only.
 
     Raises
     ------
@@ -81,76 +81,99 @@ def read_points_reference(
     bounds = tuple(_plan_bounds(source) for source in sources)
     extent = _extent(bounds)
     notes = list(dict.fromkeys(warning for source in sources for warning in source.info.warnings))
+    areas: dict[str, Area]
     if footprints is not None:
-        given = read_footprints(footprints, reference)
-        notes += given.warnings
-        areas, names, classes = list(given.polygons), list(given.ids), np.zeros(256, np.int64)
-        index = plan_index(areas)
-        counts = np.zeros(len(areas) + 1, np.int64)
-        for source in sources:
-            for cloud in source.chunks():
-                classes += np.bincount(cloud.classification, minlength=256)
-                roof = cloud.xyz[cloud.classification == BUILDING_CLASS]
-                counts += np.bincount(index.face(roof[:, 0], roof[:, 1]) + 1, minlength=len(areas) + 1)
-        measured = np.flatnonzero(counts[1:] >= MIN_BUILDING_POINTS).tolist()
-        if len(measured) < len(areas):
-            notes.append(
-                f"{len(areas) - len(measured)} of {len(areas)} given footprints have fewer than {MIN_BUILDING_POINTS} "
-                f"points of class {BUILDING_CLASS} and are no reference buildings"
-            )
-        areas, names = [areas[k] for k in measured], [names[k] for k in measured]
+        areas, classes, more = _given_areas(sources, footprints, reference)
     else:
-        raster, classes = _class_raster(sources, bounds)
-        areas = list(raster.outlines())
-        names = [f"outline-{number}" for number in range(len(areas))]
-        small = sum(area.area < MIN_OUTLINE_M2 for area in areas)
-        if areas:
-            notes.append(
-                f"Reference buildings are the {len(areas)} outlines of class {BUILDING_CLASS} on the raster: houses "
-                f"that touch are one; {small} of them are smaller than {MIN_OUTLINE_M2:g} m2 and need not be found, as "
-                "those that the end of the data cuts"
-            )
+        areas, classes, more = _raster_areas(sources, bounds)
+    notes += more
     _check_classes(sources, classes)
     if not classes[BUILDING_CLASS]:
-        areas, names = [], []
+        areas = {}
         notes.append(f"The points have no class {BUILDING_CLASS}: only the ground can be measured")
-    if classes[GROUND_CLASS] and _tells_objects(classes) and classes[list(UNCLASSIFIED)].any():
+    if classes[GROUND_CLASS] and _has_object_classes(classes) and classes[list(UNCLASSIFIED)].any():
         notes.append(
             "Points that the file leaves unclassified (0, 1) are judged neither as ground nor as object, for other "
             "classes name the objects"
         )
-    whole = extent.buffer(-_SEAM_M, join_style="mitre")
-    buildings = tuple(
-        RoofModel(
-            building_id=name,
-            footprint=area,
-            roof_type=RoofType.UNKNOWN,
-            surfaces=(),
-            touches_data_edge=not whole.contains(area) or (footprints is None and area.area < MIN_OUTLINE_M2),
-            source_id=name if footprints is not None else None,
-            lod="",
-        )
-        for name, area in zip(names, areas, strict=True)
-    )
-    index = plan_index(areas)
+    index = plan_index(list(areas.values()))
     return Reference(
         name=", ".join(file_at(path).name for path in tiles),
         kind="points",
-        buildings=buildings,
+        buildings=_buildings(areas, extent, is_given=footprints is not None),
         has_faces=False,
         outlines="given" if footprints is not None else "raster",
         tiles=tuple(functools.partial(_read_tile, file_at(path), options, index) for path in tiles),
         bounds=bounds,
-        extent=None if footprints is not None or not buildings else extent,
+        extent=None if footprints is not None or not areas else extent,
         has_ground=bool(classes[GROUND_CLASS]),
-        unclassified_is_object=not _tells_objects(classes),
+        unclassified_is_object=not _has_object_classes(classes),
         crs=None if reference.wkt is None else (f"EPSG:{reference.epsg}" if reference.epsg else reference.name),
         notes=tuple(notes),
     )
 
 
-def _tells_objects(classes: Counts) -> bool:
-    """Whether any class names an object: then classes 0 and 1 hold what nobody looked at."""
+def _given_areas(
+    sources: Sequence[Source], footprints: str | Path, reference: SpatialReference
+) -> tuple[dict[str, Area], Counts, list[str]]:
+    """The given footprints with enough points of class 6 by name, the number of points of each class, and notes."""
+    given = read_footprints(footprints, reference)
+    notes = list(given.warnings)
+    index = plan_index(list(given.polygons))
+    counts, classes = np.zeros(len(given.polygons) + 1, np.int64), np.zeros(256, np.int64)
+    for source in sources:
+        for cloud in source.chunks():
+            classes += np.bincount(cloud.classification, minlength=256)
+            roof = cloud.xyz[cloud.classification == BUILDING_CLASS]
+            counts += np.bincount(index.face(roof[:, 0], roof[:, 1]) + 1, minlength=len(counts))
+    measured = np.flatnonzero(counts[1:] >= MIN_BUILDING_POINTS).tolist()
+    if len(measured) < len(given.polygons):
+        notes.append(
+            f"{len(given.polygons) - len(measured)} of {len(given.polygons)} given footprints have fewer than "
+            f"{MIN_BUILDING_POINTS} points of class {BUILDING_CLASS} and are not reference buildings"
+        )
+    return {given.ids[k]: given.polygons[k] for k in measured}, classes, notes
+
+
+def _raster_areas(
+    sources: Sequence[Source], bounds: Sequence[Sequence[float]]
+) -> tuple[dict[str, Area], Counts, list[str]]:
+    """The outlines of the raster of class 6 by name, the number of points of each class, and notes."""
+    raster, classes = PointRaster(), np.zeros(256, np.int64)
+    for number, source in enumerate(sources):
+        for cloud in source.chunks():
+            classes += np.bincount(cloud.classification, minlength=256)
+            raster.add(cloud.xyz, cloud.classification == BUILDING_CLASS)
+        raster.finish(bounds[number + 1 :])
+    areas: dict[str, Area] = {f"outline-{number}": area for number, area in enumerate(raster.outlines())}
+    small = sum(area.area < MIN_OUTLINE_M2 for area in areas.values())
+    note = (
+        f"Reference buildings are the {len(areas)} outlines of class {BUILDING_CLASS} on the raster: houses that touch "
+        f"are one; {small} of them are smaller than {MIN_OUTLINE_M2:g} m2 and need not be found, as those that the end "
+        "of the data cuts"
+    )
+    return areas, classes, [note] if areas else []
+
+
+def _buildings(areas: dict[str, Area], extent: Area, *, is_given: bool) -> tuple[RoofModel, ...]:
+    """The areas as buildings without roof faces; those at the edge of the extent, and specks, need not be found."""
+    whole = extent.buffer(-_SEAM_M, join_style="mitre")
+    return tuple(
+        RoofModel(
+            building_id=name,
+            footprint=area,
+            roof_type=RoofType.UNKNOWN,
+            surfaces=(),
+            touches_data_edge=not whole.contains(area) or (not is_given and area.area < MIN_OUTLINE_M2),
+            source_id=name if is_given else None,
+            lod="",
+        )
+        for name, area in areas.items()
+    )
+
+
+def _has_object_classes(classes: Counts) -> bool:
+    """Whether any class names an object: then classes 0 and 1 are points that were not classified."""
     named = classes.copy()
     named[[GROUND_CLASS, *NOT_JUDGED, *UNCLASSIFIED]] = 0
     return bool(named.any())
@@ -175,23 +198,12 @@ def _plan_bounds(source: Source) -> tuple[float, float, float, float]:
 
 
 def _extent(bounds: Sequence[Sequence[float]]) -> Area:
-    """What the tiles cover together, without the seams between them."""
+    """The area that the tiles cover together, without the seams between them."""
     boxes = [shapely.box(*b).buffer(_SEAM_M / 2, join_style="mitre") for b in bounds]
     extent = shapely.union_all(boxes).buffer(-_SEAM_M / 2, join_style="mitre")
     if not isinstance(extent, Polygon | MultiPolygon):
         raise TypeError(f"an extent became a {extent.geom_type}")
     return extent
-
-
-def _class_raster(sources: Sequence[Source], bounds: Sequence[Sequence[float]]) -> tuple[PointRaster, Counts]:
-    """The raster of class 6, and the number of points of each class."""
-    raster, classes = PointRaster(), np.zeros(256, np.int64)
-    for number, source in enumerate(sources):
-        for cloud in source.chunks():
-            classes += np.bincount(cloud.classification, minlength=256)
-            raster.add(cloud.xyz, cloud.classification == BUILDING_CLASS)
-        raster.finish(bounds[number + 1 :])
-    return raster, classes
 
 
 def _check_classes(sources: Sequence[Source], classes: Counts) -> None:
@@ -205,30 +217,18 @@ def _check_classes(sources: Sequence[Source], classes: Counts) -> None:
 
 
 def _read_tile(path: Readable, options: ReadOptions, index: TopSurface) -> ReferencePoints:
-    """The points of a tile; of class 6 those inside a footprint are roof."""
+    """The points of a tile; points of class 6 inside a footprint are roof."""
     clouds = list(open_source(path, options).chunks())
-    if not clouds:
-        empty = np.zeros(0, np.int32)
-        return ReferencePoints(
-            name=path.name,
-            xyz=np.zeros((0, 3)),
-            classification=empty,
-            building=empty,
-            face=empty,
-            is_roof=np.zeros(0, np.bool_),
-            last=np.zeros(0, np.bool_),
-            return_number=np.zeros(0, np.uint8),
-        )
-    xyz = np.concatenate([cloud.xyz for cloud in clouds])
-    classification = np.concatenate([cloud.classification for cloud in clouds]).astype(np.int32)
+    xyz = np.concatenate([np.zeros((0, 3)), *(cloud.xyz for cloud in clouds)])
+    classification = np.concatenate([np.zeros(0, np.uint8), *(cloud.classification for cloud in clouds)])
     building = index.face(xyz[:, 0], xyz[:, 1])
     return ReferencePoints(
         name=path.name,
         xyz=xyz,
-        classification=classification,
+        classification=classification.astype(np.int32),
         building=building,
         face=np.full(len(xyz), -1, np.int32),
         is_roof=(classification == BUILDING_CLASS) & (building >= 0),
-        last=np.concatenate([cloud.return_number >= cloud.return_count for cloud in clouds]),
-        return_number=np.concatenate([cloud.return_number for cloud in clouds]),
+        last=np.concatenate([np.zeros(0, np.bool_), *(cloud.return_number >= cloud.return_count for cloud in clouds)]),
+        return_number=np.concatenate([np.zeros(0, np.uint8), *(cloud.return_number for cloud in clouds)]),
     )

@@ -1,4 +1,4 @@
-"""A simulated data set as a reference: exact models, and points that know what they hit."""
+"""A simulated data set as a reference: exact models, and points with the surface that they hit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from pipeline.ruler.evaluation.survey_shift import mean_shifts, moved_buildings,
 FIX = "Give the folder `truth` that `gablework simulate` wrote, with the point files where it wrote them"
 
 _ALL_POINTS = ReadOptions(keep_withheld=True, drop_classes=())
-"""Labels are by position: no point may be left out."""
+"""Labels match by position: every point must be read."""
 _LABELS_A_BATCH = 1_000_000
 _NOTE = "Returns that melt echoes of two surfaces are roof points where their label is a roof face: they were measured."
 
@@ -37,23 +37,23 @@ def read_truth_reference(
     *,
     as_surveyed: bool = False,
 ) -> Reference:
-    """The truth of one simulated data set, its points read tile by tile when asked for.
+    """The truth of one simulated data set; its points are read tile by tile on demand.
 
     Parameters
     ----------
     truth_dir : str or Path
-        The folder `truth` that `simulate` wrote: models as a run directory, scene.json, labels; conditions.parquet
-        where it is there. The point files lie where scene.json says, else as the one LAZ beside the folder.
+        The folder `truth` that `simulate` wrote: models as a run directory, scene.json, labels, and optionally
+        conditions.parquet. scene.json lists the point files; otherwise it is the one LAZ beside the folder.
     read_models : callable
         Reads the models.
     as_surveyed : bool
-        Move each building to where the survey saw it: by the mean shift of the strips of its points.
+        Move each building by the mean shift of the strips of its points, to where the survey saw it.
 
     Returns
     -------
     Reference
-        Of kind truth. Roof points are those that hit a roof face and lie inside the footprint of its building: a
-        return that the survey put outside cannot be explained by any model. Faces carry their groups.
+        Its kind is truth. Roof points hit a roof face and lie inside the footprint of its building: no model can
+        explain a return that the survey put outside. Faces carry their groups.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def read_truth_reference(
         shifts = strip_shifts(scene, str(folder / "scene.json"))
         shift = mean_shifts(len(buildings), (_roof_strips(*pair, number_of) for pair in pairs), shifts)
         buildings = moved_buildings(buildings, shift)
-        notes = (*notes, _told_shift(shift))
+        notes = (*notes, _shift_note(shift))
     footprints = plan_index([building.footprint for building in buildings])
     name = folder.parent.name if folder.name == "truth" else folder.name
     return Reference(
@@ -92,7 +92,7 @@ def read_truth_reference(
     )
 
 
-def _told_shift(shift: FloatArray) -> str:
+def _shift_note(shift: FloatArray) -> str:
     away = np.hypot(shift[:, 0], shift[:, 1])
     plan, up = (float(np.median(values)) if len(shift) else 0.0 for values in (away, np.abs(shift[:, 2])))
     return (
@@ -111,7 +111,7 @@ def _roof_strips(laz: Path, labels: Path, number_of: Mapping[str, int]) -> tuple
 
 
 def _scene(folder: Path) -> dict[str, Any]:
-    """What scene.json holds."""
+    """The content of scene.json."""
     try:
         scene: dict[str, Any] = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -145,7 +145,7 @@ def _plan_bounds(laz: Path) -> tuple[float, float, float, float]:
 
 
 def _conditions(path: Path) -> tuple[dict[str, Conditions], dict[str, Sequence[int]]]:
-    """Conditions and groups of faces by building_id; empty where there is no such table."""
+    """Conditions and groups of faces by building_id; empty without such a table."""
     if not path.is_file():
         return {}, {}
     try:
@@ -204,12 +204,12 @@ def _label_batches(path: Path, columns: Sequence[str]) -> Any:
 
 
 def _indices(ids: pa.DictionaryArray) -> LabelArray:
-    """Indices into the dictionary, (n,) int32; -1 where there is none."""
+    """Indices into the dictionary, (n,) int32; -1 for null."""
     return np.asarray(ids.indices.fill_null(-1)).astype(np.int32)
 
 
 def _read_tile(laz: Path, labels: Path, number_of: Mapping[str, int], footprints: TopSurface) -> ReferencePoints:
-    """The points of one tile with their labels, which stand in the same order."""
+    """The points of one tile with their labels, which are in the same order."""
     table, clouds = _labelled(laz, labels)
     xyz = np.concatenate([cloud.xyz for cloud in clouds]) if clouds else np.zeros((0, 3))
     building = np.concatenate([_numbers(ids, number_of, labels) for ids in table["building_id"].chunks])
@@ -231,7 +231,7 @@ def _read_tile(laz: Path, labels: Path, number_of: Mapping[str, int], footprints
 
 
 def _labelled(laz: Path, labels: Path) -> tuple[pa.Table, list[PointCloud]]:
-    """Labels and points of a tile, as many of the one as of the other."""
+    """Labels and points of a tile, equal in number."""
     try:
         table = pq.read_table(labels, columns=["class", "building_id", "face"], read_dictionary=["building_id"])
     except (OSError, ValueError, KeyError) as error:

@@ -156,13 +156,6 @@ def _area_within(polygon: Polygon, reach: Polygon) -> Polygon | MultiPolygon:
 def point_residuals(points: ReferencePoints, surface: TopSurface) -> tuple[IntArray, FloatArray]:
     """The roof points of a tile and their residuals.
 
-    Parameters
-    ----------
-    points : ReferencePoints
-        A tile.
-    surface : TopSurface
-        Of all models.
-
     Returns
     -------
     index : (k,) int64
@@ -181,18 +174,6 @@ def building_residuals(models: Sequence[RoofModel], reference: Reference) -> lis
 
     A building that lies in several tiles adds up. Whether a point is top-visible is judged with the points of all
     tiles near it, where the reference knows the tiles' bounds.
-
-    Parameters
-    ----------
-    models : sequence of RoofModel
-        What was delivered.
-    reference : Reference
-        With points; without any the tallies are empty.
-
-    Returns
-    -------
-    list of BuildingResiduals
-        One a reference building, in their order.
     """
     surface = top_surface_of(models, near=reference.buildings)
     everything, visible = _Tallies(len(reference.buildings)), _Tallies(len(reference.buildings))
@@ -358,15 +339,7 @@ DEFINITIONS: tuple[Definition, ...] = tuple(
 
 
 def residual_measures(rows: Sequence[BuildingResiduals], subset: Subset) -> list[Measure]:
-    """The figures of a subset, buildings as units of the bootstrap; empty where there are no points at all.
-
-    Parameters
-    ----------
-    rows : sequence of BuildingResiduals
-        One a reference building, as `building_residuals` gives them.
-    subset : Subset
-        Which buildings count.
-    """
+    """The figures of a subset, buildings as units of the bootstrap; empty where there are no points at all."""
     if not any(row.all_points.n_points for row in rows):
         return []
     counted = [row for row in rows if (row.counts if subset.elsewhere else subset.buildings[row.building])]

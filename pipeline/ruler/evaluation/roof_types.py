@@ -89,24 +89,7 @@ class OutcomeRow:
 def score_roof_types(
     models: Sequence[RoofModel], reference: Reference, matching: Matching, faces: FaceScore
 ) -> tuple[RoofTypeRow, ...]:
-    """One row a reference building, in their order; none against a reference without faces.
-
-    Parameters
-    ----------
-    models : sequence of RoofModel
-        Those that were matched.
-    reference : Reference
-        What they were matched to.
-    matching : Matching
-        From `match_footprints`.
-    faces : FaceScore
-        From `score_faces` of the same.
-
-    Returns
-    -------
-    tuple of RoofTypeRow
-        A building without any face to be found is correct where its type is right and no face is wrong, else false.
-    """
+    """One row a reference building, in their order; none against a reference without faces."""
     if not reference.has_faces:
         return ()
     count = len(reference.buildings)

@@ -43,13 +43,7 @@ class Subset:
 
 
 def subsets(reference: Reference) -> tuple[Subset, ...]:
-    """All reference buildings, and where conditions are known the good ones and the hard ones.
-
-    Returns
-    -------
-    tuple of Subset
-        `all` first. Buildings that touch the data edge are in none; those without conditions only in `all`.
-    """
+    """All reference buildings, and where conditions are known the good ones and the hard ones."""
     whole = np.array([not building.touches_data_edge for building in reference.buildings], np.bool_)
     everything = Subset(name="all", buildings=whole, elsewhere=True)
     if not reference.conditions:

@@ -88,22 +88,7 @@ class SurfaceRow:
 def score_surface(
     models: Sequence[RoofModel], reference: Reference, *, sample_m: float = SAMPLE_M
 ) -> tuple[SurfaceRow, ...]:
-    """One row a reference building, in their order; none against a reference without faces.
-
-    Parameters
-    ----------
-    models : sequence of RoofModel
-        What was made.
-    reference : Reference
-        With true roof faces.
-    sample_m : float
-        Spacing of the lattice: its places are odd multiples of half of it, whatever the buildings are.
-
-    Returns
-    -------
-    tuple of SurfaceRow
-        Some buildings at a time: memory does not grow with their number but for the rows.
-    """
+    """One row a reference building, in their order; none against a reference without faces."""
     if not reference.has_faces:
         return ()
     truth, made = top_surface_of(reference.buildings), top_surface_of(models, near=reference.buildings)

@@ -94,15 +94,7 @@ class ModelValidity:
 
 
 def validity(models: ModelSet, tolerances: ValidityTolerances = DEFAULT_TOLERANCES) -> tuple[ModelValidity, ...]:
-    """The faults of every model's solids, in the order of the models.
-
-    Parameters
-    ----------
-    models : ModelSet
-        Vertices of their solids are taken to the nearest millimetre.
-    tolerances : ValidityTolerances
-        Snapping and planarity.
-    """
+    """The faults of every model's solids, in the order of the models."""
     return tuple(
         ModelValidity(
             building_id=model.building_id,

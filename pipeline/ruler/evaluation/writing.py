@@ -55,20 +55,6 @@ def write_tables(
 ) -> list[Path]:
     """Write `measures.parquet`, one Parquet file a table, and `report.md`.
 
-    Parameters
-    ----------
-    evaluation : Evaluation
-        What was found.
-    out_dir : str or Path
-        A folder; made where it is not there.
-    definitions : mapping of name to Definition
-        Of all measures.
-
-    Returns
-    -------
-    list of Path
-        What was written, in that order.
-
     Raises
     ------
     RunError

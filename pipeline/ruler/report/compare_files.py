@@ -42,20 +42,6 @@ def compare_files(
 ) -> WrittenComparison:
     """Run several methods over the same candidates and write one page on what came out.
 
-    Parameters
-    ----------
-    request : CompareRequest
-        What is to be compared; `request.run.out` is the folder of everything.
-    reference : EvaluationRequest, optional
-        Truth or points to measure every variant against; its `models` are not looked at.
-    on_event, executor, cancelled
-        As of `pipeline.runtime.run.run`.
-
-    Returns
-    -------
-    WrittenComparison
-        The runs and the files: compare.json, buildings.parquet, compare.md, index.html.
-
     Raises
     ------
     InputError, SettingsError, RunError, RunCancelledError, ClusterError

@@ -32,23 +32,6 @@ def write_comparison(
 ) -> list[Path]:
     """Write `buildings.parquet`, `compare.md` and `index.html`.
 
-    Parameters
-    ----------
-    out : str or Path
-        A folder; made where it is not there.
-    runs : sequence of ComparedRun
-        Over the same candidates, in the order of the columns.
-    points : PointFiles, optional
-        What the runs were made from: points of the buildings that are drawn are read from it again. Without it the
-        pictures have no points.
-    on_step : callable
-        Told the name of each step as it begins.
-
-    Returns
-    -------
-    list of Path
-        What was written, in that order.
-
     Raises
     ------
     SettingsError

@@ -83,22 +83,7 @@ def place_of(models: Sequence[RoofModel], truth: RoofModel | None) -> shapely.Ge
 
 
 def draw_building(models: Sequence[RoofModel | None], truth: RoofModel | None, xyz: FloatArray) -> BuildingPictures:
-    """Draw a building.
-
-    Parameters
-    ----------
-    models : sequence of RoofModel or None
-        One a run; None, or without a face, where it has none.
-    truth : RoofModel, optional
-        The true building.
-    xyz : (n, 3) float64
-        Its points, metres.
-
-    Returns
-    -------
-    BuildingPictures
-        All views look from the same place at the same scale.
-    """
+    """Draw a building."""
     shown = [model for model in (*models, truth) if model is not None and model.surfaces]
     corners = [ring for model in shown for face in viewed_faces(model) for ring in face.rings]
     everything = np.concatenate([*corners, xyz]) if corners else xyz

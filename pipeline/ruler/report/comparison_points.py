@@ -26,18 +26,6 @@ class PointFiles:
 def points_within(files: PointFiles, areas: Sequence[shapely.Geometry]) -> list[FloatArray]:
     """The points within each of some areas; streamed, and files that meet no area are not read.
 
-    Parameters
-    ----------
-    files : PointFiles
-        Overlapping files give their common points once.
-    areas : sequence of polygons
-        Metres of the CRS; empty ones hold no point.
-
-    Returns
-    -------
-    list of (n, 3) float64
-        Metres, ordered by easting, northing, elevation; one array an area.
-
     Raises
     ------
     InputError

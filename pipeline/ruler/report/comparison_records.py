@@ -168,17 +168,7 @@ def _true_buildings(names: Sequence[str], runs: Sequence[ComparedRun]) -> dict[s
 def buildings_table(
     runs: Sequence[ComparedRun], buildings: Sequence[ComparedBuilding], projjson: Mapping[str, Any] | None
 ) -> pa.Table:
-    """One row a building and run as GeoParquet; columns of the truth where there are evaluations.
-
-    Parameters
-    ----------
-    runs : sequence of ComparedRun
-        In their order.
-    buildings : sequence of ComparedBuilding
-        In theirs.
-    projjson : mapping or None
-        The coordinate reference system of the footprints; None where unknown.
-    """
+    """One row a building and run as GeoParquet; columns of the truth where there are evaluations."""
     schema = _SCHEMA
     if any(run.evaluation is not None and run.evaluation.reference is not None for run in runs):
         for field in _TRUTH_FIELDS:

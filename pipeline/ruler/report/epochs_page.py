@@ -42,15 +42,7 @@ _CELLS: tuple[tuple[str, str, int, bool], ...] = (
 
 
 def write_page(diff: Diff, rows: ClassMap) -> Path:
-    """Write `changes.html`; images and styles are in it.
-
-    Parameters
-    ----------
-    diff : Diff
-        What was found.
-    rows : ClassMap
-        What the map shows, gathered while the rows were written.
-    """
+    """Write `changes.html`; images and styles are in it."""
     storage = LocalStorage(root=Path(diff.request.out))
     storage.put(PAGE, page(diff, rows).encode())
     return storage.path(PAGE)

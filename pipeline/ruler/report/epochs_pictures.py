@@ -58,15 +58,7 @@ class _Model:
 
 
 def cases(largest: pa.Table, old: Epoch, new: Epoch) -> list[Case]:
-    """The largest changes of each class with their pictures, class by class.
-
-    Parameters
-    ----------
-    largest : pa.Table
-        Rows in descending order of size, class by class.
-    old, new : Epoch
-        Where the models are read.
-    """
+    """The largest changes of each class with their pictures, class by class."""
     rows: list[dict[str, Any]] = []
     for change in _CLASSES:
         rows += largest.filter(pc.equal(largest["change"], change.value)).slice(0, A_CLASS).to_pylist()

@@ -47,20 +47,6 @@ def write_page(
 ) -> Path:
     """Write `report.html`.
 
-    Parameters
-    ----------
-    evaluation : Evaluation
-        What was found.
-    out_dir : str or Path
-        A folder; made where it is not there.
-    definitions : mapping of name to Definition
-        Of all measures.
-
-    Returns
-    -------
-    Path
-        The file: images and styles are in it.
-
     Raises
     ------
     RunError

@@ -69,22 +69,7 @@ def residual_class(residual: FloatArray) -> LabelArray:
 
 
 def section_svg(truth: RoofModel, models: Sequence[RoofModel], xyz: FloatArray) -> Markup | None:
-    """The profile of a building where `profile_line` puts it.
-
-    Parameters
-    ----------
-    truth : RoofModel
-        The reference building; it may have no faces.
-    models : sequence of RoofModel
-        Those that stand on it.
-    xyz : (n, 3) float64
-        Its points; those near the profile are drawn, in the colours of their distances to the models.
-
-    Returns
-    -------
-    Markup or None
-        An `svg` element; None where there is neither a roof nor a point.
-    """
+    """The profile of a building where `profile_line` puts it."""
     middle, along, half = profile_line(truth, models, xyz)
     s = np.linspace(-half - _MARGIN_M, half + _MARGIN_M, _STEPS)
     x, y = (middle[axis] + s * along[axis] for axis in (0, 1))

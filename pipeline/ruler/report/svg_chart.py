@@ -84,30 +84,7 @@ def histogram_svg(
     steps: FloatArray | None = None,
     marks: Sequence[float] = (),
 ) -> Markup:
-    """A histogram.
-
-    Parameters
-    ----------
-    edges : (bins + 1,) float64
-        Borders of the bins, ascending.
-    heights : (bins,) float64
-        Of the bars.
-    x, y : Axis
-        What is written.
-    ordinate : Ordinate
-        The vertical range.
-    description : str
-        For those who cannot see it.
-    steps : (bins,) float64, optional
-        A second series, drawn as a line of steps.
-    marks : sequence of float
-        Where dashed vertical lines stand.
-
-    Returns
-    -------
-    Markup
-        An `svg` element.
-    """
+    """A histogram."""
     left, right = float(edges[0]), float(edges[-1])
 
     def across(value: float) -> float:
@@ -150,28 +127,7 @@ def category_svg(
     description: str,
     pale: Sequence[bool] = (),
 ) -> Markup:
-    """Bars of shares from 0 to 1 by class, with the count of each class over its bar; nan has no bar.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Of the classes.
-    shares : (classes,) float64
-        Of the bars.
-    counts : sequence of int
-        Denominators.
-    x_name, y_name : str
-        Names of the axes.
-    description : str
-        For those who cannot see it.
-    pale : sequence of bool
-        True for classes that do not count; empty: all count.
-
-    Returns
-    -------
-    Markup
-        An `svg` element.
-    """
+    """Bars of shares from 0 to 1 by class, with the count of each class over its bar; nan has no bar."""
     ordinate = Ordinate(low=0.0, high=1.12, log=False)
     parts = _frame(ordinate, Axis(name=y_name, text=lambda value: f"{100.0 * value:.0f} %"))
     step = (WIDTH - _LEFT - _RIGHT) / max(len(names), 1)

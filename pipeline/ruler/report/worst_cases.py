@@ -56,14 +56,7 @@ class Case:
 
 
 def worst_cases(evaluation: Evaluation) -> list[Case]:
-    """The worst buildings with their pictures; each tile of the reference is read once at most.
-
-    Returns
-    -------
-    list of Case
-        Those without a model and false ones first, then by the mean of the shares of roof and points within 0.2 m;
-        empty without a reference.
-    """
+    """The worst buildings with their pictures; each tile of the reference is read once at most."""
     reference, table = evaluation.reference, evaluation.tables.get("buildings")
     if reference is None or table is None:
         return []

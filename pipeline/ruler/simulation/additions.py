@@ -1,4 +1,4 @@
-"""What stands on a roof, dormers and superstructures: drawn at random, and as further parts of the envelope."""
+"""Dormers and superstructures: drawn at random, and as further parts of the envelope of a roof."""
 
 from __future__ import annotations
 
@@ -21,11 +21,17 @@ from pipeline.ruler.simulation.roof_dimensions import (
 from pipeline.ruler.simulation.roof_parts import PARTS, rectangle
 
 _TOLERANCE_M = 1e-6
+"""Numerical guard, also in square metres."""
 _EDGE_M = 0.3
+"""Free roof along the edges of a face; plausible."""
 _APART_M = 0.5
+"""Free roof between additions; plausible."""
 _MIN_CLEARANCE_M = 0.05
+"""Finest detail of a roof: smaller ones would vanish in the rounding of models."""
 _ALONG_M = 1e-3
+"""A side this close to an edge runs along it."""
 _TRIES = 40
+"""Draws before the roof counts as full."""
 _ON_FLAT_ROOFS = (1.5, 1.5, 0.8), (4.5, 4.0, 3.2)
 _CHIMNEY = (0.5, 0.5, 0.5), (1.1, 1.1, 1.1)
 """Smallest and largest length, width and height in metres."""
@@ -33,33 +39,21 @@ _WITHOUT_DORMERS = {RoofShape.FLAT, RoofShape.PENT, RoofShape.MULTI_LEVEL_FLAT}
 
 
 def plan_rectangle(addition: Addition) -> tuple[Place, ...]:
-    """What it covers in plan, counter-clockwise."""
+    """Its rectangle in plan, counter-clockwise."""
     u, v, along, across = addition.u_m, addition.v_m, addition.length_m / 2, addition.width_m / 2
     return rectangle(u - along, u + along, v - across, v + across)
 
 
 def addition_parts(base: RoofFaces, additions: Sequence[Addition]) -> list[RoofPart]:
-    """The parts of what stands on a roof.
+    """The parts of the additions to a bare roof, one each; they follow the parts of the roof.
 
-    A box is flat, above all of the roof beneath it. A dormer stands on one sloping face and looks down along it: its
-    front wall is at the low side of its rectangle, and its roof runs into the face at the high side.
-
-    Parameters
-    ----------
-    base : RoofFaces
-        The bare roof.
-    additions : sequence of Addition
-        In the roof's frame.
-
-    Returns
-    -------
-    list of RoofPart
-        One each, to be put behind the parts of the roof.
+    A box has a flat top above all of the roof beneath it. A dormer stands on one sloping face: its front wall is at the
+    low side of its rectangle, and its roof runs into the face at the high side.
 
     Raises
     ------
     ValueError
-        Where one hangs over the outline, or a dormer does not stand on one sloping face or does not run into it.
+        One hangs over the outline, or a dormer does not stand on one sloping face or does not run into it.
     """
     if not additions:
         return []
@@ -146,21 +140,9 @@ def can_have_dormers(shape: RoofShape) -> bool:
 def random_dormers(
     shape: RoofShape, size: RoofDimensions, random: np.random.Generator, *, besides: Sequence[Addition] = ()
 ) -> tuple[Addition, ...]:
-    """Draw one to three equal dormers in a row on one face.
+    """Draw one to three equal dormers in a row on one face of the bare roof, clear of `besides`.
 
-    Parameters
-    ----------
-    shape, size : RoofShape, RoofDimensions
-        The roof; its additions do not matter.
-    random : numpy Generator
-        Where chance comes from.
-    besides : sequence of Addition
-        What stands there already: they keep clear of it.
-
-    Returns
-    -------
-    tuple of Addition
-        Empty where no face is large and steep enough, so for every roof that cannot have dormers.
+    Empty if no face is large and steep enough.
     """
     if not can_have_dormers(shape):
         return ()
@@ -236,23 +218,9 @@ def random_superstructures(
     besides: Sequence[Addition] = (),
     at_most: int = 3,
 ) -> tuple[Addition, ...]:
-    """Draw one to three boxes, or one to so many: lift shafts on flat faces, chimneys on sloping ones.
+    """Draw one to `at_most` boxes clear of `besides`: lift shafts on flat faces, chimneys on sloping ones.
 
-    Parameters
-    ----------
-    shape, size : RoofShape, RoofDimensions
-        The roof; its additions do not matter.
-    random : numpy Generator
-        Where chance comes from.
-    besides : sequence of Addition
-        What stands there already: they keep clear of it.
-    at_most : int
-        Largest number.
-
-    Returns
-    -------
-    tuple of Addition
-        Their sides keep clear of ridges and eaves, or cross them; empty where there is no room.
+    Their sides keep clear of ridges and eaves, or cross them. Empty if there is no room.
     """
     parts = PARTS[shape](size)
     bare = envelope(parts)

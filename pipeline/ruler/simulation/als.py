@@ -60,7 +60,7 @@ class ScanBlock:
 
 
 def strip_count(scene: Scene, settings: ScannerSettings) -> int:
-    """Number of strips that cover the scene, or the survey that it is a tile of."""
+    """Number of strips over the scene, or over the survey of which it is a tile."""
     return len(flight_lines(scene, settings, 0))
 
 

@@ -1,4 +1,4 @@
-"""What each building of a suite was made under: the table that splits a score by difficulty."""
+"""The conditions of each building of a suite: the table that splits a score by difficulty."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ CONDITIONS = pa.schema(
         pa.field("touches_data_edge", pa.bool_(), nullable=False),
     ]
 )
-"""One row a building. `groups` holds for each plane_id the number of the group that its face belongs to."""
+"""One row per building. `groups` has the group number of the face of each plane_id."""
 
 _STEP_M = 0.05
+"""Step of the central differences."""
 
 
 def terrain_slope_deg(terrain: Terrain, x: float, y: float) -> float:
@@ -54,7 +55,7 @@ def condition_row(building: Building, terrain: Terrain, *, touches_data_edge: bo
 
 
 def write_conditions(rows: Iterable[dict[str, Any]], path: Path) -> None:
-    """Write the table, sorted by building_id; it appears under its name only when whole."""
+    """Write the table, sorted by building_id; it appears under its name only when complete."""
     table = pa.Table.from_pylist(sorted(rows, key=lambda row: str(row["building_id"])), schema=CONDITIONS)
     part = path.with_name(f".{path.name}")
     pq.write_table(table, part, compression="zstd")

@@ -1,10 +1,10 @@
-"""The upper envelope of convex parts, exactly: which face of which part is on top where.
+"""The exact upper envelope of convex parts: which face of which part is on top where.
 
-A part is a convex plan polygon under a concave roof, the lowest of some planes. What one face of it shows is the
-convex region where its plane is the lowest of the part, less the regions where another part is higher. The latter are
-convex too: inside the other part's outline, under each of its planes. So half-plane clipping finds all borders.
-Corners that agree within some micrometres become one node, nodes are inserted into the edges that they lie on, and
-regions of one plane are joined. At last each node is moved to the exact crossing of the lines that meet in it.
+A part is a convex plan polygon under a concave roof, the lowest of some planes. A face is visible in the convex region
+where its plane is the lowest of its part, except where another part is higher. Those regions are convex too: inside the
+outline of the other part, under each of its planes. So half-plane clipping finds all borders. Corners that agree within
+some micrometres become one node, nodes are inserted into the edges that they lie on, and regions of one plane are
+joined. Finally each node moves to the exact crossing of the lines that meet in it.
 """
 
 from __future__ import annotations
@@ -20,10 +20,12 @@ from pipeline.model import FloatArray, IntArray
 from pipeline.ruler.simulation.roof_dimensions import FaceRings, RoofFaces
 
 GRID_M = 1e-6
-"""Regions are cut out on this grid; vertices are exact again afterwards. Nothing smaller is kept."""
+"""Grid of the clipped regions, whose vertices are exact again afterwards. Smaller regions are dropped."""
 
 _SAME = 1e-9
+"""Numerical guard: planes whose coefficients differ by less are one."""
 _NEAR_M = 5e-6
+"""Numerical guard: corners that are closer are one node."""
 
 Place = tuple[float, float]
 Line = tuple[float, float, float]
@@ -38,16 +40,11 @@ class RoofPart:
     planes: tuple[Line, ...]
     """Coefficients a, b, c of heights a u + b v + c."""
     labels: tuple[str, ...]
-    """What each plane counts to: faces of one label are one group, and where their planes agree too, one face."""
+    """Group of each plane: faces with one label are one group, and one face if their planes agree too."""
 
 
 def envelope(parts: Sequence[RoofPart]) -> RoofFaces:
-    """The faces that one sees from above.
-
-    Parameters
-    ----------
-    parts : sequence of RoofPart
-        Where two are equally high, the first counts.
+    """The faces that are visible from above; of two parts of equal height, the first one.
 
     Returns
     -------
@@ -58,7 +55,7 @@ def envelope(parts: Sequence[RoofPart]) -> RoofFaces:
     Raises
     ------
     ValueError
-        Where nothing has an area.
+        No part has an area.
     """
     regions = _visible_regions(parts)
     if not regions:
@@ -108,7 +105,7 @@ def _cleaned(polygon: list[Place]) -> shapely.Polygon:
 
 
 def _above(upper: Line, lower: Line) -> Line | None:
-    """The half-plane where a plane is above another; None where they are the same."""
+    """The half-plane where a plane is above another; None if they are the same."""
     a, b, c = upper[0] - lower[0], upper[1] - lower[1], upper[2] - lower[2]
     return None if max(abs(a), abs(b), abs(c)) < _SAME else (a, b, c)
 
@@ -143,7 +140,7 @@ def _sides(part: RoofPart) -> list[Line]:
 
 
 def _visible_regions(parts: Sequence[RoofPart]) -> list[tuple[tuple[int, int], shapely.Polygon]]:
-    """What is seen of every plane of every part, with the numbers of part and plane."""
+    """The visible regions of every plane of every part, with the numbers of part and plane."""
     visible = []
     sides = [_sides(part) for part in parts]
     boxes = [(*np.min(part.outline, axis=0), *np.max(part.outline, axis=0)) for part in parts]
@@ -251,7 +248,7 @@ def _distinct_planes(parts: Sequence[RoofPart]) -> list[list[int]]:
 
 @dataclasses.dataclass
 class _Drawing:
-    """Faces in plan: nodes, rings of node numbers, and what lies left of every directed edge."""
+    """Faces in plan: nodes, rings of node numbers, and the face to the left of every directed edge."""
 
     nodes: list[Place]
     rings: list[list[list[int]]]

@@ -90,13 +90,7 @@ are the shift of the strips, and the errors between points of one building are s
 
 
 def hofmann310(seed: int) -> Scene:
-    """The 310 buildings on plots, each free of its neighbours.
-
-    Parameters
-    ----------
-    seed : int
-        Of sizes, places and nuisances; not negative.
-    """
+    """The 310 buildings on plots, each free of its neighbours."""
     random = np.random.default_rng([seed, 0x310])
     shapes = [shape for shape, count in SHAPES.items() for _ in range(count)]
     shapes = [shapes[k] for k in random.permutation(len(shapes))]

@@ -1,4 +1,4 @@
-"""Plots for detached buildings: each as large as its building and the free ground around it, packed in rows."""
+"""Plots for detached buildings, each with free ground around it, packed in rows."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pipeline.ruler.simulation.scene import turned
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Plot:
-    """Where one building stands."""
+    """The place of one building."""
 
     x: float
     """Easting of the middle of the building's main rectangle, scene frame."""
     y: float
-    """Northing of it."""
+    """Northing of the same."""
     extent: tuple[float, float, float, float]
     """The plot: smallest x, smallest y, largest x, largest y."""
 
@@ -56,14 +56,14 @@ def packed_plots(
     strip_width_m : float
         Width of a strip; wide enough for any plot.
     strips : int
-        How many strips stand side by side.
+        Number of strips side by side.
     gap_m : float
         Kept free at both sides of a strip.
 
     Returns
     -------
     plots : list of Plot
-        One a building, in their order.
+        One per building, in their order.
     size_m : tuple of float
         Extent of all strips: east, north; whole metres.
 

@@ -14,8 +14,11 @@ SHORTEST_SIDE_M = 4.0
 """No roof and, where the area allows, no wing is narrower."""
 
 _NARROWEST_WING_M = 2.5
+"""Narrowest wing if the area is too small for wings of 4 m."""
 _SHORTEST_RIDGE_M = 0.3
+"""Shorter ridges become the point of a pyramid."""
 _TRIES = 400
+"""Draws before an area counts as too small."""
 
 _AREAS_M2 = {RoofShape.COURTYARD: (300.0, 1200.0), RoofShape.MULTI_LEVEL_FLAT: (120.0, 900.0)}
 _PITCHES_DEG = {
@@ -48,16 +51,14 @@ def random_dimensions(
     Parameters
     ----------
     shape : RoofShape
-        What is wanted.
+        The shape.
     random : numpy Generator
-        Where chance comes from.
+        Source of the random numbers.
     area_m2 : float, optional
-        Wanted footprint, held within 2 %; without it houses of 60 to 400 m2 (courtyards and flats of several levels:
-        more).
+        Footprint, reached within 2 %. By default 60 to 400 m2; more for courtyards and flats of several levels.
     pitch_deg : float, optional
-        Wanted pitch of the sloping faces: of the upper ones of a bent hip, of the lower ones of mansard and gambrel, of
-        the right one of an unequal gable. Without it 25 to 45 (pent: 7.5 to 20, so that none counts as flat; mansard,
-        gambrel: steeper).
+        Pitch of the sloping faces: the upper ones of a bent hip, the lower ones of mansard and gambrel, the right one
+        of an unequal gable. By default 25 to 45; pent 7.5 to 20, too steep to be flat; mansard and gambrel steeper.
 
     Returns
     -------
@@ -67,7 +68,7 @@ def random_dimensions(
     Raises
     ------
     ValueError
-        Where the area is too small for the shape with sides of 4 m (wings of compound roofs: 2.5 m).
+        The area is too small for the shape with sides of 4 m (wings of compound roofs: 2.5 m).
     """
     low, high = _AREAS_M2.get(shape, (60.0, 400.0))
     drawn_area = float(np.clip(math.sqrt(low * high) * math.exp(0.4 * random.normal()), low, high))
@@ -231,4 +232,4 @@ _COMPOUND: dict[RoofShape, Callable[[float, np.random.Generator], tuple[RoofDime
     RoofShape.COURTYARD: _courtyard,
     RoofShape.MULTI_LEVEL_FLAT: _multi_level_flat,
 }
-"""Proportions of the compound shapes from their aspect, width 1, and their area."""
+"""Functions from an aspect to the proportions of a compound shape of width 1 and their area."""

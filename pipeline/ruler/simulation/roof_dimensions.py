@@ -1,8 +1,8 @@
-"""What a parametric roof is made from, and what comes of it: shapes, sizes, faces.
+"""The input and output of parametric roofs: shapes, dimensions, faces.
 
 The frame of a roof: u along the ridge, v to the left of it, origin in the middle of the (main) rectangle, metres;
-heights over the eave. Faces run counter-clockwise seen from above. Together they cover the footprint once, so a
-surface, its walls and its solid all follow from them.
+heights over the eave. Faces run counter-clockwise seen from above and together cover the footprint once: the surface,
+the walls and the solid follow from them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class RoofShape(StrEnum):
 
 
 class AdditionKind(StrEnum):
-    """What can stand on a roof."""
+    """A kind of addition to a roof."""
 
     BOX = "box"
     """A superstructure with a flat top: lift shaft, chimney, attic box."""
@@ -66,7 +66,7 @@ class Addition:
     """Box: its top over the highest roof beneath. Dormer: its eave over the roof at its front."""
 
     def __post_init__(self) -> None:
-        """Refuse what has no body."""
+        """Reject an addition without a body."""
         if not min(self.length_m, self.width_m, self.height_m) > 0:
             raise ValueError(
                 f"a {self.kind} of {self.length_m:g} x {self.width_m:g} x {self.height_m:g} m has no body:"
@@ -99,7 +99,7 @@ class RoofDimensions:
     width_m: float
     """Across the ridge."""
     pitch_deg: float = 0.0
-    """Slope of every sloping face, 0 to 75; without meaning for flat roofs."""
+    """Slope of every sloping face, 0 to 75; ignored for flat roofs."""
     wing_length_m: float = 0.0
     """L-shape: how far the wing stands out of the main rectangle."""
     wing_width_m: float = 0.0
@@ -117,10 +117,10 @@ class RoofDimensions:
     levels: tuple[FlatPart, ...] = ()
     """Flat roof of several levels: its parts."""
     additions: tuple[Addition, ...] = ()
-    """What stands on the roof."""
+    """Dormers and superstructures."""
 
     def __post_init__(self) -> None:
-        """Refuse sizes without a roof."""
+        """Reject dimensions without a roof."""
         if not (self.length_m > 0 and self.width_m > 0):
             raise ValueError(f"a roof of {self.length_m:g} x {self.width_m:g} m has no area: both must be positive")
         if not 0 <= self.pitch_deg <= 75:
@@ -138,4 +138,4 @@ class RoofFaces:
     faces: tuple[FaceRings, ...]
     """The rings of each face."""
     groups: tuple[int, ...]
-    """A number for every face; faces of one number count as one."""
+    """A number for every face; faces with one number count as one."""

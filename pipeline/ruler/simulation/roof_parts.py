@@ -1,4 +1,4 @@
-"""Every shape as convex parts: what `envelope` makes its faces from."""
+"""Every shape as convex parts, the input of `envelope`."""
 
 from __future__ import annotations
 
@@ -225,4 +225,4 @@ PARTS: dict[RoofShape, Callable[[RoofDimensions], list[RoofPart]]] = {
     RoofShape.COURTYARD: _courtyard,
     RoofShape.MULTI_LEVEL_FLAT: _multi_level_flat,
 }
-"""The function of every shape; without what stands on it."""
+"""The function of every shape; its additions are not included."""

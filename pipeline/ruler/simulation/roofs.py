@@ -1,4 +1,4 @@
-"""The parametric roofs: what the records call each shape, and the function that makes its faces."""
+"""The parametric roofs: the roof type of each shape in the records, and the function that makes its faces."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ ROOF_TYPES: dict[RoofShape, RoofType] = {
     RoofShape.COURTYARD: RoofType.COMBINATION,
     RoofShape.MULTI_LEVEL_FLAT: RoofType.FLAT,
 }
-"""The roof type of the records for every shape, whatever stands on it."""
+"""The roof type of every shape in the records, with any additions."""
 
 
 _BARE: dict[RoofShape, Callable[[RoofDimensions], RoofFaces]] = {
@@ -63,10 +63,10 @@ _BARE: dict[RoofShape, Callable[[RoofDimensions], RoofFaces]] = {
 
 
 def _maker(shape: RoofShape) -> Callable[[RoofDimensions], RoofFaces]:
-    """The function that makes a roof of a shape, with all that stands on it."""
+    """The function that makes a roof of a shape with its additions."""
     parts = PARTS[shape]
 
-    @functools.lru_cache(maxsize=256)  # a layout asks for the same roof while it draws additions and places it
+    @functools.lru_cache(maxsize=256)  # a layout makes the same roof while it draws additions and places it
     def make(size: RoofDimensions) -> RoofFaces:
         bare = _BARE[shape](size) if shape in _BARE else envelope(parts(size))
         if not size.additions:
@@ -77,4 +77,4 @@ def _maker(shape: RoofShape) -> Callable[[RoofDimensions], RoofFaces]:
 
 
 ROOFS: dict[RoofShape, Callable[[RoofDimensions], RoofFaces]] = {shape: _maker(shape) for shape in RoofShape}
-"""The function of every shape. It raises ValueError where the sizes give no such roof."""
+"""The function of every shape. It raises ValueError if the dimensions give no such roof."""

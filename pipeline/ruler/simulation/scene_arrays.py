@@ -1,4 +1,4 @@
-"""A scene as flat arrays with a grid of its objects: what the kernels read."""
+"""A scene as flat arrays with a grid of its objects, for the kernels."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from pipeline.ruler.simulation.scene import Building, Scene, Terrain
 CELL_M = 5.0
 """Edge of the grid's cells."""
 _PAD_M = 50.0
-"""The grid reaches this far beyond the extent, farther where lines that aim into it land farther out."""
+"""The grid reaches at least this far beyond the extent, farther if rays that aim into it land farther out."""
 _BOX_HEIGHT_M = 5.0
-"""No box stands higher over the terrain."""
+"""Upper bound of the height of a box over the terrain."""
 _CLEARANCE = 2.0
-"""In beam radii: nothing farther from a beam than this matters to it."""
-_DRAWS_A_TREE = 32_768
-"""Numbers that every tree of a survey keeps for the lines of one beam."""
+"""In beam radii: objects farther from a beam do not affect it."""
+_DRAWS_PER_TREE = 32_768
+"""Random numbers that every tree of a survey reserves for the rays of one beam."""
 
 
 class SceneArrays(NamedTuple):
@@ -59,7 +59,7 @@ class SceneArrays(NamedTuple):
     cell_start: LabelArray
     """(cells + 1,) int32, first entry of each cell."""
     entries: IntArray
-    """(entries, 2) int64: the object; which random number of a line decides how deep it sinks into that crown."""
+    """(entries, 2) int64: the object, and which random number of a ray decides how deep it sinks into that crown."""
 
 
 def steepest_slope(terrain: Terrain) -> float:
@@ -69,12 +69,12 @@ def steepest_slope(terrain: Terrain) -> float:
 
 
 def landing_m(terrain: Terrain, extent: tuple[float, float, float, float], max_lean: float) -> float:
-    """How far outside of an extent lines land that aim into it at the terrain's base elevation.
+    """How far outside an extent rays land that aim into it at the base elevation of the terrain, metres.
 
     Raises
     ------
     SettingsError
-        If the terrain is as steep as the flattest line: a line would meet it more than once, or never.
+        If the terrain is as steep as the flattest ray: a ray would meet it more than once, or never.
     """
     closeness = steepest_slope(terrain) * max_lean
     if closeness >= 0.95:
@@ -95,7 +95,7 @@ def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5, bea
     scene : Scene
         What can be hit.
     max_lean : float
-        Largest lean of the lines to come: objects are entered into all cells from whose terrain they can be hit.
+        Largest lean of the rays: objects are entered into all cells from whose terrain they can be hit.
     margin_m : float
         Added to the reach, for beams with a footprint.
     beam_radius_m : float
@@ -108,7 +108,7 @@ def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5, bea
     """
     pad_m = max(_PAD_M, CELL_M * math.ceil((landing_m(scene.terrain, scene.extent, max_lean) + margin_m) / CELL_M))
     slope = steepest_slope(scene.terrain)
-    # Downhill a line goes on beyond the level of the floor, by slope * lean of what it has left.
+    # Downhill a ray continues below the level of the floor, by slope * lean of the rest.
     lean, clearance = max_lean / (1.0 - slope * max_lean), _CLEARANCE * beam_radius_m
 
     def reach(height_m: float) -> float:
@@ -169,7 +169,7 @@ def scene_arrays(scene: Scene, max_lean: float = 0.0, margin_m: float = 0.5, bea
 
 
 def _edges(plan: FloatArray, rings: FaceRings) -> FloatArray:
-    """The edges (n, 4) of all rings, the closing edge of each first; those without length are left out."""
+    """The edges (n, 4) of all rings, the closing edge of each first, without edges of length 0."""
     edges = []
     for ring in rings:
         ends = plan[list(ring)]
@@ -204,7 +204,7 @@ def _circle(corners: FloatArray, top_z_m: float) -> tuple[float, float, float, f
 def _cells(
     extent: tuple[float, float, float, float], pad_m: float, reaches: FloatArray, numbers: list[int]
 ) -> tuple[FloatArray, int, int, LabelArray, IntArray]:
-    """The grid: each object's number in every cell that its reach touches, in the order of the objects."""
+    """The grid: the number of each object in every cell that its reach touches, in the order of the objects."""
     low = np.array(extent[:2]) - pad_m
     across = math.ceil((extent[2] - extent[0] + 2 * pad_m) / CELL_M)
     up = math.ceil((extent[3] - extent[1] + 2 * pad_m) / CELL_M)
@@ -222,13 +222,13 @@ def _cells(
 
 
 def _crown_draws(start: LabelArray, objects: IntArray, trees: FloatArray, is_tile: bool) -> IntArray:
-    """The place of each entry in its cell; in the tiles of a survey, whose cells differ, a hash of the tree's place."""
+    """The place of each entry in its cell. For the tiles of a survey, whose cells differ, a hash of its position."""
     if not is_tile:
         return np.arange(len(objects)) - np.repeat(start[:-1], np.diff(start)).astype(np.int64)
     bits = np.ascontiguousarray(trees[:, :2]).view(np.uint64)
     hashed = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15) ^ (bits[:, 1] * np.uint64(0xD1B54A32D192ED03)) >> np.uint64(7)
     hashed = (hashed ^ (hashed >> np.uint64(31))) * np.uint64(0x94D049BB133111EB)
-    draws = ((hashed >> np.uint64(33)) * np.uint64(_DRAWS_A_TREE)).astype(np.int64)
+    draws = ((hashed >> np.uint64(33)) * np.uint64(_DRAWS_PER_TREE)).astype(np.int64)
     result = np.zeros(len(objects), np.int64)
     result[objects < 0] = draws[~objects[objects < 0]]
     return result

@@ -1,4 +1,4 @@
-"""Seeds that never meet: methods are tuned on the dev draws of a suite and reported on its test draws."""
+"""Disjoint seeds: methods are tuned on the dev draws of a suite and reported on its test draws."""
 
 from __future__ import annotations
 
@@ -9,34 +9,27 @@ from pipeline.errors import SettingsError
 
 
 class Split(StrEnum):
-    """What a draw of a suite may be used for."""
+    """The permitted use of a draw of a suite."""
 
     DEV = "dev"
-    """To look at, to tune, to choose settings."""
+    """Inspect, tune, choose settings."""
     TEST = "test"
-    """To report, whatever it says."""
+    """Report, whatever the result."""
 
 
 FIRST_SEEDS: Mapping[Split, int] = {Split.DEV: 1_000, Split.TEST: 90_000}
 """Seed of draw 0 of each split."""
 DRAWS = 89_000
-"""Draws a split: 0 to one less, so the dev seeds end where the test seeds begin."""
+"""Draws per split; the dev seeds end where the test seeds begin."""
 
 
 def seed_of(split: str, draw: int) -> int:
     """The seed of a draw of a split.
 
-    Parameters
-    ----------
-    split : str
-        `dev` or `test`.
-    draw : int
-        0 to `DRAWS` - 1.
-
     Raises
     ------
     SettingsError
-        Naming what is out of range.
+        Split or draw is out of range.
 
     Examples
     --------
@@ -54,7 +47,7 @@ def seed_of(split: str, draw: int) -> int:
 
 
 def split_of(seed: int) -> Split | None:
-    """The split that a seed belongs to; None where it is of neither.
+    """The split of a seed; None if it belongs to neither.
 
     Examples
     --------

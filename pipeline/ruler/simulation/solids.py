@@ -46,27 +46,15 @@ def _from_a_corner(ring: list[int], vertices: FloatArray) -> tuple[list[int], li
 def building_solid(building: Building, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Solid:
     """The closed, outward oriented solid of a building.
 
-    One wall a straight run of the outline, so a gable's end wall is one face of five vertices. Where a roof face stands
-    over another there is a wall between them.
-
-    Parameters
-    ----------
-    building : Building
-        What to extrude.
-    origin : tuple of float
-        Subtracted from the scene coordinates.
-
-    Returns
-    -------
-    Solid
-        Vertices rounded to whole millimetres.
+    Each straight run of the outline is one wall, so the end wall of a gable is one face of five vertices. A step edge
+    between roof faces is a wall. Vertices are relative to `origin` and rounded to whole millimetres.
 
     Raises
     ------
     ValueError
-        Where the roof falls into parts that share no edge.
+        The roof falls into parts that share no edge.
     BuildingError
-        Where it hangs together by no more than a corner.
+        Its parts are connected by a corner alone.
     """
     if has_steps(building):
         return _stepped_solid(building, origin)
@@ -94,7 +82,7 @@ def building_solid(building: Building, origin: tuple[float, float, float] = (0.0
 
 
 def has_steps(building: Building) -> bool:
-    """Whether a roof face stands over another's edge: two vertices over one place."""
+    """Whether the roof has a step edge: two vertices over one place."""
     plan = np.round(building.vertices[:, :2] * 1e6)
     return len(np.unique(plan, axis=0)) < len(plan)
 
@@ -122,10 +110,10 @@ def moved_plane(plane: Plane, origin: tuple[float, float, float]) -> Plane:
 def truth_record(
     building: Building, scene_origin: tuple[float, float, float], *, touches_data_edge: bool = False
 ) -> BuildingResult:
-    """The building as the record that a perfect method would deliver; its block is the source_id.
+    """The record that a perfect method would deliver for the building; its source_id is the block.
 
-    Its local origin is the scene coordinate of the building's middle in whole metres. Figures that need points
-    (density, residuals) are nan, the number of points is 0.
+    Its local origin is the middle of the building in whole metres. Figures that need points (density, residuals) are
+    nan, and the number of points is 0.
     """
     local = (float(math.floor(building.x)), float(math.floor(building.y)), float(math.floor(building.floor_z_m)))
     solid = building_solid(building, local)

@@ -1,7 +1,7 @@
-"""One wall a straight run: neighbouring walls of one vertical plane become one face.
+"""One wall per straight run: neighbouring walls of one vertical plane become one face.
 
-Corners that then stand in the middle of a straight edge are left out. They are collinear only but for the rounding to
-millimetres, so a triangulation of the faces could make triangles of any tilt from them.
+Corners in the middle of the resulting straight edges are removed. Rounding to millimetres moves them off the line, and
+a triangulation could make triangles of any tilt from them.
 """
 
 from __future__ import annotations
@@ -13,28 +13,19 @@ import numpy as np
 from pipeline.model import FaceKind, FloatArray, Solid, SolidFace
 
 _ONE_LINE_M = 0.0015
+"""Corners up to this far from a line in plan lie on it: millimetres of rounding."""
 _ON_EDGE_M = 0.005
+"""The same for vertices and edges in space."""
 
 Ring = tuple[int, ...]
 
 
 def with_straight_walls(solid: Solid) -> Solid:
-    """The same body with fewer walls and vertices.
-
-    Parameters
-    ----------
-    solid : Solid
-        Closed; walls without holes. Vertices are multiples of 1 mm.
-
-    Returns
-    -------
-    Solid
-        Walls are in the order of the first of each run; vertices keep their order.
-    """
+    """The same closed body, vertices in whole millimetres, with fewer walls and vertices; walls must have no holes."""
     walls: list[Ring | None] = [face.rings[0] for face in solid.faces if face.kind is FaceKind.WALL]
     owner = {edge: k for k, ring in enumerate(walls) if ring is not None for edge in _edges(ring)}
     for a, b in sorted(owner):
-        # Owners change while walls grow, so they are looked up anew.
+        # Owners change while walls grow.
         first, second = owner.get((a, b), -1), owner.get((b, a), -1)
         if a > b or min(first, second) < 0 or first == second or _apart(solid.vertices, a, b) > 0.0:
             continue
@@ -90,7 +81,7 @@ def _joined(ring: Ring, other: Ring) -> Ring | None:
 
 
 def _without_needless_vertices(vertices: FloatArray, faces: list[SolidFace]) -> Solid:
-    """Leave out vertices that only stand in the middle of an edge of two faces, and unused ones."""
+    """Remove unused vertices and those in the middle of an edge of two faces."""
     around: dict[int, set[int]] = {}
     for face in faces:
         for ring in face.rings:

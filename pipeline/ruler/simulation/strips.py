@@ -24,7 +24,7 @@ class ScannerSettings(Parameters):
     """The survey: instrument, flight and noise."""
 
     pulse_density_per_m2: float = parameter(
-        8.0, "Pulses a square metre of one strip.", unit="1/m2", minimum=0.01, maximum=500.0
+        8.0, "Pulses per square metre of one strip.", unit="1/m2", minimum=0.01, maximum=500.0
     )
     range_noise_m: float = parameter(0.03, "Standard deviation along the beam.", unit="m", minimum=0.0, maximum=2.0)
     altitude_m: float = parameter(600.0, "Flying height over the terrain's base.", unit="m", minimum=50.0)
@@ -77,27 +77,17 @@ class ScannerSettings(Parameters):
 
 
 def survey_extent(scene: Scene) -> tuple[float, float, float, float]:
-    """What the strips are laid over: the whole survey where the scene is one tile of it, else the scene."""
+    """Extent of the whole survey if the scene is one tile of it, else of the scene."""
     return scene.survey_extent or scene.extent
 
 
 def reach_m(
     terrain: Terrain, extent: tuple[float, float, float, float], settings: ScannerSettings, height_m: float
 ) -> float:
-    """How far outside of an extent the pulses that aim into it can hit things of a height.
+    """How far outside an extent the pulses that aim into it can hit objects of a height.
 
-    A tile of a survey must hold all objects up to here; what stands farther out cannot change its returns.
-
-    Parameters
-    ----------
-    terrain : Terrain
-        The ground.
-    extent : tuple of float
-        The tile, scene frame.
-    settings : ScannerSettings
-        The survey.
-    height_m : float
-        Of the highest object over the lowest terrain below it.
+    A tile of a survey must contain all objects up to this distance, in metres; objects farther out cannot change its
+    returns. `height_m` is that of the highest object over the lowest terrain below it.
 
     Raises
     ------
@@ -148,8 +138,8 @@ def flight_lines(scene: Scene, settings: ScannerSettings, seed: int) -> list[Fli
 def reached(places: FloatArray, scene: Scene, settings: ScannerSettings) -> BoolArray:
     """Which places (n, 3) of the scene frame some strip can hit: n flags.
 
-    Pulses aim at the terrain's base elevation. On ground that lies higher they land nearer to the flight line, so there
-    the points end inside of the extent.
+    Pulses aim at the base elevation of the terrain. On higher ground they land nearer to the flight line, and the
+    points end inside the extent.
     """
     x0, y0, x1, y1 = survey_extent(scene)
     x, y, z = places.T

@@ -27,7 +27,7 @@ LOT_WIDTH_M = 21.0
 LOT_DEPTH_M = 27.0
 """Away from the street."""
 EDGE_M = 8.0
-"""No building stands closer to the end of the data."""
+"""Smallest distance of a building to the end of the data."""
 CLEARANCE_M = 2.5
 """Smallest distance of two buildings."""
 
@@ -38,7 +38,7 @@ _MIX = (
     *((RoofShape.FLAT,) * 2),
     *((RoofShape.PENT,) * 2),
 )
-"""Share of the shapes: every fifteen houses hold all of them."""
+"""Shares of the shapes: every fifteen houses contain all of them."""
 
 
 def house_size(shape: RoofShape, random: np.random.Generator) -> RoofDimensions:
@@ -91,17 +91,7 @@ def car_at(x: float, y: float, azimuth_deg: float, terrain: Terrain, random: np.
 
 
 def suburb(seed: int, *, size_m: tuple[float, float] = (200.0, 200.0), name: str = "suburb") -> Scene:
-    """A suburb of detached houses on gentle terrain.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the layout; not negative.
-    size_m : tuple of float
-        Extent east and north; 200 x 200 m hold about 35 houses.
-    name : str
-        Name of the scene, and of its buildings.
-    """
+    """A suburb of detached houses on gentle terrain; 200 x 200 m hold about 35 houses."""
     random = np.random.default_rng([seed, 0x5B])
     terrain = undulating_terrain(86.0, random.uniform(1.0, 3.0), random.uniform(0, 360), 0.8, 110.0, random)
     azimuth = random.uniform(5.0, 40.0)
@@ -111,7 +101,7 @@ def suburb(seed: int, *, size_m: tuple[float, float] = (200.0, 200.0), name: str
     columns = math.ceil(reach / LOT_WIDTH_M) + 1
     buildings: list[Building] = []
     outlines: list[shapely.Polygon] = []
-    back_to_back = 4 * columns + 2  # houses of two rows: no other can be near
+    back_to_back = 4 * columns + 2  # houses of two rows: no other one can be near
     trees: list[Tree] = []
     boxes: list[Box] = []
     mix: list[RoofShape] = []
@@ -186,7 +176,7 @@ def _house(
 
 
 def _garden(house: Building, footprint: shapely.Polygon, terrain: Terrain, random: np.random.Generator) -> list[Tree]:
-    """Trees and shrubs around a house; a third of the houses has one whose crown reaches over the eave."""
+    """Trees and shrubs around a house; on a third of the lots one crown reaches over the eave."""
     trees = []
     half = math.hypot(house.dimensions.length_m, house.dimensions.width_m) / 2
     for _ in range(int(random.integers(1, 4))):

@@ -1,4 +1,4 @@
-"""The named suites: what `simulate` can make."""
+"""The named suites that `simulate` can make."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ class Suite:
     seed: int
     """Default seed."""
     is_sized: bool = True
-    """False where the extent follows from the buildings: `size_m` is then about what comes, and has no say."""
+    """False if the extent follows from the buildings; `size_m` is then an approximate result, not an input."""
     last_returns_only: bool = False
     """Whether the instrument records the last return only."""
     cells: tuple[Cell, ...] = ()
-    """The surveys of a suite of several; empty where there is one."""
+    """The surveys of a suite of several; empty for a single one."""
     part: Callable[[int, tuple[float, float], ScannerSettings], Callable[[Extent], Scene]] | None = None
-    """From seed, size and survey to a function that makes the scene as a tile of that extent sees it; None where the
-    scene is made as a whole."""
+    """From seed, size and survey to a function that makes the scene of the tile of an extent; None if the scene is made
+    as a whole."""
     tile_m: float = 0.0
     """Edge of the tiles of a suite that is made in parts."""
     on_slope: Callable[[int, tuple[float, float], ScannerSettings, float], Callable[[Extent], Scene]] | None = None
-    """As `part`, on ground of one slope in degrees all over; None where the suite has ground of its own alone."""
+    """As `part`, on ground with one slope in degrees everywhere; None if the ground of the suite is fixed."""
 
 
 def _suburb(seed: int, size_m: tuple[float, float]) -> Scene:
@@ -84,7 +84,7 @@ def _city_on_slope(
 
 
 def _cube(seed: int, size_m: tuple[float, float]) -> Scene:
-    """The test of Shorter and Kasparis: elevations of 0 and 10 m. The cube has 10 m edges; the seed has no say."""
+    """The test of Shorter and Kasparis: elevations of 0 and 10 m. The cube has edges of 10 m; the seed is ignored."""
     del seed
     terrain = Terrain(base_z_m=0.0)
     middle_x, middle_y = size_m[0] / 2, size_m[1] / 2
@@ -273,7 +273,7 @@ def suite_named(name: str) -> Suite:
     Raises
     ------
     SettingsError
-        Naming the valid suites.
+        The name is unknown; the message lists the valid ones.
     """
     if name not in SUITES:
         raise SettingsError([f"suite is {name!r}: use one of {', '.join(SUITES)}"])

@@ -1,4 +1,4 @@
-"""Returns that the survey puts in the wrong place: a strip's border through a rectangle, scan rows gone wrong."""
+"""Returns that the survey misplaces: the border of strips through a rectangle, wrong scan rows."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ def fault_rows(faults: tuple[SurveyFault, ...], places: FloatArray) -> FloatArra
 
 @kernel
 def move_faulty(places: FloatArray, lines: LabelArray, faults: FloatArray, seed: int, strip: int) -> None:
-    """Move the returns that faults concern, in place.
+    """Move the returns that faults affect, in place.
 
     Parameters
     ----------
     places : ndarray (n, >= 3)
-        x, y, z in the scene frame. Whether a return is concerned is judged where it stands without any fault.
+        x, y, z in the scene frame. The place without any fault decides whether a return is affected.
     lines : ndarray (n,) int32
         Scan line of each return.
     faults : ndarray (k, 11)
         As made by `fault_rows`.
     seed, strip : int
-        With the line they decide which rows are wrong.
+        With the scan line they decide which rows are wrong.
     """
     for k in range(len(places)):
         x, y = places[k, 0], places[k, 1]

@@ -1,4 +1,4 @@
-"""A scan on disk: the returns as LAZ, and one row of truth a return beside them in the same order."""
+"""A scan on disk: the returns as LAZ, and one row of truth per return in the same order."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pipeline.ruler.simulation.als import ScanBlock
 from pipeline.ruler.simulation.scene import Scene
 
 _DATE = dt.date(2025, 4, 1)
-"""Of the simulated survey; goes into the header, so that the same scene gives the same bytes on any day."""
+"""Date of the simulated survey in the header: the same scene gives the same bytes on any day."""
 
 LABELS = pa.schema(
     [
@@ -30,7 +30,7 @@ LABELS = pa.schema(
         pa.field("mixed", pa.bool_(), nullable=False),
     ]
 )
-"""One row a point: true ASPRS class, building, roof plane (-1 for walls and for what is no building), melted echoes."""
+"""One row per point: true ASPRS class, building, roof plane (-1 for walls and other objects), melted echoes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class TileFiles:
     points: int
     """Returns in the file."""
     bounds: tuple[float, float, float, float]
-    """Of the points, CRS coordinates: smallest x, smallest y, largest x, largest y; nan without points."""
+    """Bounds of the points, CRS coordinates: smallest x, smallest y, largest x, largest y; nan without points."""
 
 
 def spatial_reference(scene: Scene) -> SpatialReference:
@@ -82,20 +82,9 @@ def write_points(
     with_classes: bool = False,
     on_points: Callable[[int], None] | None = None,
 ) -> TileFiles:
-    """Stream blocks into a LAZ file and a table of labels; both appear under their names only when whole.
+    """Stream blocks into a LAZ file and a table of labels; both appear under their names only when complete.
 
-    Parameters
-    ----------
-    blocks : iterator of ScanBlock
-        From `scan` of the scene.
-    scene : Scene
-        Gives the header its frame and the labels their names.
-    laz, labels : Path
-        What is written; their folders exist.
-    with_classes : bool
-        Write the true classes into the LAZ too.
-    on_points : callable, optional
-        Told the number of points written so far.
+    The folders exist. `on_points` is called with the number of points written so far.
     """
     names = pa.array([building.building_id for building in scene.buildings], pa.string())
     part_laz, part_labels = laz.with_name(f".{laz.name}"), labels.with_name(f".{labels.name}")
@@ -137,7 +126,7 @@ def _las_points(block: ScanBlock, header: laspy.LasHeader, with_classes: bool) -
 
 
 def last_returns(blocks: Iterator[ScanBlock]) -> Iterator[ScanBlock]:
-    """The blocks as an instrument delivers them that records the last return only: it knows of no other."""
+    """The blocks as an instrument delivers them that records the last return only."""
     for block in blocks:
         last = block.points.return_number == block.points.return_count
         cloud = block.points.take(last)

@@ -82,13 +82,7 @@ def chosen_cells(cells: tuple[Cell, ...], density_per_m2: float | None, noise_m:
 
 
 def sweep(seed: int) -> Scene:
-    """All shapes in random sizes and directions on plots with some trees, and rows of touching houses.
-
-    Parameters
-    ----------
-    seed : int
-        Of sizes, directions and trees; not negative.
-    """
+    """All shapes in random sizes and directions on plots with some trees, and rows of touching houses."""
     random = np.random.default_rng([seed, 0x5E])
     planned: list[PlannedBuilding] = []
     defects: list[tuple[Defect, ...]] = []

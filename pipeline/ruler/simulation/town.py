@@ -26,16 +26,9 @@ _ROW_DEPTH_M = 11.0
 
 
 def town(seed: int, *, size_m: tuple[float, float] = (400.0, 400.0), name: str = "town") -> Scene:
-    """A town on gentle terrain. Buildings that touch share a block_id; some stand across the end of the data.
+    """A town on gentle terrain with about 2,300 buildings per square kilometre.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the layout; not negative.
-    size_m : tuple of float
-        Extent east and north. A square kilometre has about 2,300 buildings.
-    name : str
-        Name of the scene, and of its buildings.
+    Buildings that touch share a block_id; some stand across the end of the data.
     """
     random = np.random.default_rng([seed, 0x70])
     terrain = undulating_terrain(42.0, 1.2, random.uniform(0, 360), 2.5, 420.0, random)

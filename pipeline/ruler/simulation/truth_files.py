@@ -30,7 +30,7 @@ from pipeline.ruler.simulation.survey_files import TileFiles, spatial_reference
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SceneTruth:
-    """The truth of a simulated data set, without its models: those are read as any run directory's."""
+    """The truth of a simulated data set without its models, which are read like those of any run directory."""
 
     folder: Path
     """The folder of the truth: a run directory of the exact models, plus labels and scene.json."""
@@ -43,13 +43,13 @@ class SceneTruth:
     extent: tuple[float, float, float, float]
     """CRS coordinates: smallest x, smallest y, largest x, largest y."""
     building_ids: tuple[str, ...]
-    """All buildings that the labels know, sorted."""
+    """Ids of all buildings in the labels, sorted."""
     classification: ByteArray
     """(n,) uint8, true ASPRS class of every point in the order of the LAZ (tile after tile); 1 for small things."""
     building: LabelArray
     """(n,) int32, index into building_ids; -1 for none."""
     face: LabelArray
-    """(n,) int32, roof plane of the building; -1 for walls and for what is no building."""
+    """(n,) int32, roof plane of the building; -1 for walls and other objects."""
     mixed: BoolArray
     """(n,) bool, True where echoes of different surfaces melted into the return."""
 
@@ -60,7 +60,7 @@ class SceneTruth:
 
 
 def read_truth(truth_dir: str | Path) -> SceneTruth:
-    """Read the truth that `simulate` wrote, all labels in memory: 10 bytes a point.
+    """Read the truth that `simulate` wrote, with all labels in memory: 10 bytes per point.
 
     The labels of a data set of several tiles follow one another in the order of the tiles in scene.json.
 
@@ -96,7 +96,7 @@ def read_truth(truth_dir: str | Path) -> SceneTruth:
 
 
 def _numbers(names: pa.DictionaryArray, ids: Sequence[str]) -> LabelArray:
-    """Places of a column's names in the sorted ids; -1 for none."""
+    """Places of the names of a column in the sorted ids; -1 for none."""
     place = np.array([bisect.bisect_left(ids, name) for name in names.dictionary.to_pylist()], np.int32)
     building = np.full(len(names), -1, np.int32)
     known = names.indices.is_valid().to_numpy(zero_copy_only=False)
@@ -111,26 +111,7 @@ def write_models(
     truth: Path,
     part: str,
 ) -> list[dict[str, Any]]:
-    """Write the exact models of some buildings as one part of a run directory.
-
-    Parameters
-    ----------
-    buildings : sequence of Building
-        What goes into the part.
-    scene : Scene
-        Their frame and terrain.
-    settings : ScannerSettings
-        The survey: with the extent it says where the data end.
-    truth : Path
-        The run directory.
-    part : str
-        The part's hive key.
-
-    Returns
-    -------
-    list of dict
-        The buildings' rows for `write_conditions`.
-    """
+    """Write the exact models of buildings as one part of a run directory; returns their rows for `write_conditions`."""
     context = RecordContext(
         reference=spatial_reference(scene), settings_hash="truth", engine_version=pipeline.__version__
     )
@@ -147,7 +128,7 @@ def write_models(
 
 
 def _cut_by_the_end_of_the_data(buildings: Sequence[Building], scene: Scene, settings: ScannerSettings) -> list[bool]:
-    """Which buildings reach out of the extent; in a survey of tiles, on ground that may lie high, out of the strips."""
+    """Which buildings reach out of the extent, or out of the strips of a survey of tiles."""
     data = shapely.box(*(scene.survey_extent or scene.extent))
     cut = [not data.contains(building.footprint) for building in buildings]
     if scene.survey_extent is None or not buildings:
@@ -165,22 +146,9 @@ def write_manifest(
     truth: Path,
     **counts: int,
 ) -> None:
-    """Write scene.json: what was made, from what, and where its tiles lie.
+    """Write scene.json: the scene, its survey, and its tiles in the order in which `read_truth` joins their labels.
 
-    Parameters
-    ----------
-    scene : Scene
-        Its name, frame and extent; of a city any part of it, with the whole as its `survey_extent`.
-    settings : ScannerSettings
-        The survey.
-    seed : int
-        Of layout and scanner.
-    tiles : iterable of TileFiles
-        In the order in which `read_truth` joins their labels.
-    truth : Path
-        The folder.
-    **counts : int
-        Numbers of strips, buildings, trees, cars.
+    `scene` may be any part of a city. `counts` are the numbers of strips, buildings, trees and cars.
     """
     x, y, _ = scene.origin
     whole = scene.survey_extent or scene.extent

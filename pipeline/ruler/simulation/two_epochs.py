@@ -1,7 +1,7 @@
-"""Two epochs of one scene: the same place before and after buildings were changed, and what was done to which.
+"""Two epochs of one scene: before and after changes to some buildings, and the change of each.
 
-Each changed building undergoes one kind of change. What is new in the later scene stands in the whole scene and is left
-out of the earlier one, so that both are as likely as the suite that they come from.
+Each changed building undergoes one kind of change. New buildings are part of the whole scene and are left out of the
+earlier one, so both scenes are as plausible as their suite.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pipeline.ruler.simulation.scene import Building, Scene, Terrain, outline_sa
 
 
 class Work(StrEnum):
-    """What was done to a building between two epochs."""
+    """A change of a building between two epochs."""
 
     BUILT = "built"
     DEMOLISHED = "demolished"
@@ -29,12 +29,13 @@ class Work(StrEnum):
 
 
 STOREY_M = 2.8
-"""By how much walls are raised or lowered."""
+"""Height by which walls are raised or lowered."""
 MIN_EAVE_M = 2.2
 """No walls are made lower than this."""
 EXTENSION_M = 4.0
-"""By how much a building grows along its ridge."""
+"""Length by which a building grows along its ridge."""
 _CLEARANCE_M = 1.5
+"""Smallest distance of a changed building to its neighbours."""
 
 _OTHER_ROOF: Mapping[RoofShape, tuple[RoofShape, float]] = {
     RoofShape.GABLE: (RoofShape.FLAT, 0.0),
@@ -54,7 +55,7 @@ class TwoEpochs:
     later: Scene
     """After."""
     works: Mapping[str, Work]
-    """What was done, by building_id; buildings that are not named are as they were."""
+    """The change of each changed building, by building_id."""
 
 
 def two_epochs(scene: Scene, seed: int, *, share: float = 0.25, kinds: Sequence[Work] = tuple(Work)) -> TwoEpochs:
@@ -67,7 +68,7 @@ def two_epochs(scene: Scene, seed: int, *, share: float = 0.25, kinds: Sequence[
     seed : int
         Which buildings; not negative.
     share : float
-        Of the buildings that are changed, about: a kind that a building cannot undergo passes on to the next one.
+        Share of buildings to change, about: a kind that a building cannot undergo passes on to the next one.
     kinds : sequence of Work
         What may happen, in turns.
     """
@@ -107,7 +108,7 @@ def _has_room(made: Building, number: int, outlines: shapely.STRtree) -> bool:
 
 
 def _worked_on(building: Building, kind: Work, terrain: Terrain) -> Building | None:
-    """The building afterwards; None where it cannot undergo that. What is built or demolished stays as it is."""
+    """The building afterwards; None if it cannot undergo the change. Built and demolished ones stay as they are."""
     size = building.dimensions
     eave_m = _eave_height_m(building, terrain)
     if kind in {Work.BUILT, Work.DEMOLISHED}:
@@ -128,7 +129,7 @@ def _worked_on(building: Building, kind: Work, terrain: Terrain) -> Building | N
 
 
 def _eave_height_m(building: Building, terrain: Terrain) -> float:
-    """Eave above the highest terrain at the outline: what `place_building` was told."""
+    """Eave above the highest terrain at the outline, as `place_building` took it."""
     samples = outline_samples(shapely.get_coordinates(building.footprint.exterior)[:-1])
     return building.eave_z_m - float(terrain.elevation(samples[:, 0], samples[:, 1]).max())
 
@@ -136,7 +137,7 @@ def _eave_height_m(building: Building, terrain: Terrain) -> float:
 def _placed(
     building: Building, shape: RoofShape, size: RoofDimensions, eave_height_m: float, terrain: Terrain
 ) -> Building:
-    """The building anew at its place."""
+    """Another building at the same place with the same name."""
     return place_building(
         building.building_id,
         shape,

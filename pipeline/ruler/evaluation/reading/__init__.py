@@ -1,4 +1,4 @@
-"""Models of any program as one kind of thing: run directories, CityJSON, CityJSONSeq and OBJ."""
+"""Readers of models of any program: run directories, CityJSON, CityJSONSeq and OBJ."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ OBJ = (".obj",)
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reader:
-    """One thing that can be read."""
+    """A reader of one format."""
 
-    told: str
-    """What it is, for messages."""
+    description: str
+    """The format, for messages."""
     recognises: Callable[[Path], bool]
-    """Whether a path is such a thing, by its name and what lies in it."""
+    """Whether a path has this format, by its name and content."""
     read: Callable[[Path], ModelSet]
-    """Reads it."""
+    """Reads a path."""
 
 
 def read_models(path: str | Path) -> ModelSet:
@@ -37,15 +37,15 @@ def read_models(path: str | Path) -> ModelSet:
     Parameters
     ----------
     path : str or Path
-        A run directory, or its URL; the truth of a simulated data set, a CityJSON, CityJSONSeq or OBJ file, or a folder
-        of such files of one kind, also in folders within.
+        A run directory, or its URL; the truth of a simulated data set; a CityJSON, CityJSONSeq or OBJ file; or a folder
+        of such files of one kind, with its subfolders.
 
     Raises
     ------
     InputError
-        If it is nothing that can be read, is broken, or its coordinates are degrees.
+        It has no format that can be read, is broken, or its coordinates are degrees.
     RunError
-        If a run directory is damaged.
+        A run directory is damaged.
     """
     if isinstance(path, str) and is_url(path):
         if is_run(path):
@@ -61,11 +61,11 @@ def read_models(path: str | Path) -> ModelSet:
 
 
 def _readable() -> str:
-    return "; ".join(reader.told for reader in READERS)
+    return "; ".join(reader.description for reader in READERS)
 
 
 def _what_is_there(place: Path) -> str:
-    """Why a path is nothing that can be read."""
+    """Why a path cannot be read."""
     if place.is_file():
         return f"a file that ends in {place.suffix!r} holds no models" if place.suffix else "not a file with models"
     runs = sorted(folder.parent for folder in place.glob("*/buildings") if folder.is_dir())
@@ -78,7 +78,7 @@ def _what_is_there(place: Path) -> str:
 
 
 def _files(place: Path, endings: tuple[str, ...]) -> list[Path]:
-    """The file, or all files below a folder with one of some endings, sorted; hidden ones and other JSON left out."""
+    """The file, or all files below a folder with one of the endings, sorted, without hidden ones and other JSON."""
     if place.is_file():
         return [place] if place.name.lower().endswith(endings) else []
     found = (path for path in place.rglob("*") if path.name.lower().endswith(endings))
@@ -87,7 +87,7 @@ def _files(place: Path, endings: tuple[str, ...]) -> list[Path]:
 
 
 def _says_cityjson(path: Path) -> bool:
-    """Whether a JSON file is meant to be CityJSON, by its name or its content."""
+    """Whether a JSON file is CityJSON by its name or its content."""
     return path.name.lower().endswith(CITYJSON[0]) or is_cityjson(path)
 
 
@@ -134,24 +134,24 @@ def _each(read: Callable[[Path, Collected], None]) -> Callable[[list[Path], Coll
 
 READERS: tuple[Reader, ...] = (
     Reader(
-        told="a run directory, or the folder `truth` of a simulated data set (with run.json or buildings/)",
+        description="a run directory, or the folder `truth` of a simulated data set (with run.json or buildings/)",
         recognises=is_run,
         read=read_run,
     ),
     Reader(
-        told="a CityJSON 1.0, 1.1 or 2.0 file (.city.json, .json), or a folder of them",
+        description="a CityJSON 1.0, 1.1 or 2.0 file (.city.json, .json), or a folder of them",
         recognises=_only(CITYJSON),
         read=_reads("cityjson", CITYJSON, _each(read_cityjson_file)),
     ),
     Reader(
-        told="a CityJSONSeq file (.city.jsonl, .jsonl), or a folder of them",
+        description="a CityJSONSeq file (.city.jsonl, .jsonl), or a folder of them",
         recognises=_only(CITYJSONSEQ),
         read=_reads("cityjsonseq", CITYJSONSEQ, _each(read_cityjsonseq_file)),
     ),
     Reader(
-        told="an OBJ file (.obj), or a folder of them",
+        description="an OBJ file (.obj), or a folder of them",
         recognises=_only(OBJ),
         read=_reads("obj", OBJ, read_obj_files),
     ),
 )
-"""What can be read, in the order in which it is tried."""
+"""The readers, in the order in which they are tried."""

@@ -21,8 +21,8 @@ from pipeline.model import FloatArray, RoofType, Status
 from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reading.cityjson_geometry import Object, Places, chosen, has_inner_shells, parts_of
 from pipeline.ruler.evaluation.reading.collected import Collected, model_of
+from pipeline.ruler.evaluation.reading.roof_type_names import named_roof_type
 from pipeline.ruler.evaluation.reading.surfaces import assemble
-from pipeline.ruler.evaluation.reading.told_types import told_roof_type
 
 VERSIONS = ("1.0", "1.1", "2.0")
 """Versions that are read."""
@@ -39,14 +39,14 @@ _FIX = "Give a file that cjio or another validator of CityJSON accepts"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Frame:
-    """What a header says of all coordinates."""
+    """The frame of all coordinates, from the header."""
 
     scale: FloatArray
     """(3,) float64."""
     translate: FloatArray
     """(3,) float64."""
     units_m: FloatArray
-    """(3,) float64, metres a unit of easting, northing, elevation."""
+    """(3,) float64, metres per unit of easting, northing, elevation."""
     templates: Sequence[Object]
     """Geometries that instances place."""
     template_vertices: FloatArray
@@ -58,7 +58,7 @@ class Frame:
         Raises
         ------
         ValueError
-            If they are no finite triples.
+            They are not finite triples.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             metres = (_triples(vertices) * self.scale + self.translate) * self.units_m
@@ -71,7 +71,7 @@ class Frame:
 
 
 def is_cityjson(path: Path) -> bool:
-    """Whether a JSON file says near its start or its end that it is CityJSON: other JSON lies in folders too."""
+    """Whether a JSON file says near its start or its end that it is CityJSON."""
     try:
         with path.open("rb") as stream:
             start = stream.read(_PEEK_BYTES)
@@ -82,12 +82,12 @@ def is_cityjson(path: Path) -> bool:
 
 
 def read_cityjson_file(path: Path, into: Collected) -> None:
-    """Read the buildings of one CityJSON file; the file as a whole is in memory meanwhile.
+    """Read the buildings of one CityJSON file, which is in memory as a whole.
 
     Raises
     ------
     InputError
-        If it is no CityJSON of a version that is read, or broken.
+        It is broken, or not CityJSON of a supported version.
     """
     try:
         document = json.loads(path.read_bytes())
@@ -118,7 +118,7 @@ def read_cityjsonseq_file(path: Path, into: Collected) -> None:
     Raises
     ------
     InputError
-        If a line is broken; the message names it.
+        A line is broken; the message names it.
     """
     for feature, places, where in features(path, into):
         try:
@@ -132,21 +132,21 @@ def read_cityjsonseq_file(path: Path, into: Collected) -> None:
 def features(
     path: Readable, into: Collected, units_m: tuple[float, float] | None = None
 ) -> Iterator[tuple[Object, Places, str]]:
-    """The features of a CityJSONSeq file, with their vertices, and where they are, for messages.
+    """The features of a CityJSONSeq file, with their vertices and lines, for messages.
 
     Parameters
     ----------
     path : Readable
-        The file. A line of metadata may come again: it holds from there on.
+        The file. Further lines of metadata apply from there on.
     into : Collected
-        Is told of the coordinate reference system.
+        Receives the coordinate reference system.
     units_m : tuple of float, optional
-        Metres a horizontal and a vertical unit, where they are known better than from the file.
+        Metres per horizontal and per vertical unit; overrides the file.
 
     Raises
     ------
     InputError
-        If a line is no JSON, or neither metadata nor a feature.
+        A line is not JSON, or neither metadata nor a feature.
     """
     frame: Frame | None = None
     try:
@@ -183,9 +183,9 @@ def _unreadable(path: Readable, problem: str, fix: str = _FIX) -> InputError:
 
 
 def _broken(path: Readable, where: str, fault: Exception) -> InputError:
-    """What a fault of a file's content becomes."""
-    told = f"{fault} is missing" if isinstance(fault, KeyError) else str(fault)
-    return _unreadable(path, f"{where}{told}")
+    """The error for a fault in the content of a file."""
+    problem = f"{fault} is missing" if isinstance(fault, KeyError) else str(fault)
+    return _unreadable(path, f"{where}{problem}")
 
 
 def _triples(vertices: Any) -> FloatArray:
@@ -194,7 +194,7 @@ def _triples(vertices: Any) -> FloatArray:
     Raises
     ------
     ValueError
-        If they are no finite triples of numbers.
+        They are not finite triples of numbers.
     """
     array = np.array(vertices, np.float64) if len(vertices) else np.empty((0, 3))
     if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
@@ -210,7 +210,7 @@ def _frame(
     Raises
     ------
     InputError
-        If it is of another type or version, broken, or its coordinate reference system has no lengths.
+        It has another type or version, is broken, or its coordinate reference system has no lengths.
     """
     kind = header.get("type") if isinstance(header, dict) else type(header).__name__
     if kind != "CityJSON":
@@ -239,27 +239,27 @@ def _frame(
 
 
 def _reference(path: Readable, metadata: Object, into: Collected) -> SpatialReference:
-    """The coordinate reference system and its units; metres where there is none.
+    """The coordinate reference system and its units; metres without one.
 
     Raises
     ------
     CrsError
-        If it is geographic or not understood.
+        It is geographic or not understood.
     """
     text = metadata.get("referenceSystem")
     if not text:
         into.note("no referenceSystem in the file: coordinates are taken as metres")
         return SpatialReference()
-    reference, told = resolve_reference(path=str(path), header_crs=parse_crs(str(text), path=str(path)))
+    reference, notes = resolve_reference(path=str(path), header_crs=parse_crs(str(text), path=str(path)))
     if reference.horizontal_unit_m != 1.0:
-        for sentence in told:
+        for sentence in notes:
             into.note(sentence.split(";")[0])
     into.is_at(reference.name if reference.epsg is None else f"EPSG:{reference.epsg}")
     return reference
 
 
 def _buildings(objects: Mapping[str, Object], into: Collected) -> Iterator[tuple[str, list[str]]]:
-    """The buildings of a file or feature, each with its parts; a part whose building is not there is one itself."""
+    """The buildings of a file or feature with their parts; a part without its building counts as a building."""
     parent_of: dict[str, str] = {}
     for name, entry in objects.items():
         for child in entry.get("children", ()):
@@ -285,7 +285,7 @@ def _buildings(objects: Mapping[str, Object], into: Collected) -> Iterator[tuple
 def _model(
     name: str, parts: Sequence[str], objects: Mapping[str, Object], places: Places, into: Collected
 ) -> RoofModel:
-    """One building of the geometries that stand for it."""
+    """One building from its geometries."""
     attributes = objects[name].get("attributes") or {}
     geometries, lod = chosen(
         objects[name].get("geometry") or (), [objects[part].get("geometry") or () for part in parts], places
@@ -309,7 +309,7 @@ def _model(
 
 
 def _roof_type(attributes: Object, of_parts: Sequence[Object]) -> RoofType:
-    """The type that a building tells, else the one that its parts agree on."""
-    own = told_roof_type(attributes)
-    told = {told_roof_type(part) for part in of_parts}
-    return told.pop() if own is RoofType.UNKNOWN and len(told) == 1 else own
+    """The roof type of a building, else the one that its parts agree on."""
+    own = named_roof_type(attributes)
+    found = {named_roof_type(part) for part in of_parts}
+    return found.pop() if own is RoofType.UNKNOWN and len(found) == 1 else own

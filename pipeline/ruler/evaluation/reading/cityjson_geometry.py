@@ -20,7 +20,7 @@ KIND_OF_SURFACE: Mapping[str, FaceKind | None] = {
     "OuterCeilingSurface": FaceKind.GROUND,
     "OuterFloorSurface": None,
 }
-"""What semantic surfaces are here; an outer floor is a roof where nothing is above it, as its normal tells."""
+"""Kinds of semantic surfaces; the normal decides for an outer floor, which is a roof if nothing is above it."""
 
 SURFACES = ("MultiSurface", "CompositeSurface")
 SOLIDS = ("Solid", "MultiSolid", "CompositeSolid")
@@ -31,12 +31,12 @@ Object = Mapping[str, Any]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Places:
-    """Where the vertices of a file or feature are."""
+    """The vertices of a file or feature."""
 
     vertices: FloatArray
     """(n, 3) float64, absolute metres."""
     units_m: FloatArray
-    """(3,) float64, metres a unit of the coordinates."""
+    """(3,) float64, metres per unit of the coordinates."""
     templates: Sequence[Object] = ()
     """Geometries that instances place."""
     template_vertices: FloatArray = dataclasses.field(default_factory=lambda: np.empty((0, 3)))
@@ -44,7 +44,7 @@ class Places:
 
 
 def level(lod: object) -> float:
-    """A level of detail as a number; -1 for what is none.
+    """A level of detail as a number; -1 if it is not one.
 
     Examples
     --------
@@ -59,7 +59,7 @@ def level(lod: object) -> float:
 
 
 def resolved(geometry: Object, places: Places) -> Object:
-    """The geometry itself, of an instance its template."""
+    """The geometry itself, or the template of an instance."""
     if geometry["type"] != "GeometryInstance":
         return geometry
     return places.templates[_index(geometry["template"], len(places.templates), "template")]
@@ -68,22 +68,8 @@ def resolved(geometry: Object, places: Places) -> Object:
 def chosen(own: Sequence[Object], parts: Sequence[Sequence[Object]], places: Places) -> tuple[list[Object], str]:
     """The geometries that stand for a building, and their level of detail.
 
-    Of each object those of its highest level, solids before surfaces. The building's own count where none of its parts
-    has a higher level, its parts where the building's own is not higher.
-
-    Parameters
-    ----------
-    own : sequence of geometries
-        Of the building itself.
-    parts : sequence of sequences of geometries
-        Of each of its parts.
-    places : Places
-        For the levels of templates.
-
-    Returns
-    -------
-    list of geometries, and the level
-        Empty both without any geometry.
+    Each object gives the geometries of its highest level, solids before surfaces. Those of the building itself count if
+    no part has a higher level, those of the parts if the building does not. Both are empty without any geometry.
     """
     best_own, lod_own = _highest(own, places)
     of_parts = [_highest(part, places) for part in parts]
@@ -115,14 +101,14 @@ def _highest(geometries: Sequence[Object], places: Places) -> tuple[list[Object]
 
 
 def parts_of(geometry: Object, places: Places) -> Iterator[RawPart]:
-    """The parts of one geometry: one a solid, or one of all its surfaces. Inner shells of solids are left out."""
+    """The parts of one geometry: one per solid, or one of all its surfaces; without the inner shells of solids."""
     template = resolved(geometry, places)
     vertices = places.vertices if template is geometry else _placed(geometry, places)
     kind, boundaries = template["type"], template["boundaries"]
     semantics = template.get("semantics") or {}
     if not isinstance(semantics, Mapping):
         raise TypeError(f"semantics is a {type(semantics).__name__}, not an object")
-    surfaces = [_told(surface) for surface in semantics.get("surfaces", ())]
+    surfaces = [_kind_and_plane(surface) for surface in semantics.get("surfaces", ())]
     values = semantics.get("values")
     is_model = level(template.get("lod", "")) >= _MIN_MODEL_LOD
     if kind in SURFACES:
@@ -148,7 +134,7 @@ def _index(value: Any, count: int, what: str) -> int:
     Raises
     ------
     ValueError
-        If it is not.
+        It is not.
     """
     if not isinstance(value, int) or not 0 <= value < count:
         raise ValueError(f"{what} {value!r} is not one of {count}")
@@ -156,12 +142,12 @@ def _index(value: Any, count: int, what: str) -> int:
 
 
 def _at(values: Any, place: int) -> Any:
-    """An entry of nested semantic values, None where a level is null as a whole."""
+    """An entry of nested semantic values; None if a whole level is null."""
     return None if values is None else values[place]
 
 
-def _told(surface: Object) -> tuple[FaceKind | None, int]:
-    """What a semantic surface is, and its number of a roof plane where it tells one."""
+def _kind_and_plane(surface: Object) -> tuple[FaceKind | None, int]:
+    """The kind of a semantic surface, and the number of its roof plane; -1 without one."""
     kind = KIND_OF_SURFACE.get(str(surface["type"]))
     plane = surface.get("plane_id")
     return kind, plane if kind is FaceKind.ROOF and isinstance(plane, int) and plane >= 0 else -1
@@ -173,7 +159,7 @@ def _faces(
     surfaces: Sequence[tuple[FaceKind | None, int]],
     is_model: bool,
 ) -> list[RawFace]:
-    """The faces of one shell; those below LoD 1 are footprints, whichever way they look."""
+    """The faces of one shell; below LoD 1 all are footprints."""
     faces = []
     for number, rings in enumerate(shell):
         value = _at(values, number)

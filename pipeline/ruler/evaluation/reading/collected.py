@@ -1,4 +1,4 @@
-"""What a reader has gathered so far, and the set of models that it becomes."""
+"""The models and notes that a reader collects, and the resulting set of models."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Kind = Literal["run", "cityjson", "cityjsonseq", "obj"]
 
 @dataclasses.dataclass(kw_only=True)
 class Collected:
-    """Models, failed ones, and what is to be told, in the order of the files."""
+    """Models, failed ones, and notes for the report, in the order of the files."""
 
     models: list[RoofModel] = dataclasses.field(default_factory=list)
     """Those with a footprint and roof faces."""
@@ -26,9 +26,9 @@ class Collected:
     notes: dict[str, None] = dataclasses.field(default_factory=dict)
     """Sentences, each once."""
     counts: dict[str, int] = dataclasses.field(default_factory=dict)
-    """Sentences with `{n}` in place of a number that grows."""
+    """Numbers by sentences with `{n}` in place of the number."""
     crs: str | None = None
-    """Of the first file that tells one."""
+    """Coordinate reference system of the first file that has one."""
     has_footprints: bool = False
     """As in `ModelSet`."""
 
@@ -54,12 +54,11 @@ class Collected:
             self.failed.append(model)
 
     def finish(self, *, name: str, kind: Kind, path: str) -> ModelSet:
-        """The set: sorted by building_id, every id once, notes in the order of their making."""
+        """The set: sorted by building_id, unique ids, notes in their order."""
         models, failed = _unique(self.models), _unique(self.failed)
         renamed = sum(a.building_id != b.building_id for a, b in zip(_sorted(self.models), models, strict=True))
         if renamed:
             self.note(f"{renamed} models had the id of another one and were given a number behind it")
-        told = [*self.notes, *(sentence.format(n=count) for sentence, count in self.counts.items())]
         return ModelSet(
             name=name,
             kind=kind,
@@ -68,7 +67,7 @@ class Collected:
             failed=failed,
             crs=self.crs,
             has_footprints=self.has_footprints,
-            notes=tuple(told),
+            notes=(*self.notes, *(sentence.format(n=count) for sentence, count in self.counts.items())),
         )
 
 
@@ -96,7 +95,7 @@ def model_of(
     source_id: str | None = None,
     touches_data_edge: bool = False,
 ) -> RoofModel:
-    """A building of assembled parts: failed, without type, where they have no roof."""
+    """A building of assembled parts: failed and without type if they have no roof."""
     has_roof = assembled is not None and bool(assembled.surfaces) and not assembled.footprint.is_empty
     return RoofModel(
         building_id=building_id,

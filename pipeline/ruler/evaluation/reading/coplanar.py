@@ -1,4 +1,4 @@
-"""Faces that are parts of one plane: a triangulated roof is to count as the polygons that it was cut from."""
+"""Faces that are parts of one plane: a triangulated roof counts as the polygons that it was cut from."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from pipeline.model import FloatArray, IntArray, LabelArray
 DISTANCE_M = 0.01
 """Vertices up to this far from a plane lie in it."""
 ANGLE_DEG = 0.1
-"""Normals up to this far apart are the same; more where so much is within `DISTANCE_M` over the width of the face."""
+"""Normals up to this angle apart are the same. A narrow face may differ more: as far as `DISTANCE_M` tilts it."""
 
 _MIN_UP = 1e-9
+"""Numerical guard: faces whose unit normals have a smaller z are vertical and stay apart."""
 
 
 @kernel
@@ -27,7 +28,7 @@ def face_vectors(xyz: FloatArray, corners: IntArray, ring_offsets: IntArray, fac
     Parameters
     ----------
     xyz : (v, 3) float64
-        Vertices in metres, about a near origin.
+        Vertices in metres, about a nearby origin.
     corners : (c,) int64
         Vertices of all rings, one ring after the other.
     ring_offsets : (r + 1,) int64
@@ -70,7 +71,7 @@ def _neighbours(
                 keys[k] = a * vertices + b
                 owner[k] = f
     order = ascending_order(keys)
-    # every pair of faces at an edge, both ways; the second turn writes what the first one counted
+    # Every pair of faces at an edge, both ways: the first pass counts, the second one writes.
     beside, others = np.empty(0, np.int32), np.empty(0, np.int64)
     for writes in (False, True):
         count = 0
@@ -109,6 +110,32 @@ def _min_cosine(xyz: FloatArray, corners: IntArray, area: float, distance_m: flo
     return math.cos(max(math.radians(angle_deg), explained))
 
 
+@kernel(inline="always")
+def _upward_normals(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lengths (f,) of area vectors (f, 3), and their unit vectors (f, 3), turned upwards; zero without an area."""
+    areas, normals = np.empty(len(vectors)), np.zeros((len(vectors), 3))
+    for f in range(len(vectors)):
+        areas[f] = math.sqrt(vectors[f, 0] ** 2 + vectors[f, 1] ** 2 + vectors[f, 2] ** 2)
+        if areas[f] > 0.0:
+            scale = (1.0 if vectors[f, 2] >= 0.0 else -1.0) / areas[f]
+            for axis in range(3):
+                normals[f, axis] = vectors[f, axis] * scale
+    return areas, normals
+
+
+@kernel(inline="always")
+def _lie_in(xyz: FloatArray, corners: IntArray, plane: tuple[float, float, float], up: float, limit_m: float) -> bool:
+    """Whether vertices lie within a distance of the plane z = a x + b y + c; `up` is the z of its unit normal."""
+    a, b, c = plane
+    inside = True
+    for k in range(len(corners)):
+        x, y, z = xyz[corners[k], 0], xyz[corners[k], 1], xyz[corners[k], 2]
+        if abs(z - a * x - b * y - c) * up > limit_m:
+            inside = False
+            break
+    return inside
+
+
 @kernel
 def coplanar_regions(
     xyz: FloatArray,
@@ -116,40 +143,32 @@ def coplanar_regions(
     ring_offsets: IntArray,
     face_rings: IntArray,
     vectors: FloatArray,
-    told: IntArray,
+    planes: IntArray,
     distance_m: float,
     angle_deg: float,
 ) -> IntArray:
-    """Faces that share edges and lie in one plane, grown from the largest; the plane is fitted again as they join.
+    """Regions of faces that share edges and lie in one plane, grown from the largest; each new face refits the plane.
 
     Parameters
     ----------
     xyz, corners, ring_offsets, face_rings
-        As for `face_vectors`; vertices in one place are one.
+        As for `face_vectors`, with one vertex per place.
     vectors : (f, 3) float64
-        Area vectors; which way they point does not matter.
-    told : (f,) int64
-        Faces of different numbers stay apart.
+        Area vectors; their direction does not matter.
+    planes : (f,) int64
+        Faces with different numbers stay apart.
     distance_m, angle_deg : float
-        As `DISTANCE_M` and `ANGLE_DEG` say.
+        As `DISTANCE_M` and `ANGLE_DEG`.
 
     Returns
     -------
     (f,) int64
-        The number of the region of each face, numbered as they were grown.
+        The number of the region of each face, in the order of growing.
     """
-    faces = len(vectors)
-    areas = np.empty(faces)
-    normals = np.zeros((faces, 3))
-    for f in range(faces):
-        areas[f] = math.sqrt(vectors[f, 0] ** 2 + vectors[f, 1] ** 2 + vectors[f, 2] ** 2)
-        if areas[f] > 0.0:
-            scale = (1.0 if vectors[f, 2] >= 0.0 else -1.0) / areas[f]
-            for axis in range(3):
-                normals[f, axis] = vectors[f, axis] * scale
+    areas, normals = _upward_normals(vectors)
     offsets, others = _neighbours(corners, ring_offsets, face_rings, len(xyz))
-    labels = np.full(faces, -1, np.int64)
-    queue = np.empty(faces, np.int64)
+    labels = np.full(len(vectors), -1, np.int64)
+    queue = np.empty(len(vectors), np.int64)
     count = 0
     for seed in ascending_order(-areas):
         if labels[seed] >= 0:
@@ -183,17 +202,12 @@ def coplanar_regions(
             up = 1.0 / math.sqrt(1.0 + a * a + b * b)
             for q in range(offsets[face], offsets[face + 1]):
                 other = others[q]
-                if labels[other] >= 0 or told[other] != told[seed] or normals[other, 2] <= _MIN_UP:
+                if labels[other] >= 0 or planes[other] != planes[seed] or normals[other, 2] <= _MIN_UP:
                     continue
-                first, last = ring_offsets[face_rings[other]], ring_offsets[face_rings[other + 1]]
-                fits = True
-                for k in range(first, last):
-                    x, y, z = xyz[corners[k], 0], xyz[corners[k], 1], xyz[corners[k], 2]
-                    if abs(z - a * x - b * y - c) * up > distance_m:
-                        fits = False
-                        break
+                own = corners[ring_offsets[face_rings[other]] : ring_offsets[face_rings[other + 1]]]
                 cosine = (normals[other, 2] - a * normals[other, 0] - b * normals[other, 1]) * up
-                if fits and cosine >= _min_cosine(xyz, corners[first:last], areas[other], distance_m, angle_deg):
+                fits = _lie_in(xyz, own, (a, b, c), up, distance_m)
+                if fits and cosine >= _min_cosine(xyz, own, areas[other], distance_m, angle_deg):
                     labels[other] = count
                     queue[written] = other
                     written += 1

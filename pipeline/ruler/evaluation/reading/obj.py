@@ -1,4 +1,4 @@
-"""Wavefront OBJ: objects are buildings, names of groups and materials tell roofs, walls and ground."""
+"""Wavefront OBJ: objects are buildings; names of groups and materials mark roofs, walls and ground."""
 
 from __future__ import annotations
 
@@ -29,25 +29,26 @@ from pipeline.ruler.evaluation.reading.surfaces import assemble
 _OWN_HEADER = re.compile(
     rb"^# coordinates are easting, northing, elevation; one unit is (\S+) m horizontally, (\S+) m vertically"
 )
-"""First line of the files that this program writes: it tells the units, and that objects are parts of buildings."""
+"""First line of the files of this program: it states the units, and objects are then parts of buildings."""
 _OWN_MATERIAL = re.compile(r"^roof_(\d+)$")
 _COARSER_STEM = re.compile(r"^(.+)-lod\d+$")
-"""Name of a file of this program that holds a coarser level of detail than the file of the name before it."""
+"""Name of a file of this program with a coarser level of detail than the file of the name before the suffix."""
 _MIN_SOLID_FACES = 4
+"""A tetrahedron: a group with fewer faces is not a building."""
 
 
 @dataclasses.dataclass(kw_only=True)
 class _Mesh:
-    """A file as it is read: all vertices, faces by object and group."""
+    """The content of a file: all vertices, faces by object and group."""
 
     coordinates: array[float] = dataclasses.field(default_factory=lambda: array("d"))
     """x, y, z of all vertices, one after the other."""
     objects: dict[str, list[RawFace]] = dataclasses.field(default_factory=dict)
     """Faces by the name of their `o`; empty name before the first."""
     groups: dict[str, list[RawFace]] = dataclasses.field(default_factory=dict)
-    """Faces by the name of their `g` where it tells no kind, for files without `o`; empty name without."""
+    """Faces by the name of their `g` if it does not name a kind, for files without `o`; else by the empty name."""
     units_m: tuple[float, float] | None = None
-    """Metres a horizontal and a vertical unit, in files of this program."""
+    """Metres per horizontal and per vertical unit, in files of this program."""
 
     @property
     def is_own(self) -> bool:
@@ -64,14 +65,14 @@ class _Mesh:
 def read_obj_files(paths: Sequence[Path], into: Collected) -> None:
     """Read the buildings of some OBJ files.
 
-    One building an `o`; in files of this program its parts are objects of their own. Without `o`, one a group that
-    tells no kind and has faces enough for a solid. Without either a file is a building, or, where it is the only one,
-    one building for all that touches in plan. Coarser levels of detail are passed over where the finest is there too.
+    Each `o` is a building; in files of this program, a part of one. Without `o`, each group is a building if it does
+    not name a kind and has enough faces for a solid. Otherwise a file is a building, or if it is the only one, all
+    faces that touch in plan are a building. Coarser levels of detail are skipped if the finest is there.
 
     Raises
     ------
     InputError
-        If a file is broken; the message names file and line.
+        A file is broken; the message names file and line.
     """
     pieces: dict[str, list[RawPart]] = {}
     known = set(paths)
@@ -122,13 +123,13 @@ def _buildings(mesh: _Mesh, path: Path, into: Collected, *, alone: bool) -> dict
 
 
 def _part(vertices: FloatArray, faces: Sequence[RawFace]) -> RawPart:
-    """Faces as one part; a solid where they are closed."""
+    """Faces as one part; a solid if they are closed."""
     part = raw_part(vertices, faces, is_solid=False)
     return dataclasses.replace(part, is_solid=is_closed(part.xyz, (face.rings for face in part.faces)))
 
 
 def _parts(vertices: FloatArray, faces: Sequence[RawFace]) -> list[RawPart]:
-    """Pieces that hang together, a part each."""
+    """Connected pieces, one part each."""
     return [_part(piece.xyz, piece.faces) for piece in connected(raw_part(vertices, faces, is_solid=False))]
 
 
@@ -149,7 +150,7 @@ def _read(path: Path) -> _Mesh:
     Raises
     ------
     InputError
-        If a line is broken.
+        A line is broken.
     """
     mesh = _Mesh()
     number = 0
@@ -170,7 +171,7 @@ def _read(path: Path) -> _Mesh:
 
 
 class _State:
-    """Where in a file the reader is: current object, group and material."""
+    """State of the reader: current object, group and material."""
 
     def __init__(self, mesh: _Mesh) -> None:
         self.mesh = mesh
@@ -182,13 +183,7 @@ class _State:
         self.vertices = 0
 
     def take(self, words: list[str]) -> None:
-        """One line; statements that make no polygons are passed over.
-
-        Raises
-        ------
-        ValueError
-            If it is broken.
-        """
+        """Read one line; statements without polygons are skipped. Raises ValueError if it is broken."""
         key = words[0]
         if key == "v":
             self._vertex(words)
@@ -202,8 +197,8 @@ class _State:
         elif key == "usemtl":
             material = " ".join(words[1:])
             self.kind_of_material = kind_in_name(material)
-            told = _OWN_MATERIAL.match(material) if self.mesh.is_own else None
-            self.plane = int(told[1]) if told else -1
+            plane = _OWN_MATERIAL.match(material) if self.mesh.is_own else None
+            self.plane = int(plane[1]) if plane else -1
 
     def _enter_group(self, name: str) -> None:
         self.kind_of_group = kind_in_name(name)

@@ -1,4 +1,4 @@
-"""What readers of foreign files hand on: faces over vertices, before anything is made of them."""
+"""Faces over vertices as readers of foreign files pass them on."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from pipeline.model import FaceKind, FloatArray
 
 MILLIMETRES_PER_METRE = 1000.0
 FARTHEST_M = 1e8
-"""Coordinates beyond it are no lengths on the ground."""
+"""Coordinates beyond this are not metres of a projected CRS."""
 
 Rings = tuple[tuple[int, ...], ...]
-"""Vertex indices: outer ring first, the first vertex of a ring not repeated."""
+"""Vertex indices: outer ring first; the first vertex of a ring is not repeated."""
 
 
 class RawFace(NamedTuple):
-    """A polygon as the file has it."""
+    """A polygon of the file."""
 
     rings: Rings
-    """Counter-clockwise seen from outside, holes clockwise; files do not always keep to it."""
+    """Counter-clockwise seen from outside, holes clockwise; not all files comply."""
     kind: FaceKind | None
-    """What the file says that it is; None where it says nothing: then the normal decides."""
+    """Its kind in the file; None if unknown: then the normal decides."""
     plane: int = -1
-    """Number of its roof plane, where the file tells it as this program does."""
+    """Number of its roof plane in files of this program; -1 if unknown."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class RawPart:
     faces: tuple[RawFace, ...]
     """Its polygons."""
     is_solid: bool
-    """True where they are meant to close a solid."""
+    """True if they are meant to close a solid."""
 
 
 def raw_part(vertices: FloatArray, faces: Iterable[RawFace], *, is_solid: bool) -> RawPart:
@@ -49,7 +49,7 @@ def raw_part(vertices: FloatArray, faces: Iterable[RawFace], *, is_solid: bool) 
     Raises
     ------
     ValueError
-        If a face names a vertex that is not there, or one beyond `FARTHEST_M`.
+        A face names a missing vertex, or one beyond `FARTHEST_M`.
     """
     listed = tuple(faces)
     used = sorted(set(chain.from_iterable(ring for face in listed for ring in face.rings)))
@@ -71,14 +71,9 @@ def raw_part(vertices: FloatArray, faces: Iterable[RawFace], *, is_solid: bool) 
 
 
 def is_closed(vertices: FloatArray, faces: Iterable[Rings]) -> bool:
-    """Whether every edge is run both ways equally often: no hole in the surface, neighbours oriented alike.
+    """Whether every edge occurs equally often in both directions: no hole in the surface, neighbours oriented alike.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-        Metres; those that are the same to the millimetre are one.
-    faces : iterable of rings
-        As in `SolidFace.rings`.
+    Vertices (v, 3) in metres that agree to the millimetre are one.
     """
     names = _welded(vertices)
     balance: dict[tuple[int, int], int] = {}
@@ -96,17 +91,17 @@ def is_closed(vertices: FloatArray, faces: Iterable[Rings]) -> bool:
 
 
 def _welded(vertices: FloatArray) -> list[int]:
-    """A number for every vertex, the same for those in one place."""
+    """A number for every vertex, the same for vertices in one place."""
     places: dict[tuple[int, ...], int] = {}
     keys = np.rint(vertices * MILLIMETRES_PER_METRE).astype(np.int64).tolist()
     return [places.setdefault(tuple(key), len(places)) for key in keys]
 
 
 def connected(part: RawPart) -> list[RawPart]:
-    """The pieces of a part that hang together, in the order of their first faces.
+    """The connected pieces of a part, in the order of their first faces.
 
-    First by the edges that the file itself shares, so that bodies with vertices of their own stay apart where they
-    touch; what is not closed then, by edges in one place, since some files repeat the vertices of every face.
+    Edges with shared vertices count first, so bodies with vertices of their own stay apart where they touch. Pieces
+    that are not closed are then connected by edges in one place, since some files repeat the vertices of every face.
     """
     closed: list[list[int]] = []
     rest: list[list[int]] = []
@@ -122,7 +117,7 @@ def connected(part: RawPart) -> list[RawPart]:
 
 
 def _by_edges(faces: Sequence[RawFace], names: Sequence[int]) -> list[list[int]]:
-    """Faces that common edges tie together; a name for every vertex says which are one."""
+    """Faces connected by common edges; vertices with one name are one."""
     seen: dict[tuple[int, int], int] = {}
     pairs = []
     for number, face in enumerate(faces):
@@ -134,7 +129,7 @@ def _by_edges(faces: Sequence[RawFace], names: Sequence[int]) -> list[list[int]]
 
 
 def grouped(count: int, pairs: Iterable[Sequence[int]]) -> list[list[int]]:
-    """Numbers below count that pairs of them tie together, each group sorted, in the order of their first ones.
+    """Numbers below count connected by pairs: sorted groups in the order of their first members.
 
     Examples
     --------
@@ -156,11 +151,11 @@ KIND_OF_WORD: Mapping[str, FaceKind] = {
     "floor": FaceKind.GROUND,
     "base": FaceKind.GROUND,
 }
-"""Words in the names of groups and materials, and what they say of a face."""
+"""Words in the names of groups and materials, and the kind of face that they mean."""
 
 
 def kind_in_name(name: str) -> FaceKind | None:
-    """What the name of a group or material says of its faces; None where it says nothing, or two things."""
+    """The kind of face that the name of a group or material means; None without a clear one."""
     lowered = name.lower()
     kinds = {kind for word, kind in KIND_OF_WORD.items() if word in lowered}
     return kinds.pop() if len(kinds) == 1 else None

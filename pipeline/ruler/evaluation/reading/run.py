@@ -44,17 +44,12 @@ def is_run(place: str | Path) -> bool:
 def read_run(place: str | Path) -> ModelSet:
     """The buildings of a run directory, or of the truth that `simulate` writes, in metres.
 
-    Parameters
-    ----------
-    place : str or Path
-        The folder, or its URL.
-
     Raises
     ------
     RunError
-        If there are no such tables, or they are damaged.
+        The tables are missing or damaged.
     InputError
-        If its CityJSONSeq or the table of conditions is damaged.
+        Its CityJSONSeq or the table of conditions is damaged.
     """
     into = Collected()
     units_m = _units_m(place, into)
@@ -89,7 +84,7 @@ def _method(place: str | Path) -> str:
 
 
 def _units_m(place: str | Path, into: Collected) -> tuple[float, float]:
-    """Metres a horizontal and a vertical unit, from run.json, else from the tables' own metadata."""
+    """Metres per horizontal and per vertical unit, from run.json, else from the metadata of the tables."""
     storage = storage_at(place)
     if storage.has(NAME):
         manifest = read_manifest(place)
@@ -131,7 +126,7 @@ def _in_metres(wkb: bytes | None, units_m: tuple[float, float]) -> Polygon | Mul
 
 
 def _surfaces(place: str | Path, units_m: tuple[float, float]) -> dict[str, list[RoofSurface]]:
-    """Roof faces by building, in the order of their planes. Pieces of one plane that touch are one."""
+    """Roof faces by building, in the order of their planes. Touching pieces of one plane are one face."""
     horizontal, vertical = units_m
     groups = _groups(place)
     filesystem, folder = arrow_at(place)
@@ -169,7 +164,7 @@ def _surfaces(place: str | Path, units_m: tuple[float, float]) -> dict[str, list
 
 
 def _groups(place: str | Path) -> dict[str, list[int]]:
-    """The groups of each building's planes, where the truth tells them."""
+    """The groups of the planes of each building, from the truth; empty without them."""
     if not storage_at(place).has(_CONDITIONS):
         return {}
     table = place_below(place, _CONDITIONS)
@@ -188,10 +183,10 @@ def _solids(place: str | Path, units_m: tuple[float, float], into: Collected) ->
         into.note("no folder cityjson in the run: solids are unknown")
         return {}
     found: Solids = {}
-    told = Collected()
+    ignored = Collected()
     for key in keys:
         file = file_at(place_below(place, key))
-        for feature, places, where in features(file, told, units_m):
+        for feature, places, where in features(file, ignored, units_m):
             try:
                 name = feature["id"]
                 objects = feature["CityObjects"].values()

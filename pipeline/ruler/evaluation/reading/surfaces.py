@@ -1,9 +1,10 @@
 """From polygons of any file to roof faces, a footprint and solids.
 
-1. Faces that the file does not name are told by their normals, once the part as a whole faces outward: roofs look up
-   and have no other roof above them.
-2. Roof faces that share edges and lie in one plane become one, so that a triangulated model is worth the same as the
-   polygons that it was cut from.
+1. Normals classify the faces that the file does not name, once the part as a whole faces outward: roofs look up and
+have
+   no other roof above them.
+2. Roof faces that share edges and lie in one plane become one: a triangulated model counts as the polygons that it was
+   cut from.
 3. Each gets the least-squares plane of its vertices; the footprint is the union of all of them in plan.
 """
 
@@ -29,26 +30,27 @@ MIN_UP = 0.1
 """A face whose unit normal has a larger z looks up, one with a smaller -z down; the rest are walls."""
 
 _MIN_AREA_M2 = 1e-6
+"""Numerical guard: smaller areas are empty."""
 _SLIVER_M = 0.004
-"""A hole in a footprint that is narrower on average is where two files' roundings met."""
+"""A hole in a footprint that is narrower on average comes from rounding."""
 _COVERED_SHARE = 0.5
-"""A doubtful face with more of its area under other roofs is no roof."""
+"""A doubtful face with more of its area under other roofs is not a roof."""
 
 Coefficients = tuple[float, float, float]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Assembled:
-    """What the parts of a building amount to."""
+    """Roof faces, footprint and solids of a building."""
 
     surfaces: tuple[RoofSurface, ...]
-    """Roof faces; none where there is nothing that looks like a roof."""
+    """Roof faces; empty if no face looks like a roof."""
     footprint: Polygon | MultiPolygon
-    """Of the roof faces, else of the ground faces; empty without either."""
+    """Union of the roof faces, else of the ground faces; empty without either."""
     solids: tuple[Solid, ...]
-    """Of the parts that are meant to be solids."""
+    """The parts that are meant to be solids."""
     solid_origin: tuple[float, float, float]
-    """What the solids are about: whole metres."""
+    """Origin of the solids: whole metres."""
 
 
 class _Soup:
@@ -110,7 +112,7 @@ def _offsets(lengths: Sequence[int]) -> IntArray:
 
 
 def _areas_of(geometry: shapely.Geometry) -> Polygon | MultiPolygon:
-    """What of a geometry has area."""
+    """The polygons of a geometry."""
     if isinstance(geometry, Polygon | MultiPolygon):
         return geometry
     pieces = [piece for piece in shapely.get_parts(geometry) if isinstance(piece, Polygon | MultiPolygon)]
@@ -119,31 +121,20 @@ def _areas_of(geometry: shapely.Geometry) -> Polygon | MultiPolygon:
 
 
 def assemble(parts: Sequence[RawPart]) -> Assembled | None:
-    """Roof faces, footprint and solids of a building.
-
-    Parameters
-    ----------
-    parts : sequence of RawPart
-        All its geometries.
-
-    Returns
-    -------
-    Assembled or None
-        None without any face.
-    """
+    """Roof faces, footprint and solids of a building from all its geometries; None without any face."""
     parts = [part for part in parts if part.faces and len(part.xyz)]
     if not parts:
         return None
     soup = _Soup(parts)
     kinds, polygons = _kinds(soup)
     roofs = np.array(sorted(polygons), np.int64)
-    told = np.array([face.plane for face in soup.faces], np.int64)
+    planes = np.array([face.plane for face in soup.faces], np.int64)
     surfaces: list[RoofSurface] = []
     numbers = np.full(len(soup.faces), -1)
     if len(roofs):
-        regions = _regions(soup, roofs, told[roofs])
+        regions = _regions(soup, roofs, planes[roofs])
         for number, region in enumerate(regions):
-            plane_id = int(told[region[0]]) if told[region[0]] >= 0 else number
+            plane_id = int(planes[region[0]]) if planes[region[0]] >= 0 else number
             numbers[region] = plane_id
             surfaces.extend(_surfaces(soup, region, [polygons[int(face)] for face in region], plane_id))
     footprint = _united([surface.polygon for surface in surfaces])
@@ -184,10 +175,10 @@ def _united(polygons: Sequence[Polygon | MultiPolygon]) -> Polygon | MultiPolygo
 
 
 def _kinds(soup: _Soup) -> tuple[list[FaceKind], dict[int, Polygon | MultiPolygon]]:
-    """What every face is, and the plan of the roof faces that have area there, by face.
+    """The kind of every face, and the plan of the roof faces that have an area in plan, by face.
 
-    Faces that no name makes roofs, and named ones that look down, as the undersides of eaves do in some files, are
-    roofs only where no other roof is above them.
+    Roof faces without a name, and named ones that look down (undersides of eaves in some files), are roofs only if no
+    other roof is above them.
     """
     unnamed = [face.kind is None for face in soup.faces]
     by_normal = _kinds_by_normal(soup) if any(unnamed) else []
@@ -207,10 +198,10 @@ def _kinds(soup: _Soup) -> tuple[list[FaceKind], dict[int, Polygon | MultiPolygo
 
 
 def _kinds_by_normal(soup: _Soup) -> list[FaceKind]:
-    """What the normals say; those of a part that faces inward as a whole are turned round.
+    """The kinds of faces by their normals; those of a part that faces inward as a whole are turned round.
 
-    The sum of (area in plan) times (height) over the faces is the volume of a closed part, and positive too for an open
-    one whose faces look outward.
+    The sum of (area in plan) times (height) over the faces is the volume of a closed part. It is also positive for an
+    open one whose faces look outward.
     """
     lengths = np.linalg.norm(soup.vectors, axis=1)
     counts = np.diff(soup.ring_offsets[soup.face_rings])
@@ -249,7 +240,7 @@ def _covered(soup: _Soup, roofs: list[tuple[int, Polygon | MultiPolygon]], doubt
 
 
 def _height(soup: _Soup, face: int, x: float, y: float) -> float:
-    """Of the plane of a face that is not vertical, at a place in plan."""
+    """Height of the plane of a face that is not vertical at a place in plan."""
     normal = soup.vectors[face]
     corners = soup.local[soup.corners_of(face)].mean(axis=0)
     return float(corners[2] - (normal[0] * (x - corners[0]) + normal[1] * (y - corners[1])) / normal[2])
@@ -258,11 +249,11 @@ def _height(soup: _Soup, face: int, x: float, y: float) -> float:
 # ----------------------------------------------------------------------------------------------------------- planes
 
 
-def _regions(soup: _Soup, roofs: IntArray, told: IntArray) -> list[IntArray]:
+def _regions(soup: _Soup, roofs: IntArray, planes: IntArray) -> list[IntArray]:
     """Roof faces gathered by plane, each sorted, in the order of their first faces."""
     corners, ring_offsets, face_rings = soup.subset(roofs)
     vectors = soup.vectors[roofs]
-    labels = coplanar_regions(soup.local, corners, ring_offsets, face_rings, vectors, told, DISTANCE_M, ANGLE_DEG)
+    labels = coplanar_regions(soup.local, corners, ring_offsets, face_rings, vectors, planes, DISTANCE_M, ANGLE_DEG)
     regions: dict[int, list[int]] = {}
     for face, label in zip(roofs.tolist(), labels.tolist(), strict=True):
         regions.setdefault(label, []).append(face)
@@ -296,7 +287,7 @@ def _fitted(soup: _Soup, faces: Sequence[int] | IntArray) -> Coefficients:
 def _surfaces(
     soup: _Soup, region: IntArray, plans: Sequence[Polygon | MultiPolygon], plane_id: int
 ) -> list[RoofSurface]:
-    """The roof faces of one plane: pieces that do not touch are one each. About the origin still."""
+    """The roof faces of one plane, one per connected piece, relative to the origin."""
     union = _united(plans)
     pieces = [union] if isinstance(union, Polygon) else list(union.geoms)
     coefficients = _fitted(soup, region)

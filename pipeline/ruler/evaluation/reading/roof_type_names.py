@@ -1,4 +1,4 @@
-"""The roof type that a file says a building has."""
+"""Roof types by the names and codes of files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from pipeline.model import RoofType
 
 ATTRIBUTES = ("roof_type", "rf_roof_type", "b3_dak_type", "roofType", "roof:shape")
-"""Attributes that tell a roof type, the first one counts: this program, roofer, 3DBAG, CityGML, OpenStreetMap."""
+"""Attributes with a roof type, the first one counts: this program, roofer, 3DBAG, CityGML, OpenStreetMap."""
 
 ROOF_TYPE_OF_WORD: Mapping[str, RoofType] = {
     **{kind.value: kind for kind in RoofType},
@@ -31,11 +31,11 @@ ROOF_TYPE_OF_WORD: Mapping[str, RoofType] = {
     "mansard": RoofType.COMBINATION,
     "gambrel": RoofType.COMBINATION,
 }
-"""What the values mean: words, and codes of CityGML's list of roof types. `slanted` says too little to be one."""
+"""Meanings of the values: words, and codes of the list of roof types of CityGML. `slanted` is too vague."""
 
 
-def told_roof_type(attributes: Mapping[str, Any]) -> RoofType:
-    """The type that the attributes tell; unknown where they tell none, or one that has no like here."""
+def named_roof_type(attributes: Mapping[str, Any]) -> RoofType:
+    """The roof type in the attributes; unknown if there is none, or none that exists here."""
     for name in ATTRIBUTES:
         value = attributes.get(name)
         if value is not None:
