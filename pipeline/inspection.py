@@ -1,4 +1,4 @@
-"""What can be known of a tile without reconstructing it: its facts, its classes and returns, rough estimates."""
+"""Facts about a tile without reconstruction: header, classes, returns, rough estimates."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from pipeline.settings import RunSettings
 RAISED_M = 2.5
 """Cells this far above the lowest surroundings count as raised."""
 SURROUNDINGS_M = 40.0
-"""Side of the square in which the lowest surroundings are sought: wider than most buildings."""
+"""Side of the square of the lowest surroundings: wider than most buildings."""
 MIN_AREA_M2 = 10.0
 """Smaller groups of raised cells are not counted."""
 MAX_CELLS = 4_000_000
 """Bounds the raster's memory: a larger tile gets coarser cells."""
 _CORES = 2
-"""For which the time is estimated."""
+"""Cores of the estimated time."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Inspection:
-    """What is known of a tile after one streamed read."""
+    """Facts about a tile after one streamed read."""
 
     info: SourceInfo
-    """What the header says."""
+    """Facts of the header."""
     warnings: tuple[str, ...]
     """What is odd but usable, of the header and of the points."""
     used_points: int
     """Points that a run would use."""
     dropped: dict[str, int]
-    """Points that it would leave out, by cause."""
+    """Points that a run would leave out, by cause."""
     classes: dict[int, int]
     """Used points by ASPRS class."""
     returns: dict[int, int]
@@ -48,9 +48,9 @@ class Inspection:
     occupied_area_m2: float
     """Area of the raster cells that hold a point."""
     density_per_m2: float
-    """Used points a square metre of that area: unlike the header's figure not thinned by gaps."""
+    """Used points per square metre of that area; gaps do not lower it, unlike the figure of the header."""
     raised_objects: int
-    """Groups of raised cells: buildings, and also trees; touching houses count as one."""
+    """Groups of raised cells: buildings and trees; touching houses count as one."""
     cell_m: float
     """Side of the raster's cells."""
     estimated_seconds: float
@@ -94,21 +94,21 @@ class Inspection:
 
 
 def inspect(path: str | Path, options: ReadOptions | None, on_progress: Callable[[int, int], None]) -> Inspection:
-    """Read a tile once, streamed, and tell what it holds.
+    """Read a tile once, streamed, and describe its content.
 
     Parameters
     ----------
     path : str or Path
         The file.
     options : ReadOptions, optional
-        What the user says about it.
+        Options of the user for the file.
     on_progress : callable
         Called with points read and points promised.
 
     Raises
     ------
     InputError
-        As `open_source` and the reading of its points.
+        The file or its points cannot be read.
     """
     source = open_source(path, options)
     raster = _Raster(source.info)
@@ -124,10 +124,10 @@ def inspect(path: str | Path, options: ReadOptions | None, on_progress: Callable
         highest = max(highest, float(cloud.xyz[:, 2].max()))
         on_progress(used, source.info.point_count)
     plan = make_plan([str(path)], options or ReadOptions(), RunSettings())
-    return _told(source, raster, classes, returns, used, (lowest, highest), plan)
+    return _inspection(source, raster, classes, returns, used, (lowest, highest), plan)
 
 
-def _told(
+def _inspection(
     source: Source,
     raster: _Raster,
     classes: np.ndarray[tuple[int], np.dtype[np.int64]],

@@ -1,6 +1,6 @@
-"""A map of buildings by class, of a street or of a whole country, gathered part by part within bounds of memory.
+"""A map of buildings by class, from a street to a whole country, filled part by part in bounded memory.
 
-What is ordinary lies beneath; what is not is drawn over it, one by one, so that a map of a city still shows it.
+Ordinary buildings lie beneath; the others are drawn over them one by one, so a map of a city still shows them.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ from pipeline.model import FloatArray
 from pipeline.report.maps import Entry, Layer, Map, draw_map
 
 MAX_DRAWN, MAX_ORDINARY = 30_000, 20_000
-"""Footprints that are drawn. Of more that are not ordinary the largest are; where more are ordinary, the cells that
-hold some of them are drawn in their place."""
+"""Most footprints that are drawn: the largest that are not ordinary; if more are ordinary, the cells that contain them."""
 CELLS_ACROSS = 300
 """Cells along the longer side of the map."""
 
 ROWS = pa.schema([("class", pa.string()), ("geometry", pa.binary()), ("size", pa.float64()), ("id", pa.string())])
-"""What a part of the map is: class, footprint as WKB, what the rows are ordered by, and the row's name."""
+"""Columns of a part of the map: class, footprint as WKB, size by which the rows are ordered, name of the row."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,9 +32,9 @@ class MapClass:
     """One class."""
 
     name: str
-    """As the rows tell it."""
+    """Its name in the rows."""
     label: str
-    """As the legend tells it."""
+    """Its label in the legend."""
     colour: str
     """As #rrggbb."""
     hatched: bool = False
@@ -43,7 +42,7 @@ class MapClass:
 
 
 class ClassMap:
-    """Gathers what a map shows."""
+    """A map by classes: `others` are drawn over `ordinary`, the most important one last."""
 
     def __init__(self, title: str, ordinary: MapClass, others: Sequence[MapClass]) -> None:
         self._title, self._ordinary, self._others = title, ordinary, tuple(others)
@@ -55,10 +54,10 @@ class ClassMap:
         self.ordinary = 0
         """Ordinary rows with a geometry."""
         self.left_out = 0
-        """Rows that are too many and too small to be drawn."""
+        """Rows that are left out because others are larger."""
 
     def add(self, rows: pa.Table) -> None:
-        """Take in a part, with the columns of `ROWS`."""
+        """Add a part with the columns of `ROWS`."""
         is_ordinary = pc.equal(rows["class"], self._ordinary.name)
         drawn = rows.filter(pc.invert(is_ordinary))
         self._count.update(drawn["class"].to_pylist())
@@ -77,14 +76,14 @@ class ClassMap:
             self._beneath = []
 
     def _largest(self) -> pa.Table:
-        """The largest rows; of equal ones those that come first by name."""
+        """The largest rows; the first name wins among equal ones."""
         table = pa.concat_tables(self._drawn)
         order = pc.sort_indices(table, sort_keys=[("size", "descending"), ("id", "ascending")])
         self.left_out += max(0, len(table) - MAX_DRAWN)
         return table.take(order[:MAX_DRAWN])
 
     def map(self, unit_m: float) -> Map | None:
-        """The map; None where nothing has geometry."""
+        """The map, given metres per unit of the geometries; None without geometry."""
         layers = []
         if self.ordinary:
             layers.append(_layer(self._ordinary, self._cells_or_footprints(), self.ordinary, unit_m))
@@ -98,7 +97,7 @@ class ClassMap:
         return draw_map(self._title, layers)
 
     def _cells_or_footprints(self) -> Any:
-        """The ordinary footprints, or the cells that hold some."""
+        """The ordinary footprints, or the cells that contain them."""
         if self.ordinary <= MAX_ORDINARY:
             return np.concatenate(self._beneath)
         middles = np.concatenate(self._middles)

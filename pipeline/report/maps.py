@@ -1,7 +1,7 @@
 """Maps of buildings: layers of polygons drawn to a picture, with a legend and a scale bar as data.
 
-The pictures hold no text: legend and scale bar belong to the page. Faults are drawn last, and small things get an edge
-in their own colour, so that a map of a whole city still shows every fault.
+The pictures have no text: legend and scale bar belong to the page. Faults are drawn last, and small polygons get an
+edge in their own colour, so a map of a whole city still shows every fault.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from pipeline.model import FloatArray
 from pipeline.report.pictures import blank, paths_of, png_of
 
 WIDTH_PX = 1500
-"""Of a map that takes the width of a page; the height follows the extent."""
+"""Width of a map over the full page; the height follows the extent."""
 HALF_WIDTH_PX = 1000
-"""Of a map of few buildings."""
+"""Width of a map of few buildings."""
 _MIN_HEIGHT, _MAX_HEIGHT = 0.35, 1.25
 _MARGIN = 0.02
 _SMALL_PX = 14.0
@@ -30,9 +30,9 @@ _HALF_SHARE = 0.04
 _EDGE = "#ffffffa0"
 
 GOOD, FAIR, BAD, MISSING, UNJUDGED = "#3f86b5", "#e3b23c", "#cf4f2a", "#8d4fa8", "#9aa3ab"
-"""Blue, amber, vermilion, purple, grey: told apart by everybody, seen on white and on near black."""
+"""Blue, amber, vermilion, purple, grey: distinct for all kinds of colour vision, on white and on near black."""
 NO_FIGURE = "-"
-"""Shown in place of a figure that is not available."""
+"""Shown for a missing figure."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,13 +40,13 @@ class Entry:
     """A line of a legend."""
 
     label: str
-    """What it is."""
+    """Label."""
     colour: str
     """As #rrggbb."""
     count: int
-    """How many there are."""
+    """Number."""
     hatched: bool = False
-    """True where it is hatched."""
+    """Whether it is hatched."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,17 +54,17 @@ class Map:
     """A map with its words."""
 
     title: str
-    """What is shown."""
+    """Title."""
     png: bytes
     """The picture."""
     width_px: int
-    """Of it."""
+    """Its width."""
     height_px: int
-    """Of it."""
+    """Its height."""
     legend: tuple[Entry, ...]
-    """What its colours mean; only what occurs."""
+    """Meanings of the colours that occur."""
     is_half: bool
-    """True where half the width of a page is enough."""
+    """Whether half the width of a page is enough."""
     scale_label: str
     """Length of the scale bar."""
     scale_share: float
@@ -72,7 +72,7 @@ class Map:
 
     @property
     def description(self) -> str:
-        """For those who cannot see it."""
+        """Text alternative."""
         return f"Map: {self.title}. " + ", ".join(f"{entry.label}: {entry.count:,}" for entry in self.legend) + "."
 
 
@@ -83,13 +83,13 @@ class Layer:
     entry: Entry
     """Its line of the legend."""
     geometries: Sequence[Any]
-    """What is drawn."""
+    """Polygons."""
     filled: bool = True
     """False: outlines with a hatch."""
 
 
 def draw_map(title: str, layers: Sequence[Layer]) -> Map | None:
-    """The layers in their order, the later ones over the earlier; None where there is nothing to draw."""
+    """A map of the layers, later ones over earlier ones; None if they are empty."""
     drawn = [layer for layer in layers if layer.geometries]
     everything = [geometry for layer in drawn for geometry in layer.geometries if geometry is not None]
     if not everything:
@@ -134,7 +134,7 @@ def _draw_layer(axes: Axes, layer: Layer, *, is_small: bool, zorder: int) -> Non
 
 
 def _extent(bounds: FloatArray) -> tuple[float, float, float, float]:
-    """Bounds with a margin, and no flatter or taller than a page takes."""
+    """Bounds with a margin, with an aspect that fits a page."""
     west, south, east, north = (float(value) for value in bounds)
     margin = _MARGIN * max(east - west, north - south, 1.0)
     width, height = east - west + 2.0 * margin, north - south + 2.0 * margin
@@ -144,6 +144,6 @@ def _extent(bounds: FloatArray) -> tuple[float, float, float, float]:
 
 
 def _round_length(wanted_m: float) -> float:
-    """The largest of 1, 2, 5, 10 ... that is no longer."""
+    """The largest of 1, 2, 5, 10 ... up to the wanted length."""
     step = 10.0 ** math.floor(math.log10(wanted_m))
     return float(max(step * factor for factor in (1.0, 2.0, 5.0) if step * factor <= wanted_m * (1.0 + 1e-9)))

@@ -1,7 +1,7 @@
 """A shaded bird's-eye view of closed solids in parallel projection, drawn by matplotlib's 2D paths.
 
-Solids are closed and outward oriented, so faces that look away are left out; the others are painted from far to near,
-building by building. Faces with holes stay one path each, no triangulation is needed.
+Solids are closed and oriented outward: faces that look away are left out, the others are painted from far to near,
+building by building. Faces with holes are one path each, without triangulation.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from pipeline.model import FloatArray
 Colour = tuple[float, float, float]
 
 MAP_SUN = (315.0, 50.0)
-"""Azimuth and altitude in degrees of the sun over a map: in the north-west, as cartographers have it."""
+"""Azimuth and altitude in degrees of the sun over a map: in the north-west, by the convention of cartography."""
 VIEW_SUN = (245.0, 48.0)
-"""The sun over the bird's-eye view: beside the eye, so that the walls that one sees are lit."""
+"""The sun over the bird's-eye view: beside the eye, so visible walls are lit."""
 _AMBIENT = 0.5
 _SHADOW = "#c9cdc4"
 _EDGE_SHARE = 0.72
@@ -42,7 +42,7 @@ class ViewedFace:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
-    """Where one looks from."""
+    """Direction of a view."""
 
     azimuth_deg: float = 200.0
     """Direction from the scene to the eye, clockwise from north."""
@@ -83,7 +83,7 @@ def face_normal(rings: Sequence[FloatArray]) -> FloatArray:
 
 
 def draw_view(axes: Axes, buildings: Sequence[Sequence[ViewedFace]], view: View, *, shadows: bool = True) -> None:
-    """Draw buildings."""
+    """Draw buildings, each a sequence of faces; the axes become a frameless picture of equal scale."""
     right, up, towards = _basis(view)
     centres = [np.mean(np.vstack([face.rings[0] for face in faces]), axis=0) for faces in buildings]
     order = sorted(range(len(buildings)), key=lambda i: (float(centres[i][:2] @ towards[:2]), i))
@@ -112,7 +112,7 @@ def draw_view(axes: Axes, buildings: Sequence[Sequence[ViewedFace]], view: View,
 
 
 def projected(xyz: FloatArray, view: View) -> FloatArray:
-    """Where points (n, 3) are on the screen, (n, 2) metres to the right and up: as `draw_view` draws them."""
+    """Screen coordinates (n, 2), metres to the right and up, of points (n, 3), as in `draw_view`."""
     right, up, _ = _basis(view)
     return xyz @ np.stack([right, up]).T
 
@@ -128,7 +128,7 @@ def _basis(view: View) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _shadow(faces: Sequence[ViewedFace]) -> list[list[FloatArray]]:
-    """The faces thrown onto the level of the building's lowest point, away from the sun."""
+    """The shadows of the faces on the level of the lowest point of the building."""
     ground = min(float(ring[:, 2].min()) for face in faces for ring in face.rings)
     azimuth, altitude = (math.radians(angle) for angle in VIEW_SUN)
     slip = np.array([-math.sin(azimuth), -math.cos(azimuth)]) / math.tan(altitude)

@@ -18,11 +18,11 @@ from PIL import Image
 from pipeline.model import FloatArray
 
 COLOURS = 128
-"""Of a picture: with so few a PNG is a third as large."""
+"""Colours of a picture: so few make a PNG a third as large."""
 
 
 def blank(width_px: int, height_px: int) -> tuple[Figure, Axes]:
-    """A figure of a size, 100 pixels an inch, and axes that fill it."""
+    """A figure with a size in pixels, 100 per inch, and axes that fill it."""
     figure = Figure(figsize=(width_px / 100.0, height_px / 100.0), dpi=100, facecolor="none")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
@@ -30,7 +30,7 @@ def blank(width_px: int, height_px: int) -> tuple[Figure, Axes]:
 
 
 def png_of(figure: Figure) -> bytes:
-    """The figure as a PNG with a transparent background, so that it stands on a light page and on a dark one."""
+    """The figure as a PNG with a transparent background, for light and dark pages."""
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     reduced = Image.fromarray(np.asarray(canvas.buffer_rgba())).quantize(COLOURS, Image.Quantize.FASTOCTREE)
@@ -40,12 +40,12 @@ def png_of(figure: Figure) -> bytes:
 
 
 def data_uri(png: bytes) -> str:
-    """PNG bytes as an address that holds them."""
+    """PNG bytes as a data URI."""
     return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 
 def paths_of(geometries: Sequence[Any]) -> list[DrawnPath]:
-    """One path a geometry (polygon or multipolygon, holes stay holes); missing and empty ones get an empty path."""
+    """One path per geometry (polygon or multipolygon, with holes); missing and empty ones get an empty path."""
     return [_path(geometry) for geometry in geometries]
 
 

@@ -39,13 +39,13 @@ ROOF_COLOURS = {
 WALL_COLOUR = "#f1ece1"
 FAILED_COLOUR = "#c22032"
 VIEW_SIDE_M = 180.0
-"""The bird's-eye view shows a square of this side, the one with the most roof faces."""
+"""Side of the square in the bird's-eye view: the one with the most roof faces."""
 WHOLE_BELOW_M = 260.0
-"""It shows the whole run where that is no wider and no longer than this."""
+"""Up to this width and length, the view shows the whole run."""
 Window = tuple[float, float, float, float]
 """West, south, east, north."""
 NO_WINDOW: Window = (0.0, 0.0, 0.0, 0.0)
-"""Of a run without roof faces."""
+"""The window of a run without roof faces."""
 _SURFACE_KINDS = {"RoofSurface", "WallSurface"}
 
 
@@ -70,14 +70,14 @@ def render_run(
     truth : str or Path, optional
         A local run directory of true models, whose footprints are drawn as dashed lines.
     filesystem : pyarrow.fs.FileSystem, optional
-        Where the run lies; by default as `run_dir` says.
+        File system of the run; by default that of `run_dir`.
     dpi : int
-        Pixels an inch of a picture of 20 by 10.5 inches.
+        Pixels per inch of a picture of 20 by 10.5 inches.
 
     Raises
     ------
     RunError
-        The directory holds no run, or the picture cannot be written.
+        The directory has no run, or the picture cannot be written.
     """
     filesystem, run = arrow_at(run_dir) if filesystem is None else (filesystem, str(run_dir))
     buildings = read_table(run, "buildings", filesystem)
@@ -109,21 +109,21 @@ def render_run(
 
 
 def _geometries(table: pa.Table) -> Any:
-    """The geometries of a table as an array, None where there are none."""
+    """The geometries of a table as an array, with None for null."""
     return shapely.from_wkb(np.array(table["geometry"].to_pylist(), dtype=object))
 
 
 def _units(run_dir: str, filesystem: pafs.FileSystem) -> tuple[float, float]:
-    """Metres in a horizontal and in a vertical unit; 1 where the run has no manifest, as truth has none."""
+    """Metres per horizontal and per vertical unit; 1 for simulated truth, which has no manifest."""
     held = filesystem.get_file_info(f"{run_dir.rstrip('/')}/{NAME}")
     crs = {} if held.type == pafs.FileType.NotFound else read_manifest(run_dir, filesystem).crs or {}
     return float(crs.get("horizontal_unit_m", 1.0)), float(crs.get("vertical_unit_m", 1.0))
 
 
 def _window(planes: pa.Table, unit_m: float) -> tuple[Window, bool]:
-    """What the bird's-eye view shows, in CRS units, and whether that is less than the whole run.
+    """The window of the bird's-eye view in CRS units, and whether it is smaller than the whole run.
 
-    The square with the most roof faces is found on a lattice of half its side; the first of equals is taken.
+    The square with the most roof faces is found on a lattice of half its side; the first of equal ones wins.
     """
     found = _geometries(planes)
     present = found[~shapely.is_missing(found)]
@@ -149,7 +149,7 @@ def _rings(polygon: shapely.Polygon) -> list[Any]:
 
 
 def _draw_map(axes: Axes, buildings: pa.Table, planes: pa.Table, rejected: pa.Table, truth: Any) -> None:
-    """Roof faces, outlines, what failed and what was rejected."""
+    """Roof faces, outlines, failed candidates and rejected objects."""
     kinds = dict(zip(buildings["building_id"].to_pylist(), buildings["roof_type"].to_pylist(), strict=True))
     paths, fills = [], []
     rows = zip(
@@ -252,7 +252,7 @@ def _solids(
 
 
 def _viewed_faces(feature: dict[str, Any], xyz: Any, roof_colour: str) -> list[ViewedFace]:
-    """Roofs and walls of a CityJSONFeature, of each part at its finest level of detail."""
+    """Roofs and walls of a CityJSONFeature, each part at its finest level of detail."""
     faces = []
     for entry in feature["CityObjects"].values():
         for solid in sorted(entry.get("geometry", ()), key=lambda geometry: str(geometry["lod"]))[-1:]:
@@ -270,15 +270,15 @@ def _title(statistics: dict[str, Any], buildings: pa.Table) -> str:
     statuses, rmse = statistics["statuses"], statistics["quantiles"]["rmse_m"]
     methods = ", ".join(sorted(set(buildings["method"].to_pylist()))) or "no method"
     noun = "candidate" if statistics["candidates"] == 1 else "candidates"
-    told = f"{statistics['candidates']} {noun} by {methods}: " + ", ".join(f"{n} {s}" for s, n in statuses.items())
+    title = f"{statistics['candidates']} {noun} by {methods}: " + ", ".join(f"{n} {s}" for s, n in statuses.items())
     if rmse["p50"] is None:
-        return told
+        return title
     coverage = statistics["quantiles"]["coverage"]["p50"]
-    return f"{told}; rmse {rmse['p50']:.2f} m (median), {rmse['p90']:.2f} m (p90), coverage {coverage:.1%}"
+    return f"{title}; rmse {rmse['p50']:.2f} m (median), {rmse['p90']:.2f} m (p90), coverage {coverage:.1%}"
 
 
 def _legend(statistics: dict[str, Any], with_truth: bool) -> list[Any]:
-    """An entry for all that is drawn, with counts."""
+    """Legend entries with counts."""
     entries: list[Any] = [
         Patch(facecolor=ROOF_COLOURS[RoofType(kind)], edgecolor="#55504a", label=f"{kind} {count}")
         for kind, count in statistics["roof_types"].items()

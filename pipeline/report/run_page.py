@@ -25,10 +25,10 @@ from pipeline.report.statistics import QUANTILES, run_statistics
 from pipeline.runtime.manifest import NAME, PAGE, RunManifest, RunStatus, read_manifest
 
 LISTED = 500
-"""Buildings without a roof of their own that the page lists one by one: those without any model first, then the
+"""Largest number of buildings without a roof model in the list of the page: those without any model first, then the
 largest. All of them are in the table `buildings`."""
 INPUTS, PROCESSES = 200, 20
-"""Inputs and processes that the page lists; `run.json` has all."""
+"""Largest numbers of inputs and processes on the page; `run.json` has all."""
 _EXAMPLES = 3
 _DIGITS = 12
 _FAILED_TILE = "failed tile"
@@ -41,7 +41,7 @@ _FIGURES = {
     "rmse_m": "RMSE of the points, m",
     "p95_m": "95 % of the points within, m",
     "coverage": "share of points with a roof",
-    "density_per_m2": "points a m²",
+    "density_per_m2": "points per m²",
     "height_m": "height, m",
 }
 _STATUSES = {
@@ -52,7 +52,7 @@ _STATUSES = {
 
 
 def write_run_page(run_dir: str) -> str:
-    """Write `run.html` into a run directory.
+    """Write `run.html` with its images, styles and scripts into a run directory, a path or URL; returns its place.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def run_page(run_dir: str) -> str:
     """
     manifest = read_manifest(run_dir)
     if manifest.status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
-        raise RunError(f"{run_dir} is {manifest.status.value}: a report tells of a run that is over, run it to its end")
+        raise RunError(f"{run_dir} is {manifest.status.value}: a report needs a run that ended, run it to its end")
     seen = _Seen({one.building_id for one in manifest.slowest})
     filesystem, path = arrow_at(run_dir)
     dataset = table_dataset(path, "buildings", filesystem)
@@ -113,7 +113,7 @@ def run_page(run_dir: str) -> str:
 
 
 class _Seen:
-    """What the page takes from the rows of all buildings, part by part."""
+    """The rows of all buildings for the page, part by part."""
 
     def __init__(self, slow: set[str]) -> None:
         label, colour, _ = _STATUSES[Status.OK]
@@ -135,7 +135,7 @@ class _Seen:
         self._not_ok: list[tuple[bool, float, str, Mapping[str, Any]]] = []
 
     def add(self, rows: pa.Table) -> None:
-        """Take in a part."""
+        """Add a part."""
         area = pc.fill_null(rows["footprint_area_m2"], 0.0)
         columns = [rows["status"], rows["geometry"], area, rows["building_id"]]
         self.map.add(pa.table(columns, names=ROWS.names).cast(ROWS))
@@ -154,11 +154,11 @@ class _Seen:
         return heapq.nsmallest(LISTED, self._not_ok, key=lambda one: (not one[0], -one[1], one[2]))
 
     def listed(self) -> list[dict[str, Any]]:
-        """The rows of buildings without a roof of their own that are told one by one."""
-        return [_told(row) for *_, row in self._first()]
+        """The listed rows of buildings without a roof model."""
+        return [_line(row) for *_, row in self._first()]
 
 
-def _told(row: Mapping[str, Any]) -> dict[str, Any]:
+def _line(row: Mapping[str, Any]) -> dict[str, Any]:
     """A building as a line of a table."""
     place = None if row["geometry"] is None else shapely.point_on_surface(shapely.from_wkb(row["geometry"]))
     return {
@@ -177,9 +177,9 @@ def _told(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _slow(building_id: str, seconds: float, row: Mapping[str, Any] | None) -> dict[str, Any]:
-    """A slow building; one whose tile failed has no row."""
-    told = {"id": building_id} if row is None else _told(row)
-    return told | {"seconds": seconds, "is_there": row is not None}
+    """A slow building; one in a failed tile has no row."""
+    known = {"id": building_id} if row is None else _line(row)
+    return known | {"seconds": seconds, "is_there": row is not None}
 
 
 def _failed_tiles(manifest: RunManifest) -> pa.Table:
@@ -192,12 +192,12 @@ def _failed_tiles(manifest: RunManifest) -> pa.Table:
 
 
 def _unit_m(manifest: RunManifest) -> float:
-    """Metres a unit of the geometries."""
+    """Metres per unit of the geometries."""
     return float((manifest.crs or {}).get("horizontal_unit_m") or 1.0)
 
 
 def _subject(run_dir: str, manifest: RunManifest) -> str:
-    """What was run, in a sentence."""
+    """The subject, in a sentence."""
     took = "" if manifest.finished_at is None else f", in {_length(manifest.finished_at - manifest.started_at)}"
     points = manifest.counts.get("points", 0)
     return (
@@ -219,13 +219,13 @@ def _length(time: dt.timedelta) -> str:
 
 
 def _cards(manifest: RunManifest, statistics: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """The figures that stand on top: number, name, colour, meaning."""
+    """The main figures: number, name, colour, meaning."""
     cards = []
     for status, (name, colour, meaning) in _STATUSES.items():
         share = statistics["shares"][status.value]
-        told = meaning if share is None else f"{share:.1%} of all; {meaning}"
-        cards.append((f"{statistics['statuses'][status.value]:,}", name, colour, told))
-    cards.append((f"{statistics['rejected']:,}", "rejected", _REJECTED, "objects that were judged to be no buildings"))
+        text = meaning if share is None else f"{share:.1%} of all; {meaning}"
+        cards.append((f"{statistics['statuses'][status.value]:,}", name, colour, text))
+    cards.append((f"{statistics['rejected']:,}", "rejected", _REJECTED, "objects that were rejected as buildings"))
     reused = manifest.counts.get("reused", 0)
     if reused:
         cards.append((f"{reused:,}", "taken over", _REUSED, "models of an earlier run whose input did not change"))
@@ -233,7 +233,7 @@ def _cards(manifest: RunManifest, statistics: Mapping[str, Any]) -> list[tuple[s
 
 
 def _meaning(reason: str) -> str:
-    """What a reason means; of one that a later version wrote nothing is known."""
+    """The meaning of a reason; empty for one of a later version."""
     return REASONS[Reason(reason)] if reason in set(Reason) else ""
 
 

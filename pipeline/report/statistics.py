@@ -15,7 +15,7 @@ from pipeline.io import arrow_at
 from pipeline.model import RoofType, Status
 
 QUANTILES = (("p10", 0.1), ("p50", 0.5), ("p90", 0.9), ("max", 1.0))
-"""What is told of a figure's distribution over the buildings."""
+"""Quantiles of a figure over the buildings."""
 _FIGURES = ("rmse_m", "p95_m", "coverage", "density_per_m2", "height_m")
 _SUMS = ("footprint_area_m2", "roof_area_m2", "volume_m3", "n_planes", "n_points")
 _COLUMNS = ("status", "reason", "roof_type", "lod", "validity_codes", "touches_data_edge", *_FIGURES, *_SUMS)
@@ -35,7 +35,7 @@ def run_statistics(run_dir: str, filesystem: pafs.FileSystem | None = None) -> d
     Raises
     ------
     RunError
-        The directory holds no run.
+        The directory has no run.
     """
     if filesystem is None:
         filesystem, run_dir = arrow_at(run_dir)
@@ -81,15 +81,15 @@ def _known_order(counts: Counter[str], order: Sequence[str]) -> dict[str, int]:
 
 
 def _total(column: pa.ChunkedArray) -> float:
-    """Sum of what is known, rounded to thousandths; whole numbers stay whole."""
+    """Sum of the known values, rounded to thousandths; whole numbers stay whole."""
     values = [value for value in column.to_pylist() if value is not None]
     return sum(values) if pa.types.is_integer(column.type) else round(float(np.sum(values)), 3)
 
 
 def _quantiles(column: pa.ChunkedArray) -> dict[str, float | int | None]:
-    """Quantiles of what is known, and how many that are."""
+    """Quantiles and number of the known values."""
     values = column.drop_null().to_numpy()
-    told: dict[str, float | int | None] = {"n": len(values)}
+    quantiles: dict[str, float | int | None] = {"n": len(values)}
     for name, share in QUANTILES:
-        told[name] = round(float(np.quantile(values, share)), 3) if len(values) else None
-    return told
+        quantiles[name] = round(float(np.quantile(values, share)), 3) if len(values) else None
+    return quantiles

@@ -12,7 +12,7 @@ def statistics_tables(statistics: Mapping[str, Any]) -> list[Table]:
     """The figures of `run_statistics` as rich tables for a terminal."""
     tables = [_outcome_table(statistics), _count_table("Roof types", "type", statistics["roof_types"])]
     if statistics["rejected_reasons"]:
-        tables.append(_count_table("Judged to be no building", "reason", statistics["rejected_reasons"]))
+        tables.append(_count_table("Rejected objects", "reason", statistics["rejected_reasons"]))
     tables.append(_quantile_table(statistics))
     return tables
 
@@ -27,8 +27,8 @@ def _outcome_table(statistics: Mapping[str, Any]) -> Table:
     for status, count in statistics["statuses"].items():
         share = statistics["shares"][status]
         table.add_row(status, "", str(count), "" if share is None else f"{share:.1%}")
-        for reason, told in statistics["reasons"].get(status, {}).items():
-            table.add_row("", reason, str(told), f"{told / statistics['candidates']:.1%}")
+        for reason, number in statistics["reasons"].get(status, {}).items():
+            table.add_row("", reason, str(number), f"{number / statistics['candidates']:.1%}")
     table.add_section()
     table.add_row("all", "", str(statistics["candidates"]), "")
     return table
@@ -48,11 +48,13 @@ def _quantile_table(statistics: Mapping[str, Any]) -> Table:
     """Quantiles of the figures over the buildings."""
     table = Table(title="Over the buildings", title_justify="left")
     table.add_column("figure")
-    names = list(dict.fromkeys(name for told in statistics["quantiles"].values() for name in told if name != "n"))
+    names = list(
+        dict.fromkeys(name for quantiles in statistics["quantiles"].values() for name in quantiles if name != "n")
+    )
     for name in names:
         table.add_column(name, justify="right")
     table.add_column("n", justify="right")
-    for figure, told in statistics["quantiles"].items():
-        values = ["" if told[name] is None else f"{told[name]:.3f}" for name in names]
-        table.add_row(figure, *values, str(told["n"]))
+    for figure, quantiles in statistics["quantiles"].items():
+        values = ["" if quantiles[name] is None else f"{quantiles[name]:.3f}" for name in names]
+        table.add_row(figure, *values, str(quantiles["n"]))
     return table

@@ -8,7 +8,7 @@ import roofs_by_hand as by_hand
 from roofs_by_hand import flat, gable, hip, reference
 
 from pipeline.model import RoofType
-from pipeline.ruler.evaluation.evaluate import evaluate, needs_blocks, tells_types
+from pipeline.ruler.evaluation.evaluate import evaluate, has_roof_types, needs_blocks
 from pipeline.ruler.evaluation.models import ModelSet, RoofModel
 
 TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0)]
@@ -29,16 +29,16 @@ def test_blocks_do_not_depend_on_the_format() -> None:
 
 def test_roof_types_that_no_model_tells_are_not_judged() -> None:
     truth = reference(TRUTH)
-    untold = models([dataclasses.replace(one, roof_type=RoofType.UNKNOWN) for one in TRUTH])
-    assert tells_types(models(TRUTH))
-    assert tells_types(models([]))
-    assert not tells_types(untold)
-    found = evaluate(untold, truth)
+    untyped = models([dataclasses.replace(one, roof_type=RoofType.UNKNOWN) for one in TRUTH])
+    assert has_roof_types(models(TRUTH))
+    assert has_roof_types(models([]))
+    assert not has_roof_types(untyped)
+    found = evaluate(untyped, truth)
     assert not any(measure.name.startswith("roof_types.") for measure in found.measures)
     assert not {"outcomes", "outcomes_by_shape", "confusion"} & found.tables.keys()
     assert found.measure("faces.completeness_10m2").value == 1.0
     assert any("roof type" in note for note in found.notes)
-    one = models([TRUTH[0], *untold.models[1:]])
+    one = models([TRUTH[0], *untyped.models[1:]])
     assert evaluate(one, truth).measure("roof_types.accuracy").value == 1 / 3
 
 

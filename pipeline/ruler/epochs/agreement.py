@@ -1,4 +1,4 @@
-"""Whether two runs can be compared at all, and what makes their comparison less than even."""
+"""Whether two runs can be compared, and warnings about differences between them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipeline.ruler.epochs.epoch import Epoch
 
 
 def check_agreement(old: Epoch, new: Epoch) -> tuple[str, ...]:
-    """What is to be known of two runs that are compared, a sentence each.
+    """Warnings about two runs that are compared, one sentence each.
 
     Raises
     ------
@@ -29,22 +29,22 @@ def check_agreement(old: Epoch, new: Epoch) -> tuple[str, ...]:
     if before.method != after.method:
         warnings.append(f"the methods differ: OLD is of {before.method}, NEW of {after.method}")
     elif before.settings_hash != after.settings_hash:
-        told = _differing(before.settings, after.settings)
-        warnings.append(f"the settings differ: {told or 'see run.json of both'}")
+        differing = _differing(before.settings, after.settings)
+        warnings.append(f"the settings differ: {differing or 'see run.json of both'}")
     if before.engine_version != after.engine_version:
         warnings.append(f"the versions differ: OLD is of {before.engine_version}, NEW of {after.engine_version}")
     given = [manifest.request.get("footprints") is not None for manifest in (before, after)]
     if given[0] != given[1]:
         which, other = ("OLD", "NEW") if given[0] else ("NEW", "OLD")
         warnings.append(
-            f"{which} was modelled in given footprints, {other} was not: outlines differ by what they are drawn from, "
-            f"and {which} holds no building without a footprint"
+            f"{which} was modelled in given footprints, {other} was not: outlines differ by their source, and {which} "
+            "has no building without a footprint"
         )
     return tuple(warnings)
 
 
 def _check_reference(old: Epoch, new: Epoch) -> list[str]:
-    """What is to be known of the reference systems; refuses those that differ."""
+    """Warnings about the reference systems; rejects different ones."""
     first, second = old.reference, new.reference
     fix = "Compare runs of one coordinate reference system: reproject the points of one and run it again"
     for axis, a, b in (
@@ -76,7 +76,7 @@ def _check_reference(old: Epoch, new: Epoch) -> list[str]:
 
 
 def _vertical_part(crs: Any) -> Any | None:
-    """The vertical CRS of a compound one; None where there is none."""
+    """The vertical CRS of a compound one; None without one."""
     if crs.is_bound and crs.source_crs is not None:
         return _vertical_part(crs.source_crs)
     return next((part for part in crs.sub_crs_list if part.is_vertical), None)

@@ -22,19 +22,19 @@ class Coverage:
     """Where a run has data, in metres."""
 
     area: Any
-    """What the inputs, the tiles and the area of interest cover together; None where the run does not tell."""
+    """Common area of the inputs, the tiles and the area of interest; None if run.json does not record it."""
     failed: Any
-    """The tiles that failed; empty where none did."""
+    """The tiles that failed; empty if none did."""
     notes: tuple[str, ...]
-    """What is not known, a sentence each."""
+    """Unknown facts, one sentence each."""
 
     def shrunk(self, edge_m: float) -> Coverage:
-        """Without what is nearer to the end of the data than `edge_m`."""
+        """Without places nearer to the end of the data than `edge_m`."""
         area = None if self.area is None else self.area.buffer(-edge_m, join_style="mitre")
         return dataclasses.replace(self, area=area)
 
     def share(self, footprints: Any) -> FloatArray:
-        """Share of each footprint, (n,), that is covered and not of a failed tile; 1 where nothing is known."""
+        """Share of each footprint, (n,), that is covered and not in a failed tile; 1 if the coverage is unknown."""
         share = np.ones(len(footprints)) if self.area is None else _share(footprints, self.area)
         return share if self.failed.is_empty else np.maximum(share - _share(footprints, self.failed), 0.0)
 
@@ -53,10 +53,10 @@ def _share(footprints: Any, area: Any) -> FloatArray:
 
 
 def coverage_of(manifest: RunManifest, reference: SpatialReference) -> Coverage:
-    """What a manifest tells of where its run has data.
+    """The coverage of a run from its manifest.
 
-    Runs of earlier versions tell neither the lattice nor the bounds of their inputs; what they do not tell does not
-    narrow the coverage, and a note says so.
+    Runs of earlier versions record neither the lattice nor the bounds of their inputs; missing facts do not narrow the
+    coverage, and a note says so.
     """
     notes, area = [], None
     bounds = [entry.bounds_m for entry in manifest.inputs if entry.bounds_m is not None]
@@ -68,9 +68,11 @@ def coverage_of(manifest: RunManifest, reference: SpatialReference) -> Coverage:
         area = tiles if area is None else shapely.intersection(area, tiles)
         failed = shapely.union_all(manifest.squares(sorted(manifest.failed_tiles)))
     if area is None:
-        notes.append("run.json does not tell where its data lie: what is beyond them cannot be told from new or gone")
+        notes.append(
+            "run.json does not record where its data lie: buildings outside cannot be distinguished from new or gone"
+        )
     elif not bounds:
-        notes.append("run.json does not tell the bounds of its inputs: coverage is that of whole tiles")
+        notes.append("run.json does not record the bounds of its inputs: coverage is that of whole tiles")
     aoi = manifest.request.get("aoi")
     if aoi is not None and area is not None:
         drawn = _area_of_interest(str(aoi), manifest, reference)
@@ -82,7 +84,7 @@ def coverage_of(manifest: RunManifest, reference: SpatialReference) -> Coverage:
 
 
 def _area_of_interest(path: str, manifest: RunManifest, reference: SpatialReference) -> Any | None:
-    """The polygons of the file in metres; None where it is not there, or is another one by now."""
+    """The polygons of the file in metres; None if it is missing or has changed."""
     known = {entry.path: entry.sha256 for entry in manifest.inputs}
     if not Path(path).is_file() or known.get(path) != sha256_of(path):
         return None

@@ -1,4 +1,4 @@
-"""Two run directories in, the files of a comparison out; the page is of `pipeline.ruler.report.epochs_page`."""
+"""From two run directories to the files of a comparison; `pipeline.ruler.report.epochs_page` writes the page."""
 
 from __future__ import annotations
 
@@ -24,30 +24,31 @@ from pipeline.ruler.epochs.writing import GEOJSON, JSON, PARQUET, GeoJson, geojs
 FORMAT = 1
 """Version of `changes.json`."""
 _LEVEL_SHARE = 0.5
+"""Share of the least height change from which on a shift of all elevations gives a warning."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DiffRequest:
-    """What is to be compared, and how."""
+    """A comparison of two runs."""
 
     old: str
     """The run directory of the earlier epoch: a path or a URL."""
     new: str
-    """That of the later one."""
+    """The run directory of the later epoch."""
     out: str
-    """The folder of the results; made where it is not there."""
+    """The folder of the results, created if missing."""
     settings: DiffSettings = dataclasses.field(default_factory=DiffSettings)
-    """What counts as a change."""
+    """The thresholds of a change."""
     geojson: GeoJson = "changed"
     """Which rows `changes.geojson` holds."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Diff:
-    """What a comparison found."""
+    """The result of a comparison."""
 
     request: DiffRequest
-    """What was asked."""
+    """The request."""
     old: Epoch
     """The earlier epoch."""
     new: Epoch
@@ -55,16 +56,16 @@ class Diff:
     summary: Summary
     """All sums."""
     warnings: tuple[str, ...]
-    """What is to be known of the result, a sentence each."""
+    """Warnings about the result, one sentence each."""
     written: tuple[Path, ...]
     """The files."""
 
     def as_dict(self) -> dict[str, Any]:
-        """What `changes.json` holds: no times and no durations, so that the same runs give the same bytes."""
+        """The content of `changes.json`, without times and durations: the same runs give the same bytes."""
         return {
             "format": FORMAT,
-            "old": _told(self.old),
-            "new": _told(self.new),
+            "old": _facts(self.old),
+            "new": _facts(self.new),
             "settings": dataclasses.asdict(self.request.settings),
             "warnings": list(self.warnings),
             **self.summary.as_dict(),
@@ -72,13 +73,7 @@ class Diff:
 
 
 def refuse_run_as_out(out: str, runs: Sequence[str]) -> None:
-    """Refuse to write among the files of a run.
-
-    Raises
-    ------
-    RunError
-        The place of the results is that of a run.
-    """
+    """Refuse to write into the folder of a run, by a RunError."""
 
     def whole(place: str) -> str:
         return place.rstrip("/") if is_url(place) else str(Path(place).resolve())
@@ -87,7 +82,7 @@ def refuse_run_as_out(out: str, runs: Sequence[str]) -> None:
         raise RunError(f"{out} is one of the runs that are compared: give --out a folder of its own")
 
 
-def _told(epoch: Epoch) -> dict[str, Any]:
+def _facts(epoch: Epoch) -> dict[str, Any]:
     manifest = epoch.manifest
     return {
         "run": epoch.run_dir,
@@ -111,18 +106,18 @@ def diff(
     Parameters
     ----------
     request : DiffRequest
-        What is compared.
+        The comparison.
     on_part : callable
-        Told the groups done and all groups, after every part.
+        Called with the groups done and all groups after every part.
     take_in : sequence of callable
-        Given the rows too, part by part: what else is to be made of them, such as a map.
+        Further consumers of the rows of every part, such as a map.
 
     Raises
     ------
     RunError
-        A directory holds no run that ended, or the results cannot be written.
+        A directory has no run that ended, or the results cannot be written.
     CrsError
-        The runs are of different reference systems or units.
+        The runs have different reference systems or units.
     """
     refuse_run_as_out(request.out, (request.old, request.new))
     storage = LocalStorage(root=Path(request.out))

@@ -1,6 +1,7 @@
-"""One of the two runs: what its manifest tells, an index of all its buildings, and the records of some of them.
+"""One of the two runs: its manifest, an index of all its buildings, and the records of some of them.
 
-Of the whole run only the index is held, some 50 bytes a building; geometry is read for a part of the plan at a time.
+Only the index of the whole run is in memory, some 50 bytes per building; geometry is read for a part of the plan at a
+time.
 """
 
 from __future__ import annotations
@@ -29,24 +30,24 @@ COLUMNS = (
     *("volume_m3", "rmse_m", "point_spacing_m", "noise_m", "ridge_z_sigma_m", "unexplained_m2"),
     *("touches_data_edge", "acquired_from", "acquired_to"),
 )
-"""What is read of a building that is compared."""
+"""Columns of a building that is compared."""
 ROUGH_TIMES = 2.5
-"""Points that scatter about a face this many times as much as the noise of its building are those of a tree, or of
-small things on a roof."""
+"""Points that scatter about a face by this many times the noise of its building come from a tree or from small things
+on a roof. It decides a doubt only, never a class."""
 _PLANES = ("building_id", "geometry", "origin_x", "origin_y", "origin_z", "coefficients", "rmse_m")
 _BOX = ("xmin", "ymin", "xmax", "ymax")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rejected:
-    """What an epoch judged to be no building, all arrays of length k."""
+    """Objects that an epoch rejected as buildings, all arrays of length k."""
 
     boxes: FloatArray
     """(k, 4) float64, bounds in metres: west, south, east, north; nan without geometry."""
     area_m2: FloatArray
-    """(k,) float64, plan area; nan where it was not measured."""
+    """(k,) float64, plan area; nan if it was not measured."""
     height_m: FloatArray
-    """(k,) float64, height above ground; nan where it was not measured."""
+    """(k,) float64, height above ground; nan if it was not measured."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,7 +59,7 @@ class Buildings:
     table: pa.Table
     """The columns `COLUMNS` of these buildings in this order."""
     footprints: Any
-    """(n,) array of shapely geometries in metres, valid; None where there is none."""
+    """(n,) array of shapely geometries in metres, valid; None without one."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -68,9 +69,9 @@ class Epoch:
     name: str
     """OLD or NEW, for messages."""
     run_dir: str
-    """Where it lies."""
+    """Path or URL."""
     manifest: RunManifest
-    """What it tells of itself."""
+    """Its manifest."""
     reference: SpatialReference
     """CRS and units."""
     coverage: Coverage
@@ -82,13 +83,13 @@ class Epoch:
     places: IntArray
     """(n,) int64, its row there."""
     rejected: Rejected
-    """What it judged to be no building."""
+    """Objects that it rejected as buildings."""
     fragments: Sequence[Any]
     """The files of the table of buildings by their number."""
     planes: dict[str, list[Any]]
     """The files of the table of planes by tile."""
     schemas: tuple[pa.Schema, pa.Schema]
-    """Of the tables of buildings and of planes."""
+    """Schemas of the tables of buildings and of planes."""
     table: pads.Dataset
     """The table of buildings."""
 
@@ -130,12 +131,12 @@ class Epoch:
 
 
 def open_epoch(name: str, run_dir: str) -> Epoch:
-    """Open a run that is to be compared.
+    """Open a run for a comparison; `name` is OLD or NEW.
 
     Raises
     ------
     RunError
-        It holds no run that ended, or a damaged one.
+        There is no run that ended, or it is damaged.
     """
     manifest = read_manifest(run_dir)
     if manifest.status not in {RunStatus.FINISHED, RunStatus.INCOMPLETE}:
@@ -192,7 +193,7 @@ def _empty(schema: pa.Schema, columns: Sequence[str]) -> pa.Table:
 
 
 def _boxes(tables: Sequence[pa.Table], unit_m: float) -> FloatArray:
-    """Bounds (n, 4) in metres of the column `bbox`, nan where it is null."""
+    """Bounds (n, 4) in metres of the column `bbox`, nan for null."""
     parts = [np.empty((0, 4))]
     for table in tables:
         column = table["bbox"].combine_chunks()
@@ -203,7 +204,7 @@ def _boxes(tables: Sequence[pa.Table], unit_m: float) -> FloatArray:
 
 
 def floats(column: Any) -> FloatArray:
-    """A column of numbers as float64, nan where it is null."""
+    """A column of numbers as float64, nan for null."""
     values: FloatArray = (
         column.cast(pa.float64()).to_numpy(zero_copy_only=False)
         if isinstance(column, pa.Array)
@@ -213,7 +214,7 @@ def floats(column: Any) -> FloatArray:
 
 
 def _footprints(column: Any, unit_m: float) -> Any:
-    """Geometries in metres, repaired where they are invalid."""
+    """Geometries in metres; invalid ones are repaired."""
     found = shapely.from_wkb(np.array(column.to_pylist(), dtype=object))
     if unit_m != 1.0:
         found = shapely.transform(found, lambda xy: xy * unit_m)
@@ -259,6 +260,6 @@ def _faces(table: pa.Table, noise_m: FloatArray, reference: SpatialReference) ->
 
 
 def _starts(index: IntArray, count: int) -> IntArray:
-    """Where each of `count` begins in an ascending index, and the end: (count + 1,)."""
+    """Start of each of `count` in an ascending index, and the end: (count + 1,)."""
     starts: IntArray = np.searchsorted(index, np.arange(count + 1)).astype(np.int64)
     return starts

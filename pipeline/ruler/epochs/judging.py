@@ -23,16 +23,16 @@ from pipeline.ruler.epochs.settings import DiffSettings
 from pipeline.ruler.epochs.sides import Side
 
 NEAR = 1.5
-"""A change this much above or below its limit is told as near it."""
+"""A change within this factor of its limit is near it. It decides a doubt only, never a class."""
 OVERLAPS_SHARE = 0.1
-"""From this share of a footprint on its overlap with a building of the other epoch is told as a doubt."""
+"""Least share of a footprint that overlaps a building of the other epoch for a doubt."""
 
 Words = npt.NDArray[np.object_]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What counts as a change of each group."""
+    """Least changes of each group."""
 
     height_m: FloatArray
     """(g,) float64, least difference of height."""
@@ -42,7 +42,7 @@ class Limits:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Circumstances:
-    """What each epoch can tell of the places of g groups; False and 1 where nothing speaks against it."""
+    """Information of each epoch about the places of g groups; False and 1 by default."""
 
     covered_by_old: FloatArray
     """(g,) float64, share of the footprint where the earlier epoch has data."""
@@ -53,7 +53,7 @@ class Circumstances:
     failed_tile_of_new: BoolArray
     """(g,) bool, the same of the later one."""
     rejected_in_old: BoolArray
-    """(g,) bool, the earlier epoch holds a like object there that it judged to be no building."""
+    """(g,) bool, the earlier epoch rejected a similar object there as a building."""
     rejected_in_new: BoolArray
     """(g,) bool, the same of the later one."""
     overlapped: FloatArray
@@ -62,7 +62,7 @@ class Circumstances:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdicts:
-    """What became of g groups."""
+    """Verdicts on g groups."""
 
     change: Words
     """(g,) `Change`."""
@@ -77,13 +77,13 @@ class Verdicts:
     is_reshaped: BoolArray
     """(g,) bool."""
     change_ratio: FloatArray
-    """(g,) float64, the largest change over its limit; nan where one side is missing or has no roof."""
+    """(g,) float64, the largest change over its limit; nan if one side is missing or has no roof."""
     doubts: tuple[tuple[Doubt, BoolArray], ...]
-    """Each doubt with the (g,) groups that it holds for."""
+    """Each doubt with the (g,) groups that it applies to."""
 
 
 def limits(old: Side, new: Side, settings: DiffSettings) -> Limits:
-    """What counts as a change: the settings, but more where the models are not known so well."""
+    """Least changes: the settings, or more if the models are less accurate."""
     sigma_m = np.hypot(old.sigma_m, new.sigma_m)
     spacing_m = np.maximum(old.spacing_m, new.spacing_m)
     return Limits(
@@ -95,7 +95,7 @@ def limits(old: Side, new: Side, settings: DiffSettings) -> Limits:
 def judge(
     old: Side, new: Side, figures: FloatArray, limit: Limits, seen: Circumstances, settings: DiffSettings
 ) -> Verdicts:
-    """Judge every group."""
+    """Judge every group by its figures (g, 16) from `compare_roofs`."""
     only_old, only_new = new.count == 0, old.count == 0
     both = ~only_old & ~only_new
     shift_m, form_m3 = figures[:, SHIFT_M], figures[:, FORM_M3]
@@ -151,7 +151,7 @@ def _ratio(figures: FloatArray, part_m2: FloatArray, limit: Limits, settings: Di
 
 
 def _reasons(old: Side, new: Side, seen: Circumstances, settings: DiffSettings) -> Words:
-    """Why groups are not comparable: the first reason that holds, None where none does."""
+    """Why groups are not comparable: the first reason that applies, else None."""
     only_old, only_new = new.count == 0, old.count == 0
     least = settings.min_covered_share - 1e-9
     holds = (

@@ -1,8 +1,8 @@
 """Which buildings of two epochs belong together: by the overlap of their footprints in plan.
 
-Pairs that share enough of the smaller footprint are edges of a graph; its connected groups are what is compared. One
-building may so become several (split), several one (merged), or both. A group whose two sides cover little in common is
-no group: what stood there is gone, and something else is new.
+Pairs that share enough of the smaller footprint are edges of a graph; its connected groups are compared. One building
+can become several (split), several one (merged), or both. A group whose sides have little area in common is dissolved:
+its old buildings are gone and its new ones are new.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from pipeline.model import BoolArray, FloatArray, IntArray
 from pipeline.ruler.epochs.epoch import Epoch
 from pipeline.ruler.epochs.settings import DiffSettings
 
-ROWS_A_PART = 20_000
-"""Buildings of one epoch whose geometry is held at once, about."""
+ROWS_PER_PART = 20_000
+"""Buildings of one epoch whose geometry is in memory at once, about."""
 _MIN_M2 = 1e-6
+"""Numerical guard: smaller overlaps are none."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,11 +54,11 @@ class Groups:
     """All pairs, also those between two groups."""
 
 
-def parts_of(xy: FloatArray, most: int = ROWS_A_PART) -> Iterator[IntArray]:
-    """Places (n, 2) in compact parts of at most so many, by halving at the median of the longer side.
+def parts_of(xy: FloatArray, most: int = ROWS_PER_PART) -> Iterator[IntArray]:
+    """Split places (n, 2) into compact parts of at most `most`, by halving at the median of the longer side.
 
-    Which place falls into which part depends on the places alone, not on their order. Places that coincide stay
-    together, whatever their number. Places that are nan come last.
+    The parts depend on the places alone, not on their order. Coinciding places stay together, whatever their number.
+    Places that are nan come last.
 
     Yields
     ------
@@ -74,7 +75,7 @@ def parts_of(xy: FloatArray, most: int = ROWS_A_PART) -> Iterator[IntArray]:
         axis = int(span[1] > span[0])
         middle = float(np.median(xy[part, axis]))
         low = xy[part, axis] < middle
-        if not low.any():  # more than half of them lie at the low end
+        if not low.any():  # more than half of them are at the low end
             low = xy[part, axis] <= middle
         if len(part) <= most or span[axis] == 0.0:
             yield part
@@ -106,7 +107,7 @@ def around(boxes: FloatArray) -> FloatArray:
 
 
 def overlapping(old: Any, new: Any) -> tuple[IntArray, IntArray, FloatArray]:
-    """Indices into two arrays of valid footprints that share area, and how much; ordered by both indices."""
+    """Indices into two arrays of valid footprints that share area, and that area in m2; ordered by both indices."""
     if len(old) == 0 or len(new) == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
     a, b = shapely.STRtree(new).query(old)
@@ -147,7 +148,7 @@ def all_pairs(old: Epoch, new: Epoch) -> tuple[Pairs, FloatArray, FloatArray]:
 
 
 def grouped(pairs: Pairs, old_m2: FloatArray, new_m2: FloatArray, settings: DiffSettings) -> Groups:
-    """Buildings that belong together."""
+    """Buildings that belong together; `old_m2` (o,) and `new_m2` (n,) are the areas of all footprints."""
     smaller = np.minimum(old_m2[pairs.old], new_m2[pairs.new])
     kept = pairs.common_m2 >= settings.min_overlap_share * smaller
     count, labels = _components(pairs, kept, len(old_m2), len(new_m2))

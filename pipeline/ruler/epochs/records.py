@@ -1,4 +1,4 @@
-"""What the results tell: the classes of changes, the closed lists of reasons and doubts, the columns of the table."""
+"""The vocabulary of the results: classes of changes, closed lists of reasons and doubts, columns of the table."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pyarrow as pa
 
 
 class Change(StrEnum):
-    """What became of a building, or of several that belong together."""
+    """The change of a building, or of several that belong together."""
 
     NEW = "new"
     GONE = "gone"
@@ -27,9 +27,9 @@ CHANGES: Mapping[Change, str] = {
     Change.LOWERED: "nearly all of its roof lies lower",
     Change.RESHAPED: "a part of its plan was added or removed, or has another roof",
     Change.UNCHANGED: "no change reaches its limit",
-    Change.NOT_COMPARABLE: "one epoch does not tell enough; `reason` says why",
+    Change.NOT_COMPARABLE: "one epoch has too little information; `reason` says why",
 }
-"""The classes with what they mean."""
+"""Meanings of the classes."""
 
 
 class Relation(StrEnum):
@@ -51,11 +51,11 @@ RELATIONS: Mapping[Relation, str] = {
     Relation.ONLY_OLD: "one in OLD, none in NEW",
     Relation.ONLY_NEW: "one in NEW, none in OLD",
 }
-"""The relations with what they mean."""
+"""Meanings of the relations."""
 
 
 class Incomparable(StrEnum):
-    """Why a building is not comparable; of several reasons the first of this list is told."""
+    """Why a building is not comparable; the first reason of this list counts."""
 
     FAILED_IN_OLD = "failed_in_old"
     FAILED_IN_NEW = "failed_in_new"
@@ -74,18 +74,18 @@ INCOMPARABLE: Mapping[Incomparable, str] = {
     Incomparable.FAILED_IN_NEW: "NEW has a candidate there, but no model",
     Incomparable.TILE_FAILED_IN_OLD: "a tile of OLD failed there",
     Incomparable.TILE_FAILED_IN_NEW: "a tile of NEW failed there",
-    Incomparable.OUTSIDE_OLD: "OLD has no data there, or ends near by",
-    Incomparable.OUTSIDE_NEW: "NEW has no data there, or ends near by",
+    Incomparable.OUTSIDE_OLD: "OLD has no data there, or ends nearby",
+    Incomparable.OUTSIDE_NEW: "NEW has no data there, or ends nearby",
     Incomparable.EDGE_OF_OLD: "the data of OLD end at this building: it may be cut",
     Incomparable.EDGE_OF_NEW: "the data of NEW end at this building: it may be cut",
-    Incomparable.REJECTED_IN_OLD: "OLD holds an object of like extent and height, judged to be no building",
-    Incomparable.REJECTED_IN_NEW: "NEW holds an object of like extent and height, judged to be no building",
+    Incomparable.REJECTED_IN_OLD: "OLD has an object of similar extent and height that was rejected as a building",
+    Incomparable.REJECTED_IN_NEW: "NEW has an object of similar extent and height that was rejected as a building",
 }
-"""The reasons with what they mean."""
+"""Meanings of the reasons."""
 
 
 class Doubt(StrEnum):
-    """What makes a verdict less certain than others."""
+    """A reason why a verdict is less certain."""
 
     BLOCK_IN_OLD = "block_in_old"
     BLOCK_IN_NEW = "block_in_new"
@@ -99,61 +99,61 @@ class Doubt(StrEnum):
 DOUBTS: Mapping[Doubt, str] = {
     Doubt.BLOCK_IN_OLD: "the model of OLD is a block in place of its roof (`fallback`)",
     Doubt.BLOCK_IN_NEW: "the model of NEW is a block in place of its roof (`fallback`)",
-    Doubt.ROUGH_PART: "most of what changed are roof faces about which the points scatter: it may be a tree",
-    Doubt.UNEXPLAINED_PART: "a model has roof without points (`unexplained_m2`) of half of what changed or more",
-    Doubt.NEAR_LIMIT: "`change_ratio` is between 2/3 and 3/2: a little more or less would be told otherwise",
-    Doubt.OVERLAPS_ANOTHER: "new or gone, but more than a tenth of it overlaps a building of the other epoch",
-    Doubt.OTHER_UNITS: "the epochs divide what stands there into another number of buildings",
+    Doubt.ROUGH_PART: "most of the changed area is roof faces with scattered points: it may be a tree",
+    Doubt.UNEXPLAINED_PART: "a model has roof without points (`unexplained_m2`) over at least half of the changed area",
+    Doubt.NEAR_LIMIT: "`change_ratio` is between 2/3 and 3/2: a small difference would change the verdict",
+    Doubt.OVERLAPS_ANOTHER: "new or gone, and more than a tenth of it overlaps a building of the other epoch",
+    Doubt.OTHER_UNITS: "the epochs divide the same place into different numbers of buildings",
 }
-"""The doubts with what they mean."""
+"""Meanings of the doubts."""
 
 _TIME = pa.timestamp("us", tz="UTC")
 _NAMES = pa.list_(pa.string())
 
 COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
-    ("change_id", pa.string(), "`n-` and the smallest building_id of NEW; `o-` and that of OLD where NEW has none"),
+    ("change_id", pa.string(), "`n-` and the smallest building_id of NEW; `o-` and that of OLD if NEW has none"),
     ("change", pa.string(), "the class, see above"),
-    ("is_raised", pa.bool_(), "nearly all of the roof lies higher, also where `change` is `reshaped`"),
+    ("is_raised", pa.bool_(), "nearly all of the roof lies higher, even if `change` is `reshaped`"),
     ("is_lowered", pa.bool_(), "nearly all of the roof lies lower"),
-    ("is_reshaped", pa.bool_(), "plan or roof are others, also where `change` is `raised` or `lowered`"),
-    ("reason", pa.string(), "why it is not comparable; null where it is"),
-    ("doubts", _NAMES, "what makes the verdict less certain, from the list above"),
+    ("is_reshaped", pa.bool_(), "plan or roof differ, even if `change` is `raised` or `lowered`"),
+    ("reason", pa.string(), "why it is not comparable; null if it is"),
+    ("doubts", _NAMES, "why the verdict is less certain, from the list above"),
     ("relation", pa.string(), "how many buildings belong together, see above"),
     ("old_ids", _NAMES, "building_id of all that belong together in OLD, sorted"),
     ("new_ids", _NAMES, "the same in NEW"),
-    ("old_source_ids", _NAMES, "their `source_id` in OLD, in the order of `old_ids`, where footprints were given"),
+    ("old_source_ids", _NAMES, "their `source_id` in OLD, in the order of `old_ids`, if footprints were given"),
     ("new_source_ids", _NAMES, "the same in NEW"),
-    ("iou", pa.float64(), "common area of both sides over the area of both together; null where one side is missing"),
+    ("iou", pa.float64(), "common area of both sides over the area of both together; null if one side is missing"),
     ("old_area_m2", pa.float64(), "plan area in OLD"),
     ("new_area_m2", pa.float64(), "plan area in NEW"),
     ("area_change_m2", pa.float64(), "NEW less OLD"),
     ("old_height_m", pa.float64(), "height above ground in OLD, of the highest building"),
     ("new_height_m", pa.float64(), "the same in NEW"),
-    ("height_change_m", pa.float64(), "median difference of the roofs' elevations where both epochs have a roof"),
+    ("height_change_m", pa.float64(), "median difference of the roof elevations where both epochs have a roof"),
     ("ridge_change_m", pa.float64(), "difference of the highest roof points"),
-    ("ground_change_m", pa.float64(), "difference of the floors' elevations"),
+    ("ground_change_m", pa.float64(), "difference of the floor elevations"),
     ("old_volume_m3", pa.float64(), "volume of the solids in OLD"),
     ("new_volume_m3", pa.float64(), "the same in NEW"),
     ("volume_change_m3", pa.float64(), "NEW less OLD"),
-    ("added_m2", pa.float64(), "plan area of parts that were added; all of it where new"),
-    ("removed_m2", pa.float64(), "plan area of parts that were removed; all of it where gone"),
+    ("added_m2", pa.float64(), "plan area of added parts; the whole building if new"),
+    ("removed_m2", pa.float64(), "plan area of removed parts; the whole building if gone"),
     ("raised_m2", pa.float64(), "plan area of parts whose roof lies higher"),
     ("lowered_m2", pa.float64(), "plan area of parts whose roof lies lower"),
-    ("gained_m3", pa.float64(), "volume of added and raised parts; all of it where new"),
-    ("lost_m3", pa.float64(), "volume of removed and lowered parts; all of it where gone"),
+    ("gained_m3", pa.float64(), "volume of added and raised parts; the whole building if new"),
+    ("lost_m3", pa.float64(), "volume of removed and lowered parts; the whole building if gone"),
     ("max_raise_m", pa.float64(), "largest difference in a part that lies higher"),
     ("max_drop_m", pa.float64(), "largest difference in a part that lies lower, positive"),
     ("roof_difference_m", pa.float64(), "mean absolute difference of the roofs, whatever its size"),
-    ("least_height_change_m", pa.float64(), "from which difference on this roof counts as higher or lower"),
-    ("least_width_m", pa.float64(), "from which width on a part of this building counts"),
-    ("change_ratio", pa.float64(), "the largest measured change over its limit: told as changed from 1 on"),
+    ("least_height_change_m", pa.float64(), "least difference at which this roof counts as higher or lower"),
+    ("least_width_m", pa.float64(), "least width at which a part of this building counts"),
+    ("change_ratio", pa.float64(), "the largest measured change over its limit: changed from 1 on"),
     ("old_roof_type", pa.string(), "roof type in OLD, of the largest building"),
     ("new_roof_type", pa.string(), "the same in NEW"),
     ("old_acquired", _TIME, "latest acquisition in OLD"),
     ("new_acquired", _TIME, "earliest acquisition in NEW"),
-    ("geometry", pa.binary(), "footprint in NEW, in OLD where NEW has none; united where several belong together"),
+    ("geometry", pa.binary(), "footprint in NEW, in OLD if NEW has none; the union of several that belong together"),
 )
 """Name, type and meaning of every column of `changes.parquet`."""
 
 SCHEMA = pa.schema([pa.field(name, kind) for name, kind, _ in COLUMNS])
-"""One row a building, or a group of buildings that belong together."""
+"""One row per building, or per group of buildings that belong together."""

@@ -199,8 +199,9 @@ def _shift_of(values: FloatArray, share: float, min_m: float, figures: FloatArra
     lowest, highest = ordered[rank], ordered[count - 1 - rank]
     uniform = lowest if lowest > 0.0 else min(highest, 0.0)
     figures[UNIFORM_M] = uniform
-    figures[SHIFT_M] = uniform if abs(uniform) >= min_m else 0.0
-    return figures[SHIFT_M]
+    moved: float = uniform if abs(uniform) >= min_m else 0.0
+    figures[SHIFT_M] = moved
+    return moved
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""What counts as a change: the thresholds of a comparison of two epochs."""
+"""The thresholds of a comparison of two epochs."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ TABLE = "diff"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DiffSettings(Parameters):
-    """From which size on a change is told."""
+    """The least size of a change."""
 
     min_overlap_share: float = parameter(
         0.25,
-        "Two footprints belong together where they share this part of the smaller one.",
+        "Two footprints belong together if they share at least this part of the smaller one.",
         minimum=0.01,
         maximum=1.0,
     )
     min_iou: float = parameter(
         0.2,
-        "Buildings that belong together but share less than this of their common area are told as gone and new.",
+        "Buildings that belong together and share less than this of their common area count as gone and new.",
         minimum=0.0,
         maximum=0.9,
     )
@@ -36,52 +36,52 @@ class DiffSettings(Parameters):
     )
     sigmas: float = parameter(
         3.0,
-        "And from this many standard deviations on, both epochs' together.",
+        "The difference must also reach this many standard deviations of both epochs together.",
         minimum=0.0,
         maximum=20.0,
     )
     uniform_share: float = parameter(
         0.9,
-        "A building is raised (lowered) where this part of its roof is higher (lower).",
+        "A building is raised (lowered) if this part of its roof is higher (lower).",
         minimum=0.5,
         maximum=1.0,
     )
     min_area_change_m2: float = parameter(
         5.0,
-        "A building is reshaped where this much of its plan was added or removed, or has another roof.",
+        "A building is reshaped if this much of its plan was added or removed, or has another roof.",
         unit="m2",
         minimum=0.1,
         maximum=100_000.0,
     )
     min_volume_change_m3: float = parameter(
-        5.0, "And where this much volume came or went there.", unit="m3", minimum=0.0, maximum=1_000_000.0
+        5.0, "A reshaped building must also gain or lose this much volume.", unit="m3", minimum=0.0, maximum=1_000_000.0
     )
     min_width_m: float = parameter(
         1.5,
-        "Parts that are narrower do not count: outlines and edges of roofs are not known better.",
+        "Narrower parts do not count: outlines and edges of roofs are not more accurate.",
         unit="m",
         minimum=0.2,
         maximum=50.0,
     )
     spacings: float = parameter(
-        1.5, "Nor do parts that are narrower than this many point spacings.", minimum=0.0, maximum=10.0
+        1.5, "Parts that are narrower than this many point spacings do not count either.", minimum=0.0, maximum=10.0
     )
     min_covered_share: float = parameter(
         0.95,
-        "Told as new or gone is only what lies with this part of its footprint where the other epoch has data.",
+        "A building is new or gone only if the other epoch has data in this part of its footprint.",
         minimum=0.01,
         maximum=1.0,
     )
     edge_m: float = parameter(
         2.0,
-        "What is nearer to the end of an epoch's data counts as not covered by it.",
+        "Places nearer to the end of the data of an epoch count as not covered by it.",
         unit="m",
         minimum=0.0,
         maximum=100.0,
     )
     vertical_shift_m: float = parameter(
         0.0,
-        "Known difference of the epochs' elevations, NEW less OLD, that is no change of any building.",
+        "Known difference of the elevations, NEW less OLD, that is not a change of any building.",
         unit="m",
         minimum=-1000.0,
         maximum=1000.0,
@@ -93,12 +93,12 @@ class DiffSettings(Parameters):
 
 
 def read_settings(path: str | None, options: Mapping[str, Any]) -> DiffSettings:
-    """The settings of a TOML file under those of the command line.
+    """The settings of the `[diff]` table of a TOML file, overridden by options that are not None.
 
     Raises
     ------
     SettingsError
-        The file cannot be read or parsed, or holds faults: all are told at once.
+        The file cannot be read or parsed, or has faults: the error lists all of them.
     """
     table: dict[str, Any] = {}
     if path is not None:

@@ -1,4 +1,4 @@
-"""One epoch's side of the groups that are compared: sums, extremes and names of the buildings of each group."""
+"""The side of one epoch in each group: sums, extremes and names of its buildings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ROOF_TYPES = [kind.value for kind in RoofType]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Side:
-    """What an epoch has of g groups; nan and null where it has nothing."""
+    """The buildings of an epoch in g groups; nan and null if it has none."""
 
     count: IntArray
     """(g,) int64, buildings."""
@@ -34,11 +34,11 @@ class Side:
     ridge_m: FloatArray
     """(g,) float64, highest roof point, metres."""
     sigma_m: FloatArray
-    """(g,) float64, standard deviation of the roofs' elevations, of the worst model; 0 where nothing is known."""
+    """(g,) float64, standard deviation of the roofs' elevations, of the worst model; 0 if unknown."""
     spacing_m: FloatArray
-    """(g,) float64, largest point spacing; 0 where it is unknown."""
+    """(g,) float64, largest point spacing; 0 if unknown."""
     unexplained_m2: FloatArray
-    """(g,) float64, plan area of roof without points; 0 where it is unknown."""
+    """(g,) float64, plan area of roof without points; 0 if unknown."""
     has_failed: BoolArray
     """(g,) bool, some building has no model."""
     has_block: BoolArray
@@ -50,7 +50,7 @@ class Side:
     ids: pa.ListArray
     """(g,) names of the buildings, sorted."""
     source_ids: pa.ListArray
-    """(g,) their own ids in the given footprints, in the order of `ids`; null without one."""
+    """(g,) ids of the given footprints, in the order of `ids`; null without one."""
     acquired_from: pa.Array
     """(g,) earliest acquisition."""
     acquired_to: pa.Array
@@ -60,7 +60,7 @@ class Side:
 
 
 def side_of(buildings: Buildings, group: IntArray, count: int, vertical_unit_m: float) -> Side:
-    """Bring the buildings of an epoch together by group."""
+    """Aggregate the buildings of an epoch by group, (n,) int64 numbers from 0 to count - 1."""
     table = buildings.table
     by_name = pc.sort_indices(
         pa.table({"group": pa.array(group), "name": table["building_id"].combine_chunks()}),
@@ -122,7 +122,7 @@ def _lists(column: pa.ChunkedArray, starts: IntArray) -> pa.ListArray:
 def _of_largest(
     values: npt.NDArray[np.object_], area_m2: FloatArray, group: IntArray, count: int
 ) -> npt.NDArray[np.object_]:
-    """The value of the largest building of each group; of equal ones that with the first name."""
+    """The value of the largest building of each group; the first name wins among equal ones."""
     found = np.full(count, None, object)
     order = np.lexsort((-np.arange(len(values)), area_m2))  # the last one stays
     found[group[order]] = values[order]
@@ -130,7 +130,7 @@ def _of_largest(
 
 
 def _times(column: pa.ChunkedArray, group: IntArray, count: int, ufunc: np.ufunc) -> pa.Array:
-    """The extreme time of each group; null where none is known."""
+    """The extreme time of each group; null if unknown."""
     known = np.asarray(column.is_valid().to_numpy(), np.bool_)
     micros = column.cast(pa.int64()).fill_null(0).to_numpy()
     start = np.iinfo(np.int64).max if ufunc is np.minimum else np.iinfo(np.int64).min
@@ -140,7 +140,7 @@ def _times(column: pa.ChunkedArray, group: IntArray, count: int, ufunc: np.ufunc
 
 
 def _united(footprints: Any, starts: IntArray, numbers: IntArray) -> Any:
-    """One geometry a group."""
+    """One geometry per group."""
     found = np.full(len(numbers), None, object)
     single = np.flatnonzero(numbers == 1)
     found[single] = footprints[starts[single]]

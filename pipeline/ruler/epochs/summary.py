@@ -1,4 +1,4 @@
-"""Sums of a comparison, gathered part by part: how many of each class, areas, volumes, reasons, doubts, the largest."""
+"""Sums of a comparison, part by part: counts of classes, areas, volumes, reasons, doubts, the largest changes."""
 
 from __future__ import annotations
 
@@ -23,22 +23,23 @@ SUMS = (
 LARGEST = 300
 """Rows of each class that are kept for the page."""
 _REACH_MM = 20_000
+"""Range of the histogram of levels; larger differences count at its ends."""
 HEIGHT_EDGES_M = tuple(0.5 * step for step in range(-24, 25))
-"""Borders of the classes in which rises and drops are counted; what is beyond counts in the outermost ones."""
+"""Borders of the classes of rises and drops; values beyond count in the outermost ones."""
 
 
 def size_of(table: pa.Table) -> Any:
-    """By what rows are ordered: the volume that came and went; 0 where it is unknown."""
+    """Order of the rows: gained plus lost volume; 0 if unknown."""
     gained, lost = (pc.fill_null(table[name], 0.0) for name in ("gained_m3", "lost_m3"))
     return pc.add(gained, lost)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Level:
-    """How the elevations of the two epochs go together where nothing changed."""
+    """Agreement of the elevations of the two epochs on unchanged roofs."""
 
     median_m: float | None
-    """Median of the roofs' differences, NEW less OLD; None without such roofs."""
+    """Median of the differences, NEW less OLD; None without such roofs."""
     spread_m: float | None
     """Half of the distance between the quantiles that hold 68.27 % of them: one standard deviation."""
     count: int
@@ -46,7 +47,7 @@ class Level:
 
 
 class Summary:
-    """Gathers what is told of all rows."""
+    """Aggregates all rows."""
 
     def __init__(self) -> None:
         self.rows: Counter[str] = Counter()
@@ -64,7 +65,7 @@ class Summary:
         self._largest: dict[str, pa.Table] = {}
 
     def add(self, table: pa.Table) -> None:
-        """Take in the rows of one part."""
+        """Add the rows of one part."""
         self.reasons.update(_counted(table["reason"]))
         self.relations.update(_counted(table["relation"]))
         self.flags.update(
@@ -116,13 +117,13 @@ class Summary:
 
     @property
     def largest(self) -> pa.Table:
-        """The largest rows of every class but the unchanged, class by class, at most `LARGEST` of each."""
+        """The largest rows of every class except the unchanged, class by class, at most `LARGEST` of each."""
         held = [self._largest[change.value] for change in Change if change.value in self._largest]
         return pa.concat_tables(held) if held else SCHEMA.empty_table()
 
     @property
     def level(self) -> Level:
-        """How the elevations of the epochs go together."""
+        """Agreement of the elevations of the epochs."""
         count = int(self._level.sum())
         if count == 0:
             return Level(median_m=None, spread_m=None, count=0)
@@ -161,12 +162,12 @@ class Summary:
 
 
 def _places(share: float, count: int) -> tuple[int, int]:
-    """The ranks whose mean is a quantile; symmetric, so that exchanging the epochs only turns its sign."""
+    """The ranks whose mean is a quantile; symmetric: exchanging the epochs only turns its sign."""
     rank = share * (count - 1)
     return int(np.floor(rank + 1e-9)), int(np.ceil(rank - 1e-9))
 
 
 def _counted(column: Any) -> dict[str, int]:
-    """How often each value occurs; null is left out."""
+    """How often each value occurs, without null."""
     counts = pc.value_counts(column)
     return {pair["values"]: pair["counts"] for pair in counts.to_pylist() if pair["values"] is not None}

@@ -35,20 +35,20 @@ TakeIn = Callable[[pa.Table], None]
 
 @contextlib.contextmanager
 def parquet_sink(storage: LocalStorage, reference: SpatialReference) -> Iterator[TakeIn]:
-    """A function that appends rows to `changes.parquet`, which is there when the block ends and not before."""
+    """A function that appends rows to `changes.parquet`, which appears when the block ends."""
     geo: dict[str, Any] = geo_metadata(np.empty(0, object), reference.projjson)
     column = geo["columns"]["geometry"]
     with _writing(storage, PARQUET) as path:
         schema = SCHEMA.append(_BBOX)
-        # without Arrow's own copy of the schema, which would hide the metadata that are known only at the end
+        # Without the copy of the schema by Arrow: it would hide the metadata that are known only at the end.
         with pq.ParquetWriter(path, schema, compression="zstd", store_schema=False) as writer:
 
             def take_in(table: pa.Table) -> None:
                 geometries = shapely.from_wkb(np.array(table["geometry"].to_pylist(), dtype=object))
-                told = geo_metadata(geometries, None)["columns"]["geometry"]
-                column["geometry_types"] = sorted({*column["geometry_types"], *told["geometry_types"]})
-                if "bbox" in told:
-                    column["bbox"] = _around(column.get("bbox"), told["bbox"])
+                added = geo_metadata(geometries, None)["columns"]["geometry"]
+                column["geometry_types"] = sorted({*column["geometry_types"], *added["geometry_types"]})
+                if "bbox" in added:
+                    column["bbox"] = _around(column.get("bbox"), added["bbox"])
                 writer.write_table(table.append_column(_BBOX, _bbox(geometries)), row_group_size=ROWS_A_GROUP)
 
             yield take_in
@@ -57,12 +57,12 @@ def parquet_sink(storage: LocalStorage, reference: SpatialReference) -> Iterator
 
 @contextlib.contextmanager
 def geojson_sink(storage: LocalStorage, reference: SpatialReference, rows: GeoJson) -> Iterator[TakeIn]:
-    """A function that appends rows to `changes.geojson`: longitude and latitude of WGS 84, as RFC 7946 wants it.
+    """A function that appends rows to `changes.geojson`: longitude and latitude of WGS 84, as in RFC 7946.
 
     Raises
     ------
     ValueError
-        The CRS is unknown: nothing can be told in WGS 84.
+        The CRS is unknown.
     """
     to_degrees = _to_degrees(reference)
     with _writing(storage, GEOJSON) as path, path.open("w", encoding="utf-8", newline="\n") as stream:
@@ -121,7 +121,7 @@ def _to_degrees(reference: SpatialReference) -> Callable[[Any], Any]:
 
 @contextlib.contextmanager
 def _writing(storage: LocalStorage, key: str) -> Iterator[Path]:
-    """A temporary path that takes the place of the file; what the disk refuses is told as the console knows it."""
+    """A temporary path that replaces the file at the end; errors of the disk become a RunError."""
     try:
         with storage.putting(key) as path:
             yield path

@@ -1,7 +1,7 @@
-"""True buildings that touch, joined to blocks: what a run without footprints can be compared with.
+"""True buildings that touch, joined to blocks, for runs without footprints.
 
-Without given footprints nothing in the points tells where one house of a row ends and the next begins. Simulated truth
-names the block of every building as its source_id.
+Without given footprints, the points do not show where one house of a row ends and the next begins. The source_id of
+every simulated building is its block.
 """
 
 from __future__ import annotations
@@ -21,23 +21,24 @@ from pipeline.ruler.evaluation.reference import Conditions, Reference, Reference
 BLOCK_SHAPE = "block"
 """Shape of a block of several buildings, in their conditions."""
 _TOUCH_M = 0.02
-"""What is closer than this is in touch, and in one plane."""
+"""Surfaces that are closer touch, or lie in one plane; well above the rounding of 1 mm."""
 _MIN_BORDER_M = 0.5
+"""Least length of a common border: corners do not count."""
 
 
 def joined_reference(reference: Reference) -> Reference:
-    """The reference with buildings that share a source_id as one; those alone, or without one, stay as they are.
+    """The reference with buildings that share a source_id joined; single ones, or those without one, stay unchanged.
 
-    The roof type of a block is that of its parts where they agree, else combination; it has the defects of all. Faces
-    keep their planes and groups under new numbers, counted through the parts; faces of one plane that touch become one
-    group, for nothing in the points tells them apart.
+    The roof type of a block is that of its parts if they agree, else combination; it has the defects of all. Faces keep
+    their planes and groups under new numbers. Touching faces of one plane become one group, since the points do not
+    separate them.
     """
     groups: dict[str, list[int]] = {}
     for number, building in enumerate(reference.buildings):
         groups.setdefault(building.source_id or f"alone {number}", []).append(number)
     if len(groups) == len(reference.buildings):
         return reference
-    block_of = np.full(len(reference.buildings) + 1, -1, np.int32)  # the last for index -1: no building
+    block_of = np.full(len(reference.buildings) + 1, -1, np.int32)  # the last one is for index -1: no building
     shift_of = np.zeros(len(reference.buildings) + 1, np.int32)
     buildings: list[RoofModel] = []
     conditions: dict[str, Conditions] = {}

@@ -1,8 +1,8 @@
 """Percentile bootstrap (Efron 1979) of figures that are functions of sums over independent units.
 
-A unit is a building, or a block of raster cells: what lies within one is correlated, so units are drawn, never points.
-Every figure here is a function of sums over the units (a share is a ratio of two, a quantile follows from summed
-histograms), so a resample is a vector of weights and thousands of them are one matrix product.
+A unit is a building, or a block of raster cells. Points within a unit are correlated, so units are drawn, never points.
+Every figure is a function of sums over the units (a share is a ratio of two, a quantile follows from summed
+histograms): a resample is a vector of weights, and thousands of them are one matrix product.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ Statistic = Callable[[Sums], FloatArray]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Share:
-    """A figure from 0 to 1. Where all units agree on an end of it, resampling says nothing and a limit is given."""
+    """A figure from 0 to 1. If all units agree on 0 or 1, resampling has no spread and an exact limit is given."""
 
     figure: Statistic
     """The figure itself."""
     denominator: str
-    """Column of which units with something in it count as trials."""
+    """Column whose units that are not zero count as trials."""
 
     def __call__(self, sums: Sums) -> FloatArray:
-        """As any statistic."""
+        """The figure of sums."""
         return self.figure(sums)
 
     def limits(self, value: float, columns: Mapping[str, FloatArray]) -> tuple[float, float]:
@@ -56,7 +56,7 @@ class Estimate:
     """A figure and its interval."""
 
     value: float
-    """Of the units as they are."""
+    """The figure of the original units."""
     low: float
     """Lower end; nan with fewer than two units."""
     high: float
@@ -69,7 +69,7 @@ def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws:
     Parameters
     ----------
     columns : mapping of name to (units,) or (units, k) float64
-        What is summed over the units.
+        Columns to sum over the units.
     statistic : callable
         From sums, each (draws,) or (draws, k), to the figure, (draws,); nan where it is undefined.
     draws : int
@@ -113,7 +113,7 @@ def bootstrap(columns: Mapping[str, FloatArray], statistic: Statistic, *, draws:
 
 
 def _resamples(units: int, draws: int) -> Iterator[npt.NDArray[np.uint8]]:
-    """How often each unit is drawn, (rows, units), some rows at a time; the same for the same numbers."""
+    """How often each unit is drawn, (rows, units), some rows at a time; deterministic."""
     if units <= _MAX_KEPT_UNITS:
         yield from _kept_resamples(units, draws)
         return
@@ -122,7 +122,7 @@ def _resamples(units: int, draws: int) -> Iterator[npt.NDArray[np.uint8]]:
 
 @functools.lru_cache(maxsize=4)
 def _kept_resamples(units: int, draws: int) -> tuple[npt.NDArray[np.uint8], ...]:
-    """All of them, kept: most figures of an evaluation are over the same units, and drawing costs most."""
+    """All of them, cached: most figures of an evaluation have the same units, and drawing costs most."""
     return tuple(_drawn_resamples(units, draws))
 
 
@@ -139,7 +139,7 @@ def _figures(statistic: Statistic, sums: Sums) -> FloatArray:
 
 
 def share(numerator: str, denominator: str) -> Share:
-    """Sum of one column over the sum of another that holds it."""
+    """Sum of one column over the sum of another that contains it."""
     return Share(figure=ratio(numerator, denominator), denominator=denominator)
 
 

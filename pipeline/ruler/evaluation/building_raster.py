@@ -1,7 +1,7 @@
-"""The raster that detection is measured on: cells of 0.5 m, anchored at whole multiples of their side, in windows.
+"""The raster of the detection measures: cells of 0.5 m, anchored at whole multiples of their side, in windows.
 
-A cell is building where class 6 is more than half of its points, closed twice and opened once by the 3 x 3 cross; a
-polygon fills the cells whose centres lie in it. Windows of 250 m keep a city in bounded memory.
+A cell is building if class 6 has more than half of its points, after two closings and one opening by the 3 x 3 cross. A
+polygon fills the cells whose centres lie in it. Windows of 250 m bound the memory of a city.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ CELL_M = 0.5
 WINDOW_CELLS = 500
 """Side of a window."""
 _CLOSINGS = 2
+"""Part of the definition of the raster."""
 _REACH_CELLS = 2 * _CLOSINGS + 2
-"""How far closing and opening look."""
+"""Reach of closing and opening."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, order=True)
@@ -81,7 +82,7 @@ def windows_of(bounds: FloatArray) -> list[CellWindow]:
 
 
 def dilated(cells: BoolArray) -> BoolArray:
-    """Grown by the 3 x 3 cross; nothing comes in from outside."""
+    """Grown by the 3 x 3 cross; cells outside are not set."""
     grown = cells.copy()
     grown[1:] |= cells[:-1]
     grown[:-1] |= cells[1:]
@@ -91,12 +92,12 @@ def dilated(cells: BoolArray) -> BoolArray:
 
 
 def eroded(cells: BoolArray) -> BoolArray:
-    """Shrunk by the 3 x 3 cross, but not from outside."""
+    """Shrunk by the 3 x 3 cross; cells outside count as set."""
     return ~dilated(~cells)
 
 
 def edge_ring(cells: BoolArray) -> BoolArray:
-    """The cells on either side of the borders of what is set: dilation without erosion."""
+    """The cells on either side of the borders of the set cells: dilation without erosion."""
     return dilated(cells) & ~eroded(cells)
 
 
@@ -114,7 +115,10 @@ def _cleaned(cells: BoolArray) -> BoolArray:
 def _fill(
     cells: BoolArray, edges: FloatArray, starts: IntArray, chosen: IntArray, x_min: float, y_min: float, cell: float
 ) -> None:
-    """Set the cells whose centres lie in one of the chosen polygons: crossings of each row of centres, in pairs."""
+    """Set the cells (rows, columns) with centres in a chosen polygon, by pairs of crossings per row of centres.
+
+    `edges` (e, 4) are x, y of start and end in metres; `starts` (polygons + 1,) is the first edge of each polygon.
+    """
     rows, columns = cells.shape
     for polygon in chosen:
         first, last = starts[polygon], starts[polygon + 1]
@@ -149,7 +153,7 @@ def _fill(
 
 
 class PlanRaster:
-    """Polygons as a raster, window by window."""
+    """Polygons in metres as one raster, window by window."""
 
     def __init__(self, polygons: Sequence[Polygon | MultiPolygon]) -> None:
         parts, owner = shapely.get_parts(np.asarray(polygons, dtype=object), return_index=True)
@@ -162,7 +166,7 @@ class PlanRaster:
         self._tree = shapely.STRtree(polygons)
 
     def window(self, window: CellWindow) -> BoolArray:
-        """(rows, columns) bool, True for cells whose centre lies in a polygon: borders count at their lower left."""
+        """(rows, columns) bool, True for cells with their centre in a polygon; borders count at their lower left."""
         cells = np.zeros((window.rows, window.columns), np.bool_)
         chosen = np.sort(self._tree.query(shapely.box(*window.bounds))).astype(np.int64)
         if len(chosen):
@@ -175,7 +179,7 @@ class PlanRaster:
 
 @kernel
 def _window_keys(x: FloatArray, y: FloatArray, cell: float, side: int) -> IntArray:
-    """Window that holds each point, row and column in one number."""
+    """Window of each point (n,) in metres, row and column in one number."""
     keys = np.empty(len(x), np.int64)
     for i in range(len(x)):
         keys[i] = (math.floor(y[i] / cell) // side << 32) + math.floor(x[i] / cell) // side
@@ -186,7 +190,7 @@ def _window_keys(x: FloatArray, y: FloatArray, cell: float, side: int) -> IntArr
 def _vote(
     balance: LabelArray, slot: IntArray, x: FloatArray, y: FloatArray, counted: BoolArray, cell: float, side: int
 ) -> None:
-    """Add one for each counted point to its cell, take one away for each other."""
+    """Add 1 to the cell of each counted point, subtract 1 for each other one: balance (windows, side, side)."""
     for i in range(len(x)):
         row = math.floor(y[i] / cell) % side
         column = math.floor(x[i] / cell) % side
@@ -194,10 +198,10 @@ def _vote(
 
 
 class PointRaster:
-    """Which cells are building by the classes of points, added tile by tile.
+    """Building cells by the classes of points, added tile by tile.
 
-    Of a cell only the balance is kept: points of buildings less the others. A window becomes bits as soon as no
-    further tile reaches it.
+    A cell stores only the balance: points of buildings less the others. A window becomes bits as soon as no further
+    tile reaches it.
     """
 
     def __init__(self) -> None:
@@ -218,7 +222,7 @@ class PointRaster:
                 self._open[row, column] = votes.copy()
 
     def finish(self, still_to_come: Sequence[Sequence[float]] = ()) -> None:
-        """Close the windows that none of the tiles to come reaches; x_min, y_min, x_max, y_max of each of those."""
+        """Close the windows that no tile to come reaches, given x_min, y_min, x_max, y_max of each of them."""
         side = WINDOW_CELLS * CELL_M
         for row, column in list(self._open):
             x0, y0 = column * side - CELL_M, row * side - CELL_M
@@ -227,7 +231,7 @@ class PointRaster:
                 self._done[row, column] = np.packbits(self._open.pop((row, column)) > 0)
 
     def window(self, window: CellWindow) -> BoolArray:
-        """(rows, columns) bool, True where buildings have more than half of the points, closed and opened.
+        """(rows, columns) bool, True if buildings have more than half of the points, after closing and opening.
 
         Every tile must have been added and finished.
         """
@@ -248,13 +252,13 @@ class PointRaster:
         return _cleaned(cells)[_REACH_CELLS:-_REACH_CELLS, _REACH_CELLS:-_REACH_CELLS]
 
     def outlines(self) -> list[Polygon]:
-        """The exact outlines of what hangs together over the sides of cells, with holes; from the south west."""
+        """The exact outlines of 4-connected cells, with holes, from the south west."""
         return outlines_of(self._runs())
 
     def _runs(self) -> IntArray:
         """(n, 3) int64, row, first column and the column behind the last of every run of set cells in a window."""
         found = [np.zeros((0, 3), np.int64)]
-        # closing reaches into windows that no point lies in
+        # Closing reaches into windows without points.
         places = {(row + i, column + j) for row, column in self._done for i in (-1, 0, 1) for j in (-1, 0, 1)}
         for row, column in sorted(places):
             window = CellWindow(row=row * WINDOW_CELLS, column=column * WINDOW_CELLS)
@@ -273,7 +277,7 @@ def outlines_of(runs: IntArray) -> list[Polygon]:
     Parameters
     ----------
     runs : (n, 3) int64
-        Row, first column, column behind the last; runs of one row may abut but not overlap.
+        Row, first column, column after the last; runs of one row may abut and must not overlap.
 
     Returns
     -------
@@ -296,7 +300,7 @@ def outlines_of(runs: IntArray) -> list[Polygon]:
     firsts = order[starts[:-1]]
     outlines = []
     for k in np.argsort(firsts).tolist():
-        # all coordinates are multiples of 0.5: the union is exact; normalised rings begin at a corner
+        # All coordinates are multiples of 0.5: the union is exact. Normalised rings begin at a corner.
         outline = shapely.normalize(shapely.union_all(boxes[order[starts[k] : starts[k + 1]]]))
         outlines.append(shapely.simplify(outline, 0.0))
     return outlines
@@ -304,9 +308,9 @@ def outlines_of(runs: IntArray) -> list[Polygon]:
 
 @kernel
 def _neighbours(runs: IntArray) -> IntArray:
-    """Pairs of runs in rows that follow one another and share a column."""
+    """Pairs (p, 2) of sorted runs (n, 3) in consecutive rows that share a column."""
     n = len(runs)
-    # the runs of two rows, each sorted and apart, overlap fewer times than there are runs
+    # Sorted, separate runs of two rows overlap fewer times than there are runs.
     pairs = np.empty((2 * n, 2), np.int64)
     found = 0
     below = 0

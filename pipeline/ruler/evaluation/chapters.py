@@ -1,6 +1,6 @@
-"""The figures of an evaluation as a reader wants them: chapters of lines with label, value, interval and denominator.
+"""The figures of an evaluation for readers: chapters of lines with label, value, interval and denominator.
 
-Terminal, Markdown and page all show these texts, so that a figure reads the same everywhere.
+Terminal, Markdown and page all show these texts: a figure reads the same everywhere.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ TITLES = {
     Group.GROUND: "Ground filter",
     Group.VALIDITY: "Validity of the solids",
 }
-"""What the chapters are called."""
+"""Titles of the chapters."""
 SUBSETS = {"all": "all", "good": "without defects", "hard": "with defects"}
-"""Subsets of buildings in their order, and what they are called; others follow under their own name."""
+"""Subsets of buildings in their order, with their labels; others follow under their own name."""
 NOTHING = "-"
-"""In place of a figure that there is none of."""
+"""Shown for a missing figure."""
 _UNITS = {
     "share": (100.0, 1, " %"),
     "count": (1.0, 0, ""),
@@ -51,9 +51,9 @@ class Line:
     measure: Measure
     """The figures."""
     value: str
-    """`93.4 %`, `0.052 m`; a dash where there is none."""
+    """`93.4 %`, `0.052 m`; a dash for a missing figure."""
     interval: str
-    """`92.9 to 94.0 %`; empty where there is none, or resampling did not change the figure."""
+    """`92.9 to 94.0 %`; empty without one, or if resampling did not change the figure."""
     n: str
     """Denominator with separated thousands."""
 
@@ -64,7 +64,7 @@ class Line:
 
     @property
     def subset(self) -> str:
-        """What the subset is called."""
+        """Label of the subset."""
         return SUBSETS.get(self.measure.subset, self.measure.subset)
 
 
@@ -75,7 +75,7 @@ class Chapter:
     group: Group
     """Which."""
     title: str
-    """What it is called."""
+    """Its title."""
     lines: tuple[Line, ...]
     """In the order of the measures; the subsets of one measure follow one another."""
     tables: tuple[CountTable, ...]
@@ -83,14 +83,14 @@ class Chapter:
 
     @property
     def subsets(self) -> tuple[str, ...]:
-        """The subsets that occur, as they are called, in their order."""
+        """Labels of the subsets that occur, in their order."""
         found = {line.measure.subset for line in self.lines}
         ordered = [name for name in SUBSETS if name in found] + sorted(found - SUBSETS.keys())
         return tuple(SUBSETS.get(name, name) for name in ordered)
 
     @property
     def measures(self) -> dict[str, dict[str, Line]]:
-        """Lines by name of the measure and by what the subset is called."""
+        """Lines by name of the measure and label of the subset."""
         found: dict[str, dict[str, Line]] = {}
         for line in self.lines:
             found.setdefault(line.definition.name, {})[line.subset] = line
@@ -103,7 +103,7 @@ def definition_of(name: str, definitions: Mapping[str, Definition] = DEFINITIONS
     Raises
     ------
     KeyError
-        No module defines it: a fault of the program.
+        No module defines it: an error in the program.
     """
     if name not in definitions:
         raise KeyError(f"measure {name!r} has no definition: add it to DEFINITIONS of the module that measures it")
@@ -157,7 +157,7 @@ def unit_sign(unit: str) -> str:
 
 
 def supported_decimals(low: float, high: float, unit: str) -> int:
-    """Decimals of a figure as printed: those of its unit, but no more than two digits of half its interval.
+    """Decimals of a printed figure: those of its unit, and at most two digits of half its interval (nan without one).
 
     Examples
     --------
@@ -174,7 +174,7 @@ def supported_decimals(low: float, high: float, unit: str) -> int:
 
 
 def number_text(value: float, unit: str, decimals: int, *, signed: bool = False) -> str:
-    """A figure without its unit's sign; a share that is not whole is never printed as 0 or 100 %.
+    """A figure without the sign of its unit; only whole shares are printed as 0 or 100 %.
 
     Examples
     --------

@@ -15,7 +15,7 @@ from pipeline.model import BoolArray, FloatArray, RoofType
 from pipeline.ruler.evaluation.measure import Group
 
 OUTCOMES = ("correct", "passable", "false")
-"""How a roof ends, best first (Hofmann, Maas, Streilein 2003)."""
+"""Outcomes of a roof, best first (Hofmann, Maas, Streilein 2003)."""
 AREA_CLASSES_M2 = (0.0, 50.0, 100.0, 200.0, 500.0, math.inf)
 """Borders of the classes of footprints in breakdowns."""
 
@@ -27,7 +27,7 @@ class CountTable:
     title: str
     """What is counted."""
     header: tuple[str, ...]
-    """One text a column."""
+    """One text per column."""
     rows: tuple[tuple[str, ...], ...]
     """The first column names the row."""
 
@@ -36,7 +36,7 @@ Tables = Mapping[str, pa.Table]
 
 
 def count_tables(tables: Tables) -> dict[Group, tuple[CountTable, ...]]:
-    """The counts that belong to a chapter, by chapter; what was not measured is left out."""
+    """The count tables by chapter, without those that were not measured."""
     makers: Sequence[tuple[Group, str, Callable[[pa.Table], list[CountTable]]]] = (
         (Group.ROOF_TYPES, "outcomes", _outcomes),
         (Group.ROOF_TYPES, "confusion", _confusion),
@@ -57,7 +57,7 @@ def _in_order_of_types(names: set[str]) -> list[str]:
 
 
 def _outcomes(table: pa.Table) -> list[CountTable]:
-    """As the paper prints them: a row a roof type, the sum beneath; one table a subset that is not empty."""
+    """As in the paper: one row per roof type and their sum; one table per subset that is not empty."""
     printed = []
     rows = table.to_pylist()
     for subset in dict.fromkeys(row["subset"] for row in rows):
@@ -69,8 +69,8 @@ def _outcomes(table: pa.Table) -> list[CountTable]:
         lines.append(("all", [sum(counts[i] for _, counts in lines) for i in range(len(OUTCOMES))]))
         header = ("roof type", *OUTCOMES, "buildings", "share correct", "share passable or better")
         body = tuple((kind, *_outcome_cells(counts)) for kind, counts in lines)
-        told = {"all": "all buildings", "good": "buildings without defects", "hard": "buildings with defects"}
-        printed.append(CountTable(title=f"Outcomes: {told.get(subset, subset)}", header=header, rows=body))
+        titles = {"all": "all buildings", "good": "buildings without defects", "hard": "buildings with defects"}
+        printed.append(CountTable(title=f"Outcomes: {titles.get(subset, subset)}", header=header, rows=body))
     return printed
 
 
@@ -115,7 +115,10 @@ def _ground(table: pa.Table) -> list[CountTable]:
 
 
 def breakdowns(tables: Tables) -> tuple[CountTable, ...]:
-    """Where buildings are lost: by shape, by what makes them hard, by size; edge buildings are left out."""
+    """Losses of buildings by shape, defect and size, without edge buildings; empty without a table of buildings.
+
+    Columns whose measure was not possible are left out.
+    """
     table = tables.get("buildings")
     if table is None or table.num_rows == 0:
         return ()
@@ -165,7 +168,7 @@ def _classes(table: pa.Table) -> list[tuple[str, str, list[tuple[str, BoolArray]
 
 
 def _ratios(table: pa.Table) -> list[tuple[str, FloatArray, FloatArray]]:
-    """Names, numerators and denominators, a building each, of the shares that the table allows."""
+    """Names, numerators and denominators (one per building) of the shares that the table allows."""
     names = set(table.column_names)
     ratios: list[tuple[str, FloatArray, FloatArray]] = []
     if "model_id" in names:

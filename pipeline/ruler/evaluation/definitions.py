@@ -1,4 +1,4 @@
-"""Every measure that there is, by name: collected once from the modules that measure."""
+"""All measures by name, collected from the modules that measure."""
 
 from __future__ import annotations
 

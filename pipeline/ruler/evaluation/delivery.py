@@ -1,4 +1,4 @@
-"""What was delivered: models, blocks and nothing for the reference buildings; models where no building is."""
+"""Delivered models, blocks and gaps per reference building, and models where no building is."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ _ALONE = Subset(name="all", buildings=np.zeros(0, np.bool_), elsewhere=True)
 
 
 class Delivered(StrEnum):
-    """What a reference building got."""
+    """The delivery for a reference building."""
 
     LOD2 = "lod2"
     """A model that is ok, with a level of detail of 2 or more."""
     BLOCK = "block"
     """A fallback, or a model of level of detail 1."""
     NOTHING = "nothing"
-    """No model that stands for it."""
+    """No model stands for it."""
 
 
 class Stands(StrEnum):
-    """Where a model stands."""
+    """Place of a model."""
 
     FOR_BUILDING = "for_building"
     """It stands for one reference building."""
     PART = "part"
-    """It stands for none, but at least half of it lies on reference buildings."""
+    """It stands for no building, and at least half of it lies on reference buildings."""
     JOINS = "joins"
-    """It covers at least half of each of several reference buildings, and lies on them by half or stands for one."""
+    """It covers at least half of several reference buildings, and half of it lies on them or it stands for one."""
     FALSE = "false"
     """Less than half of it lies on reference buildings, and the reference is complete there."""
     LEFT_OUT = "left_out"
-    """It stands for no building, and lies on one that the data edge cuts, at that edge, or where nothing is known."""
+    """It stands for no building, and lies on one that the data edge cuts, at that edge, or outside the reference."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -57,11 +57,11 @@ class DeliveryRow:
     model: int
     """Index of the model that stands for it; -1 for none."""
     delivered: Delivered
-    """What it got."""
+    """Its delivery."""
     parts: int
     """Number of models that are parts (`Stands.PART`) and lie mostly on it."""
     joined: bool
-    """Whether a model that covers at least half of another one too covers at least half of it."""
+    """Whether a model covers at least half of it and of another building."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -75,27 +75,27 @@ class DeliveredModel:
     status: Status
     """ok or fallback."""
     building: int
-    """Index of the reference building that it stands for, else of the one that it lies on most; -1 for none."""
+    """Index of the reference building that it stands for, else of the one with the largest common area; -1 for none."""
     share_on_reference: float
     """Share of its footprint on reference buildings."""
     covers: int
-    """Number of reference buildings of which it covers at least half."""
+    """Number of reference buildings that it covers by at least half."""
     stands: Stands
-    """Where it stands."""
+    """Its place."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Delivery:
-    """What was delivered."""
+    """The delivery."""
 
     buildings: tuple[DeliveryRow, ...]
-    """One a reference building."""
+    """One per reference building."""
     models: tuple[DeliveredModel, ...]
-    """One a model."""
+    """One per model."""
 
 
 def score_delivery(models: Sequence[RoofModel], reference: Reference, matching: Matching) -> Delivery:
-    """What the reference buildings got, and where the models stand."""
+    """The delivery for each reference building and the place of each model, in their orders."""
     pairs = matching.overlaps
     cut = np.array([building.touches_data_edge for building in reference.buildings], np.bool_)
     covering = pairs.common_m2 >= (MIN_SHARE - _ROUNDING) * matching.reference_m2[pairs.first]
@@ -157,7 +157,7 @@ def measures(delivery: Delivery, subset: Subset) -> list[Measure]:
     """The figures of one subset of the buildings. False models count in the subset `all` only."""
     buildings = delivery.buildings
     judged = [row for row in delivery.models if row.stands is not Stands.LEFT_OUT]
-    # a false model is a unit of its own, also where a corner of it touches a building
+    # A false model is a unit of its own, even if a corner of it touches a building.
     place = [row.building for row in buildings]
     place += [-1 if row.stands is Stands.FALSE else row.building for row in judged]
     unit = [0] * len(buildings) + [row.model for row in judged]

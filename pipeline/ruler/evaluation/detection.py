@@ -1,11 +1,11 @@
 """Detection of buildings by area and by object (Rutzinger, Rottensteiner, Pfeifer 2009).
 
-By area: on the raster of `building_raster`, with and without the ring of one cell on either side of the reference's
-edges, which alone holds 9 to 15 % of the area. Where the footprints of a part are given nothing is known outside them:
-cells count inside the given footprints only, and neither correctness nor quality exists.
+By area: on the raster of `building_raster`, with and without the ring of one cell on either side of the edges of the
+reference, which alone has 9 to 15 % of the area. Given footprints may be incomplete: then cells count inside them only,
+and there is neither correctness nor quality.
 
-By object: a reference building is found where at least half of its area is covered by models, whatever their number; a
-model is right where at least half of its area lies on reference buildings.
+By object: a reference building is found if models cover at least half of its area, whatever their number; a model is
+right if at least half of its area lies on reference buildings.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from pipeline.ruler.evaluation.subsets import Subset, measured
 from pipeline.scene import BUILDING_CLASS
 
 MIN_OVERLAP = 0.5
-"""Share of its own area from which on a building is found, or a model is right."""
+"""Least share of its own area of a found building or a right model."""
 OBJECT_AREAS_M2 = (0.0, 10.0, 50.0)
-"""Measures by object are given for all objects and for those of at least these areas."""
+"""Least areas of the objects that are measured."""
 BLOCK_CELLS = 100
 """Side of the blocks of 50 m that are the units of the bootstrap by area."""
 
@@ -71,32 +71,32 @@ class DetectionBlock:
     found: int
     """Cells that are building in the models."""
     both_without_ring: int
-    """The same three without the cells at the reference's edges."""
+    """`both` without the cells at the edges of the reference."""
     reference_without_ring: int
-    """See there."""
+    """`reference` without them."""
     found_without_ring: int
-    """See there."""
+    """`found` without them."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DetectedObject:
-    """A reference building or a model, and how much of it lies on the other kind."""
+    """A reference building or a model, and its share on the other kind."""
 
     name: str
     """Its building_id."""
     building: int
-    """Index of the reference building; of a model the one that it shares most area with, -1 for none."""
+    """Index of the reference building; for a model the one with the largest common area, -1 for none."""
     area_m2: float
-    """Of its footprint."""
+    """Area of its footprint."""
     overlap: float
-    """Share of its area that lies on models, or of a model on reference buildings."""
+    """Share of its area on models, or for a model on reference buildings."""
     counts: bool
-    """False where it touches the edge of the data; for a model where it lies on such a building or at that edge, or
-    where nothing is known."""
+    """False if it touches the edge of the data; for a model if it lies on such a building or at that edge, or where
+    the reference is incomplete."""
 
     @property
     def found(self) -> bool:
-        """Whether it is found, or for a model right."""
+        """Whether a building is found, or a model right."""
         return self.overlap >= MIN_OVERLAP
 
 
@@ -105,17 +105,17 @@ class Detection:
     """All rows of the measures of detection."""
 
     blocks: tuple[DetectionBlock, ...]
-    """By row and column, those without any building cell left out; empty without reference buildings."""
+    """By row and column, without blocks that have no building cell; empty without reference buildings."""
     buildings: tuple[DetectedObject, ...]
-    """One a reference building, in their order."""
+    """One per reference building, in their order."""
     models: tuple[DetectedObject, ...]
-    """One a model, in their order."""
+    """One per model, in their order."""
     has_correctness: bool
-    """False where the reference is complete nowhere, so that no model can be told wrong."""
+    """False if the reference is complete nowhere, so no model can be wrong."""
 
 
 def detect(models: Sequence[RoofModel], reference: Reference) -> Detection:
-    """Compare where models stand with where buildings are."""
+    """Compare the places of models and buildings; given footprints need one pass over the points."""
     buildings, right = _objects(models, reference)
     return Detection(
         blocks=_blocks(models, reference),
@@ -129,7 +129,7 @@ def detect(models: Sequence[RoofModel], reference: Reference) -> Detection:
 
 
 def _blocks(models: Sequence[RoofModel], reference: Reference) -> tuple[DetectionBlock, ...]:
-    """Cells counted a block, window by window."""
+    """Count cells per block, window by window."""
     outlines = [building.footprint for building in reference.buildings]
     found = [model.footprint for model in models]
     if not outlines and reference.extent is None:
@@ -149,7 +149,7 @@ def _blocks(models: Sequence[RoofModel], reference: Reference) -> tuple[Detectio
 
 
 def _bounds_within(areas: Sequence[shapely.Geometry], known: Sequence[shapely.Geometry]) -> FloatArray:
-    """(n, 4) bounds of areas, cut at the bounds of what is known: no cell counts beyond, however far a model goes."""
+    """(n, 4) bounds of areas, cut at the bounds of the known areas: no cell counts beyond them."""
     bounds = shapely.bounds(np.array([*areas], dtype=object)).reshape(-1, 4)
     whole = shapely.total_bounds(np.array([*known], dtype=object))
     low, high = np.maximum(bounds[:, :2], whole[:2]), np.minimum(bounds[:, 2:], whole[2:])
@@ -168,7 +168,7 @@ def _class_raster(reference: Reference) -> PointRaster:
 
 
 def _count(window: CellWindow, reference: BoolArray, found: BoolArray, ring: BoolArray) -> list[DetectionBlock]:
-    """The blocks of a window that hold any building cell."""
+    """The blocks of a window with any building cell."""
     layers = []
     for counted in (np.ones_like(ring), ~ring):
         layers += [reference & found & counted, reference & counted, found & counted]
@@ -198,7 +198,7 @@ def _count(window: CellWindow, reference: BoolArray, found: BoolArray, ring: Boo
 def _objects(
     models: Sequence[RoofModel], reference: Reference
 ) -> tuple[tuple[DetectedObject, ...], tuple[DetectedObject, ...]]:
-    """Reference buildings and models with the share of their area that lies on the other kind."""
+    """Reference buildings and models with the share of their area on the other kind."""
     truth = sound_polygons([building.footprint for building in reference.buildings])
     made = sound_polygons([model.footprint for model in models])
     pairs = overlapping(truth, made)
@@ -245,13 +245,13 @@ _CELLS = f"R, F: cells of {CELL_M:g} m that are building in the reference and in
 
 def _definitions() -> tuple[Definition, ...]:
     found = []
-    for suffix, (label, told) in _RING.items():
+    for suffix, (label, cells) in _RING.items():
         for name, formula in (
             ("completeness", "count(R and F) / count(R)"),
             ("correctness", "count(R and F) / count(F)"),
             ("quality", "count(R and F) / count(R or F)"),
         ):
-            found.append((f"area_{name}{suffix}", f"{name} by area{label}", f"{formula}; {_CELLS}; {told}"))
+            found.append((f"area_{name}{suffix}", f"{name} by area{label}", f"{formula}; {_CELLS}; {cells}"))
     for least in OBJECT_AREAS_M2:
         label = f" of at least {least:g} m2" if least else ""
         for name, formula in (
@@ -279,14 +279,14 @@ def _suffix(min_m2: float) -> str:
 
 
 DEFINITIONS: tuple[Definition, ...] = _definitions()
-"""What this module measures."""
+"""The measures."""
 
 
 def detection_measures(rows: Detection, subset: Subset) -> list[Measure]:
-    """The figures of a subset; by area only over all buildings, since a cell of a model belongs to no building.
+    """The figures of a subset; by area only for all buildings, since a cell of a model belongs to no building.
 
-    Units of the bootstrap are blocks of 50 m by area; by object the reference buildings, each with the models that
-    share most area with it, and the models that stand on none.
+    Units of the bootstrap by area are blocks of 50 m; by object, the reference buildings, each with the models that
+    share most of their area with it, and the models on no building.
     """
     found = _area_measures(rows, subset) if subset.elsewhere else []
     return found + _object_measures(rows, subset)
@@ -317,7 +317,7 @@ def _area_measures(rows: Detection, subset: Subset) -> list[Measure]:
 
 
 def _object_measures(rows: Detection, subset: Subset) -> list[Measure]:
-    """Completeness, correctness and quality of objects from each size on."""
+    """Completeness, correctness and quality of objects of each least size."""
     if not rows.buildings and not rows.has_correctness:
         return []
     found = []

@@ -23,18 +23,18 @@ from pipeline.ruler.evaluation.subsets import Subset, subsets
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What an evaluation found."""
+    """The result of an evaluation."""
 
     models: ModelSet
-    """What was measured."""
+    """The measured models."""
     reference: Reference | None
-    """Against what, with blocks joined where they were; None: the models alone."""
+    """The reference, with blocks joined if needed; None: the models alone."""
     measures: tuple[Measure, ...]
     """Every figure, in the order of the chapters."""
     tables: Mapping[str, pa.Table]
     """The rows behind the figures by name; see `pipeline.ruler.evaluation.tables`."""
     notes: tuple[str, ...]
-    """What the measures had to assume or leave out."""
+    """Assumptions and omissions of the measures."""
 
     def measure(self, name: str, subset: str = "all") -> Measure:
         """One figure.
@@ -51,17 +51,14 @@ class Evaluation:
 
 
 def needs_blocks(models: ModelSet, reference: Reference) -> bool:
-    """Whether single houses of a row cannot be asked for: models without footprints against simulated truth.
-
-    Whatever wrote them: a run and its own CityJSON are held to one reference.
-    """
+    """Whether single houses of a row cannot be expected: models without footprints against simulated truth."""
     return reference.kind == "truth" and not models.has_footprints
 
 
-def tells_types(models: ModelSet) -> bool:
-    """Whether any model says a roof type, so that types can be judged; True without models: none is found then."""
-    untold = {RoofType.UNKNOWN, RoofType.NONE}
-    return not models.models or any(model.roof_type not in untold for model in models.models)
+def has_roof_types(models: ModelSet) -> bool:
+    """Whether any model has a roof type, so types can be judged; True without models, for then none is found."""
+    unknown = {RoofType.UNKNOWN, RoofType.NONE}
+    return not models.models or any(model.roof_type not in unknown for model in models.models)
 
 
 def evaluate(
@@ -79,19 +76,19 @@ def evaluate(
     models : ModelSet
         From `pipeline.ruler.evaluation.reading.read_models`.
     reference : Reference, optional
-        From `read_truth_reference` or `read_points_reference`; without one only delivery and validity are told.
+        From `read_truth_reference` or `read_points_reference`; without one only delivery and validity are measured.
     blocks : bool, optional
-        Join true buildings that touch; by default as `needs_blocks` says.
+        Join true buildings that touch; by default as in `needs_blocks`.
     ground : callable, optional
-        What was found as ground; without it the ground measures are left out.
+        The found ground; without it the ground measures are left out.
     on_step : callable
-        Told the name of each step as it begins.
+        Called with the name of each step as it begins.
 
     Returns
     -------
     Evaluation
-        The points of the reference are read once for the residuals, and once more each for detection against points
-        and for the ground.
+        The points of the reference are read once for the residuals, and once each for detection against points and for
+        the ground.
     """
     on_step("solids")
     solids = validity.validity(models)
@@ -133,14 +130,16 @@ def _buildings(
     found: dict[str, pa.Table],
     on_step: Callable[[str], None],
 ) -> list[Measure]:
-    """Everything that asks for buildings; adds the tables to `found`."""
+    """All measures of buildings; adds the tables to `found`."""
     on_step("footprints")
     matching = match_footprints(models.models, reference)
     delivered = delivery.score_delivery(models.models, reference, matching)
     outlines = footprints.score_footprints(models.models, reference, matching)
     on_step("roof faces")
     face_score = faces.score_faces(models.models, reference)
-    types = roof_types.score_roof_types(models.models, reference, matching, face_score) if tells_types(models) else ()
+    types = (
+        roof_types.score_roof_types(models.models, reference, matching, face_score) if has_roof_types(models) else ()
+    )
     on_step("roof surfaces")
     surfaces = surface.score_surface(models.models, reference)
     on_step("points")
@@ -172,17 +171,17 @@ def _buildings(
 def _notes(models: ModelSet, reference: Reference) -> tuple[str, ...]:
     found = []
     codes = [crs for crs in (models.crs, reference.crs) if crs is not None and crs.startswith("EPSG:")]
-    # a name and a code may well mean the same; of a compound code the first part is the horizontal one
+    # A name and a code may mean the same. The first part of a compound code is the horizontal one.
     if len({code.split("+")[0] for code in codes}) > 1:
         found.append(
             f"The models are in {codes[0]}, the reference in {codes[1]}: coordinates were compared as they are."
         )
-    if reference.has_faces and not tells_types(models):
-        found.append("No model tells its roof type: types, and the outcomes that ask for them, are not judged.")
+    if reference.has_faces and not has_roof_types(models):
+        found.append("No model has a roof type: types, and the outcomes that need them, are not judged.")
     if models.has_footprints and reference.outlines == "given":
         found.append(
             "The models follow given footprints, and so does the reference: where these are the same, outlines and "
-            "detection agree by themselves and say nothing of the method."
+            "detection agree by themselves and say nothing about the method."
         )
     known = [building.footprint for building in reference.buildings]
     if reference.extent is not None:

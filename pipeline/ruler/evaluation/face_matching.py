@@ -25,8 +25,9 @@ MAX_NORMAL_ANGLE_DEG = 10.0
 MAX_OFFSET_M = 0.3
 """Largest mean distance between a face and its match, across the true plane."""
 _ROUNDING = 1e-6
-"""Metres, degrees: a lift by exactly the limit is still within it, whatever the coordinates' last bits."""
+"""Numerical guard, metres and degrees: exactly the limit is still within it."""
 _ROUNDING_SHARE = 1e-9
+"""Numerical guard for comparisons of shares."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -92,7 +93,7 @@ class Compared:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FaceMatch:
-    """What matches what. A unit is a true face alone, or a group of them."""
+    """The matches of faces. A unit is a true face alone, or a group of them."""
 
     true: Planes
     """(n) true faces."""
@@ -157,7 +158,11 @@ def compared(true: Planes, made: Planes) -> Compared:
 
 
 def match_faces(models: Sequence[RoofModel], reference: Sequence[RoofModel]) -> FaceMatch:
-    """Match all faces of all models to all true faces, one to one, the largest common area first."""
+    """Match all faces of all models to all true faces, one to one, the largest common area first.
+
+    Single faces and pieces of groups are matched first. A group is found if its matched pieces have at least half of
+    its area, or if a model face that is free, or matches one of its pieces, matches its union and mean plane.
+    """
     true, made = flattened(reference), flattened(models)
     unit = _units(reference)
     units = int(unit.max()) + 1 if len(unit) else 0

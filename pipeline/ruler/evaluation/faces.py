@@ -1,13 +1,13 @@
-"""Roof faces of models against true roof faces: completeness, correctness and quality, and what was split or joined.
+"""Roof faces of models against true roof faces: completeness, correctness, quality, and splits and joins.
 
-A true face is found where a model face overlaps it mutually by at least half of both plan areas, the normals agree
-within 10 deg and the offset within 0.3 m, one to one; after the comparison of building extraction by Rutzinger,
+A true face is found if a model face overlaps it by at least half of both plan areas, the normals agree within 10 deg
+and the offset within 0.3 m, one to one; after the comparison of building extraction by Rutzinger,
 Rottensteiner and Pfeifer (2009). All faces of all models take part: a building that was split costs no faces.
 
-The offset is the mean signed distance over the common area, across the true plane: the distance at the centroid, for
-both are planes. A root mean square would also grow with the angle and the size of the face (5 deg across a face of
-12 m are 0.3 m of it), so that the limit of 10 deg would never decide; how far a tilted face is off is told by the
-surface and residual measures.
+The offset is the mean signed distance over the common area, across the true plane. Both are planes, so it is the
+distance at the centroid. A root mean square would also grow with the angle and the size of the face (5 deg across a
+face of 12 m give 0.3 m), and the limit of 10 deg would never decide. The surface and residual measures show how far a
+tilted face is off.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ MIN_FACE_AREA_M2 = 10.0
 MIN_FACE_POINTS = 11
 """True faces with fewer points need not be found."""
 _ROUNDING = 1e-6
+"""Numerical guard, square metres."""
 
 
 class FaceVerdict(StrEnum):
-    """What a model face is."""
+    """Verdict on a model face."""
 
     RIGHT = "right"
     """Matches a true face that was to be found, or a piece of one."""
@@ -53,7 +54,7 @@ class FaceVerdict(StrEnum):
     NEITHER = "neither"
     """Too small to be wrong, or matches a true face that need not be found."""
     LEFT_OUT = "left_out"
-    """On a building that touches the data edge, of a model at that edge, or where the reference says nothing."""
+    """On a building that touches the data edge, of a model at that edge, or outside the reference."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,17 +70,17 @@ class ReferenceFace:
     group: int
     """As in the reference; -1 for none."""
     unit: int
-    """What is counted: a face alone, or a group. Numbered over the reference."""
+    """Number of the counted unit: a face alone, or a group."""
     area_m2: float
     """Its own area in its plane."""
     slope_deg: float
     """0 is horizontal."""
     n_points: int
-    """Its own points; -1 where unknown."""
+    """Its own points; -1 if unknown."""
     unit_area_m2: float
     """Area of the unit."""
     to_be_found: bool
-    """Whether the unit has at least 10 m2 and 11 points, and its building is not cut by the data edge."""
+    """Whether the unit has at least 10 m2 and 11 points, and the data edge does not cut its building."""
     found: bool
     """Whether the unit was found."""
     matched: bool
@@ -132,18 +133,23 @@ class ModelFace:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FaceScore:
-    """All faces and what became of them."""
+    """All faces with their verdicts."""
 
     reference: tuple[ReferenceFace, ...]
-    """One a true roof face, building by building."""
+    """One per true roof face, building by building."""
     models: tuple[ModelFace, ...]
-    """One a model face, model by model."""
+    """One per model face, model by model."""
     components: tuple[FaceComponent, ...]
     """Faces of at least 10 m2 that lie on one another."""
 
 
 def score_faces(models: Sequence[RoofModel], reference: Reference) -> FaceScore:
-    """Match all faces of all models to all true faces, and say what each counts as."""
+    """Match all faces of all models to all true faces, and give each a verdict; empty without true faces.
+
+    A model face that matches a true face is judged unless the data edge cuts the building. Other faces are judged as in
+    `where_judged`, except on a cut building, or on no building as part of a model that the edge of the data excuses
+    (`excused_models`). A cut model may still find faces.
+    """
     if not reference.has_faces:
         return FaceScore(reference=(), models=(), components=())
     match = match_faces(models, reference.buildings)
@@ -161,7 +167,7 @@ def score_faces(models: Sequence[RoofModel], reference: Reference) -> FaceScore:
     building, left_out = _judged(models, reference, match, unit_building, unit_cut, cut)
     made_large = match.made.area_m2 >= MIN_FACE_AREA_M2 - _ROUNDING
     unit_of = match.matched_unit
-    # pieces of a bent face may be small: with the large unit that they match they count
+    # Pieces of a bent face may be small: they count with the large unit that they match.
     matched_large = np.append(large, False)[unit_of]
     components, unit_topology, made_topology = face_components(
         TopologyInput(
@@ -188,7 +194,7 @@ def score_faces(models: Sequence[RoofModel], reference: Reference) -> FaceScore:
 
 
 def _points(reference: Reference) -> IntArray:
-    """Points of every true face; -1 where nothing is known."""
+    """Points of every true face; -1 if unknown."""
     known = reference.face_points
     counts = [
         known.get((building.building_id, surface.plane_id), 0) if known else -1
@@ -206,7 +212,7 @@ def _judged(
     unit_cut: BoolArray,
     cut: BoolArray,
 ) -> tuple[IntArray, BoolArray]:
-    """Of every model face: the reference building that it belongs to, and whether it is left out."""
+    """The reference building of every model face, and whether the face is left out."""
     footprints = sound_polygons([building.footprint for building in reference.buildings])
     over = overlapping(footprints, match.made.polygon)
     building = mostly_on(len(match.made.owner), over)
@@ -348,7 +354,7 @@ def measures(score: FaceScore, subset: Subset) -> list[Measure]:
 
 
 def _columns(score: FaceScore, subset: Subset) -> tuple[dict[str, FloatArray], dict[str, float]]:
-    """Sums over the units of the bootstrap, and numbers of what the subset holds."""
+    """Sums over the units of the bootstrap, and counts of the subset."""
     units = list({row.unit: row for row in reversed(score.reference)}.values())
     true = {
         "large": [row.to_be_found for row in units],

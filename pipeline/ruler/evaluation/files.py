@@ -1,4 +1,4 @@
-"""Evaluations of what lies on the disk: which reader for which argument."""
+"""Evaluations of files: which reader for which argument."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pipeline.settings import RunSettings
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EvaluationRequest:
-    """What is to be measured, and against what."""
+    """The models to measure, and the reference."""
 
     models: str
     """A run directory, or models of other programs."""
@@ -33,31 +33,25 @@ class EvaluationRequest:
     footprints: str | None = None
     """Outlines of buildings, with points."""
     ground: tuple[str, ...] = ()
-    """Point files whose class 2 is the ground to be judged; without any the run's own ground stage."""
+    """Point files whose class 2 is the ground to be judged; by default that of the ground stage of the run."""
     crs: str | None = None
-    """Of the point files, where their header has none or a wrong one."""
+    """CRS of the point files, if their header has none or a wrong one."""
     vertical_unit: str | None = None
     """Unit of their elevations."""
     as_surveyed: bool = False
     """Move true buildings to where the survey saw them."""
     blocks: bool | None = None
-    """Join true buildings that touch; None: as the models need it."""
+    """Join true buildings that touch; None: as the models need."""
 
     def __post_init__(self) -> None:
-        """Hold what belongs together.
-
-        Raises
-        ------
-        SettingsError
-            If truth and points are both given, or footprints or ground without what they belong to.
-        """
+        """Check that the fields belong together; raises SettingsError with all faults."""
         faults = []
         if self.truth is not None and self.points:
             faults.append("both a truth and points are given as the reference: use one of --truth and --points")
         if self.footprints is not None and not self.points:
             faults.append(f"footprints are {self.footprints} without points: give the classified tile by --points")
         if self.as_surveyed and self.truth is None:
-            faults.append("as-surveyed is asked for without a truth: only simulated strips tell their shifts")
+            faults.append("as-surveyed is given without a truth: only simulated strips have known shifts")
         if self.ground and self.truth is None and not self.points:
             faults.append(f"ground is {', '.join(self.ground)} without a reference: give --points or --truth")
         if faults:
@@ -65,7 +59,7 @@ class EvaluationRequest:
 
 
 def read_reference(request: EvaluationRequest) -> Reference | None:
-    """What a request measures against; None where it names nothing.
+    """The reference of a request; None without one. Its models are not read.
 
     Raises
     ------
@@ -85,7 +79,7 @@ def evaluate_files(
     on_step: Callable[[str], None] = lambda _: None,
     reference: Reference | None = None,
 ) -> Evaluation:
-    """Read and measure.
+    """Read and measure; `reference` is that of the same request, if it serves several models.
 
     Raises
     ------
@@ -105,14 +99,14 @@ def evaluate_files(
 
 
 def _ground(files: Sequence[str], models: ModelSet, reference: Reference, options: ReadOptions) -> FoundGround | None:
-    """What was found as ground: by given files, else by the stage of the run; None for models of other programs."""
+    """The found ground, by given files, else by the stage of the run; None for models of other programs."""
     if not reference.has_ground:
         return None
     if files:
         return GroundOfFiles(files, options)
     if models.kind != "run":
         return None
-    if not storage_at(models.path).has(MANIFEST):  # simulated truth, or tables alone: nothing there found ground
+    if not storage_at(models.path).has(MANIFEST):  # simulated truth, or tables alone: no ground stage
         return None
     settings = read_manifest(models.path).settings
     sections = {name: table for name, table in settings.items() if name != "general"}

@@ -18,8 +18,9 @@ from pipeline.ruler.evaluation.reference import Reference
 from pipeline.ruler.evaluation.subsets import Subset, measured, measured_median
 
 LIMITS = (0.5, 0.8, 0.9)
-"""IoU from which on shares are told."""
+"""Limits of the shares of buildings by IoU."""
 _ROUNDING = 1e-9
+"""Numerical guard for comparisons of shares."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -31,27 +32,31 @@ class FootprintRow:
     building_id: str
     """Its name."""
     model: int
-    """Index of the model that stands for it; -1 where it was not found."""
+    """Index of the model that stands for it; -1 if it was not found."""
     model_id: str | None
     """Name of that model."""
     iou: float
-    """Intersection over union with that model; 0 where it was not found."""
+    """Intersection over union with that model; 0 if it was not found."""
     iou_together: float
     """The same with the union of all models that share at least half of either with it; 0 without any."""
     models_over: int
     """Number of those models."""
     area_m2: float
-    """Of the reference footprint."""
+    """Area of the reference footprint."""
     model_area_m2: float
-    """Of the model that stands for it; nan where it was not found."""
+    """Area of the model that stands for it; nan if it was not found."""
     area_bias: float
-    """Model area / reference area - 1; nan where it was not found."""
+    """Model area / reference area - 1; nan if it was not found."""
     offset_m: float
-    """Shift of the outline that explains the difference of areas, positive outwards; nan where it was not found."""
+    """Shift of the outline that explains the difference of areas, positive outwards; nan if it was not found."""
 
 
 def score_footprints(models: Sequence[RoofModel], reference: Reference, matching: Matching) -> tuple[FootprintRow, ...]:
-    """One row a reference building, in their order."""
+    """One row per reference building, in their order.
+
+    The offset is the difference of the areas over the mean of both perimeters. It is exact for an outline whose edges
+    were all moved by one distance, since the area grows by the perimeter half way.
+    """
     true = sound_polygons([building.footprint for building in reference.buildings])
     made = sound_polygons([model.footprint for model in models])
     true_m, made_m = shapely.length(true), shapely.length(made)

@@ -1,9 +1,9 @@
 """The ground filter against reference classes: type I, type II and total error, and kappa (Sithole, Vosselman 2003).
 
-Judged are last returns, the ones that a ground filter decides on; noise and water are left out, and where a file tells
-objects by their classes also what it leaves unclassified: nobody looked whether that is ground. What was found comes
-from a classified file that any program wrote, or from the ground stage of a run: its filter over the same points, with
-its settings and its rule for the points near the terrain (`ground_points`).
+Last returns are judged, since ground filters decide on them. Noise and water are left out. If other classes name the
+objects, unclassified points are left out too: they may be ground. The found ground comes from a classified file of any
+program, or from the ground stage of a run: its filter over the same points, with its settings and its rule for points
+near the terrain (`ground_points`).
 """
 
 from __future__ import annotations
@@ -35,18 +35,19 @@ from pipeline.terrain.settings import OutlierSettings
 NOT_JUDGED = (7, 9, 18)
 """Reference classes that are neither ground nor object: low noise, water, high noise."""
 UNCLASSIFIED = (0, 1)
-"""Classes that name no object. In the benchmark's samples all that is not ground has one of them."""
+"""Classes that name no object. In the samples of the benchmark, all points that are not ground have one of them."""
 BLOCK_M = 50
 """Side of the blocks that are the units of the bootstrap."""
 MM = 1000
 WINDOW_CELLS = 512
 """Side of the windows in which the terrain is drawn, in cells of 1 m."""
 _WHOLE_POINTS = 20_000_000
-"""More points than these are searched for outliers window by window."""
+"""Above this number of points, outliers are searched window by window to bound memory."""
 _NO_MORE = 2**62
+"""Larger than any key."""
 
 FoundGround = Callable[[ReferencePoints], BoolArray]
-"""From the points of a tile to what was found: (n,) bool, True for ground."""
+"""From the points of a tile to the found ground: (n,) bool, True for ground."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,7 +72,7 @@ class GroundBlock:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TileGround:
-    """The figures of one tile, as the samples of the benchmark are reported."""
+    """The figures of one tile."""
 
     tile: str
     """Its name."""
@@ -93,7 +94,7 @@ class TileGround:
 
 
 def ground_blocks(reference: Reference, found: FoundGround) -> list[GroundBlock]:
-    """Count right and wrong points of every tile, block by block; one tile in memory."""
+    """Count right and wrong points of every tile by blocks, one tile in memory; empty if no ground is known."""
     if not reference.has_ground:
         return []
     rows: list[GroundBlock] = []
@@ -145,14 +146,14 @@ def tile_figures(rows: Sequence[GroundBlock]) -> list[TileGround]:
 
 
 class GroundOfFiles:
-    """Ground as classified files say that some program wrote for the same points.
+    """Ground in classified files that another program wrote for the same points.
 
     Parameters
     ----------
     paths : sequence of str or Path
         LAS, LAZ or other point files; class 2 is ground.
     options : ReadOptions, optional
-        CRS and units as for the reference; nothing is dropped, whatever it says.
+        CRS and units as for the reference; no points are dropped.
     """
 
     def __init__(self, paths: Sequence[str | Path], options: ReadOptions | None = None) -> None:
@@ -166,7 +167,7 @@ class GroundOfFiles:
         Raises
         ------
         InconsistentInputError
-            Some points of the tile are in none of the files.
+            Points of the tile are in none of the files.
         """
         if len(points.xyz) == 0:
             return np.zeros(0, np.bool_)
@@ -198,7 +199,7 @@ class GroundOfFiles:
 def matched_points(
     wanted: FloatArray, wanted_return: np.ndarray | None, offered: FloatArray, offered_return: np.ndarray | None
 ) -> IntArray:
-    """The offered point at the place of each wanted one.
+    """The offered point at the same place as each wanted one.
 
     Parameters
     ----------
@@ -210,7 +211,7 @@ def matched_points(
     Returns
     -------
     (n,) int64
-        Index into the offered points, each given once; -1 where none is left. Equal points pair up in their order.
+        Index into the offered points, each used once; -1 if none is left. Equal points pair up in their order.
     """
     a, b = np.rint(wanted * MM).astype(np.int64), np.rint(offered * MM).astype(np.int64)
     r = np.zeros(len(a), np.int64) if wanted_return is None else wanted_return.astype(np.int64)
@@ -232,7 +233,7 @@ def matched_points(
 def _merged(
     plan_a: IntArray, rest_a: IntArray, order_a: IntArray, plan_b: IntArray, rest_b: IntArray, order_b: IntArray
 ) -> IntArray:
-    """Pairs of equal keys of two sorted lists."""
+    """Index of the equal key in the second of two sorted lists of keys (plan, rest), (n,); -1 for none."""
     match = np.full(len(plan_a), -1, np.int64)
     j = 0
     for i in range(len(plan_a)):
@@ -248,11 +249,11 @@ def _merged(
 
 
 class GroundOfRun:
-    """Ground as a run's own ground stage finds it, its filter run again over the reference's points.
+    """Ground by the ground stage of a run, its filter run again over the points of the reference.
 
-    Made in one pass over the points: the lowest last return of each cell of 1 m, then the terrain window by window
-    with all the halo that the filter looks at, so that it does not depend on the tiles. Classes of the file are never
-    believed here, whatever the run did. Gross outliers are searched tile by tile.
+    One pass over the points gives the lowest last return of each cell of 1 m, then the terrain is made window by window
+    with the halo of the filter, so it does not depend on the tiles. The classes of the file are never used here, even
+    if the run used them. Gross outliers are searched tile by tile.
     """
 
     def __init__(self, reference: Reference, settings: SceneSettings) -> None:
@@ -263,7 +264,7 @@ class GroundOfRun:
         self._terrain = {place: self._drawn(*place) for place in sorted(self._lowest)}
 
     def __call__(self, points: ReferencePoints) -> BoolArray:
-        """Ground of a tile: near the terrain or below it; outliers are none."""
+        """Ground of a tile: points near the terrain or below it, without outliers."""
         x, y, z = _millimetres(points.xyz)
         found = np.zeros(len(x), np.bool_)
         for (row, column), index in _by_window(x, y):
@@ -323,7 +324,7 @@ class GroundOfRun:
 
 
 def kept_points(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: OutlierSettings) -> BoolArray:
-    """Mask of the points that are no gross outliers; many points window by window."""
+    """Mask of the points that are not gross outliers; window by window for many points."""
     if len(x_mm) <= _WHOLE_POINTS:
         return dense_enough(x_mm, y_mm, z_mm, settings)
     kept = np.zeros(len(x_mm), np.bool_)
@@ -338,7 +339,7 @@ def kept_points(x_mm: IntArray, y_mm: IntArray, z_mm: IntArray, settings: Outlie
 
 
 def _millimetres(xyz: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Coordinates as a run takes them in."""
+    """Coordinates in whole millimetres, as in a run."""
     x, y, z = (np.rint(xyz[:, axis] * MM).astype(np.int64) for axis in range(3))
     return x, y, z
 
@@ -388,7 +389,7 @@ DEFINITIONS: tuple[Definition, ...] = tuple(
         ("kappa", "kappa", "share", Better.HIGHER, "(agreement - agreement by chance) / (1 - agreement by chance)"),
     )
 )
-"""What this module measures."""
+"""The measures."""
 
 
 def _columns(rows: Sequence[GroundBlock]) -> dict[str, FloatArray]:
@@ -408,7 +409,7 @@ def _columns(rows: Sequence[GroundBlock]) -> dict[str, FloatArray]:
 
 
 def ground_measures(rows: Sequence[GroundBlock], subset: Subset) -> list[Measure]:
-    """The figures over all tiles, blocks of 50 m as units of the bootstrap; only for the subset of all."""
+    """The figures over all tiles, blocks of 50 m as units of the bootstrap; only for the subset `all`."""
     if not rows or not subset.elsewhere:
         return []
     columns = _columns(rows)

@@ -1,6 +1,6 @@
-"""Footprints of models and of the reference: which overlap, and which stand for one another.
+"""Footprints of models and of the reference: which overlap, and which model stands for which building.
 
-A building is found where a model's footprint overlaps it by an intersection over union (IoU) of at least one half,
+A building is found if the footprint of a model overlaps it with an intersection over union (IoU) of at least one half,
 one to one, best first (Rutzinger, Rottensteiner and Pfeifer 2009).
 """
 
@@ -19,14 +19,16 @@ from pipeline.ruler.evaluation.models import RoofModel
 from pipeline.ruler.evaluation.reference import Reference
 
 MIN_IOU = 0.5
-"""Overlap from which on a building is found."""
+"""Least overlap of a found building: two models cannot both reach it."""
 MIN_SHARE = 0.5
-"""Share of a footprint or face from which on it counts as lying on another."""
+"""Least share of a footprint or face that lies on another one."""
 EDGE_M = 5.0
-"""Farther inside the extent of a reference no model is cut by the edge of the data, whatever it says of itself."""
+"""A model farther inside the extent of the reference is not cut by the edge of the data, whatever it claims."""
 _MIN_M2 = 1e-6
+"""Numerical guard: smaller overlaps are none."""
 _ROUNDING = 1e-9
-_PAIRS_A_BLOCK = 65_536
+"""Numerical guard for comparisons of shares."""
+_PAIRS_PER_BLOCK = 65_536
 
 Geometries = npt.NDArray[Any]
 """Array of shapely geometries."""
@@ -67,17 +69,17 @@ class Matching:
     model_m2: FloatArray
     """(m,) float64, footprint areas."""
     model_of: IntArray
-    """(r,) int64, the model that stands for it (IoU >= 0.5, one to one); -1 where it was not found."""
+    """(r,) int64, the model that stands for it (IoU >= 0.5, one to one); -1 if it was not found."""
     iou: FloatArray
-    """(r,) float64, IoU with that model; 0 where it was not found."""
+    """(r,) float64, IoU with that model; 0 if it was not found."""
     reference_of: IntArray
     """(m,) int64, the reference building that it stands for; -1 for none."""
     share_on_reference: FloatArray
     """(m,) float64, share of the model's footprint that stands on reference buildings."""
     share_in_extent: FloatArray
-    """(m,) float64, share of it where the reference is complete; 0 where it is so nowhere."""
+    """(m,) float64, share of it where the reference is complete."""
     mostly_on: IntArray
-    """(m,) int64, the reference building that it shares most area with; -1 for none."""
+    """(m,) int64, the reference building with the largest common area; -1 for none."""
 
     def models_over(self, building: int) -> IntArray:
         """All models that overlap a reference building, by index."""
@@ -86,7 +88,7 @@ class Matching:
 
 
 def sound_polygons(polygons: Sequence[shapely.Geometry]) -> Geometries:
-    """The polygons as an array; those that are invalid repaired to the area that they enclose."""
+    """The polygons as an array; invalid ones are repaired to the area that they enclose."""
     array = np.empty(len(polygons), dtype=object)
     array[:] = polygons
     bad = ~shapely.is_valid(array)
@@ -96,7 +98,7 @@ def sound_polygons(polygons: Sequence[shapely.Geometry]) -> Geometries:
 
 
 def overlapping(first: Geometries, second: Geometries) -> Overlaps:
-    """All pairs of two sets of polygons that share area, with the common area."""
+    """All pairs of two arrays of valid (multi)polygons, from `sound_polygons`, that share area."""
     if len(first) == 0 or len(second) == 0:
         none = np.zeros(0, np.int64)
         return Overlaps(first=none, second=none, common_m2=np.zeros(0), middle=np.zeros((0, 2)))
@@ -108,8 +110,8 @@ def overlapping(first: Geometries, second: Geometries) -> Overlaps:
     order = np.lexsort((b, a))
     a, b = a[order].astype(np.int64), b[order].astype(np.int64)
     common, middle = np.zeros(len(a)), np.zeros((len(a), 2))
-    for start in range(0, len(a), _PAIRS_A_BLOCK):
-        block = slice(start, start + _PAIRS_A_BLOCK)
+    for start in range(0, len(a), _PAIRS_PER_BLOCK):
+        block = slice(start, start + _PAIRS_PER_BLOCK)
         shared = shapely.intersection(first[a[block]], second[b[block]])
         common[block] = shapely.area(shared)
         real = np.flatnonzero(common[block] > _MIN_M2)
@@ -127,9 +129,9 @@ def summed(index: IntArray, values: FloatArray, count: int) -> FloatArray:
 def one_to_one(first: IntArray, second: IntArray, weight: FloatArray) -> BoolArray:
     """Which of some pairs hold when each index may be taken once, the largest weight first.
 
-    Equal weights go by the first index, then by the second. Plan areas that do not overlap within either set can
-    compete only where they share exactly half, so the order decides next to nothing; where models overlap each other
-    it sees to it that a face counts once.
+    Equal weights go by the first index, then by the second. Plan areas that do not overlap within either set compete
+    only if they share exactly half, so the order rarely matters. If models overlap each other, it makes a face count
+    once.
     """
     kept = np.zeros(len(first), np.bool_)
     taken_first: set[int] = set()
@@ -144,7 +146,7 @@ def one_to_one(first: IntArray, second: IntArray, weight: FloatArray) -> BoolArr
 
 
 def match_footprints(models: Sequence[RoofModel], reference: Reference) -> Matching:
-    """Match the footprints of models to those of a reference."""
+    """Match the footprints of models to those of a reference; ties in IoU go to the smaller index."""
     made = sound_polygons([model.footprint for model in models])
     true = sound_polygons([building.footprint for building in reference.buildings])
     model_m2, reference_m2 = shapely.area(made), shapely.area(true)
@@ -175,7 +177,7 @@ def share_covered(polygons: Geometries, cover: Geometries, pairs: Overlaps) -> F
     areas = shapely.area(polygons)
     common = summed(pairs.second, pairs.common_m2, len(polygons))
     times = np.bincount(pairs.second, minlength=len(polygons))
-    several = np.flatnonzero(times > 1)  # only there the cover may overlap itself and count twice
+    several = np.flatnonzero(times > 1)  # here the cover may overlap itself and count twice
     if len(several):
         order = np.argsort(pairs.second, kind="stable")
         start, end = (np.searchsorted(pairs.second[order], several, side) for side in ("left", "right"))
@@ -199,7 +201,7 @@ def share_in_extent(polygons: Geometries, extent: shapely.Geometry | None) -> Fl
 
 
 def mostly_on(count: int, pairs: Overlaps) -> IntArray:
-    """For each of `count` second polygons the first that it shares most area with, (count,); -1 for none."""
+    """For each of `count` second polygons the first one with the largest common area, (count,); -1 for none."""
     found = np.full(count, -1, np.int64)
     order = np.lexsort((-pairs.first, pairs.common_m2))  # ascending: the largest area, then the smallest index, last
     found[pairs.second[order]] = pairs.first[order]
@@ -209,10 +211,11 @@ def mostly_on(count: int, pairs: Overlaps) -> IntArray:
 def where_judged(
     polygons: Geometries, cover: Geometries, pairs: Overlaps, extent: shapely.Geometry | None
 ) -> BoolArray:
-    """Which polygons, (n,), of a model stand where the reference says something.
+    """Which polygons, (n,), of a model stand where the reference has information.
 
-    At least half of such a one lies on reference buildings or in the extent, or it covers at least half of a reference
-    building: to be so large that most of it lies beyond the extent is no excuse. `pairs` name the buildings first.
+    At least half of such a polygon lies on reference buildings or in the extent, or it covers at least half of a
+    reference building: a polygon that is so large that most of it lies beyond the extent is still judged. `pairs` name
+    the buildings first.
     """
     known = np.maximum(share_covered(polygons, cover, pairs), share_in_extent(polygons, extent))
     judged: BoolArray = known >= MIN_SHARE - _ROUNDING
@@ -224,9 +227,9 @@ def where_judged(
 def excused_models(models: Sequence[RoofModel], reference: Reference) -> BoolArray:
     """Which models, (m,), are excused by the edge of the data where they stand on no reference building.
 
-    Those that lie across the border of the extent, and those that say they touch the edge and are not farther than 5 m
-    inside. Of a model on a reference building the reference alone says whether it is cut: what is judged has no say in
-    what is judged.
+    These are models across the border of the extent, and models at most 5 m inside that claim to touch the edge.
+    For a model on a reference building, the reference alone decides whether it is cut: a model must not choose whether
+    it is judged.
     """
     claims = np.array([model.touches_data_edge for model in models], np.bool_)
     if reference.extent is None or len(claims) == 0:

@@ -1,4 +1,4 @@
-"""What a measure is: a figure with its interval, its denominator, and the subset of buildings that it is over."""
+"""A measure: a figure with its interval, its denominator, and its subset of buildings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Better(StrEnum):
-    """Which way is better."""
+    """The better direction of a measure."""
 
     HIGHER = "higher"
     LOWER = "lower"
@@ -42,9 +42,9 @@ class Definition:
     unit: str
     """m, m2, share (0 to 1), count, or empty."""
     better: Better
-    """Which way is better."""
+    """The better direction."""
     formula: str
-    """How it is computed, one line of Markdown."""
+    """Its computation, one line of Markdown."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,11 +52,11 @@ class Measure:
     """A measured figure."""
 
     name: str
-    """Of its definition."""
+    """Name of its definition."""
     value: float
-    """nan where the denominator is zero."""
+    """The figure; nan if the denominator is zero."""
     low: float = float("nan")
-    """Lower end of the 95 % bootstrap interval; nan where there is none."""
+    """Lower end of the 95 % bootstrap interval; nan without one."""
     high: float = float("nan")
     """Upper end."""
     n: int

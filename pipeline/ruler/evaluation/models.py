@@ -1,4 +1,4 @@
-"""Buildings as footprints, planar roof faces and solids: what the measures look at, whatever wrote them."""
+"""Buildings of any program as footprints, planar roof faces and solids: the input of all measures."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class RoofSurface:
     coefficients: tuple[float, float, float]
     """a, b, c: rise per metre east and north, height over the origin."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Coordinates that the plane is given about."""
+    """Origin of the plane."""
     plane_id: int = -1
-    """Number of its plane within the building, as in the record; -1 where it has none."""
+    """Number of its plane within the building, as in the record; -1 if it has none."""
     group: int = -1
-    """Surfaces of one building with one group >= 0 count as one face: the two parts of a bent hip face."""
+    """Surfaces of one building with one group >= 0 count as one face, such as the two parts of a bent hip face."""
 
     def elevation(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Elevation of the plane at places x, y."""
@@ -47,32 +47,32 @@ class RoofSurface:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RoofModel:
-    """A building as far as the score looks at it."""
+    """A building for the measures."""
 
     building_id: str
     """Its name."""
     footprint: Polygon | MultiPolygon
     """2D, coordinates in metres."""
     roof_type: RoofType
-    """What it is said to be."""
+    """Its claimed roof type."""
     surfaces: tuple[RoofSurface, ...]
     """Its roof faces."""
     touches_data_edge: bool = False
-    """True where it is cut, or a speck of the raster: as reference it need not be found. Of a model it is the model's
-    own claim, which excuses it only at the end of the reference's extent."""
+    """True if it is cut by the edge of the data, or a speck of the raster: such a reference building need not be found.
+    For a model it is a claim, which excuses it only at the edge of the extent of the reference."""
     source_id: str | None = None
     """As in the record; in simulated truth the block, which buildings that touch share."""
     status: Status = Status.OK
-    """ok, or fallback where a block stands in place of a model; what others made is ok."""
+    """ok, or fallback for a block; models of other programs are ok."""
     lod: str = "2.2"
-    """Level of detail, as the model says."""
+    """Level of detail that the model claims."""
     solids: tuple[Solid, ...] = ()
     """Its closed solids about `solid_origin`; empty where only surfaces are known."""
     solid_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Coordinates of the solids' origin, metres."""
 
     def top(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Elevation of the highest roof face at places x, y; nan where there is none."""
+        """Elevation of the highest roof face at places x, y; nan without one."""
         top = np.full(len(x), -np.inf)
         for surface in self.surfaces:
             inside = shapely.intersects_xy(surface.polygon, x, y)
@@ -82,21 +82,21 @@ class RoofModel:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelSet:
-    """Models as one program delivered them, in metres."""
+    """The models of one program, in metres."""
 
     name: str
-    """What the report calls them: the method of a run, else the file's name."""
+    """Their name in the report: the method of a run, else the name of the file."""
     kind: Literal["run", "cityjson", "cityjsonseq", "obj"]
-    """What was read."""
+    """Format."""
     path: str
-    """Where."""
+    """Path or URL."""
     models: tuple[RoofModel, ...]
     """Those with a footprint and at least one roof face, sorted by building_id."""
     failed: tuple[RoofModel, ...] = ()
     """Records without a model: failed candidates, objects without geometry. Their footprint may be empty."""
     crs: str | None = None
-    """Name or code of the coordinate reference system; None where unknown."""
+    """Name or code of the coordinate reference system; None if unknown."""
     has_footprints: bool = False
-    """True where the models follow given footprints: neighbours in a row are then told apart."""
+    """True if the models follow given footprints, which separate neighbours in a row."""
     notes: tuple[str, ...] = ()
-    """What the reader had to assume or leave out, as sentences for the report."""
+    """Assumptions and omissions of the reader, as sentences for the report."""

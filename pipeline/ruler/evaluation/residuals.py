@@ -1,9 +1,9 @@
 """Measured points against the models: the vertical distance to the top surface over the reference footprints.
 
-Every roof point inside a reference footprint counts, whatever the models' own footprints are: where no roof of any
-model covers it, it is a miss, so that a smaller footprint cannot buy a better score. The top surface is the highest
-roof face of all models together. Top-visible points are those without another roof point of the same building more
-than 1.1 m higher within 0.5 m in plan: facades, and what lies under overhangs, are left out.
+Every roof point inside a reference footprint counts, whatever the footprints of the models are. A point without a roof
+above or below it is a miss, so a smaller footprint cannot buy a better score. The top surface is the highest roof face
+of all models together. Top-visible points have no other roof point of the same building more than 1.1 m higher within
+0.5 m in plan: points on facades and under overhangs are left out.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from pipeline.ruler.evaluation.subsets import Subset, measured, measured_median
 TOLERANCE_M = 0.2
 """Vertical distance that still counts as right."""
 ROUNDING_M = 0.001
-"""Models are rounded to 1 mm: a gap between faces that is narrower is none."""
+"""Models are rounded to 1 mm: narrower gaps between faces are closed."""
 VISIBLE_RADIUS_M = 0.5
 """Within this distance in plan a higher point hides a lower one."""
 EDGES_M: FloatArray = np.concatenate(
@@ -40,19 +40,20 @@ EDGES_M: FloatArray = np.concatenate(
 """Borders of the bins of |residual|: 5 mm up to 1 m, 50 mm up to 5 m, 0.5 m up to 50 m, and all beyond."""
 
 _BEYOND_M = 10.0
+"""Roofs farther from all reference buildings are left out of the index."""
 _COLUMNS = ("n_points", "n_covered", "n_within")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ResidualTally:
-    """What the residuals of some points come to."""
+    """Sums over the residuals of points."""
 
     n_points: int
     """Roof points."""
     n_covered: int
-    """Those that a roof covers."""
+    """Points that a roof covers."""
     n_within: int
-    """Those that are covered and within 0.2 m."""
+    """Covered points within 0.2 m."""
     sum_m: float
     """Sum of the residuals, point minus roof, of the covered ones."""
     sum_squares_m2: float
@@ -67,7 +68,7 @@ class ResidualTally:
 
     @property
     def bias_m(self) -> float:
-        """Mean of the covered points, positive where the points are above the roof; nan without any."""
+        """Mean of the covered points, positive if the points are above the roof; nan without any."""
         return self.sum_m / self.n_covered if self.n_covered else math.nan
 
     @property
@@ -105,26 +106,26 @@ class BuildingResiduals:
     all_points: ResidualTally
     """All roof points inside the footprint."""
     top_visible: ResidualTally
-    """Those that see the sky."""
+    """Top-visible points."""
     counts: bool = True
-    """False where it touches the edge of the data: it need not be found. Outlines of the raster count all the same:
-    in a dense town they hang together, and the blocks that are cut hold most of the points."""
+    """False if it touches the edge of the data: it need not be found. Outlines of the raster count all the same: in a
+    dense town they are connected, and the blocks that are cut have most of the points."""
 
 
 def top_surface_of(
     models: Sequence[RoofModel], tolerance_m: float = ROUNDING_M, *, near: Sequence[RoofModel] | None = None
 ) -> TopSurface:
-    """The highest roof face of all models, to be asked at any place.
+    """The highest roof face of all models at any place.
 
     Parameters
     ----------
     models : sequence of RoofModel
-        Whose roof faces.
+        The models.
     tolerance_m : float
-        A gap between faces that is narrower is none.
+        Narrower gaps between faces are closed.
     near : sequence of RoofModel, optional
-        It will be asked over these footprints only: what lies beyond their bounds is cut away, for one model at a
-        wrong place in the world would make the index of all others coarse.
+        Limits the surface to the bounds of these footprints: one model at a wrong place in the world would make the
+        index of all others coarse.
     """
     surfaces = [surface for model in models for surface in model.surfaces]
     polygons = [surface.polygon for surface in surfaces]
@@ -148,7 +149,7 @@ def top_surface_of(
 
 
 def _area_within(polygon: Polygon, reach: Polygon) -> Polygon | MultiPolygon:
-    """What of a polygon lies within reach; lines and points of it are left out."""
+    """The part of a polygon within reach, without lines and points."""
     pieces = shapely.get_parts(shapely.intersection(shapely.make_valid(polygon), reach)).tolist()
     return MultiPolygon([piece for piece in pieces if isinstance(piece, Polygon)])
 
@@ -161,7 +162,7 @@ def point_residuals(points: ReferencePoints, surface: TopSurface) -> tuple[IntAr
     index : (k,) int64
         Places of the roof points in the tile.
     residual : (k,) float64
-        Point minus roof, metres; nan where no roof covers it.
+        Point minus roof, metres; nan without a roof.
     """
     index = np.flatnonzero(points.is_roof & (points.building >= 0))
     x, y, z = points.xyz[index].T
@@ -172,8 +173,8 @@ def point_residuals(points: ReferencePoints, surface: TopSurface) -> tuple[IntAr
 def building_residuals(models: Sequence[RoofModel], reference: Reference) -> list[BuildingResiduals]:
     """The residuals of every reference building: one pass over the points, one tile in memory.
 
-    A building that lies in several tiles adds up. Whether a point is top-visible is judged with the points of all
-    tiles near it, where the reference knows the tiles' bounds.
+    Buildings in several tiles add up. All tiles near a point decide whether it is top-visible, if the reference knows
+    the bounds of the tiles.
     """
     surface = top_surface_of(models, near=reference.buildings)
     everything, visible = _Tallies(len(reference.buildings)), _Tallies(len(reference.buildings))
@@ -201,7 +202,7 @@ def building_residuals(models: Sequence[RoofModel], reference: Reference) -> lis
 
 
 def _top_visible_by_building(xyz: FloatArray, building: LabelArray) -> BoolArray:
-    """Which points see the sky among those of their own building."""
+    """Which points are top-visible among those of their own building."""
     order = np.argsort(building, kind="stable")
     borders = [*np.flatnonzero(np.diff(building[order], prepend=-2)).tolist(), len(order)]
     seen = np.zeros(len(xyz), np.bool_)
@@ -212,14 +213,14 @@ def _top_visible_by_building(xyz: FloatArray, building: LabelArray) -> BoolArray
 
 
 class _Seam:
-    """Roof points near other tiles: they are judged at the end, together with their neighbours there."""
+    """Roof points near other tiles, which are judged at the end together with their neighbours there."""
 
     def __init__(self, bounds: Sequence[tuple[float, float, float, float]]) -> None:
         self._bounds = bounds
         self._kept: list[tuple[FloatArray, LabelArray, FloatArray, BoolArray]] = []
 
     def judged_here(self, number: int, xyz: FloatArray, building: LabelArray, residual: FloatArray) -> BoolArray:
-        """Which points of a tile are too far from all others to have neighbours there; keeps those that have."""
+        """Which points of a tile have no neighbours in other tiles; keeps the others for the end."""
         here = np.ones(len(xyz), np.bool_)
         near = np.zeros(len(xyz), np.bool_)
         own = self._bounds[number] if self._bounds else (0.0, 0.0, 0.0, 0.0)
@@ -236,7 +237,7 @@ class _Seam:
         return here
 
     def points(self) -> tuple[FloatArray, LabelArray, FloatArray, BoolArray]:
-        """Coordinates, buildings, residuals of what was kept, and which of them were left to be judged."""
+        """Coordinates, buildings, residuals of the kept points, and which of them are still to be judged."""
         empty = (np.zeros((0, 3)), np.zeros(0, np.int32), np.zeros(0), np.zeros(0, np.bool_))
         kept = [empty, *self._kept]
         return (
@@ -283,7 +284,7 @@ def _tally(
     sums: FloatArray,
     histogram: LabelArray,
 ) -> None:
-    """Add points to the sums of their buildings."""
+    """Add residuals (n,) in metres to counts (b, 3), sums (b, 2) and histogram (b, bins) of their buildings."""
     for i in range(len(building)):
         b = building[i]
         counts[b, 0] += 1
@@ -327,19 +328,19 @@ DEFINITIONS: tuple[Definition, ...] = tuple(
     Definition(
         name=f"residuals.{name}{suffix}",
         group=Group.RESIDUALS,
-        label=f"{label}{told}",
+        label=f"{label}{suffix_label}",
         unit=unit,
         better=better,
         formula=f"{formula}; P: {points}; {_MEANING}",
     )
-    for suffix, (told, points) in _SUFFIXES.items()
+    for suffix, (suffix_label, points) in _SUFFIXES.items()
     for name, label, unit, better, formula in _FORMULAS
 )
-"""What this module measures."""
+"""The measures."""
 
 
 def residual_measures(rows: Sequence[BuildingResiduals], subset: Subset) -> list[Measure]:
-    """The figures of a subset, buildings as units of the bootstrap; empty where there are no points at all."""
+    """The figures of a subset, buildings as units of the bootstrap; empty without points."""
     if not any(row.all_points.n_points for row in rows):
         return []
     counted = [row for row in rows if (row.counts if subset.elsewhere else subset.buildings[row.building])]

@@ -1,4 +1,4 @@
-"""Roof types, and the outcome of a building as Hofmann, Maas and Streilein (2003) tell it."""
+"""Roof types, and the outcome of a building after Hofmann, Maas and Streilein (2003)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PAPER_TYPES = (RoofType.FLAT, RoofType.PENT, RoofType.GABLE, RoofType.HIP, Roof
 
 
 class Outcome(StrEnum):
-    """How a building was reconstructed."""
+    """Quality of a reconstruction."""
 
     CORRECT = "correct"
     """All roof faces to be found and only those, and the right type."""
@@ -47,11 +47,11 @@ class RoofTypeRow:
     model: int
     """Index of the model that stands for it; -1 for none."""
     model_type: RoofType
-    """What that model says; none where there is none."""
+    """Roof type of that model; none without a model."""
     faces_to_find: int
     """Its faces to be found, groups as one."""
     faces_found: int
-    """Those of them that were found."""
+    """Found ones of these."""
     wrong_faces: int
     """Model faces of at least 10 m2 that match nothing and lie most on it."""
     outcome: Outcome
@@ -89,7 +89,10 @@ class OutcomeRow:
 def score_roof_types(
     models: Sequence[RoofModel], reference: Reference, matching: Matching, faces: FaceScore
 ) -> tuple[RoofTypeRow, ...]:
-    """One row a reference building, in their order; none against a reference without faces."""
+    """One row per reference building, in their order; none against a reference without faces.
+
+    A building without faces to be found is correct if its type is right and no face is wrong, else false.
+    """
     if not reference.has_faces:
         return ()
     count = len(reference.buildings)
@@ -148,9 +151,9 @@ def confusion(rows: Sequence[RoofTypeRow], subset: Subset) -> dict[tuple[RoofTyp
 
 
 def outcome_table(rows: Sequence[RoofTypeRow], subset: Subset) -> tuple[OutcomeRow, ...]:
-    """The paper's table of a subset: a row a true type, then all, then a row a shape where shapes are known.
+    """The table of the paper for a subset: one row per true type, one for all, then one per known shape.
 
-    The paper's five types always have a row; others where there are buildings of them.
+    The five types of the paper always have a row, others only with buildings.
     """
     counted = [row for row in rows if subset.buildings[row.building]]
     others = [kind for kind in _TYPES if kind not in _PAPER_TYPES and any(row.true_type is kind for row in counted)]

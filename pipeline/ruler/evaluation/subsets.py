@@ -20,14 +20,14 @@ _VALUES_A_BLOCK = 1_000_000
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Subset:
-    """Which reference buildings a figure is over."""
+    """The reference buildings of a figure."""
 
     name: str
     """all, good or hard."""
     buildings: BoolArray
     """(buildings,) bool, True for those in it; never those that touch the data edge."""
     elsewhere: bool
-    """True where what stands on no reference building counts too: only in `all`."""
+    """True if objects on no reference building count too: only in `all`."""
 
     def holds(self, building: IntArray) -> BoolArray:
         """Whether things on these reference buildings (index, -1 for none) count; any shape."""
@@ -43,7 +43,10 @@ class Subset:
 
 
 def subsets(reference: Reference) -> tuple[Subset, ...]:
-    """All reference buildings, and where conditions are known the good ones and the hard ones."""
+    """All reference buildings first, then the good and the hard ones if conditions are known.
+
+    Buildings that touch the data edge are in none; those without conditions only in `all`.
+    """
     whole = np.array([not building.touches_data_edge for building in reference.buildings], np.bool_)
     everything = Subset(name="all", buildings=whole, elsewhere=True)
     if not reference.conditions:
@@ -66,18 +69,18 @@ def summed_over_units(
     Parameters
     ----------
     subset : Subset
-        What counts.
+        The subset.
     building : (n,) int64
-        Reference building that each thing is on; -1 for none.
+        Reference building of each thing; -1 for none.
     model : (n,) int64
-        Model that it belongs to: where it is on no building, its model is its unit. Any number >= 0 elsewhere.
+        Its model, which is its unit if it is on no building. Any number >= 0 otherwise.
     columns : mapping of name to (n,) float64
-        What is summed.
+        Columns to sum.
 
     Returns
     -------
     dict of name to (units,) float64
-        First the buildings of the subset, also those that nothing is on, then the models that stand on none.
+        The buildings of the subset, including empty ones, then the models on no building.
     """
     place = np.cumsum(subset.buildings) - 1
     held = subset.holds(building)
@@ -93,7 +96,7 @@ def summed_over_units(
 def measured(
     name: str, columns: Mapping[str, FloatArray], statistic: Statistic, *, n: float, subset: Subset
 ) -> Measure:
-    """A figure of units with its interval; of the columns only those that the statistic looks at are resampled."""
+    """A figure of units with its interval; only the columns that the statistic reads are resampled."""
     looked_at = _LookedAt({name: np.asarray(column)[:1] for name, column in columns.items()})
     with np.errstate(all="ignore"):
         statistic(looked_at)
@@ -104,16 +107,16 @@ def measured(
 
 
 def measured_median(name: str, values: FloatArray, subset: Subset) -> Measure:
-    """The median over buildings with its percentile interval: a value a unit, so the units themselves are redrawn.
+    """The median over buildings with its percentile interval: one value per unit, so the units are redrawn.
 
     Parameters
     ----------
     name : str
-        Of the measure.
+        Name of the measure.
     values : (n,) float64
-        One a building, finite; nan comes back for none, no interval for one.
+        One finite value per building. Without values the result is nan, with one there is no interval.
     subset : Subset
-        Which they are of.
+        The subset of the buildings.
     """
     count = len(values)
     if count == 0:
@@ -135,7 +138,7 @@ def measured_median(name: str, values: FloatArray, subset: Subset) -> Measure:
 
 
 class _LookedAt(dict[str, FloatArray]):
-    """Sums that remember which of them were asked for."""
+    """Sums that remember which of them were read."""
 
     def __init__(self, sums: Sums) -> None:
         super().__init__(sums)

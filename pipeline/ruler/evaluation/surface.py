@@ -1,7 +1,7 @@
 """Roof surfaces against true roof surfaces: vertical differences on a lattice over the true roofs.
 
-The top of all models together is compared with the true top, so that neither split nor joined buildings are an excuse.
-A place of a true roof that no model covers is a miss.
+The top of all models together is compared with the true top: split and joined buildings do not matter. A place of a
+true roof that no model covers is a miss.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ SAMPLE_M = 0.25
 GOOD_M = 0.2
 """Vertical distance that still counts as right."""
 _ROUNDING = 1e-6
+"""Numerical guard, metres."""
 EDGES_M: FloatArray = np.concatenate(
     (
         [0.0],
-        [1e-6],  # what is right but for the last bits is no difference
+        [1e-6],  # differences in the last bits are none
         np.arange(1, 200) * 0.001,
         0.2 + np.arange(160) * 0.005,
         1.0 + np.arange(80) * 0.05,
@@ -50,17 +51,17 @@ class SurfaceRow:
     building_id: str
     """Its name."""
     n_places: int
-    """Places of the lattice on its true roof."""
+    """Lattice places on its true roof."""
     n_covered: int
-    """Those that a model covers."""
+    """Places that a model covers."""
     n_within: int
-    """Those where the models are within 0.2 m."""
+    """Places where the models are within 0.2 m."""
     sum_m: float
     """Sum of the differences where covered."""
     sum_squares_m2: float
     """Sum of their squares."""
     median_m: float
-    """Median of the absolute differences where covered; nan where nothing is."""
+    """Median of the absolute differences where covered; nan without any."""
     histogram: npt.NDArray[np.int32]
     """(bins,) int32, absolute differences where covered over `EDGES_M`."""
 
@@ -76,19 +77,22 @@ class SurfaceRow:
 
     @property
     def bias_m(self) -> float:
-        """Mean difference where covered; nan where nothing is."""
+        """Mean difference where covered; nan without any."""
         return self.sum_m / self.n_covered if self.n_covered else math.nan
 
     @property
     def rmse_m(self) -> float:
-        """Root mean square of the differences where covered; nan where nothing is."""
+        """Root mean square of the differences where covered; nan without any."""
         return math.sqrt(self.sum_squares_m2 / self.n_covered) if self.n_covered else math.nan
 
 
 def score_surface(
     models: Sequence[RoofModel], reference: Reference, *, sample_m: float = SAMPLE_M
 ) -> tuple[SurfaceRow, ...]:
-    """One row a reference building, in their order; none against a reference without faces."""
+    """One row per reference building, in their order; none against a reference without faces.
+
+    The lattice has its places at odd multiples of half of `sample_m`. Memory is bounded, apart from the rows.
+    """
     if not reference.has_faces:
         return ()
     truth, made = top_surface_of(reference.buildings), top_surface_of(models, near=reference.buildings)

@@ -1,8 +1,8 @@
 """True buildings where the survey saw them: moved by the error of the strips that hit them.
 
-A strip's own shift moves all its points alike, so no method can tell it from the points: against the truth where it
-stands every model of that strip is off by as much. To judge the method and not the survey, each true building is moved
-by the mean shift of its points. What differs between strips within one building remains, as do all other errors.
+The shift of a strip moves all its points alike. No method can detect it from the points, and against the unmoved truth
+every model of that strip is off by as much. To judge the method and not the survey, each true building is moved by the
+mean shift of its points. Differences between the strips of one building remain, as do all other errors.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def strip_shifts(scene: Mapping[str, Any], path: str) -> FloatArray:
     Raises
     ------
     InputError
-        The scene does not tell them.
+        The scene has none.
     """
     shifts = np.array(scene.get("strip_shifts_m") or np.zeros((0, 3)), np.float64)
     if shifts.ndim != 2 or shifts.shape[1:] != (3,) or len(shifts) == 0:

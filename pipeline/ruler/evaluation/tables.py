@@ -1,4 +1,4 @@
-"""Rows of the measure modules as tables: what became of every building, model, face and point."""
+"""Rows of the measure modules as tables of buildings, models, faces and points."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ROLES = {
     Stands.FALSE: "false",
     Stands.LEFT_OUT: "edge",
 }
-"""Where a model stands, as the table says it."""
+"""Places of a model in the table."""
 Columns = dict[str, list[Any]]
 
 
@@ -47,7 +47,7 @@ def building_table(
     residuals: Sequence[BuildingResiduals],
     surface: Sequence[SurfaceRow],
 ) -> pa.Table:
-    """One row a reference building; columns of measures that were not possible are absent."""
+    """One row per reference building; columns of measures that were not possible are absent."""
     buildings = reference.buildings
     middles = [building.footprint.centroid for building in buildings]
     columns: Columns = {
@@ -110,7 +110,7 @@ def _tallied(prefix: str, tallies: Sequence[ResidualTally]) -> Columns:
 
 
 def model_table(models: ModelSet, solids: Sequence[ModelValidity], delivery: Delivery | None) -> pa.Table:
-    """One row a model, then one a record without a model."""
+    """One row per model, then one per record without a model."""
     everything = (*models.models, *models.failed)
     empty = [None] * len(models.failed)
     middles = [model.footprint.centroid for model in everything]
@@ -133,7 +133,7 @@ def model_table(models: ModelSet, solids: Sequence[ModelValidity], delivery: Del
 
 
 def true_face_table(score: FaceScore, reference: Reference) -> pa.Table:
-    """One row a true roof face."""
+    """One row per true roof face."""
     polygons = [surface.polygon for building in reference.buildings for surface in building.surfaces]
     rows = score.reference
     return pa.table(
@@ -159,7 +159,7 @@ def true_face_table(score: FaceScore, reference: Reference) -> pa.Table:
 
 
 def model_face_table(score: FaceScore, models: Sequence[RoofModel], reference: Reference) -> pa.Table:
-    """One row a roof face of a model."""
+    """One row per roof face of a model."""
     polygons = [surface.polygon for model in models for surface in model.surfaces]
     rows, buildings = score.models, reference.buildings
     return pa.table(
@@ -192,7 +192,7 @@ def topology_table(score: FaceScore) -> pa.Table:
 
 
 def residual_histogram(rows: Sequence[BuildingResiduals]) -> pa.Table:
-    """Points of all counted buildings by the size of their residual; those that no roof covers are in no bin."""
+    """Points of all counted buildings by the size of their residual; points without a roof are in no bin."""
     counted = [row for row in rows if row.counts]
 
     def summed(tallies: Sequence[ResidualTally]) -> list[int]:

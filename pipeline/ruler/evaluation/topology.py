@@ -1,4 +1,4 @@
-"""How faces were split and joined: connected components of true faces and model faces that lie on one another."""
+"""Splits and joins of faces: connected components of true faces and model faces that lie on one another."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Topology(StrEnum):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FaceComponent:
-    """Faces that are linked, where one overlaps another by at least half of either."""
+    """Linked faces: one overlaps another by at least half of either."""
 
     kind: Topology
     """By the numbers."""
     building: int
-    """Reference building of its first true face, else the one that the model face lies on most; -1 for none."""
+    """Reference building of its first true face, else the one under most of the model face; -1 for none."""
     model: int
     """Model of its first model face; -1 without any."""
     true_faces: int
@@ -78,14 +78,14 @@ Components = tuple[tuple[FaceComponent, ...], list[Topology | None], list[Topolo
 
 
 def face_components(given: TopologyInput) -> Components:
-    """The connected components, and for every unit and every model face what it is in (None: takes no part)."""
+    """The connected components, and the kind of component of every unit and model face (None: takes no part)."""
     units, faces = len(given.unit_m2), len(given.face_m2)
     key, place = np.unique(given.unit * np.int64(max(faces, 1)) + given.face, return_inverse=True)
     common = np.bincount(place, weights=given.common_m2, minlength=len(key))
     unit, face = key // max(faces, 1), key % max(faces, 1)
     least = np.minimum(given.unit_m2[unit], given.face_m2[face]) if len(key) else np.zeros(0)
     linked = (common >= (MIN_SHARE - _ROUNDING) * least) & given.unit_counts[unit] & given.face_counts[face]
-    # the faces that match pieces of one group are one node: the first of them
+    # Faces that match pieces of one group are one node: the first of them.
     node = np.arange(faces)
     grouped = np.flatnonzero((given.face_group >= 0) & given.face_counts)
     _, first, member = np.unique(given.face_group[grouped], return_index=True, return_inverse=True)

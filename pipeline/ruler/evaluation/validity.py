@@ -1,4 +1,4 @@
-"""Validity of the solids by the rules of ISO 19107, judged as `pipeline.quality.validity` judges this program's own."""
+"""Validity of solids by ISO 19107, judged by the same code as the solids of this program."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.ruler.evaluation.models import ModelSet
 from pipeline.ruler.evaluation.reading.raw import is_closed
 
 NO_SOLID = "no_solid"
-"""In place of a code: the model is surfaces alone."""
+"""Instead of a code, for a model of surfaces alone."""
 
 SOLIDS_VALID = "validity.solids_valid"
 MODELS_VALID = "validity.models_valid"
@@ -63,14 +63,14 @@ DEFINITIONS: tuple[Definition, ...] = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelValidity:
-    """How the solids of one model keep the rules."""
+    """The faults of the solids of one model."""
 
     building_id: str
     """Of the model."""
     codes: tuple[tuple[int, ...], ...]
     """Codes of each solid, ascending; empty for a valid one."""
     closed: tuple[bool, ...]
-    """Whether each solid is closed: every edge is run both ways equally often."""
+    """Whether each solid is closed: every edge occurs equally often in both directions."""
 
     @property
     def n_solids(self) -> int:
@@ -94,7 +94,7 @@ class ModelValidity:
 
 
 def validity(models: ModelSet, tolerances: ValidityTolerances = DEFAULT_TOLERANCES) -> tuple[ModelValidity, ...]:
-    """The faults of every model's solids, in the order of the models."""
+    """The faults of the solids of every model, in their order; vertices are rounded to millimetres."""
     return tuple(
         ModelValidity(
             building_id=model.building_id,

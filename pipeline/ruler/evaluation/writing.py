@@ -1,7 +1,7 @@
-"""An evaluation as files: one Parquet file a table, and `report.md` for people.
+"""An evaluation as files: one Parquet file per table, and `report.md` for people.
 
-Every file is written under a temporary name and renamed, so that a reader sees the old file or the new one. Tables with
-a `geometry` column are GeoParquet, so that any GIS opens them.
+Every file is written under a temporary name and renamed: a reader sees the old file or the new one. Tables with a
+`geometry` column are GeoParquet, which any GIS opens.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ INTERVALS = (
     "Intervals hold 95 % of 1,000 bootstrap resamples of whole buildings (rasters: blocks); where all of them agree on "
     "0 or 100 %, they are the exact binomial limits. A figure has no more digits than its interval supports."
 )
-"""What an interval is, for readers."""
+"""Explanation of the intervals, for readers."""
 _SCHEMA = pa.schema(
     [
         pa.field("name", pa.string(), nullable=False),
@@ -53,7 +53,7 @@ _SCHEMA = pa.schema(
 def write_tables(
     evaluation: Evaluation, out_dir: str | Path, definitions: Mapping[str, Definition] = DEFINITIONS
 ) -> list[Path]:
-    """Write `measures.parquet`, one Parquet file a table, and `report.md`.
+    """Write `measures.parquet`, one Parquet file per table, and `report.md`; returns their paths in that order.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def write_tables(
 
 
 def measures_table(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> pa.Table:
-    """All figures: name, group, label, subset, value, low, high, n, unit, better; what is not a number is null."""
+    """All figures: name, group, label, subset, value, low, high, n, unit, better; null for nan."""
     rows = []
     for measure in evaluation.measures:
         definition = definition_of(measure.name, definitions)
@@ -86,7 +86,7 @@ def measures_table(evaluation: Evaluation, definitions: Mapping[str, Definition]
 
 
 def _with_geo(table: pa.Table, crs: str | None) -> pa.Table:
-    """The table with the metadata of GeoParquet where it has geometries."""
+    """The table, with the metadata of GeoParquet if it has geometries."""
     if "geometry" not in table.column_names:
         return table
     geometries = shapely.from_wkb(np.array(table["geometry"].to_pylist(), dtype=object))
@@ -97,7 +97,7 @@ def _with_geo(table: pa.Table, crs: str | None) -> pa.Table:
 
 
 def _projjson(crs: str | None) -> dict[str, object] | None:
-    """The coordinate reference system of the geometries; None where unknown, or where its unit is not the metre."""
+    """The coordinate reference system of the geometries; None if unknown, or if its unit is not the metre."""
     if crs is None:
         return None
     try:
@@ -110,8 +110,8 @@ def _projjson(crs: str | None) -> dict[str, object] | None:
     return found
 
 
-def told_subject(evaluation: Evaluation) -> tuple[str, str]:
-    """What was measured, and against what, as two sentences."""
+def subject_sentences(evaluation: Evaluation) -> tuple[str, str]:
+    """The measured models and the reference, as two sentences."""
     models, reference = evaluation.models, evaluation.reference
     kinds = {"run": "a run", "cityjson": "CityJSON", "cityjsonseq": "CityJSONSeq", "obj": "OBJ"}
     measured = f"{models.name}: {_counted(len(models.models), 'model')} ({kinds[models.kind]})"
@@ -135,14 +135,14 @@ def _counted(number: int, what: str) -> str:
 
 
 def all_notes(evaluation: Evaluation) -> tuple[str, ...]:
-    """What readers and measures assumed or left out, each once."""
+    """Assumptions and omissions of readers and measures, each once."""
     reference = () if evaluation.reference is None else evaluation.reference.notes
     return tuple(dict.fromkeys((*evaluation.models.notes, *reference, *evaluation.notes)))
 
 
 def markdown(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> str:
-    """The report for people: what, against what, notes, a table a chapter, breakdowns, formulas."""
-    measured, against = told_subject(evaluation)
+    """The report for people: models, reference, notes, one table per chapter, breakdowns, formulas."""
+    measured, against = subject_sentences(evaluation)
     parts = ["# Evaluation", f"- Measured: {markdown_cell(measured)}\n- Against: {markdown_cell(against)}"]
     parts.append(INTERVALS)
     notes = all_notes(evaluation)

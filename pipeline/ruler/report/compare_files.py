@@ -1,4 +1,4 @@
-"""A comparison of methods as a user asks for it: runs, evaluations, tables and the page in one folder."""
+"""A comparison of methods: runs, evaluations, tables and the page in one folder."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class WrittenComparison:
     summary: CompareSummary
     """The runs."""
     evaluations: dict[str, Evaluation]
-    """By label; empty without a reference."""
+    """Evaluations by label; empty without a reference."""
     written: tuple[Path, ...]
     """The files beside the runs."""
 
@@ -40,12 +40,15 @@ def compare_files(
     executor: Executor | None = None,
     cancelled: Callable[[], bool] = never,
 ) -> WrittenComparison:
-    """Run several methods over the same candidates and write one page on what came out.
+    """Run several methods over the same candidates; write compare.json, buildings.parquet, compare.md and index.html.
+
+    `request.run.out` is the folder of all files. With a `reference`, every variant is evaluated against it; its
+    `models` are not read. `on_event`, `executor` and `cancelled` are those of `pipeline.runtime.run.run`.
 
     Raises
     ------
     InputError, SettingsError, RunError, RunCancelledError, ClusterError
-        As `pipeline.runtime.run.run` and `evaluate_files`.
+        As in `pipeline.runtime.run.run` and `evaluate_files`.
     """
 
     def step(name: str) -> None:
@@ -76,15 +79,15 @@ def compare_files(
     paths = find_inputs(request.run.inputs, only_files=request.run.only_files)
     points = PointFiles(paths=tuple(paths), options=options)
     written = write_comparison(summary.out, runs, points=points, on_step=step)
-    told = json.dumps(comparison_facts(request, summary), indent=1, ensure_ascii=False).encode()
-    LocalStorage(root=Path(summary.out)).put(SUMMARY, told)
+    document = json.dumps(comparison_facts(request, summary), indent=1, ensure_ascii=False).encode()
+    LocalStorage(root=Path(summary.out)).put(SUMMARY, document)
     return WrittenComparison(
         summary=summary, evaluations=evaluations, written=(Path(summary.out) / SUMMARY, *(Path(p) for p in written))
     )
 
 
 def comparison_facts(request: CompareRequest, summary: CompareSummary) -> dict[str, Any]:
-    """The content of compare.json: what was compared, and what came out of each variant."""
+    """The content of compare.json: the inputs, and the result of each variant."""
     variants = []
     for variant in request.variants:
         run = summary.runs[variant.label]

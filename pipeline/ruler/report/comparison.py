@@ -30,14 +30,17 @@ def write_comparison(
     points: PointFiles | None = None,
     on_step: Callable[[str], None] = lambda _: None,
 ) -> list[Path]:
-    """Write `buildings.parquet`, `compare.md` and `index.html`.
+    """Write `buildings.parquet`, `compare.md` and `index.html`; returns their paths in that order.
+
+    The runs have the same candidates and are the columns. Points of the drawn buildings are read again from `points`;
+    without it the pictures have none. `on_step` is called with the name of each step as it begins.
 
     Raises
     ------
     SettingsError
         There is no run, or two have one label.
     RunError
-        A directory holds no run, the runs are of different candidates, or the folder cannot be made.
+        A directory has no run, the runs have different candidates, or the folder cannot be created.
     InputError
         A point file cannot be read.
     """

@@ -1,4 +1,4 @@
-"""What is compared: runs over the same candidates, their records of a building, and how far these are apart."""
+"""Runs over the same candidates, their records of a building, and the differences between them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ComparedRun:
     """A run that is compared."""
 
     label: str
-    """What tables and pages call it."""
+    """Its label in tables and pages."""
     method: str
     """Name of the method."""
     preset: str
@@ -28,14 +28,14 @@ class ComparedRun:
     run_dir: str
     """A finished local run directory."""
     seconds: Mapping[str, float] | None = None
-    """Seconds that each building took, by building_id; what is missing is unknown."""
+    """Seconds per building, by building_id; missing ones are unknown."""
     evaluation: Evaluation | None = None
-    """Of this run; all against one reference."""
+    """Evaluation of this run; all have one reference."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Record:
-    """What one run made of a building."""
+    """The record of a building in one run."""
 
     status: Status
     """ok, fallback or failed."""
@@ -46,7 +46,7 @@ class Record:
     lod: str | None
     """None without a model."""
     roof_type: str
-    """As the record tells it."""
+    """Roof type in the record."""
     n_planes: int
     """Delivered roof planes."""
     rmse_m: float
@@ -58,9 +58,9 @@ class Record:
     valid: bool
     """Whether all its solids are valid; False without a model."""
     footprint_area_m2: float
-    """nan where unknown."""
+    """nan if unknown."""
     seconds: float
-    """nan where unknown."""
+    """nan if unknown."""
     touches_data_edge: bool
     """Whether the data end at the candidate."""
     geometry: bytes | None
@@ -70,25 +70,25 @@ class Record:
 
     @property
     def is_model(self) -> bool:
-        """Whether the method's own model was delivered."""
+        """Whether the model of the method was delivered."""
         return self.status is Status.OK
 
     @property
     def outcome(self) -> str | None:
-        """correct, passable or false; None where it was not judged."""
+        """correct, passable or false; None if it was not judged."""
         return self.truth.get("outcome")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Difference:
-    """How far the runs are apart in one building; every part from 0, all agree, to 1."""
+    """Differences of the runs in one building; every part from 0 (all agree) to 1."""
 
     status: float
     """Share of pairs of runs with different statuses."""
     outcome: float
-    """Share of pairs with different outcomes; 0 where none was judged."""
+    """Share of pairs with different outcomes; 0 if none was judged."""
     roof_type: float
-    """Share of pairs with different roof types, of the runs that delivered a model of their own, as below."""
+    """Share of pairs with different roof types, among the runs with a model of their own, as below."""
     faces: float
     """Largest minus smallest number of planes, over the largest."""
     residual: float
@@ -107,15 +107,15 @@ class ComparedBuilding:
     building_id: str
     """The same in all."""
     records: tuple[Record, ...]
-    """One a run, in their order."""
+    """One per run, in their order."""
     true_id: str | None
-    """Of the reference building that it stands on; None where there is none."""
+    """Id of the reference building under it; None without one."""
     difference: Difference
-    """How far the runs are apart."""
+    """Differences of the runs."""
 
 
 def difference_of(records: Sequence[Record]) -> Difference:
-    """How far the records of one building are apart."""
+    """Differences between the records of one building."""
     modelled = [record for record in records if record.is_model]
     planes = [record.n_planes for record in modelled]
     rmse = [record.rmse_m for record in modelled if math.isfinite(record.rmse_m)]

@@ -1,4 +1,4 @@
-"""Which buildings are worth looking at: those on which runs differ, and typical ones beside them."""
+"""The buildings that are drawn: those on which runs differ, and typical ones."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from pipeline.ruler.report.comparison_building import FULL_RESIDUAL_M, ComparedB
 CASES = 12
 """Buildings that are drawn."""
 DIFFERENT = 9
-"""So many of them are chosen for their differences, where there are as many."""
+"""Most of them that are chosen for their differences."""
 SAME_RESIDUAL_M = 0.05
-"""Methods agree where their RMSE differ by no more."""
+"""Methods agree if their RMSE differ by at most this."""
 KINDS = {
     "status": "status",
     "outcome": "outcome against the truth",
@@ -24,26 +24,26 @@ KINDS = {
     "faces": "number of roof planes",
     "residual": "RMSE",
 }
-"""Kinds of differences in the order in which they choose, and what they are called."""
+"""Kinds of differences in the order in which they choose, with their labels."""
 RULE = (
-    f"Of {CASES} buildings up to {DIFFERENT} are those on which the methods differ most: in turn by "
+    f"Up to {DIFFERENT} of {CASES} buildings are those on which the methods differ most: in turn by "
     f"{', '.join(KINDS.values())} (share of pairs of methods that differ; planes: largest minus smallest number over "
     f"the largest; RMSE: largest minus smallest, {FULL_RESIDUAL_M:g} m counting in full; type, planes and RMSE among "
     "the methods that delivered a model of their own). The others are typical ones where all agree, RMSE within "
     f"{SAME_RESIDUAL_M:g} m: of each roof type in turn, the most frequent first, the one nearest the median footprint. "
     "Buildings that the data's edge cuts are left out where there are others."
 )
-"""How buildings are chosen, for readers."""
+"""The choice of buildings, for readers."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Choice:
-    """A building to be drawn."""
+    """A building that is drawn."""
 
     building: ComparedBuilding
-    """Which."""
+    """The building."""
     why: str
-    """For readers."""
+    """Reason, for readers."""
 
 
 def most_different_first(buildings: Sequence[ComparedBuilding]) -> list[ComparedBuilding]:
@@ -52,7 +52,7 @@ def most_different_first(buildings: Sequence[ComparedBuilding]) -> list[Compared
 
 
 def chosen_buildings(buildings: Sequence[ComparedBuilding]) -> list[Choice]:
-    """The buildings to be drawn, by `RULE`; the same whatever the order of the buildings."""
+    """The buildings that are drawn, by `RULE`; independent of the order of the buildings."""
     whole = [one for one in buildings if not any(record.touches_data_edge for record in one.records)]
     ordered = most_different_first(whole or buildings)
     typical = _typical(ordered)
@@ -63,7 +63,7 @@ def chosen_buildings(buildings: Sequence[ComparedBuilding]) -> list[Choice]:
 
 
 def _different(ordered: Sequence[ComparedBuilding], most: int) -> list[Choice]:
-    """Those with the largest part of each kind in turn; of equal ones the one that differs more in all."""
+    """Buildings with the largest difference of each kind in turn; the larger total difference wins among equal ones."""
     queues = {
         kind: [
             one
@@ -84,7 +84,7 @@ def _different(ordered: Sequence[ComparedBuilding], most: int) -> list[Choice]:
 
 
 def _typical(ordered: Sequence[ComparedBuilding]) -> list[Choice]:
-    """Those where all runs deliver models of one type and number of planes: of each type in turn, the middle first."""
+    """Buildings where all models have one type and number of planes: of each type in turn, the median size first."""
     agreed: dict[str, list[ComparedBuilding]] = {}
     for one in ordered:
         apart = one.difference

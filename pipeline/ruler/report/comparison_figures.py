@@ -1,4 +1,4 @@
-"""The figures of compared runs side by side: a row a figure, a column a run."""
+"""The figures of compared runs side by side: one row per figure, one column per run."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ MEASURES = (
     "residuals.rmse_top_visible",
     "validity.models_valid",
 )
-"""Of an evaluation, in their order; those that no run has are left out."""
+"""Measures of an evaluation, in their order; those that no run has are left out."""
 Records = Sequence[Record]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cell:
-    """What stands in a table."""
+    """A cell of a table."""
 
     text: str
     """The figure."""
     note: str = ""
-    """What belongs to it: an interval, a denominator, reasons."""
+    """An interval, a denominator, reasons."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,17 +48,17 @@ class FigureTable:
     """Figures of all runs."""
 
     title: str
-    """What they are."""
+    """Title."""
     first: str
     """Header of the first column."""
     labels: tuple[str, ...]
-    """Of the runs: headers of the others."""
+    """Labels of the runs: headers of the other columns."""
     rows: tuple[tuple[str, tuple[Cell, ...]], ...]
-    """A name and a cell a run."""
+    """A name and one cell per run."""
 
 
 def figure_tables(runs: Sequence[ComparedRun], buildings: Sequence[ComparedBuilding]) -> tuple[FigureTable, ...]:
-    """What the runs made, their roof types, their time, and what an evaluation found, as far as there is any."""
+    """Results, roof types, times and measures of the runs, without empty tables."""
     columns = [tuple(building.records[place] for building in buildings) for place in range(len(runs))]
     tables = [_made(buildings, columns), _roof_types(columns), _seconds(columns), _measures(runs), _outcomes(runs)]
     labels = tuple(run.label for run in runs)
@@ -66,7 +66,7 @@ def figure_tables(runs: Sequence[ComparedRun], buildings: Sequence[ComparedBuild
 
 
 def figure(value: float, unit: str, decimals: int) -> str:
-    """A figure with its unit; a dash where it is unknown."""
+    """A figure with its unit; a dash if unknown."""
     return number_text(value, unit, decimals) + unit_sign(unit) if math.isfinite(value) else NOTHING
 
 
@@ -83,10 +83,10 @@ def _made(buildings: Sequence[ComparedBuilding], columns: Sequence[Records]) -> 
     rows.append(("records with valid solids", [_share(sum(one.valid for one in r), len(r)) for r in columns]))
     rows.append(("roof planes of the models", [_planes(records) for records in columns]))
     for name, wanted in (("RMSE", "rmse_m"), ("95th percentile", "p95_m")):
-        told = f"{name} of a building, median"
-        rows.append((f"{told}, blocks counted", [_median(records, wanted, "m", 3) for records in columns]))
+        label = f"{name} of a building, median"
+        rows.append((f"{label}, blocks counted", [_median(records, wanted, "m", 3) for records in columns]))
         both = [_median([records[i] for i in common], wanted, "m", 3) for records in columns]
-        rows.append((f"{told}, where all have a model", both))
+        rows.append((f"{label}, where all have a model", both))
     rows.append(("points with a roof, median", [_median(records, "coverage", "share", 1) for records in columns]))
     return _rows("What the methods made", "figure", rows)
 
@@ -94,8 +94,8 @@ def _made(buildings: Sequence[ComparedBuilding], columns: Sequence[Records]) -> 
 def _status(records: Records, status: Status) -> Cell:
     found = [record for record in records if record.status is status]
     reasons = Counter(record.reason for record in found if record.reason is not None)
-    told = [f"{reason} {n:,}" for reason, n in sorted(reasons.items(), key=lambda item: (-item[1], item[0]))]
-    return _share(len(found), len(records), ", ".join(told))
+    note = [f"{reason} {n:,}" for reason, n in sorted(reasons.items(), key=lambda item: (-item[1], item[0]))]
+    return _share(len(found), len(records), ", ".join(note))
 
 
 def _share(part: int, whole: int, note: str = "") -> Cell:
@@ -122,7 +122,7 @@ def _median(records: Records, name: str, unit: str, decimals: int) -> Cell:
 
 
 def _roof_types(columns: Sequence[Records]) -> FigureTable:
-    """How many buildings are said to be what; blocks and failed ones have no type of the method's."""
+    """Number of buildings per roof type, without blocks and failed ones."""
     counts = [Counter(record.roof_type for record in records if record.is_model) for records in columns]
     kinds = [kind.value for kind in RoofType if any(count[kind.value] for count in counts)]
     rows = [(kind, [Cell(text=f"{count[kind]:,}") for count in counts]) for kind in kinds]
@@ -130,7 +130,7 @@ def _roof_types(columns: Sequence[Records]) -> FigureTable:
 
 
 def _seconds(columns: Sequence[Records]) -> FigureTable:
-    """Seconds a building, where they are known."""
+    """Seconds per building, where known."""
     known = [np.array([one.seconds for one in records if math.isfinite(one.seconds)]) for records in columns]
     if not any(len(values) for values in known):
         return _rows("", "", [])
@@ -149,7 +149,7 @@ def _seconds(columns: Sequence[Records]) -> FigureTable:
 
 
 def seconds_text(seconds: float) -> str:
-    """Three digits, and no more than milliseconds.
+    """Three digits, at most milliseconds.
 
     Examples
     --------
@@ -203,5 +203,5 @@ def _outcomes(runs: Sequence[ComparedRun]) -> FigureTable:
 def _outcome_cell(row: Sequence[int] | None) -> Cell:
     if row is None or not sum(row):
         return Cell(text=NOTHING)
-    told = f"{figure(row[0] / sum(row), 'share', 1)} correct of {sum(row):,}"
-    return Cell(text=" / ".join(f"{count:,}" for count in row), note=told)
+    note = f"{figure(row[0] / sum(row), 'share', 1)} correct of {sum(row):,}"
+    return Cell(text=" / ".join(f"{count:,}" for count in row), note=note)

@@ -41,43 +41,43 @@ class ComparisonCase:
     """A building with its pictures."""
 
     choice: Choice
-    """Which, and why."""
+    """The building, and the reason."""
     pictures: BuildingPictures
-    """Of all runs."""
+    """Pictures of all runs."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """All that a page shows."""
+    """The content of a page."""
 
     runs: tuple[ComparedRun, ...]
     """In the order of the columns."""
     manifests: tuple[RunManifest, ...]
-    """Theirs."""
+    """Manifests of the runs."""
     buildings: tuple[ComparedBuilding, ...]
-    """That all runs have, by building_id."""
+    """Buildings that all runs have, by building_id."""
     left_out: int
-    """Buildings that some run lacks, for its tiles failed."""
+    """Buildings that a run with failed tiles lacks."""
     tables: tuple[FigureTable, ...]
     """Figures side by side."""
     cases: tuple[ComparisonCase, ...]
     """The buildings that are drawn."""
     has_points: bool
-    """Whether points were at hand."""
+    """Whether points were available."""
 
     @property
     def title(self) -> str:
-        """Of the page."""
+        """Title of the page."""
         *others, last = (run.label for run in self.runs)
         return f"{', '.join(others)} and {last}" if others else last
 
     @property
     def subject(self) -> str:
-        """What was compared, in a sentence."""
+        """The subject, in a sentence."""
         noun = "building" if len(self.buildings) == 1 else "buildings"
         files = list(dict.fromkeys(file.path.rsplit("/", 1)[-1] for file in self.manifests[0].inputs))
-        told = ", ".join(files[:4]) + (f" and {len(files) - 4} more files" if len(files) > 4 else "")
-        return f"{len(self.buildings):,} {noun}" + (f" of {told}" if told else "")
+        names = ", ".join(files[:4]) + (f" and {len(files) - 4} more files" if len(files) > 4 else "")
+        return f"{len(self.buildings):,} {noun}" + (f" of {names}" if names else "")
 
 
 def page(comparison: Comparison) -> str:
@@ -120,7 +120,7 @@ def _has_intervals(comparison: Comparison) -> bool:
 
 
 def _notes(comparison: Comparison) -> list[str]:
-    """What a reader has to know of the runs before anything else."""
+    """Warnings about the runs."""
     notes = []
     for run, manifest in zip(comparison.runs, comparison.manifests, strict=True):
         if manifest.failed_tiles:
@@ -129,19 +129,19 @@ def _notes(comparison: Comparison) -> list[str]:
         elif manifest.status is not RunStatus.FINISHED:
             notes.append(f"{run.label}: the run is {manifest.status.value}; not all of its buildings may be there.")
     if comparison.left_out:
-        but = ", but for the figures of the evaluation, which are of each run" if _has_intervals(comparison) else ""
-        notes.append(f"{comparison.left_out:,} buildings that not all runs have are left out of all that follows{but}.")
+        rest = ", except from the evaluations of the runs" if _has_intervals(comparison) else ""
+        notes.append(f"{comparison.left_out:,} buildings that not all runs have are left out below{rest}.")
     if not comparison.has_points:
-        notes.append("No points were at hand: the pictures show models alone.")
+        notes.append("No points were available: the pictures show models alone.")
     evaluations = [run.evaluation for run in comparison.runs if run.evaluation is not None]
-    told = [set(all_notes(evaluation)) for evaluation in evaluations]
-    if told:
-        notes += [note for note in all_notes(evaluations[0]) if all(note in one for one in told)]
+    known = [set(all_notes(evaluation)) for evaluation in evaluations]
+    if known:
+        notes += [note for note in all_notes(evaluations[0]) if all(note in one for one in known)]
     return list(dict.fromkeys(notes))
 
 
 def _stacks(comparison: Comparison) -> list[dict[str, Any]]:
-    """Bars of statuses, and of outcomes where they were judged: title, and a row a run of (name, count, share)."""
+    """Bars of statuses and of judged outcomes: title, and one row per run of (name, count, share)."""
     stacks = [_stack("Candidates", _counts(comparison, list(Status), lambda record: record.status), comparison)]
     outcomes = _counts(comparison, OUTCOMES, lambda record: record.outcome)
     if any(sum(counts) for _, counts in outcomes):
@@ -152,7 +152,7 @@ def _stacks(comparison: Comparison) -> list[dict[str, Any]]:
 def _counts(
     comparison: Comparison, names: Sequence[str], of: Callable[[Record], str | None]
 ) -> list[tuple[str, list[int]]]:
-    """How many records of each run are what, a name a row."""
+    """Number of records per run, one row per name."""
     found = [Counter(of(one.records[i]) for one in comparison.buildings) for i in range(len(comparison.runs))]
     return [(str(name), [counts[name] for counts in found]) for name in names]
 
@@ -162,8 +162,8 @@ def _stack(title: str, parts: Sequence[tuple[str, Sequence[int]]], comparison: C
     for place, run in enumerate(comparison.runs):
         total = sum(counts[place] for _, counts in parts)
         held = [(name, counts[place], counts[place] / total) for name, counts in parts if counts[place]]
-        told = ", ".join(f"{name} {count:,}" for name, count, _ in held)
-        rows.append({"label": run.label, "parts": held, "told": f"{run.label}: {told or 'none'}"})
+        counted = ", ".join(f"{name} {count:,}" for name, count, _ in held)
+        rows.append({"label": run.label, "parts": held, "description": f"{run.label}: {counted or 'none'}"})
     return {"title": title, "names": [name for name, _ in parts], "rows": rows}
 
 
@@ -177,7 +177,7 @@ def _case(comparison: Comparison, case: ComparisonCase) -> dict[str, Any]:
             {
                 "label": run.label,
                 "uri": None if png is None else data_uri(png),
-                "alt": f"{name} by {run.label}: {_told(record)}.",
+                "alt": f"{name} by {run.label}: {_summary(record)}.",
                 "status": record.status.value,
                 "reason": record.reason,
                 "detail": record.reason_detail,
@@ -200,7 +200,7 @@ def _case(comparison: Comparison, case: ComparisonCase) -> dict[str, Any]:
     }
 
 
-def _told(record: Record) -> str:
+def _summary(record: Record) -> str:
     """A record in a few words."""
     if record.status is Status.FAILED:
         return f"failed, {record.reason}"
@@ -210,20 +210,20 @@ def _told(record: Record) -> str:
 
 
 def _figures(record: Record) -> list[tuple[str, str]]:
-    """What stands beneath a picture."""
-    told = []
+    """The caption of a picture."""
+    figures = []
     if record.status is not Status.FAILED:
-        told += [("roof", record.roof_type), ("planes", f"{record.n_planes}")]
-        told += [("RMSE", figure(record.rmse_m, "m", 3)), ("covered", figure(record.coverage, "share", 1))]
+        figures += [("roof", record.roof_type), ("planes", f"{record.n_planes}")]
+        figures += [("RMSE", figure(record.rmse_m, "m", 3)), ("covered", figure(record.coverage, "share", 1))]
     if math.isfinite(record.seconds):
-        told.append(("time", seconds_text(record.seconds)))
+        figures.append(("time", seconds_text(record.seconds)))
     found = record.truth.get("faces_found")
     if found is not None:
-        told.append(("faces found", f"{found} of {record.truth.get('faces_to_find')}"))
-        told.append(("wrong faces", f"{record.truth.get('faces_wrong') or 0}"))
+        figures.append(("faces found", f"{found} of {record.truth.get('faces_to_find')}"))
+        figures.append(("wrong faces", f"{record.truth.get('faces_wrong') or 0}"))
     if record.truth.get("iou") and record.status is not Status.FAILED:
-        told.append(("footprint IoU", f"{record.truth['iou']:.2f}"))
-    return told
+        figures.append(("footprint IoU", f"{record.truth['iou']:.2f}"))
+    return figures
 
 
 def _columns(has_outcomes: bool) -> list[str]:
@@ -231,7 +231,7 @@ def _columns(has_outcomes: bool) -> list[str]:
 
 
 def _row(building: ComparedBuilding, has_outcomes: bool) -> dict[str, Any]:
-    """One row of the table of buildings: texts with the values that they are sorted by."""
+    """One row of the table of buildings: texts with their sort values."""
     cells = []
     for record in building.records:
         status = record.status.value + (f": {record.reason}" if record.reason else "")
@@ -309,5 +309,5 @@ def markdown(comparison: Comparison) -> str:
 
 def _brief(record: Record) -> str:
     """A record in a cell."""
-    told = _told(record)
-    return f"{told}, {record.outcome}" if record.outcome else told
+    summary = _summary(record)
+    return f"{summary}, {record.outcome}" if record.outcome else summary

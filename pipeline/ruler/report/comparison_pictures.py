@@ -23,18 +23,18 @@ from pipeline.ruler.report.viewed_models import viewed_faces
 from pipeline.ruler.report.worst_cases import TRUTH_COLOUR
 
 WIDTH_PX = 480
-"""Of a picture."""
+"""Width of a picture."""
 REACH_M = 0.3
-"""Points this far beyond the footprints belong to the building."""
+"""Points up to this far outside the footprints belong to the building."""
 LOW_M = 1.5
-"""Points that are no higher above the floor are ground or low walls: grey in plan, left out of the views."""
+"""Points up to this height above the floor are ground or low walls: grey in plan, left out of the views."""
 PLAN_POINTS, VIEW_POINTS = 8_000, 2_500
-"""More are thinned evenly."""
+"""Most points of a picture; more are thinned evenly."""
 BLOCK_COLOUR = "#b9bcc0"
 """Roofs of blocks, which are hatched too."""
 LOW_COLOUR = "#9aa0a6"
 HEIGHT_COLOURS = ("#8707a6", "#b12a90", "#d5546e", "#f0804e", "#fdb42f", "#f0f921")
-"""Of points in plan, from low to high: matplotlib's plasma without its darkest, so that a dark page shows them all."""
+"""Colours of points in plan, from low to high: the plasma map without its darkest colours, for dark pages."""
 _HATCH = "//"
 _GOOD = 2
 _MARGIN = 0.06
@@ -45,34 +45,34 @@ _OFF_AXIS_DEG = 35.0
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BuildingPictures:
-    """All pictures of a building: one width and height."""
+    """All pictures of a building, of one width and height."""
 
     width_px: int
-    """Of each."""
+    """Width of each."""
     height_px: int
-    """Of each."""
+    """Height of each."""
     plan: bytes | None
     """Points by elevation; None without points."""
     low_m: float
     """Elevation of the darkest points; nan without points."""
     high_m: float
-    """Of the brightest."""
+    """Elevation of the brightest points."""
     n_points: int
-    """In the plan before thinning."""
+    """Points in plan before thinning."""
     scale_m: float
-    """A round length."""
+    """Length of the scale bar."""
     scale_share: float
-    """Its share of the plan's width."""
+    """Its share of the width of the plan."""
     views: tuple[bytes | None, ...]
-    """One a run; None where it has no model."""
+    """One per run; None without a model."""
     truth: bytes | None
-    """The true model; None without."""
+    """The true model; None without one."""
 
 
 def place_of(models: Sequence[RoofModel], truth: RoofModel | None) -> shapely.Geometry:
-    """Where the points of a building are: over the footprints of at least half of the runs, or over true roofs.
+    """The area of the points of a building: the footprints of at least half of the runs, and true roofs.
 
-    One run alone may spread a rectangle over its neighbours: what stands there is not this building.
+    A single run may spread a rectangle over neighbours, whose points do not belong to this building.
     """
     footprints = [model.footprint for model in models if not model.footprint.is_empty]
     needed = (len(footprints) + 1) // 2
@@ -83,7 +83,7 @@ def place_of(models: Sequence[RoofModel], truth: RoofModel | None) -> shapely.Ge
 
 
 def draw_building(models: Sequence[RoofModel | None], truth: RoofModel | None, xyz: FloatArray) -> BuildingPictures:
-    """Draw a building."""
+    """Draw a building with its points (n, 3) in metres; all views have one direction and scale."""
     shown = [model for model in (*models, truth) if model is not None and model.surfaces]
     corners = [ring for model in shown for face in viewed_faces(model) for ring in face.rings]
     everything = np.concatenate([*corners, xyz]) if corners else xyz
@@ -121,7 +121,7 @@ def draw_building(models: Sequence[RoofModel | None], truth: RoofModel | None, x
 
 
 def _nothing(runs: int) -> BuildingPictures:
-    """Of a building without points and models."""
+    """Pictures of a building without points and models."""
     return BuildingPictures(
         width_px=WIDTH_PX,
         height_px=WIDTH_PX,
@@ -141,7 +141,7 @@ def _thinned(xyz: FloatArray, most: int) -> FloatArray:
 
 
 def _azimuth_deg(xy: FloatArray) -> float:
-    """From where a building is seen best: 35 deg off across its longer axis, as near to the usual view as may be."""
+    """Azimuth of the view: 35 deg off the normal of the longer axis, as near to the usual view as possible."""
     rectangle = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shapely.multipoints(xy)))
     if len(rectangle) < 5:
         return _SEEN_FROM_DEG
@@ -168,7 +168,7 @@ def _set_frame(axes: Axes, frame: tuple[float, float, float, float]) -> None:
 
 
 def _elevations(xyz: FloatArray) -> tuple[float, float]:
-    """Between which elevations colours change: the middle 98 % of the points."""
+    """Range of elevations of the colours: the middle 98 % of the points."""
     if len(xyz) == 0:
         return math.nan, math.nan
     low, high = (float(value) for value in np.quantile(xyz[:, 2], (0.01, 0.99)))

@@ -1,4 +1,4 @@
-"""The points of some buildings, read again from the tiles that they were made from."""
+"""The points of some buildings, read again from their tiles."""
 
 from __future__ import annotations
 
@@ -15,16 +15,19 @@ from pipeline.model import FloatArray
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PointFiles:
-    """Where the points lie."""
+    """Point files and their options."""
 
     paths: tuple[str, ...]
     """Point files."""
     options: ReadOptions = dataclasses.field(default_factory=ReadOptions)
-    """As the runs read them: CRS and vertical unit."""
+    """Options of the runs: CRS and vertical unit."""
 
 
 def points_within(files: PointFiles, areas: Sequence[shapely.Geometry]) -> list[FloatArray]:
-    """The points within each of some areas; streamed, and files that meet no area are not read.
+    """The points within each area (polygons in metres): streamed, without files that meet no area.
+
+    Returns one (n, 3) float64 array in metres per area, ordered by easting, northing, elevation. Points in several
+    files occur once.
 
     Raises
     ------
@@ -52,7 +55,7 @@ def points_within(files: PointFiles, areas: Sequence[shapely.Geometry]) -> list[
 def _chunks(
     source: Source, path: str, options: ReadOptions, bounds_m: Sequence[tuple[float, ...]]
 ) -> Iterator[FloatArray]:
-    """Points of a file near some rectangles: of COPC a window a rectangle, of others one pass within all of them."""
+    """Points of a file near rectangles: one window per rectangle for COPC, else one pass over all of them."""
     if not bounds_m:
         return
     unit_m = source.info.reference.horizontal_unit_m

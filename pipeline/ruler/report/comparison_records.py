@@ -1,4 +1,4 @@
-"""The records of several runs over the same candidates, building by building, and what is true of each."""
+"""The records of several runs over the same candidates, building by building, with their true buildings."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ _TRUTH_FIELDS = (
 
 
 def read_buildings(runs: Sequence[ComparedRun], manifests: Sequence[RunManifest]) -> tuple[list[ComparedBuilding], int]:
-    """The buildings that all runs have, by building_id, and how many a run with failed tiles lacks.
+    """The buildings that all runs have, by building_id, and the number that a run with failed tiles lacks.
 
     Raises
     ------
     RunError
-        The runs have different buildings although none has failed tiles: they are of different candidates.
+        The runs have different buildings although none has failed tiles: their candidates differ.
     """
     tables = [_rows_of(run) for run in runs]
     everywhere = set(tables[0]).intersection(*tables)
@@ -93,7 +93,7 @@ def read_buildings(runs: Sequence[ComparedRun], manifests: Sequence[RunManifest]
 
 
 def _rows_of(run: ComparedRun) -> dict[str, Mapping[str, Any]]:
-    """What is looked at of a run's records, by building_id."""
+    """The records of a run, by building_id."""
     table = read_table(run.run_dir, "buildings").select(list(_READ))
     return {row["building_id"]: row for row in table.to_pylist()}
 
@@ -134,10 +134,9 @@ def _known(table: pa.Table) -> list[str]:
 
 
 def _true_buildings(names: Sequence[str], runs: Sequence[ComparedRun]) -> dict[str, str]:
-    """The reference building that each building stands on: of largest common area, one to one, largest first.
+    """The reference building under each building: one to one, the largest common area first.
 
-    A building's place is what the footprints of all runs cover together, so that it has one true building, whatever
-    some run made of it.
+    The union of the footprints of all runs is the place of a building, so all runs have one true building.
     """
     reference = next((run.evaluation.reference for run in runs if run.evaluation and run.evaluation.reference), None)
     if reference is None or not reference.buildings or not names:
@@ -168,7 +167,7 @@ def _true_buildings(names: Sequence[str], runs: Sequence[ComparedRun]) -> dict[s
 def buildings_table(
     runs: Sequence[ComparedRun], buildings: Sequence[ComparedBuilding], projjson: Mapping[str, Any] | None
 ) -> pa.Table:
-    """One row a building and run as GeoParquet; columns of the truth where there are evaluations."""
+    """One row per building and run as GeoParquet, with columns of the truth if there are evaluations."""
     schema = _SCHEMA
     if any(run.evaluation is not None and run.evaluation.reference is not None for run in runs):
         for field in _TRUTH_FIELDS:
@@ -191,6 +190,6 @@ def buildings_table(
 
 
 def projjson_of(manifest: RunManifest) -> dict[str, Any] | None:
-    """The coordinate reference system of a run's tables; None where unknown."""
+    """The coordinate reference system of the tables of a run; None if unknown."""
     wkt = (manifest.crs or {}).get("wkt")
     return None if not wkt else dict(pyproj.CRS.from_wkt(wkt).to_json_dict())

@@ -1,4 +1,4 @@
-"""The map of a comparison of two epochs: what changed over what did not."""
+"""The map of a comparison of two epochs: changed buildings over unchanged ones."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _DRAWN = (Change.NOT_COMPARABLE, Change.RESHAPED, Change.LOWERED, Change.RAISED,
 
 def epochs_map() -> ClassMap:
     """An empty map of changes."""
-    return ClassMap("Buildings by what became of them", _class(Change.UNCHANGED), [_class(change) for change in _DRAWN])
+    return ClassMap("Buildings by change", _class(Change.UNCHANGED), [_class(change) for change in _DRAWN])
 
 
 def gathering(drawn: ClassMap) -> Callable[[pa.Table], None]:
-    """Takes rows of changes into a map."""
+    """A function that adds rows of changes to a map."""
 
     def gather(table: pa.Table) -> None:
         columns = [table["change"], table["geometry"], size_of(table), table["change_id"]]

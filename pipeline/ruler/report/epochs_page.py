@@ -38,11 +38,11 @@ _CELLS: tuple[tuple[str, str, int, bool], ...] = (
     ("IoU", "iou", 2, False),
     ("ratio", "change_ratio", 1, False),
 )
-"""Columns of the table: header, column, decimals, whether the sign is told."""
+"""Columns of the table: header, column, decimals, whether the sign is shown."""
 
 
 def write_page(diff: Diff, rows: ClassMap) -> Path:
-    """Write `changes.html`; images and styles are in it."""
+    """Write `changes.html` with its images and styles; `rows` is the map, filled while the rows were written."""
     storage = LocalStorage(root=Path(diff.request.out))
     storage.put(PAGE, page(diff, rows).encode())
     return storage.path(PAGE)
@@ -50,24 +50,24 @@ def write_page(diff: Diff, rows: ClassMap) -> Path:
 
 def page(diff: Diff, rows: ClassMap) -> str:
     """The page as text."""
-    told = diff.as_dict()
+    facts = diff.as_dict()
     drawn = rows.map(diff.new.reference.horizontal_unit_m)
     largest = diff.summary.largest
     pictures = cases(largest, diff.old, diff.new)
     listed = [_row(row) for row in largest.to_pylist()]
-    changed = sum(one["rows"] for name, one in told["changes"].items() if name != Change.UNCHANGED.value)
+    changed = sum(one["rows"] for name, one in facts["changes"].items() if name != Change.UNCHANGED.value)
     return page_template("epochs.html", "pipeline.ruler.report").render(
         title=" to ".join(_names_of(diff.old.run_dir, diff.new.run_dir)),
         subject=_subject(diff),
         warnings=diff.warnings,
-        cards=[(name, told["changes"][name.value], COLOURS[name], CHANGES[name]) for name in Change],
-        level=told["level"],
+        cards=[(name, facts["changes"][name.value], COLOURS[name], CHANGES[name]) for name in Change],
+        level=facts["level"],
         map=None if drawn is None else {"uri": data_uri(drawn.png), "it": drawn},
         left_out=rows.left_out,
         max_drawn=MAX_DRAWN,
         chart=_chart(diff),
-        reasons=[(INCOMPARABLE[Incomparable(name)], count) for name, count in told["reasons"].items()],
-        doubts=[(DOUBTS[Doubt(name)], count) for name, count in told["doubts"].items()],
+        reasons=[(INCOMPARABLE[Incomparable(name)], count) for name, count in facts["reasons"].items()],
+        doubts=[(DOUBTS[Doubt(name)], count) for name, count in facts["doubts"].items()],
         cases=[_case(case) for case in pictures],
         size=(WIDTH_PX, HEIGHT_PX),
         lines=(OLD_LINE, NEW_LINE),
@@ -78,12 +78,12 @@ def page(diff: Diff, rows: ClassMap) -> str:
         parquet=PARQUET,
         colours={name.value: colour for name, colour in COLOURS.items()},
         settings=_settings(diff.request.settings),
-        runs=[_told(diff.old), _told(diff.new)],
+        runs=[_run_row(diff.old), _run_row(diff.new)],
     )
 
 
 def _names_of(old: str, new: str) -> tuple[str, str]:
-    """The ends of two paths from where they differ on.
+    """The last differing parts of two paths.
 
     >>> _names_of("surveys/2019/run", "surveys/2024/run"), _names_of("a/old", "b/new")
     (('2019', '2024'), ('old', 'new'))
@@ -96,17 +96,17 @@ def _names_of(old: str, new: str) -> tuple[str, str]:
 
 
 def _subject(diff: Diff) -> str:
-    """What was compared, in a sentence."""
+    """The subject, in a sentence."""
     times = diff.summary.acquired
-    told = [f"OLD is {diff.old.run_dir}", f"NEW is {diff.new.run_dir}"]
+    sides = [f"OLD is {diff.old.run_dir}", f"NEW is {diff.new.run_dir}"]
     for place, name in enumerate(("old_acquired", "new_acquired")):
         if name in times:
-            told[place] += f" (acquired {'until' if place == 0 else 'from'} {times[name]:%Y-%m-%d})"
-    return f"{told[0]}, {len(diff.old):,} candidates; {told[1]}, {len(diff.new):,} candidates."
+            sides[place] += f" (acquired {'until' if place == 0 else 'from'} {times[name]:%Y-%m-%d})"
+    return f"{sides[0]}, {len(diff.old):,} candidates; {sides[1]}, {len(diff.new):,} candidates."
 
 
 def _chart(diff: Diff) -> Any:
-    """How far roofs went up or down; None where none did."""
+    """Histogram of rises and drops of roofs; None without any."""
     counts = diff.summary.heights.astype(np.float64)
     if not counts.any():
         return None
@@ -121,7 +121,7 @@ def _chart(diff: Diff) -> Any:
 
 
 def _row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """One row of the table: texts with the values that they are sorted by."""
+    """One row of the table: texts with their sort values."""
     cells = []
     for _, column, decimals, signed in _CELLS:
         value = row[column]
@@ -143,7 +143,7 @@ def _row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _other_flags(row: Mapping[str, Any]) -> list[str]:
-    """What is true of a row beside its class."""
+    """Further changes of a row besides its class."""
     return [name for name in ("is_raised", "is_lowered", "is_reshaped") if row[name] and name != f"is_{row['change']}"]
 
 
@@ -153,7 +153,7 @@ def _roofs(row: Mapping[str, Any]) -> str:
 
 
 def _names(row: Mapping[str, Any]) -> str:
-    """All names on both sides, those of the user's own footprints first."""
+    """All names on both sides, those of given footprints first."""
     parts = []
     for which in ("old", "new"):
         own = [name for name in row[f"{which}_source_ids"] if name is not None]
@@ -163,8 +163,7 @@ def _names(row: Mapping[str, Any]) -> str:
 
 
 def _case(case: Case) -> dict[str, Any]:
-    told = _row(case.row)
-    return told | {
+    return _row(case.row) | {
         "plan": data_uri(case.plan),
         "scale_m": case.scale_m,
         "scale_share": case.scale_share,
@@ -189,7 +188,7 @@ def _figure(value: float | None, decimals: int) -> str:
 
 
 def _figures(row: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What stands beside the pictures of a change."""
+    """The figures beside the pictures of a change."""
     parts: Sequence[tuple[str, str, str, int]] = (
         ("gained", "gained_m3", "m³", 0),
         ("lost", "lost_m3", "m³", 0),
@@ -198,10 +197,10 @@ def _figures(row: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("higher", "raised_m2", "m²", 0),
         ("lower", "lowered_m2", "m²", 0),
     )
-    told = [(label, f"{row[name]:,.{digits}f} {unit}") for label, name, unit, digits in parts if row[name]]
+    figures = [(label, f"{row[name]:,.{digits}f} {unit}") for label, name, unit, digits in parts if row[name]]
     if row["height_change_m"] is not None:
-        told.append(("median height", f"{row['height_change_m']:+.2f} m"))
-    return told
+        figures.append(("median height", f"{row['height_change_m']:+.2f} m"))
+    return figures
 
 
 def _settings(settings: DiffSettings) -> list[tuple[str, str, str]]:
@@ -212,7 +211,7 @@ def _settings(settings: DiffSettings) -> list[tuple[str, str, str]]:
     return found
 
 
-def _told(epoch: Epoch) -> tuple[str, ...]:
+def _run_row(epoch: Epoch) -> tuple[str, ...]:
     """A row of the table of runs."""
     manifest = epoch.manifest
     return (

@@ -22,8 +22,8 @@ from pipeline.ruler.epochs.records import Change
 from pipeline.ruler.report.epochs_map import COLOURS
 
 WIDTH_PX, HEIGHT_PX = 420, 320
-"""Of a picture."""
-A_CLASS = 3
+"""Size of a picture."""
+PER_CLASS = 3
 """Changes of each class that are drawn, the largest."""
 OLD_LINE, NEW_LINE = "#c2401f", "#2f6fa8"
 """Outlines in plan."""
@@ -42,13 +42,13 @@ class Case:
     plan: bytes
     """Outlines of both epochs."""
     scale_m: float
-    """A round length."""
+    """Length of the scale bar."""
     scale_share: float
     """Its share of the plan's width."""
     old: bytes | None
     """The model of the earlier epoch; None without one."""
     new: bytes | None
-    """That of the later one."""
+    """The model of the later epoch; None without one."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,10 +58,10 @@ class _Model:
 
 
 def cases(largest: pa.Table, old: Epoch, new: Epoch) -> list[Case]:
-    """The largest changes of each class with their pictures, class by class."""
+    """The largest changes of each class with their pictures, class by class; rows are in descending order of size."""
     rows: list[dict[str, Any]] = []
     for change in _CLASSES:
-        rows += largest.filter(pc.equal(largest["change"], change.value)).slice(0, A_CLASS).to_pylist()
+        rows += largest.filter(pc.equal(largest["change"], change.value)).slice(0, PER_CLASS).to_pylist()
     before = _models(old, {name for row in rows for name in row["old_ids"]})
     after = _models(new, {name for row in rows for name in row["new_ids"]})
     return [
@@ -113,7 +113,7 @@ def _case(row: Mapping[str, Any], before: list[_Model], after: list[_Model]) -> 
 
 
 def _plan(row: Mapping[str, Any], before: list[_Model], after: list[_Model], bounds: FloatArray) -> tuple[bytes, float]:
-    """The outlines of both epochs over one another, and the width of the picture in metres."""
+    """The outlines of both epochs, and the width of the picture in metres."""
     figure, axes = blank(WIDTH_PX, HEIGHT_PX)
     colour = COLOURS[Change(row["change"])]
     shape = [one.outline for one in (after or before)]

@@ -20,7 +20,7 @@ SHARES = ((0.95, "#3f86b5"), (0.9, "#8bb8d0"), (0.75, "#e3c15c"), (0.5, "#de8a3e
 
 
 def maps(evaluation: Evaluation) -> list[Map]:
-    """The maps that the evaluation allows, in the order of the page."""
+    """The maps of an evaluation, in the order of the page."""
     buildings, faces = evaluation.tables.get("buildings"), evaluation.tables.get("true_faces")
     made = []
     if evaluation.reference is None or buildings is None:
@@ -44,19 +44,19 @@ def maps(evaluation: Evaluation) -> list[Map]:
 def _layer(
     label: str, colour: str, geometries: Sequence[Any], chosen: Any, *, filled: bool = True, hatched: bool = False
 ) -> Layer:
-    """Those of the geometries that are chosen."""
+    """The chosen geometries."""
     picked = [geometry for geometry, is_so in zip(geometries, chosen, strict=True) if is_so]
     entry = Entry(label=label, colour=colour, count=len(picked), hatched=hatched or not filled)
     return Layer(entry=entry, geometries=picked, filled=filled)
 
 
 def _missing(buildings: pa.Table) -> list[bool]:
-    """Where no model stands for the building."""
+    """Whether no model stands for each building."""
     return [value is None for value in buildings["model_id"].to_pylist()]
 
 
 def _cut(buildings: pa.Table) -> list[bool]:
-    """Where the building is cut by the end of the data."""
+    """Whether the end of the data cuts each building."""
     if "touches_data_edge" not in buildings.column_names:
         return [False] * buildings.num_rows
     return [bool(value) for value in buildings["touches_data_edge"].to_pylist()]
@@ -102,7 +102,7 @@ def _found_layers(buildings: pa.Table, geometries: Sequence[Any]) -> list[Layer]
 
 
 def _false_models(evaluation: Evaluation) -> Layer:
-    """Models that stand where no building is, hatched."""
+    """Models where no building is, hatched."""
     table = evaluation.tables.get("models")
     chosen = set()
     if table is not None and "role" in table.column_names:

@@ -14,7 +14,7 @@ from pipeline.ruler.evaluation.counts import breakdowns
 from pipeline.ruler.evaluation.definitions import DEFINITIONS
 from pipeline.ruler.evaluation.evaluate import Evaluation
 from pipeline.ruler.evaluation.measure import Definition
-from pipeline.ruler.evaluation.writing import INTERVALS, all_notes, told_subject
+from pipeline.ruler.evaluation.writing import INTERVALS, all_notes, subject_sentences
 from pipeline.ruler.report.evaluation_maps import maps
 from pipeline.ruler.report.histograms import charts
 from pipeline.ruler.report.section import RESIDUAL_CLASSES
@@ -37,20 +37,20 @@ HEADLINE = (
     ("delivery.records_fallback",),
     ("delivery.records_failed",),
 )
-"""The figures that decide; of each row the first that was measured, and of all the first eight."""
+"""The main figures: the first measured one of each row, and the first eight of all rows."""
 HEADLINE_FIGURES = 8
-"""How many at most."""
+"""Largest number."""
 
 
 def write_page(
     evaluation: Evaluation, out_dir: str | Path, definitions: Mapping[str, Definition] = DEFINITIONS
 ) -> Path:
-    """Write `report.html`.
+    """Write `report.html` with its images and styles.
 
     Raises
     ------
     RunError
-        The folder cannot be made.
+        The folder cannot be created.
     """
     storage = LocalStorage(root=Path(out_dir))
     storage.put(PAGE, page(evaluation, definitions).encode())
@@ -60,7 +60,7 @@ def write_page(
 def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINITIONS) -> str:
     """The page as text."""
     found = chapters(evaluation, definitions)
-    measured, against = told_subject(evaluation)
+    measured, against = subject_sentences(evaluation)
     name = evaluation.models.name
     return page_template("evaluation.html", "pipeline.ruler.report").render(
         title=name if evaluation.reference is None else f"{name} against {evaluation.reference.name}",
@@ -83,7 +83,7 @@ def page(evaluation: Evaluation, definitions: Mapping[str, Definition] = DEFINIT
 
 
 def headline(found: Sequence[Chapter]) -> list[tuple[str, Line]]:
-    """The figures over all buildings that decide, with the titles of their chapters."""
+    """The main figures of all buildings, with the titles of their chapters."""
     lines = {
         line.definition.name: (chapter.title, line)
         for chapter in found
@@ -95,7 +95,7 @@ def headline(found: Sequence[Chapter]) -> list[tuple[str, Line]]:
 
 
 def _with_uris(thing: Any, **pictures: str) -> dict[str, Any]:
-    """The fields of a dataclass and its properties, its PNG bytes as addresses that hold them."""
+    """The fields and properties of a dataclass, with PNG bytes as data URIs."""
     known = {name: getattr(thing, name) for name in dir(thing) if not name.startswith("_") and name not in pictures}
     for field, name in pictures.items():
         png = getattr(thing, field)

@@ -16,8 +16,9 @@ from pipeline.ruler.evaluation.counts import floats
 from pipeline.ruler.report.svg_chart import Axis, Ordinate, category_svg, histogram_svg, rebinned
 
 GOOD_M = 0.2
-"""Where the line stands in charts of distances: METHODS counts points within it."""
+"""Marked distance in charts: points within it count as right."""
 _MIN_SHARE = 1e-5
+"""Lower end of logarithmic axes."""
 _FACE_AREAS_M2 = (0.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, math.inf)
 _MIN_FACE_M2 = 10.0
 _SLOPES_DEG = (0.0, 7.0, 20.0, 30.0, 40.0, 50.0, 90.0)
@@ -28,15 +29,15 @@ class Chart:
     """A chart with its words."""
 
     title: str
-    """What is shown."""
+    """Title."""
     svg: Markup
     """An inline SVG."""
     caption: str
-    """What to know about it."""
+    """Caption."""
 
 
 def charts(tables: Mapping[str, pa.Table]) -> list[Chart]:
-    """The charts that the tables allow, in the order of the page; buildings at the edge of the data are left out."""
+    """The charts of the tables, in the order of the page, without buildings at the edge of the data."""
     made = [_residuals(tables["residual_histogram"])] if "residual_histogram" in tables else []
     cut: set[str] = set()
     if "buildings" in tables:
@@ -88,7 +89,7 @@ def _residuals(table: pa.Table) -> Chart | None:
             steps=steps,
             marks=(-GOOD_M, GOOD_M),
         ),
-        caption=f"{counts.sum():,.0f} points that have a roof; {words}; the outermost bars hold all beyond. "
+        caption=f"{counts.sum():,.0f} points that have a roof; {words}; the outermost bars include all values beyond. "
         + ("Line: points that are visible from above. " if steps is not None else "")
         + f"Dashed: {GOOD_M:g} m.",
     )
@@ -111,7 +112,7 @@ def _plain(
         return None
     heights = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0].astype(np.float64)
     middle = float(np.median(values))
-    told = f"{100.0 * middle:.1f} %" if percent else f"{middle:.3f}"
+    median = f"{100.0 * middle:.1f} %" if percent else f"{middle:.3f}"
     return Chart(
         title=title,
         svg=histogram_svg(
@@ -120,10 +121,10 @@ def _plain(
             x=Axis(name=x_name, text=(lambda v: f"{100.0 * v:.0f} %") if percent else (lambda v: f"{v:g}")),
             y=Axis(name=what, text=lambda value: f"{value:,.0f}"),
             ordinate=Ordinate(low=0.0, high=max(1.0, float(heights.max())) * 1.05, log=False),
-            description=f"Histogram of {title.lower()}: {len(values):,} {what}, median {told}.",
+            description=f"Histogram of {title.lower()}: {len(values):,} {what}, median {median}.",
             marks=marks,
         ),
-        caption=f"{len(values):,} {what}, median {told}. {caption}".strip(),
+        caption=f"{len(values):,} {what}, median {median}. {caption}".strip(),
     )
 
 
@@ -177,7 +178,7 @@ def _of_buildings(table: pa.Table) -> list[Chart | None]:
                 what="buildings",
                 percent=True,
                 marks=(0.0,),
-                caption="The outermost bars hold all beyond.",
+                caption="The outermost bars include all values beyond.",
             )
         )
     return made
@@ -223,7 +224,7 @@ def _of_faces(table: pa.Table) -> list[Chart | None]:
 def _completeness(
     values: FloatArray, found: BoolArray, borders: tuple[float, ...], title: str, x_name: str, by_area: bool
 ) -> Chart | None:
-    """Shares of faces that were found, by class of what `values` says."""
+    """Shares of found faces, by classes of `values`."""
     if len(values) == 0:
         return None
     names, shares, counts, pale = [], [], [], []
@@ -240,9 +241,7 @@ def _completeness(
     )
     caption = "Over the bars: true faces. "
     caption += (
-        "Pale: too small to have to be found; too sparse ones are left out."
-        if by_area
-        else "Only faces that have to be found."
+        "Pale: too small to be required; too sparse ones are left out." if by_area else "Only faces that must be found."
     )
     return Chart(
         title=title,

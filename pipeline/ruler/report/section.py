@@ -17,10 +17,10 @@ from pipeline.ruler.report.svg_chart import ticks
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ResidualClass:
-    """Distances of a point to the model's top that have one colour."""
+    """A class of distances of points to the model, with one colour."""
 
     low_m: float
-    """From here on; nan: no roof at the point."""
+    """Lower end; nan: no roof at the point."""
     colour: str
     """As #rrggbb."""
     label: str
@@ -35,7 +35,7 @@ RESIDUAL_CLASSES = (
     ResidualClass(low_m=0.5, colour="#c44f1d", label="more than 0.5 m above"),
     ResidualClass(low_m=math.nan, colour="#b0308f", label="no roof at the point"),
 )
-"""In ascending order; blue and orange are told apart by everybody."""
+"""In ascending order; blue and orange differ for all kinds of colour vision."""
 UNCOVERED = len(RESIDUAL_CLASSES) - 1
 """The class of points without a roof."""
 _WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 380.0, 40.0, 8.0, 10.0, 38.0
@@ -54,7 +54,7 @@ _POINTS = 400
 
 
 def top_of(models: Sequence[RoofModel], x: FloatArray, y: FloatArray) -> FloatArray:
-    """Elevation of the highest roof face of several models at places x, y; nan where there is none."""
+    """Elevation of the highest roof face of several models at places x, y; nan without one."""
     top = np.full(len(x), np.nan)
     for model in models:
         top = np.fmax(top, model.top(x, y))
@@ -69,7 +69,10 @@ def residual_class(residual: FloatArray) -> LabelArray:
 
 
 def section_svg(truth: RoofModel, models: Sequence[RoofModel], xyz: FloatArray) -> Markup | None:
-    """The profile of a building where `profile_line` puts it."""
+    """The profile of a building along `profile_line` as an `svg` element; None without roofs and points.
+
+    Points (n, 3) near the profile are drawn in the colours of their distances to the models.
+    """
     middle, along, half = profile_line(truth, models, xyz)
     s = np.linspace(-half - _MARGIN_M, half + _MARGIN_M, _STEPS)
     x, y = (middle[axis] + s * along[axis] for axis in (0, 1))
@@ -87,8 +90,10 @@ def section_svg(truth: RoofModel, models: Sequence[RoofModel], xyz: FloatArray) 
     ]
     for name, top in roofs.items():
         parts += [f'<polyline class="{name}" points="{line}"/>' for line in frame.lines(s, top, walls=name == "model")]
-    told = f"Section across {truth.building_id}: {len(near)} points" + ("" if models else "; no model stands here")
-    head = f'<svg class="section" viewBox="0 0 {_WIDTH:.0f} {frame.height:.0f}" role="img" aria-label="{escape(told)}">'
+    label = f"Section across {truth.building_id}: {len(near)} points" + ("" if models else "; no model stands here")
+    head = (
+        f'<svg class="section" viewBox="0 0 {_WIDTH:.0f} {frame.height:.0f}" role="img" aria-label="{escape(label)}">'
+    )
     return Markup(head + "".join(parts) + "</svg>")  # noqa: S704 -- the only text from outside is escaped above
 
 
@@ -140,7 +145,7 @@ class _Frame:
         return parts
 
     def lines(self, s: FloatArray, top: FloatArray, *, walls: bool) -> list[str]:
-        """The pieces of a roof line, with walls down to the floor where asked for."""
+        """The pieces of a roof line, optionally with walls down to the floor."""
         known = np.isfinite(top)
         borders = np.flatnonzero(np.diff(known.astype(np.int8), prepend=0, append=0))
         found = []
@@ -156,14 +161,13 @@ class _Frame:
 def profile_line(
     truth: RoofModel, models: Sequence[RoofModel], xyz: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Where the profile lies: across the building, where its points are farthest from the models.
+    """The place of the profile: across the building, where its points are farthest from the models.
 
     Returns
     -------
     middle : (2,) float64
-        On the longer axis of the footprint's rectangle, not at its ends: of its stretches of 2 m the one with the
-        largest sum of distances beyond 0.2 m, each counted as 1 m at most; the middle of the building where none is
-        clearly worse.
+        On the longer axis of the rectangle of the footprint, not at its ends: the stretch of 2 m with the largest sum
+        of distances beyond 0.2 m, each at most 1 m; the middle of the building if no stretch is clearly worse.
     along : (2,) float64
         Unit vector of the shorter side.
     half : float

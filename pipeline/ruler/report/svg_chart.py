@@ -1,4 +1,4 @@
-"""Small charts as inline SVG: their colours come from the page's style sheet, so they follow its light and dark theme.
+"""Small charts as inline SVG; their colours come from the style sheet of the page, light or dark.
 
 Classes: `bar` and `bar-b` (filled), `line-b` (a second series as steps), `axis`, `grid`, `mark`, `tick`, `name`.
 """
@@ -15,18 +15,18 @@ from markupsafe import Markup, escape
 from pipeline.model import FloatArray
 
 WIDTH, HEIGHT = 380.0, 230.0
-"""Of the view box; the page scales it."""
+"""Size of the view box; the page scales it."""
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58.0, 20.0, 10.0, 40.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Axis:
-    """What is written along an axis."""
+    """Labels of an axis."""
 
     name: str
-    """With its unit."""
+    """Name and unit."""
     text: Callable[[float], str]
-    """How a tick is written."""
+    """Text of a tick."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ class Ordinate:
 
 
 def ticks(low: float, high: float, wanted: int) -> list[float]:
-    """About so many round values between low and high, both ends included where they are round.
+    """About `wanted` round values from low to high.
 
     Examples
     --------
@@ -84,7 +84,10 @@ def histogram_svg(
     steps: FloatArray | None = None,
     marks: Sequence[float] = (),
 ) -> Markup:
-    """A histogram."""
+    """A histogram of heights (bins,) over edges (bins + 1,).
+
+    `steps` (bins,) is a second series, drawn as a line of steps. Dashed vertical lines stand at `marks`.
+    """
     left, right = float(edges[0]), float(edges[-1])
 
     def across(value: float) -> float:
@@ -127,7 +130,10 @@ def category_svg(
     description: str,
     pale: Sequence[bool] = (),
 ) -> Markup:
-    """Bars of shares from 0 to 1 by class, with the count of each class over its bar; nan has no bar."""
+    """Bars of shares from 0 to 1 by class, with the count of each class over its bar; nan has no bar.
+
+    Classes that do not count are `pale`.
+    """
     ordinate = Ordinate(low=0.0, high=1.12, log=False)
     parts = _frame(ordinate, Axis(name=y_name, text=lambda value: f"{100.0 * value:.0f} %"))
     step = (WIDTH - _LEFT - _RIGHT) / max(len(names), 1)
@@ -178,21 +184,21 @@ def _svg(parts: Sequence[str], x_name: str, description: str) -> Markup:
 
 
 def rebinned(edges_low: FloatArray, edges_high: FloatArray, counts: FloatArray, edges: FloatArray) -> FloatArray:
-    """Counts of bins shared out to other bins, evenly within each; what lies beyond goes to the outermost ones.
+    """Counts of bins distributed to other bins, evenly within each; values beyond go to the outermost ones.
 
     Parameters
     ----------
     edges_low, edges_high : (n,) float64
-        Borders of the bins as they are, adjoining and ascending; the outermost may be infinite.
+        Borders of the given bins, adjoining and ascending; the outermost may be infinite.
     counts : (n,) float64
-        In each.
+        Their counts.
     edges : (m + 1,) float64
         Borders wanted.
 
     Returns
     -------
     (m,) float64
-        Of the same sum.
+        Counts with the same sum.
     """
     low = np.where(np.isfinite(edges_low), edges_low, np.minimum(edges[0], edges_high) - 1.0)
     high = np.where(np.isfinite(edges_high), edges_high, np.maximum(edges[-1], edges_low) + 1.0)

@@ -12,7 +12,7 @@ from pipeline.ruler.evaluation.models import RoofModel, RoofSurface
 
 
 def viewed_faces(model: RoofModel, roof_colour: str | None = None) -> list[ViewedFace]:
-    """Roofs and walls of the solids; roofs alone where there are none."""
+    """Roofs and walls of the solids, or roofs alone without solids; by default in the colour of the roof type."""
     roof = roof_colour or ROOF_COLOURS[model.roof_type]
     if not model.solids:
         return [ViewedFace(rings=_lifted(surface), colour=roof) for surface in model.surfaces]

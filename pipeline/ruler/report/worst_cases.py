@@ -23,13 +23,13 @@ from pipeline.ruler.report.section import RESIDUAL_CLASSES, UNCOVERED, profile_l
 from pipeline.ruler.report.viewed_models import viewed_faces
 
 CASES = 12
-"""How many are shown."""
+"""Largest number of cases."""
 MAX_NOT_FOUND = 4
-"""How many of them may be buildings without a model."""
+"""Largest number of cases without a model."""
 SOUND_SHARE = 0.999
-"""A correct building of which no less is within 0.2 m is no worst case."""
-POINTS_A_CASE = 12_000
-"""More points of a building are thinned evenly."""
+"""A correct building with at least this share within 0.2 m is not a worst case."""
+POINTS_PER_CASE = 12_000
+"""Most points of a building; more are thinned evenly."""
 SIDE_PX = 560
 """Width and height of a picture."""
 TRUTH_COLOUR, MODEL_COLOUR, SECTION_COLOUR = "#2a9470", "#7f93a6", "#777d86"
@@ -42,13 +42,13 @@ class Case:
     """One building with its pictures."""
 
     building_id: str
-    """Of the reference."""
+    """Id of the reference building."""
     figures: tuple[tuple[str, str], ...]
     """Name and text of each figure of the caption."""
     plan_png: bytes
     """Faces of the models with the points over them, true outlines dashed."""
     view_png: bytes | None
-    """The model from the south; the true one where none was delivered; None where neither has faces."""
+    """The model from the south, else the true one; None if neither has faces."""
     view_is_truth: bool
     """Whether the view shows the truth."""
     section: Markup | None
@@ -56,7 +56,10 @@ class Case:
 
 
 def worst_cases(evaluation: Evaluation) -> list[Case]:
-    """The worst buildings with their pictures; each tile of the reference is read once at most."""
+    """The worst buildings with their pictures; empty without a reference. Each tile is read at most once.
+
+    Buildings without a model and false ones come first, then by the mean of the shares of roof and points within 0.2 m.
+    """
     reference, table = evaluation.reference, evaluation.tables.get("buildings")
     if reference is None or table is None:
         return []
@@ -77,7 +80,7 @@ def worst_cases(evaluation: Evaluation) -> list[Case]:
 
 
 def chosen_rows(table: pa.Table) -> list[dict[str, Any]]:
-    """The rows of the worst buildings, the worst first; those at the edge of the data have no say."""
+    """The rows of the worst buildings, the worst first, without those at the edge of the data."""
     rows = [row for row in table.to_pylist() if not row.get("touches_data_edge")]
     judged = []
     for row in rows:
@@ -98,9 +101,9 @@ def chosen_rows(table: pa.Table) -> list[dict[str, Any]]:
 
 
 def _within(row: Mapping[str, Any]) -> float:
-    """Mean of the shares of the true roof and of the points within 0.2 m, as far as known; 1 where neither is.
+    """Mean of the shares of the true roof and of the points within 0.2 m, as far as known; 1 if neither is.
 
-    Both count: a survey that is shifted as a whole puts good models beside the true roofs, but not beside the points.
+    Both count: a survey that is shifted as a whole puts good models beside the true roofs, and not beside the points.
     """
     known = []
     share = row.get("surface_within")
@@ -128,7 +131,7 @@ def _points_of(reference: Reference, wanted: Sequence[int]) -> dict[int, FloatAr
     found = {}
     for building, parts in kept.items():
         xyz = np.concatenate(parts) if parts else np.zeros((0, 3))
-        found[building] = xyz[:: max(1, math.ceil(len(xyz) / POINTS_A_CASE))]
+        found[building] = xyz[:: max(1, math.ceil(len(xyz) / POINTS_PER_CASE))]
     return found
 
 
@@ -152,48 +155,48 @@ def _case(
 
 
 def _figures(row: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """What the caption tells, as far as it is known."""
+    """The caption, as far as known."""
 
     def known(name: str) -> bool:
         value = row.get(name)
         return value is not None and not (isinstance(value, float) and math.isnan(value))
 
-    told: list[tuple[str, str]] = []
+    figures: list[tuple[str, str]] = []
     if known("outcome"):
-        told.append(("outcome", str(row["outcome"])))
+        figures.append(("outcome", str(row["outcome"])))
     true_type = row.get("true_type")
     if true_type not in {None, "none", "unknown"}:
         model_type = row.get("model_type")
         made = "not found" if row.get("model_id") is None else str(model_type or "?")
-        told.append(("roof type", f"{true_type}, modelled: {made}"))
+        figures.append(("roof type", f"{true_type}, modelled: {made}"))
     elif "model_id" in row:
-        told.append(("model", "not found" if row["model_id"] is None else str(row.get("model_type") or "found")))
+        figures.append(("model", "not found" if row["model_id"] is None else str(row.get("model_type") or "found")))
     if known("shape"):
-        told.append(("shape", str(row["shape"])))
+        figures.append(("shape", str(row["shape"])))
     if row.get("defects"):
-        told.append(("made hard by", ", ".join(row["defects"])))
+        figures.append(("made hard by", ", ".join(row["defects"])))
     if known("model_status") and row["model_status"] != "ok":
-        told.append(("status", str(row["model_status"])))
+        figures.append(("status", str(row["model_status"])))
     if known("faces_to_find"):
-        told.append(
+        figures.append(
             ("faces", f"{row['faces_found']} of {row['faces_to_find']} found, {row.get('faces_wrong') or 0} wrong")
         )
     if known("n_points") and row["n_points"]:
         share = f"{100.0 * row['n_within'] / row['n_points']:.1f} % of {row['n_points']:,}"
-        told.append(("points within 0.2 m", share))
+        figures.append(("points within 0.2 m", share))
     if known("surface_within"):
-        told.append(("roof within 0.2 m", f"{100.0 * row['surface_within']:.1f} %"))
+        figures.append(("roof within 0.2 m", f"{100.0 * row['surface_within']:.1f} %"))
     if known("point_rmse_m"):
-        told.append(("point RMSE", f"{row['point_rmse_m']:.3f} m"))
+        figures.append(("point RMSE", f"{row['point_rmse_m']:.3f} m"))
     if known("iou"):
-        told.append(("footprint IoU", f"{row['iou']:.2f}"))
+        figures.append(("footprint IoU", f"{row['iou']:.2f}"))
     if known("footprint_area_m2"):
-        told.append(("footprint", f"{row['footprint_area_m2']:.0f} m²"))
-    return tuple(told)
+        figures.append(("footprint", f"{row['footprint_area_m2']:.0f} m²"))
+    return tuple(figures)
 
 
 def _square(truth: RoofModel, own: Sequence[RoofModel]) -> tuple[float, float, float]:
-    """Middle and side of what the plan shows: the building and its models, but no more than twice the building."""
+    """Middle and side of the plan: the building and its models, at most twice the size of the building."""
     west, south, east, north = truth.footprint.bounds
     side = max(east - west, north - south)
     x, y = (west + east) / 2.0, (south + north) / 2.0
@@ -239,7 +242,7 @@ def _plan(truth: RoofModel, own: Sequence[RoofModel], around: Sequence[RoofModel
 
 
 def _view(models: Sequence[RoofModel]) -> bytes | None:
-    """Bird's-eye view; None where there is no face."""
+    """Bird's-eye view; None without a face."""
     viewed = [faces for model in models if (faces := viewed_faces(model))]
     if not viewed:
         return None

@@ -1,8 +1,7 @@
 """From polygons of any file to roof faces, a footprint and solids.
 
 1. Normals classify the faces that the file does not name, once the part as a whole faces outward: roofs look up and
-have
-   no other roof above them.
+   have no other roof above them.
 2. Roof faces that share edges and lie in one plane become one: a triangulated model counts as the polygons that it was
    cut from.
 3. Each gets the least-squares plane of its vertices; the footprint is the union of all of them in plan.
