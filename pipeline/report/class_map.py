@@ -19,7 +19,7 @@ from pipeline.model import FloatArray
 from pipeline.report.maps import Entry, Layer, Map, draw_map
 
 MAX_DRAWN, MAX_ORDINARY = 30_000, 20_000
-"""Most footprints that are drawn: the largest that are not ordinary; if more are ordinary, the cells that contain them."""
+"""Most footprints that are drawn: the largest ones that are not ordinary; ordinary ones beyond this become cells."""
 CELLS_ACROSS = 300
 """Cells along the longer side of the map."""
 
