@@ -237,8 +237,8 @@ def test_a_city_on_a_hillside_has_one_slope_all_over(tmp_path: Path, slope_deg: 
 
 
 @pytest.mark.parametrize(
-    ("suite", "slope_deg", "told"), [("suburb", 10.0, "ground of its own"), ("city", 31.0, "slope_deg is 31")]
+    ("suite", "slope_deg", "problem"), [("suburb", 10.0, "ground of its own"), ("city", 31.0, "slope_deg is 31")]
 )
-def test_a_slope_that_cannot_be_is_refused(tmp_path: Path, suite: str, slope_deg: float, told: str) -> None:
-    with pytest.raises(SettingsError, match=told):
+def test_a_slope_that_cannot_be_is_refused(tmp_path: Path, suite: str, slope_deg: float, problem: str) -> None:
+    with pytest.raises(SettingsError, match=problem):
         simulate(suite, tmp_path, slope_deg=slope_deg)

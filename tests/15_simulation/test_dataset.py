@@ -59,9 +59,9 @@ def test_the_tile_is_read_by_our_own_reader(made: ScenePaths) -> None:
 
 def test_the_tile_is_raw_and_holds_classes_only_when_asked(made: ScenePaths, tmp_path: Path) -> None:
     assert set(np.asarray(laspy.read(made.laz).classification).tolist()) == {1}
-    told = simulate("suburb", tmp_path, 5, size_m=SIZE, output=Output(with_classes=True))
-    truth = read_truth(told.truth)
-    assert np.array_equal(np.asarray(laspy.read(told.laz).classification), truth.classification)
+    classified = simulate("suburb", tmp_path, 5, size_m=SIZE, output=Output(with_classes=True))
+    truth = read_truth(classified.truth)
+    assert np.array_equal(np.asarray(laspy.read(classified.laz).classification), truth.classification)
 
 
 def test_labels_stand_in_the_order_of_the_points(made: ScenePaths) -> None:
@@ -133,13 +133,13 @@ def test_the_same_call_gives_the_same_bytes_whatever_the_chunks(made: ScenePaths
 
 
 def test_density_and_noise_can_be_chosen(tmp_path: Path) -> None:
-    told: list[int] = []
-    output = Output(chunk_points=5_000, on_points=told.append)
+    found: list[int] = []
+    output = Output(chunk_points=5_000, on_points=found.append)
     paths = simulate("gable", tmp_path, 2, density_per_m2=20.0, noise_m=0.0, output=output)
     assert paths.points / 1600 == pytest.approx(20.0, rel=0.25)
-    assert told[-1] == paths.points
-    assert told == sorted(told)
-    assert len(told) > 2
+    assert found[-1] == paths.points
+    assert found == sorted(found)
+    assert len(found) > 2
     truth, models = read_truth(paths.truth), read_models(paths.truth).models
     roof = (truth.face >= 0) & ~truth.mixed
     x, y, z = laspy.read(paths.laz).xyz[roof].T
@@ -177,7 +177,7 @@ def test_unknown_suites_and_impossible_sizes_are_refused(tmp_path: Path) -> None
 
 def test_another_suite_in_the_same_folder_leaves_no_points_of_the_first(tmp_path: Path) -> None:
     simulate("cube", tmp_path)
-    (tmp_path / "survey.laz").write_bytes(b"of somebody else")
+    (tmp_path / "survey.laz").write_bytes(b"of another program")
     simulate("city", tmp_path, 7, size_m=(50.0, 50.0), density_per_m2=1.0)
     simulate("gable", tmp_path, density_per_m2=1.0)
     assert sorted(path.name for path in tmp_path.rglob("*.laz")) == ["gable.laz", "survey.laz"]

@@ -113,15 +113,15 @@ def test_the_command_takes_a_split_and_a_draw_and_writes_them_down(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "problem"),
     [
         (["--split", "dev", "--seed", "3"], "both --seed 3 and --split dev"),
         (["--draw", "3"], "draw is 3 of no split"),
         (["--split", "train"], "split is 'train'"),
     ],
 )
-def test_the_command_refuses_seeds_that_contradict_each_other(words: list[str], told: str, tmp_path: Path) -> None:
+def test_the_command_refuses_seeds_that_contradict_each_other(words: list[str], problem: str, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["simulate", "gable", "--out", str(tmp_path), *words])
     assert done.exit_code == 2
-    assert told in done.output
+    assert problem in done.output
     assert list(tmp_path.iterdir()) == []

@@ -23,13 +23,13 @@ def stands(models: list[RoofModel], truth: Reference) -> list[Stands]:
     return [row.stands for row in score_delivery(models, truth, match_footprints(models, truth)).models]
 
 
-def told(models: list[RoofModel], truth: Reference, subset: int = 0) -> dict[str, float]:
+def figures_of(models: list[RoofModel], truth: Reference, subset: int = 0) -> dict[str, float]:
     delivery = score_delivery(models, truth, match_footprints(models, truth))
     return by_hand.values(measures(delivery, subsets(truth)[subset]))
 
 
 def test_the_truth_scored_against_itself_is_perfect() -> None:
-    figures = told(TRUTH, reference(TRUTH))
+    figures = figures_of(TRUTH, reference(TRUTH))
     assert {name for name, value in figures.items() if value == 1.0} == {"lod2", "correctness"}
     assert {name for name, value in figures.items() if value == 0.0} == set(figures) - {"lod2", "correctness"}
     records = {one.name for one in DEFINITIONS if "records" in one.name}
@@ -50,7 +50,7 @@ def test_blocks_and_gaps_are_told_apart() -> None:
         Delivered.BLOCK,
         Delivered.NOTHING,
     ]
-    figures = told(models, truth)
+    figures = figures_of(models, truth)
     assert (figures["lod2"], figures["block"], figures["nothing"]) == (0.25, 0.5, 0.25)
 
 
@@ -58,11 +58,11 @@ def test_a_model_where_no_building_is_is_false_where_the_reference_is_complete()
     tree, corner = flat("tree", 200.0), flat("corner", 66.1, width=12.0)  # 5.9 of its 12 m are on a building
     truth = reference(TRUTH)
     assert stands([*TRUTH, tree, corner], truth)[4:] == [Stands.FALSE, Stands.FALSE]
-    figures = told([*TRUTH, tree, corner], truth)
+    figures = figures_of([*TRUTH, tree, corner], truth)
     assert (figures["false_models"], figures["correctness"]) == (2, pytest.approx(4 / 6))
     assert figures["lod2"] == 1.0
     assert stands([*TRUTH, tree], reference(TRUTH, extent=None))[4] is Stands.LEFT_OUT
-    assert told([*TRUTH, tree], reference(TRUTH, extent=None))["correctness"] == 1.0
+    assert figures_of([*TRUTH, tree], reference(TRUTH, extent=None))["correctness"] == 1.0
     at_edge = flat("at the edge", -99.0, touches_data_edge=True)  # the extent begins at -100
     assert stands([at_edge, *TRUTH], truth)[0] is Stands.LEFT_OUT
 
@@ -82,14 +82,14 @@ def test_one_model_over_everything_is_false_and_joins_all_buildings() -> None:
         footprint = by_hand.EXTENT.buffer(grown)
         giant = dataclasses.replace(flat(name), footprint=footprint)
         assert stands([giant], truth) == [Stands.FALSE]
-        figures = told([giant], truth)
+        figures = figures_of([giant], truth)
         assert (figures["correctness"], figures["false_models"], figures["joined"]) == (0.0, 1, 1.0)
         assert stands([giant], reference(TRUTH, extent=None)) == [Stands.LEFT_OUT]
 
 
 def test_a_building_in_parts_of_which_none_stands_for_it_is_split() -> None:
     thirds = [flat(str(x), 40.0 + 10.0 * x / 3.0, width=10.0 / 3.0) for x in range(3)]
-    figures = told(thirds, reference([flat("c", 40.0)]))
+    figures = figures_of(thirds, reference([flat("c", 40.0)]))
     assert (figures["split"], figures["nothing"], figures["part_models"]) == (1.0, 1.0, 3)
 
 
@@ -97,7 +97,7 @@ def test_parts_of_a_building_are_no_false_models() -> None:
     truth = reference(TRUTH)
     halves = [dataclasses.replace(TRUTH[0], surfaces=(face,), footprint=face.polygon) for face in TRUTH[0].surfaces]
     assert stands([*halves, *TRUTH[1:]], truth)[:2] == [Stands.FOR_BUILDING, Stands.PART]
-    figures = told([*halves, *TRUTH[1:]], truth)
+    figures = figures_of([*halves, *TRUTH[1:]], truth)
     assert (figures["split"], figures["part_models"], figures["false_models"]) == (0.25, 1, 0)
     assert (figures["lod2"], figures["correctness"]) == (1.0, 1.0)
 
@@ -110,34 +110,34 @@ def test_a_model_over_several_buildings_joins_them() -> None:
     assert [one.stands for one in delivery.models] == [Stands.JOINS]
     assert [one.covers for one in delivery.models] == [3]
     assert [one.joined for one in delivery.buildings] == [True, True, True, False]
-    figures = told([row], truth)
+    figures = figures_of([row], truth)
     assert (figures["joined"], figures["joining_models"], figures["nothing"]) == (0.75, 1, 1.0)
     pair = flat("pair", 4.0, width=15.9)  # half of the first and nearly all of the second
-    figures = told([pair], truth)
+    figures = figures_of([pair], truth)
     assert (figures["joined"], figures["lod2"], figures["joining_models"]) == (0.5, 0.25, 1)
 
 
 def test_a_row_of_parts_and_a_joining_model_in_random_order_is_told_the_same() -> None:
     truth = reference(TRUTH)
     models = [flat("x", 200.0), *TRUTH[1:], gable("y", 3.0)]
-    assert told(models, truth) == told(models[::-1], truth)
+    assert figures_of(models, truth) == figures_of(models[::-1], truth)
 
 
 def test_what_the_data_edge_cuts_does_not_count() -> None:
     cut = gable("cut", 80.0, touches_data_edge=True)
     truth = reference([*TRUTH, cut])
-    assert told(TRUTH, truth)["lod2"] == 1.0
+    assert figures_of(TRUTH, truth)["lod2"] == 1.0
     part = flat("part", 80.0, width=3.0)
     assert stands([*TRUTH, part], truth)[4] is Stands.LEFT_OUT
     assert stands([*TRUTH, cut], truth)[4] is Stands.FOR_BUILDING
-    assert told([*TRUTH, cut], truth) == told(TRUTH, truth)
+    assert figures_of([*TRUTH, cut], truth) == figures_of(TRUTH, truth)
 
 
 def test_false_models_are_in_no_subset_but_all() -> None:
     known = {one.building_id: by_hand.conditions(good=one.building_id != "d") for one in TRUTH}
     truth = reference(TRUTH, conditions=known)
     models = [*TRUTH[:3], flat("tree", 200.0), flat("corner", 66.1, width=12.0)]
-    everything, good, hard = (told(models, truth, subset) for subset in range(3))
+    everything, good, hard = (figures_of(models, truth, subset) for subset in range(3))
     assert [one["false_models"] for one in (everything, good, hard)] == [2, 0, 0]
     assert [one["lod2"] for one in (everything, good, hard)] == [0.75, 1.0, 0.0]
     assert math.isnan(hard["correctness"])

@@ -65,5 +65,5 @@ def test_what_the_models_say_of_the_edge_changes_no_figure() -> None:
 def test_footprints_on_both_sides_are_told_to_say_nothing() -> None:
     outlines = [dataclasses.replace(one, surfaces=()) for one in TRUTH]
     given = dataclasses.replace(reference(outlines, extent=None), outlines="given", has_faces=False)
-    told = [evaluate(models(TRUTH, has_footprints=follow), given).notes for follow in (True, False)]
-    assert ["say nothing of the method" in " ".join(notes) for notes in told] == [True, False]
+    facts = [evaluate(models(TRUTH, has_footprints=follow), given).notes for follow in (True, False)]
+    assert ["say nothing about the method" in " ".join(notes) for notes in facts] == [True, False]

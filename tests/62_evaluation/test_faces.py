@@ -51,37 +51,37 @@ def found(models: list[RoofModel], truth: list[RoofModel]) -> list[bool]:
 def test_the_truth_scored_against_itself_is_perfect(truth: list[RoofModel]) -> None:
     known = reference(truth, extent=None)
     score = score_faces(truth, known)
-    told = {one.name: one for one in measures(score, subsets(known)[0])}
-    assert set(told) == {one.name for one in DEFINITIONS}
+    facts = {one.name: one for one in measures(score, subsets(known)[0])}
+    assert set(facts) == {one.name for one in DEFINITIONS}
     for name in SHARES:
-        assert told[name].value == 1.0
-        assert told[name].high == 1.0 or len(truth) == 1
+        assert facts[name].value == 1.0
+        assert facts[name].high == 1.0 or len(truth) == 1
     assert {row.verdict for row in score.models} <= {FaceVerdict.RIGHT, FaceVerdict.NEITHER}
     assert all(row.found and row.matched and not row.as_group for row in score.reference)
     assert max(row.angle_deg for row in score.reference) == 0.0
     assert max(abs(row.offset_m) for row in score.reference) == 0.0
     assert {one.kind for one in score.components} == {Topology.ONE_TO_ONE}
     large = len({row.unit for row in score.reference if row.unit_area_m2 >= 10})
-    assert told["faces.topology_1_1"].value == large
-    assert told["faces.completeness_10m2"].n == large
+    assert facts["faces.topology_1_1"].value == large
+    assert facts["faces.completeness_10m2"].n == large
 
 
 def test_a_removed_face_is_missing_and_nothing_is_wrong() -> None:
-    told = scored([TRUTH[0], with_face(TRUTH[1], 0, None), TRUTH[2]], TRUTH)
-    assert told["completeness_10m2"] == told["completeness_all"] == pytest.approx(6 / 7)
-    assert told["correctness_10m2"] == told["correctness_all"] == told["correctness_area"] == 1.0
-    assert told["quality_10m2"] == pytest.approx(6 / 7)
+    facts = scored([TRUTH[0], with_face(TRUTH[1], 0, None), TRUTH[2]], TRUTH)
+    assert facts["completeness_10m2"] == facts["completeness_all"] == pytest.approx(6 / 7)
+    assert facts["correctness_10m2"] == facts["correctness_all"] == facts["correctness_area"] == 1.0
+    assert facts["quality_10m2"] == pytest.approx(6 / 7)
     slanted = math.sqrt(1 + 0.7**2)
     whole = (96 + 112) * slanted + 80
-    assert told["completeness_area"] == told["quality_area"] == pytest.approx(1 - 40 * slanted / whole)
-    assert (told["topology_1_1"], told["topology_1_0"]) == (6, 1)
+    assert facts["completeness_area"] == facts["quality_area"] == pytest.approx(1 - 40 * slanted / whole)
+    assert (facts["topology_1_1"], facts["topology_1_0"]) == (6, 1)
 
 
 def test_a_dropped_building_loses_its_faces() -> None:
-    told = scored([TRUTH[0], TRUTH[2]], TRUTH)
-    assert told["completeness_10m2"] == pytest.approx(3 / 7)
-    assert told["correctness_10m2"] == 1.0
-    assert told["topology_1_0"] == 4
+    facts = scored([TRUTH[0], TRUTH[2]], TRUTH)
+    assert facts["completeness_10m2"] == pytest.approx(3 / 7)
+    assert facts["correctness_10m2"] == 1.0
+    assert facts["topology_1_0"] == 4
 
 
 @pytest.mark.parametrize(("lift", "kept"), [(0.2, True), (0.3, True), (-0.3, True), (0.31, False), (-0.31, False)])
@@ -126,10 +126,10 @@ def test_a_lost_face_of_a_model_is_wrong_where_it_should_have_been() -> None:
     assert [row.verdict for row in score.models].count(FaceVerdict.WRONG) == 1
     (wrong,) = [row for row in score.models if row.verdict is FaceVerdict.WRONG]
     assert (wrong.building, wrong.model_id, wrong.plane_id) == (1, "b", 2)
-    told = figures(score, reference(TRUTH[:2]))
-    assert told["completeness_10m2"] == told["correctness_10m2"] == pytest.approx(5 / 6)
-    assert told["quality_10m2"] == pytest.approx(5 / 7)
-    assert told["topology_1_1"] == 6  # how faces lie on one another does not ask for their planes
+    facts = figures(score, reference(TRUTH[:2]))
+    assert facts["completeness_10m2"] == facts["correctness_10m2"] == pytest.approx(5 / 6)
+    assert facts["quality_10m2"] == pytest.approx(5 / 7)
+    assert facts["topology_1_1"] == 6  # how faces lie on one another does not ask for their planes
 
 
 def test_faces_match_one_to_one() -> None:
@@ -137,35 +137,35 @@ def test_faces_match_one_to_one() -> None:
     twice = dataclasses.replace(true[0], surfaces=true[0].surfaces * 2)
     assert scored([twice], true)["correctness_10m2"] == 0.5
     halves = [flat("m", width=6.0), flat("n", 6.0, width=6.0)]
-    told = scored(halves, true)
-    assert (told["completeness_10m2"], told["correctness_10m2"], told["topology_1_n"]) == (1.0, 0.5, 1)
+    facts = scored(halves, true)
+    assert (facts["completeness_10m2"], facts["correctness_10m2"], facts["topology_1_n"]) == (1.0, 0.5, 1)
     thirds = [flat(str(x), x, width=4.0) for x in (0.0, 4.0, 8.0)]
-    told = scored(thirds, true)
-    assert (told["completeness_10m2"], told["correctness_10m2"], told["topology_1_n"]) == (0.0, 0.0, 1)
+    facts = scored(thirds, true)
+    assert (facts["completeness_10m2"], facts["correctness_10m2"], facts["topology_1_n"]) == (0.0, 0.0, 1)
 
 
 def test_faces_joined_and_tangled_are_counted() -> None:
     true = [flat(str(x), x, width=6.0) for x in (0.0, 6.0, 12.0)]
-    told = scored([flat("m", width=18.0)], true)
-    assert [told[f"topology_{kind}"] for kind in ("1_1", "1_n", "n_1", "n_m", "1_0", "0_1")] == [0, 0, 1, 0, 0, 0]
+    facts = scored([flat("m", width=18.0)], true)
+    assert [facts[f"topology_{kind}"] for kind in ("1_1", "1_n", "n_1", "n_m", "1_0", "0_1")] == [0, 0, 1, 0, 0, 0]
     across = [
         dataclasses.replace(flat(str(y)), surfaces=(surface(rectangle(0, y, 18, y + 4), (0.0, 0.0, 6.0)),))
         for y in (0.0, 4.0)
     ]
-    told = scored(across, true)
-    assert [told[f"topology_{kind}"] for kind in ("1_1", "1_n", "n_1", "n_m", "1_0", "0_1")] == [0, 0, 0, 1, 0, 0]
-    told = scored([flat("far", 200.0)], true)
-    assert [told[f"topology_{kind}"] for kind in ("1_1", "1_n", "n_1", "n_m", "1_0", "0_1")] == [0, 0, 0, 0, 3, 1]
+    facts = scored(across, true)
+    assert [facts[f"topology_{kind}"] for kind in ("1_1", "1_n", "n_1", "n_m", "1_0", "0_1")] == [0, 0, 0, 1, 0, 0]
+    facts = scored([flat("far", 200.0)], true)
+    assert [facts[f"topology_{kind}"] for kind in ("1_1", "1_n", "n_1", "n_m", "1_0", "0_1")] == [0, 0, 0, 0, 3, 1]
 
 
 def test_a_split_building_costs_no_faces() -> None:
     one = TRUTH[1]
     parts = [dataclasses.replace(one, building_id=str(k), surfaces=(face,)) for k, face in enumerate(one.surfaces)]
-    told = scored(parts, [one])
-    assert all(told[name.split(".")[1]] == 1.0 for name in SHARES)
+    facts = scored(parts, [one])
+    assert all(facts[name.split(".")[1]] == 1.0 for name in SHARES)
     row = dataclasses.replace(TRUTH[0], surfaces=tuple(face for true in TRUTH for face in true.surfaces))
-    told = scored([row], TRUTH)  # nor does a model that joins buildings
-    assert all(told[name.split(".")[1]] == 1.0 for name in SHARES)
+    facts = scored([row], TRUTH)  # nor does a model that joins buildings
+    assert all(facts[name.split(".")[1]] == 1.0 for name in SHARES)
 
 
 # ------------------------------------------------------------------------------------------------------- bent faces
@@ -185,9 +185,9 @@ def one_sided(name: str, true: RoofModel) -> RoofModel:
 def test_a_bent_face_is_found_as_one_face_and_as_two() -> None:
     true = bent_gable("t")
     for made in (true, one_sided("m", true)):
-        told = scored([made], [true])
-        assert all(told[name.split(".")[1]] == 1.0 for name in SHARES)
-        assert (told["topology_1_1"], told["topology_1_n"]) == (2, 0)
+        facts = scored([made], [true])
+        assert all(facts[name.split(".")[1]] == 1.0 for name in SHARES)
+        assert (facts["topology_1_1"], facts["topology_1_n"]) == (2, 0)
         known = reference([true])
         assert {one.n for one in measures(score_faces([made], known), subsets(known)[0]) if "complete" in one.name} == {
             2
@@ -249,8 +249,8 @@ def test_area_and_points_of_a_bent_face_are_summed() -> None:
 
 def test_small_faces_are_neither_right_nor_wrong() -> None:
     true = [flat("large"), flat("small", 20.0, width=3.0, depth=3.0)]
-    told = scored(true, true)
-    assert (told["completeness_10m2"], told["correctness_10m2"], told["completeness_all"]) == (1.0, 1.0, 1.0)
+    facts = scored(true, true)
+    assert (facts["completeness_10m2"], facts["correctness_10m2"], facts["completeness_all"]) == (1.0, 1.0, 1.0)
     known = reference(true)
     for models, verdicts, complete in (
         (true, [FaceVerdict.RIGHT, FaceVerdict.NEITHER], 1.0),
@@ -261,11 +261,11 @@ def test_small_faces_are_neither_right_nor_wrong() -> None:
     ):
         score = score_faces(models, known)
         assert [row.verdict for row in score.models] == verdicts
-        told = {one.name: one for one in measures(score, subsets(known)[0])}
-        assert told["faces.completeness_10m2"].value == 1.0
-        assert told["faces.completeness_10m2"].n == 1
-        assert told["faces.completeness_all"].value == complete
-        assert told["faces.correctness_10m2"].value == (0.5 if FaceVerdict.WRONG in verdicts else 1.0)
+        facts = {one.name: one for one in measures(score, subsets(known)[0])}
+        assert facts["faces.completeness_10m2"].value == 1.0
+        assert facts["faces.completeness_10m2"].n == 1
+        assert facts["faces.completeness_all"].value == complete
+        assert facts["faces.correctness_10m2"].value == (0.5 if FaceVerdict.WRONG in verdicts else 1.0)
 
 
 def test_faces_with_too_few_points_need_not_be_found() -> None:
@@ -273,10 +273,10 @@ def test_faces_with_too_few_points_need_not_be_found() -> None:
     known = reference(TRUTH, face_points=points)
     score = score_faces(TRUTH, known)
     assert [row.to_be_found for row in score.reference] == [True, False, *[False] * 4, True]
-    told = {one.name: one for one in measures(score, subsets(known)[0])}
-    assert (told["faces.completeness_10m2"].value, told["faces.completeness_10m2"].n) == (1.0, 2)
-    assert (told["faces.correctness_10m2"].value, told["faces.correctness_10m2"].n) == (1.0, 2)
-    assert told["faces.completeness_all"].n == 7
+    facts = {one.name: one for one in measures(score, subsets(known)[0])}
+    assert (facts["faces.completeness_10m2"].value, facts["faces.completeness_10m2"].n) == (1.0, 2)
+    assert (facts["faces.correctness_10m2"].value, facts["faces.correctness_10m2"].n) == (1.0, 2)
+    assert facts["faces.completeness_all"].n == 7
 
 
 def test_what_the_data_edge_cuts_is_neither_found_nor_wrong() -> None:
@@ -291,9 +291,9 @@ def test_what_the_data_edge_cuts_is_neither_found_nor_wrong() -> None:
     ):
         score = score_faces(models, known)
         assert [row.verdict for row in score.models[2:]] == [FaceVerdict.LEFT_OUT] * (len(models) - 1)
-        told = {one.name: one for one in measures(score, subsets(known)[0])}
-        assert [told[name].value for name in SHARES] == [1.0] * len(SHARES)
-        assert told["faces.completeness_all"].n == told["faces.topology_1_1"].value == 2
+        facts = {one.name: one for one in measures(score, subsets(known)[0])}
+        assert [facts[name].value for name in SHARES] == [1.0] * len(SHARES)
+        assert facts["faces.completeness_all"].n == facts["faces.topology_1_1"].value == 2
     uncut = reference([TRUTH[0], dataclasses.replace(cut, touches_data_edge=False)])
     assert figures(score_faces([TRUTH[0], cut], uncut), uncut)["completeness_10m2"] == 1.0  # a cut model may find
 
@@ -325,9 +325,9 @@ def test_a_face_elsewhere_is_wrong_only_where_the_reference_is_complete() -> Non
         score = score_faces([*TRUTH, far], known)
         assert score.models[-1].verdict is verdict
         assert score.models[-1].building == -1
-        told = figures(score, known)
-        assert told["correctness_10m2"] == pytest.approx(7 / 8 if extent else 1.0)
-        assert told["completeness_10m2"] == 1.0
+        facts = figures(score, known)
+        assert facts["correctness_10m2"] == pytest.approx(7 / 8 if extent else 1.0)
+        assert facts["completeness_10m2"] == 1.0
     high = with_face(TRUTH[2], 0, lifted(TRUTH[2].surfaces[0], 3.0))
     assert score_faces([high], reference(TRUTH, extent=None)).models[0].verdict is FaceVerdict.WRONG
 
@@ -343,17 +343,17 @@ def test_good_and_hard_buildings_are_told_apart() -> None:
         [TRUTH[0], with_face(TRUTH[1], 1, lifted(TRUTH[1].surfaces[1], 1.0)), flat("far", 200.0)], truth
     )
     everything, good, hard = ({one.name: one for one in measures(score, subset)} for subset in subsets(truth))
-    assert [told["faces.completeness_10m2"].value for told in (everything, good, hard)] == pytest.approx(
+    assert [facts["faces.completeness_10m2"].value for facts in (everything, good, hard)] == pytest.approx(
         [5 / 7, 2 / 3, 3 / 4]
     )
-    assert [told["faces.correctness_10m2"].value for told in (everything, good, hard)] == pytest.approx(
+    assert [facts["faces.correctness_10m2"].value for facts in (everything, good, hard)] == pytest.approx(
         [5 / 7, 1.0, 3 / 4]
     )
-    assert [told["faces.quality_10m2"].value for told in (everything, good, hard)] == pytest.approx(
+    assert [facts["faces.quality_10m2"].value for facts in (everything, good, hard)] == pytest.approx(
         [5 / 9, 2 / 3, 3 / 5]
     )
-    assert [told["faces.topology_0_1"].value for told in (everything, good, hard)] == [1, 0, 0]
-    assert [told["faces.completeness_10m2"].subset for told in (everything, good, hard)] == ["all", "good", "hard"]
+    assert [facts["faces.topology_0_1"].value for facts in (everything, good, hard)] == [1, 0, 0]
+    assert [facts["faces.completeness_10m2"].subset for facts in (everything, good, hard)] == ["all", "good", "hard"]
 
 
 def test_without_true_faces_there_is_nothing_to_say() -> None:
@@ -364,10 +364,10 @@ def test_without_true_faces_there_is_nothing_to_say() -> None:
 
 
 def test_no_models_find_nothing_and_are_never_wrong() -> None:
-    told = scored([], TRUTH)
-    assert told["completeness_10m2"] == told["quality_10m2"] == told["completeness_area"] == 0.0
-    assert math.isnan(told["correctness_10m2"])
-    assert told["topology_1_0"] == 7
+    facts = scored([], TRUTH)
+    assert facts["completeness_10m2"] == facts["quality_10m2"] == facts["completeness_area"] == 0.0
+    assert math.isnan(facts["correctness_10m2"])
+    assert facts["topology_1_0"] == 7
 
 
 # ------------------------------------------------------------------------------------------------------- invariants
@@ -392,8 +392,8 @@ def test_the_score_does_not_depend_on_the_order_of_models() -> None:
     truth = by_hand.models_of_scene(suburb(12, size_m=(90.0, 90.0)))
     models = damaged(truth, np.random.default_rng(5))
     known = reference(truth, extent=None)
-    told, other = figures(score_faces(models, known), known), figures(score_faces(models[::-1], known), known)
-    assert told == pytest.approx(other, nan_ok=True)
+    facts, other = figures(score_faces(models, known), known), figures(score_faces(models[::-1], known), known)
+    assert facts == pytest.approx(other, nan_ok=True)
 
 
 # ------------------------------------------------ the slow twin: rasters of 5 cm, counting, naive double loops

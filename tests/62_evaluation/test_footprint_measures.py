@@ -24,12 +24,12 @@ def scored(models: list[RoofModel], truth: Reference) -> tuple[FootprintRow, ...
     return score_footprints(models, truth, match_footprints(models, truth))
 
 
-def told(models: list[RoofModel], truth: Reference) -> dict[str, float]:
+def figures_of(models: list[RoofModel], truth: Reference) -> dict[str, float]:
     return by_hand.values(measures(scored(models, truth), subsets(truth)[0]))
 
 
 def test_the_truth_scored_against_itself_is_perfect() -> None:
-    figures = told(TRUTH, reference(TRUTH))
+    figures = figures_of(TRUTH, reference(TRUTH))
     assert {f"footprints.{name}" for name in figures} == {one.name for one in DEFINITIONS}
     for name, value in figures.items():
         assert value == (0.0 if name in {"area_bias_median", "offset_median"} else 1.0)
@@ -44,7 +44,7 @@ def test_a_shrunk_footprint_loses_what_geometry_says(metres: float) -> None:
         assert (row.iou, row.iou_together) == pytest.approx([min(ratio, 1 / ratio)] * 2)
         assert row.area_bias == pytest.approx(ratio - 1)
         assert row.offset_m == pytest.approx(-metres)
-    figures = told(models, reference(TRUTH))
+    figures = figures_of(models, reference(TRUTH))
     assert figures["offset_median"] == pytest.approx(-metres)
     assert figures["iou_mean"] == pytest.approx(np.mean([row.iou for row in rows]))
     assert figures["iou_median"] == pytest.approx(np.median([row.iou for row in rows]))
@@ -59,7 +59,7 @@ def test_the_offset_is_exact_for_outlines_with_corners_that_turn_in_and_with_cou
 
 
 def test_a_dropped_building_counts_as_nothing_found() -> None:
-    figures = told(TRUTH[1:], reference(TRUTH))
+    figures = figures_of(TRUTH[1:], reference(TRUTH))
     assert figures["iou_mean"] == pytest.approx(2 / 3)
     assert figures["iou_mean_found"] == figures["iou_median_found"] == 1.0
     assert figures["iou_from_50"] == figures["iou_from_80"] == figures["iou_from_90"] == pytest.approx(2 / 3)
@@ -72,7 +72,7 @@ def test_a_dropped_building_counts_as_nothing_found() -> None:
 def test_shares_change_at_their_limits() -> None:
     true = [flat("t", width=10.0, depth=10.0)]
     for width, reached in ((4.9, 0), (5.0, 1), (7.9, 1), (8.0, 2), (8.9, 2), (9.0, 3)):
-        figures = told([flat("m", width=width, depth=10.0)], reference(true))
+        figures = figures_of([flat("m", width=width, depth=10.0)], reference(true))
         assert [figures[f"iou_from_{limit}"] for limit in (50, 80, 90)] == [1.0] * reached + [0.0] * (3 - reached)
 
 

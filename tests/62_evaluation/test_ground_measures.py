@@ -154,8 +154,8 @@ def test_what_a_file_leaves_unclassified_is_object_only_where_it_names_no_object
     (every,) = tile_figures(ground_blocks(reference, lambda _: np.ones(100, np.bool_)))
     assert (every.ground, every.object) == (25, 75)
     named = dataclasses.replace(reference, unclassified_is_object=False)
-    (told,) = tile_figures(ground_blocks(named, lambda _: np.ones(100, np.bool_)))
-    assert (told.ground, told.object) == (25, 25)
+    (facts,) = tile_figures(ground_blocks(named, lambda _: np.ones(100, np.bool_)))
+    assert (facts.ground, facts.object) == (25, 25)
 
 
 def test_tiles_are_told_apart_and_add_up() -> None:

@@ -200,7 +200,7 @@ def test_holes_in_a_roof_are_holes_in_the_footprint(tmp_path: Path) -> None:
 
 
 def test_the_roof_type_is_what_the_file_says(tmp_path: Path) -> None:
-    told = {
+    found = {
         "b3_dak_type": {
             "horizontal": "flat",
             "multiple horizontal": "flat",
@@ -211,7 +211,7 @@ def test_the_roof_type_is_what_the_file_says(tmp_path: Path) -> None:
         "roof_type": {"gable": "gable", "combination": "combination", "dome": "unknown"},
         "roofType": {"1000": "flat", 1030: "gable", "1040": "hip", "9999": "unknown"},
     }
-    for attribute, values in told.items():
+    for attribute, values in found.items():
         for value, wanted in values.items():
             house = building([solid()], attributes={attribute: value})
             (model,) = read(tmp_path, document({"house": house}, box(0, 3))).models
@@ -298,10 +298,10 @@ def _broken() -> dict[str, tuple[Json | str, str]]:
 
 @pytest.mark.parametrize("fault", sorted(_broken()))
 def test_broken_files_tell_what_is_wrong(tmp_path: Path, fault: str) -> None:
-    text, told = _broken()[fault]
+    text, found = _broken()[fault]
     with pytest.raises(InputError, match=r"of_others\.city\.json") as caught:
         read(tmp_path, text)
-    assert told in caught.value.problem
+    assert found in caught.value.problem
 
 
 def test_a_broken_line_of_a_sequence_is_named(tmp_path: Path) -> None:
@@ -320,10 +320,10 @@ def test_a_broken_line_of_a_sequence_is_named(tmp_path: Path) -> None:
         "line 2: type is None": [sound[0], "{}"],
         "the file is empty": [],
     }
-    for told, lines in cases.items():
+    for found, lines in cases.items():
         with pytest.raises(InputError, match=r"s\.city\.jsonl") as caught:
             read(tmp_path, "\n".join(lines), "s.city.jsonl")
-        assert caught.value.problem.startswith(told), (told, caught.value.problem)
+        assert caught.value.problem.startswith(found), (found, caught.value.problem)
 
 
 def test_a_sequence_is_read_feature_by_feature(tmp_path: Path) -> None:

@@ -27,11 +27,11 @@ def arrays(faces: list[list[tuple[int, ...]]]) -> tuple[IntArray, IntArray, IntA
     return np.array([index for ring in rings for index in ring], np.int64), offsets, of_faces
 
 
-def regions(xyz: FloatArray, faces: list[list[tuple[int, ...]]], told: list[int] | None = None) -> list[int]:
+def regions(xyz: FloatArray, faces: list[list[tuple[int, ...]]], planes: list[int] | None = None) -> list[int]:
     """The regions of faces."""
     corners, ring_offsets, face_rings = arrays(faces)
     vectors = face_vectors(xyz, corners, ring_offsets, face_rings)
-    numbers = np.array(told or [-1] * len(faces), np.int64)
+    numbers = np.array(planes or [-1] * len(faces), np.int64)
     return coplanar_regions(xyz, corners, ring_offsets, face_rings, vectors, numbers, DISTANCE_M, ANGLE_DEG).tolist()
 
 
@@ -115,7 +115,7 @@ def test_faces_of_one_height_that_do_not_touch_stay_apart() -> None:
 
 def test_faces_that_a_file_numbers_differently_stay_apart() -> None:
     xyz, triangles = lattice(2, 1, 1.0)
-    assert regions(xyz, [[triangle] for triangle in triangles], told=[3, 3, 4, 4]) == [0, 0, 1, 1]
+    assert regions(xyz, [[triangle] for triangle in triangles], planes=[3, 3, 4, 4]) == [0, 0, 1, 1]
 
 
 def test_a_step_of_two_centimetres_between_parallel_faces_stays() -> None:
@@ -187,6 +187,6 @@ def test_faces_with_vertices_of_their_own_are_pieces_by_place() -> None:
 
 
 def test_names_tell_a_kind_only_where_they_are_clear() -> None:
-    told = {"RoofSurface": FaceKind.ROOF, "my_wall.3": FaceKind.WALL, "GROUND": FaceKind.GROUND}
-    assert {name: kind_in_name(name) for name in told} == told
+    kinds = {"RoofSurface": FaceKind.ROOF, "my_wall.3": FaceKind.WALL, "GROUND": FaceKind.GROUND}
+    assert {name: kind_in_name(name) for name in kinds} == kinds
     assert [kind_in_name(name) for name in ("house", "", "roof_and_wall")] == [None, None, None]

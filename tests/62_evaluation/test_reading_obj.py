@@ -124,7 +124,7 @@ def test_broken_files_tell_the_line(tmp_path: Path) -> None:
         "line 9: invalid literal": corners() + "f 1 2 x\n",
         "the file has no faces": corners(),
     }
-    for told, text in cases.items():
+    for found, text in cases.items():
         with pytest.raises(InputError, match=r"of_others\.obj") as caught:
             read(tmp_path, text)
-        assert caught.value.problem.startswith(told), (told, caught.value.problem)
+        assert caught.value.problem.startswith(found), (found, caught.value.problem)

@@ -53,8 +53,8 @@ def test_a_run_that_broke_off_or_lacks_solids_says_so(tmp_path: Path) -> None:
     models = read_models(run)
     assert len(models.models) == 4
     assert all(model.solids == () for model in models.models)
-    told = [note.split(":")[0] for note in models.notes]
-    assert told[1:] == ["the run is incomplete", "no folder cityjson in the run"]
+    facts = [note.split(":")[0] for note in models.notes]
+    assert facts[1:] == ["the run is incomplete", "no folder cityjson in the run"]
 
 
 def test_of_several_levels_of_detail_the_finest_is_measured(tmp_path: Path) -> None:
@@ -144,10 +144,10 @@ def test_what_cannot_be_read_is_told_with_what_can(tmp_path: Path) -> None:
         outer: "truth",
         tmp_path / "empty": "without files",
     }
-    for path, told in cases.items():
+    for path, facts in cases.items():
         with pytest.raises(InputError) as caught:
             read_models(path)
-        assert told in caught.value.problem
+        assert facts in caught.value.problem
         assert all(reader.description in caught.value.fix for reader in READERS)
 
 

@@ -124,10 +124,10 @@ def test_faces_without_semantics_are_told_by_their_normals(
     name: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     lines = files.without_planes(files.sequence_of(request.getfixturevalue(name)))
-    told = read_models(files.write_sequence(tmp_path / "told.city.jsonl", lines))
+    found = read_models(files.write_sequence(tmp_path / "found.city.jsonl", lines))
     bare = read_models(files.write_sequence(tmp_path / "bare.city.jsonl", files.without_semantics(lines)))
-    files.assert_same_models(told, bare)
-    for model, other in zip(told.models, bare.models, strict=True):
+    files.assert_same_models(found, bare)
+    for model, other in zip(found.models, bare.models, strict=True):
         kinds = [[face.kind for face in solid.faces] for each in (model, other) for solid in each.solids]
         assert kinds[: len(model.solids)] == kinds[len(model.solids) :]
 

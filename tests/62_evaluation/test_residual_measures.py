@@ -322,8 +322,8 @@ def test_a_model_at_a_wrong_place_in_the_world_changes_no_residual_and_no_index(
     wide = dataclasses.replace(house("wide", 0.0, 0.0), surfaces=(lid,))
     x, y = np.meshgrid(np.arange(-9.7, 49.0, 0.5), np.arange(-9.7, 17.0, 0.5))
     both = top_surface_of([*true, astray, wide], near=true)
-    told = near.elevation(x.ravel(), y.ravel())
-    assert both.elevation(x.ravel(), y.ravel()) == pytest.approx(np.where(np.isnan(told), 3.0, told))
+    facts = near.elevation(x.ravel(), y.ravel())
+    assert both.elevation(x.ravel(), y.ravel()) == pytest.approx(np.where(np.isnan(facts), 3.0, facts))
     assert np.isnan(top_surface_of([astray], near=true).elevation(np.array([5.0]), np.array([4.0]))).all()
 
 

@@ -38,7 +38,7 @@ def outcomes(models: list[RoofModel], **more: object) -> list[Outcome]:
     return [row.outcome for row in scored(models, reference(TRUTH, **more))]
 
 
-def told(models: list[RoofModel], truth: Reference) -> dict[str, float]:
+def figures_of(models: list[RoofModel], truth: Reference) -> dict[str, float]:
     return by_hand.values(measures(scored(models, truth), subsets(truth)[0]))
 
 
@@ -48,7 +48,7 @@ def replaced(place: int, one: RoofModel) -> list[RoofModel]:
 
 @pytest.mark.parametrize("buildings", [TRUTH, [gable("only")]])
 def test_the_truth_scored_against_itself_is_perfect(buildings: list[RoofModel]) -> None:
-    figures = told(buildings, reference(buildings))
+    figures = figures_of(buildings, reference(buildings))
     assert {name for name, value in figures.items() if value == 1.0} == {
         "correct",
         "accuracy",
@@ -87,7 +87,7 @@ def test_a_wrong_type_is_passable_and_told_in_the_confusion() -> None:
         (RoofType.GABLE, RoofType.HIP): 1,
         (RoofType.HIP, RoofType.HIP): 1,
     }
-    figures = told(models, truth)
+    figures = figures_of(models, truth)
     assert figures["accuracy"] == figures["accuracy_found"] == 0.75
     by_chance = (1 * 1 + 2 * 1 + 1 * 2) / 16
     assert figures["kappa"] == pytest.approx((0.75 - by_chance) / (1 - by_chance))
@@ -98,7 +98,7 @@ def test_a_dropped_building_is_false_and_of_no_type() -> None:
     rows = scored(TRUTH[1:], truth)
     assert rows[0].outcome is Outcome.FALSE
     assert confusion(rows, subsets(truth)[0])[RoofType.GABLE, RoofType.NONE] == 1
-    figures = told(TRUTH[1:], truth)
+    figures = figures_of(TRUTH[1:], truth)
     assert (figures["false"], figures["accuracy"], figures["accuracy_found"]) == (0.25, 0.75, 1.0)
 
 
@@ -167,7 +167,7 @@ def test_the_table_of_the_paper_counts_by_type_and_by_shape() -> None:
 
 def test_what_the_data_edge_cuts_does_not_count() -> None:
     truth = reference([*TRUTH, gable("cut", 80.0, touches_data_edge=True)])
-    figures = told(TRUTH, truth)
+    figures = figures_of(TRUTH, truth)
     assert (figures["correct"], figures["accuracy"]) == (1.0, 1.0)
     assert sum(confusion(scored(TRUTH, truth), subsets(truth)[0]).values()) == 4
 
@@ -179,7 +179,7 @@ def test_kappa_is_that_of_a_naive_count() -> None:
     truth = [dataclasses.replace(one, roof_type=kinds[random.integers(4)]) for one in true]
     said = [one.roof_type if random.random() < 0.5 else kinds[random.integers(4)] for one in truth[:20]]
     models = [dataclasses.replace(one, roof_type=kind) for one, kind in zip(truth, said, strict=False)]
-    figures = told(models, reference(truth))
+    figures = figures_of(models, reference(truth))
     pairs = [(one.roof_type, models[k].roof_type if k < 20 else RoofType.NONE) for k, one in enumerate(truth)]
     agreed = sum(a == b for a, b in pairs) / 25
     chance = sum(sum(a == kind for a, _ in pairs) * sum(b == kind for _, b in pairs) for kind in RoofType) / 625
@@ -191,6 +191,6 @@ def test_without_true_faces_or_models_little_is_said() -> None:
     without = reference(TRUTH, has_faces=False)
     assert scored(TRUTH, without) == ()
     assert measures((), subsets(without)[0]) == []
-    figures = told([], reference(TRUTH))
+    figures = figures_of([], reference(TRUTH))
     assert (figures["false"], figures["accuracy"], figures["kappa"]) == (1.0, 0.0, 0.0)
     assert math.isnan(figures["accuracy_found"])

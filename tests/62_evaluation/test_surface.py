@@ -22,13 +22,13 @@ from pipeline.ruler.simulation.suburb import suburb
 TRUTH = [gable("a"), hip("b", 20.0), flat("c", 40.0)]
 
 
-def told(models: list[RoofModel], truth: Reference, subset: int = 0) -> dict[str, float]:
+def figures_of(models: list[RoofModel], truth: Reference, subset: int = 0) -> dict[str, float]:
     return by_hand.values(measures(score_surface(models, truth), subsets(truth)[subset]))
 
 
 @pytest.mark.parametrize("truth", [TRUTH, by_hand.models_of_scene(suburb(3, size_m=(100.0, 100.0)))])
 def test_the_truth_scored_against_itself_is_perfect(truth: list[RoofModel]) -> None:
-    figures = told(truth, reference(truth))
+    figures = figures_of(truth, reference(truth))
     assert {f"surface.{name}" for name in figures} == {one.name for one in DEFINITIONS}
     assert figures["coverage"] == figures["within_0_2m"] == figures["within_0_2m_mean"] == 1.0
     assert [figures[name] for name in ("median", "p95", "rmse", "bias")] == pytest.approx([0.0] * 4, abs=2e-6)
@@ -39,7 +39,7 @@ def test_the_truth_scored_against_itself_is_perfect(truth: list[RoofModel]) -> N
 
 @pytest.mark.parametrize(("lift", "within"), [(0.2, 1.0), (0.21, 0.0), (-0.3, 0.0)])
 def test_a_lifted_roof_is_off_by_the_lift(lift: float, within: float) -> None:
-    figures = told([gable("m", lift=lift)], reference(TRUTH[:1]))
+    figures = figures_of([gable("m", lift=lift)], reference(TRUTH[:1]))
     assert [figures[name] for name in ("rmse", "median")] == pytest.approx([abs(lift)] * 2, abs=0.0055)
     assert figures["bias"] == pytest.approx(lift)
     assert (figures["within_0_2m"], figures["coverage"]) == (within, 1.0)
@@ -63,7 +63,7 @@ def test_shrunk_footprints_cover_less_and_cannot_buy_a_better_score() -> None:
 
 
 def test_a_removed_face_and_a_dropped_building_are_misses() -> None:
-    figures = told([with_face(TRUTH[0], 0, None), TRUTH[1]], reference(TRUTH))
+    figures = figures_of([with_face(TRUTH[0], 0, None), TRUTH[1]], reference(TRUTH))
     whole = 96 + 112 + 80
     assert figures["coverage"] == figures["within_0_2m"] == pytest.approx((48 + 112) / whole, abs=0.001)
     assert figures["within_0_2m_mean"] == pytest.approx((0.5 + 1.0 + 0.0) / 3)
@@ -78,7 +78,7 @@ def test_a_removed_face_and_a_dropped_building_are_misses() -> None:
 def test_all_models_together_are_compared_and_the_upper_face_is_the_roof() -> None:
     faces = TRUTH[1].surfaces
     split = [dataclasses.replace(TRUTH[1], surfaces=(face,)) for face in faces]
-    assert told(split, reference(TRUTH[1:2])) == told([TRUTH[1]], reference(TRUTH[1:2]))
+    assert figures_of(split, reference(TRUTH[1:2])) == figures_of([TRUTH[1]], reference(TRUTH[1:2]))
     above = dataclasses.replace(TRUTH[1], surfaces=(lifted(faces[0], 2.0),))
     (row,) = score_surface([TRUTH[1], above], reference(TRUTH[1:2]))
     assert row.bias_m == pytest.approx(2.0 * 40 / 112, abs=0.02)
@@ -120,7 +120,7 @@ def test_pooled_quantiles_follow_the_places_within_a_bin() -> None:
     truth = by_hand.models_of_scene(suburb(22, size_m=(120.0, 120.0)))
     random = np.random.default_rng(6)
     models = [moved(one, 0.0, 0.0, random.normal(0.0, 0.4)) for one in truth]
-    figures = told(models, reference(truth))
+    figures = figures_of(models, reference(truth))
     rows = score_surface(models, reference(truth))
     pooled = np.concatenate([np.full(row.n_places, row.median_m) for row in rows])
     assert figures["median"] == pytest.approx(np.median(pooled), abs=0.006)
@@ -166,15 +166,15 @@ def test_the_data_edge_and_subsets_choose_the_buildings() -> None:
     known = {"a": by_hand.conditions(good=True), "b": by_hand.conditions(good=False)}
     truth = reference([*TRUTH, flat("cut", 60.0, touches_data_edge=True)], conditions=known)
     models = [TRUTH[0], moved(TRUTH[1], 0.0, 0.0, 1.0), TRUTH[2]]
-    assert [told(models, truth, k)["bias"] for k in range(3)] == pytest.approx([112 / 288, 0.0, 1.0], abs=0.002)
-    assert told(models, truth)["coverage"] == 1.0
+    assert [figures_of(models, truth, k)["bias"] for k in range(3)] == pytest.approx([112 / 288, 0.0, 1.0], abs=0.002)
+    assert figures_of(models, truth)["coverage"] == 1.0
 
 
 def test_without_true_faces_or_models_there_is_no_difference() -> None:
     without = reference(TRUTH, has_faces=False)
     assert score_surface(TRUTH, without) == ()
     assert measures((), subsets(without)[0]) == []
-    figures = told([], reference(TRUTH))
+    figures = figures_of([], reference(TRUTH))
     assert figures["coverage"] == figures["within_0_2m"] == 0.0
     assert math.isnan(figures["rmse"])
     assert math.isnan(figures["median"])

@@ -98,7 +98,7 @@ def test_options_that_do_not_go_together_are_told_at_once() -> None:
         EvaluationRequest(models="run", footprints="f.gpkg", ground=("g.laz",), as_surveyed=True)
     text = str(caught.value)
     assert "footprints are f.gpkg without points" in text
-    assert "as-surveyed is asked for without a truth" in text
+    assert "as-surveyed is given without a truth" in text
     assert "ground is g.laz without a reference" in text
     with pytest.raises(SettingsError, match="use one of --truth and --points"):
         EvaluationRequest(models="run", truth="t", points=("p.laz",))

@@ -1,4 +1,4 @@
-"""Validity of delivered solids, whoever wrote them."""
+"""Validity of delivered solids of any program."""
 
 from __future__ import annotations
 

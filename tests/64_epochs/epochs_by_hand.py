@@ -28,7 +28,7 @@ from pipeline.runtime.manifest import InputFile, RunManifest, RunStatus, write_m
 ORIGIN = (565_000.0, 5_934_000.0, 0.0)
 """Of all scenes: east and north in metres."""
 EXTENT = (-500.0, -500.0, 500.0, 500.0)
-"""Where both epochs have data unless told otherwise, about the origin."""
+"""Where both epochs have data by default, about the origin."""
 UTM = "EPSG:25832+7837"
 GROUND = Terrain(base_z_m=100.0)
 
@@ -80,7 +80,7 @@ def failed(name: str, x: float, y: float, side: float = 10.0) -> BuildingResult:
 
 
 def rejected(name: str, x: float, y: float, side: float = 10.0, height: float = 7.0) -> RejectedObject:
-    """An object that was judged to be no building."""
+    """An object that was rejected as a building."""
     return RejectedObject(
         object_id=name,
         origin=(ORIGIN[0] + x, ORIGIN[1] + y, 100.0),

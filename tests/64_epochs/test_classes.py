@@ -1,4 +1,4 @@
-"""Which class is told: pairs of houses made by hand, one change each, and what must not pass for one."""
+"""Classes of changes: pairs of houses made by hand, one change each, and differences that are not a change."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def test_a_shed_under_a_new_hall_is_gone_and_the_hall_is_new(compare: Compare) -
     assert rows["b"]["doubts"] == []
 
 
-# --- what cannot be told ---------------------------------------------------------------------------------------------
+# --- not comparable --------------------------------------------------------------------------------------------------
 
 
 def test_a_failed_candidate_is_not_taken_for_a_gone_or_a_new_house(compare: Compare) -> None:

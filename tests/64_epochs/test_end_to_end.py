@@ -59,7 +59,7 @@ def test_every_change_is_found_and_nothing_else_is_told(
     rows = pq.read_table(tmp_path / "changes.parquet").to_pylist()
     geometries = shapely.from_wkb(np.array([row["geometry"] for row in rows], dtype=object))
     origin = np.array(epochs.later.origin[:2])
-    told = {}
+    facts = {}
     for building in (*epochs.earlier.buildings, *epochs.later.buildings):
         footprint = shapely.transform(building.footprint, lambda xy: xy + origin)
         over = [
@@ -67,10 +67,10 @@ def test_every_change_is_found_and_nothing_else_is_told(
             for row, geometry in zip(rows, geometries, strict=True)
             if geometry.intersection(footprint).area > 0.5 * min(footprint.area, geometry.area)
         ]
-        told[building.building_id] = over
-    expected = {name: [EXPECTED[epochs.works.get(name)]] for name in told}
-    assert told == expected
-    assert len(rows) == len(told)
+        facts[building.building_id] = over
+    expected = {name: [EXPECTED[epochs.works.get(name)]] for name in facts}
+    assert facts == expected
+    assert len(rows) == len(facts)
     assert made.warnings == ()
     assert abs(made.summary.level.median_m or 0.0) < 0.01
 
@@ -83,5 +83,5 @@ def test_a_run_tells_where_its_data_lie(runs: tuple[str, str], epochs: TwoEpochs
     x, y, _ = epochs.earlier.origin
     assert points.bounds_m == pytest.approx((west + x, south + y, east + x, north + y), abs=2.0)
     assert manifest.lattice["tile_size_m"] > 0.0
-    told = json.loads(Path(runs[0], "run.json").read_text())
-    assert told["lattice"] == dict(manifest.lattice)
+    facts = json.loads(Path(runs[0], "run.json").read_text())
+    assert facts["lattice"] == dict(manifest.lattice)

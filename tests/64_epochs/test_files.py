@@ -87,25 +87,25 @@ def test_without_a_crs_there_is_no_geojson_and_it_is_told(tmp_path: Path) -> Non
     out = tmp_path / "out"
     out.mkdir()
     (out / "changes.geojson").write_text("of an earlier comparison")
-    told = run((str(runs[0]), str(runs[1])), out)
+    found = run((str(runs[0]), str(runs[1])), out)
     assert not (out / "changes.geojson").exists()
-    assert any("RFC 7946" in warning for warning in told["warnings"])
-    assert any("unknown" in warning for warning in told["warnings"])
+    assert any("RFC 7946" in warning for warning in found["warnings"])
+    assert any("unknown" in warning for warning in found["warnings"])
     assert geopandas.read_parquet(out / "changes.parquet").crs is None
 
 
 def test_sums_are_those_of_the_rows(pair: tuple[str, str], tmp_path: Path) -> None:
-    told = run(pair, tmp_path / "out")
+    found = run(pair, tmp_path / "out")
     rows = pq.read_table(tmp_path / "out" / "changes.parquet").to_pylist()
     for change in Change:
         own = [row for row in rows if row["change"] == change.value]
-        sums = told["changes"][change.value]
+        sums = found["changes"][change.value]
         assert sums["rows"] == len(own)
         assert sums["old_buildings"] == sum(len(row["old_ids"]) for row in own)
         for name in ("added_m2", "gained_m3", "lost_m3"):
             assert sums[name] == pytest.approx(sum(row[name] or 0.0 for row in own), abs=0.06)
-    assert told["level"] == {"median_m": 0.0, "spread_m": 0.0, "unchanged_roofs": 1}
-    assert (told["old"]["buildings"], told["new"]["buildings"]) == (3, 3)
+    assert found["level"] == {"median_m": 0.0, "spread_m": 0.0, "unchanged_roofs": 1}
+    assert (found["old"]["buildings"], found["new"]["buildings"]) == (3, 3)
 
 
 def test_the_same_comparison_writes_the_same_bytes(pair: tuple[str, str], tmp_path: Path) -> None:
@@ -117,8 +117,8 @@ def test_the_same_comparison_writes_the_same_bytes(pair: tuple[str, str], tmp_pa
 
 def test_runs_without_buildings_give_an_empty_table(tmp_path: Path) -> None:
     runs = [str(write_epoch(tmp_path / name, [])) for name in ("old", "new")]
-    told = run((runs[0], runs[1]), tmp_path / "out")
-    assert sum(sums["rows"] for sums in told["changes"].values()) == 0
+    found = run((runs[0], runs[1]), tmp_path / "out")
+    assert sum(sums["rows"] for sums in found["changes"].values()) == 0
     assert pq.read_table(tmp_path / "out" / "changes.parquet").num_rows == 0
     assert json.loads((tmp_path / "out" / "changes.geojson").read_text())["features"] == []
     assert (
@@ -134,29 +134,29 @@ def test_surveys_that_do_not_agree_in_height_are_told_with_the_shift(tmp_path: P
         write_epoch(tmp_path / name, [house(f"h{k}", 40.0 * k, eave=eave) for k in range(5)])
         for name, eave in (("old", 5.0), ("new", 5.4))
     ]
-    told = run((str(runs[0]), str(runs[1])), tmp_path / "out")
-    assert told["level"]["median_m"] == pytest.approx(0.4, abs=2e-3)
-    assert any("vertical_shift_m to 0.400" in warning for warning in told["warnings"])
+    found = run((str(runs[0]), str(runs[1])), tmp_path / "out")
+    assert found["level"]["median_m"] == pytest.approx(0.4, abs=2e-3)
+    assert any("vertical_shift_m to 0.400" in warning for warning in found["warnings"])
 
 
 def test_other_settings_methods_and_versions_are_told(tmp_path: Path) -> None:
     old = write_epoch(tmp_path / "old", [house("a1")], settings={"roof": {"x": 1.0}}, settings_hash="cd")
     new = write_epoch(tmp_path / "new", [house("a2")], settings={"roof": {"x": 2.0}}, engine_version="9")
-    told = run((str(old), str(new)), tmp_path / "out")
-    assert "the settings differ: [roof] x 1.0 / 2.0" in told["warnings"]
-    assert "the versions differ: OLD is of 0, NEW of 9" in told["warnings"]
+    found = run((str(old), str(new)), tmp_path / "out")
+    assert "the settings differ: [roof] x 1.0 / 2.0" in found["warnings"]
+    assert "the versions differ: OLD is of 0, NEW of 9" in found["warnings"]
     other = write_epoch(tmp_path / "other", [house("a2")], method="kmeans", request={"footprints": "f.gpkg"})
-    told = run((str(old), str(other)), tmp_path / "out2")
-    assert any("methods differ: OLD is of arrangement, NEW of kmeans" in warning for warning in told["warnings"])
-    assert any("NEW was modelled in given footprints" in warning for warning in told["warnings"])
+    found = run((str(old), str(other)), tmp_path / "out2")
+    assert any("methods differ: OLD is of arrangement, NEW of kmeans" in warning for warning in found["warnings"])
+    assert any("NEW was modelled in given footprints" in warning for warning in found["warnings"])
 
 
 def test_runs_that_do_not_tell_where_their_data_lie_are_compared_with_a_warning(tmp_path: Path) -> None:
     old = write_epoch(tmp_path / "old", [house("a1")], extent=None)
     new = write_epoch(tmp_path / "new", [house("a2"), house("b2", 3000.0)])
-    told = run((str(old), str(new)), tmp_path / "out")
-    assert told["changes"]["new"]["rows"] == 1
-    assert any(warning.startswith("OLD: run.json does not tell where its data lie") for warning in told["warnings"])
+    found = run((str(old), str(new)), tmp_path / "out")
+    assert found["changes"]["new"]["rows"] == 1
+    assert any(warning.startswith("OLD: run.json does not record where its data lie") for warning in found["warnings"])
 
 
 @pytest.mark.parametrize(
@@ -232,20 +232,20 @@ def test_runs_may_lie_in_an_object_store_and_the_results_too(
                 storage_at(f"{bucket}/{Path(place).name}").put(key, path.read_bytes())
     urls = [f"{bucket}/{Path(place).name}" for place in pair]
     here = CliRunner().invoke(app, ["batch", "diff", *pair, "--out", str(tmp_path / "here"), "--json"])
-    there = CliRunner().invoke(app, ["batch", "diff", *urls, "--out", f"{bucket}/told", "--json"])
+    there = CliRunner().invoke(app, ["batch", "diff", *urls, "--out", f"{bucket}/found", "--json"])
     assert (here.exit_code, there.exit_code) == (0, 0), there.stderr
-    told = json.loads(there.stdout)
-    assert told["changes"] == json.loads(here.stdout)["changes"]
-    assert told["old"]["run"] == urls[0]
+    found = json.loads(there.stdout)
+    assert found["changes"] == json.loads(here.stdout)["changes"]
+    assert found["old"]["run"] == urls[0]
     names = sorted(path.name for path in (tmp_path / "here").iterdir())
-    assert told["written"] == [f"{bucket}/told/{Path(place).name}" for place in json.loads(here.stdout)["written"]]
-    assert sorted(storage_at(f"{bucket}/told").keys()) == names
-    got = pq.read_table(pa.BufferReader(storage_at(f"{bucket}/told").get("changes.parquet")))
+    assert found["written"] == [f"{bucket}/found/{Path(place).name}" for place in json.loads(here.stdout)["written"]]
+    assert sorted(storage_at(f"{bucket}/found").keys()) == names
+    got = pq.read_table(pa.BufferReader(storage_at(f"{bucket}/found").get("changes.parquet")))
     assert got.equals(pq.read_table(tmp_path / "here" / "changes.parquet"))
 
 
 def test_what_fails_puts_nothing_into_a_store(pair: tuple[str, str], bucket: str) -> None:
-    words = ["batch", "diff", pair[0], f"{bucket}/nowhere", "--out", f"{bucket}/told"]
+    words = ["batch", "diff", pair[0], f"{bucket}/nowhere", "--out", f"{bucket}/found"]
     assert CliRunner().invoke(app, words).exit_code == 4
     for path in Path(pair[0]).rglob("*.*"):
         storage_at(f"{bucket}/run").put(path.relative_to(pair[0]).as_posix(), path.read_bytes())
@@ -253,4 +253,4 @@ def test_what_fails_puts_nothing_into_a_store(pair: tuple[str, str], bucket: str
     refused = CliRunner().invoke(app, words)
     assert refused.exit_code == 4
     assert "is one of the runs that are compared" in refused.stderr
-    assert storage_at(f"{bucket}/told").keys() == []
+    assert storage_at(f"{bucket}/found").keys() == []

@@ -74,23 +74,23 @@ def test_options_stand_above_the_file(pair: tuple[Path, Path], tmp_path: Path) -
     words = (*pair, "--out", tmp_path / "out", "--settings", settings, "--json", "--no-page")
     changes = json.loads(invoke(*words).stdout)["changes"]
     assert (changes["raised"]["rows"], changes["reshaped"]["rows"], changes["unchanged"]["rows"]) == (0, 0, 4)
-    told = json.loads(invoke(*words, "--min-height-change", "2.5").stdout)
-    assert told["changes"]["raised"]["rows"] == 1
-    assert told["settings"]["min_height_change_m"] == 2.5
+    found = json.loads(invoke(*words, "--min-height-change", "2.5").stdout)
+    assert found["changes"]["raised"]["rows"] == 1
+    assert found["settings"]["min_height_change_m"] == 2.5
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "told"),
+    ("words", "code", "found"),
     [
         (["--min-width", "-3"], ExitCode.USAGE, "min_width_m is -3: use 0.2 to 50 m"),
         (["--settings", "nowhere.toml"], ExitCode.USAGE, "nowhere.toml cannot be read"),
     ],
 )
 def test_wrong_settings_end_with_their_code(
-    pair: tuple[Path, Path], tmp_path: Path, words: list[str], code: ExitCode, told: str
+    pair: tuple[Path, Path], tmp_path: Path, words: list[str], code: ExitCode, found: str
 ) -> None:
     result = invoke(*pair, "--out", tmp_path / "out", *words)
-    assert (result.exit_code, told in result.stderr) == (code, True), result.stderr
+    assert (result.exit_code, found in result.stderr) == (code, True), result.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -120,11 +120,11 @@ def test_the_table_has_a_row_a_building_and_run_with_what_the_records_say(
     ]
     by_key = {(row["building_id"], row["label"]): row for row in rows}
     blocked = by_key["blocked", "broken"]
-    told = {"status": "fallback", "reason": "no_plane", "lod": "1.2", "rmse_m": 0.7}
-    assert {name: blocked[name] for name in told} == told
+    facts = {"status": "fallback", "reason": "no_plane", "lod": "1.2", "rmse_m": 0.7}
+    assert {name: blocked[name] for name in facts} == facts
     gone = by_key["gone", "broken"]
-    told = {"status": "failed", "reason": "too_few_points", "lod": None, "rmse_m": None, "seconds": None}
-    assert {name: gone[name] for name in told} == told
+    facts = {"status": "failed", "reason": "too_few_points", "lod": None, "rmse_m": None, "seconds": None}
+    assert {name: gone[name] for name in facts} == facts
     assert by_key["agreed", "broken"]["seconds"] == 1.5
     assert {row["difference"] for row in rows if row["building_id"] == "agreed"} == {0.0}
     assert all(row["difference"] > 0.0 for row in rows if row["building_id"] != "agreed")
@@ -147,8 +147,8 @@ def test_with_a_truth_every_building_has_its_outcome_and_one_true_building_whate
     assert all(outcomes[key] == "false" for key in wrong)
     assert rows["gone", "broken"]["faces_found"] == 0
     assert rows["gone", "sound"]["faces_found"] == rows["gone", "sound"]["faces_to_find"] == 2
-    told = report.read_text()
-    assert "| gable | 4 / 0 / 0 (100.0 % correct of 4) | 3 / 0 / 1 (75.0 % correct of 4) | 2 / 0 / 2" in told
+    facts = report.read_text()
+    assert "| gable | 4 / 0 / 0 (100.0 % correct of 4) | 3 / 0 / 1 (75.0 % correct of 4) | 2 / 0 / 2" in facts
     assert "Against the first run" in page.read_text()
     assert sum((image["alt"] or "").startswith("The true model") for image in Reader(page.read_text()).all("img")) == 4
 
@@ -183,7 +183,7 @@ def test_runs_of_different_candidates_are_refused_unless_tiles_of_one_failed(
     assert "other: 1 tile failed" in report.read_text()
     _, report, _ = write_comparison(tmp_path / "judged", evaluated([*runs, other]))
     assert (
-        "left out of all that follows, but for the figures of the evaluation, which are of each run"
+        "left out below, except from the evaluations of the runs"
         in report.read_text()
     )
 
@@ -257,16 +257,16 @@ def test_buildings_are_chosen_for_each_kind_of_difference_and_typical_ones_besid
     edge = compared("edge", record(), record(status=Status.FAILED, touches_data_edge=True))
     buildings = [*agreeing, *others, edge]
     chosen = chosen_buildings(buildings)
-    told = names(chosen)
-    assert len(set(told)) == CASES
-    assert "edge" not in told
+    facts = names(chosen)
+    assert len(set(facts)) == CASES
+    assert "edge" not in facts
     # The largest of each kind first: the most planes, the largest RMSE; of equal ones the first name.
-    assert told[:4] == ["status0", "type0", "planes19", "rmse19"]
-    assert told[DIFFERENT:] == ["flat4", "hip2", "flat3"]
+    assert facts[:4] == ["status0", "type0", "planes19", "rmse19"]
+    assert facts[DIFFERENT:] == ["flat4", "hip2", "flat3"]
     assert [choice.why for choice in chosen[:2]] == ["differs in status", "differs in roof type"]
     for seed in range(3):
         random.Random(seed).shuffle(buildings)
-        assert names(chosen_buildings(buildings)) == told
+        assert names(chosen_buildings(buildings)) == facts
     assert names(chosen_buildings([edge])) == ["edge"]
     assert len(chosen_buildings(agreeing)) == CASES
     assert len(set(names(chosen_buildings([*others[:40], agreeing[0]])))) == CASES
@@ -531,7 +531,7 @@ def test_what_is_written_does_not_depend_on_when_and_where(
 
 
 def test_seconds_grow_with_three_digits() -> None:
-    told = [seconds_text(10.0**power) for power in range(-3, 5)]
-    assert told == ["0.001 s", "0.010 s", "0.100 s", "1.00 s", "10.0 s", "100 s", "1,000 s", "10,000 s"]
+    facts = [seconds_text(10.0**power) for power in range(-3, 5)]
+    assert facts == ["0.001 s", "0.010 s", "0.100 s", "1.00 s", "10.0 s", "100 s", "1,000 s", "10,000 s"]
     assert seconds_text(math.nan) == "-"
-    assert all(a != b for a, b in itertools.pairwise(told))
+    assert all(a != b for a, b in itertools.pairwise(facts))

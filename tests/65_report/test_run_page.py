@@ -1,4 +1,4 @@
-"""The page about a run: what is told is what the run holds, whatever its size, and text is never markup."""
+"""The page of a run: it shows the content of the run, at any size, and text is never markup."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ def test_the_page_tells_what_the_run_holds(street_run: Path) -> None:
         street_run, timings_s={"split": 3.0, "reconstruct": 6.0, "total": 9.5}, peak_memory_bytes={"driver": 5 * 10**8}
     )
     _, read = page_of(street_run)
-    told = words(read)
+    found = words(read)
     for text in ("too few points", "invalid solid", "500 MB", "Failures by reason"):
-        assert text in told
-    assert "25.00%" in told
+        assert text in found
+    assert "25.00%" in found
     assert sum("bar-of" in (one.get("class") or "") for one in read.all("i")) == 2
     pictures = [one for one in read.all("img") if (one["alt"] or "").startswith("Map:")]
     assert len(pictures) == 1
@@ -84,13 +84,13 @@ def test_the_slowest_are_told_with_what_they_are_and_lost_ones_without(street_ru
     )
     assert read_manifest(street_run) == manifest
     text, read = page_of(street_run)
-    told = words(read)
+    found = words(read)
     for table in text.split('<table class="sortable">')[1:]:
         rows = table.split("</table>")[0].split("<tr>")[1:]
         assert len({row.count("<td") + row.count("<th ") for row in rows}) == 1  # a script sorts by any column
-    assert "gone 9.00 in a tile that could not be published" in told
-    assert f"{name} 1.50" in told
-    assert "1 of 1 tiles could not be published" in told
+    assert "gone 9.00 in a tile that could not be published" in found
+    assert f"{name} 1.50" in found
+    assert "1 of 1 tiles could not be published" in found
 
 
 def test_a_failed_tile_is_on_the_map(street_run: Path) -> None:
@@ -153,7 +153,7 @@ def test_what_is_listed_is_bounded_those_without_a_model_first(
 @pytest.mark.parametrize("status", [RunStatus.RUNNING, RunStatus.FAILED])
 def test_a_run_that_is_not_over_has_no_page(street_run: Path, status: RunStatus) -> None:
     change(street_run, status=status)
-    with pytest.raises(RunError, match=f"is {status.value}: a report tells of a run that is over"):
+    with pytest.raises(RunError, match=f"is {status.value}: a report needs a run that ended"):
         write_run_page(str(street_run))
     assert not (street_run / PAGE).exists()
 

@@ -17,38 +17,38 @@ from pipeline.report.table import statistics_tables
 
 
 def test_statuses_reasons_and_types_are_counted(street_run: Path) -> None:
-    told = run_statistics(str(street_run))
-    assert (told["candidates"], told["rejected"]) == (4, 1)
-    assert told["statuses"] == {"ok": 2, "fallback": 1, "failed": 1}
-    assert told["shares"] == {"ok": 0.5, "fallback": 0.25, "failed": 0.25}
-    assert told["reasons"] == {"failed": {"too_few_points": 1}, "fallback": {"invalid_solid": 1}}
-    assert told["rejected_reasons"] == {"vegetation": 1}
-    assert told["roof_types"] == {"flat": 1, "gable": 2, "none": 1}
-    assert told["lods"] == {"2.2": 2, "1.2": 1}
-    assert told["validity_codes"] == {"104": 1, "203": 1}
+    found = run_statistics(str(street_run))
+    assert (found["candidates"], found["rejected"]) == (4, 1)
+    assert found["statuses"] == {"ok": 2, "fallback": 1, "failed": 1}
+    assert found["shares"] == {"ok": 0.5, "fallback": 0.25, "failed": 0.25}
+    assert found["reasons"] == {"failed": {"too_few_points": 1}, "fallback": {"invalid_solid": 1}}
+    assert found["rejected_reasons"] == {"vegetation": 1}
+    assert found["roof_types"] == {"flat": 1, "gable": 2, "none": 1}
+    assert found["lods"] == {"2.2": 2, "1.2": 1}
+    assert found["validity_codes"] == {"104": 1, "203": 1}
 
 
 def test_sums_and_quantiles_are_of_what_is_known(street_run: Path) -> None:
-    told = run_statistics(str(street_run))
-    assert told["sums"]["volume_m3"] == 360.0 + 2700.0 + 720.0
-    assert told["sums"]["n_planes"] == 7
-    assert told["quantiles"]["rmse_m"] == {"n": 3, "p10": 0.031, "p50": 0.031, "p90": 0.031, "max": 0.031}
-    assert told["quantiles"]["coverage"]["n"] == 4
-    assert told["quantiles"]["coverage"]["p10"] < 0.5
+    found = run_statistics(str(street_run))
+    assert found["sums"]["volume_m3"] == 360.0 + 2700.0 + 720.0
+    assert found["sums"]["n_planes"] == 7
+    assert found["quantiles"]["rmse_m"] == {"n": 3, "p10": 0.031, "p50": 0.031, "p90": 0.031, "max": 0.031}
+    assert found["quantiles"]["coverage"]["n"] == 4
+    assert found["quantiles"]["coverage"]["p10"] < 0.5
 
 
 def test_the_figures_are_plain_json(street_run: Path) -> None:
-    told = run_statistics(str(street_run))
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
+    found = run_statistics(str(street_run))
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
 def test_a_run_that_found_nothing_is_told_as_such(make_run: Callable[..., Path]) -> None:
-    told = run_statistics(str(make_run([])))
-    assert told["candidates"] == 0
-    assert set(told["shares"].values()) == {None}
-    assert told["quantiles"]["rmse_m"] == {"n": 0, "p10": None, "p50": None, "p90": None, "max": None}
-    assert told["sums"]["volume_m3"] == 0.0
-    assert statistics_tables(told)
+    found = run_statistics(str(make_run([])))
+    assert found["candidates"] == 0
+    assert set(found["shares"].values()) == {None}
+    assert found["quantiles"]["rmse_m"] == {"n": 0, "p10": None, "p50": None, "p90": None, "max": None}
+    assert found["sums"]["volume_m3"] == 0.0
+    assert statistics_tables(found)
 
 
 def test_the_tables_show_the_counts(street_run: Path) -> None:
