@@ -182,10 +182,7 @@ def test_runs_of_different_candidates_are_refused_unless_tiles_of_one_failed(
     assert "4 buildings that not all runs have are left out" in report.read_text()
     assert "other: 1 tile failed" in report.read_text()
     _, report, _ = write_comparison(tmp_path / "judged", evaluated([*runs, other]))
-    assert (
-        "left out below, except from the evaluations of the runs"
-        in report.read_text()
-    )
+    assert "left out below, except from the evaluations of the runs" in report.read_text()
 
 
 def test_no_run_and_two_of_one_label_are_refused(runs: list[ComparedRun], tmp_path: Path) -> None:
