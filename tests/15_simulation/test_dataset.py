@@ -206,7 +206,7 @@ def test_a_call_that_was_interrupted_can_be_made_again(tmp_path: Path) -> None:
     assert not (tmp_path / "truth" / ".scene.json").exists()
 
 
-def test_a_folder_that_cannot_be_one_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_one_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"file: cannot be written \(Not a directory\)"):
         simulate("cube", tmp_path / "file")

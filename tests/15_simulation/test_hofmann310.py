@@ -1,4 +1,4 @@
-"""The 310 buildings hold what the paper tells of them, whatever the seed: the slow tests draw two more."""
+"""The 310 buildings have the figures of the paper for every seed: the slow tests draw two more."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_points_are_1_2_m_apart_and_single_returns(made: ScenePaths) -> None:
     assert np.sqrt(area / made.points) == pytest.approx(1.2, abs=0.03)
 
 
-def test_the_data_set_tells_which_are_good(made: ScenePaths) -> None:
+def test_the_data_set_marks_the_good_ones(made: ScenePaths) -> None:
     good = pq.read_table(made.truth / "conditions.parquet", columns=["good"])["good"].to_pylist()
     assert (sum(good), len(good)) == (197, 310)
 

@@ -43,7 +43,7 @@ def test_the_suites_own_seeds_belong_to_no_split() -> None:
     assert {split_of(suite.seed) for suite in SUITES.values()} == {None}
 
 
-def test_an_unknown_split_and_an_impossible_draw_are_both_told() -> None:
+def test_an_unknown_split_and_an_impossible_draw_are_both_reported() -> None:
     with pytest.raises(SettingsError, match=r"split is 'tets': use one of dev, test; draw is -1: use 0 to 88999"):
         seed_of("tets", -1)
 

@@ -81,7 +81,7 @@ def lifted(model: RoofModel, up_m: float) -> RoofModel:
 
 @pytest.mark.parametrize(("up_m", "groups"), [(0.0, [0, 0, 0, 0]), (0.5, [0, 0, 2, 2])])
 def test_faces_of_one_plane_that_touch_are_one_face_of_the_block(up_m: float, groups: list[int]) -> None:
-    """Nothing in the points tells where the one roof ends and the next begins, unless there is a step."""
+    """The points do not show where one roof ends and the next begins, unless there is a step."""
     parts = (house("a", 0, "row"), lifted(house("b", 8, "row"), up_m))
     joined = joined_reference(
         Reference(name="r", kind="truth", buildings=parts, has_faces=True, outlines="truth", tiles=())

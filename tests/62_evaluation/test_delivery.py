@@ -36,7 +36,7 @@ def test_the_truth_scored_against_itself_is_perfect() -> None:
     assert {f"delivery.{name}" for name in figures} | records == {one.name for one in DEFINITIONS}
 
 
-def test_blocks_and_gaps_are_told_apart() -> None:
+def test_blocks_and_gaps_are_distinguished() -> None:
     models = [
         TRUTH[0],
         dataclasses.replace(TRUTH[1], status=Status.FALLBACK, lod="1.2"),
@@ -117,7 +117,7 @@ def test_a_model_over_several_buildings_joins_them() -> None:
     assert (figures["joined"], figures["lod2"], figures["joining_models"]) == (0.5, 0.25, 1)
 
 
-def test_a_row_of_parts_and_a_joining_model_in_random_order_is_told_the_same() -> None:
+def test_a_row_of_parts_and_a_joining_model_in_random_order_count_the_same() -> None:
     truth = reference(TRUTH)
     models = [flat("x", 200.0), *TRUTH[1:], gable("y", 3.0)]
     assert figures_of(models, truth) == figures_of(models[::-1], truth)

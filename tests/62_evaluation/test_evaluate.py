@@ -27,7 +27,7 @@ def test_blocks_do_not_depend_on_the_format() -> None:
     assert not needs_blocks(models(TRUTH), dataclasses.replace(truth, kind="points"))
 
 
-def test_roof_types_that_no_model_tells_are_not_judged() -> None:
+def test_roof_types_that_no_model_has_are_not_judged() -> None:
     truth = reference(TRUTH)
     untyped = models([dataclasses.replace(one, roof_type=RoofType.UNKNOWN) for one in TRUTH])
     assert has_roof_types(models(TRUTH))
@@ -42,7 +42,7 @@ def test_roof_types_that_no_model_tells_are_not_judged() -> None:
     assert evaluate(one, truth).measure("roof_types.accuracy").value == 1 / 3
 
 
-def test_models_that_are_nowhere_near_are_told() -> None:
+def test_models_that_are_nowhere_near_give_a_note() -> None:
     truth = reference(TRUTH)
     assert evaluate(models(TRUTH), truth).notes == ()
     beyond = flat("far", 1e6)
@@ -62,7 +62,7 @@ def test_what_the_models_say_of_the_edge_changes_no_figure() -> None:
     assert by_hand.EXTENT.covers(damaged[2].footprint)
 
 
-def test_footprints_on_both_sides_are_told_to_say_nothing() -> None:
+def test_footprints_on_both_sides_give_a_note() -> None:
     outlines = [dataclasses.replace(one, surfaces=()) for one in TRUTH]
     given = dataclasses.replace(reference(outlines, extent=None), outlines="given", has_faces=False)
     facts = [evaluate(models(TRUTH, has_footprints=follow), given).notes for follow in (True, False)]

@@ -332,7 +332,7 @@ def test_a_face_elsewhere_is_wrong_only_where_the_reference_is_complete() -> Non
     assert score_faces([high], reference(TRUTH, extent=None)).models[0].verdict is FaceVerdict.WRONG
 
 
-def test_good_and_hard_buildings_are_told_apart() -> None:
+def test_good_and_hard_buildings_are_separate() -> None:
     known = {
         "a": by_hand.conditions(good=True),
         "b": by_hand.conditions(good=False),

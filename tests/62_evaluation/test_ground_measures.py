@@ -158,7 +158,7 @@ def test_what_a_file_leaves_unclassified_is_object_only_where_it_names_no_object
     assert (facts.ground, facts.object) == (25, 25)
 
 
-def test_tiles_are_told_apart_and_add_up() -> None:
+def test_tiles_are_separate_and_add_up() -> None:
     rows = [block(10, 0, 0, 10, "a"), block(0, 10, 10, 0, "b"), block(10, 0, 0, 10, "a", 3)]
     assert [(f.tile, f.total) for f in tile_figures(rows)] == [("a", 0.0), ("b", 1.0)]
     measured = {m.name: m.value for m in ground_measures(rows, subsets(reference_of([]))[0])}

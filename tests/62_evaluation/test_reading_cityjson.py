@@ -337,7 +337,7 @@ def test_a_sequence_is_read_feature_by_feature(tmp_path: Path) -> None:
         next(lines)
 
 
-def test_one_id_twice_is_two_models_and_told(tmp_path: Path) -> None:
+def test_one_id_twice_is_two_models_and_a_note(tmp_path: Path) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         read(tmp_path / folder, document({"house": building([solid()])}, box(0, 3)))

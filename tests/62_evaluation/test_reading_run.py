@@ -37,7 +37,7 @@ def manifest(status: RunStatus = RunStatus.FINISHED, **crs: object) -> RunManife
     )
 
 
-def test_the_manifest_tells_the_units(tmp_path: Path) -> None:
+def test_the_manifest_has_the_units(tmp_path: Path) -> None:
     metres = read_models(files.write_run(tmp_path / "metres", files.village()))
     feet = files.write_run(tmp_path / "feet", files.village(), files.reference(None, FOOT_M, 1.0))
     write_manifest(feet, manifest(horizontal_unit_m=FOOT_M))
@@ -84,7 +84,7 @@ def test_given_footprints_are_known_by_their_ids(tmp_path: Path) -> None:
         assert [model.source_id for model in models.models] == [source_id, None]
 
 
-def test_the_truth_tells_which_faces_count_as_one(tmp_path: Path) -> None:
+def test_the_truth_knows_which_faces_count_as_one(tmp_path: Path) -> None:
     truth = files.write_run(tmp_path / "truth", [small.two_parts(), small.gable()])
     assert {surface.group for model in read_models(truth).models for surface in model.surfaces} == {-1}
     groups = {"building_id": ["gable", "two_parts"], "groups": [[0, 1], [0, 1, 0, 2]]}
@@ -128,7 +128,7 @@ def test_damaged_runs_are_refused(tmp_path: Path) -> None:
         read_models(run)
 
 
-def test_what_cannot_be_read_is_told_with_what_can(tmp_path: Path) -> None:
+def test_an_unreadable_path_is_an_error_that_lists_readable_ones(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("nothing")
     mixed = tmp_path / "mixed"
     mixed.mkdir()

@@ -42,7 +42,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_run_tells_what_its_records_tell(run: Path) -> None:
+def test_a_run_says_what_its_records_say(run: Path) -> None:
     models = read_models(run)
     assert (models.kind, models.name, models.crs) == ("run", "fuzzy-sart", "EPSG:7415")
     assert [model.building_id for model in models.models] == ["courtyard", "gable", "pent", "two_parts"]
@@ -120,9 +120,7 @@ def test_a_triangulated_file_is_worth_the_same_as_its_polygons(
 
 
 @pytest.mark.parametrize("name", ["run", "town"])
-def test_faces_without_semantics_are_told_by_their_normals(
-    name: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
+def test_normals_classify_faces_without_semantics(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     lines = files.without_planes(files.sequence_of(request.getfixturevalue(name)))
     found = read_models(files.write_sequence(tmp_path / "found.city.jsonl", lines))
     bare = read_models(files.write_sequence(tmp_path / "bare.city.jsonl", files.without_semantics(lines)))

@@ -93,7 +93,7 @@ def test_outlines_of_the_raster_are_the_buildings_where_no_footprints_are_given(
     assert not points.is_roof[points.building < 0].any()
 
 
-def test_given_footprints_with_points_are_the_buildings_and_the_rest_is_told(tile: Path, tmp_path: Path) -> None:
+def test_given_footprints_with_points_are_the_buildings_and_the_rest_is_noted(tile: Path, tmp_path: Path) -> None:
     xyz, classes = street()
     # of the shed's points only ten are left
     shed = np.flatnonzero(shapely.contains_xy(HOUSES["shed"], xyz[:, 0], xyz[:, 1]))

@@ -76,7 +76,7 @@ def test_a_wrong_face_more_makes_a_building_passable_but_a_small_one_does_not() 
         assert [row.wrong_faces for row in rows] == [int(size == 5.0), 0, 0, 0]
 
 
-def test_a_wrong_type_is_passable_and_told_in_the_confusion() -> None:
+def test_a_wrong_type_is_passable_and_in_the_confusion() -> None:
     models = replaced(0, dataclasses.replace(TRUTH[0], roof_type=RoofType.HIP))
     truth = reference(TRUTH)
     rows = scored(models, truth)

@@ -140,7 +140,7 @@ def test_the_lattice_does_not_depend_on_the_buildings() -> None:
     assert (one.n_places, one.sum_m) == (other.n_places, pytest.approx(other.sum_m))
 
 
-def test_a_building_is_told_by_its_own_roof_though_others_stand_within_its_bounds() -> None:
+def test_a_building_is_measured_by_its_own_roof_though_others_stand_within_its_bounds() -> None:
     row = [moved(gable(str(x), x), 0.0, 0.0, 0.0, 45.0) for x in (0.0, 12.0, 24.0)]
     rows = score_surface([row[0], moved(row[1], 0.0, 0.0, 1.0)], reference(row))
     assert [one.n_places * 0.0625 for one in rows] == pytest.approx([96.0] * 3, rel=0.01)

@@ -47,7 +47,7 @@ def test_every_building_of_one_strip_moves_by_its_shift(shifted: Path) -> None:
     east, north, up = shift_of(shifted)
     assert math.hypot(east, north, up) > 0.1
     for before, after in zip(there.buildings, seen.buildings, strict=True):
-        # a building at the end of the data may have no point on its roof: then nothing tells where it was seen
+        # a building at the end of the data may have no point on its roof: then its shift is unknown
         if not before.touches_data_edge:
             moved = shapely.affinity.translate(before.footprint, east, north)
             assert shapely.symmetric_difference(moved, after.footprint).area < 1e-6
@@ -79,7 +79,7 @@ def test_a_building_that_two_strips_saw_moves_by_the_mean_of_its_points() -> Non
     assert moved[2].tolist() == [0.0, 0.0, 0.0]
 
 
-def test_a_scene_that_tells_no_shifts_is_refused(shifted: Path, tmp_path: Path) -> None:
+def test_a_scene_without_shifts_is_refused(shifted: Path, tmp_path: Path) -> None:
     scene = json.loads((shifted / "scene.json").read_text())
     del scene["strip_shifts_m"]
     for path in shifted.iterdir():
@@ -93,7 +93,7 @@ def test_a_scene_that_tells_no_shifts_is_refused(shifted: Path, tmp_path: Path) 
         read_truth_reference(tmp_path, as_surveyed=True)
 
 
-def test_options_that_do_not_go_together_are_told_at_once() -> None:
+def test_options_that_do_not_go_together_are_reported_at_once() -> None:
     with pytest.raises(SettingsError) as caught:
         EvaluationRequest(models="run", footprints="f.gpkg", ground=("g.laz",), as_surveyed=True)
     text = str(caught.value)

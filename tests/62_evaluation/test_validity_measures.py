@@ -58,7 +58,7 @@ def test_every_measure_is_defined_in_its_chapter(village: ModelSet) -> None:
     assert {entry.group for entry in DEFINITIONS} == {Group.VALIDITY}
 
 
-def test_a_missing_face_a_moved_vertex_and_surfaces_alone_are_told_apart(village: ModelSet) -> None:
+def test_a_missing_face_a_moved_vertex_and_surfaces_alone_are_distinguished(village: ModelSet) -> None:
     gable, pent = small.gable_solid(), small.pent().solids[0]
     open_shell = dataclasses.replace(gable, faces=gable.faces[:-1])
     damaged = with_solids(village, "gable", open_shell)

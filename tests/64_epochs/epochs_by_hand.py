@@ -48,7 +48,7 @@ def house(
     at_edge: bool = False,
     origin: tuple[float, float, float] = ORIGIN,
 ) -> BuildingResult:
-    """A house with its middle at a place; `sigma` is what its record tells of its roof's uncertainty."""
+    """A house with its middle at a place; `sigma` is the uncertainty of its roof in the record."""
     built = place_building(
         name,
         shape,

@@ -32,7 +32,7 @@ def test_a_house_that_is_as_it_was_is_unchanged_though_its_outline_jitters(compa
     assert row["iou"] > 0.9
 
 
-def test_new_and_gone_houses_are_told_with_their_size(compare: Compare) -> None:
+def test_new_and_gone_houses_have_their_size(compare: Compare) -> None:
     rows = compare([house("a1"), house("b1", 50.0)], [house("a2"), house("c2", 0.0, 50.0)])
     assert {name: row["change"] for name, row in rows.items()} == {"a": "unchanged", "b": "gone", "c": "new"}
     assert rows["c"]["added_m2"] == rows["c"]["area_change_m2"] == pytest.approx(108.0, abs=0.1)
@@ -67,7 +67,7 @@ def test_a_house_with_another_roof_is_reshaped_and_not_raised(compare: Compare, 
     assert row["volume_change_m3"] == pytest.approx(row["gained_m3"] - row["lost_m3"], rel=0.08)
 
 
-def test_an_extension_is_told_with_its_area_and_volume(compare: Compare) -> None:
+def test_an_extension_has_its_area_and_volume(compare: Compare) -> None:
     flat = {"shape": RoofShape.FLAT, "azimuth": 90.0}
     row = one(compare([house("a1", 0.0, length=12.0, **flat)], [house("a2", 2.0, length=16.0, **flat)]))
     assert row["change"] == "reshaped"
@@ -112,7 +112,7 @@ def test_a_known_shift_of_the_surveys_is_no_change(compare: Compare) -> None:
     assert one(found)["height_change_m"] == pytest.approx(0.0, abs=2e-3)
 
 
-def test_a_part_that_may_be_a_tree_and_a_roof_without_points_are_told_as_doubts(compare: Compare) -> None:
+def test_a_part_that_may_be_a_tree_and_a_roof_without_points_are_doubts(compare: Compare) -> None:
     flat: dict[str, Any] = {"shape": RoofShape.FLAT, "azimuth": 90.0, "sigma": 0.03}
     grown = house("a2", 2.0, length=16.0, **flat)
     rough = dataclasses.replace(grown, planes=(dataclasses.replace(grown.planes[0], rmse_m=0.2),))

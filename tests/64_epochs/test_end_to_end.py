@@ -51,9 +51,7 @@ def runs(epochs: TwoEpochs, tmp_path_factory: pytest.TempPathFactory) -> tuple[s
     return made[0], made[1]
 
 
-def test_every_change_is_found_and_nothing_else_is_told(
-    epochs: TwoEpochs, runs: tuple[str, str], tmp_path: Path
-) -> None:
+def test_every_change_is_found_and_nothing_else(epochs: TwoEpochs, runs: tuple[str, str], tmp_path: Path) -> None:
     assert sorted(epochs.works.values()) == sorted(Work)
     made = diff(DiffRequest(old=runs[0], new=runs[1], out=str(tmp_path)))
     rows = pq.read_table(tmp_path / "changes.parquet").to_pylist()
@@ -75,7 +73,7 @@ def test_every_change_is_found_and_nothing_else_is_told(
     assert abs(made.summary.level.median_m or 0.0) < 0.01
 
 
-def test_a_run_tells_where_its_data_lie(runs: tuple[str, str], epochs: TwoEpochs) -> None:
+def test_a_run_records_where_its_data_lie(runs: tuple[str, str], epochs: TwoEpochs) -> None:
     manifest = read_manifest(runs[0])
     (points,) = manifest.inputs
     assert points.bounds_m is not None

@@ -82,7 +82,7 @@ def test_geojson_is_in_degrees_and_holds_what_was_asked_for(pair: tuple[str, str
     assert not (tmp_path / "all" / "changes.geojson").exists()
 
 
-def test_without_a_crs_there_is_no_geojson_and_it_is_told(tmp_path: Path) -> None:
+def test_without_a_crs_there_is_a_warning_and_no_geojson(tmp_path: Path) -> None:
     runs = [write_epoch(tmp_path / name, [house("a1")], crs=None) for name in ("old", "new")]
     out = tmp_path / "out"
     out.mkdir()
@@ -129,7 +129,7 @@ def test_runs_without_buildings_give_an_empty_table(tmp_path: Path) -> None:
     )
 
 
-def test_surveys_that_do_not_agree_in_height_are_told_with_the_shift(tmp_path: Path) -> None:
+def test_surveys_that_do_not_agree_in_height_give_a_warning_with_the_shift(tmp_path: Path) -> None:
     runs = [
         write_epoch(tmp_path / name, [house(f"h{k}", 40.0 * k, eave=eave) for k in range(5)])
         for name, eave in (("old", 5.0), ("new", 5.4))
@@ -139,7 +139,7 @@ def test_surveys_that_do_not_agree_in_height_are_told_with_the_shift(tmp_path: P
     assert any("vertical_shift_m to 0.400" in warning for warning in found["warnings"])
 
 
-def test_other_settings_methods_and_versions_are_told(tmp_path: Path) -> None:
+def test_other_settings_methods_and_versions_give_warnings(tmp_path: Path) -> None:
     old = write_epoch(tmp_path / "old", [house("a1")], settings={"roof": {"x": 1.0}}, settings_hash="cd")
     new = write_epoch(tmp_path / "new", [house("a2")], settings={"roof": {"x": 2.0}}, engine_version="9")
     found = run((str(old), str(new)), tmp_path / "out")
@@ -151,7 +151,7 @@ def test_other_settings_methods_and_versions_are_told(tmp_path: Path) -> None:
     assert any("NEW was modelled in given footprints" in warning for warning in found["warnings"])
 
 
-def test_runs_that_do_not_tell_where_their_data_lie_are_compared_with_a_warning(tmp_path: Path) -> None:
+def test_runs_that_do_not_record_where_their_data_lie_are_compared_with_a_warning(tmp_path: Path) -> None:
     old = write_epoch(tmp_path / "old", [house("a1")], extent=None)
     new = write_epoch(tmp_path / "new", [house("a2"), house("b2", 3000.0)])
     found = run((str(old), str(new)), tmp_path / "out")
@@ -197,7 +197,7 @@ def test_a_damaged_table_is_named_and_nothing_half_is_left(pair: tuple[str, str]
     assert [path.name for path in (tmp_path / "out").iterdir()] == []
 
 
-def test_settings_come_from_a_file_and_from_options_and_all_faults_are_told(tmp_path: Path) -> None:
+def test_settings_come_from_a_file_and_from_options_and_all_faults_are_reported(tmp_path: Path) -> None:
     path = tmp_path / "diff.toml"
     path.write_text("[diff]\nmin_height_change_m = 1\nedge_m = 5.0\n")
     assert read_settings(str(path), {"edge_m": 7.0, "min_width_m": None}) == DiffSettings(

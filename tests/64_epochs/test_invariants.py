@@ -67,7 +67,7 @@ def figures(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def mirrored(row: dict[str, Any]) -> dict[str, Any]:
-    """What a row tells with the epochs exchanged."""
+    """A row with the epochs exchanged."""
     found = {}
     for name, value in figures(row).items():
         other = name
@@ -112,8 +112,8 @@ def test_neither_order_nor_tiles_nor_the_size_of_parts_matter(tmp_path: Path, mo
     runs = [write_epoch(tmp_path / f"s{k}", one) for k, one in enumerate(scattered)]
     second = compared(runs[0], runs[1], tmp_path / "b")
     assert (tmp_path / "a" / "changes.parquet").read_bytes() == (tmp_path / "b" / "changes.parquet").read_bytes()
-    monkeypatch.setattr(matching, "ROWS_A_PART", 2)
-    monkeypatch.setattr(comparing, "GROUPS_A_PART", 2)
+    monkeypatch.setattr(matching, "ROWS_PER_PART", 2)
+    monkeypatch.setattr(comparing, "GROUPS_PER_PART", 2)
     monkeypatch.setattr(matching.parts_of, "__defaults__", (2,))
     in_parts = compared(runs[0], runs[1], tmp_path / "c")
     assert in_parts.sort_by("change_id").equals(second.sort_by("change_id"))

@@ -44,7 +44,7 @@ def invoke(*words: str | Path) -> Any:
     return CliRunner().invoke(app, ["batch", "diff", *(str(word) for word in words)])
 
 
-def test_the_command_writes_four_files_and_tells_the_sums(pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_the_command_writes_four_files_and_prints_the_sums(pair: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = invoke(*pair, "--out", out)
     assert result.exit_code == ExitCode.DONE, result.stderr

@@ -173,7 +173,7 @@ def test_what_a_neighbour_covers_is_neither_added_nor_removed() -> None:
     assert beside[COMMON_M2] == pytest.approx(130.0, rel=0.02)
 
 
-def test_parts_on_rough_faces_are_told() -> None:
+def test_parts_on_rough_faces_are_counted() -> None:
     old = [(shapely.box(0, 0, 10, 10), (0.0, 0.0, 5.0))]
     new = [(shapely.box(0, 0, 14, 10), (0.0, 0.0, 5.0))]
     found = figures(old, new, rough_new=True)

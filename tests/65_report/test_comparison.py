@@ -215,7 +215,7 @@ def record(**changes: object) -> Record:
     return Record(**{**fields, **changes})  # type: ignore[arg-type]
 
 
-def test_differences_are_the_shares_and_ranges_that_the_page_tells() -> None:
+def test_differences_are_the_shares_and_ranges_of_the_page() -> None:
     apart = difference_of(
         [
             record(),
@@ -383,7 +383,7 @@ def test_points_in_a_view_have_the_colours_of_their_distances_to_that_model(runs
     for found, wanted in zip(counts[1:], (1, 4), strict=True):
         assert found[wanted] > 500
         assert max(found[kind] for kind in bad if kind != wanted) < 50
-    # The scale bar tells metres of the plan: the roof is 10 m wide.
+    # The scale bar is in metres of the plan: the roof is 10 m wide.
     assert drawn.plan is not None
     shown = np.flatnonzero((pixels(drawn.plan)[:, :, 3] > 0.5).any(axis=0))
     assert np.ptp(shown) / (drawn.width_px * drawn.scale_share / drawn.scale_m) == pytest.approx(10.0, abs=0.7)

@@ -54,7 +54,7 @@ def words(read: Reader) -> str:
     return " ".join(" ".join(read.texts).split())
 
 
-def test_the_page_tells_what_the_run_holds(street_run: Path) -> None:
+def test_the_page_shows_the_content_of_the_run(street_run: Path) -> None:
     change(
         street_run, timings_s={"split": 3.0, "reconstruct": 6.0, "total": 9.5}, peak_memory_bytes={"driver": 5 * 10**8}
     )
@@ -76,7 +76,7 @@ def test_the_page_tells_what_the_run_holds(street_run: Path) -> None:
     assert all(link is None or link.startswith(("data:image/png;base64,", "#")) for link in links)
 
 
-def test_the_slowest_are_told_with_what_they_are_and_lost_ones_without(street_run: Path) -> None:
+def test_the_slowest_are_listed_with_their_facts_and_lost_ones_without(street_run: Path) -> None:
     name = small.gable().building_id
     slowest = (SlowBuilding(building_id="gone", seconds=9.0), SlowBuilding(building_id=name, seconds=1.5))
     manifest = change(
@@ -172,7 +172,7 @@ def test_a_manifest_without_the_slowest_is_read(street_run: Path) -> None:
     assert read_manifest(street_run).slowest == ()
 
 
-def test_a_reason_of_a_later_version_is_told_by_its_name(street_run: Path) -> None:
+def test_a_reason_of_a_later_version_is_shown_by_its_name(street_run: Path) -> None:
     part = street_run / "buildings" / "tile=t2" / "part-0.parquet"
     table = pq.read_table(part, partitioning=None)
     place = table.schema.get_field_index("reason")

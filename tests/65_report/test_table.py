@@ -42,7 +42,7 @@ def test_the_figures_are_plain_json(street_run: Path) -> None:
     assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
-def test_a_run_that_found_nothing_is_told_as_such(make_run: Callable[..., Path]) -> None:
+def test_a_run_that_found_nothing_has_empty_figures(make_run: Callable[..., Path]) -> None:
     found = run_statistics(str(make_run([])))
     assert found["candidates"] == 0
     assert set(found["shares"].values()) == {None}

@@ -31,7 +31,7 @@ def strip_shifts(scene: Mapping[str, Any], path: str) -> FloatArray:
     """
     shifts = np.array(scene.get("strip_shifts_m") or np.zeros((0, 3)), np.float64)
     if shifts.ndim != 2 or shifts.shape[1:] != (3,) or len(shifts) == 0:
-        raise InputError(path, "strip_shifts_m is missing: nothing tells by how much each strip is off", _FIX)
+        raise InputError(path, "strip_shifts_m is missing: the shift of each strip is unknown", _FIX)
     return shifts
 
 

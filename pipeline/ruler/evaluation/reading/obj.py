@@ -83,7 +83,7 @@ def read_obj_files(paths: Sequence[Path], into: Collected) -> None:
             continue
         mesh = _read(path)
         if not mesh.is_own:
-            into.note("an OBJ tells no units and no reference system: coordinates are taken as metres")
+            into.note("an OBJ has no units and no reference system: coordinates are taken as metres")
         try:
             named = _buildings(mesh, path, into, alone=len(paths) == 1)
         except ValueError as fault:
