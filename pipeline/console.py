@@ -1,12 +1,12 @@
-"""How a command speaks: progress, tables, errors and exit codes, for people on a terminal, for logs and for machines.
+"""The output of a command: progress, tables, errors and exit codes, for people, logs and programs.
 
 | mode | standard output | standard error |
 | --- | --- | --- |
 | terminal | tables | progress bars, warnings, errors |
-| elsewhere (a file, a pipe, CI) | tables | one log line an event, throttled |
-| `--json` | one JSON document | one JSON object an event, a line each |
+| elsewhere (a file, a pipe, CI) | tables | one log line per event, throttled |
+| `--json` | one JSON document | one JSON object per event, one per line |
 | `--quiet` | as above | warnings and errors only |
-| `GABLEWORK_LOG_JSON=1` | as above | one JSON object a line: events, errors, what libraries say |
+| `GABLEWORK_LOG_JSON=1` | as above | one JSON object per line: events, errors, lines of libraries |
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pipeline.runtime.monitoring.events import Event
 
 LOG_INTERVAL_S = 2.0
-"""A log line of progress follows the last one of its stage after this time at the earliest."""
+"""Shortest time between two log lines of progress of one stage."""
 
 
 LOG_WIDTH = 120
@@ -63,12 +63,12 @@ EXIT_CODES: Mapping[ExitCode, str] = {
     ExitCode.USAGE: "The command line or a setting is wrong; nothing was done.",
     ExitCode.INPUT: "An input cannot be used; the message names the file, the value and the fix.",
     ExitCode.RUN_DIRECTORY: (
-        "A run directory or work folder cannot be written, read or resumed; or what a batch plans cannot work."
+        "A run directory or work folder cannot be written, read or resumed; or a batch's plan cannot work."
     ),
     ExitCode.INTERNAL: "A fault of gablework itself; the traceback is printed.",
     ExitCode.INTERRUPTED: "Interrupted from the keyboard.",
 }
-"""The table of the reference docs."""
+"""The meaning of each code, for the reference docs."""
 
 
 def exit_code_of(error: BaseException) -> ExitCode:
@@ -89,7 +89,7 @@ def exit_code_of(error: BaseException) -> ExitCode:
 
 
 class Console:
-    """What a command prints with; as a context manager it turns exceptions into messages and exit codes.
+    """The output of a command; as a context manager it turns exceptions into messages and exit codes.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Console:
     quiet : bool
         No progress.
     log_json : bool
-        Whatever goes to standard error is one JSON object a line, as `GABLEWORK_LOG_JSON=1` asks for.
+        Everything on standard error is one JSON object per line, like with `GABLEWORK_LOG_JSON=1`.
     clock : callable
         Seconds, monotonic; replaced in tests.
     """
@@ -121,7 +121,7 @@ class Console:
         self._logs = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
-        """Start to speak.
+        """Start logging.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class Console:
             try:
                 self._log_json = logs.wants_json() or self._log_json
             except SettingsError as error:
-                self._tell_error(error, ExitCode.USAGE)
+                self._show_error(error, ExitCode.USAGE)
                 raise typer.Exit(ExitCode.USAGE) from error
             if self._log_json:
                 self._logs.callback(logs.log_everything_as_json())
@@ -148,14 +148,14 @@ class Console:
         Raises
         ------
         typer.Exit
-            With the code of `EXIT_CODES`, in place of any error but those that typer itself handles.
+            With the code of `EXIT_CODES`, in place of any error except those that typer itself handles.
         """
         self._close_bars()
         with self._logs:
             if error is None or isinstance(error, SystemExit | typer.Exit | typer.Abort | typer.BadParameter):
                 return
             code = exit_code_of(error)
-            self._tell_error(error, code)
+            self._show_error(error, code)
             raise typer.Exit(code) from error
 
     # --- progress ----------------------------------------------------------------------------------------------------
@@ -222,10 +222,10 @@ class Console:
             self._bars = None
             self._tasks = {}
 
-    # --- what is said once -------------------------------------------------------------------------------------------
+    # --- single messages -------------------------------------------------------------------------------------------
 
     def warn(self, message: str, stage: str = "") -> None:
-        """Say on standard error what is usable but not as it should be."""
+        """Print a warning on standard error."""
         if self._log_json:
             from pipeline.runtime.monitoring.logs import LOG
 
@@ -243,8 +243,8 @@ class Console:
             self._close_bars()
             print(message, flush=True)
 
-    def tell(self, message: str) -> None:
-        """Say how a command fares that runs until it is told to end: a line for people, or one of its log."""
+    def status(self, message: str) -> None:
+        """Report the state of a command that runs until it is ended: a line for people, or a line of its log."""
         if self._log_json:
             from pipeline.runtime.monitoring.logs import LOG
 
@@ -253,7 +253,7 @@ class Console:
             self.say(message)
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-        """Show a table for people; nothing without rows. Columns of figures only are set to the right."""
+        """Show a table for people; nothing without rows. Columns of numbers are aligned right."""
         if not rows or self.as_json:
             return
         from rich.table import Table
@@ -280,7 +280,7 @@ class Console:
         if self.as_json:
             print(json.dumps(_json_value(content), indent=2, allow_nan=False), flush=True)
 
-    def _tell_error(self, error: BaseException, code: ExitCode) -> None:
+    def _show_error(self, error: BaseException, code: ExitCode) -> None:
         message = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
         if self._log_json:
             from pipeline.runtime.monitoring.logs import LOG
@@ -305,7 +305,7 @@ class Console:
 
 
 def _json_value(value: Any) -> Any:
-    """A value as JSON knows it: what is not finite becomes null, what is unknown its text.
+    """A value as JSON: numbers that are not finite become null, unknown types their text.
 
     >>> _json_value({"rmse_m": float("nan"), 3: (1, Ellipsis)})
     {'rmse_m': None, '3': [1, 'Ellipsis']}
@@ -320,7 +320,7 @@ def _json_value(value: Any) -> Any:
 
 
 def is_figure(text: str) -> bool:
-    """Whether a cell reads as a figure, a unit allowed behind it.
+    """Whether a cell is a number, with or without a unit.
 
     >>> [is_figure(text) for text in ("12", "98.5 %", "0.3 m", "gable", "")]
     [True, True, True, False, True]

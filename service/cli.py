@@ -157,7 +157,7 @@ def serve(
             _ = settings.resources
 
         def on_ready(url: str) -> None:
-            console.tell(f"gablework listens on {url}")
+            console.status(f"gablework listens on {url}")
             console.document({"url": url, "state": str(settings.state)})
 
         serve_until_told(settings, on_ready, with_driver=driver)

@@ -1,4 +1,4 @@
-"""The science commands. Each composes what stands below and imports it only when it runs: start-up counts."""
+"""The science commands. Each imports what it composes only when it runs, since start-up time counts."""
 
 from pipeline.cli.app import app
 from pipeline.cli.batch import batch
@@ -11,7 +11,7 @@ from pipeline.cli.simulating import demo, simulate, warm_up
 
 __all__ = ["AsJson", "app"]
 
-# as `gablework --help` lists them
+# in the order of `gablework --help`
 _COMMANDS = (
     *(reconstruct, rerun, compare, classify, inspect, evaluate, report, digest, replay),
     *(simulate, demo, warm_up, worker),

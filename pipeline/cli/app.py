@@ -1,4 +1,4 @@
-"""The command line's application and what stands before every command."""
+"""The application of the command line, and the options before every command."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import typer
 
 app = typer.Typer(
     name="gablework",
-    help="Building models from raw airborne LiDAR: no classes and no footprints needed, both used when given.",
+    help="Building models from raw airborne LiDAR: it needs neither classes nor footprints, and uses both when given.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

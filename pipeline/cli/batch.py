@@ -1,4 +1,4 @@
-"""The group `gablework batch`: runs over whole surveys, and what changed between two of them."""
+"""The group `gablework batch`: runs over whole surveys, and changes between two of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pipeline.cli.batching import plan, run, schedule, status
 from pipeline.cli.differing import diff
 
 batch = typer.Typer(
-    help="City-scale runs from one file: planned, watched, resumed, repeated for what changed; and what changed.",
+    help="City-scale runs from one file: plan, run, resume, repeat for what changed; list changes between two runs.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )

@@ -28,10 +28,10 @@ _NEXT = 3
 
 def plan(
     file: BatchFile,
-    read: Annotated[int, typer.Option(min=1, help="Inputs that are read in whole, to tell how many buildings.")] = 3,
+    read: Annotated[int, typer.Option(min=1, help="Inputs to read whole, to estimate the number of buildings.")] = 3,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what a batch run will take, and refuse what cannot work, before anything runs."""
+    """Estimate what a batch run takes, and refuse what cannot work, before anything runs."""
     with Console(as_json=as_json) as console:
         from pipeline.batch.batch_file import read_batch
         from pipeline.batch.estimates import estimate, refuse
@@ -46,12 +46,12 @@ def plan(
 
 
 def run(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """Run a batch; one that was cut off goes on where it stopped, and what did not change is not done again."""
+    """Run a batch; an interrupted one continues where it stopped, and unchanged parts are not computed again."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.batch.batch_file import read_batch
         from pipeline.batch.run import run_batch
 
-        # whoever ends services by SIGTERM, as systemd and Kubernetes do, finds a run that can go on
+        # SIGTERM, as systemd and Kubernetes send it, leaves a run that can continue
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         summary = run_batch(read_batch(file), console.on_event)
         show_summary(console, summary)
@@ -61,7 +61,7 @@ def run(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
 
 
 def status(file: BatchFile, as_json: AsJson = False) -> None:
-    """Tell how far a batch run is, also from another terminal, and after it died."""
+    """Show the progress of a batch run, from any terminal, even after it died."""
     with Console(as_json=as_json) as console:
         from pipeline.batch.batch_file import read_batch
         from pipeline.batch.status import NAME, read_status
@@ -72,14 +72,14 @@ def status(file: BatchFile, as_json: AsJson = False) -> None:
             console.document({"state": "never run", "schedule": _scheduled(batch)})
             return
         found = read_status(batch.work_folder)
-        console.table(f"The run of {file}", ("figure", "value"), [*_told(found), *_times(batch)])
+        console.table(f"The run of {file}", ("figure", "value"), [*_status_rows(found), *_times(batch)])
         for warning in found.warnings:
             console.warn(warning)
         console.document(dataclasses.asdict(found) | {"schedule": _scheduled(batch)})
 
 
 def schedule(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """Run a batch at the times of its table [schedule], until this command is ended; a missed time is told."""
+    """Run a batch at the times of its table [schedule] until this command ends; report missed times."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.batch.batch_file import read_batch
         from pipeline.batch.schedule_process import Ending, keep_schedule, start_run
@@ -93,7 +93,7 @@ def schedule(file: BatchFile, as_json: AsJson = False, quiet: Quiet = False) -> 
 
 
 def _end_by_signals(end: Callable[[], None]) -> None:
-    """Have signals call a function; a terminal that is closed ends nothing under nohup."""
+    """Have signals call a function; under nohup, closing the terminal ends nothing."""
     numbers = [signal.SIGTERM, signal.SIGINT]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
@@ -102,7 +102,7 @@ def _end_by_signals(end: Callable[[], None]) -> None:
 
 
 def _scheduled(batch: Batch) -> dict[str, Any] | None:
-    """What is remembered of a batch's times, as plain JSON values."""
+    """The history of a batch's schedule, as plain JSON values."""
     from pipeline.batch.schedule_file import read_schedule
 
     state = read_schedule(batch.work_folder)
@@ -110,16 +110,16 @@ def _scheduled(batch: Batch) -> dict[str, Any] | None:
 
 
 def _times(batch: Batch) -> list[tuple[str, str]]:
-    """The next times, and what became of the last one."""
+    """The next times, and the outcome of the last one."""
     from pipeline.batch.schedule_file import iso, read_schedule
 
     if not batch.schedule.cron:
         return []
-    told = "paused"
+    next_times = "paused"
     if not batch.schedule.paused:
         times = batch.schedule.rules.cron.next_times(dt.datetime.now(tz=dt.UTC), _NEXT)
-        told = ", ".join(f"{at:%Y-%m-%d %H:%M %Z}" for at in times)
-    rows = [("next times", told)]
+        next_times = ", ".join(f"{at:%Y-%m-%d %H:%M %Z}" for at in times)
+    rows = [("next times", next_times)]
     state = read_schedule(batch.work_folder)
     if state is not None and state.entries:
         last = state.entries[-1]
@@ -134,7 +134,7 @@ def _rows(found: Estimate) -> list[tuple[str, str]]:
         ("inputs", f"files: {found.files}, {found.points / 1e6:,.1f} million points"),
         ("tiles", f"{found.tiles} of {found.tile_size_m:g} m"),
         ("buildings", f"about {found.buildings:,} ({found.buildings_from})"),
-        ("memory of a worker", f"at most {found.worker_bytes / 2**30:.1f}{limit} GiB"),
+        ("memory per worker", f"at most {found.worker_bytes / 2**30:.1f}{limit} GiB"),
         ("time", f"{duration(found.seconds[0])} to {duration(found.seconds[1])} with {_hands(found.workers)}"),
         ("work folder", f"{found.work_bytes / 1e9:.2f} GB{_of(found.work_free_bytes)}"),
         ("results", f"{found.out_bytes / 1e9:.2f} GB{_of(found.out_free_bytes)}"),
@@ -142,17 +142,17 @@ def _rows(found: Estimate) -> list[tuple[str, str]]:
 
 
 def _hands(workers: int) -> str:
-    """Who does it; where no worker is there the time is that of one."""
-    return f"{workers} workers" if workers > 1 else "1 worker" if workers else "1 worker, of which none is there now"
+    """The number of workers; without any, the time is that of one."""
+    return f"{workers} workers" if workers > 1 else "1 worker" if workers else "1 worker (none is there now)"
 
 
 def _of(free: int | None) -> str:
-    return "" if free is None else f" of {free / 1e9:.1f} GB that are free"
+    return "" if free is None else f" of {free / 1e9:.1f} GB free"
 
 
-def _told(found: Status) -> list[tuple[str, str]]:
+def _status_rows(found: Status) -> list[tuple[str, str]]:
     rows = [("state", found.state), ("process", found.process), ("started", found.started_at)]
-    rows.append(("told", found.updated_at))
+    rows.append(("updated", found.updated_at))
     if found.stage and not found.stages:
         rows.append((found.stage, "under way" if found.state == "running" else "was under way"))
     for name, stage in found.stages.items():
@@ -162,8 +162,8 @@ def _told(found: Status) -> list[tuple[str, str]]:
         failed = f", {found.buildings['failed']} failed"
         rows.append(("buildings", f"{found.buildings['done']} done{failed}, {found.buildings['queued']} queued"))
     if found.rate_per_s is not None and found.state == "running":
-        rows.append(("rate", f"{found.rate_per_s:g} a second in {found.stage}"))
+        rows.append(("rate", f"{found.rate_per_s:g} per second in {found.stage}"))
     if found.remaining_s is not None:
-        rows.append(("still", f"{duration(found.remaining_s[0])} to {duration(found.remaining_s[1])}"))
+        rows.append(("remaining", f"{duration(found.remaining_s[0])} to {duration(found.remaining_s[1])}"))
     rows.extend((name, text) for name, text in (("waiting", found.waiting), ("message", found.message)) if text)
     return rows

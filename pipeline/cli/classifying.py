@@ -32,7 +32,7 @@ def classify(
     tiles: Annotated[
         list[str], typer.Argument(metavar="TILES", help="LAS, LAZ, COPC, PLY or ASCII files, or folders of them.")
     ],
-    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: a LAZ file an input.")],
+    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: one LAZ file per input.")],
     rasters: Annotated[
         bool, typer.Option("--rasters", help="Write terrain.tif, surface.tif and height.tif, too.")
     ] = False,
@@ -50,7 +50,7 @@ def classify(
     tls_ca: TlsCa = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are already there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -85,7 +85,7 @@ def classify(
 
 
 def show_classes(console: Console, summary: ClassifySummary) -> None:
-    """What was written, as tables."""
+    """The outputs, as tables."""
     names = {1: "other", 2: "ground", 5: "vegetation", 6: "building", 7: "noise"}
     total = max(1, sum(summary.classes.values()))
     rows = [

@@ -58,4 +58,4 @@ def worker(
             metrics_port=metrics_port,
             metrics_host=metrics_host,
         )
-        serve_worker(options, console.tell)
+        serve_worker(options, console.status)

@@ -84,12 +84,12 @@ def diff(
 
 
 def _show(console: Console, found: Diff) -> None:
-    """The sums as tables, and what is to be known of them."""
+    """The sums as tables, and the warnings."""
     from pipeline.ruler.epochs.records import INCOMPARABLE
 
     for warning in found.warnings:
         console.warn(warning)
-    told = found.summary.as_dict()
+    sums = found.summary.as_dict()
     rows = [
         (
             name.replace("_", " "),
@@ -99,10 +99,10 @@ def _show(console: Console, found: Diff) -> None:
             f"{one['gained_m3']:,.0f} m3",
             f"{one['lost_m3']:,.0f} m3",
         )
-        for name, one in told["changes"].items()
+        for name, one in sums["changes"].items()
     ]
     console.table("Changes", ["what", "rows", "without doubt", "plan area", "gained", "lost"], rows)
     reasons = {one.value: text for one, text in INCOMPARABLE.items()}
     console.table(
-        "Not comparable", ["rows", "why"], [(count, reasons[name]) for name, count in told["reasons"].items()]
+        "Not comparable", ["rows", "why"], [(count, reasons[name]) for name, count in sums["reasons"].items()]
     )

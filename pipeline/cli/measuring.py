@@ -29,7 +29,7 @@ def inspect(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Tell what a tile holds and roughly what it takes; reads it once, streamed."""
+    """Show the facts of a tile and an estimate of time and memory; reads it once, streamed."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.inspection import inspect as inspect_tile
         from pipeline.io.source import ReadOptions
@@ -79,12 +79,10 @@ def evaluate(
     ],
     truth: Truth = None,
     points: Points = None,
-    footprints: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Building outlines that go with the points.")
-    ] = None,
+    footprints: Annotated[str | None, typer.Option(metavar="FILE", help="Building outlines for the points.")] = None,
     ground: Annotated[
         list[str] | None,
-        typer.Option(metavar="FILE", help="The same points as some program classified them: judge its ground."),
+        typer.Option(metavar="FILE", help="The same points, classified by another program: judge its ground."),
     ] = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
@@ -102,7 +100,7 @@ def evaluate(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure models: against simulated truth, against classified points, or by themselves."""
+    """Measure models: against simulated truth, against classified points, or alone."""
     with Console(as_json=as_json, quiet=quiet) as console:
         from pipeline.ruler.evaluation.files import EvaluationRequest, evaluate_files
         from pipeline.runtime.monitoring.events import Event

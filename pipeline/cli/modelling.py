@@ -63,7 +63,7 @@ def reconstruct(
     footprints: Footprints = None,
     overrides: Annotated[
         str | None,
-        typer.Option(metavar="FILE", help="What to do with single buildings, as TOML; docs/how_to/overrides.md."),
+        typer.Option(metavar="FILE", help="Corrections of single buildings, as TOML; docs/how_to/overrides.md."),
     ] = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
@@ -133,11 +133,11 @@ def rerun(
     run_dir: Annotated[str, typer.Argument(metavar="RUN", help="The directory of a finished run.")],
     overrides: Annotated[
         str | None,
-        typer.Option(metavar="FILE", help="The overrides that take the place of the run's; default its own file."),
+        typer.Option(metavar="FILE", help="The overrides that replace the run's; default its own file."),
     ] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="ID", help="A building to model again in any case; several by several --only."),
+        typer.Option(metavar="ID", help="A building to model again in any case; repeat --only for several."),
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -188,7 +188,7 @@ def compare(
         list[str],
         typer.Option(metavar="M1,M2,…", help="METHOD or METHOD:PRESET, two or more; preset robust or faithful."),
     ],
-    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: a run a method, and the page.")],
+    out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: one run per method, and the page.")],
     footprints: Footprints = None,
     crs: Crs = None,
     vertical_unit: VerticalUnit = None,
@@ -272,14 +272,14 @@ def compare(
         names = ("ok", "fallback", "failed")
         rows = [
             (
-                told["label"],
-                *(told["statuses"].get(name, 0) for name in names),
-                told["counts"]["roof_faces"],
-                f"{1e3 * told['seconds_a_building'].get('median', 0.0):.1f} ms",
+                variant["label"],
+                *(variant["statuses"].get(name, 0) for name in names),
+                variant["counts"]["roof_faces"],
+                f"{1e3 * variant['seconds_a_building'].get('median', 0.0):.1f} ms",
             )
-            for told in facts["variants"]
+            for variant in facts["variants"]
         ]
-        console.table("Methods", ["method", *names, "roof faces", "a building (median)"], rows)
+        console.table("Methods", ["method", *names, "roof faces", "per building (median)"], rows)
         found = {label: headline(chapters(evaluation)) for label, evaluation in made.evaluations.items()}
         if found:
             values = {label: {line.label: line.value for _, line in lines} for label, lines in found.items()}
@@ -322,7 +322,7 @@ def replay(
         row = replay_row(found, replayed)
         console.table("This time", ["column", "value"], [(name, value) for name, value in row.items() if value != []])
         if replayed.loss is not None and replayed.loss.stderr:
-            console.say(f"its process said last:\n{replayed.loss.stderr}")
+            console.say(f"the last lines of its process:\n{replayed.loss.stderr}")
         written = [str(path) for path in write_replay(out, found, replayed)] if out is not None else []
         for path in written:
             console.say(f"wrote {path}")
@@ -334,12 +334,12 @@ def replay(
 
 
 def _in_order(words: str | None) -> str | None:
-    """Levels of detail as the settings write them: each once, the coarsest first."""
+    """Levels of detail in the settings' form: each once, the coarsest first."""
     return None if words is None else ",".join(sorted({word.strip() for word in words.split(",")}))
 
 
 def _run_settings(path: str | None, **overrides: str | None) -> RunSettings:
-    """The settings of a file, or the defaults, under the options of the command line."""
+    """The settings of a file, or the defaults, overridden by options of the command line."""
     from pipeline.settings import RunSettings
 
     given = {name: value for name, value in overrides.items() if value is not None}
@@ -365,7 +365,7 @@ def _read_statistics(run_dir: str) -> dict[str, Any]:
 
 
 def show_summary(console: Console, summary: RunSummary) -> None:
-    """What a run found, as tables or as the JSON document."""
+    """The results of a run, as tables."""
     from pipeline.report.table import statistics_tables
 
     for table in statistics_tables(_statistics_of(summary.run_dir)):

@@ -9,13 +9,13 @@ import typer
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document; events as JSON lines on stderr.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress; warnings and errors only.")]
 Crs = Annotated[
-    str | None, typer.Option(metavar="EPSG:n", help="The inputs' CRS, where their header has none or a wrong one.")
+    str | None, typer.Option(metavar="EPSG:n", help="The inputs' CRS, if their header has none or a wrong one.")
 ]
 VerticalUnit = Annotated[
-    str | None, typer.Option(metavar="UNIT", help="Unit of elevations: m, ft or us-ft; default as the header says.")
+    str | None, typer.Option(metavar="UNIT", help="Unit of elevations: m, ft or us-ft; default from the header.")
 ]
 AUTO = "auto"
-"""The word for as many workers as the machine or the job wants."""
+"""The word for as many workers as the job needs and the machine has."""
 _MAX_WORKERS = 1024
 
 
@@ -47,7 +47,7 @@ def count_or_auto(text: str, *, least: int) -> str:
 
 
 def worker_count(text: str) -> int | None:
-    """How many workers an option asks for; 0 for none, None for `auto`.
+    """The number of workers in an option; 0 for none, None for `auto`.
 
     Raises
     ------
@@ -72,13 +72,13 @@ Method = Annotated[
     str | None,
     typer.Option(
         metavar="METHOD",
-        help="fuzzy-sart, parameter-space-2d, parameter-space-3d or kmeans; default as the settings say.",
+        help="arrangement, fuzzy-sart, parameter-space-2d, parameter-space-3d or kmeans; default from the settings.",
     ),
 ]
 Lods = Annotated[
     str | None,
     typer.Option(
-        metavar="L1,L2,…", help="Levels of detail to write: 1.2, 1.3, 2.2, or several; default as the settings say."
+        metavar="L1,L2,…", help="Levels of detail to write: 1.2, 1.3, 2.2, or several; default from the settings."
     ),
 ]
 Footprints = Annotated[
@@ -89,12 +89,10 @@ Bbox = Annotated[
     tuple[float, float, float, float] | None,
     typer.Option(metavar="XMIN YMIN XMAX YMAX", help="Only this rectangle, in the CRS's units."),
 ]
-Aoi = Annotated[
-    str | None, typer.Option(metavar="FILE", help="Only what lies inside the polygons of this vector file.")
-]
+Aoi = Annotated[str | None, typer.Option(metavar="FILE", help="Only the area inside the polygons of this vector file.")]
 Classes = Annotated[
     Literal["trust", "audit", "ignore"] | None,
-    typer.Option(help="What the file's own classes are worth; default as the settings say."),
+    typer.Option(help="How to use the file's own classes; default from the settings."),
 ]
 SettingsFile = Annotated[str | None, typer.Option(metavar="FILE", help="Settings as TOML; docs/reference/settings.md.")]
 Scheduler = Annotated[
@@ -117,22 +115,22 @@ PerformanceReport = Annotated[
 ]
 MetricsPort = Annotated[
     int | None,
-    typer.Option(metavar="N", min=1, max=65535, help="Show figures to Prometheus on this port, at /metrics."),
+    typer.Option(metavar="N", min=1, max=65535, help="Show metrics for Prometheus on this port, at /metrics."),
 ]
 MetricsHost = Annotated[
-    str, typer.Option(metavar="ADDRESS", help="Address of these figures: whoever reaches it reads them.")
+    str, typer.Option(metavar="ADDRESS", help="Address of these metrics: anyone who reaches it can read them.")
 ]
-LogJson = Annotated[bool, typer.Option("--log-json", help="Log one JSON object a line; as GABLEWORK_LOG_JSON=1 does.")]
+LogJson = Annotated[bool, typer.Option("--log-json", help="Log one JSON object per line, like GABLEWORK_LOG_JSON=1.")]
 Scratch = Annotated[
     str | None,
     typer.Option(
         metavar="DIR",
-        help="Folder for what is neither input nor result, the same for all workers; default beside the results.",
+        help="Folder for intermediate results, the same for all workers; default beside the results.",
     ),
 ]
 Meshes = Annotated[
     Literal["building", "tile", "glb", "none"],
-    typer.Option(help="One OBJ a building, one OBJ a tile, one GLB a tile, or none."),
+    typer.Option(help="One OBJ per building, one OBJ per tile, one GLB per tile, or none."),
 ]
 Licence = Annotated[
     str | None, typer.Option(metavar="TEXT", help="Licence of the source data, written into the results.")
@@ -142,14 +140,14 @@ Truth = Annotated[
 ]
 Points = Annotated[
     list[str] | None,
-    typer.Option(metavar="TILE", help="A classified tile to measure against; several by several --points."),
+    typer.Option(metavar="TILE", help="A classified tile to measure against; repeat --points for several."),
 ]
 AsSurveyed = Annotated[
     bool, typer.Option("--as-surveyed", help="Move each true building by the shift of the strips that saw it.")
 ]
 Isolate = typer.Option(
     "--isolate/--no-isolate",
-    help="Model buildings in a supervised child process, so that a bad one costs only itself.",
+    help="Model buildings in a supervised child process, so a bad one harms no other.",
 )
 BuildingTimeout = Annotated[
     float, typer.Option(metavar="S", help="Seconds that a building may take in its child process.")
@@ -160,4 +158,4 @@ BuildingMemory = Annotated[
 BUILDING_TIMEOUT_S, BUILDING_MEMORY_GIB = 600.0, 4.0
 """Defaults of `pipeline.runtime.isolation.isolated_items.IsolationLimits`, which is too slow to import for `--help`."""
 
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already there.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")]

@@ -25,7 +25,7 @@ def simulate(
     ],
     out: Annotated[str, typer.Option(metavar="DIR", help="The folder to write: LAZ tiles and the truth beside them.")],
     seed: Annotated[
-        int | None, typer.Option(metavar="N", help="Of layout and scanner; default the suite's own.")
+        int | None, typer.Option(metavar="N", help="Seed of layout and scanner; default the suite's own.")
     ] = None,
     split: Annotated[
         str | None,
@@ -37,10 +37,10 @@ def simulate(
         typer.Option(metavar="EAST NORTH", help="Extent in metres; default the suite's own."),
     ] = None,
     density: Annotated[
-        float | None, typer.Option(metavar="D", help="Pulses a square metre; of sweep, which cells.")
+        float | None, typer.Option(metavar="D", help="Pulses per square metre; for sweep, which cells.")
     ] = None,
     noise: Annotated[
-        float | None, typer.Option(metavar="M", help="Range noise in metres; of sweep, which cells.")
+        float | None, typer.Option(metavar="M", help="Range noise in metres; for sweep, which cells.")
     ] = None,
     with_classes: Annotated[bool, typer.Option("--with-classes", help="Write the true classes into the tile.")] = False,
     as_json: AsJson = False,
@@ -79,7 +79,7 @@ def demo(
     size: Annotated[
         tuple[float, float] | None, typer.Option(metavar="EAST NORTH", help="Extent of the suburb in metres.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Of the suburb; default its own.")] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of the suburb; default its own.")] = None,
     workers: Workers = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -110,8 +110,8 @@ def demo(
             ("the truth", made.scene.truth),
         ]
         console.table("", ["what", "where"], places)
-        told = {"measures": measures_table(made.evaluation).to_pylist(), "picture": str(made.picture)}
-        console.document(dataclasses.asdict(made.summary) | told)
+        document = {"measures": measures_table(made.evaluation).to_pylist(), "picture": str(made.picture)}
+        console.document(dataclasses.asdict(made.summary) | document)
 
 
 def warm_up(
