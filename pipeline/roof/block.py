@@ -25,21 +25,9 @@ _SHARES_OF_TOLERANCE = (0.0, 0.5, 1.0)
 
 
 def block_plane(points: FloatArray, ground_z_m: float, percentile: float) -> Plane:
-    """The horizontal plane at a percentile of the points' elevations.
+    """The horizontal plane at a percentile (0 to 100) of the elevations of points, (n, 3) with n >= 1.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Roof points, at least one.
-    ground_z_m : float
-        The floor; the plane lies at least 0.1 m above it.
-    percentile : float
-        0 to 100.
-
-    Returns
-    -------
-    Plane
-        Rounded to 1 mm.
+    It is rounded to 1 mm and lies at least 0.1 m above the floor.
     """
     z = np.sort(points[:, 2])
     height = float(z[min(len(z) - 1, math.floor(percentile / 100.0 * len(z)))])

@@ -113,18 +113,9 @@ def _straight_rings(
 def dominant_directions(runs: Sequence[Run], within: float) -> list[float]:
     """The directions, modulo a right angle, that the walls of a building follow, the one with most walls first.
 
-    Parameters
-    ----------
-    runs : sequence of Run
-        Of all rings.
-    within : float
-        Radians; lines closer than this to a direction, or to the one square to it, follow it.
-
-    Returns
-    -------
-    list of float
-        Radians. A direction counts with the squared lengths of the lines that follow it: the first holds at least
-        40 % of them all, more than a round outline gives any direction (2 / 7.5 at 12 degrees), each other one 20 %.
+    All in radians. Lines closer than `within` to a direction, or to the one square to it, follow it. A direction counts
+    with the squared lengths of its lines: the first holds at least 40 % of them all, more than a round outline gives
+    any direction (2 / 7.5 at 12 degrees), each other one 20 %.
     """
     left = list(runs)
     whole = math.fsum(run.length**2 for run in runs)

@@ -124,19 +124,9 @@ class EdgePoints:
 
 
 def mixed_pulse_reach_mm(outline_mm: shapely.Geometry, points: EdgePoints) -> float:
-    """How far beyond its edge a roof gives points, all around.
+    """How far beyond its edge a roof gives points, all around: millimetres, at most 500; 0 where no pulse is split.
 
-    Parameters
-    ----------
-    outline_mm : geometry
-        Around the roof points, near to their edge.
-    points : EdgePoints
-        The roof points.
-
-    Returns
-    -------
-    float
-        Millimetres, at most 500; 0 where no pulse is split.
+    The outline runs around the roof points, near their edge.
     """
     if not points.split.any():
         return 0.0

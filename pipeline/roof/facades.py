@@ -91,7 +91,7 @@ class FacadePoints:
     def of(
         cls, single: FloatArray, later: FloatArray, roof: FloatArray, ground: FloatArray, ground_z_m: float
     ) -> FacadePoints:
-        """Take heights above the terrain and make the points ready to be found.
+        """Take heights above the terrain and index the points.
 
         Parameters
         ----------

@@ -21,17 +21,7 @@ _ROUND_MM = (5.0, 20.0)
 
 
 def footprint_in_mm(footprint: Polygon | MultiPolygon) -> MultiPolygon:
-    """A given footprint on the millimetre grid: valid, without repeated vertices.
-
-    Parameters
-    ----------
-    footprint : Polygon or MultiPolygon
-        Local metres; a third dimension is ignored.
-
-    Returns
-    -------
-    MultiPolygon
-        Integer millimetres.
+    """A given footprint in integer millimetres, valid, without repeated vertices; it is in local metres, 2D or 3D.
 
     Raises
     ------
@@ -163,11 +153,6 @@ def clip_partition(partition: RoofPartition, footprint_mm: MultiPolygon, min_are
         Integer millimetres.
     min_area_m2 : float
         Smaller pieces join the neighbour with the longest border, or go where they have none.
-
-    Returns
-    -------
-    RoofPartition
-        Every polygon connected.
 
     Raises
     ------

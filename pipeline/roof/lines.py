@@ -183,18 +183,9 @@ def dominant_direction(runs: Sequence[Run]) -> float | None:
 
 
 def square(runs: Sequence[Run], dominant: float | None, within: float, tolerance: float) -> None:
-    """Give runs near the dominant direction, or square to it, that direction; exact ones stay.
+    """Give runs near the dominant direction (radians), or square to it, that direction, in place; exact ones stay.
 
-    Parameters
-    ----------
-    runs : sequence of Run
-        Changed in place.
-    dominant : float or None
-        Radians; None changes nothing.
-    within : float
-        Radians. A short run is less certain: it may be off by the tolerance over its length.
-    tolerance : float
-        In the unit of the coordinates.
+    "Near" is `within`, radians, or for short runs, which are less certain, the tolerance over their length.
     """
     if dominant is None:
         return

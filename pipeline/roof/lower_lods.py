@@ -122,17 +122,7 @@ def _numbered_through(lod: str, levels: Sequence[LevelPart]) -> LodParts:
 
 
 def block_forms(part: SolidPart, level: Plane, ground_z_m: float) -> Iterator[LevelPart]:
-    """Ways to draw one part of a building as a block (LoD1.2), the one with fewer vertices first.
-
-    Parameters
-    ----------
-    part : SolidPart
-        With roof faces, as for LoD2.2.
-    level : Plane
-        The horizontal roof.
-    ground_z_m : float
-        Elevation of the floor, local metres.
-    """
+    """Ways to draw one part of a building, with its roof faces of LoD2.2, as a block (LoD1.2); fewer vertices first."""
     polygons = [_polygon_mm(face) for face in part.faces]
     yield from _drawn([polygons], [level], ground_z_m)
 

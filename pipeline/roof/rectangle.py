@@ -147,19 +147,8 @@ def _hull(ordered: IntArray) -> IntArray:
 def rectangle_on_line(hull: FloatArray, line: PlanLine, side: int) -> Rectangle | None:
     """The minimal rectangle on a line that holds the part of a convex hull on one side of it.
 
-    Parameters
-    ----------
-    hull : (h, 2) float64
-        Counter-clockwise, metres.
-    line : PlanLine
-        Carries one side of the rectangle.
-    side : int
-        1 for the left of the line, -1 for the right.
-
-    Returns
-    -------
-    Rectangle or None
-        None where the hull has no area on that side.
+    The hull (h, 2) is counter-clockwise, in metres; `side` is 1 for the left of the line, -1 for the right. None where
+    the hull has no area there.
     """
     part = _beyond(np.ascontiguousarray(line.frame(hull)), float(side))
     if len(part) == 0:
@@ -207,8 +196,7 @@ def minimum_rectangle(hull: FloatArray) -> Rectangle | None:
     Returns
     -------
     Rectangle or None
-        Along the edge that gives it; of equal areas (to 1e-9 of them) the first one. None for fewer than three
-        vertices.
+        Along the edge that gives it, the first among equal areas (to 1e-9 of them). None for fewer than three vertices.
     """
     if len(hull) < 3:
         return None

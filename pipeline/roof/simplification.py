@@ -30,16 +30,11 @@ def simplify_partition(partition: RoofPartition, tolerance_m: float, *, outline_
     Parameters
     ----------
     partition : RoofPartition
-        A valid coverage.
+        A valid coverage; its polygons keep their order.
     tolerance_m : float
         Square root of the area that may be cut off or added, metres; 0 changes nothing.
     outline_too : bool
         Whether the outer border is simplified as well.
-
-    Returns
-    -------
-    RoofPartition
-        The same polygons in the same order.
 
     Raises
     ------
@@ -62,17 +57,8 @@ def unite_close_vertices(partition: RoofPartition, distance_mm: float) -> RoofPa
     Where a clipped border passes close by a corner of the footprint, two vertices can lie a millimetre apart: distinct
     here, the same for a reader with a tolerance.
 
-    Parameters
-    ----------
-    partition : RoofPartition
-        A coverage in integer millimetres.
-    distance_mm : float
-        Vertices at most this far apart become the leftmost of them.
-
-    Returns
-    -------
-    RoofPartition
-        Without polygons that vanished. The same object where no vertices are close.
+    Vertices of a coverage in integer millimetres that are at most this far apart become the leftmost of them; polygons
+    that vanish go. The same object comes back where no vertices are close.
 
     Raises
     ------

@@ -84,7 +84,7 @@ def test_only_allowed_nodes_take_a_label() -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_of_expansions_that_cost_the_same_the_one_that_changes_least_is_taken(seed: int) -> None:
+def test_the_expansion_that_changes_least_is_taken_of_those_that_cost_the_same(seed: int) -> None:
     rng = np.random.default_rng(seed)
     costs, pairs, weights = random_graph(seed, 9, 2)
     costs, weights = costs // 12, weights // 12 + 1  # many ties

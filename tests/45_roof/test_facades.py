@@ -1,4 +1,4 @@
-"""Outlines at the facades: where the walls stand, told by points beneath the eaves."""
+"""Outlines at the facades: where points beneath the eaves show the walls."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def drawn(points: FacadePoints, usual_m: float = 0.0) -> shapely.MultiPolygon:
     return shapely.transform(outline_mm, lambda xy: xy / 1e3)
 
 
-def test_every_line_stands_where_its_own_wall_was_hit() -> None:
+def test_every_line_lies_where_its_own_wall_was_hit() -> None:
     points = facades(street(), wall(0, 0.2), wall(1, 0.5), wall(2, 0.35), wall(3, 0.0))
     assert np.allclose(drawn(points).bounds, (0.0, 0.2, 11.5, 7.65), atol=0.03)
 
@@ -90,7 +90,7 @@ def test_a_line_along_a_neighbour_stays() -> None:
     assert np.allclose(bounds[1:], (0.4, 11.6, 7.6), atol=0.03)
 
 
-def test_plants_before_a_wall_are_no_wall() -> None:
+def test_plants_before_a_wall_are_not_a_wall() -> None:
     random = np.random.default_rng(4)
     bush = np.column_stack(
         (random.uniform(0.5, 11.5, 200), random.uniform(-1.5, 0.5, 200), random.uniform(0, 5.0, 200))
@@ -99,13 +99,13 @@ def test_plants_before_a_wall_are_no_wall() -> None:
     assert south(points) == Eave(length_m=12.0, is_open=True, overhang_m=None)
 
 
-def test_a_parked_row_of_cars_or_a_fence_is_no_wall() -> None:
+def test_a_parked_row_of_cars_or_a_fence_is_not_a_wall() -> None:
     low = wall(0, 0.3, 80)
     low[:, 2] *= 0.9 / 5.5
     assert south(facades(street(), low)).overhang_m is None
 
 
-def test_points_of_one_corner_alone_are_no_wall() -> None:
+def test_points_of_one_corner_alone_are_not_a_wall() -> None:
     corner = wall(0, 0.3, 200)
     corner = corner[corner[:, 0] < 2.0]
     assert len(corner) > 10
@@ -172,13 +172,13 @@ def test_the_mean_overhang_is_never_negative() -> None:
     assert mean_overhang_m([Eave(length_m=3.0, is_open=True, overhang_m=-0.05)], 0.3) == 0.0
 
 
-def test_a_usual_overhang_is_for_buildings_none_of_whose_walls_is_seen() -> None:
+def test_the_usual_overhang_is_for_buildings_without_visible_walls() -> None:
     assert np.allclose(drawn(facades(street()), usual_m=0.3).bounds, (0.3, 0.3, 11.7, 7.7))
     seen = facades(street(), wall(0, 0.2))
     assert drawn(seen, usual_m=0.3).equals(drawn(seen))
 
 
-def test_last_of_several_returns_are_told_too_far_inside_by_the_reach() -> None:
+def test_the_last_of_several_returns_lies_too_far_inside_by_the_reach() -> None:
     hit = wall(0, 0.4)
     later = FacadePoints.of(street(), hit, facades(NONE).roof, NONE, 0.0)
     deep, right = south(later).overhang_m, south(later, reach_m=0.12).overhang_m

@@ -55,6 +55,13 @@ class Hall:
         cells = cells_of_points(self.plan, self.points)
         return cut_off_far_corners(self.plan, self.points, cells, self.planes, self.labels, self.around, LIMITS, 0)
 
+    def far_costs(self) -> list[int]:
+        """What far planes cost in the first cell, where misfits are the same."""
+        costs, misfits = np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64)
+        add_costs_of_far_planes(self.plan, self.planes, self.around, FAR_M, costs, misfits)
+        assert costs.tolist() == misfits.tolist()
+        return costs[0].tolist()
+
     def areas(self) -> list[float]:
         return sorted(cell_areas_m2(self.plan).tolist())
 
@@ -103,7 +110,7 @@ def test_a_plane_below_the_points_is_cut_off_too() -> None:
     assert east + west == pytest.approx(72.0, abs=0.01)
 
 
-def test_of_two_planes_that_fit_beyond_the_better_one_decides_where_to_cut() -> None:
+def test_the_better_of_two_planes_that_fit_beyond_decides_where_to_cut() -> None:
     hall = Hall(FALLING, [RISING, (-0.8, 0.0, 14.5), FALLING])
     assert hall.cut() == 1
     assert hall.areas() == pytest.approx([24.0, 48.0], abs=0.01)
@@ -169,50 +176,43 @@ def test_a_cell_that_is_far_at_all_corners_is_found_and_left_whole() -> None:
 def test_a_plane_costs_where_it_goes_on_by_more_than_its_slope(plane: tuple[float, float, float], *, far: bool) -> None:
     hall = Hall(LOW, [plane, LOW])
     hall.points[:, 2] = 3.0
-    around = heights_around(hall.plan, heights_raster(hall.points, SPACING_M))
-    costs, misfits = np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64)
-    add_costs_of_far_planes(hall.plan, hall.planes, around, FAR_M, costs, misfits)
-    assert (costs[0, 0] > 0, costs[0, 1]) == (far, 0)
-    assert (costs == misfits).all()
+    hall.look_around()
+    own, other = hall.far_costs()
+    assert (own > 0, other) == (far, 0)
 
 
 @pytest.mark.parametrize(("height_m", "cost"), [(3.4, 0), (4.5, 20_000), (13.0, 40_000), (1.5, 20_000)])
 def test_a_plane_costs_by_the_metre_up_to_a_limit(height_m: float, cost: int) -> None:
     hall = Hall(LOW, [(0.0, 0.0, height_m), LOW])
     hall.points[:, 2] = 3.0
-    around = heights_around(hall.plan, heights_raster(hall.points, SPACING_M))
-    costs, misfits = np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64)
-    add_costs_of_far_planes(hall.plan, hall.planes, around, FAR_M, costs, misfits)
-    assert costs.tolist() == misfits.tolist() == [[cost, 0]]
+    hall.look_around()
+    assert hall.far_costs() == [cost, 0]
 
 
 @pytest.mark.parametrize(("slope", "is_far"), [(1.0, False), (1.8, False), (3.0, True)])
 def test_steep_planes_go_on_no_farther_than_one_of_45_degrees(slope: float, *, is_far: bool) -> None:
     hall = Hall(LOW, [(0.0, slope, 3.0)])
     hall.points[:, 2] = 3.0 + slope * hall.points[:, 1]
-    # the eave is a metre from the first points, so that those of the next cells tell
+    # the eave is a metre from the first points, so those of the next cells decide
     around = heights_around(hall.plan, heights_raster(hall.points[hall.points[:, 1] > 0.9], SPACING_M))
     extended = with_level_planes(hall.plan, hall.planes, hall.labels, around, FAR_M)
     assert (len(extended) > 1) == is_far
 
 
-def test_of_planes_that_are_all_far_the_nearest_costs_nothing() -> None:
-    hall = Hall(LOW, [(0.0, 0.0, 14.0), (0.0, 0.0, 11.0)])
-    costs, misfits = np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64)
-    add_costs_of_far_planes(hall.plan, hall.planes, hall.around, FAR_M, costs, misfits)
-    assert costs[0, 0] > 0
-    assert costs[0, 1] == 0
+def test_the_nearest_plane_costs_nothing_where_all_are_far() -> None:
+    farther, nearest = Hall(LOW, [(0.0, 0.0, 14.0), (0.0, 0.0, 11.0)]).far_costs()
+    assert farther > 0
+    assert nearest == 0
 
 
 @pytest.mark.slow
 def test_where_no_plane_fits_a_corner_there_is_a_level_one() -> None:
     hall = Hall(LOW, [RISING, (0.0, 0.0, 9.0)])
-    arguments = (hall.plan,)
-    extended = with_level_planes(*arguments, hall.planes, hall.labels, hall.around, FAR_M)
+    extended = with_level_planes(hall.plan, hall.planes, hall.labels, hall.around, FAR_M)
     assert extended[:2].tolist() == hall.planes.tolist()
     assert extended[2:].tolist() == [[0.0, 0.0, 3.0]]
     fitting = np.array([RISING, LOW])
-    assert len(with_level_planes(*arguments, fitting, hall.labels, hall.around, FAR_M)) == 2
+    assert len(with_level_planes(hall.plan, fitting, hall.labels, hall.around, FAR_M)) == 2
 
 
 def cut_corner() -> tuple[FloatArray, FloatArray, MultiPolygon]:

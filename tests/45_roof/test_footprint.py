@@ -136,7 +136,7 @@ def test_a_block_is_drawn_back_where_its_courtyard_touches_the_outline() -> None
     assert 78.0 * 0.99 < area_m2 < 78.0
 
 
-def test_a_block_without_an_area_is_told() -> None:
+def test_a_block_without_an_area_is_an_error() -> None:
     plane = block_plane(np.full((3, 3), 5.0), 0.0, 50.0)
     for form in block_forms(shapely.MultiPolygon(), plane, 0.0, 0.3, 1.0):
         with pytest.raises(BuildingError, match="has an area of 0 m2"):

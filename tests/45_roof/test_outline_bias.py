@@ -25,7 +25,7 @@ def scene() -> Scene:
     return sweep(seed_of("dev", 1))
 
 
-def outlines(density: float, beam_radius_m: float, *, tell_returns: bool = True) -> np.ndarray:
+def outlines(density: float, beam_radius_m: float, *, with_returns: bool = True) -> np.ndarray:
     """IoU, area and true area of every building that stands alone: rows (k, 3)."""
     survey = dataclasses.replace(SCANNER, pulse_density_per_m2=density, beam_radius_m=beam_radius_m)
     block = scan_all(scene(), survey, 3)
@@ -45,7 +45,7 @@ def outlines(density: float, beam_radius_m: float, *, tell_returns: bool = True)
             points=xyz,
             ground=np.zeros((0, 3)),
             ground_z_m=float(xyz[roof, 2].min()) - 3.0,
-            split_returns=xyz[split] if tell_returns else np.zeros((0, 3)),
+            split_returns=xyz[split] if with_returns else np.zeros((0, 3)),
         )
         bare = roof_points(prepare_cloud(candidate), settings)
         plane = block_plane(bare.points, candidate.ground_z_m, 70.0)
@@ -74,7 +74,7 @@ def test_outlines_have_the_true_area_whatever_density_and_beam(
 
 
 @pytest.mark.slow
-def test_without_told_returns_a_roof_is_as_large_as_the_scanner_sees_it() -> None:
-    rows, told = outlines(2.0, 0.3, tell_returns=False), outlines(2.0, 0.3)
-    grown = np.sqrt(rows[:, 1]) - np.sqrt(told[:, 1])
+def test_without_recorded_returns_a_roof_is_as_large_as_the_scanner_sees_it() -> None:
+    rows, known = outlines(2.0, 0.3, with_returns=False), outlines(2.0, 0.3)
+    grown = np.sqrt(rows[:, 1]) - np.sqrt(known[:, 1])
     assert 0.4 < np.median(grown) < 0.8  # twice the beam's radius on a square

@@ -31,23 +31,26 @@ TYPES = {
 }
 
 
+def type_of(roof: Any, planes: Any = None, settings: RoofTypeSettings | None = None, parts: Any = None) -> RoofType:
+    """The type of an exact roof, perhaps on other planes or with other solids."""
+    parts = parts or roof.parts()
+    faces = [face for part in parts for face in part.faces]
+    return roof_type(planes or roof.planes, faces, [part.solid for part in parts], settings or RoofTypeSettings())
+
+
 @pytest.mark.parametrize("kind", list(TYPES))
 @pytest.mark.parametrize("turn_deg", [0.0, 200.0])
 @pytest.mark.parametrize("with_footprint", [True, False])
 def test_an_exact_roof_has_its_type(exact_roof: ExactRoofs, kind: str, turn_deg: float, with_footprint: bool) -> None:
     roof = exact_roof(kind, turn_deg=turn_deg, with_footprint=with_footprint, density=6.0)
-    parts = roof.parts()
-    faces = [face for part in parts for face in part.faces]
-    assert roof_type(roof.planes, faces, [part.solid for part in parts], RoofTypeSettings()) is TYPES[kind]
+    assert type_of(roof) is TYPES[kind]
 
 
-def test_two_pent_roofs_that_fall_towards_one_another_are_no_gable(exact_roof: ExactRoofs) -> None:
+def test_two_pent_roofs_that_fall_towards_one_another_are_not_a_gable(exact_roof: ExactRoofs) -> None:
     roof = exact_roof("gable", with_footprint=True)
-    parts = roof.parts()
-    faces = [face for part in parts for face in part.faces]
     # the same faces on planes turned upside down meet in a valley
     valley = [type(p)(a=-p.a, b=-p.b, c=p.c, n_points=1, rmse_m=0.0) for p in roof.planes]
-    assert roof_type(valley, faces, [part.solid for part in parts], RoofTypeSettings()) is RoofType.COMBINATION
+    assert type_of(roof, valley) is RoofType.COMBINATION
 
 
 @pytest.mark.parametrize("shape", list(RoofShape))
@@ -65,16 +68,14 @@ def test_the_truth_of_every_shape_has_its_type(shape: RoofShape) -> None:
             terrain=Terrain(base_z_m=0.0),
         )
         truth = truth_record(building, (0.0, 0.0, 0.0))
-        told = roof_type(truth.planes, truth.faces, truth.solids, RoofTypeSettings())
-        assert told is ROOF_TYPES[shape], size
+        found = roof_type(truth.planes, truth.faces, truth.solids, RoofTypeSettings())
+        assert found is ROOF_TYPES[shape], size
 
 
 def with_lifted_plane(roof: Any, lift_m: float, settings: RoofTypeSettings | None = None) -> RoofType:
-    """The type of an exact roof whose last plane is drawn higher: along its borders stand walls."""
+    """The type of an exact roof whose last plane is drawn higher: there are walls along its borders."""
     planes = [*roof.planes[:-1], dataclasses.replace(roof.planes[-1], c=roof.planes[-1].c + lift_m)]
-    parts = solid_parts(roof.drawn(), planes, 0.0)
-    faces = [face for part in parts for face in part.faces]
-    return roof_type(planes, faces, [part.solid for part in parts], settings or RoofTypeSettings())
+    return type_of(roof, planes, settings, solid_parts(roof.drawn(), planes, 0.0))
 
 
 @pytest.mark.parametrize("kind", ["hip", "gable"])
@@ -101,5 +102,5 @@ def test_a_roof_of_many_small_directions_is_a_combination_though_its_top_is_flat
     assert roof_type(truth.planes, truth.faces, truth.solids, alone) is RoofType.FLAT
 
 
-def test_without_faces_there_is_no_type() -> None:
+def test_a_roof_without_faces_has_no_type() -> None:
     assert roof_type([], [], [], RoofTypeSettings()) is RoofType.NONE

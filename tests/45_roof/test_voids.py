@@ -1,4 +1,4 @@
-"""Places of a given outline that no roof point is near to."""
+"""Places of a given outline without a roof point nearby."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def drawn(outline: shapely.Geometry, roof: shapely.Geometry, density: float) -> 
 
 
 @pytest.mark.parametrize(("density", "off_m"), [(10.0, 0.8), (2.0, 2.0)])
-def test_a_courtyard_that_the_outline_does_not_tell_is_found_where_it_lies(density: float, off_m: float) -> None:
+def test_a_courtyard_missing_in_the_outline_is_found_where_it_lies(density: float, off_m: float) -> None:
     outline, yard = turned(shapely.box(0, 0, 32, 26)), turned(shapely.box(9, 7, 23, 18))
     given, left = drawn(outline, outline.difference(yard), density)
     void = shapely.difference(given, left)
@@ -68,7 +68,7 @@ def test_an_outline_without_any_point_stays_as_it_is() -> None:
     assert without_voids(given, np.zeros((0, 3)), 0.5, SETTINGS) is given
 
 
-def test_the_order_of_the_points_tells_nothing() -> None:
+def test_the_order_of_the_points_does_not_matter() -> None:
     outline = turned(shapely.box(0, 0, 32, 26))
     points = strewn(outline.difference(turned(shapely.box(9, 7, 23, 18))), 6.0)
     given = footprint_in_mm(outline)

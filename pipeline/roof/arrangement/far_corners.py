@@ -167,18 +167,8 @@ def add_costs_of_far_planes(
 ) -> None:
     """Raise the cost of planes in the cells at whose corners they are farther from the points than another.
 
-    Parameters
-    ----------
-    plan : Subdivision
-        The cells.
-    planes : (k, 3) float64
-        Coefficients a, b, c.
-    around : HeightsAround
-        From `heights_around`.
-    far_m : float
-        How far a plane may go above or below the points.
-    costs, misfits : (c, k) int64
-        From `cell_costs`; changed in place.
+    `far_m` is how far a plane may go above or below the points without cost; `costs` and `misfits` (c, k), from
+    `cell_costs`, change in place.
     """
     farthest = np.zeros(costs.shape)
     for h in range(plan.counts[EDGES]):
@@ -205,17 +195,7 @@ def with_level_planes(
 ) -> FloatArray:
     """The planes, and horizontal ones where none of them fits a corner that the plane of its cell is far from.
 
-    Parameters
-    ----------
-    plan, planes, around, far_m
-        As in `add_costs_of_far_planes`.
-    labels : (c,) int32
-        Plane of every cell.
-
-    Returns
-    -------
-    (k + l, 3) float64
-        The given ones first.
+    `labels` (c,) are the planes of the cells; `far_m` as in `add_costs_of_far_planes`. The given planes come first.
     """
     extended = np.empty((len(planes) + _MAX_LEVEL, 3))
     k = len(planes)

@@ -25,21 +25,10 @@ _MAX_PAIRED = 500
 
 
 def lower_piece(region: FloatArray, planes: FloatArray, number: int) -> FloatArray:
-    """Where a plane is the lowest of several within a rectangle: the rectangle clipped by half planes.
+    """Where a plane is the lowest of several within a rectangle: its corners (m, 2), counter-clockwise.
 
-    Parameters
-    ----------
-    region : (4,) float64
-        Least and largest u, least and largest v.
-    planes : (k, 3) float64
-        (a, b, c) of z = a u + b v + c.
-    number : int
-        Which of them.
-
-    Returns
-    -------
-    (m, 2) float64
-        Corners, counter-clockwise; none where another plane is lower everywhere.
+    The rectangle (least and largest u, least and largest v) is clipped by half planes. `planes` (k, 3) are (a, b, c) of
+    z = a u + b v + c. There are no corners where another plane is lower everywhere.
     """
     u0, u1, v0, v1 = region.tolist()
     corners = [(u0, v0), (u1, v0), (u1, v1), (u0, v1)]

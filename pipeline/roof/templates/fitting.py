@@ -114,7 +114,7 @@ class Templates:
 
 
 def fit_templates(points: FloatArray, outline_mm: MultiPolygon) -> Templates:
-    """Fit flat, pent, gable, hip and half-hip roofs to the parts of an outline.
+    """Fit flat, pent, gable, hip and half-hip roofs to the parts of an outline, of the least BIC that is found.
 
     Parameters
     ----------
@@ -122,11 +122,6 @@ def fit_templates(points: FloatArray, outline_mm: MultiPolygon) -> Templates:
         Roof points that see the sky, local metres, in a canonical order.
     outline_mm : MultiPolygon
         Valid, integer millimetres of the same frame.
-
-    Returns
-    -------
-    Templates
-        Of least BIC among those that are tried.
 
     Raises
     ------
@@ -191,18 +186,9 @@ def margin_of_templates(
     """By how much the Bayesian information criterion of templates is below that of other roof faces.
 
     The criterion is the sum of min((r / sigma)^2, 9) over the points' vertical residuals r, plus the free parameters
-    times ln n (Schwarz 1978, with errors that are capped). Points that the faces do not cover count in neither.
+    times ln n (Schwarz 1978, with capped errors). Points that the faces do not cover count in neither.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Those that the templates were fitted to.
-    templates : Templates
-        Theirs.
-    partition : RoofPartition
-        The other faces, a coverage in integer millimetres.
-    planes : sequence of Plane
-        The planes that its labels number.
+    `points` (n, 3) are those that the templates were fitted to; `partition` is a coverage in integer millimetres.
     """
     others = np.full(len(points), np.inf)
     x_mm, y_mm = points[:, 0] * 1e3, points[:, 1] * 1e3
@@ -223,12 +209,7 @@ def margin_of_templates(
 def parameters_of(partition: RoofPartition, planes: Sequence[Plane]) -> float:
     """Free parameters of roof faces: three per plane, two (direction and place) per pair of faces that meets in a step.
 
-    Parameters
-    ----------
-    partition : RoofPartition
-        A coverage: faces share their vertices.
-    planes : sequence of Plane
-        The planes that its labels number.
+    The partition is a coverage: its faces share their vertices.
     """
     beside: dict[tuple[float, ...], int] = {}
     steps: set[tuple[int, int]] = set()

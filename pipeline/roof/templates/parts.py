@@ -40,12 +40,8 @@ _FINALISTS = 3
 def main_direction(edges: FloatArray) -> float:
     """The direction along which, or across which, most of an outline runs; radians, -pi/4 to pi/4.
 
-    In an outline with very many edges the longest ones decide, since each is compared with every other.
-
-    Parameters
-    ----------
-    edges : (e, 4) float64
-        x, y of both ends, metres.
+    `edges` (e, 4) are x, y of both ends, metres. If they are very many, only the longest ones decide: each is compared
+    with every other.
     """
     if len(edges) > _LONGEST_EDGES:
         shortness = np.empty(len(edges))

@@ -45,21 +45,10 @@ def robust_line(t: FloatArray, z: FloatArray, reach_m: float, level: bool) -> tu
     """The line z = c + s t that most points lie near, by graduated non-convexity.
 
     Weights of Geman and McClure, (reach^2 / (reach^2 + r^2))^2, with a reach that halves from fit to fit (Blake and
-    Zisserman 1987): first all points count, at last those within the reach.
+    Zisserman 1987) down to `reach_m`: first all points count, at last those within the reach.
 
-    Parameters
-    ----------
-    t, z : (m,) float64
-        Places and heights, metres.
-    reach_m : float
-        The last reach.
-    level : bool
-        Whether the slope is 0.
-
-    Returns
-    -------
-    c, s : float
-        Height at t = 0 and slope; slope 0 where all places are one.
+    Places `t` and heights `z` are (m,), metres. The result is the height c at t = 0 and the slope s, which is 0 for a
+    level line and where all places are one.
     """
     c, s = 0.0, 0.0
     for step in range(_STEPS + 1):
@@ -148,10 +137,7 @@ def _stays_near(planes: FloatArray, count: int, points: FloatArray, box: FloatAr
 def _refit(planes: FloatArray, count: int, points: FloatArray, reach_m: float) -> bool:
     """Let every plane of an envelope go free: points to their plane, planes to their points (Magnani and Boyd 2009).
 
-    Returns
-    -------
-    bool
-        False where a plane is left with too few points; the planes are then undefined.
+    False where a plane is left with too few points, or turns over; the planes are then undefined.
     """
     sums = np.empty((count, 6))
     for step in range(_REFITS):
