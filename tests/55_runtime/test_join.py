@@ -25,7 +25,7 @@ from pipeline.runtime.stages.border_facets import facet_names, shared_facets, un
 from pipeline.runtime.stages.join import join_tiles
 from pipeline.runtime.stages.open_fragments import open_fragments
 from pipeline.runtime.stages.sites import Joined
-from pipeline.runtime.stages.split_window import Split
+from pipeline.runtime.stages.split_window import Split, SplitFigures
 from pipeline.scene import BUILDING_CLASS, GROUND_CLASS, WindowPoints, split_tile
 from pipeline.terrain.candidates import NOWHERE
 from pipeline.terrain.facets import FacetKind, VertexKind
@@ -56,16 +56,8 @@ EASY = CandidateSettings(
 def handed_on(whole: WholeSplit, grid: TileGrid, cut: SurfaceSettings, judging: CandidateSettings) -> Split:
     """What a split hands on of its fragments; through a pickle, as in a run."""
     surfaces = open_fragments(whole.fragments, whole.keys, whole.starts, whole.tile, grid, cut, judging)
-    found = Split(
-        tile=whole.tile,
-        surfaces=surfaces,
-        footprints=None,
-        points=int(whole.starts[-1]),
-        duplicates=0,
-        outliers=0,
-        audit=(0, 0, 0),
-        outcome="",
-    )
+    figures = SplitFigures(tile=whole.tile, points=0, duplicates=0, outliers=0, audit=(0, 0, 0), outcome="")
+    found = Split(tile=whole.tile, surfaces=surfaces, footprints=None, figures=figures)
     copy: Split = pickle.loads(pickle.dumps(found))
     return copy
 

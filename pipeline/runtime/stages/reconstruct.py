@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pipeline.model import Status
@@ -101,16 +102,12 @@ def reconstruct(context: RunContext, settings: RunSettings, joined: Joined, *, c
         nonlocal made
         made += sum(not model.reused for model in models)
 
+    brief: Callable[[Batch], tuple[Modelled, ...]] = operator.attrgetter("modelled")
     units = ProgressUnits(total=len(joined.candidates), done=len, failed=_failed_of)
-    context.map_stored("reconstruct", model_batch, dict(largest_first), _modelled_of, units, count)
+    context.map_stored("reconstruct", model_batch, dict(largest_first), brief, units, count)
     # only now: models whose input did not change are taken from the earlier batches
     drop_outcomes(scratch, stage, tasks)
     return Models(places=places, scratch=scratch, made=made)
-
-
-def _modelled_of(batch: Batch) -> tuple[Modelled, ...]:
-    """The brief of a batch."""
-    return batch.modelled
 
 
 def _failed_of(models: Sequence[Modelled]) -> int:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import operator
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 from pipeline.runtime.plan import check_windows, split_grid, window_bytes
 from pipeline.runtime.run_context import RunContext
@@ -14,7 +15,7 @@ from pipeline.runtime.scratch.outcomes import Place, key_of, result_of
 from pipeline.runtime.stages.cleanup import clear_tiles
 from pipeline.runtime.stages.given_footprints import GivenFootprints, Outline, numbers_by_tile
 from pipeline.runtime.stages.ingested import Ingested, classes_in_use, content_by_tile, points_by_tile
-from pipeline.runtime.stages.split_window import Split, SplitFigures, SplitTask, figures_of_split, split_window
+from pipeline.runtime.stages.split_window import Split, SplitFigures, SplitTask, split_window
 from pipeline.runtime.stages.tile_content import content_of_window
 from pipeline.settings import RunSettings
 from pipeline.terrain.scene_settings import ClassesInUse
@@ -36,7 +37,7 @@ class Splits:
 
     def stored(self, scratch: Scratch) -> Iterator[Split]:
         """The descriptors of all tiles in their order, read one after the other."""
-        return (result_of(scratch, place) for _, place in sorted(self.places.items(), key=lambda item: item[0]))
+        return (result_of(scratch, place) for _, place in sorted(self.places.items(), key=operator.itemgetter(0)))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +110,8 @@ def split_windows(
         tasks[Place(folder, tile.key, key)] = task
     clear_tiles(context.scratch, folder, tasks)
     function = functools.partial(split_window, settings=settings.scene)
-    found = context.map_stored(stage, function, tasks, figures_of_split)
+    brief: Callable[[Split], SplitFigures] = operator.attrgetter("figures")
+    found = context.map_stored(stage, function, tasks, brief)
     outcomes = {figures.tile: figures.outcome for figures in found.values()}
     keys = {}
     for tile in outcomes:

@@ -65,15 +65,11 @@ class FootprintPoints:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Split:
-    """What the join needs of one tile, and its figures."""
+class SplitFigures:
+    """The figures of one tile, which travel to the driver."""
 
     tile: Tile
     """The tile."""
-    surfaces: TileSurfaces | None
-    """What the join needs of the tile's surfaces; None where footprints were given."""
-    footprints: FootprintPoints | None
-    """The points in given footprints; None where none were given."""
     points: int
     """Points of the core, without duplicates."""
     duplicates: int
@@ -87,27 +83,17 @@ class Split:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SplitFigures:
-    """The figures of a `Split`, which travel to the driver."""
+class Split:
+    """What the join needs of one tile, and the tile's figures."""
 
     tile: Tile
-    points: int
-    duplicates: int
-    outliers: int
-    audit: tuple[int, int, int]
-    outcome: str
-
-
-def figures_of_split(found: Split) -> SplitFigures:
-    """The figures without the descriptors."""
-    return SplitFigures(
-        tile=found.tile,
-        points=found.points,
-        duplicates=found.duplicates,
-        outliers=found.outliers,
-        audit=found.audit,
-        outcome=found.outcome,
-    )
+    """The tile."""
+    surfaces: TileSurfaces | None
+    """What the join needs of the tile's surfaces; None where footprints were given."""
+    footprints: FootprintPoints | None
+    """The points in given footprints; None where none were given."""
+    figures: SplitFigures
+    """The tile's figures."""
 
 
 def split_window(task: SplitTask, settings: SceneSettings) -> Split:
@@ -157,16 +143,15 @@ def split_window(task: SplitTask, settings: SceneSettings) -> Split:
     else:
         cut, judging = settings.surfaces, settings.candidates
         surfaces = open_fragments(result.fragments, keys, starts, task.tile, task.grid, cut, judging)
-    return Split(
+    figures = SplitFigures(
         tile=task.tile,
-        surfaces=surfaces,
-        footprints=footprints,
         points=len(loaded.core),
         duplicates=loaded.duplicates,
         outliers=outliers,
         audit=audit,
         outcome=outcome.hexdigest(),
     )
+    return Split(tile=task.tile, surfaces=surfaces, footprints=footprints, figures=figures)
 
 
 def _put(task: SplitTask, arrays: dict[str, npt.NDArray[Any]], outcome: Hash) -> None:
