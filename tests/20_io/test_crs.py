@@ -88,7 +88,7 @@ def test_an_unknown_unit_lists_the_known_ones():
 def test_the_given_crs_replaces_the_header_s_and_says_so_only_where_they_differ():
     reference, reported = resolve("EPSG:2154", crs="EPSG:7415")
     assert reference.epsg == 7415
-    assert any("in place of the header's" in warning for warning in reported)
+    assert any("replaces the header's" in warning for warning in reported)
     assert resolve("EPSG:28992", crs="EPSG:7415")[1] == ()
 
 

@@ -159,7 +159,7 @@ def test_what_is_not_in_a_bucket_is_told(bucket):
         (f"{bucket}/nothing/", "there is no such thing|the folder is empty"),
         ("s3://no-such-bucket/t/", "there is no such bucket"),
         ("https://host/folder/", "does not list its files.*a tile index"),
-        ("ftp://host/a.laz", "ftp:// is not understood"),
+        ("ftp://host/a.laz", "ftp:// is not supported"),
     ):
         with pytest.raises(UnreadableInputError, match=reported):
             find_inputs([entry])

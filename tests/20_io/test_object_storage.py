@@ -145,7 +145,7 @@ def test_without_the_extra_the_error_names_it():
 @pytest.mark.parametrize(
     ("url", "reported"),
     [
-        ("ftp://host/run", "ftp:// is not understood"),
+        ("ftp://host/run", "ftp:// is not supported"),
         ("https://host/run", "nothing can be stored there"),
         ("s3://", "names no bucket"),
         ("s3://bucket/../other", "names no bucket"),

@@ -114,7 +114,7 @@ def test_a_status_without_a_known_code_decides(status, again):
 
 
 def test_what_the_server_said_counts_before_what_the_library_made_of_it():
-    # fsspec tells of every failed look at a web server as a missing file
+    # fsspec reports every failed request to a web server as a missing file
     error = FileNotFoundError("https://host/a.laz")
     error.__cause__ = AnswerError("SlowDown", 503)
     assert cause_of(error) is CODES["SlowDown"]

@@ -2,7 +2,7 @@
  * What a building is drawn as: its roof type, or why it has none.
  *
  * Colours are of the palette of Okabe and Ito (2008), told apart with every kind of colour blindness; fallback and
- * failed are told by hatching and outline too.
+ * failed are shown by hatching and outline, too.
  */
 export const CATEGORIES = {
   flat: { label: "Flat", colour: "#56b4e9" },
