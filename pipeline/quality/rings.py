@@ -131,6 +131,23 @@ def _touches_enclose_a_part(ids: IntArray, ring_offsets: IntArray) -> bool:
 
 
 @kernel
+def _place_of_inner_rings(flat: IntArray, ring_offsets: IntArray) -> int:
+    """The fault of inner rings that do not lie within the outer ring, or not outside one another; else 0."""
+    rings = len(ring_offsets) - 1
+    for r in range(1, rings):
+        side = _side_of_ring(flat, ring_offsets[r], ring_offsets[r + 1], 0, ring_offsets[1])
+        if side != _INSIDE:
+            return INTERSECTION_RINGS if side == _BOTH else INNER_RING_OUTSIDE
+    for r in range(1, rings):
+        for s in range(1, rings):
+            if r != s:
+                side = _side_of_ring(flat, ring_offsets[r], ring_offsets[r + 1], ring_offsets[s], ring_offsets[s + 1])
+                if side != _OUTSIDE:
+                    return INTERSECTION_RINGS if side == _BOTH else INNER_RINGS_NESTED
+    return 0
+
+
+@kernel
 def polygon_code(flat: IntArray, ids: IntArray, ring_offsets: IntArray) -> int:
     """The first fault of a polygon whose plane is known, 0 where there is none.
 
@@ -164,14 +181,7 @@ def polygon_code(flat: IntArray, ids: IntArray, ring_offsets: IntArray) -> int:
                 return DUPLICATED_RINGS
             if _rings_cross(flat, ids, ring_offsets[s], ring_offsets[s + 1], ring_offsets[r], ring_offsets[r + 1]):
                 return INTERSECTION_RINGS
-    for r in range(1, rings):
-        side = _side_of_ring(flat, ring_offsets[r], ring_offsets[r + 1], 0, ring_offsets[1])
-        if side != _INSIDE:
-            return INTERSECTION_RINGS if side == _BOTH else INNER_RING_OUTSIDE
-    for r in range(1, rings):
-        for s in range(1, rings):
-            if r != s:
-                side = _side_of_ring(flat, ring_offsets[r], ring_offsets[r + 1], ring_offsets[s], ring_offsets[s + 1])
-                if side != _OUTSIDE:
-                    return INTERSECTION_RINGS if side == _BOTH else INNER_RINGS_NESTED
+    code = _place_of_inner_rings(flat, ring_offsets)
+    if code:
+        return code
     return POLYGON_INTERIOR_DISCONNECTED if _touches_enclose_a_part(ids, ring_offsets) else 0

@@ -237,6 +237,29 @@ def _is_folded(corners: IntArray, rings: IntArray, cut: IntArray, min_cosine: fl
 
 
 @kernel
+def _faces_are_sound(
+    corners: IntArray,
+    ids: IntArray,
+    ring_offsets: IntArray,
+    face_offsets: IntArray,
+    planarity_mm: float,
+    found: BoolArray,
+) -> bool:
+    """Set found[code] for the first fault of every face; whether there is none."""
+    sound = True
+    for f in range(len(face_offsets) - 1):
+        rings = ring_offsets[face_offsets[f] : face_offsets[f + 1] + 1]
+        code = TOO_FEW_POINTS
+        if len(rings) >= 2:
+            start, stop = rings[0], rings[-1]
+            code = _face_code(corners[start:stop], ids[start:stop], rings - start, planarity_mm)
+        if code:
+            found[code] = True
+            sound = False
+    return sound
+
+
+@kernel
 def _find_faults(
     vertices: IntArray,
     ids: IntArray,
@@ -252,20 +275,9 @@ def _find_faults(
         for k in range(3):
             corners[i, k] = vertices[ids[i], k]
     faces = len(face_offsets) - 1
-    sound = True
-    for f in range(faces):
-        rings = ring_offsets[face_offsets[f] : face_offsets[f + 1] + 1]
-        if len(rings) < 2:
-            found[TOO_FEW_POINTS] = True
-            sound = False
-            continue
-        start, stop = rings[0], rings[-1]
-        code = _face_code(corners[start:stop], ids[start:stop], rings - start, planarity_mm)
-        if code:
-            found[code] = True
-            sound = False
-    if not sound:
+    if not _faces_are_sound(corners, ids, ring_offsets, face_offsets, planarity_mm, found):
         return
+    sound = True
     triangles = np.empty((len(ids) + 2 * len(ring_offsets), 3), np.int64)
     face_of = np.empty(len(triangles), np.int64)
     count = 0

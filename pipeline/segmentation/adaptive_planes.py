@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +23,13 @@ from pipeline.segmentation.plane_regression import best_fit_plane, cluster_sums,
 from pipeline.segmentation.plane_settings import MIN_PLANE_POINTS, AdaptivePlaneSettings
 from pipeline.segmentation.point_assignment import distance_to_plane, vote_among_neighbours
 from pipeline.segmentation.redundant_planes import dissolve_redundant
-from pipeline.segmentation.trial_regions import FITTED_NEIGHBOURS, local_planes, noise_of_local_planes, take_regions
+from pipeline.segmentation.trial_regions import (
+    FITTED_NEIGHBOURS,
+    TrialLimits,
+    local_planes,
+    noise_of_local_planes,
+    take_regions,
+)
 
 _DENSE_SPACING_M = 0.3
 """Closer points are averaged to nodes: the noise between such neighbours hides the slope, and nodes are fewer."""
@@ -89,20 +96,30 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
         spacing_m = _NODE_CELL_M
     else:
         nodes, node_of = points, np.arange(len(points), dtype=np.int32)
-    coefficients, labels, sigma_m = _detect(
-        points,
-        nodes,
-        node_of,
-        nearest_neighbours(nodes, _NEIGHBOURS),
-        spacing_m,
-        settings.noises,
-        settings.min_distance_m,
-        settings.max_distance_m,
-        settings.fewest_points(spacing_m),
-        math.cos(math.radians(settings.max_slope_deg)),
-        math.cos(math.radians(settings.normal_angle_deg)),
+    limits = _Limits(
+        noises=settings.noises,
+        min_distance_m=settings.min_distance_m,
+        max_distance_m=settings.max_distance_m,
+        fewest_points=settings.fewest_points(spacing_m),
+        min_cosine=math.cos(math.radians(settings.max_slope_deg)),
+        normal_cosine=math.cos(math.radians(settings.normal_angle_deg)),
     )
+    neighbours = nearest_neighbours(nodes, _NEIGHBOURS)
+    coefficients, labels, sigma_m = _detect(points, nodes, node_of, neighbours, spacing_m, limits)
     return DetectedPlanes(coefficients=coefficients, labels=labels, sigma_m=sigma_m)
+
+
+class _Limits(NamedTuple):
+    """`AdaptivePlaneSettings` at a density of points."""
+
+    noises: float
+    min_distance_m: float
+    max_distance_m: float
+    fewest_points: int
+    min_cosine: float
+    """Of a plane's slope."""
+    normal_cosine: float
+    """Least cosine between a plane and a point's own."""
 
 
 @kernel
@@ -364,17 +381,12 @@ def _detect(
     node_of: LabelArray,
     neighbours: LabelArray,
     spacing_m: float,
-    noises: float,
-    min_distance_m: float,
-    max_distance_m: float,
-    fewest_points: int,
-    min_cosine: float,
-    normal_cosine: float,
+    limits: _Limits,
 ) -> tuple[FloatArray, LabelArray, float]:
     """Kernel of `detect_planes`: planes, labels of the points, noise."""
-    local, variances = local_planes(nodes, neighbours)
-    order = ascending_order(variances)
-    sigma_m = noise_of_local_planes(variances, order)
+    noises, min_distance_m, max_distance_m, fewest_points, min_cosine, normal_cosine = limits
+    surroundings = local_planes(nodes, neighbours)
+    sigma_m = noise_of_local_planes(surroundings.variances, surroundings.order)
     distance_m = min(max(noises * sigma_m, min_distance_m), max_distance_m)
     # of a plane through m points spread evenly over a disc the slope has the error 2 sigma sqrt(pi) / (spacing m)
     slope_error = 2.0 * math.sqrt(math.pi) * sigma_m / (spacing_m * (FITTED_NEIGHBOURS + 1.0))
@@ -386,10 +398,8 @@ def _detect(
         reach_m = distance_m if pass_ > 0 else _GROWING_SHARE * distance_m
         min_normal_cosine = normal_cosine if tells and pass_ == 0 else 0.0
         before = count
-        count = take_regions(
-            nodes, neighbours, local, variances, order, labels, before, reach_m, min_normal_cosine, fewest_points,
-            min_cosine,
-        )  # fmt: skip
+        trial_limits = TrialLimits(reach_m, min_normal_cosine, fewest_points, min_cosine)
+        count = take_regions(surroundings, labels, before, trial_limits)
         if count > before:
             labels = _settled(nodes, neighbours, labels, count, distance_m, sigma_m, fewest_points, min_cosine)
     planes, usable, _ = _fitted(nodes, labels, count, fewest_points, min_cosine)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -178,14 +179,16 @@ def cluster(vectors: FloatArray, areas_m2: FloatArray, settings: FuzzySartCluste
     labels, templates, epochs, work = _learn(
         np.ascontiguousarray(vectors, dtype=np.float64),
         order,
-        settings.vigilance,
-        settings.tau_epochs,
-        settings.epochs_per_tau * settings.tau_epochs,
-        settings.learning_rate_start,
-        settings.learning_rate_end,
-        settings.neighbourhood_start,
-        settings.neighbourhood_end,
-        settings.clustering_work_limit,
+        _Learning(
+            vigilance=settings.vigilance,
+            tau=settings.tau_epochs,
+            max_epochs=settings.epochs_per_tau * settings.tau_epochs,
+            rate_start=settings.learning_rate_start,
+            rate_end=settings.learning_rate_end,
+            reach_start=settings.neighbourhood_start,
+            reach_end=settings.neighbourhood_end,
+            work_limit=settings.clustering_work_limit,
+        ),
     )
     if work > settings.clustering_work_limit:
         raise BuildingError(
@@ -196,20 +199,32 @@ def cluster(vectors: FloatArray, areas_m2: FloatArray, settings: FuzzySartCluste
     return Clustering(labels=labels, templates=templates, epochs=int(epochs))
 
 
+class _Learning(NamedTuple):
+    """`FuzzySartClusteringSettings` as the kernel takes them."""
+
+    vigilance: float
+    tau: int
+    """Epochs in which a neuron learns."""
+    max_epochs: int
+    rate_start: float
+    rate_end: float
+    reach_start: float
+    reach_end: float
+    """Ranks over which the learning fades, for a winner of age 0 and tau."""
+    work_limit: int
+
+
 @kernel
 def _learn(
     vectors: FloatArray,
     order: npt.NDArray[np.int64],
-    vigilance: float,
-    tau: int,
-    max_epochs: int,
-    rate_start: float,
-    rate_end: float,
-    reach_start: float,
-    reach_end: float,
-    work_limit: int,
+    learning: _Learning,
 ) -> tuple[LabelArray, FloatArray, int, int]:
-    """Labels, templates, epochs and comparisons; stops early once the comparisons pass the limit."""
+    """Labels, templates, epochs and comparisons; stops early once the comparisons pass the limit.
+
+    It stays whole: its arrays grow as neurons are made, so that parts of it would pass all of them to and fro.
+    """
+    vigilance, tau, max_epochs, rate_start, rate_end, reach_start, reach_end, work_limit = learning
     n = vectors.shape[0]
     module = np.empty(n)
     largest = 0.0

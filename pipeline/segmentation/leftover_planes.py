@@ -16,6 +16,7 @@ from pipeline.segmentation.plane_regression import (
     add_point,
     best_fit_plane,
     cosine_of_slope,
+    height_above,
     mean_square_residual,
 )
 
@@ -52,13 +53,7 @@ def cluster_leftovers(
     next_label = 0
     for i in range(n):
         next_label = max(next_label, labels[i] + 1)
-    flatness = np.full(n, np.inf)
-    for i in range(n):
-        if labels[i] < 0:
-            sums = _sums_of_neighbourhood(points, neighbours, grown, i)
-            a, b, c, fitted = best_fit_plane(sums)
-            if fitted and sums[0] >= _MIN_SEED_POINTS:
-                flatness[i] = mean_square_residual(sums, a, b, c) * cosine_of_slope(a, b) ** 2
+    flatness = _flatness(points, neighbours, labels)
     queue = np.empty(n, np.int32)
     asked = np.full(n, -1, np.int32)
     for seed in ascending_order(flatness):
@@ -91,7 +86,7 @@ def cluster_leftovers(
                 if j < 0 or grown[j] >= 0 or asked[j] == seed:
                     continue
                 asked[j] = seed
-                if abs(points[j, 2] - a * points[j, 0] - b * points[j, 1] - c) * cosine <= distance_m:
+                if abs(height_above(points, j, a, b, c)) * cosine <= distance_m:
                     queue[held] = j
                     held += 1
         if at == held and held >= fewest_points:
@@ -99,6 +94,19 @@ def cluster_leftovers(
                 grown[queue[s]] = next_label
             next_label += 1
     return grown
+
+
+@kernel
+def _flatness(points: FloatArray, neighbours: LabelArray, labels: LabelArray) -> FloatArray:
+    """Mean square perpendicular residual of each leftover point's neighbourhood, (n,) m2; infinite without a plane."""
+    flatness = np.full(labels.size, np.inf)
+    for i in range(labels.size):
+        if labels[i] < 0:
+            sums = _sums_of_neighbourhood(points, neighbours, labels, i)
+            a, b, c, fitted = best_fit_plane(sums)
+            if fitted and sums[0] >= _MIN_SEED_POINTS:
+                flatness[i] = mean_square_residual(sums, a, b, c) * cosine_of_slope(a, b) ** 2
+    return flatness
 
 
 @kernel

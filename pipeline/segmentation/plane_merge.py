@@ -180,6 +180,28 @@ def _merged_residual(
 
 
 @kernel
+def _chains_of_partners(pairs: IntArray, n: int) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Chains of the partners of n clusters: first and last entry of each, (n,); what follows an entry, its partner.
+
+    Two entries per pair, in the order of the pairs, codes low * n + high; -1 ends a chain.
+    """
+    first = np.full(n, -1, np.int64)
+    last = np.full(n, -1, np.int64)
+    following = np.full(2 * pairs.size, -1, np.int64)
+    partner = np.empty(2 * pairs.size, np.int64)
+    for p in range(pairs.size):
+        i, j = pairs[p] // n, pairs[p] % n
+        for entry, owner, other in ((2 * p, i, j), (2 * p + 1, j, i)):
+            partner[entry] = other
+            if first[owner] < 0:
+                first[owner] = entry
+            else:
+                following[last[owner]] = entry
+            last[owner] = entry
+    return first, last, following, partner
+
+
+@kernel
 def merge_planes(
     sums: FloatArray,
     planes: FloatArray,
@@ -219,25 +241,13 @@ def merge_planes(
     small = float(small_cluster_points)
     root = np.arange(n).astype(np.int32)
     version = np.zeros(n, np.int32)
-    # Chains of partners, two entries a pair.
-    first = np.full(n, -1, np.int64)
-    last = np.full(n, -1, np.int64)
-    following = np.full(2 * pairs.size, -1, np.int64)
-    partner = np.empty(2 * pairs.size, np.int64)
+    first, last, following, partner = _chains_of_partners(pairs, n)
     # pairs of clusters, low * n + high, with the sum of their versions
     queue = heap_with_room(pairs.size + 16)
     held = 0
     work = 0
     for p in range(pairs.size):
-        i = pairs[p] // n
-        j = pairs[p] % n
-        for entry, owner, other in ((2 * p, i, j), (2 * p + 1, j, i)):
-            partner[entry] = other
-            if first[owner] < 0:
-                first[owner] = entry
-            else:
-                following[last[owner]] = entry
-            last[owner] = entry
+        i, j = pairs[p] // n, pairs[p] % n
         work += 1
         residual = _merged_residual(sums, planes, i, j, min_cosine, min_cosine_small, small)
         if residual < max_residual_m:
@@ -257,10 +267,7 @@ def merge_planes(
         version[i] += 1
         version[j] = -1
         sums[i] += sums[j]
-        a, b, c, _ = best_fit_plane(sums[i])
-        planes[i, 0] = a
-        planes[i, 1] = b
-        planes[i, 2] = c
+        planes[i, 0], planes[i, 1], planes[i, 2], _ = best_fit_plane(sums[i])
         following[last[i]] = first[j]
         last[i] = last[j]
         # The merged cluster is compared with all partners of both, each once; spent entries leave the chain.
@@ -282,8 +289,7 @@ def merge_planes(
             mark[other] = merges
             partner[entry] = other
             work += 1
-            low = min(i, other)
-            high = max(i, other)
+            low, high = min(i, other), max(i, other)
             residual = _merged_residual(sums, planes, low, high, min_cosine, min_cosine_small, small)
             if residual < max_residual_m:
                 queue = heap_push(queue, held, residual, low * n + high, version[low] + version[high])

@@ -94,6 +94,26 @@ def mean_square_residual(sums: FloatArray, a: float, b: float, c: float) -> floa
 
 
 @kernel
+def height_above(points: FloatArray, i: int, a: float, b: float, c: float) -> float:
+    """Vertical distance of point i above a plane, metres; negative below it."""
+    return float(points[i, 2] - a * points[i, 0] - b * points[i, 1] - c)
+
+
+@kernel
+def has_company(
+    points: FloatArray, neighbours: LabelArray, j: int, a: float, b: float, c: float, reach: float, share: float
+) -> bool:
+    """Whether at least a share of the neighbours of point j lies within a vertical reach of a plane."""
+    known = 0
+    near = 0
+    for other in neighbours[j]:
+        if other >= 0:
+            known += 1
+            near += abs(height_above(points, other, a, b, c)) <= reach
+    return bool(near >= share * known)
+
+
+@kernel
 def cosine_of_slope(a: float, b: float) -> float:
     """Turns a vertical distance to the plane into a perpendicular one (Eq. 1)."""
     return 1.0 / math.sqrt(1.0 + a * a + b * b)

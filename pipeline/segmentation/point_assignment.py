@@ -16,6 +16,40 @@ def distance_to_plane(points: FloatArray, i: int, planes: FloatArray, k: int) ->
     return float(abs(vertical) * cosine_of_slope(planes[k, 0], planes[k, 1]))
 
 
+@kernel(inline="always")
+def _relative_distance(
+    points: FloatArray, i: int, planes: FloatArray, cosines: FloatArray, k: int, distance_m: float
+) -> float:
+    """Perpendicular distance of a point to a plane whose cosine of slope is known, over the largest one."""
+    vertical = points[i, 2] - planes[k, 0] * points[i, 0] - planes[k, 1] * points[i, 1] - planes[k, 2]
+    return float(abs(vertical) * cosines[k] / distance_m)
+
+
+@kernel
+def _votes(
+    neighbours: LabelArray, labels: LabelArray, usable: BoolArray, i: int, kind: LabelArray, votes: LabelArray
+) -> int:
+    """Fill in the planes of a point and its neighbours, each once, and the votes of the neighbours; how many planes."""
+    kinds = 0
+    for q in range(-1, neighbours.shape[1]):
+        j = i if q < 0 else neighbours[i, q]
+        if j < 0 or (q >= 0 and j == i):
+            continue
+        k = labels[j]
+        if k < 0 or not usable[k]:
+            continue
+        at = 0
+        while at < kinds and kind[at] != k:
+            at += 1
+        if at == kinds:
+            kind[at] = k
+            votes[at] = 0
+            kinds += 1
+        if q >= 0:
+            votes[at] += 1
+    return kinds
+
+
 @kernel
 def vote_among_neighbours(
     points: FloatArray,
@@ -80,37 +114,18 @@ def vote_among_neighbours(
             if not asked:
                 continue
             if alike and usable[old[i]]:
-                k = old[i]
-                vertical = points[i, 2] - planes[k, 0] * points[i, 0] - planes[k, 1] * points[i, 1] - planes[k, 2]
-                ratio = abs(vertical) * cosines[k] / distance_m
+                ratio = _relative_distance(points, i, planes, cosines, old[i], distance_m)
                 if ratio > 1.0 or not ratio * ratio - vote_weight * width < 1.0:
                     new[i] = -1
                     changes[n_changes] = i
                     n_changes += 1
                 continue
-            kinds = 0
-            for q in range(-1, width):
-                j = i if q < 0 else neighbours[i, q]
-                if j < 0 or (q >= 0 and j == i):
-                    continue
-                k = old[j]
-                if k < 0 or not usable[k]:
-                    continue
-                at = 0
-                while at < kinds and kind[at] != k:
-                    at += 1
-                if at == kinds:
-                    kind[at] = k
-                    votes[at] = 0
-                    kinds += 1
-                if q >= 0:
-                    votes[at] += 1
+            kinds = _votes(neighbours, old, usable, i, kind, votes)
             least = 1.0
             chosen = np.int32(-1)
             for s in range(kinds):
                 k = kind[s]
-                vertical = points[i, 2] - planes[k, 0] * points[i, 0] - planes[k, 1] * points[i, 1] - planes[k, 2]
-                ratio = abs(vertical) * cosines[k] / distance_m
+                ratio = _relative_distance(points, i, planes, cosines, k, distance_m)
                 if ratio > 1.0:
                     continue
                 cost = ratio * ratio - vote_weight * votes[s]

@@ -7,9 +7,22 @@ import numpy as np
 from pipeline.compiler import kernel
 from pipeline.kernels.counting_sort import counting_sort
 from pipeline.kernels.merge_sort import ascending_order
-from pipeline.model import BoolArray, FloatArray, LabelArray
+from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_merge import touching_pairs
 from pipeline.segmentation.point_assignment import distance_to_plane
+
+
+@kernel
+def _partners(pairs: IntArray, n: int) -> tuple[LabelArray, LabelArray]:
+    """Partners of each of n clusters, ascending, from codes low * n + high: where those of each start, and they."""
+    m = pairs.size
+    owners = np.empty(2 * m, np.int32)
+    for p in range(m):
+        owners[p], owners[m + p] = pairs[p] % n, pairs[p] // n
+    first, partner = counting_sort(owners, n)
+    for p in range(2 * m):
+        partner[p] = owners[(partner[p] + m) % (2 * m)]
+    return first, partner
 
 
 @kernel
@@ -49,14 +62,7 @@ def dissolve_redundant(
     pairs = touching_pairs(neighbours, labels, usable)
     if plane_cost <= 0.0 or pairs.size == 0:
         return
-    # the partners of every cluster, ascending: as the higher of a pair, then as the lower
-    m = pairs.size
-    owners = np.empty(2 * m, np.int32)
-    for p in range(m):
-        owners[p], owners[m + p] = pairs[p] % n, pairs[p] // n
-    first, partner = counting_sort(owners, n)
-    for p in range(2 * m):
-        partner[p] = owners[(partner[p] + m) % (2 * m)]
+    first, partner = _partners(pairs, n)
     begin, member = counting_sort(labels, n)
     size = np.empty(n, np.int64)
     for k in range(n):

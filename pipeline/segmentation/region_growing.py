@@ -7,13 +7,22 @@ parallel faces of two roofs, becomes several regions.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.errors import BuildingError
 from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import FloatArray, LabelArray, Reason
-from pipeline.segmentation.plane_regression import N_SUMS, add_point, best_fit_plane, cosine_of_slope
+from pipeline.segmentation.plane_regression import (
+    N_SUMS,
+    add_point,
+    best_fit_plane,
+    cosine_of_slope,
+    has_company,
+    height_above,
+)
 from pipeline.segmentation.plane_settings import RegionGrowingSettings
 
 WORK_LIMIT = 1_000_000_000
@@ -69,11 +78,7 @@ def grow_regions(
         np.ascontiguousarray(neighbours, dtype=np.int32),
         clusters.astype(np.int32),
         np.ascontiguousarray(gradients, dtype=np.float64),
-        distance_m,
-        max(fewest_points, 3),
-        settings.agreeing_share,
-        settings.free_plane_points,
-        work_limit,
+        _Rules(distance_m, max(fewest_points, 3), settings.agreeing_share, settings.free_plane_points, work_limit),
     )
     if work > work_limit:
         raise BuildingError(
@@ -81,6 +86,16 @@ def grow_regions(
             f"region growing stood at {work} looks at neighbours of {len(points)} points, the limit is {work_limit}",
         )
     return planes, labels
+
+
+class _Rules(NamedTuple):
+    """`RegionGrowingSettings` for one building."""
+
+    distance_m: float
+    fewest_points: int
+    agreeing_share: float
+    free_plane_points: int
+    work_limit: int
 
 
 @kernel
@@ -108,24 +123,15 @@ def _misfits(points: FloatArray, neighbours: LabelArray, clusters: LabelArray, g
 
 
 @kernel
-def _near(points: FloatArray, i: int, a: float, b: float, c: float, reach: float) -> bool:
-    """Whether a point lies within a vertical reach of a plane."""
-    return bool(abs(points[i, 2] - a * points[i, 0] - b * points[i, 1] - c) <= reach)
-
-
-@kernel
 def _grow_regions(
     points: FloatArray,
     neighbours: LabelArray,
     clusters: LabelArray,
     gradients: FloatArray,
-    distance_m: float,
-    fewest_points: int,
-    agreeing_share: float,
-    free_plane_points: int,
-    work_limit: int,
+    rules: _Rules,
 ) -> tuple[FloatArray, LabelArray, int]:
     """Kernel of `grow_regions`; the looks at neighbours too, with which it gives up beyond the limit."""
+    distance_m, fewest_points, agreeing_share, free_plane_points, work_limit = rules
     n = len(points)
     work = 0
     labels = np.full(n, -1, np.int32)
@@ -166,16 +172,10 @@ def _grow_regions(
             for j in neighbours[i]:
                 if j < 0 or labels[j] >= 0 or asked[j] == seed:
                     continue
-                if not _near(points, j, a, b, c, reach):
+                if abs(height_above(points, j, a, b, c)) > reach:
                     continue
-                known = 0
-                agreeing = 0
                 work += neighbours.shape[1]
-                for other in neighbours[j]:
-                    if other >= 0:
-                        known += 1
-                        agreeing += _near(points, other, a, b, c, reach)
-                if agreeing >= agreeing_share * known:
+                if has_company(points, neighbours, j, a, b, c, reach, agreeing_share):
                     asked[j] = seed
                     queue[held] = j
                     held += 1
@@ -183,8 +183,6 @@ def _grow_regions(
         if held >= fewest_points and fitted:
             for q in range(held):
                 labels[queue[q]] = count
-            planes[count, 0] = a
-            planes[count, 1] = b
-            planes[count, 2] = c
+            planes[count, 0], planes[count, 1], planes[count, 2] = a, b, c
             count += 1
     return planes[:count].copy(), labels, work

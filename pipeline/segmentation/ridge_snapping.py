@@ -1,14 +1,14 @@
 """Straight ridges: points near the line in which two roof planes meet (Shorter and Kasparis, end of section 3.3).
 
-The paper moves the points near the intersection of two planes onto that line. A roof that is modelled from labels
-wants the same in the domain of labels: the points near the line take the label of the side on which they lie, so the
-border between two planes becomes exactly their intersection. Both forms are here.
+The paper moves the points near the intersection of two planes onto that line. Here, where a roof is modelled from
+labels, the points near the line take the label of the side on which they lie: the border between two planes becomes
+exactly their intersection.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,8 +24,7 @@ _MIN_AGREEMENT = 0.7
 """Share of the points along a border that must lie on their plane's own side."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Ridge:
+class Ridge(NamedTuple):
     """Where two planes meet: a ridge, a hip or a valley, as a segment in plan."""
 
     plane_low: int
@@ -115,50 +114,6 @@ def label_by_ridges(
     return snapped
 
 
-def snap_to_ridges(
-    points: FloatArray,
-    planes: FloatArray,
-    labels: LabelArray,
-    ridges: tuple[Ridge, ...],
-    *,
-    distance_m: float,
-    reach_m: float,
-) -> FloatArray:
-    """The paper's own form: points moved onto their plane, and those near a ridge onto its line.
-
-    Labelled points get the elevation of their plane. Points within reach of a ridge, of one of its two labels, that
-    both planes explain, go to the foot of the perpendicular in plan, at the elevation where the planes meet; the
-    nearest ridge wins. Unlabelled points stay. Parameters as for `find_ridges`.
-
-    Returns
-    -------
-    (n, 3) float64
-        Moved points, metres; the given array is not touched.
-    """
-    moved = points.copy()
-    on_plane = np.flatnonzero(labels >= 0)
-    coefficients = planes[labels[on_plane]]
-    moved[on_plane, 2] = _elevation(coefficients, points[on_plane])
-    nearest_m = np.full(len(points), np.inf)
-    members = _members(labels, len(planes))
-    for ridge in ridges:
-        near, distance = _near(points, planes, members, ridge, distance_m, reach_m)
-        closer = np.abs(distance) < nearest_m[near]
-        near, distance = near[closer], distance[closer]
-        nearest_m[near] = np.abs(distance)
-        gradient = planes[ridge.plane_low] - planes[ridge.plane_high]
-        steepness = math.hypot(gradient[0], gradient[1])
-        moved[near, 0] = points[near, 0] - distance * gradient[0] / steepness
-        moved[near, 1] = points[near, 1] - distance * gradient[1] / steepness
-        moved[near, 2] = _elevation(planes[ridge.plane_low][None, :], moved[near])
-    return moved
-
-
-def _elevation(coefficients: FloatArray, points: FloatArray) -> FloatArray:
-    """Elevation of planes at points, row by row."""
-    return np.asarray(coefficients[:, 0] * points[:, 0] + coefficients[:, 1] * points[:, 1] + coefficients[:, 2])
-
-
 def _members(labels: LabelArray, n_planes: int) -> tuple[IntArray, IntArray]:
     """Points by plane: where those of each begin, (n_planes + 1,), and their indices, ascending."""
     order = np.argsort(labels, kind="stable")
@@ -180,7 +135,7 @@ def _near(
     begin, order = members
     low, high = ridge.plane_low, ridge.plane_high
     index = np.concatenate([order[begin[low] : begin[low + 1]], order[begin[high] : begin[high + 1]]])
-    return _near_segment(points, planes, index, low, high, *ridge.start, *ridge.end, distance_m, reach_m)
+    return _near_segment(points, planes, index, ridge, distance_m, reach_m)
 
 
 @kernel
@@ -188,16 +143,13 @@ def _near_segment(
     points: FloatArray,
     planes: FloatArray,
     index: IntArray,
-    low: int,
-    high: int,
-    start_x: float,
-    start_y: float,
-    end_x: float,
-    end_y: float,
+    ridge: Ridge,
     distance_m: float,
     reach_m: float,
 ) -> tuple[IntArray, FloatArray]:
     """The kernel of `_near` over the points of an index."""
+    low, high = ridge.plane_low, ridge.plane_high
+    (start_x, start_y), (end_x, end_y) = ridge.start, ridge.end
     gradient_x = planes[low, 0] - planes[high, 0]
     gradient_y = planes[low, 1] - planes[high, 1]
     steepness = math.hypot(gradient_x, gradient_y)
@@ -251,9 +203,7 @@ def _segments(
         end = begin
         while end < border.size and border[end] // n == pair:
             end += 1
-        low = pair // n_planes
-        high = pair % n_planes
-        if _segment(points, planes, labels, border[begin:end] % n, low, high, distance_m, reach_m, rows[count]):
+        if _segment(points, planes, labels, border[begin:end] % n, pair, distance_m, reach_m, rows[count]):
             count += 1
         begin = end
     return rows[:count].copy()
@@ -285,13 +235,13 @@ def _segment(
     planes: FloatArray,
     labels: LabelArray,
     border: IntArray,
-    low: int,
-    high: int,
+    pair: int,
     distance_m: float,
     reach_m: float,
     row: FloatArray,
 ) -> bool:
-    """Fill the row of the ridge between two planes; False where they do not meet along their border."""
+    """Fill the row of the ridge between the planes of a code low * planes + high; False where they have none."""
+    low, high = pair // len(planes), pair % len(planes)
     gradient_x = planes[low, 0] - planes[high, 0]
     gradient_y = planes[low, 1] - planes[high, 1]
     steepness = math.hypot(gradient_x, gradient_y)

@@ -9,17 +9,21 @@ region's points of 1 - (distance / limit)^2, the complement of MSAC's cost (Torr
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.compiler import kernel
 from pipeline.kernels.heap import heap_pop, heap_push, heap_with_room
+from pipeline.kernels.merge_sort import ascending_order
 from pipeline.model import FloatArray, IntArray, LabelArray
 from pipeline.segmentation.plane_regression import (
     N_SUMS,
     add_point,
     best_fit_plane,
     cosine_of_slope,
+    has_company,
+    height_above,
     mean_square_residual,
 )
 
@@ -41,24 +45,27 @@ _REFIT_GROWTH = 1.3
 """A region is fitted again each time that it has grown by this factor."""
 
 
+class Surroundings(NamedTuple):
+    """Points with their neighbours, and the plane of each with these."""
+
+    points: FloatArray
+    """(n, 3) float64, metres."""
+    neighbours: LabelArray
+    """(n, k) int32, nearest neighbours of every point, the nearest first, -1 where there are fewer."""
+    planes: FloatArray
+    """(n, 3) float64, (a, b, c) of z = a x + b y + c."""
+    variances: FloatArray
+    """(n,) float64, sum of squared perpendicular residuals over the degrees of freedom, square metres; infinite where
+    there is no plane."""
+    order: IntArray
+    """(n,) int64, the points by ascending variance."""
+
+
 @kernel
-def local_planes(points: FloatArray, neighbours: LabelArray) -> tuple[FloatArray, FloatArray]:
+def local_planes(points: FloatArray, neighbours: LabelArray) -> Surroundings:
     """The plane of every point and its nearest neighbours.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Metres.
-    neighbours : (n, k) int32
-        Nearest neighbours of every point, the nearest first, -1 where there are fewer.
-
-    Returns
-    -------
-    planes : (n, 3) float64
-        (a, b, c) of z = a x + b y + c.
-    variances : (n,) float64
-        Sum of squared perpendicular residuals over the degrees of freedom, square metres; infinite where there is no
-        plane.
+    Arguments as in `Surroundings`.
     """
     n = len(points)
     planes = np.zeros((n, 3))
@@ -76,21 +83,15 @@ def local_planes(points: FloatArray, neighbours: LabelArray) -> tuple[FloatArray
         if fitted and sums[0] > 3.0:
             square = mean_square_residual(sums, a, b, c) * cosine_of_slope(a, b) ** 2
             variances[i] = square * sums[0] / (sums[0] - 3.0)
-    return planes, variances
+    return Surroundings(points, neighbours, planes, variances, ascending_order(variances))
 
 
 @kernel(inline="always")
 def noise_of_local_planes(variances: FloatArray, order: IntArray) -> float:
-    """Standard deviation of the noise, metres, from what `local_planes` tells; 0 where there is no plane.
+    """Standard deviation of the noise, metres, from `local_planes`; 0 where there is no plane.
 
     From the lower quartile: neighbourhoods across edges and in trees are the upper part of the distribution.
-
-    Parameters
-    ----------
-    variances : (n,) float64
-        From `local_planes`.
-    order : (n,) int64
-        The points by ascending variance.
+    Arguments as in `Surroundings`.
     """
     known = 0
     for variance in variances:
@@ -100,65 +101,67 @@ def noise_of_local_planes(variances: FloatArray, order: IntArray) -> float:
     return math.sqrt(variances[order[(known - 1) // 4]] * _FREEDOM / _LOWER_QUARTILE_CHI2)
 
 
-@kernel
-def _height(points: FloatArray, i: int, a: float, b: float, c: float) -> float:
-    """Height of a point above a plane."""
-    return float(points[i, 2] - a * points[i, 0] - b * points[i, 1] - c)
+class TrialLimits(NamedTuple):
+    """Which regions are taken."""
+
+    distance_m: float
+    """Largest perpendicular distance of a point to the plane of the region that it joins."""
+    min_normal_cosine: float
+    """Least cosine between that plane and the point's own; 0: points need company instead."""
+    fewest_points: int
+    """Smaller regions are not taken."""
+    min_cosine: float
+    """Regions with a smaller cosine of their slope are not taken."""
+
+
+class _Trial(NamedTuple):
+    """Memory of the trial regions, used again for each of them."""
+
+    asked: LabelArray
+    """(n,) int32, number of the last region that asked or holds a point."""
+    refused: LabelArray
+    """(n + 1,) int32, number of the last plane that refused a point; in the last entry how many planes there were."""
+    queue: LabelArray
+    """(n,) int32, points of a region."""
 
 
 @kernel
 def _joins(
-    points: FloatArray,
-    neighbours: LabelArray,
-    local: FloatArray,
-    cosines: FloatArray,
-    j: int,
-    a: float,
-    b: float,
-    c: float,
-    reach: float,
-    least: float,
+    surroundings: Surroundings, cosines: FloatArray, j: int, a: float, b: float, c: float, reach: float, least: float
 ) -> bool:
     """Whether a point is near a plane and of its direction or, where that says nothing, in company there.
 
     `least` is the least cosine between the two directions over the cosine of the plane's slope; 0 asks for company.
     """
-    if abs(_height(points, j, a, b, c)) > reach:
+    points, local = surroundings.points, surroundings.planes
+    if abs(height_above(points, j, a, b, c)) > reach:
         return False
     if least > 0.0:
         return bool((a * local[j, 0] + b * local[j, 1] + 1.0) * cosines[j] >= least)
-    known = 0
-    near = 0
-    for other in neighbours[j]:
-        if other >= 0:
-            known += 1
-            near += abs(_height(points, other, a, b, c)) <= reach
-    return near >= _COMPANY * known
+    return has_company(points, surroundings.neighbours, j, a, b, c, reach, _COMPANY)
 
 
 @kernel
 def _grow(
-    points: FloatArray,
-    neighbours: LabelArray,
-    local: FloatArray,
+    surroundings: Surroundings,
     cosines: FloatArray,
     labels: LabelArray,
     reached: LabelArray,
     seed: int,
-    distance_m: float,
-    min_normal_cosine: float,
-    asked: LabelArray,
+    limits: TrialLimits,
+    trial: _Trial,
     mark: int,
-    refused: LabelArray,
-    queue: LabelArray,
 ) -> tuple[int, float, float, float, float]:
-    """A region from a seed over unlabelled points: how many, at the head of `queue`; (a, b, c) of it; its gain.
+    """A region from a seed over unlabelled points: how many, at the head of `trial.queue`; (a, b, c) of it; its gain.
 
-    None at all where it only repeats regions before it. A point that one plane refused is not asked again until there
-    is another one: `refused` has the number of that plane, its last entry how many there were.
+    No points where it only repeats regions before it. A point that one plane refused is not asked again until the
+    region has another one.
     """
+    points, neighbours = surroundings.points, surroundings.neighbours
+    distance_m, min_normal_cosine = limits.distance_m, limits.min_normal_cosine
+    asked, refused, queue = trial
     n = len(points)
-    a, b, c = local[seed, 0], local[seed, 1], local[seed, 2]
+    a, b, c = surroundings.planes[seed]
     sums = np.zeros(N_SUMS)
     queue[0] = seed
     asked[seed] = mark
@@ -187,7 +190,7 @@ def _grow(
         for j in neighbours[i]:
             if j < 0 or labels[j] >= 0 or asked[j] == mark or refused[j] == refused[n]:
                 continue
-            if _joins(points, neighbours, local, cosines, j, a, b, c, reach, least):
+            if _joins(surroundings, cosines, j, a, b, c, reach, least):
                 asked[j] = mark
                 queue[held] = j
                 held += 1
@@ -201,7 +204,7 @@ def _grow(
     gain = 0.0
     for q in range(held):
         i = queue[q]
-        ratio = _height(points, i, a, b, c) / reach
+        ratio = height_above(points, i, a, b, c) / reach
         if abs(ratio) <= 1.0:
             queue[kept] = i
             kept += 1
@@ -210,19 +213,7 @@ def _grow(
 
 
 @kernel
-def take_regions(
-    points: FloatArray,
-    neighbours: LabelArray,
-    local: FloatArray,
-    variances: FloatArray,
-    order: IntArray,
-    labels: LabelArray,
-    first_label: int,
-    distance_m: float,
-    min_normal_cosine: float,
-    fewest_points: int,
-    min_cosine: float,
-) -> int:
+def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: int, limits: TrialLimits) -> int:
     """Label regions among the unlabelled points, the greatest gain first, in place.
 
     A gain can only fall as other regions take points, so the best trial region grows anew and is taken if it is still
@@ -230,53 +221,39 @@ def take_regions(
 
     Parameters
     ----------
-    points : (n, 3) float64
-        Metres.
-    neighbours : (n, k) int32
-        Nearest neighbours of every point, -1 where there are fewer.
-    local, variances : (n, 3) and (n,) float64
-        From `local_planes`.
-    order : (n,) int64
-        The points by ascending variance: those of little variance are the first seeds.
+    surroundings : Surroundings
+        From `local_planes`. Points of little variance are the first seeds.
     labels : (n,) int32
         -1 for none; changed.
     first_label : int
         Of the first region.
-    distance_m : float
-        Largest perpendicular distance of a point to the plane of the region that it joins.
-    min_normal_cosine : float
-        Least cosine between that plane and the point's own; 0: points need company instead.
-    fewest_points : int
-        Smaller regions are not taken.
-    min_cosine : float
-        Regions with a smaller cosine of their slope are not taken.
+    limits : TrialLimits
+        Which regions are taken.
 
     Returns
     -------
     int
         One more than the last label.
     """
-    n = len(points)
+    neighbours, local = surroundings.neighbours, surroundings.planes
+    distance_m, fewest_points = limits.distance_m, limits.fewest_points
+    n = len(labels)
     cosines = np.empty(n)
     for i in range(n):
         cosines[i] = cosine_of_slope(local[i, 0], local[i, 1])
-    asked = np.full(n, -1, np.int32)
-    refused = np.zeros(n + 1, np.int32)
-    queue = np.empty(n, np.int32)
+    asked, queue = np.full(n, -1, np.int32), np.empty(n, np.int32)
+    trial = _Trial(asked, np.zeros(n + 1, np.int32), queue)
     reached = np.zeros(n, np.int32)
     anew = np.zeros(n, np.int32)
     # the loss of every trial region and its seed, behind them that of none
     trials, held_trials = heap_push(heap_with_room(64), 0, 0.0, -1, 0), 1
     mark = 0
-    for seed in order:
-        if variances[seed] > 4.0 * distance_m * distance_m:
+    for seed in surroundings.order:
+        if surroundings.variances[seed] > 4.0 * distance_m * distance_m:
             break
         if labels[seed] >= 0 or reached[seed] >= _TRIALS:
             continue
-        held, a, b, c, gain = _grow(
-            points, neighbours, local, cosines, labels, reached, seed, distance_m, min_normal_cosine, asked, mark,
-            refused, queue,
-        )  # fmt: skip
+        held, a, b, c, gain = _grow(surroundings, cosines, labels, reached, seed, limits, trial, mark)
         reached[seed] += 1
         if held >= fewest_points:
             # points just beyond the limit would only grow the same region once more
@@ -284,10 +261,10 @@ def take_regions(
             for q in range(held):
                 reached[queue[q]] += 1
                 for j in neighbours[queue[q]]:
-                    if j >= 0 and asked[j] != mark and abs(_height(points, j, a, b, c)) <= beside:
+                    if j >= 0 and asked[j] != mark and abs(height_above(surroundings.points, j, a, b, c)) <= beside:
                         asked[j] = mark
                         reached[j] += 1
-            if cosine_of_slope(a, b) >= min_cosine:
+            if cosine_of_slope(a, b) >= limits.min_cosine:
                 trials = heap_push(trials, held_trials, -gain, seed, 0)
                 held_trials += 1
         mark += 1
@@ -298,12 +275,9 @@ def take_regions(
         held_trials -= 1
         if labels[seed] >= 0:
             continue
-        held, a, b, _, gain = _grow(
-            points, neighbours, local, cosines, labels, anew, seed, distance_m, min_normal_cosine, asked, mark,
-            refused, queue,
-        )  # fmt: skip
+        held, a, b, _, gain = _grow(surroundings, cosines, labels, anew, seed, limits, trial, mark)
         mark += 1
-        if held < fewest_points or cosine_of_slope(a, b) < min_cosine:
+        if held < fewest_points or cosine_of_slope(a, b) < limits.min_cosine:
             continue
         if gain < -lost and -gain > trials.keys[0]:
             trials = heap_push(trials, held_trials, -gain, seed, 0)

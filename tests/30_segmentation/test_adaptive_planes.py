@@ -16,7 +16,7 @@ from pipeline.model import BoolArray, FloatArray, IntArray, LabelArray
 from pipeline.segmentation.adaptive_planes import DetectedPlanes, detect_planes, mean_nodes, merge_by_f_test
 from pipeline.segmentation.plane_regression import cluster_sums
 from pipeline.segmentation.plane_settings import AdaptivePlaneSettings
-from pipeline.segmentation.trial_regions import local_planes, noise_of_local_planes, take_regions
+from pipeline.segmentation.trial_regions import TrialLimits, local_planes, noise_of_local_planes, take_regions
 
 LENGTH_M, WIDTH_M = 20.0, 12.0
 
@@ -306,7 +306,7 @@ def test_a_difference_within_the_noise_of_few_points_is_none() -> None:
 
 def test_the_noise_of_local_planes_is_that_of_the_points() -> None:
     points = gable(4.0, 0.05, rise=0.2)
-    _, variances = local_planes(points, nearest_neighbours(points, 10))
+    variances = local_planes(points, nearest_neighbours(points, 10)).variances
     assert noise_of_local_planes(variances, np.argsort(variances)) == pytest.approx(0.05, rel=0.2)
     assert noise_of_local_planes(np.full(3, np.inf), np.arange(3)) == 0.0
 
@@ -315,10 +315,9 @@ def test_the_region_with_the_greatest_gain_is_taken_first() -> None:
     points = gable(4.0, 0.02)
     points = points[(points[:, 1] < 6) | (points[:, 0] < 8)]
     neighbours = nearest_neighbours(points, 10)
-    local, variances = local_planes(points, neighbours)
+    surroundings = local_planes(points, neighbours)
     labels = np.full(len(points), -1, np.int32)
-    order = np.argsort(variances)
-    assert take_regions(points, neighbours, local, variances, order, labels, 0, 0.1, 0.0, 20, 0.3) == 2
+    assert take_regions(surroundings, labels, 0, TrialLimits(0.1, 0.0, 20, 0.3)) == 2
     assert np.median(labels[points[:, 1] < 5]) == 0
     assert np.median(labels[points[:, 1] > 7]) == 1
 

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.geometry import nearest_neighbours
 from pipeline.model import FloatArray, LabelArray
-from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges, snap_to_ridges
+from pipeline.segmentation.ridge_snapping import find_ridges, label_by_ridges
 
 NEAR = {"distance_m": 0.35, "reach_m": 0.8}
 
@@ -68,30 +68,6 @@ def test_unlabelled_points_stay_unlabelled() -> None:
     labels = np.where(np.arange(500) % 10 == 0, -1, true).astype(np.int32)
     ridges = find_ridges(points, planes, labels, nearest_neighbours(points, 9), **NEAR)
     assert (label_by_ridges(points, planes, labels, ridges, **NEAR)[::10] == -1).all()
-
-
-def test_moved_points_lie_on_their_plane_and_near_the_ridge_on_its_line() -> None:
-    points, planes, true, _ = two_planes("ridge")
-    ridges = find_ridges(points, planes, true, nearest_neighbours(points, 9), **NEAR)
-    moved = snap_to_ridges(points, planes, true, ridges, **NEAR)
-    on_plane = planes[true, 0] * moved[:, 0] + planes[true, 1] * moved[:, 1] + planes[true, 2]
-    np.testing.assert_allclose(moved[:, 2], on_plane, atol=1e-9)
-    near = (np.abs(points[:, 1]) < 0.2) & (points[:, 0] > 1) & (points[:, 0] < 11)
-    assert near.sum() > 10
-    np.testing.assert_allclose(moved[near, 1], 0.0, atol=1e-9)
-    np.testing.assert_allclose(moved[near, 2], 8.0, atol=1e-9)
-    np.testing.assert_array_equal(moved[near, 0], points[near, 0])
-    apart = np.abs(points[:, 1]) > 0.8
-    np.testing.assert_array_equal(moved[apart, :2], points[apart, :2])
-
-
-def test_moving_does_not_touch_unlabelled_points_nor_the_input() -> None:
-    points, planes, _, _ = two_planes("ridge")
-    before = points.copy()
-    moved = snap_to_ridges(points, planes, np.full(500, -1, np.int32), (), **NEAR)
-    np.testing.assert_array_equal(moved, before)
-    snap_to_ridges(points, planes, np.zeros(500, np.int32), (), **NEAR)
-    np.testing.assert_array_equal(points, before)
 
 
 def test_a_step_has_no_ridge() -> None:
