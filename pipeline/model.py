@@ -55,12 +55,12 @@ REASONS: Mapping[Reason, str] = {
     "explains less than three quarters",
     Reason.NO_PLANE: "no plane passed the refinement",
     Reason.NO_PARTITION: "the planes could not be turned into roof faces",
-    Reason.INVALID_SOLID: "the solid broke a validity rule; `validity_codes` tells which",
+    Reason.INVALID_SOLID: "the solid broke a validity rule; `validity_codes` lists which",
     Reason.TOO_COMPLEX: "the counted work passed its bound",
     Reason.NO_FOOTPRINT: "no outline could be made from the points",
     Reason.INTERNAL_ERROR: "a fault of gablework in this one building; the detail names the exception; kept as a "
     "bundle",
-    Reason.CRASHED: "its process died at it, twice, the second time alone; the detail tells the signal or the exit "
+    Reason.CRASHED: "its process died at it, twice, the second time alone; the detail names the signal or the exit "
     "code; kept as a bundle",
     Reason.TIMED_OUT: "it took longer than the limit that protects the run (`--building-timeout`); kept as a bundle",
     Reason.OUT_OF_MEMORY: "it took more memory than its process may have (`--building-memory`), or the machine had no "
@@ -71,9 +71,9 @@ REASONS: Mapping[Reason, str] = {
     Reason.NO_WALLS: "too little of its outline is wall: a mound, a bank",
     Reason.VEGETATION: "rough, many returns, ground seen beneath",
     Reason.TOO_NARROW: "narrower than a building: a wall, a hedge, a wire",
-    Reason.OVERRIDDEN: "the user's overrides say that it is no building; the detail is their note",
+    Reason.OVERRIDDEN: "the user's overrides reject it; the detail is their note",
 }
-"""What the reasons mean, in words of the records' reference."""
+"""Meanings of the reasons, as in the records' reference."""
 
 
 class RoofType(StrEnum):
@@ -89,7 +89,7 @@ class RoofType(StrEnum):
 
 
 class FaceKind(StrEnum):
-    """What a face of a solid is; the semantics of OBJ groups and CityJSON surfaces."""
+    """Kind of a face of a solid; the semantics of OBJ groups and CityJSON surfaces."""
 
     ROOF = "roof"
     WALL = "wall"
@@ -206,16 +206,16 @@ class Candidate:
     """Local elevation of the lowest terrain at the outline: where the walls end."""
     split_returns: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """(k, 3) float64, those of the points whose pulse went on to a lower return: it met them with a part of its beam.
-    Empty where the file tells no returns."""
+    Empty where the file has no returns."""
     footprint: Polygon | MultiPolygon | None = None
     """Given footprint in local metres; None where none was given."""
     source_id: str | None = None
     """The given footprint's own id."""
     outline: MultiPolygon | None = None
-    """Its part of the outline that it was drawn with the units it touches, local metres; None where it stands alone."""
+    """Its part of the outline that it was drawn with the units it touches, local metres; None where it touches none."""
     beside: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """(j, 3) float64, other points within about 2 m around and beneath, of pulses with one return: facades and ground.
-    Empty unless outlines are asked for at the walls."""
+    Empty unless outlines are drawn at the walls."""
     beside_later: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     """(i, 3) float64, the same of pulses with several returns, the last of each."""
     touches_data_edge: bool = False
@@ -234,7 +234,7 @@ class PlanFace:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Segmentation:
-    """What a segmentation method returns: planes, and the plane of every point."""
+    """Result of a segmentation method: planes, and the plane of every point."""
 
     planes: tuple[Plane, ...]
     """The roof planes."""
@@ -244,7 +244,7 @@ class Segmentation:
     """The building primitive of a method that knows the whole form: its roof faces in plan, closed by walls as they
     are. None where the faces are to be drawn from the labels."""
     roof_type: RoofType | None = None
-    """What the method itself takes the roof for; None leaves it to the rule over the delivered planes."""
+    """Roof type that the method names; None leaves it to the rule over the delivered planes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -337,7 +337,7 @@ class RoofFace:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelQuality:
-    """How well the points support a delivered model; nan is what they cannot tell, or a model that does not exist."""
+    """How well the points support a delivered model: nan where they do not say, or without a model."""
 
     point_spacing_m: float = math.nan
     """Typical distance of neighbouring roof points in plan, metres."""
@@ -371,7 +371,7 @@ class LodModel:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BuildingResult:
-    """What became of a candidate. Every candidate gives one, also one that failed."""
+    """Outcome of a candidate. Every candidate has one, also one that failed."""
 
     building_id: str
     """As the candidate's."""
@@ -390,7 +390,7 @@ class BuildingResult:
     roof_type: RoofType
     """From the delivered planes; none where there is no model."""
     lod: str
-    """Of the model: the finest that was asked for, 1.2 for a fallback block, empty where there is no model."""
+    """Level of detail of the model: the finest requested, 1.2 for a fallback block, empty where there is no model."""
     footprint: Polygon | MultiPolygon | None
     """2D outline of the delivered solids in local metres (failed: of the points where that is possible)."""
     footprint_share: float = math.nan
@@ -421,4 +421,4 @@ class BuildingResult:
     touches_data_edge: bool
     """As the candidate's."""
     coarser: tuple[LodModel, ...] = ()
-    """Models at the coarser levels of detail that were asked for, the finest first; none beside a fallback block."""
+    """Models at the coarser requested levels of detail, the finest first; none beside a fallback block."""

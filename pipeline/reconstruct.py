@@ -62,7 +62,7 @@ are dense: a tree would make a roof, too."""
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Building:
-    """What every step of one building takes."""
+    """Common arguments of the steps for one building."""
 
     candidate: Candidate
     method: str
@@ -359,7 +359,7 @@ def _record(
     model : _Model
         Valid solids.
     fallback : BuildingError, optional
-        Why the model is a block; None where it is the one that was asked for.
+        Why the model is a block; None where it is the requested model.
     codes : tuple of int
         Of the faults that kept the method's own solids from delivery.
     """

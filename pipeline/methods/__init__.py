@@ -145,7 +145,7 @@ def method_named(name: str) -> Method:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ReconstructSettings:
-    """What modelling one building needs: settings of the method, of the roof and of the roof type."""
+    """Settings for modelling one building: of the method, of the roof and of the roof type."""
 
     method: Parameters | None = None
     """An instance of the method's settings class; None for its defaults."""

@@ -5,7 +5,7 @@ similarity, points to planes (2.1), least squares and convex hulls (2.2), the li
 rectangle on it that holds the hull of either side, both made equal by the larger one (2.3), the model of ten vertices
 and fifteen parameters (2.4), or its flat and pent counterparts.
 
-`KMeansSettings.faithful` is that and no more. The defaults choose the number of clusters, refine their planes, and
+`KMeansSettings.faithful` does just that. The defaults choose the number of clusters, refine their planes, and
 draw the paper's model only where it explains the building; other roofs are drawn from the labels of their points.
 """
 
@@ -45,7 +45,7 @@ from pipeline.segmentation.surrounding_ground import far_from
 from pipeline.tin.delaunay import triangulate
 
 _MIN_FACETS = 3
-"""Fewer facets are no two groups."""
+"""Fewer facets do not make two groups."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -205,13 +205,13 @@ def planes_of(top: BuildingTop, settings: KMeansSettings) -> tuple[FloatArray, L
     labels = np.where((labels >= 0) & (shares[labels] < settings.min_plane_share), -1, labels).astype(np.int32)
     planes, labels = _best_fit_planes(top.points, labels)
     if len(planes) == 2 and _angle_deg(planes[0], planes[1]) < settings.one_plane_deg:
-        # one plane on which the clusters told only noise apart
+        # one plane: the clusters differed by noise alone
         planes, labels = _best_fit_planes(top.points, np.zeros(len(labels), np.int32))
     return planes, labels
 
 
 def _refined_planes(top: BuildingTop, clusters: LabelArray, settings: KMeansSettings) -> tuple[FloatArray, LabelArray]:
-    """Parts that hang together, best-fit planes, merging, assignment anew, straight ridges."""
+    """Parts that hang together, best-fit planes, merging, reassignment, straight ridges."""
     parts = connected_parts(clusters, top.tin.neighbours)
     return planes_of_clusters(
         top.points,
@@ -302,7 +302,7 @@ def _explains(model: BuildingPrimitive, top: BuildingTop, settings: KMeansSettin
     corners = np.array(model.corners[-4:])
     along, up = corners[1] - corners[0], corners[3] - corners[0]
     columns, rows = (max(2, math.ceil(math.hypot(*side) / top.spacing_m)) for side in (along.tolist(), up.tolist()))
-    # a sample lies at least half a spacing from the next, so a point is near to no more than these of them
+    # a sample lies at least half a spacing from the next, so a point is near to at most this many
     near_to_one = (4.0 * settings.fill_gap_spacings + 2.0) ** 2
     if settings.fitting_fill * columns * rows > near_to_one * len(top.points):
         return False

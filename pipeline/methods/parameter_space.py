@@ -30,9 +30,9 @@ from pipeline.segmentation.single_linkage import cluster_by_linkage
 from pipeline.tin.delaunay import triangulate, unique_xy
 
 _MIN_POINTS = 4
-"""Below this there is neither a spacing nor a noise to speak of."""
+"""Fewest points with a spacing and a noise: a definition, not a setting."""
 _VOTING_PASSES = 4
-"""Repetitions of the choice between regions; it ends when nothing changes."""
+"""Most repetitions of the choice between regions. It ends earlier when nothing changes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,7 @@ class BuildingFacets:
     vertices: FloatArray
     """(v, 3) float64, roof points and terrain samples about their barycentre."""
     vertex_of_point: LabelArray
-    """(n,) int32, the vertex that stands for each roof point."""
+    """(n,) int32, the vertex that represents each roof point."""
     tin: Tin
     """Its facets."""
     parameters: FloatArray
@@ -181,7 +181,7 @@ def facets_of(cloud: PreparedCloud, settings: ParameterSpaceSettings) -> Buildin
 
 
 def _one_a_square(roof: FloatArray, size_m: float) -> tuple[LabelArray, LabelArray]:
-    """Indices of the points nearest to the middle of each square, ascending, and which of them stands for each point.
+    """Indices of the points nearest to the middle of each square, ascending, and which of them represents each point.
 
     Of equally near ones the lower index; all points where the size is 0.
     """
@@ -217,7 +217,7 @@ def _not_terrain(
 
 
 def _kept_clusters(labels: LabelArray, centres: FloatArray, kept: BoolArray) -> tuple[LabelArray, FloatArray]:
-    """The clusters that are left, numbered anew in their order."""
+    """The remaining clusters, renumbered in their order."""
     number = np.full(len(kept) + 1, -1, np.int32)
     number[:-1][kept] = np.arange(int(kept.sum()), dtype=np.int32)
     return number[labels], centres[kept]
@@ -248,7 +248,7 @@ def _primitive(
 def _interpolated(
     roof: FloatArray, groups: LabelArray, n_groups: int, min_points: int
 ) -> tuple[FloatArray, LabelArray]:
-    """Least-squares planes of groups of points; groups that hold no plane are none any more."""
+    """Least-squares planes of groups of points; groups without a plane are dropped."""
     sums = cluster_sums(roof, groups, n_groups)
     fits = [best_fit_plane(row) for row in sums]
     kept = np.array([fit[3] and row[0] >= min_points for fit, row in zip(fits, sums, strict=True)], np.bool_)

@@ -1,6 +1,6 @@
 """From rough clusters of points to roof planes: the end that Fuzzy SART and the robust form of k-means have in common.
 
-Best-fit planes, merging and assignment anew; then once more with clusters that grow among the points that no plane
+Best-fit planes, merging and reassignment; then once more with clusters that grow among the points that no plane
 explains; at last straight ridges (Shorter and Kasparis, section 3.3).
 """
 
@@ -68,6 +68,6 @@ def planes_of_clusters(
     reach_m = settings.ridge_reach_spacings * spacing_m
     ridges = find_ridges(points, planes, labels, neighbours, distance_m=distance_m, reach_m=reach_m)
     labels = label_by_ridges(points, planes, labels, ridges, distance_m=distance_m, reach_m=reach_m)
-    # a sliver along a ridge can lose all its points to the two sides: it is no plane any more
+    # a sliver along a ridge can lose all its points to the two sides and is then dropped
     kept = np.unique(labels[labels >= 0])
     return planes[kept], np.where(labels >= 0, np.searchsorted(kept, labels), -1).astype(np.int32)

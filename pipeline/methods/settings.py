@@ -50,7 +50,7 @@ class FuzzySartSettings(RoofFaceSettings, FuzzySartClusteringSettings, PlaneRefi
     )
     max_absorption_m: float = parameter(0.30, "Largest such distance.", unit="m", minimum=0.0, maximum=10.0)
     max_absorption_slope_deg: float = parameter(
-        60.0, "Facets that are steeper absorb nothing (Eq. 2) and are no roof.", unit="deg", minimum=1.0, maximum=89.0
+        60.0, "Facets that are steeper absorb nothing (Eq. 2) and are not roof.", unit="deg", minimum=1.0, maximum=89.0
     )
     ground_gap_spacings: float = parameter(
         1.3,
@@ -103,7 +103,7 @@ class FuzzySartSettings(RoofFaceSettings, FuzzySartClusteringSettings, PlaneRefi
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ParameterSpaceSettings(RoofFaceSettings, RegionGrowingSettings, RoofTreeSettings):
-    """What both methods share."""
+    """Settings that both methods share."""
 
     tin_spacing_m: float = parameter(
         0.7,
@@ -158,10 +158,10 @@ class ParameterSpace2dSettings(ParameterSpaceSettings, SingleLinkageSettings):
     """Settings of the method in slope and orientation."""
 
     min_slope_deg: float = parameter(
-        0.0, "Clusters with less mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
+        0.0, "Clusters with less mean slope are not roof.", unit="deg", minimum=0.0, maximum=90.0
     )
     max_slope_deg: float = parameter(
-        75.0, "Clusters with more mean slope are no roof.", unit="deg", minimum=0.0, maximum=90.0
+        75.0, "Clusters with more mean slope are not roof.", unit="deg", minimum=0.0, maximum=90.0
     )
 
     @classmethod
@@ -219,7 +219,7 @@ class KMeansSettings(RoofFaceSettings, NormalClusteringSettings, PlaneRefinement
     refine: bool = parameter(
         True,
         "Whether clusters are split where they do not hang together, merged where they are one plane, and their points "
-        "assigned anew; without it there is one least-squares fit a cluster (as the paper).",
+        "reassigned; without it there is one least-squares fit per cluster (as the paper).",
     )
     one_plane_deg: float = parameter(
         6.0,
@@ -230,7 +230,7 @@ class KMeansSettings(RoofFaceSettings, NormalClusteringSettings, PlaneRefinement
     )
     min_plane_share: float = parameter(
         0.1,
-        "An unrefined cluster with a smaller share of the points is no roof plane.",
+        "An unrefined cluster with a smaller share of the points is not a roof plane.",
         minimum=0.0,
         maximum=0.5,
     )

@@ -20,7 +20,7 @@ _MAX_TURN_COSINE = math.cos(math.radians(MAX_TURN_DEG))
 MIN_NORMALS = 5
 """Directions of a curve. Hip roofs, also those on an L, have four; a mansard's break is a larger turn."""
 MIN_SHARE = 0.5
-"""Of the roof's plan area."""
+"""Share of the roof's plan area."""
 SLIVER_HEIGHT_M = 0.5
 """Planes meet across a wall that is nowhere higher, as for the roof types."""
 

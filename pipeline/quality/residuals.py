@@ -21,7 +21,7 @@ _MAX_CELLS = 1_000_000
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ResidualSummary:
-    """What the residuals of a building come to."""
+    """Figures of the residuals of a building."""
 
     rmse_m: float
     """Root mean square over the covered points; nan without any."""
@@ -42,7 +42,7 @@ class _Faces(NamedTuple):
 
     origin_x: float
     origin_y: float
-    """Of the frame, metres."""
+    """Origin of the frame, metres."""
     planes: FloatArray
     """(n, 3) float64."""
     edges: FloatArray
@@ -226,7 +226,7 @@ def _seen(
 
 
 class TopSurface:
-    """The highest of many planar faces: built once, asked for any number of places.
+    """The highest of many planar faces: built once, queried at any number of places.
 
     Coordinates are taken relative to a corner in whole metres, which is exact: nothing is lost at 1e6 m. A place on
     the border of two faces belongs to exactly one of them; of faces of one height the first counts.

@@ -22,7 +22,8 @@ from pipeline.model import FaceKind, FloatArray, IntArray, LabelArray, Plane, So
 SAME_TOP_M = 0.05
 """Roof faces that end within this of the highest point meet there."""
 MIN_SIGMA_M = 0.004
-"""What no number of points undoes: beams average over an edge, and survey and model are in whole millimetres."""
+"""Least standard deviation, metres, however many the points: beams average over an edge, and survey and model are in
+whole millimetres."""
 _BLOCKS = 4
 """A plane's points are gathered in so many blocks each way, of equal size over their extent."""
 

@@ -33,9 +33,11 @@ from pipeline.roof.simplification import simplify_partition, unite_close_vertice
 from pipeline.tin.delaunay import triangulate
 
 _PITCH_SPACINGS = 1.2
+"""Pitch of the samples in empty places, in point spacings: about as dense as the points."""
 _MARGIN_SPACINGS = 4.0
+"""Margin around the points, in point spacings: room for the eave and for samples beyond it."""
 _MAX_EXTENT_M = 1900.0
-"""What the triangulation takes, less the frame around."""
+"""Largest extent that the triangulation takes, less the frame around it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,7 +61,7 @@ class RoofPoints:
     outline_mm: MultiPolygon | None = None
     """The outline that was drawn together with touching units; integer millimetres."""
     facades: FacadePoints | None = None
-    """What tells of the walls beneath; None where the outline is to be drawn at the eaves."""
+    """Points that show the walls beneath; None where the outline is drawn at the eaves."""
 
 
 def roof_points(cloud: PreparedCloud, settings: RoofSettings) -> RoofPoints:
@@ -127,7 +129,7 @@ class RoofPlan:
     faces: RoofPartition
     """Continued beyond the outline, to be clipped by it."""
     planes: tuple[Plane, ...]
-    """What the labels of the faces number."""
+    """The planes that the labels of the faces number."""
     outline_mm: MultiPolygon
     """The given footprint, or the outline around the roof points; integer millimetres."""
     raw: RoofPartition | None

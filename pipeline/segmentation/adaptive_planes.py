@@ -77,7 +77,7 @@ def detect_planes(points: FloatArray, spacing_m: float, settings: AdaptivePlaneS
     points : (n, 3) float64
         Points that see the sky, metres about an origin in whole metres near them, in canonical order.
     spacing_m : float
-        Typical spacing in plan, as `geometry.point_spacing_m` tells it.
+        Typical spacing in plan, from `geometry.point_spacing_m`.
     settings : AdaptivePlaneSettings
         Thresholds.
 
@@ -117,7 +117,7 @@ class _Limits(NamedTuple):
     max_distance_m: float
     fewest_points: int
     min_cosine: float
-    """Of a plane's slope."""
+    """Least cosine of a plane's slope."""
     normal_cosine: float
     """Least cosine between a plane and a point's own."""
 
@@ -209,7 +209,7 @@ def _f_ratio(sums: FloatArray, i: int, j: int, sigma_m: float) -> float:
 
 @kernel
 def merge_by_f_test(sums: FloatArray, pairs: IntArray, sigma_m: float) -> LabelArray:
-    """Merge planes that an F-test cannot tell apart, the least different first.
+    """Merge planes that an F-test does not distinguish, the least different first.
 
     Parameters
     ----------
@@ -390,13 +390,13 @@ def _detect(
     distance_m = min(max(noises * sigma_m, min_distance_m), max_distance_m)
     # of a plane through m points spread evenly over a disc the slope has the error 2 sigma sqrt(pi) / (spacing m)
     slope_error = 2.0 * math.sqrt(math.pi) * sigma_m / (spacing_m * (FITTED_NEIGHBOURS + 1.0))
-    tells = slope_error < _SLOPE_ERROR and spacing_m < _NORMALS_SPACING_M
+    has_direction = slope_error < _SLOPE_ERROR and spacing_m < _NORMALS_SPACING_M
 
     labels = np.full(len(nodes), -1, np.int32)
     count = 0
     for pass_ in range(2):  # the roof; then what is left over
         reach_m = distance_m if pass_ > 0 else _GROWING_SHARE * distance_m
-        min_normal_cosine = normal_cosine if tells and pass_ == 0 else 0.0
+        min_normal_cosine = normal_cosine if has_direction and pass_ == 0 else 0.0
         before = count
         trial_limits = TrialLimits(reach_m, min_normal_cosine, fewest_points, min_cosine)
         count = take_regions(surroundings, labels, before, trial_limits)

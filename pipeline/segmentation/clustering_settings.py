@@ -167,13 +167,13 @@ class ClusterMembershipSettings(Parameters):
     min_members: int = parameter(4, "Fewest facets of a cluster.", unit="facets", minimum=1, maximum=100_000)
     max_o_deviation_m: float = parameter(
         1.3,
-        "Clusters whose O-distance has this standard deviation or more are no roof.",
+        "Clusters whose O-distance has this standard deviation or more are not roof.",
         unit="m",
         minimum=0.01,
         maximum=100.0,
     )
     ground_below_deg: float = parameter(
-        4.0, "Clusters with less slope and a negative O-distance are no roof.", unit="deg", minimum=0.0, maximum=90.0
+        4.0, "Clusters with less slope and a negative O-distance are not roof.", unit="deg", minimum=0.0, maximum=90.0
     )
     wall_above_deg: float = parameter(
         76.0, "Clusters with more slope are walls.", unit="deg", minimum=1.0, maximum=90.0

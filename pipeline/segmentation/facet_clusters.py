@@ -67,7 +67,7 @@ def labels_of_points(
     vertex_point : (v,) int32
         Point at every vertex, -1 where there is none.
     facet_of_point : (n,) int32
-        Facet that holds a point that is no vertex, else -1.
+        Facet that holds a point that is not a vertex, else -1.
 
     Returns
     -------

@@ -18,7 +18,7 @@ _NORMAL_NOISE = 1.5
 
 
 def passes_for_noise(sigma_m: float, spacing_m: float, wanted_deg: float, max_passes: int) -> int:
-    """How often the normals are averaged until the noise turns them by no more than a wanted angle.
+    """How often the normals are averaged until the noise turns them by at most a given angle.
 
     Parameters
     ----------

@@ -97,7 +97,7 @@ def centre_of_building(points: FloatArray) -> FloatArray:
 def facet_vectors(
     kind: str, normals: FloatArray, centroids: FloatArray, centre: FloatArray, *, scaled_min: float = 0.0
 ) -> FloatArray:
-    """What is clustered: one vector a facet.
+    """The vectors that are clustered, one per facet.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def cluster(vectors: FloatArray, areas_m2: FloatArray, settings: FuzzySartCluste
     """Cluster facet vectors by Fuzzy SART.
 
     Inputs are presented in descending area, ties by index, epoch after epoch, until no neuron was made or removed,
-    all have lived tau epochs and none moved. Outliers are told by -1, and no vectors give no clusters.
+    all have lived tau epochs and none moved. Outliers have the label -1; without vectors there are no clusters.
 
     Parameters
     ----------

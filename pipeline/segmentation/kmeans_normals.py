@@ -4,7 +4,7 @@ The facets of a TIN over one roof plane have alike normals, those over another p
 cosine of [the] angle between normal vectors" groups them. The centre of a cluster is the direction of the sum of its
 normals, which is what maximises the sum of cosines, so every round lowers the inertia, the sum of 1 - cosine.
 
-The paper tells neither the start nor how many clusters there are. Here the start is deterministic, and the silhouette
+The paper states neither the start nor the number of clusters. Here the start is deterministic, and the silhouette
 judges the number: with the cosine distance the mean distance of a facet to a whole cluster is one minus its product
 with the mean normal, so the silhouette is exact at the cost of one product a facet and cluster.
 """

@@ -1,6 +1,6 @@
 """A second look at points that no plane explains: small faces whose facets were too few or too noisy to cluster.
 
-An extension of the paper, which tells that small, under-sampled faces are lost: clusters grow among the leftovers,
+An extension of the paper, which reports that small, under-sampled faces are lost: clusters grow among the leftovers,
 from the flattest neighbourhoods on, and go through the same refinement as those of the facets.
 """
 

@@ -1,8 +1,8 @@
 """From the rough clusters of a TIN to roof planes of its points (Shorter and Kasparis, section 3.3).
 
-Rounds of: best-fit planes of the clusters on the *original* elevations, clusters of one plane merged, points assigned
-anew to the planes around them, outliers absorbed. The paper tells these steps; its thresholds are unpublished and are
-settings here.
+Rounds of: best-fit planes of the clusters on the *original* elevations, clusters of one plane merged, points
+reassigned to the planes around them, outliers absorbed. The paper describes these steps; its thresholds are unpublished
+and are settings here.
 """
 
 from __future__ import annotations

@@ -35,13 +35,17 @@ class AdaptivePlaneSettings(Parameters):
         1.3, "Least area of a plane in plan where points are dense.", unit="m2", minimum=0.0, maximum=1e4
     )
     min_area_sparse_m2: float = parameter(
-        10.0, "Least area that is asked for however sparse the points.", unit="m2", minimum=0.0, maximum=1e4
+        10.0,
+        "Largest area that is required of a plane, however sparse the points.",
+        unit="m2",
+        minimum=0.0,
+        maximum=1e4,
     )
     min_points: int = parameter(
         6, "Fewest points of a plane where the larger area holds as many.", unit="points", minimum=5, maximum=10_000
     )
     max_slope_deg: float = parameter(
-        75.0, "Planes steeper than this are no roof.", unit="deg", minimum=1.0, maximum=89.0
+        75.0, "Planes steeper than this are not roof.", unit="deg", minimum=1.0, maximum=89.0
     )
     normal_angle_deg: float = parameter(
         30.0,
@@ -94,7 +98,7 @@ class RegionGrowingSettings(Parameters):
         maximum=1.0,
     )
     free_plane_points: int = parameter(
-        8, "Points from which on a region has a plane of its own, and no more its cluster's direction.", unit="points",
+        8, "Points from which on a region has a plane of its own, in place of its cluster's direction.", unit="points",
         minimum=4, maximum=10_000,
     )  # fmt: skip
 
@@ -133,7 +137,7 @@ class PlaneRefinementSettings(Parameters):
         25, "Points that make a plane, however dense the cloud.", minimum=3, maximum=100_000
     )
     max_slope_deg: float = parameter(
-        70.0, "Planes steeper than this are no roof.", unit="deg", minimum=1.0, maximum=89.0
+        70.0, "Planes steeper than this are not roof.", unit="deg", minimum=1.0, maximum=89.0
     )
     outlier_factor: float = parameter(
         2.0,

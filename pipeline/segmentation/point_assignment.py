@@ -64,7 +64,7 @@ def vote_among_neighbours(
     """Every point takes the plane of its neighbourhood with the least (distance / limit)^2 minus weight times votes.
 
     All points choose at once from the labels before, so the outcome does not depend on their order. A plane beyond
-    the distance is no choice; a point without any choice is an outlier.
+    the distance is not a choice; a point without any choice is an outlier.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def vote_among_neighbours(
     for _ in range(passes):
         n_changes = 0
         for i in range(old.size):
-            # amid labels that stayed as they were a point chooses as before
+            # a point chooses as before where the labels around it stayed
             new[i] = old[i]
             asked = changed[i]
             alike = width > 0 and old[i] >= 0

@@ -12,7 +12,7 @@ from pipeline.segmentation.clustering_settings import RoofTreeSettings
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TreeVerdict:
-    """What a tree says of a roof."""
+    """Answer of a tree for a roof."""
 
     roof_type: RoofType
     """`none` where no cluster is left, `unknown` where the tree has no answer."""

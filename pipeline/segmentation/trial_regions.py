@@ -33,14 +33,15 @@ _FREEDOM = FITTED_NEIGHBOURS + 1 - 3
 _LOWER_QUARTILE_CHI2 = 1.92256
 """Lower quartile of the chi-squared distribution with that freedom, 4."""
 _TRIALS = 2
-"""Trial regions that reach a point before it is no seed any more: fewer miss planes, more only take time."""
+"""Trial regions that reach a point before it stops being a seed: fewer miss planes, more only take time."""
 _REPEATED_POINTS = 64
 """Size at which a trial region is given up if nearly all of its points were reached that often."""
 _REPEATED_SHARE = 0.9
+"""That share: giving up earlier could lose regions, later only takes time."""
 _COMPANY = 0.5
-"""Share of a point's neighbours that must lie near the plane too, where its own plane tells nothing."""
+"""Share of a point's neighbours that must lie near the plane too, where its own plane says nothing."""
 _FIRST_REFIT = 8.0
-"""Points from which on a region has a plane of its own and no more its seed's."""
+"""Points from which on a region has a plane of its own in place of its seed's."""
 _REFIT_GROWTH = 1.3
 """A region is fitted again each time that it has grown by this factor."""
 
@@ -216,7 +217,7 @@ def _grow(
 def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: int, limits: TrialLimits) -> int:
     """Label regions among the unlabelled points, the greatest gain first, in place.
 
-    A gain can only fall as other regions take points, so the best trial region grows anew and is taken if it is still
+    A gain can only fall as other regions take points, so the best trial region grows again and is taken if it is still
     the best: a lazy greedy choice.
 
     Parameters
@@ -244,7 +245,7 @@ def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: in
     asked, queue = np.full(n, -1, np.int32), np.empty(n, np.int32)
     trial = _Trial(asked, np.zeros(n + 1, np.int32), queue)
     reached = np.zeros(n, np.int32)
-    anew = np.zeros(n, np.int32)
+    reached_again = np.zeros(n, np.int32)
     # the loss of every trial region and its seed, behind them that of none
     trials, held_trials = heap_push(heap_with_room(64), 0, 0.0, -1, 0), 1
     mark = 0
@@ -275,7 +276,7 @@ def take_regions(surroundings: Surroundings, labels: LabelArray, first_label: in
         held_trials -= 1
         if labels[seed] >= 0:
             continue
-        held, a, b, _, gain = _grow(surroundings, cosines, labels, anew, seed, limits, trial, mark)
+        held, a, b, _, gain = _grow(surroundings, cosines, labels, reached_again, seed, limits, trial, mark)
         mark += 1
         if held < fewest_points or cosine_of_slope(a, b) < limits.min_cosine:
             continue

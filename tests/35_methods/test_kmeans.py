@@ -158,7 +158,7 @@ def test_unequal_pitches_give_the_faithful_model_two_equal_sides_and_a_residual(
     first, second = (plane.slope_deg for plane in faithful.planes)
     assert first == pytest.approx(second, abs=0.2)
     result = reconstruct_building(candidate, "kmeans", ReconstructSettings(method=FAITHFUL))
-    assert result.rmse_m > 0.2, "the record tells how badly a symmetric model fits"
+    assert result.rmse_m > 0.2, "the record says how badly a symmetric model fits"
     robust = segment(candidate, ROBUST)
     assert robust.faces is None, "the symmetric model does not explain the building"
     assert sorted(plane.slope_deg for plane in robust.planes) == pytest.approx([30, 45], abs=1)

@@ -1,4 +1,4 @@
-"""Levels of detail on request: the finest is the record's, others stand beside it, a block asked for is no fault."""
+"""Levels of detail on request: the finest is the record's, others come with it, a requested block is not a fault."""
 
 from __future__ import annotations
 
