@@ -1,6 +1,6 @@
-"""Real programs for tests: found or skipped, each in a process group of its own, logged, ended by their ids.
+"""Real programs for tests: found or skipped, each logged in its own process group and ended by id.
 
-A folder of tests takes what it needs into its conftest: put this folder on `sys.path`, then
+To use them in a conftest: put this folder on `sys.path`, then
 `from processes import postgres_server, postgres_url, programs`.
 """
 
@@ -28,17 +28,17 @@ import pytest
 Value = TypeVar("Value")
 
 REQUIRED = "GABLEWORK_REQUIRE_PROGRAMS"
-"""Environment variable of .ci/run: 1 makes a test fail where it would skip for want of a program."""
+"""Environment variable of .ci/run: with 1 a test fails if a program is missing, instead of being skipped."""
 
 LONG_S = 300.0
-"""A deadline for what takes seconds on a quiet machine; not a promise of speed."""
+"""A deadline for work that takes seconds on an idle machine; not a promise of speed."""
 
 _POSTGRES_FOLDERS = "/usr/lib/postgresql/*/bin"
 _LOG_TAIL_LINES = 60
 
 
 def missing(what: str) -> NoReturn:
-    """Skip the test for want of a program, or fail where programs are required."""
+    """Skip the test for lack of a program, or fail if programs are required."""
     if os.environ.get(REQUIRED) == "1":
         pytest.fail(f"{what}, and {REQUIRED}=1")
     pytest.skip(what)
@@ -60,7 +60,7 @@ def program(name: str, *elsewhere: str) -> Path:
 
 
 def free_port() -> int:
-    """A TCP port of the loopback that nobody listens on."""
+    """A free TCP port of the loopback."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port: int = listener.getsockname()[1]
@@ -70,7 +70,7 @@ def free_port() -> int:
 def wait_for(
     condition: Callable[[], Value | None], what: str, deadline_s: float = LONG_S, *, interval_s: float = 0.02
 ) -> Value:
-    """What the condition returns once it is true; a failure that names what was waited for after the deadline."""
+    """Wait until the condition is true; returns its value, or fails after the deadline with the name of `what`."""
     end = time.monotonic() + deadline_s
     while True:
         value = condition()
@@ -82,7 +82,7 @@ def wait_for(
 
 
 def listens(port: int, host: str = "127.0.0.1") -> bool:
-    """Whether somebody listens."""
+    """Whether a program listens."""
     with contextlib.suppress(OSError), socket.create_connection((host, port), timeout=1.0):
         return True
     return False
@@ -155,7 +155,6 @@ class Program:
 
     @property
     def text(self) -> str:
-        """The log so far."""
         return self.log.read_text(errors="replace")
 
     def children(self) -> list[psutil.Process]:
@@ -176,7 +175,7 @@ class Program:
         return wait_for(alive_and_true, f"{what} of {self.name}", deadline_s)
 
     def wait_for_port(self, port: int) -> None:
-        """Wait until somebody listens on a port of the loopback."""
+        """Wait until a program listens on a port of the loopback."""
         self.wait_for(lambda: listens(port), f"port {port}")
 
     def wait_for_text(self, words: str, deadline_s: float = LONG_S) -> None:
@@ -216,7 +215,6 @@ class Program:
                 child.kill()
 
     def tail(self) -> str:
-        """The end of the log."""
         lines = self.text.splitlines()
         return "\n".join([f"--- {self.name}: {' '.join(self.command)}", *lines[-_LOG_TAIL_LINES:]])
 
@@ -272,14 +270,14 @@ def programs(tmp_path: Path) -> Iterator[Programs]:
 
 
 class PostgresServer:
-    """A PostgreSQL server of our own: a fresh cluster in a folder, on a free port of the loopback, with a password.
+    """A PostgreSQL server with a fresh cluster in a folder, on a free port of the loopback, with a password.
 
     PostgreSQL refuses to run as root; then it runs as the user `postgres`.
 
     Parameters
     ----------
     folder : Path
-        Gets the data and the log; exists, and the parents let everybody pass.
+        Gets the data and the log; exists, and other users may enter its parents.
     """
 
     user = "gablework"

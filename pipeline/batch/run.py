@@ -13,7 +13,7 @@ from pipeline.batch.keys import as_keys, errors_with_keys
 from pipeline.batch.status import StatusWriter, buildings_before
 from pipeline.errors import GableworkError, RunCancelledError
 from pipeline.report.run_page import write_run_page
-from pipeline.runtime.cluster.run_metrics import RunMetrics, both, serve_metrics
+from pipeline.runtime.cluster.run_metrics import RunMetrics, combined, serve_metrics
 from pipeline.runtime.cluster.serial_executor import Executor
 from pipeline.runtime.monitoring.events import Event, Listener, ignore, never
 from pipeline.runtime.run import RunSummary, run
@@ -62,7 +62,7 @@ def run_batch(
         status = StatusWriter(batch.work_folder, str(batch.path), batch.out)
         if batch.cluster.metrics_port:
             shown.callback(serve_metrics(batch.cluster.metrics_port))
-            on_event = both(RunMetrics(), on_event)
+            on_event = combined(RunMetrics(), on_event)
         return _run_with_status(batch, status, on_event, executor, cancelled, known)
 
 

@@ -1,4 +1,4 @@
-"""Compiled kernels are recognized by their cache files, without compiling any."""
+"""Stored files show whether kernels are compiled; nothing is compiled to find out."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from pipeline.compiler import kernel
 def half(x):
     return x / {divisor}
 """
-ASKED = (
-    "from kernel import half; from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled as compiled; "
-)
+ASKED = "from kernel import half; from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled as found; "
 
 
 def says(folder: Path, words: str, **environment: str) -> list[str]:
@@ -32,15 +30,15 @@ def test_a_kernel_is_compiled_once_it_was_called_here_and_no_more_when_source_or
 ) -> None:
     source = tmp_path / "kernel.py"
     source.write_text(KERNEL.format(divisor="2.0"))
-    assert says(tmp_path, ASKED + "print(compiled((half,))); half(3.0); print(compiled((half,)))") == ["False", "True"]
-    assert says(tmp_path, ASKED + "print(compiled((half,)))") == ["True"]
-    assert says(tmp_path, ASKED + "print(compiled((half,)))", NUMBA_CPU_NAME="x86-64-v3") == ["False"]
+    assert says(tmp_path, ASKED + "print(found((half,))); half(3.0); print(found((half,)))") == ["False", "True"]
+    assert says(tmp_path, ASKED + "print(found((half,)))") == ["True"]
+    assert says(tmp_path, ASKED + "print(found((half,)))", NUMBA_CPU_NAME="x86-64-v3") == ["False"]
     source.write_text(KERNEL.format(divisor="3.0"))
-    assert says(tmp_path, ASKED + "print(compiled((half,)))") == ["False"]
+    assert says(tmp_path, ASKED + "print(found((half,)))") == ["False"]
 
 
-def test_an_empty_cache_is_reported_and_stays_empty_and_without_numba_nothing_need_be_compiled(tmp_path: Path) -> None:
-    asked = "from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled as compiled; print(compiled())"
+def test_an_empty_cache_is_noticed_and_stays_empty_and_without_numba_nothing_need_be_compiled(tmp_path: Path) -> None:
+    asked = "from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled as found; print(found())"
     assert says(tmp_path, asked) == ["False"]
     assert list((tmp_path / "cache").rglob("*.kernel")) == []
     assert says(tmp_path, asked, NUMBA_DISABLE_JIT="1") == ["True"]

@@ -1,11 +1,10 @@
-"""Executors: every task gives its result, whatever happens to the workers, and what cannot go on says so."""
+"""Executors: every task gives its result, whatever happens to the workers, or an error says why not."""
 
 from __future__ import annotations
 
 import os
 import sys
 import threading
-import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,6 +14,7 @@ import dask
 import psutil
 import pytest
 from distributed import Client, Status
+from processes import LONG_S, wait_for
 
 from pipeline.errors import ClusterError, RunCancelledError, RunError, VersionMismatchError
 from pipeline.runtime.cluster import worker_setup
@@ -25,7 +25,7 @@ from pipeline.runtime.cluster.serial_executor import SerialExecutor
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.isolation.forked_child import can_fork
 from pipeline.runtime.monitoring.events import Event, Watch
-from pipeline.runtime.monitoring.measurement import Measured, measure_packed, packed
+from pipeline.runtime.monitoring.measurement import Measured, measure_packed, pack_task
 from pipeline.runtime.monitoring.versions import ENGINE, differences, fingerprint, versions_here, versions_of
 from pipeline.runtime.resources import Resources
 
@@ -33,18 +33,9 @@ sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
 
 import chores
 
-LONG_S = 120.0
-
-
-def wait_for(condition: Any, what: str) -> None:
-    end = time.monotonic() + LONG_S
-    while not condition():
-        assert time.monotonic() < end, f"waited in vain for {what}"
-        time.sleep(0.02)
-
 
 def collect(running: Iterable[Measured[int]], results: list[int]) -> None:
-    """Keep what comes, though the map may end with an error."""
+    """Keep the results so far, even if the map ends with an error."""
     for measured in running:
         results.append(measured.result)  # noqa: PERF401 - extend would keep nothing then
 
@@ -132,7 +123,7 @@ def test_tasks_under_suspicion_are_tried_alone_and_none_is_lost(cluster: Cluster
 
 @pytest.mark.slow
 def test_a_keeper_stays_while_it_starts_its_worker_anew_and_one_that_gave_up_is_replaced(tmp_path: Path) -> None:
-    # Dask would end it where no process of the worker's name is there at the time
+    # Dask would end it if no worker of that name is there at the time
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 ms"}):
         with Cluster(workers=1) as one, one.executor() as executor:
             keeper = one._embedded.workers[0]
@@ -192,7 +183,7 @@ def test_the_content_is_that_of_children_of_this_process(cluster: Cluster, subur
 # --- called off ------------------------------------------------------------------------------------------------------
 
 
-def test_a_run_that_is_cancelled_ends_its_tasks_and_waits_for_them(cluster: Cluster, tmp_path: Path) -> None:
+def test_a_cancelled_run_stops_its_tasks_and_waits_for_them(cluster: Cluster, tmp_path: Path) -> None:
     off = threading.Event()
     watch = Watch(cancelled=off.is_set, stop=Path(tmp_path, "go").touch)
     tasks = [(str(tmp_path), f"task{k}") for k in range(30)]
@@ -278,7 +269,7 @@ class Lookouts:
             self.monitor.look("split", Watch(listener=self.events.append))
 
 
-def test_waiting_for_workers_is_reported_with_the_time_and_the_fix_and_so_is_their_return() -> None:
+def test_events_report_missing_workers_with_time_and_fix_and_their_return() -> None:
     world = Lookouts()
     world.pass_time(70)
     assert [event.kind for event in world.events] == ["waiting"] * 3
@@ -313,7 +304,7 @@ def test_a_scheduler_that_is_silent_is_lost_after_a_while_and_not_before() -> No
         world.pass_time(3)
 
 
-def test_a_broken_connection_to_the_scheduler_is_reported_at_once() -> None:
+def test_a_broken_connection_to_the_scheduler_is_an_error_at_once() -> None:
     world = Lookouts()
     world.client.status = "connecting"
     with pytest.raises(ClusterError, match="connection to it broke"):
@@ -342,16 +333,16 @@ def test_a_task_of_another_version_is_refused_before_it_is_unpacked() -> None:
     other = fingerprint().replace(f"{ENGINE}=", f"{ENGINE}=9.")
     with pytest.raises(VersionMismatchError, match=rf"worker \S+: {ENGINE} \S+ where the client has 9\."):
         measure_packed(other, b"no pickle at all")
-    assert measure_packed(fingerprint(), packed(chores.double, 4)).result == 8
+    assert measure_packed(fingerprint(), pack_task(chores.double, 4)).result == 8
 
 
-def test_a_fingerprint_covers_every_version() -> None:
+def test_a_fingerprint_has_every_version() -> None:
     assert versions_of(fingerprint()) == dict(versions_here())
     assert {"python", "numpy", "numba", "distributed", "pyarrow", "shapely", ENGINE} <= set(versions_here())
     assert "none" not in versions_here().values()
 
 
-def test_all_that_differs_is_reported() -> None:
+def test_all_differences_are_listed() -> None:
     ours = {"numpy": "2.1", "numba": "0.63", "scipy": "1.16"}
     found = differences(ours, {"numpy": "2.0", "scipy": "1.16", "pandas": "3"})
     assert found == ["numpy 2.0 where the client has 2.1", "no numba where the client has 0.63"]

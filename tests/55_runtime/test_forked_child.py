@@ -1,4 +1,4 @@
-"""Processes forked from a preloaded server: they have what it loaded, and nothing of it is lost but time."""
+"""Children forked from a preloaded server have what it loaded; the loss of the server costs only time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from multiprocessing import forkserver
 from pathlib import Path
@@ -16,13 +15,13 @@ from typing import Any
 
 import psutil
 import pytest
+from processes import LONG_S, wait_for
 
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.isolation import child_pool, fork_server
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, supervise
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
-DEADLINE_S = 120.0
 
 PROGRAM = """
 import os, threading, time
@@ -39,7 +38,7 @@ def ask(expression):
     return eval(expression)
 """
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked only on Linux")
 
 
 @pytest.fixture(autouse=True)
@@ -53,14 +52,14 @@ def no_children_left() -> Iterator[None]:
 
 @pytest.fixture
 def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-    """What an expression is in a fresh child, which has loaded a module of the test."""
+    """Evaluates an expression in a fresh child that has loaded a module of the test."""
     (tmp_path / "loaded_by_a_test.py").write_text(PROGRAM)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.syspath_prepend(str(tmp_path))
     import loaded_by_a_test  # type: ignore[import-not-found]
 
     def asked(expression: str, loads: str = "loaded_by_a_test:load") -> Any:
-        for child in tuple(child_pool._children._idle):
+        for child in tuple(child_pool._pool._idle):
             child.begun = 1
         with child_pool.borrowed_child(lambda: False, fresh=True, loads=(loads,)) as child:
             child.begun = 1
@@ -71,25 +70,16 @@ def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
 
 
 def ours() -> list[psutil.Process]:
-    """Children and servers of this process, but for the server of Dask's workers, which outlives other tests."""
+    """Children and servers of this process, without the server of Dask's workers, which outlives other tests."""
     of_dask = forkserver._forkserver._forkserver_pid
     found = psutil.Process().children(recursive=True)
     return [process for process in found if process.name().startswith("gable") and process.pid != of_dask]
 
 
 def servers() -> list[psutil.Process]:
-    """The servers of this process that live."""
+    """The living servers of this process."""
     found = [process for process in ours() if process.name() == fork_server.NAME]
     return [process for process in found if process.status() != psutil.STATUS_ZOMBIE]
-
-
-def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    """What the condition gives once it is true."""
-    end = time.monotonic() + DEADLINE_S
-    while not (value := condition()):
-        assert time.monotonic() < end, f"waited in vain for {what}"
-        time.sleep(0.02)
-    return value
 
 
 def test_children_have_what_their_server_loaded(ask: Callable[..., Any]) -> None:
@@ -99,38 +89,38 @@ def test_children_have_what_their_server_loaded(ask: Callable[..., Any]) -> None
     assert first != loaded_by
 
 
-def test_a_server_is_there_before_anybody_asks_for_a_child(ask: Callable[..., Any]) -> None:
+def test_a_server_can_start_before_its_first_child(ask: Callable[..., Any]) -> None:
     child_pool.preload(["loaded_by_a_test"])
     (server,) = wait_for(servers, "the server")
     assert ask("__import__('loaded_by_a_test').LOADED_BY") == server.pid
 
 
-def test_what_a_server_cannot_load_is_reported_by_the_child(ask: Callable[..., Any]) -> None:
+def test_a_child_reports_what_its_server_cannot_load(ask: Callable[..., Any]) -> None:
     child_pool.preload(["loaded_by_a_test:fail"])
     assert ask("1 + 1") == 2
     with pytest.raises(RunError, match=r"(?s)3 times in a row.*OSError: not loaded"):
         ask("1", "loaded_by_a_test:fail")
 
 
-def test_children_have_the_environment_and_the_folder_of_now(
+def test_children_have_the_present_environment_and_folder(
     ask: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = ask("os.getppid()")
     monkeypatch.setenv("SOME_WORD", "new")
     monkeypatch.chdir(tmp_path)
-    child_pool._children._idle[0].end()
+    child_pool._pool._idle[0].end()
     assert ask("os.environ['SOME_WORD'], os.getcwd(), os.getppid()") == ("new", str(tmp_path), server)
 
 
-def test_a_variable_that_is_read_once_gets_another_server(
+def test_a_change_of_a_variable_that_is_read_once_starts_another_server(
     ask: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = ask("os.getppid()")
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
-    child_pool._children._idle[0].end()
+    child_pool._pool._idle[0].end()
     after = ask("os.getppid()")
     assert after != before
-    wait_for(lambda: [server.pid for server in servers()] == [after], "the end of the server that forks no more")
+    wait_for(lambda: [server.pid for server in servers()] == [after], "the end of the retired server")
 
 
 def test_children_begin_with_one_thread_and_their_own_session(ask: Callable[..., Any]) -> None:
@@ -150,51 +140,49 @@ def test_children_of_a_server_that_is_killed_die_and_the_work_is_done_by_others(
     server.kill()
     wait_for(lambda: len(mark.read_text()) == 2, "the second trial")
     go.touch()
-    thread.join(DEADLINE_S)
+    thread.join(LONG_S)
     assert len(found) == 1
     assert not isinstance(found[0], Loss)
     assert [other.pid for other in servers()] != [server.pid]
 
 
-def test_a_service_that_must_end_keeps_its_server(ask: Callable[..., Any]) -> None:
+def test_a_server_ignores_sigterm(ask: Callable[..., Any]) -> None:
     server = ask("os.getppid()")
     os.kill(server, signal.SIGTERM)
-    child_pool._children._idle[0].end()
+    child_pool._pool._idle[0].end()
     assert ask("os.getppid()") == server
 
 
 def test_nothing_is_forked_from_a_process_with_threads(
     ask: Callable[..., Any], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(child_pool._children, "_can_fork", True)  # it is not afterwards
+    monkeypatch.setattr(child_pool._pool, "_can_fork", True)  # restored after the test
     with caplog.at_level(logging.WARNING):
         assert ask("os.getppid()", "loaded_by_a_test:load_with_thread") == os.getpid()
-        child_pool._children._idle[0].end()
+        child_pool._pool._idle[0].end()
         assert ask("os.getppid()", "loaded_by_a_test:load") == os.getpid()
     assert "started threads" in caplog.text
 
 
-def test_where_nothing_can_be_forked_children_are_executed(
+def test_children_are_spawned_if_nothing_can_be_forked(
     ask: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(child_pool._children, "_can_fork", False)
+    monkeypatch.setattr(child_pool._pool, "_can_fork", False)
     assert ask("os.getppid()") == os.getpid()
     loss = ask("os.kill(os.getpid(), 11)")
     assert "signal 11 (SIGSEGV), also alone" in loss.detail
     assert servers() == []
 
 
-def test_a_child_that_is_cancelled_before_its_server_has_loaded_never_begins(
-    ask: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_a_child_cancelled_before_its_server_has_loaded_never_begins(ask: Callable[..., Any], tmp_path: Path) -> None:
     fifo = tmp_path / "fifo"
-    os.mkfifo(fifo)  # who opens it waits for a writer
+    os.mkfifo(fifo)  # opening it waits for a writer
     with (
         pytest.raises(RunCancelledError),
         child_pool.borrowed_child(lambda: True, fresh=False, loads=(f"loaded_by_a_test:read:{fifo}",)),
     ):
         pytest.fail("it is not ready")
-    assert child_pool._children._all == set()
+    assert child_pool._pool._all == set()
 
 
 FIRST_FILE = """
@@ -203,15 +191,15 @@ held = os.open(sys.argv[1], os.O_RDONLY)
 assert held == 3, held
 from pipeline.runtime.isolation import child_pool
 from pipeline.runtime.isolation.isolated_items import IsolationLimits, supervise
-child_pool.fork_server()
+child_pool.fork_own_server()
 limits = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
 for turn in range(2):
     print([found for _, found in supervise(functools.partial(os.pread, 3, 5), [0, 1], limits)])
 """
 
 
-def test_a_file_that_was_opened_before_anything_else_is_read_in_children_by_its_number(tmp_path: Path) -> None:
-    """Libraries such as PROJ keep the number of their data base's descriptor; a pipe there broke them and the pipe."""
+def test_children_read_a_file_opened_before_the_fork_by_its_number(tmp_path: Path) -> None:
+    """Libraries such as PROJ keep the descriptor of their database; a pipe with that number broke both."""
     (tmp_path / "data").write_bytes(b"held data")
     command = [sys.executable, "-P", "-c", FIRST_FILE, str(tmp_path / "data")]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)

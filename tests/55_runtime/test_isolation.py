@@ -1,4 +1,4 @@
-"""Supervised children: each building can only harm itself, and no child outlives its owner."""
+"""Supervised children: a building harms only itself, and no child outlives its parent."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from typing import Any
 import psutil
 import pyarrow.dataset as ds
 import pytest
+from processes import LONG_S, wait_for
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -29,12 +30,11 @@ from pipeline.runtime.isolation.isolated_items import IsolationLimits, Loss, sup
 from pipeline.runtime.isolation.messages import Frames, frame
 
 LIMITS = IsolationLimits(timeout_s=120.0, memory_bytes=2**30)
-DEADLINE_S = 120.0
 
 
 @pytest.fixture(autouse=True)
 def no_children_left() -> Iterator[None]:
-    """Children that know no faults of other tests, and none afterwards."""
+    """No children of other tests before a test, and none after it."""
     child_pool.kill_children()
     yield
     child_pool.kill_children()
@@ -43,12 +43,12 @@ def no_children_left() -> Iterator[None]:
 
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Children that load nothing, and so start at once."""
+    """Children that load nothing and therefore start at once."""
     monkeypatch.setattr(child_pool, "_LOADS", ())
 
 
 def child_processes(of: int | None = None) -> list[psutil.Process]:
-    """The living children that work for a process, for this one by default; not the server that they come from."""
+    """The living children of a process, by default this one, without their server."""
     found = []
     for process in psutil.Process(of).children(recursive=True):
         with contextlib.suppress(psutil.NoSuchProcess):
@@ -58,20 +58,11 @@ def child_processes(of: int | None = None) -> list[psutil.Process]:
 
 
 def ended(process: psutil.Process) -> bool:
-    """Whether a process does nothing any more."""
+    """Whether a process has ended."""
     try:
         return bool(process.status() == psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
         return True
-
-
-def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    """What the condition gives once it is true."""
-    end = time.monotonic() + DEADLINE_S
-    while not (value := condition()):
-        assert time.monotonic() < end, f"waited in vain for {what}"
-        time.sleep(0.02)
-    return value
 
 
 def rows(run_dir: str, table: str = "buildings") -> dict[str, dict[str, Any]]:
@@ -79,11 +70,11 @@ def rows(run_dir: str, table: str = "buildings") -> dict[str, dict[str, Any]]:
     return {row["building_id"]: row for row in found}
 
 
-# --- with plain functions: what the supervisor promises ---------------------------------------------------------------
+# --- plain functions: promises of the supervisor ---------------------------------------------------------------
 
 
 def outcomes(function: Callable[[Any], Any], items: list[Any], limits: IsolationLimits = LIMITS) -> list[Any]:
-    """What became of each item, in their order."""
+    """The outcome of each item, in order."""
     found = dict(supervise(function, items, limits))
     return [found[index] for index in range(len(items))]
 
@@ -100,7 +91,7 @@ def do(order):
 
 @pytest.fixture
 def orders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bare: None) -> Callable[[str], str]:
-    """A function that executes its item as Python in the child, and gives it back."""
+    """A function that executes its item as Python in the child and returns it."""
     (tmp_path / "orders_of_a_test.py").write_text(PROGRAM)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -134,7 +125,7 @@ def test_results_come_from_one_child_that_stays(orders: Callable[[str], str]) ->
         ("raise MemoryError", Reason.OUT_OF_MEMORY, "1 GiB"),
     ],
 )
-def test_an_item_that_costs_its_process_costs_only_itself(
+def test_an_item_that_kills_its_process_harms_only_itself(
     orders: Callable[[str], str], order: str, reason: Reason, words: str
 ) -> None:
     before, loss, after = outcomes(orders, ["1", order, "2"])
@@ -148,39 +139,37 @@ def test_an_item_that_costs_its_process_costs_only_itself(
 @pytest.mark.parametrize(
     "order", ["while True: pass", "import collections, itertools; collections.deque(itertools.repeat(0), maxlen=0)"]
 )
-def test_an_item_that_never_ends_is_ended_also_where_it_holds_the_interpreter(
-    orders: Callable[[str], str], order: str
-) -> None:
+def test_an_endless_item_is_ended_even_if_it_holds_the_interpreter(orders: Callable[[str], str], order: str) -> None:
     before, loss, after = outcomes(orders, ["1", order, "2"], IsolationLimits(timeout_s=1.5))
     assert (before, after) == ("1", "2")
     assert isinstance(loss, Loss)
     assert loss.reason is Reason.TIMED_OUT
     assert "1.5 s" in loss.detail
     assert loss.seconds >= 1.5
-    assert "in do" in loss.stderr, "the place where it hung is named"
+    assert "in do" in loss.stderr, "the traceback is there"
 
 
-def test_one_that_only_fails_in_company_is_no_loss(orders: Callable[[str], str], tmp_path: Path) -> None:
+def test_an_item_that_succeeds_alone_is_not_lost(orders: Callable[[str], str], tmp_path: Path) -> None:
     first_only = f"p = '{tmp_path}/mark'\nif not os.path.exists(p): open(p, 'w').close(); os.abort()"
     assert outcomes(orders, ["1", first_only, "2"]) == ["1", first_only, "2"]
 
 
 @pytest.mark.slow
-def test_memory_that_others_piled_up_is_not_blamed_on_the_last(orders: Callable[[str], str]) -> None:
+def test_memory_used_by_earlier_items_is_not_blamed_on_the_last(orders: Callable[[str], str]) -> None:
     piles = (
         "import sys; sys.modules['os'].__dict__.setdefault('pile', []).append(b'1' * (400 * 2**20)); time.sleep(0.2)"
     )
     assert outcomes(orders, [piles] * 4) == [piles] * 4
 
 
-def test_a_child_that_keeps_much_memory_is_replaced(orders: Callable[[str], str]) -> None:
+def test_a_child_that_holds_much_memory_is_replaced(orders: Callable[[str], str]) -> None:
     piles = "import sys; sys.modules['os'].__dict__.setdefault('pile', []).append(b'1' * (700 * 2**20))"
     assert outcomes(orders, [piles]) == [piles]
     assert child_processes() == []
 
 
 @pytest.mark.slow
-def test_the_same_fault_is_reported_in_the_same_words(orders: Callable[[str], str]) -> None:
+def test_the_same_fault_has_the_same_detail(orders: Callable[[str], str]) -> None:
     limits = IsolationLimits(timeout_s=1.0, memory_bytes=2**29)
     faults = ["os.abort()", "while True: pass", "held = [b'1' * 2**25 for _ in range(10**6)]"]
     first, again = outcomes(orders, faults, limits), outcomes(orders, faults[::-1], limits)[::-1]
@@ -193,7 +182,7 @@ def test_printing_does_not_disturb_the_pipe(orders: Callable[[str], str]) -> Non
 
 
 @pytest.mark.slow
-def test_what_a_child_writes_does_not_pile_up(orders: Callable[[str], str]) -> None:
+def test_only_the_end_of_a_childs_output_is_kept(orders: Callable[[str], str]) -> None:
     loud = "for _ in range(64): os.write(2, b'y' * 2**20); time.sleep(0.02)"
     _, loss = outcomes(orders, [loud, loud + "\nprint('last words', flush=True); os.abort()"])
     assert "last words" in loss.stderr
@@ -203,8 +192,8 @@ def test_what_a_child_writes_does_not_pile_up(orders: Callable[[str], str]) -> N
 def test_an_error_of_the_function_is_raised_here(orders: Callable[[str], str]) -> None:
     with pytest.raises(PermissionError, match="not yours"):
         outcomes(orders, ["1", "raise PermissionError('not yours')"])
-    with pytest.raises(RunError, match="Own: fault"):  # a class that this process cannot know
-        outcomes(orders, ["class Own(Exception): pass\nraise Own('fault')"])
+    with pytest.raises(RunError, match="Own: words"):  # a class that this process cannot know
+        outcomes(orders, ["class Own(Exception): pass\nraise Own('words')"])
 
 
 def test_a_large_result_arrives_whole(tmp_path: Path, orders: Callable[[str], str]) -> None:
@@ -212,7 +201,7 @@ def test_a_large_result_arrives_whole(tmp_path: Path, orders: Callable[[str], st
     assert outcomes(orders, [long, "1"]) == [long, "1"]
 
 
-def test_calling_off_kills_the_child_within_an_item(orders: Callable[[str], str]) -> None:
+def test_cancelling_kills_the_child_within_an_item(orders: Callable[[str], str]) -> None:
     began = time.monotonic()
     with pytest.raises(RunCancelledError):
         dict(supervise(orders, ["while True: pass"], LIMITS, lambda: time.monotonic() - began > 0.5))
@@ -229,7 +218,7 @@ def test_a_child_killed_from_outside_costs_nothing(orders: Callable[[str], str],
     victim.kill()
     wait_for(lambda: len((tmp_path / "reached").read_text()) == 2, "the second trial")
     (tmp_path / "go").touch()
-    thread.join(DEADLINE_S)
+    thread.join(LONG_S)
     assert found == ["1", waits, "2"]
 
 
@@ -254,27 +243,27 @@ def test_threads_have_children_of_their_own(orders: Callable[[str], str], tmp_pa
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(DEADLINE_S)
+        thread.join(LONG_S)
     assert found == {"a": [meeting("a", "b")], "b": [meeting("b", "a")]}
     assert len(child_processes()) == 2
 
 
-def test_a_new_child_calls_what_it_must_load_with_its_argument(tmp_path: Path) -> None:
+def test_a_new_child_calls_its_load_with_the_argument(tmp_path: Path) -> None:
     (outcome,) = supervise(os.path.abspath, ["."], LIMITS, loads=(f"os:chdir:{tmp_path}",))
     assert outcome == (0, str(tmp_path.resolve()))
 
 
-def test_children_that_cannot_start_are_an_error_with_what_they_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_children_that_cannot_start_are_an_error_with_their_output(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(child_pool, "_LOADS", ("no_such_module:load",))
     with pytest.raises(RunError, match=r"(?s)3 times in a row.*No module named 'no_such_module'"):
         outcomes(len, ["abc"])
 
 
-def test_children_that_die_whenever_they_get_work_are_an_error(
+def test_children_that_die_before_an_item_begins_are_an_error(
     orders: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "orders_of_a_test.py").write_text("import os; os._exit(9)")
-    with pytest.raises(RunError, match="3 times in a row: its process ended with exit code 9"):
+    with pytest.raises(RunError, match="3 times in a row before it began: its process ended with exit code 9"):
         outcomes(orders, ["1"])
 
 
@@ -286,12 +275,12 @@ def test_children_that_die_whenever_they_get_work_are_an_error(
         ({"memory_bytes": 2**20}, "use at least 0.5 GiB"),
     ],
 )
-def test_limits_that_no_building_can_keep_are_refused(fields: dict[str, Any], words: str) -> None:
+def test_limits_too_small_for_any_building_are_refused(fields: dict[str, Any], words: str) -> None:
     with pytest.raises(SettingsError, match=words):
         IsolationLimits(**fields)
 
 
-def test_bytes_that_are_no_message_are_noticed() -> None:
+def test_bytes_that_are_not_a_message_are_an_error() -> None:
     with pytest.raises(ValueError, match="something else wrote"):
         list(Frames().feed(b"\xff" * 20))
     whole = frame({"a": 1})
@@ -299,7 +288,7 @@ def test_bytes_that_are_no_message_are_noticed() -> None:
     assert [list(frames.feed(whole[i : i + 1])) for i in range(len(whole))][-1] == [{"a": 1}]
 
 
-# --- no child outlives its owner --------------------------------------------------------------------------------------
+# --- no child outlives its parent -------------------------------------------------------------------------------
 
 WORKER = """
 import signal, sys, time
@@ -324,21 +313,21 @@ time.sleep(1000)
 def test_a_child_is_gone_when_its_worker_is_killed(
     orders: Callable[[str], str], tmp_path: Path, order: str, sign: signal.Signals
 ) -> None:
-    program = f"open('{tmp_path}/reached', 'w').close()\n{order}"
-    with subprocess.Popen([sys.executable, "-c", WORKER, str(tmp_path), program], stderr=subprocess.DEVNULL) as worker:
+    item = f"open('{tmp_path}/reached', 'w').close()\n{order}"
+    with subprocess.Popen([sys.executable, "-c", WORKER, str(tmp_path), item], stderr=subprocess.DEVNULL) as worker:
         wait_for(lambda: (tmp_path / "reached").exists() or worker.poll() is not None, "the item")
         family = psutil.Process(worker.pid).children(recursive=True)
         (busy,) = child_processes(worker.pid)
         assert busy in family
         worker.send_signal(sign)
     for process in family:
-        wait_for(lambda process=process: ended(process), "the end of the child, and of the server that it came from")
+        wait_for(lambda process=process: ended(process), "the end of the child and of its server")
 
 
-def test_a_child_outlives_the_thread_that_asked_for_it(orders: Callable[[str], str]) -> None:
+def test_a_child_outlives_the_thread_that_started_it(orders: Callable[[str], str]) -> None:
     thread = threading.Thread(target=lambda: outcomes(orders, ["1"]))
     thread.start()
-    thread.join(DEADLINE_S)
+    thread.join(LONG_S)
     (first,) = child_processes()
     assert outcomes(orders, ["2"]) == ["2"]
     assert child_processes() == [first]
@@ -355,7 +344,7 @@ def test_isolation_changes_no_content(suburb: Path, reconstruct: Any) -> None:
 
 
 @pytest.mark.parametrize("isolate", [True, False])
-def test_a_building_that_meets_a_fault_of_ours_is_kept_with_and_without_a_child(
+def test_a_building_with_an_internal_error_leaves_a_bundle_with_and_without_a_child(
     suburb: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch, isolate: bool
 ) -> None:
     victim = min(rows(reconstruct(suburb).run_dir))
@@ -377,7 +366,7 @@ def test_a_building_that_meets_a_fault_of_ours_is_kept_with_and_without_a_child(
 
 
 @pytest.mark.slow
-def test_every_fault_costs_its_building_alone_and_is_reported_and_stored(
+def test_every_fault_harms_only_its_building_and_leaves_record_and_bundle(
     town: Path, reconstruct: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = reconstruct(town)
@@ -409,5 +398,5 @@ def test_every_fault_costs_its_building_alone_and_is_reported_and_stored(
     for name in good.keys() - lost:
         assert [hurt[name][column] for column in columns] == [good[name][column] for column in columns]
     for name in lost - {victims["crash_gather"]}:
-        assert hurt[name]["geometry"] is not None, "where it is, is known"
+        assert hurt[name]["geometry"] is not None, "its place is known"
         assert hurt[name]["input_hash"] == good[name]["input_hash"]

@@ -96,7 +96,7 @@ def test_tasks_that_need_more_memory_than_there_is_run_one_after_the_other(tmp_p
     assert {one.result for one in measured} == {"a", "b"}
 
 
-def test_tasks_run_in_processes_of_their_own_which_are_named() -> None:
+def test_tasks_run_in_processes_of_their_own() -> None:
     (measured,) = LocalExecutor(1).map("test", chores.double, [4], Watch())
     assert measured.process.partition(":")[0] == peak_of_process()[0].partition(":")[0]
     assert measured.process != peak_of_process()[0]
@@ -122,7 +122,7 @@ def test_an_error_of_a_task_is_raised_here_and_says_where_it_happened() -> None:
 
 
 @pytest.mark.slow
-def test_cancellation_ends_the_tasks_that_run(tmp_path: Path) -> None:
+def test_cancelling_stops_running_tasks(tmp_path: Path) -> None:
     stopped = threading.Event()
 
     def begun() -> bool:

@@ -1,4 +1,4 @@
-"""The cost of a task: the CPU time of its own thread and of the children that worked for it, and no other."""
+"""The CPU time of a task: that of its own thread and of its children, and no other."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_tasks_of_other_threads_pay_for_themselves() -> None:
     assert measured.cpu_s < 0.2
 
 
-def test_when_a_task_began_is_reported() -> None:
+def test_a_measurement_has_the_start_of_the_task() -> None:
     before = time.time()
     measured = measure(spin, 0.01)
     assert before <= measured.began_s <= time.time()

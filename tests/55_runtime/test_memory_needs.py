@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from distributed import Client, LocalCluster, Nanny
+from processes import LONG_S, wait_for
 
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.memory_needs import (
@@ -34,20 +33,12 @@ sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
 
 import chores
 
-LONG_S = 90.0
 GIB = 2**30
-
-
-def wait_for(condition: Any, what: str) -> None:
-    end = time.monotonic() + LONG_S
-    while not condition():
-        assert time.monotonic() < end, f"waited in vain for {what}"
-        time.sleep(0.02)
 
 
 @dataclasses.dataclass
 class Bench:
-    """A scheduler, workers that announce what a test says, and the events of a run on them."""
+    """A scheduler, workers with given announcements, and the events of a run on them."""
 
     local: LocalCluster
     folder: Path
@@ -125,7 +116,7 @@ def test_giants_go_to_the_worker_that_has_room_for_them(bench: Bench) -> None:
     assert len(processes) == 1
 
 
-def test_where_no_worker_announces_memory_all_run_with_a_warning(bench: Bench) -> None:
+def test_without_announced_memory_all_tasks_run_with_a_warning(bench: Bench) -> None:
     add_worker(bench, None)
     bench.go()
     assert sorted(bench.run([bench.task(f"giant{k}", 3 * GIB) for k in range(3)])) == ["giant0", "giant1", "giant2"]
@@ -135,7 +126,7 @@ def test_where_no_worker_announces_memory_all_run_with_a_warning(bench: Bench) -
     assert "--resources MEMORY=" in event.message
 
 
-def test_a_need_that_no_worker_has_runs_where_most_is_and_is_reported(bench: Bench) -> None:
+def test_a_task_too_large_for_every_worker_runs_on_the_largest_with_a_warning(bench: Bench) -> None:
     add_worker(bench, 2 * GIB)
     bench.go()
     assert bench.run([bench.task("giant", 64 * GIB)]) == ["giant"]

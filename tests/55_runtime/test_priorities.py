@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 from distributed import Client
+from processes import LONG_S, wait_for
 
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.priorities import PRIORITIES, Traffic, priority_of
@@ -18,15 +17,6 @@ from pipeline.runtime.monitoring.events import Watch
 sys.path.insert(0, str(Path(__file__).parent / "on_workers"))
 
 import chores
-
-LONG_S = 90.0
-
-
-def wait_for(condition: Any, what: str) -> None:
-    end = time.monotonic() + LONG_S
-    while not condition():
-        assert time.monotonic() < end, f"waited in vain for {what}"
-        time.sleep(0.02)
 
 
 def test_no_wish_leads_out_of_the_kind_of_a_run() -> None:

@@ -1,4 +1,4 @@
-"""Certificates: a file that cannot be used is named with the fix, before anything is tried."""
+"""Certificates: unusable files are refused with name and fix, before any connection."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ def nothing_given(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
-def test_files_that_can_be_used_are_passed_to_dask_for_every_role(authority: Authority) -> None:
+def test_dask_gets_usable_files_for_every_role(authority: Authority) -> None:
     files = authority.files()
-    options = files.security
-    assert options["require_encryption"] is True
-    assert {options[f"tls_{role}_cert"] for role in ("scheduler", "worker", "client")} == {files.cert}
-    assert {options[f"tls_{role}_key"] for role in ("scheduler", "worker", "client")} == {files.key}
+    security = files.security
+    assert security["require_encryption"] is True
+    assert {security[f"tls_{role}_cert"] for role in ("scheduler", "worker", "client")} == {files.cert}
+    assert {security[f"tls_{role}_key"] for role in ("scheduler", "worker", "client")} == {files.key}
 
 
 def test_a_key_may_lie_in_the_file_of_its_certificate(authority: Authority, tmp_path: Path) -> None:
@@ -74,17 +74,17 @@ def test_a_key_may_lie_in_the_file_of_its_certificate(authority: Authority, tmp_
     assert TlsFiles(ca=files.ca, cert=str(both)).security["tls_worker_key"] == str(both)
 
 
-def test_every_file_that_is_missing_is_reported_at_once(authority: Authority) -> None:
-    with pytest.raises(SettingsError) as caught:
+def test_all_missing_files_are_reported_at_once(authority: Authority) -> None:
+    with pytest.raises(SettingsError) as refused:
         TlsFiles(ca="/nowhere/ca.pem", cert="/nowhere/one.pem", key=authority.files().key)
-    assert [fault.split(":")[0] for fault in caught.value.faults] == [
+    assert [fault.split(":")[0] for fault in refused.value.faults] == [
         "TLS_CA is /nowhere/ca.pem",
         "TLS_CERT is /nowhere/one.pem",
     ]
-    assert all("No such file" in fault and "--tls-ca" in fault for fault in caught.value.faults)
+    assert all("No such file" in fault and "--tls-ca" in fault for fault in refused.value.faults)
 
 
-def test_files_that_are_something_else_are_reported(authority: Authority, tmp_path: Path) -> None:
+def test_files_with_other_content_are_refused(authority: Authority, tmp_path: Path) -> None:
     files, other = authority.files(), authority.files("two")
     text = tmp_path / "notes.txt"
     text.write_text("no certificate")
@@ -92,7 +92,7 @@ def test_files_that_are_something_else_are_reported(authority: Authority, tmp_pa
     key = load_pem_private_key(Path(files.key).read_bytes(), None)
     locked.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret")))
     for given, words in (
-        ({"ca": str(text), "cert": files.cert, "key": files.key}, "TLS_CA is .*no PEM file"),
+        ({"ca": str(text), "cert": files.cert, "key": files.key}, "TLS_CA is .*not a PEM file"),
         ({"ca": files.key, "cert": files.cert, "key": files.key}, "TLS_CA is .*no certificate of a CA"),
         ({"ca": files.ca, "cert": files.cert, "key": other.key}, "TLS_CERT is .*is not that of the certificate"),
         ({"ca": files.ca, "cert": files.cert, "key": ""}, "TLS_KEY is .*one.pem: no private key"),
@@ -166,7 +166,7 @@ class Door:
                     continue
 
     def close(self) -> None:
-        """Let no client in any more."""
+        """Accept no more connections."""
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         self._thread.join()
@@ -181,7 +181,7 @@ def doors() -> Iterator[list[Door]]:
         door.close()
 
 
-def test_a_look_at_the_port_shows_why_a_connection_failed(
+def test_a_probe_of_the_port_explains_a_failed_connection(
     authority: Authority, tmp_path: Path, doors: list[Door]
 ) -> None:
     ours, theirs = authority.files(), Authority(tmp_path, "theirs").files()
@@ -193,7 +193,7 @@ def test_a_look_at_the_port_shows_why_a_connection_failed(
     mixed = TlsFiles(ca=ours.ca, cert=theirs.cert, key=theirs.key)
     assert "it does not accept our certificate" in explain_failure(f"tls://{secure}", mixed)
     assert "it wants a certificate of ours" in explain_failure(f"tls://{secure}", None)
-    # nothing to report: all is well, or no process is there
+    # no reason: everything is fine, or no one listens
     assert explain_failure(f"tls://{secure}", ours) == explain_failure(f"tcp://{plain}", None) == ""
     assert explain_failure("tls://127.0.0.1:9", ours) == explain_failure("inproc://somewhere", None) == ""
 
@@ -214,6 +214,6 @@ def test_a_worker_goes_on_looking_where_the_port_explains_why_it_did_not_start(
     plain = WorkerOptions(scheduler=f"tls://127.0.0.1:{doors[0].port}", tls=files)
     with pytest.raises(ConnectionError, match="does not speak TLS: write tcp://"):
         asyncio.run(_start(Unwilling(), plain))
-    alone = WorkerOptions(scheduler="tls://127.0.0.1:9", tls=files)
+    unreachable = WorkerOptions(scheduler="tls://127.0.0.1:9", tls=files)
     with pytest.raises(ClusterError, match="does not start: IOStream is not idle"):
-        asyncio.run(_start(Unwilling(), alone))
+        asyncio.run(_start(Unwilling(), unreachable))

@@ -23,7 +23,7 @@ from pipeline.console import Console
 from pipeline.errors import RunCancelledError, RunError, SettingsError
 from pipeline.runtime.cluster.dask_executor import Cluster
 from pipeline.runtime.cluster.performance_report import BINS, ROWS, PerformanceReport
-from pipeline.runtime.cluster.run_metrics import RunMetrics, TallyMetrics, both, serve_metrics
+from pipeline.runtime.cluster.run_metrics import RunMetrics, TallyMetrics, combined, serve_metrics
 from pipeline.runtime.engine import executor_for
 from pipeline.runtime.monitoring import logs
 from pipeline.runtime.monitoring.events import Event, Watch
@@ -52,7 +52,7 @@ def test_events_of_a_run_become_figures() -> None:
     now_s = [100.0]
     metrics = RunMetrics(registry, clock=lambda: now_s[0])
     heard: list[Event] = []
-    tell = both(metrics, heard.append)
+    tell = combined(metrics, heard.append)
     tell(Event(kind="stage", stage="split", total=400))
     tell(Event(kind="progress", stage="split", done=400, total=400))
     tell(Event(kind="stage", stage="reconstruct", total=20_000))
@@ -108,7 +108,7 @@ def test_what_a_process_sent_and_worked_off_become_figures() -> None:
     assert found["gablework_peak_memory_bytes"] > 2**20
 
 
-def test_figures_are_served_and_a_taken_port_is_reported() -> None:
+def test_figures_are_served_and_a_taken_port_is_refused() -> None:
     port = free_port()
     end = serve_metrics(port)
     try:
@@ -140,7 +140,7 @@ def lines() -> Iterator[io.StringIO]:
     logger.setLevel(level)
 
 
-def entries_of(lines: io.StringIO) -> list[dict[str, object]]:
+def logged(lines: io.StringIO) -> list[dict[str, object]]:
     return [json.loads(line) for line in lines.getvalue().splitlines()]
 
 
@@ -155,7 +155,7 @@ def test_a_task_that_fails_logs_its_run_stage_and_tile(lines: io.StringIO) -> No
     with pytest.raises(ZeroDivisionError):
         measure(broken, task, "split")
     ids = {"run": "ab12", "stage": "split", "tile": "x85_y447"}
-    inside, failed = entries_of(lines)
+    inside, failed = logged(lines)
     assert inside.items() >= {**ids, "building": "b1", "level": "info", "message": "from deep inside"}.items()
     assert failed.items() >= {**ids, "level": "error", "message": "the task failed"}.items()
     assert "ZeroDivisionError: of True" in str(failed["exception"])
@@ -163,7 +163,7 @@ def test_a_task_that_fails_logs_its_run_stage_and_tile(lines: io.StringIO) -> No
     assert TALLIES.worked["split", "failed"] == before.get(("split", "failed"), 0) + 1
     # nothing sticks to the thread
     logs.LOG.info("later")
-    assert set(entries_of(lines)[-1]) == {"at", "level", "logger", "message"}
+    assert set(logged(lines)[-1]) == {"at", "level", "logger", "message"}
 
 
 def test_a_fault_of_the_input_has_no_traceback_and_a_run_that_is_cancelled_no_line(lines: io.StringIO) -> None:
@@ -174,7 +174,7 @@ def test_a_fault_of_the_input_has_no_traceback_and_a_run_that_is_cancelled_no_li
 
         with pytest.raises(type(error)):
             measure(broken, None, "publish")
-    (line,) = entries_of(lines)
+    (line,) = logged(lines)
     assert line["message"] == "the task failed: disk full: make room"
     assert "exception" not in line
 
@@ -217,7 +217,7 @@ raise KeyError("lost")
 """
 
 
-def test_all_that_a_process_of_ours_says_is_json_also_what_libraries_say_and_uncaught_errors() -> None:
+def test_all_output_of_a_process_is_json_also_lines_of_libraries_and_uncaught_exceptions() -> None:
     environment = {**os.environ, logs.VARIABLE: "1"}
     ended = subprocess.run([sys.executable, "-c", SPEAKS], env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
@@ -229,7 +229,7 @@ def test_all_that_a_process_of_ours_says_is_json_also_what_libraries_say_and_unc
     assert "KeyError: 'lost'" in lost["exception"]
 
 
-def test_a_command_that_fails_reports_it_in_json_and_leaves_the_loggers_as_they_were(
+def test_a_failing_command_reports_it_in_json_and_restores_the_loggers(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv(logs.VARIABLE, "1")
@@ -246,8 +246,8 @@ def test_a_command_that_fails_reports_it_in_json_and_leaves_the_loggers_as_they_
         serve()
     assert (root.handlers, sys.excepthook) == (before, hook)
     said = capsys.readouterr()
-    library, entry, fault = (json.loads(line) for line in said.err.splitlines())
-    assert (said.out, entry["message"]) == ("", "listening")
+    library, listening, fault = (json.loads(line) for line in said.err.splitlines())
+    assert (said.out, listening["message"]) == ("", "listening")
     assert library["logger"] == "a.library"
     assert (fault["level"], fault["message"]) == ("error", "by nought")
     assert "ZeroDivisionError: by nought" in fault["exception"]
@@ -260,7 +260,7 @@ def took(seconds: float, began_s: float, process: str = "host:1") -> Measured[in
     return Measured(result=0, seconds=seconds, cpu_s=seconds, process=process, peak_bytes=2**28, began_s=began_s)
 
 
-def test_the_page_shows_stages_processes_and_the_longest_tasks(tmp_path: Path) -> None:
+def test_the_page_lists_stages_processes_and_the_longest_tasks(tmp_path: Path) -> None:
     now_s = [1000.0]
     path = tmp_path / "time.html"
     with PerformanceReport(str(path), clock=lambda: now_s[0]) as report:
@@ -293,10 +293,10 @@ def test_the_page_is_written_also_where_the_run_breaks_off(tmp_path: Path) -> No
     path = tmp_path / "time.html"
     with pytest.raises(ZeroDivisionError), PerformanceReport(str(path)):
         raise ZeroDivisionError
-    assert "No task came to its end" in path.read_text()
+    assert "No task was finished" in path.read_text()
 
 
-def test_a_place_where_no_page_can_be_written_is_reported_before_anything_runs(tmp_path: Path) -> None:
+def test_an_unusable_place_for_the_page_is_refused_before_anything_runs(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="make the folder"):
         Cluster(scheduler="tcp://127.0.0.1:9").executor(performance_report=str(tmp_path / "none" / "time.html"))
     with pytest.raises(SettingsError, match="this run has none: use --workers 1"):

@@ -136,7 +136,7 @@ class BatchRun:
         return driver.wait_for(lambda: self.gates.reached(stage), f"a task in {stage}")
 
     def status(self) -> dict[str, Any]:
-        """What the status command tells; asked in this process, as starting one takes longer than the answer."""
+        """Output of the status command, run in this process, which is faster than starting another."""
         ended = CliRunner().invoke(app, ["batch", "status", str(self.file), "--json"])
         assert ended.exit_code == 0, ended.stderr
         found: dict[str, Any] = json.loads(ended.stdout)
@@ -212,7 +212,7 @@ def kill_scheduler(run: BatchRun, driver: Program, pid: int) -> None:
 
 
 def second_driver(run: BatchRun, driver: Program, pid: int) -> None:
-    """Somebody starts the same batch once more: it refuses, and the first goes on."""
+    """Start the same batch again: it refuses, and the first one continues."""
     other = run.start()
     assert other.ended() == REFUSED
     assert "is at work already" in other.text
@@ -340,7 +340,7 @@ def _modelled(run: BatchRun) -> tuple[int, int]:
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "batch_faults.md"
 
 
-def rows_told() -> list[list[str]]:
+def rows_of_page() -> list[list[str]]:
     """The rows of the page's table, cell by cell."""
     lines = [line.strip("| ").split(" | ") for line in PAGE.read_text().splitlines() if line.startswith("|")]
     assert tuple(lines[0]) == HEADER
@@ -352,7 +352,7 @@ def check(run: BatchRun, fault: Fault, undisturbed: Undisturbed) -> None:
     row = strike(run, fault, undisturbed.digest)
     assert row.struck.endswith(fault.state), row
     assert (row.content, row.done_twice) == ("same", ONE_RUN if fault.code == 0 else "no"), row
-    assert list(row.cells) in rows_told(), f"{PAGE} has no row | {' | '.join(row.cells)} |"
+    assert list(row.cells) in rows_of_page(), f"{PAGE} has no row | {' | '.join(row.cells)} |"
 
 
 def cases(*, in_store: bool) -> list[Any]:

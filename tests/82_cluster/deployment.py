@@ -1,4 +1,4 @@
-"""The whole service as real processes on the loopback, to be killed one by one and restarted as a supervisor would."""
+"""The whole service as real processes on the loopback, which tests kill and restart."""
 
 from __future__ import annotations
 
@@ -24,41 +24,41 @@ from service.settings import ServiceSettings
 from service.store import JobStore
 
 STAGES = ("ingest", "split", "reconstruct", "publish", "outputs")
-"""Where a job can be held: the tasks of the first four on the workers, the last in the driver."""
+"""Stages in which a job can be held: the first four in tasks on the workers, the last in the driver."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Ended:
-    """A job that is over, as its store and its folder tell it."""
+    """A finished job, from its store and its folder."""
 
     job: Job
     events: Sequence[JobEvent]
     run: Path
     """The last attempt's run directory."""
     digest: str
-    """Of the run's content, computed from its files; empty where there is none."""
+    """Digest of the run's content, computed from its files; empty without a run."""
     buildings: Mapping[str, tuple[str, str]]
     """Status and reason of every building."""
 
     @property
     def ends(self) -> int:
-        """How often it was told to be over."""
+        """Number of its final events."""
         return sum(event.status is not None and event.status.is_over for event in self.events)
 
     @property
     def seconds(self) -> float:
-        """From submission to the end."""
+        """Time from submission to the end."""
         assert self.job.finished_at is not None
         return (self.job.finished_at - self.job.created_at).total_seconds()
 
 
 class Gates:
-    """Stages in which tasks wait until they are let through: one folder each, as `tests/faults` understands it.
+    """Stages in which tasks wait until the gate opens: one folder each, as `tests/faults` reads it.
 
     Parameters
     ----------
     folder : Path
-        Gets a folder for each stage.
+        Gets a folder per stage.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -69,7 +69,7 @@ class Gates:
 
     @property
     def asked(self) -> dict[str, str]:
-        """What goes into the environment."""
+        """Faults for the environment."""
         return {stage: str(path) for stage, path in self._folders.items()}
 
     def close(self, stage: str) -> None:
@@ -80,7 +80,7 @@ class Gates:
         (folder / "go").unlink()
 
     def open(self, *stages: str) -> None:
-        """Let all through, or those of some stages."""
+        """Open the gates of all or some stages."""
         for stage in stages or STAGES:
             (self._folders[stage] / "go").touch()
 
@@ -138,20 +138,18 @@ class Deployment:
         self._gablework = str(program("gablework"))
         self.running: dict[str, Program] = {}
         self.gone: set[str] = set()
-        """What the supervisor does not start again."""
+        """Programs that the supervisor does not restart."""
         self.replaced: list[Program] = []
-        """Programs that live beside those that took their names."""
+        """Programs that still run beside their replacements."""
         self.submitted: set[str] = set()
         """The ids of all jobs."""
 
     @property
     def scheduler_address(self) -> str:
-        """Where the scheduler listens."""
         return f"tcp://127.0.0.1:{self._ports['scheduler']}"
 
     @property
     def url(self) -> str:
-        """Where the API listens."""
         return f"http://127.0.0.1:{self._ports['api']}"
 
     # --- programs ----------------------------------------------------------------------------------------------------
@@ -178,22 +176,21 @@ class Deployment:
 
     @property
     def workers(self) -> list[str]:
-        """Names of the workers."""
         return [name for name in self.running if name.startswith("worker")]
 
     def supervise(self) -> None:
-        """Start again what has died, as a supervisor does, but not what is gone for good."""
+        """Restart dead programs, as a supervisor does, except those in `gone`."""
         for name, one in list(self.running.items()):
             if not one.alive and name not in self.gone:
                 self.start(name)
 
     def settle(self) -> None:
-        """Let all through, bring back everything, and wait until it answers."""
+        """Open all gates, restart everything, and wait until it answers."""
         self.gates.open()
         self.restore()
 
     def restore(self) -> None:
-        """Bring back everything, and wait until it answers and the scheduler knows all workers."""
+        """Restart everything, and wait until it answers and the scheduler knows all workers."""
         from distributed import Client
 
         self.gone.clear()
@@ -220,7 +217,7 @@ class Deployment:
         raise LookupError(f"process {pid} belongs to no worker")
 
     def freeze(self, name: str) -> Program:
-        """Stop a program in its tracks (SIGSTOP), but not while it holds the database's lock."""
+        """Stop a program with SIGSTOP, at a moment when it does not hold the database's lock."""
         one = self.running[name]
         database = self._database.removeprefix("sqlite:///")
 
@@ -242,39 +239,33 @@ class Deployment:
     # --- jobs --------------------------------------------------------------------------------------------------------
 
     def submit(self, tile: Path, settings: Mapping[str, Any], title: str = "") -> str:
-        """Send a tile; the job's id."""
+        """Send a tile; returns the job's id."""
         with tile.open("rb") as stream:
-            answer = httpx.post(
-                f"{self.url}/jobs",
-                files={"tile": (tile.name, stream)},
-                data={"settings": json.dumps(settings), "title": title},
-                timeout=LONG_S,
-            )
+            files, data = {"tile": (tile.name, stream)}, {"settings": json.dumps(settings), "title": title}
+            answer = httpx.post(f"{self.url}/jobs", files=files, data=data, timeout=LONG_S)
         assert answer.status_code == 201, answer.text
         job_id: str = answer.json()["jobID"]
         self.submitted.add(job_id)
         return job_id
 
     def status(self, job_id: str) -> str | None:
-        """What the API tells; None while it does not answer."""
+        """The API's answer; None while it does not answer."""
         try:
             answer = httpx.get(f"{self.url}/jobs/{job_id}", timeout=LONG_S)
         except httpx.TransportError:
             return None
         assert answer.status_code == 200, answer.text
-        told: str = answer.json()["status"]
-        return told
+        status: str = answer.json()["status"]
+        return status
 
     def job(self, job_id: str) -> Job:
-        """A job as stored."""
         return self._store.get(job_id)
 
     def events(self, job_id: str) -> list[JobEvent]:
-        """What happened to a job."""
         return self._store.events(job_id, limit=10_000)
 
     def held(self, job_id: str, stage: str) -> int:
-        """Wait until a job is held in a stage, and bring back what dies; the id of a process that waits there."""
+        """Wait until a job is held in a stage, restarting dead programs; returns a waiting process."""
 
         def reached() -> int | None:
             self.supervise()
@@ -285,7 +276,7 @@ class Deployment:
         return wait_for(reached, f"the stage {stage}")
 
     def ended(self, job_id: str) -> Ended:
-        """Wait until a job is over, and bring back what dies meanwhile."""
+        """Wait until a job is over, restarting dead programs."""
 
         def over() -> bool:
             self.supervise()

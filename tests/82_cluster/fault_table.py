@@ -1,10 +1,10 @@
-"""Faults, the stages in which they strike, and what became of the job, as rows of a table."""
+"""Faults, the stages in which they strike, and the outcome of the job, as rows of a table."""
 
 from __future__ import annotations
 
 import dataclasses
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,38 +21,38 @@ class Moment:
     """When a fault strikes."""
 
     job_id: str
-    """The job that is under way."""
+    """The running job."""
     pid: int
-    """A process that is held in the stage; 0 in the queue."""
+    """A process held in the stage; 0 in the queue."""
 
 
 def kill_worker_process(service: Deployment, moment: Moment) -> None:
-    """What the kernel does when memory runs out: the process alone; its nanny starts another."""
+    """Kill only the process, as the kernel does when memory runs out; its nanny starts another."""
     kill_process(moment.pid)
 
 
 def kill_worker(service: Deployment, moment: Moment) -> None:
-    """A machine is gone: worker, nanny and child at once."""
+    """Lose a machine: worker, nanny and child at once."""
     name = service.worker_of(moment.pid)
     service.gone.add(name)
     service.running[name].kill()
 
 
 def kill_all_workers(service: Deployment, moment: Moment) -> None:
-    """All machines are gone; others come when the job has told that it waits."""
+    """Lose all machines; others come when the job has reported that it waits."""
     service.gone.update(service.workers)
     for name in service.workers:
         service.running[name].kill()
     service.gates.open()
     wait_for(
         lambda: any(event.kind == "waiting" for event in service.events(moment.job_id)),
-        "an event that tells that the job waits for workers",
+        "the event that the job waits for workers",
     )
     service.gone.clear()
 
 
 def killed(name: str) -> Callable[[Deployment, Moment], None]:
-    """A program dies; its supervisor starts it again."""
+    """Kill a program; its supervisor restarts it."""
 
     def strike(service: Deployment, moment: Moment) -> None:
         service.running[name].kill()
@@ -61,7 +61,7 @@ def killed(name: str) -> Callable[[Deployment, Moment], None]:
 
 
 def freeze_driver(service: Deployment, moment: Moment) -> None:
-    """A driver falls silent, another takes its job, and then the first goes on as if nothing had been."""
+    """Freeze a driver until another one has its job, then let it continue."""
     silent = service.freeze("driver")
     attempt = service.job(moment.job_id).attempt
     service.start("driver")
@@ -72,20 +72,20 @@ def freeze_driver(service: Deployment, moment: Moment) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """Something that goes wrong while a job is in a stage, and again in the next."""
+    """A fault that strikes in several stages of a job."""
 
     name: str
-    """As the table tells it."""
+    """Text in the table."""
     strike: Callable[[Deployment, Moment], None]
-    """Does it."""
+    """Causes it."""
     stages: Sequence[str]
-    """Where it strikes, in the order of a job."""
+    """Stages in which it strikes, in the order of a job."""
     begun_again: Sequence[str] = ()
-    """Where the job is begun once more."""
+    """Stages in which the job is begun again."""
 
     @property
     def begun(self) -> int:
-        """How often the job is begun by its end."""
+        """Number of begun attempts by the end of the job."""
         return 1 + sum(stage in self.begun_again for stage in self.stages)
 
 
@@ -103,26 +103,26 @@ FAULTS = (
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What became of a job."""
+    """Outcome of a job."""
 
     fault: str
     stages: str
-    """Where it struck, one after the other."""
+    """Stages in which it struck."""
     status: str
     begun: int
-    """How often it was begun."""
+    """Number of attempts."""
     ended: int
-    """How often it was told to be over."""
+    """Number of final events."""
     content: str
-    """The digest against that of an undisturbed run."""
+    """Comparison with the digest of an undisturbed run."""
     marked: str
-    """Buildings that cost their process."""
+    """Buildings that killed their process."""
     lost_s: float
     """Seconds longer than the undisturbed run."""
 
     @property
     def outcome(self) -> tuple[str, ...]:
-        """All but the seconds, which no two runs share."""
+        """All columns except the seconds, which differ from run to run."""
         return (self.fault, self.stages, self.status, str(self.begun), str(self.ended), self.content, self.marked)
 
 
@@ -146,19 +146,22 @@ def strike(service: Deployment, fault: Fault, tile: Path, settings: Mapping[str,
         begun += stage in fault.begun_again
         if following is not None:
             service.gates.close(following)
-        # what the stage before has cost is there again
+        # restart what the last stage has lost
         service.restore()
         fault.strike(service, Moment(job_id, pid))
         service.gates.open(stage)
     return service.ended(job_id)
 
 
+def without(buildings: Mapping[str, tuple[str, str]], names: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """The buildings except some."""
+    return {name: buildings[name] for name in buildings.keys() - set(names)}
+
+
 def row(fault: str, stages: Sequence[str], ended: Ended, undisturbed: Ended) -> Row:
-    """What became of a job, against an undisturbed one."""
+    """Outcome of a job, compared with an undisturbed one."""
     reasons = {name: reason for name, (_, reason) in ended.buildings.items() if reason in COSTLY}
-    rest_is_same = {name: told for name, told in ended.buildings.items() if name not in reasons} == {
-        name: told for name, told in undisturbed.buildings.items() if name not in reasons
-    }
+    rest_is_same = without(ended.buildings, reasons) == without(undisturbed.buildings, reasons)
     content = "same" if ended.digest == undisturbed.digest else "same but for them" if rest_is_same else "differs"
     return Row(
         fault=fault,
@@ -179,13 +182,13 @@ HEADER = ("fault", "strikes in", "job", "begun", "ended", "content", "buildings 
 
 def markdown(rows: Sequence[Row]) -> str:
     """The table."""
-    told = [(*(cell or "none" for cell in row.outcome), f"{max(row.lost_s, 0.0):.0f}") for row in rows]
-    lines = [HEADER, ["---"] * len(HEADER), *told]
+    cells = [(*(cell or "none" for cell in row.outcome), f"{max(row.lost_s, 0.0):.0f}") for row in rows]
+    lines = [HEADER, ["---"] * len(HEADER), *cells]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
 def without_seconds(page: str) -> list[list[str]]:
-    """The rows of the page's table whose last column are seconds, without it."""
+    """The rows of the page's table without the last column, the seconds."""
     lines = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in page.splitlines() if "|" in line]
     start = lines.index(list(HEADER))
     return [line[:-1] for line in lines[start + 2 :] if len(line) == len(HEADER)]

@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from batch_faults import FAULTS, BatchRun, Fault, Undisturbed, cases, check, modelled_twice, rows_told
+from batch_faults import FAULTS, BatchRun, Fault, Undisturbed, cases, check, modelled_twice, rows_of_page
 from processes import Programs, program
 
 pytestmark = pytest.mark.slow
@@ -36,8 +36,8 @@ def test_a_building_that_any_run_models_again_is_noticed(runs: list[tuple[int, i
     assert modelled_twice(runs) is twice
 
 
-def test_the_page_tells_all_rows_and_no_other() -> None:
-    assert [row[:2] for row in rows_told()] == [[fault.name, ", ".join(fault.stages)] for fault in FAULTS]
+def test_the_page_has_exactly_these_rows() -> None:
+    assert [row[:2] for row in rows_of_page()] == [[fault.name, ", ".join(fault.stages)] for fault in FAULTS]
 
 
 def test_a_poisonous_building_costs_only_itself_also_after_a_kill(
@@ -54,7 +54,7 @@ def test_a_poisonous_building_costs_only_itself_also_after_a_kill(
     assert again.ended() == 0, again.tail()
     found = run.buildings()
     assert found.pop(poison) == ("failed", "crashed")
-    assert found == {name: told for name, told in undisturbed_batch.buildings.items() if name != poison}
+    assert found == {name: outcome for name, outcome in undisturbed_batch.buildings.items() if name != poison}
     assert (run.folder / "models" / "quarantine" / f"{poison}.bundle").is_file()
 
 

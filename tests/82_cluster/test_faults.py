@@ -1,6 +1,6 @@
-"""Real processes are killed at every stage of a job: none is lost, none ends twice, the content is the same.
+"""Real processes are killed at every stage of a job: no job is lost or ends twice, and the content is the same.
 
-Every test adds its rows to a table; the last one holds docs/reference/faults.md against it.
+Every test adds its rows to a table; the last test compares docs/reference/faults.md with it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import httpx
 import pytest
 from deployment import Deployment, Ended
-from fault_table import FAULTS, Fault, Row, markdown, row, strike, without_seconds
+from fault_table import FAULTS, Fault, Row, markdown, row, strike, without, without_seconds
 from processes import Programs, program
 
 pytestmark = pytest.mark.slow
@@ -47,7 +47,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Deployment]:
 
 @pytest.fixture(scope="module")
 def undisturbed(service: Deployment, town_tile: Path) -> Ended:
-    """A job that nothing happens to; the second one, since the first also starts the children of the workers."""
+    """A job without faults; the second one, since the first also starts the children of the workers."""
     service.ended(service.submit(town_tile, SETTINGS, "first"))
     ended = service.ended(service.submit(town_tile, SETTINGS, "undisturbed"))
     assert (ended.job.status, ended.job.attempt, ended.ends) == ("successful", 1, 1)
@@ -67,19 +67,14 @@ def test_a_job_outlives(
     fault: Fault, service: Deployment, undisturbed: Ended, town_tile: Path, table: list[Row]
 ) -> None:
     service.settle()
-    told = row(fault.name, fault.stages, strike(service, fault, town_tile, SETTINGS), undisturbed)
-    table.append(told)
+    outcome = row(fault.name, fault.stages, strike(service, fault, town_tile, SETTINGS), undisturbed)
+    table.append(outcome)
     while service.replaced:
         silent = service.replaced.pop()
         assert silent.stop() == 0
         assert "held attempt 1; the job is" in silent.text, "it did not learn that its job has passed on"
-    assert (told.status, told.begun, told.ended, told.content, told.marked) == (
-        "successful",
-        fault.begun,
-        1,
-        "same",
-        "",
-    )
+    expected = ("successful", fault.begun, 1, "same", "")
+    assert (outcome.status, outcome.begun, outcome.ended, outcome.content, outcome.marked) == expected
 
 
 def test_no_job_is_lost_or_doubled_by_all_of_it(service: Deployment, undisturbed: Ended) -> None:
@@ -91,7 +86,7 @@ def test_no_job_is_lost_or_doubled_by_all_of_it(service: Deployment, undisturbed
         assert sum(event.status == "successful" for event in service.events(job["jobID"])) == 1
 
 
-def test_buildings_that_cost_their_process_cost_only_themselves(
+def test_buildings_that_kill_their_process_harm_only_themselves(
     undisturbed: Ended, town_tile: Path, table: list[Row], tmp_path: Path, programs: Programs
 ) -> None:
     crashing, endless, eating = sorted(undisturbed.buildings)[3:24:8]
@@ -103,11 +98,9 @@ def test_buildings_that_cost_their_process_cost_only_themselves(
     ended = service.ended(service.submit(town_tile, SETTINGS, "poisonous buildings"))
     marked = {name: reason for name, (status, reason) in ended.buildings.items() if status == "failed"}
     assert marked == expected
-    assert {name: told for name, told in ended.buildings.items() if name not in expected} == {
-        name: told for name, told in undisturbed.buildings.items() if name not in expected
-    }
+    assert without(ended.buildings, expected) == without(undisturbed.buildings, expected)
     for name in service.workers:
-        assert service.running[name].alive, "a building cost a worker"
+        assert service.running[name].alive, "a building killed a worker"
     for name, reason in expected.items():
         bundle = ended.run / "quarantine" / f"{name}.bundle"
         replayed = subprocess.run(
@@ -115,12 +108,18 @@ def test_buildings_that_cost_their_process_cost_only_themselves(
         )
         assert replayed.returncode == 0, replayed.stderr
         assert json.loads(replayed.stdout)["record"]["status"] == "ok"
-        told = row(POISONS[reason], ("reconstruct",), ended, undisturbed)
-        assert (told.status, told.begun, told.ended, told.content) == ("successful", 1, 1, "same but for them")
-        table.append(dataclasses.replace(told, content="same but for it", marked=f"it alone: `{reason}`; replayed: ok"))
+        outcome = row(POISONS[reason], ("reconstruct",), ended, undisturbed)
+        assert (outcome.status, outcome.begun, outcome.ended, outcome.content) == (
+            "successful",
+            1,
+            1,
+            "same but for them",
+        )
+        marked = f"it alone: `{reason}`; replayed: ok"
+        table.append(dataclasses.replace(outcome, content="same but for it", marked=marked))
 
 
-def test_the_page_tells_what_happens(table: list[Row], tmp_path: Path) -> None:
+def test_the_page_says_what_happens(table: list[Row], tmp_path: Path) -> None:
     if len(table) != len(FAULTS) + len(POISONS):
         pytest.skip(f"needs all rows, has {len(table)} of {len(FAULTS) + len(POISONS)}: run the whole file")
     page = tmp_path / "faults.md"

@@ -77,7 +77,7 @@ def test_a_run_that_outlives_a_killed_schedule_is_not_met_by_another(run: BatchR
     os.kill(pid, 0)  # the task of the first run is still there, and the gates are closed
     assert record(run).counts == {}
     run.gates.open()
-    second.wait_for(lambda: record(run).counts, "what became of the run")
+    second.wait_for(lambda: record(run).counts, "the outcome of the run")
     os.kill(second.pid, signal.SIGTERM)
     assert second.ended() == 0, second.tail()
     assert record(run).counts == {"ran": 1}

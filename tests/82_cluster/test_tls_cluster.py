@@ -1,4 +1,4 @@
-"""A scheduler and workers that speak TLS only: the same content as without, and nobody else gets a word in."""
+"""A scheduler and workers with TLS: the same content as without, and no one else can connect."""
 
 from __future__ import annotations
 
@@ -110,8 +110,8 @@ def test_a_run_over_tls_gives_the_same_content_and_only_those_with_a_certificate
         command = [sys.executable, "-m", "service.cli", "worker", "--scheduler", address, "--name", name, *words]
         programs.start(name, command, env=env).wait_for_text(f"is at the scheduler {address}")
 
-    code, told = reconstruct(tile, tmp_path / "run", "--scheduler", address, *options(files))
-    assert code == 0, told
+    code, output = reconstruct(tile, tmp_path / "run", "--scheduler", address, *options(files))
+    assert code == 0, output
     manifest = read_manifest(tmp_path / "run")
     assert manifest.content_sha256 == digest
 
@@ -121,23 +121,23 @@ def test_a_run_over_tls_gives_the_same_content_and_only_those_with_a_certificate
         "DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT": files.cert,
         "DASK_DISTRIBUTED__COMM__TLS__CLIENT__KEY": files.key,
     }
-    code, told = reconstruct(tile, tmp_path / "dask", "--scheduler", address, env=own)
-    assert code == 0, told
+    code, output = reconstruct(tile, tmp_path / "dask", "--scheduler", address, env=own)
+    assert code == 0, output
     assert read_manifest(tmp_path / "dask").content_sha256 == digest
 
     # every connection is encrypted, those between workers too
     with Client(address, security=Cluster(scheduler=address, tls=files).security) as client:
         workers = client.scheduler_info(n_workers=-1)["workers"]
         assert len(workers) == 2
-        assert all(one.startswith("tls://") and told["nanny"].startswith("tls://") for one, told in workers.items())
+        assert all(one.startswith("tls://") and worker["nanny"].startswith("tls://") for one, worker in workers.items())
 
     for words, fault in (
         (["--scheduler", address], "wants TLS and there are no certificates: give --tls-ca"),
         (["--scheduler", f"tcp://127.0.0.1:{port}"], f"it speaks TLS: write tls://127.0.0.1:{port}"),
         (["--scheduler", f"tcp://127.0.0.1:{port}", *options(files)], f"write tls://127.0.0.1:{port}"),
     ):
-        code, told = reconstruct(tile, tmp_path / "refused", *words)
-        assert (code, fault in told) == (4, True), told
+        code, output = reconstruct(tile, tmp_path / "refused", *words)
+        assert (code, fault in output) == (4, True), output
     # a client that comes with the certificate of another CA, and one with none
     other = tmp_path / "other"
     other.mkdir()
@@ -177,6 +177,6 @@ def test_an_embedded_cluster_speaks_tls_where_certificates_are_given(
             Cluster(scheduler=cluster.address.replace("tls://", "tcp://")).executor(),
         ):
             pytest.fail("it connected")
-    code, told = reconstruct(tile, tmp_path / "run", "--workers", "2", env=variables(files))
-    assert code == 0, told
+    code, output = reconstruct(tile, tmp_path / "run", "--workers", "2", env=variables(files))
+    assert code == 0, output
     assert read_manifest(tmp_path / "run").content_sha256 == digest

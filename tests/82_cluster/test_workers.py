@@ -112,7 +112,7 @@ class Bench:
         return run(request, self.listen, cancelled=cancelled or self.over.is_set)
 
     def listen(self, event: Event) -> None:
-        """Keep what a run tells."""
+        """Keep the events of a run."""
         self.events.append(event)
 
     def begin(self, out: str) -> Future[RunSummary]:
@@ -195,17 +195,17 @@ def test_a_worker_process_that_is_killed_below_its_nanny_changes_nothing(bench: 
     assert running.result(END_S).digest == digest
 
 
-def test_a_run_without_workers_waits_tells_it_and_goes_on_when_one_comes(bench: Bench, digest: str) -> None:
+def test_a_run_without_workers_reports_that_it_waits_and_continues_when_one_comes(bench: Bench, digest: str) -> None:
     folder, env = bench.pausing("split")
     only = bench.start_worker("one", env=env)
     running = bench.begin("run")
     wait_for(reached(folder), "a task of split")
     only.kill()
 
-    def told() -> list[Event]:
+    def waiting_events() -> list[Event]:
         return [event for event in bench.events if (event.kind, event.stage) == ("waiting", "split")]
 
-    waiting = wait_for(told, "the word that it waits")[0]
+    waiting = wait_for(waiting_events, "the event that it waits")[0]
     assert f"gablework worker --scheduler {bench.address}" in waiting.message
     bench.start_worker("two")
     assert running.result(END_S).digest == digest
@@ -287,7 +287,7 @@ def test_a_worker_of_another_version_that_comes_late_is_refused_by_its_first_tas
 # --- gablework worker ------------------------------------------------------------------------------------------------
 
 
-def test_a_worker_that_is_told_to_end_finishes_what_runs_and_nothing_runs_twice(bench: Bench) -> None:
+def test_a_worker_that_drains_finishes_its_task_and_nothing_runs_twice(bench: Bench) -> None:
     workers = [bench.start_gablework_worker(name) for name in ("one", "two")]
     for worker in workers:
         worker.wait_for_text("is at the scheduler")

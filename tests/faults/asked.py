@@ -12,6 +12,6 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def environment(**faults: Any) -> dict[str, str]:
-    """The variables that ask for faults; `sitecustomize.py` tells which there are."""
+    """The environment variables for faults; `sitecustomize.py` lists them."""
     paths = [str(FOLDER), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return {"PYTHONPATH": os.pathsep.join(paths), "GABLEWORK_FAULTS": json.dumps(faults)}

@@ -1,33 +1,32 @@
 """Faults on demand for processes under test; the product itself has none.
 
-Put this folder on PYTHONPATH and say in GABLEWORK_FAULTS, as JSON, what is to go wrong. Python imports this file in
-every process that it starts, so workers and their children obey, too; nothing of the pipeline is imported before the
-process itself does so.
+Put this folder on PYTHONPATH and describe the faults in GABLEWORK_FAULTS, as JSON. Python imports this file in every
+process that it starts, also in workers and their children; it imports nothing of the pipeline itself.
 
 ```
 {
   "crash": ["<building_id>", ...],          SIGSEGV while the building is modelled
   "abort": [...],                           abort(), as an assertion of a C library does
   "exit": [...],                            ends its process with exit code 7
-  "endless": [...],                         loops for ever in Python
-  "endless_native": [...],                  loops for ever in C and holds the interpreter's lock
-  "eat_memory": [...],                      takes 32 MiB after the other
+  "endless": [...],                         loops forever in Python
+  "endless_native": [...],                  loops forever in C and holds the interpreter's lock
+  "eat_memory": [...],                      takes 32 MiB again and again
   "ask_memory": [...],                      asks for 64 TiB at once
   "raise": [...],                           ZeroDivisionError
   "chatter": [...],                         prints 32 MB to standard output, then is modelled
-  "crash_gather": [...],                    SIGSEGV while its points are put together
-  "crash_once": {"ids": [...], "folder": "/f"}   SIGSEGV for the first process that comes to it, by a mark in the folder
+  "crash_gather": [...],                    SIGSEGV while its points are gathered
+  "crash_once": {"ids": [...], "folder": "/f"}   SIGSEGV in the first process only, by a mark in the folder
   "pause": {"<stage>": "/folder", ...},     the stage's tasks write /folder/reached-<pid> and wait for /folder/go
   "kill": {"<stage>": "/folder", ...}       the first of the stage's tasks kills its process, by a mark in the folder
-  "full": {"<stage>": "/folder", ...}       the stage's tasks find the disk full as long as /folder/full is there
-  "impatient": 2.0                          object stores may say nothing for so many seconds only
+  "full": {"<stage>": "/folder", ...}       the disk is full for the stage's tasks while /folder/full exists
+  "impatient": 2.0                          time-out of object stores in seconds
 }
 ```
 
-Buildings are named by their ids, which an undisturbed run of the same input tells; `"*"` means all. Stages are ingest,
+Buildings are named by their ids, as in an undisturbed run of the same input; `"*"` means all. Stages are ingest,
 split, reconstruct and publish, and outputs in the service's driver. A stage's task pauses before it does anything.
 `PYTHONPATH` must be an absolute path.
-`environment()` in `tests/faults/asked.py` puts both variables together.
+`environment()` in `tests/faults/asked.py` sets both variables.
 """
 
 from __future__ import annotations
@@ -62,11 +61,11 @@ BUILDINGS = "pipeline.reconstruct"
 """The module that models one building."""
 
 URLS = "pipeline.io.urls"
-"""The module that knows how long a server may be silent."""
+"""The module with the time-out of servers."""
 
 
 def crash() -> None:
-    """Die as a fault in native code does."""
+    """Die like a fault in native code."""
     os.kill(os.getpid(), signal.SIGSEGV)
 
 

@@ -1,7 +1,4 @@
-"""Whether the kernels of a run are compiled already.
-
-A run that meets none compiles them first, which takes longer than many a run.
-"""
+"""Whether the kernels of a run are compiled already: compiling them takes longer than many runs."""
 
 from __future__ import annotations
 
@@ -18,26 +15,25 @@ from pipeline.terrain.point_assignment import assign_points
 from pipeline.triangulation.faces import triangulate_rings
 
 GROUND = (points_by_cell, classify_facets, assign_points)
-"""Kernels that every run calls that finds ground and buildings in the points alone."""
+"""Kernels of every run that finds ground and buildings in the points alone."""
 MODELLING = (take_regions, raster_labels, subdivide, triangulate_rings, shell_intersects_itself)
-"""Kernels that every process calls that models by the default method, in the order in which it comes to them
-(`pipeline.runtime.stages.model_batch.load`). What a kernel calls is kept before it is."""
+"""Kernels of every process that models by the default method, in the order of their calls
+(`pipeline.runtime.stages.model_batch.load`). A kernel is stored after its callees."""
 
 
 def kernels_are_compiled(kernels: Iterable[Any] = (*GROUND, *MODELLING)) -> bool:
-    """Whether a run in this place need not compile kernels; compiles nothing, and reads the head of a file per kernel.
+    """Whether a run here needs no compilation; only reads the header of one file per kernel.
 
-    It holds for this user on this machine, or for all who share `NUMBA_CACHE_DIR`; it says nothing of workers
-    elsewhere.
+    The answer holds for this user on this machine, or for all users of `NUMBA_CACHE_DIR`, not for workers elsewhere.
 
     Parameters
     ----------
     kernels : iterable
-        Those that stand for all; `MODELLING` is enough for inputs with classes.
+        Representatives of all kernels; `MODELLING` is enough for inputs with classes.
 
     Returns
     -------
     bool
-        Also True where numba is switched off (`NUMBA_DISABLE_JIT`): nothing is compiled then.
+        Also True if numba is switched off (`NUMBA_DISABLE_JIT`).
     """
     return all(kernel.is_compiled for kernel in kernels)

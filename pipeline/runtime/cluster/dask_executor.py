@@ -1,8 +1,4 @@
-"""Tasks on Dask: an embedded cluster, or one elsewhere.
-
-A plan is data and tasks are plain functions of one argument; an executor maps a function over tasks
-and yields results as they come, in any order. Nothing else of the engine shows.
-"""
+"""Tasks on Dask: an embedded cluster, or one elsewhere."""
 
 from __future__ import annotations
 
@@ -29,32 +25,32 @@ from pipeline.runtime.monitoring.measurement import Measured, Result, Task, mism
 from pipeline.runtime.monitoring.versions import ENGINE, TALKING, WORKING, differences
 
 CONNECT_S = 20.0
-"""A scheduler that does not answer within so long is not there."""
+"""Time-out of the connection to a scheduler."""
 _ANSWER_S = 30.0
 _MEND_S = 5.0
 _CLOSE_S = 30.0
 _NEVER = "365 days"
-"""So long after a worker's death Dask looks whether one of its name is there, and ends its keeper if not: also where
-the worker came back long ago, died again just now, and is being started. That death would be blamed on its task.
-Keepers that gave up are told by their status (`Cluster.mend`)."""
+"""Delay after a worker's death until Dask ends the nanny if no worker of that name is there. Dask does so even if the
+worker came back long ago, died again just now, and is being restarted, which would be blamed on its task.
+`Cluster.mend` recognises nannies that gave up by their status."""
 
 
-class _ToldOnce(logging.Filter):
-    """Leaves out what Dask's client says as its search for a lost scheduler is ended: `ClusterError` tells it."""
+class _CancelledErrors(logging.Filter):
+    """Drops the lines of Dask's client when its search for a lost scheduler ends; `ClusterError` reports the loss."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a line is printed."""
+        """Whether a line is logged."""
         return record.exc_info is None or not isinstance(record.exc_info[1], asyncio.CancelledError)
 
 
-_TOLD_ONCE = _ToldOnce()
+_CANCELLED_ERRORS = _CancelledErrors()
 
 
 class Cluster:
-    """Workers for any number of runs, also several at once from several threads; a context manager.
+    """Workers for any number of runs, also concurrent ones in several threads; a context manager.
 
-    Embedded, the scheduler lives in this process and every worker is a process of its own, restarted when it dies.
-    With the address of a scheduler nothing is started here, and each executor connects by itself: a scheduler that
+    An embedded cluster has its scheduler in this process; each worker is a separate process, restarted when it dies.
+    With the address of a scheduler nothing is started here. Each executor makes its own connection, so a scheduler that
     comes back serves the next run.
 
     Parameters
@@ -62,17 +58,17 @@ class Cluster:
     workers : int
         Processes of the embedded cluster, one thread each; unused with `scheduler`.
     scheduler : str or None
-        Address of a scheduler that is already there.
+        Address of an existing scheduler.
     local_directory : str or None
-        Where embedded workers spill; a temporary folder by default.
+        Folder for spilled data of embedded workers; a temporary folder by default.
     tls : TlsFiles or None
         Certificates for all connections, also with embedded workers; by default those of the environment
-        (`GABLEWORK_TLS_…`), and where there are none what Dask's own configuration says.
+        (`GABLEWORK_TLS_…`), otherwise those of Dask's own configuration.
 
     Raises
     ------
     SettingsError
-        Certificates of the environment cannot be used.
+        The certificates of the environment cannot be used.
     """
 
     _starting = threading.Lock()
@@ -115,25 +111,25 @@ class Cluster:
 
     @property
     def advice(self) -> str:
-        """What to do where no worker is there."""
+        """What to do if no worker is there."""
         if self.embedded:
-            return "Workers that die are started again by themselves; if they die again and again they lack memory"
-        return f"Start one by gablework worker --scheduler {self.address}"
+            return "Workers that die are restarted automatically; if they die again and again they lack memory"
+        return f"Start one with gablework worker --scheduler {self.address}"
 
     @property
     def security(self) -> Any:
-        """What Dask is told of TLS; None leaves it to Dask's own configuration."""
+        """Dask's TLS settings; None for Dask's own configuration."""
         from distributed import Security
 
         return None if self.tls is None else Security(**self.tls.security)
 
     def mend(self, workers: int) -> None:
-        """Start embedded workers anew that their keeper gave up: one that dies as soon as it starts is not restarted.
+        """Restart embedded workers that their nanny gave up because they died during their start.
 
         Parameters
         ----------
         workers : int
-            How many are there now.
+            Number of workers that are there now.
         """
         if self._embedded is None or workers >= self._workers or time.monotonic() - self._mended_s < _MEND_S:
             return
@@ -142,8 +138,8 @@ class Cluster:
         embedded = self._embedded
 
         def forget() -> None:
-            for name, keeper in list(embedded.workers.items()):
-                if keeper.status in (Status.closed, Status.failed):
+            for name, nanny in list(embedded.workers.items()):
+                if nanny.status in (Status.closed, Status.failed):
                     del embedded.workers[name]
 
         self._mended_s = time.monotonic()
@@ -159,16 +155,16 @@ class Cluster:
         Parameters
         ----------
         priority : int
-            Of the runs of one kind, those with a higher one go first where workers are scarce.
+            Among runs of one kind, those with a higher priority go first if workers are scarce.
         traffic : {'interactive', 'batch'}
-            Tasks of interactive runs go before those of batch runs, whatever their priority.
+            Tasks of interactive runs always go before those of batch runs.
         performance_report : str, optional
-            Gets a page about the workers' time when the run is over.
+            Path of a page about the workers' time, written when the run is over.
         """
         return DaskExecutor(self, priority=priority_of(traffic, priority), performance_report=performance_report)
 
     def __enter__(self) -> Self:
-        """Start the embedded workers; connect to nothing yet.
+        """Start the embedded workers without connecting to them.
 
         Raises
         ------
@@ -184,15 +180,15 @@ class Cluster:
         settings = {
             "distributed.admin.log-format": "%(message)s",
             "distributed.logging.distributed": "critical",
-            # a suspect is tried alone before it is blamed, so it need not take many workers with it
+            # a suspect is tried alone before it is blamed, so it does not have to kill many workers
             "distributed.scheduler.allowed-failures": 1,
             **worker_setup.LEAN_LOOP,
         }
         starting = contextlib.ExitStack()
         try:
-            # the configuration is the process's own, not the thread's, and workers copy it as they start
+            # the configuration belongs to the process, not to the thread, and workers copy it as they start
             with self._starting, dask.config.set(settings), starting:
-                # also those that are started again later
+                # also for workers that are restarted later
                 starting.enter_context(dask.config.set(starting.enter_context(forked_workers())))
                 self._embedded = LocalCluster(
                     n_workers=self._workers,
@@ -204,7 +200,7 @@ class Cluster:
                     preload=[worker_setup.__name__],
                     security=self.security,
                     resources={RESOURCE: each_bytes},
-                    # the server that they are forked from may have begun with another one
+                    # their fork server may have started with another environment
                     env=environment_with_this_package(),
                 )
                 self._while_running = starting.pop_all()
@@ -220,7 +216,7 @@ class Cluster:
         if self._embedded is not None:
             embedded, self._embedded = self._embedded, None
             self._while_running.close()
-            # what does not end in time ends with this process
+            # workers that do not end in time end with this process
             with contextlib.suppress(TimeoutError):
                 embedded.close(timeout=_CLOSE_S)
 
@@ -231,13 +227,13 @@ class DaskExecutor:
     Parameters
     ----------
     cluster : Cluster
-        Where tasks go.
+        Runs the tasks.
     priority : int
-        Tasks of a higher one go first where workers are scarce; `priority_of` knows which.
+        Dask's priority of the tasks, from `priority_of`.
     owned : bool
-        Whether the cluster lives and ends with this executor.
+        Whether the cluster starts and ends with this executor.
     performance_report : str, optional
-        Gets a page about the workers' time, also of a run that breaks off: docs/how_to/watch_a_run.md.
+        Path of a page about the workers' time, also written if the run breaks off: docs/how_to/watch_a_run.md.
     """
 
     def __init__(
@@ -257,13 +253,13 @@ class DaskExecutor:
         Raises
         ------
         ClusterError
-            The scheduler does not answer, or certificates and address do not go together.
+            The scheduler does not answer, or certificates and address do not match.
         """
         import dask
         from distributed import Client
 
-        logging.getLogger("distributed.client").addFilter(_TOLD_ONCE)
-        # what was entered before a fault is left again
+        logging.getLogger("distributed.client").addFilter(_CANCELLED_ERRORS)
+        # a fault leaves what was entered before it
         with contextlib.ExitStack() as stack:
             if self._owned:
                 stack.enter_context(self._cluster)
@@ -275,12 +271,12 @@ class DaskExecutor:
             try:
                 client = Client(address, timeout=CONNECT_S, set_as_default=False, **given)
             except (OSError, TimeoutError, ValueError, TypeError, RuntimeError) as error:
-                told = explain_failure(address, tls)
-                if not told and isinstance(error, TypeError | RuntimeError):
+                reason = explain_failure(address, tls)
+                if not reason and isinstance(error, TypeError | RuntimeError):
                     raise
                 raise ClusterError(
-                    f"the scheduler {address} cannot be used: {told}"
-                    if told
+                    f"the scheduler {address} cannot be used: {reason}"
+                    if reason
                     else f"the scheduler {address} does not answer: {error}. Check the address, or use --workers"
                 ) from error
             self._client = stack.enter_context(client)
@@ -298,39 +294,27 @@ class DaskExecutor:
 
     @property
     def memory_limit_bytes(self) -> int | None:
-        """The smallest worker's limit; None where none has one, or where no worker is there.
-
-        Raises
-        ------
-        ClusterError
-            The scheduler is lost.
-        """
+        """The smallest worker's limit; None without limits or workers."""
         found = self._ask(self._client.scheduler.identity, n_workers=-1)
         limits = [worker["memory_limit"] for worker in found["workers"].values()]
         return min((limit for limit in limits if limit), default=None)
 
     @property
     def worker_count(self) -> int:
-        """Workers that are there now.
-
-        Raises
-        ------
-        ClusterError
-            The scheduler is lost.
-        """
+        """Number of workers that are there now."""
         return len(self._ask(self._client.scheduler.identity, n_workers=-1)["workers"])
 
     def prepare(self, stage: str, watch: Watch) -> None:
-        """Wait for a worker, tell the waiting, and compare the versions of all processes.
+        """Wait for a worker, reporting the wait, and compare the versions of all processes.
 
         Raises
         ------
         ClusterError
             The scheduler is lost.
         VersionMismatchError
-            Some process runs other versions than this one.
+            A process runs other versions than this one.
         RunCancelledError
-            The watch called the run off.
+            The run was cancelled.
         """
         monitor = self._started()
         while not monitor.threads:
@@ -344,19 +328,7 @@ class DaskExecutor:
     def map(
         self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
     ) -> Generator[Measured[Result], None, None]:
-        """Results as they come; `Dispatch` tells what happens to tasks whose workers die.
-
-        Raises
-        ------
-        RunCancelledError
-            The watch called the run off.
-        ClusterError
-            The scheduler was lost.
-        VersionMismatchError
-            A worker that came late runs other versions than this process.
-        RunError
-            Workers died again and again on one task.
-        """
+        """Results as they come; `Dispatch` handles tasks whose workers die, and raises what cannot be handled."""
         dispatch = Dispatch(
             client=self._client,
             monitor=self._started(),
@@ -365,7 +337,7 @@ class DaskExecutor:
             tasks=tasks,
             watch=watch,
             priority=self._priority,
-            # workers that end with the run need not be waited for
+            # workers that end with the run need no long wait
             settle_s=SETTLE_INTERRUPTED_S if self._owned and self._cluster.embedded else SETTLE_S,
         )
         if self._report is None:
@@ -376,7 +348,7 @@ class DaskExecutor:
             yield measured
 
     def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
-        """The step's result, worked out here: what a driver holds of a city should not travel."""
+        """Run the step here: a driver's data of a whole city should not travel."""
         return function(task)
 
     def _started(self) -> ClusterMonitor:
@@ -390,7 +362,7 @@ class DaskExecutor:
         Raises
         ------
         ClusterError
-            There is none.
+            It does not answer.
         """
         try:
             return self._client.sync(what, callback_timeout=_ANSWER_S, **options)
@@ -398,15 +370,7 @@ class DaskExecutor:
             raise self._started().lost(f"it did not answer ({type(error).__name__}: {error})") from error
 
     def _check_versions(self) -> None:
-        """Compare this process with the scheduler and all workers.
-
-        Raises
-        ------
-        VersionMismatchError
-            They differ.
-        ClusterError
-            The scheduler is lost.
-        """
+        """Compare this process with the scheduler and all workers."""
         from distributed.versions import get_versions
 
         packages = [ENGINE, *WORKING]
@@ -415,16 +379,16 @@ class DaskExecutor:
         message = {"op": "versions", "packages": packages}
         scheduler = self._ask(self._client.scheduler.versions, packages=[ENGINE])
         workers = self._ask(self._client.scheduler.broadcast, msg=message, on_error="ignore")
-        told = {f"scheduler {self._cluster.address}": differences(talking, _plain(scheduler))}
+        found = {f"scheduler {self._cluster.address}": differences(talking, _plain(scheduler))}
         for address, theirs in sorted(workers.items()):
-            told[f"worker {address}"] = differences(ours, _plain(theirs))
-        faults = [f"{process}: {', '.join(what)}" for process, what in told.items() if what]
+            found[f"worker {address}"] = differences(ours, _plain(theirs))
+        faults = [f"{process}: {', '.join(what)}" for process, what in found.items() if what]
         if faults:
             raise VersionMismatchError(mismatch_message(faults))
 
 
 def memory_of_workers(*, workers: int, scheduler: str | None, tls: TlsFiles | None = None) -> tuple[int, int | None]:
-    """How many workers a run would have now, and the memory limit of the smallest; nothing is started.
+    """The number of workers that a run would have now, and the memory limit of the smallest; starts nothing.
 
     Raises
     ------
@@ -440,15 +404,15 @@ def memory_of_workers(*, workers: int, scheduler: str | None, tls: TlsFiles | No
 
 
 def _plain(found: Mapping[str, Any]) -> dict[str, str]:
-    """What a Dask process tells of its versions, by name; what it has not is left out."""
-    told = {name: str(version) for name, version in found["packages"].items() if version is not None}
-    major_minor = told["python"].split(".")[:2]
+    """Versions of a Dask process by name, without missing packages."""
+    versions = {name: str(version) for name, version in found["packages"].items() if version is not None}
+    major_minor = versions["python"].split(".")[:2]
     wanted = (ENGINE, *TALKING, *WORKING)
-    return {"python": ".".join(major_minor), **{name: told[name] for name in wanted if name in told}}
+    return {"python": ".".join(major_minor), **{name: versions[name] for name in wanted if name in versions}}
 
 
 def _share_bytes(workers: int) -> int:
-    """Memory of one of several workers that share this machine, as Dask reckons it."""
+    """Memory of one of several workers that share this machine, as Dask computes it."""
     from distributed.system import MEMORY_LIMIT
 
     return int(MEMORY_LIMIT / max(1, workers))

@@ -30,7 +30,7 @@ from typing import Any, Generic, Self
 from pipeline.errors import RunCancelledError, RunError
 from pipeline.runtime.cluster.dispatch import SETTLE_INTERRUPTED_S, TICK_S, blame
 from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, borrowed_child, start_failure
-from pipeline.runtime.isolation.supervision import End
+from pipeline.runtime.isolation.supervision import ChildEnd
 from pipeline.runtime.monitoring.events import Watch
 from pipeline.runtime.monitoring.logs import LOG, facts_of_task
 from pipeline.runtime.monitoring.machine import cores, memory_bytes
@@ -38,9 +38,9 @@ from pipeline.runtime.monitoring.measurement import Measured, Result, Task, meas
 from pipeline.runtime.monitoring.tallies import TALLIES
 
 _WORN_BYTES = 2**30
-"""A child that keeps more than this between tasks is not used again: buildings have their own limits."""
+"""A child that holds more than this between tasks is not used again; buildings have their own limits."""
 
-_SAID: set[str] = set()
+_PASSED_ON: set[str] = set()
 
 
 class LocalExecutor:
@@ -49,9 +49,9 @@ class LocalExecutor:
     Parameters
     ----------
     children : int, optional
-        Tasks at once; by default one per core.
+        Number of concurrent tasks; by default one per core.
     memory_limit_bytes : int, optional
-        What all of them may take together; by default the machine's memory.
+        Their total memory; by default the machine's memory.
     """
 
     def __init__(self, children: int | None = None, memory_limit_bytes: int | None = None) -> None:
@@ -69,26 +69,20 @@ class LocalExecutor:
         Raises
         ------
         RunCancelledError
-            The watch called the run off.
+            The run was cancelled.
         RunError
-            Children died of one task, also when it ran alone.
+            One task killed its children, also when it ran alone.
         """
         return _Stage(stage, function, tasks, watch, self._memory_bytes).results(self._children)
 
     def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
-        """The step's result, worked out in a child: this process has no kernels.
-
-        Raises
-        ------
-        RunCancelledError, RunError
-            As `map`.
-        """
+        """Run the step in a child: this process has no kernels."""
         with contextlib.closing(self.map(stage, function, [task], watch)) as found:
             return next(found).result
 
     @property
     def memory_limit_bytes(self) -> int | None:
-        """The machine's: one task may take all of it while no other runs."""
+        """The machine's memory: one task may take all of it while no other runs."""
         return self._memory_bytes
 
     def __enter__(self) -> Self:
@@ -98,7 +92,7 @@ class LocalExecutor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Children stay, for the next run of this process; they end with it."""
+        """Keep the children for the next run of this process; they end with it."""
 
 
 class _Stage(Generic[Task, Result]):
@@ -153,7 +147,7 @@ class _Stage(Generic[Task, Result]):
             return landed
 
     def _settle(self) -> None:
-        """Let no task begin, tell those that run to end, and kill those that do not."""
+        """Start no more tasks, ask running ones to end, and kill those that do not."""
         with self._changed:
             self._over = True
             self._changed.notify_all()
@@ -169,7 +163,7 @@ class _Stage(Generic[Task, Result]):
     # --- in the threads ----------------------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        """Take tasks until there are none."""
+        """Run tasks until there are none."""
         while (number := self._taken()) is not None:
             landed: Measured[Result] | BaseException | None = None
             try:
@@ -180,7 +174,7 @@ class _Stage(Generic[Task, Result]):
                     landed = RunError(blame(self._stage, self._tasks[number], here=True))
                 else:
                     facts = {"stage": self._stage, **facts_of_task(self._tasks[number])}
-                    LOG.warning("a process died of the task (%s): it is tried alone", outcome.told, extra=facts)
+                    LOG.warning("the task killed its process (%s): it is tried alone", outcome.detail, extra=facts)
             except BaseException as error:  # noqa: BLE001 - raised where the results are waited for
                 landed = error
             with self._changed:
@@ -189,12 +183,12 @@ class _Stage(Generic[Task, Result]):
                 if landed is None:
                     self._suspects.append(number)
                 self._changed.notify_all()
-            # only now: with the last result the stage is over, and what still runs then is called off
+            # last, since the last result ends the stage and cancels what still runs
             if landed is not None:
                 self._landed.put(landed)
 
     def _taken(self) -> int | None:
-        """The next task, once it may run; None where nothing is left to do."""
+        """The next task, once it may run; None if nothing is left to do."""
         with self._changed:
             while not self._over:
                 if self._suspects:
@@ -217,11 +211,11 @@ class _Stage(Generic[Task, Result]):
         return int(getattr(self._tasks[number], "memory_bytes", 0))
 
     def _fits(self, number: int) -> bool:
-        """Whether there is memory for a task beside those that run; alone it may run in any case."""
+        """Whether there is memory for a task beside the running ones; a single task always fits."""
         return not self._running or sum(self._running.values()) + self._need_bytes(number) <= self._memory_bytes
 
-    def _done(self, number: int) -> Measured[Result] | End:
-        """What a task found, or how its child ended."""
+    def _done(self, number: int) -> Measured[Result] | ChildEnd:
+        """The result of a task, or the end of its child."""
         task = self._tasks[number]
         if getattr(task, "supervises", False):
             return measure(self._function, task, self._stage)
@@ -238,18 +232,12 @@ class _Stage(Generic[Task, Result]):
         finally:
             TALLIES.end(self._stage, outcome, time.perf_counter() - began)
 
-    def _in_child(self, task: Task) -> Measured[Result] | End:
-        """A task in a child, which has all the memory and all the time that it wants.
-
-        Raises
-        ------
-        RunError
-            Children die before they begin.
-        """
+    def _in_child(self, task: Task) -> Measured[Result] | ChildEnd:
+        """Run a task in a child, with the machine's memory and without a time-out."""
         for _ in range(FRUITLESS_STARTS):
             with borrowed_child(self._killed.is_set, fresh=self._alone, loads=()) as child:
                 found: Any = None
-                for said in child.work(
+                for message in child.work(
                     measure_in_child,
                     [(0, (self._function, task, self._stage))],
                     timeout_s=math.inf,
@@ -257,21 +245,21 @@ class _Stage(Generic[Task, Result]):
                     cancelled=self._killed.is_set,
                     one="task",
                 ):
-                    found = said
-                if not isinstance(found, End):
-                    self._pass_on(child.new_words())
-                if isinstance(found, End) or child.memory_bytes > _WORN_BYTES:
+                    found = message
+                if not isinstance(found, ChildEnd):
+                    self._pass_on(child.new_output())
+                if isinstance(found, ChildEnd) or child.memory_bytes > _WORN_BYTES:
                     child.end()
-            if not isinstance(found, End):
+            if not isinstance(found, ChildEnd):
                 measured: Measured[Result] = found.result
                 return measured
             if found.index is not None:
                 return found
-        raise RunError(start_failure(found.told, found.stderr, f"does the tasks of the stage {self._stage}"))
+        raise RunError(start_failure(found.detail, found.stderr, f"runs the tasks of the stage {self._stage}"))
 
     @staticmethod
-    def _pass_on(words: str) -> None:
-        """Say what a child said, warnings and log lines; the same words of several children once."""
-        if words and words not in _SAID:
-            _SAID.add(words)
-            sys.stderr.write(words)
+    def _pass_on(output: str) -> None:
+        """Print a child's warnings and log lines; the same output of several children once."""
+        if output and output not in _PASSED_ON:
+            _PASSED_ON.add(output)
+            sys.stderr.write(output)

@@ -1,8 +1,8 @@
-"""A page about the time of the workers: which were busy when and with what, per stage and per process.
+"""A page about the time of the workers: their load over time, per stage and per process.
 
-Drawn from what every task measures of itself, so it needs nothing on the scheduler and no library. (Dask's own report
-needs bokeh on client and scheduler, loads its scripts from the internet, and its scheduler keeps the last hundred
-thousand tasks only.) However many tasks there are, what is kept is bounded: sums over bins of time that get wider.
+It is drawn from the measurements of the tasks and needs neither a library nor the scheduler. (Dask's own report needs
+bokeh on client and scheduler, loads scripts from the internet, and its scheduler remembers only the last hundred
+thousand tasks.) Its memory is bounded for any number of tasks: sums over bins of time that get wider.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from pipeline.errors import RunError
 from pipeline.runtime.monitoring.measurement import Measured
 
 BINS = 480
-"""Most bins of time; where a run lasts longer, two become one."""
+"""Largest number of time bins; if a run lasts longer, bins are merged in pairs."""
 ROWS = 200
-"""Processes that have a row of their own in the picture; the table has all."""
+"""Largest number of processes with a row in the picture; the table has all."""
 SLOWEST = 20
-"""Tasks that are told one by one."""
+"""Number of longest tasks that are listed."""
 
 _FIRST_BIN_S = 0.125
 _COLOURS = ("#4e79a7", "#f28e2b", "#59a14f", "#e15759", "#76b7b2", "#edc948", "#b07aa1", "#9c755f")
@@ -40,19 +40,19 @@ _STYLE = (
 
 
 class PerformanceReport:
-    """Collects while a run goes on, and writes the page when it is left; also where the run broke off.
+    """Collects measurements during a run and writes the page on exit, also if the run breaks off.
 
     Parameters
     ----------
     path : str
-        The page, HTML; written whole under a temporary name first.
+        The HTML page; written under a temporary name first.
     clock : callable
         Seconds since 1970; replaced in tests.
 
     Raises
     ------
     RunError
-        The folder of the page is not there.
+        The folder of the page does not exist.
     """
 
     def __init__(self, path: str, clock: Callable[[], float] = time.time) -> None:
@@ -69,7 +69,7 @@ class PerformanceReport:
         self._slowest: list[tuple[float, str, str, float]] = []
 
     def __enter__(self) -> Self:
-        """Time counts from here."""
+        """Start the clock."""
         self._began_s = self._clock()
         return self
 
@@ -93,8 +93,8 @@ class PerformanceReport:
                 raise RunError(f"the performance report {self.path} cannot be written: {fault.strerror}") from fault
 
     def add(self, stage: str, measured: Measured[Any]) -> None:
-        """Take what one task measured."""
-        # clocks of machines differ: what seems to begin earlier began with the run
+        """Add the measurement of one task."""
+        # clocks of machines differ: an earlier start counts as the start of the run
         start_s = max(0.0, measured.began_s - self._began_s)
         for name, sums in ((stage, self._stages), (measured.process, self._processes)):
             row = sums.setdefault(name, [0.0, 0.0, 0.0, 0.0])
@@ -116,7 +116,7 @@ class PerformanceReport:
         return of.setdefault(name, [0.0] * BINS)
 
     def _spread(self, bins: list[float], start_s: float, seconds: float) -> None:
-        """Add a task's seconds to the bins that it lay in; where they do not reach, all become wider."""
+        """Add a task's seconds to its bins; widens all bins if they end too early."""
         end_s = start_s + seconds
         while end_s > BINS * self._bin_s:
             self._bin_s *= 2.0
@@ -130,7 +130,7 @@ class PerformanceReport:
 
     @property
     def efficiency(self) -> float:
-        """Seconds of all tasks by the time of all processes that worked, 0 to 1."""
+        """Seconds of all tasks divided by the time of all working processes, 0 to 1."""
         wall_s = max(1e-9, self._ended_s - self._began_s)
         busy_s = sum(row[1] for row in self._processes.values())
         return busy_s / (wall_s * max(1, len(self._processes)))
@@ -140,7 +140,7 @@ class PerformanceReport:
         wall_s = self._ended_s - self._began_s
         began = dt.datetime.fromtimestamp(self._began_s, dt.UTC).isoformat(timespec="seconds")
         tasks = int(sum(row[0] for row in self._stages.values()))
-        told = (
+        summary = (
             f"Began {began}, took {wall_s:.1f} s: {tasks} tasks on {len(self._processes)} processes, "
             f"which were busy {100 * self.efficiency:.0f} % of the time."
         )
@@ -158,17 +158,17 @@ class PerformanceReport:
         ]
         parts = [
             "<!doctype html><html lang=en><meta charset=utf-8><title>Workers' time</title>",
-            f"<style>{_STYLE}</style><h1>Workers' time</h1><p>{html.escape(told)}</p>",
-            *(["<p>No task came to its end.</p>"] if not tasks else [self._chart(), self._rows()]),
+            f"<style>{_STYLE}</style><h1>Workers' time</h1><p>{html.escape(summary)}</p>",
+            *(["<p>No task was finished.</p>"] if not tasks else [self._chart(), self._rows()]),
             _table("Stages", ["stage", "tasks", "seconds", "mean s", "longest s"], stages),
             _table("Processes", ["process", "tasks", "seconds", "busy %", "peak MiB"], processes),
             _table("Longest tasks", ["stage", "process", "seconds", "began at s"], slowest),
-            "<p>Seconds are of the clock, as the tasks measured them; times of other machines are by their clocks.</p>",
+            "<p>Seconds are wall-clock times measured by the tasks; each machine uses its own clock.</p>",
         ]
         return "\n".join(parts) + "\n"
 
     def _shown(self) -> int:
-        """Bins that the run reached."""
+        """Number of bins that the run reached."""
         return max(1, min(BINS, int((self._ended_s - self._began_s) / self._bin_s) + 1))
 
     def _chart(self) -> str:
@@ -194,7 +194,7 @@ class PerformanceReport:
         return f"<h2>Busy processes over time</h2><p>{''.join(keys)}</p>{picture}"
 
     def _rows(self) -> str:
-        """A row a process: the darker, the busier."""
+        """One row per process: the darker, the busier."""
         shown = self._shown()
         cells = [
             f'<rect x="{_WIDTH * k / shown:.1f}" y="{_ROW * row}" width="{_WIDTH / shown + 0.2:.1f}" '
@@ -204,10 +204,10 @@ class PerformanceReport:
             if busy > 0.0
         ]
         left = len(self._processes) - len(self._by_process)
-        told = f"<p>{left} more processes have no row.</p>" if left else ""
+        note = f"<p>{left} more processes have no row.</p>" if left else ""
         height = _ROW * len(self._by_process)
         picture = _picture("each process over time", height, cells)
-        return f"<h2>Each process over time</h2>{picture}{told}"
+        return f"<h2>Each process over time</h2>{picture}{note}"
 
 
 def _picture(label: str, height: int, shapes: list[str]) -> str:
@@ -219,7 +219,7 @@ def _y(value: float, most: int) -> str:
 
 
 def _table(title: str, header: list[str], rows: list[list[str]]) -> str:
-    """A table, nothing without rows."""
+    """A table; empty without rows."""
     if not rows:
         return ""
     head = "".join(f"<th>{html.escape(name)}</th>" for name in header)

@@ -1,4 +1,4 @@
-"""Who goes first where workers are scarce: one table for all that starts runs."""
+"""The order of runs if workers are scarce: one table for everything that starts runs."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from types import MappingProxyType
 from typing import Literal
 
 Traffic = Literal["interactive", "batch"]
-"""`interactive`: somebody waits for it (a job of the service, a command). `batch`: a run over a city, for days."""
+"""`interactive`: a user waits for it (a job of the service, a command). `batch`: a run over a city, for days."""
 
 PRIORITIES = MappingProxyType({"interactive": 0, "batch": -1_000_000})
-"""Dask's priority of each kind of traffic: of the tasks that wait at a worker, those of the highest number go first."""
+"""Dask's priority of each kind of traffic: at a worker, waiting tasks with the highest number go first."""
 
 _BAND = 499_999
-"""How far a run's own wish moves it within its kind: never into the next."""
+"""Largest shift by a run's own priority: never into the other kind."""
 
 
 def priority_of(traffic: Traffic, wish: int = 0) -> int:
@@ -21,9 +21,9 @@ def priority_of(traffic: Traffic, wish: int = 0) -> int:
     Parameters
     ----------
     traffic : {'interactive', 'batch'}
-        What kind of run it is.
+        Kind of the run.
     wish : int
-        What the user asked for; only compared with that of other runs of the same kind.
+        The user's priority; compared only with that of other runs of the same kind.
 
     Examples
     --------

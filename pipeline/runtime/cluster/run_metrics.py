@@ -1,11 +1,11 @@
-"""What Prometheus reads of runs and of workers: events of a run as figures, beside the tallies of the process.
+"""Metrics for Prometheus: the events of a run as figures, and the tallies of the process.
 
 The driver of a run:
 
     serve_metrics(port)
-    run(request, on_event=both(RunMetrics(), console.on_event))
+    run(request, on_event=combined(RunMetrics(), console.on_event))
 
-A worker shows its tallies alone: `gablework worker --metrics-port N`.
+A worker shows only its tallies: `gablework worker --metrics-port N`.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ UNITS = {
     "reconstruct": "buildings",
     "publish": "tiles",
 }
-"""What a stage counts; anything else counts tasks."""
+"""Units counted by each stage; other stages count tasks."""
 
 
 class RunMetrics(Collector):
-    """A listener that keeps what the events of a run say, for Prometheus.
+    """A listener that turns the events of a run into metrics.
 
     Parameters
     ----------
     registry : CollectorRegistry, optional
-        Where it is shown; the process's own by default.
+        Registry to show them in; the process's own by default.
     clock : callable
         Seconds since 1970; replaced in tests.
     """
@@ -60,7 +60,7 @@ class RunMetrics(Collector):
         registry.register(self)
 
     def __call__(self, event: Event) -> None:
-        """Take an event of the run."""
+        """Record an event of the run."""
         with self._lock:
             self._heard_s = self._clock()
             if event.kind == "warning":
@@ -74,11 +74,11 @@ class RunMetrics(Collector):
                 self._units[event.stage] = (event.done, event.total, event.failed)
 
     def close(self) -> None:
-        """Show nothing any more."""
+        """Remove the metrics from the registry."""
         self._registry.unregister(self)
 
     def collect(self) -> Iterator[Metric]:
-        """The figures of now."""
+        """The present figures."""
         with self._lock:
             units, stage = dict(self._units), "" if self._finished else self._stage
             waiting, finished, warnings, heard_s = self._waiting, self._finished, self._warnings, self._heard_s
@@ -105,38 +105,38 @@ class RunMetrics(Collector):
 
 
 class TallyMetrics(Collector):
-    """The tallies of a process, for Prometheus.
+    """The tallies of a process as metrics.
 
     Parameters
     ----------
     tallies : Tallies
-        Of the process.
+        Counts of the process.
     """
 
     def __init__(self, tallies: Tallies = TALLIES) -> None:
         self._tallies = tallies
 
     def collect(self) -> Iterator[Metric]:
-        """The figures of now."""
+        """The present figures."""
         known = self._tallies
         flying = GaugeMetricFamily("gablework_tasks_in_flight", "Tasks on the cluster now.", labels=["stage"])
         for stage, count in dict(known.in_flight).items():
             flying.add_metric([stage], count)
         yield flying
-        for name, told, counts in (
+        for name, meaning, counts in (
             ("gablework_tasks_sent", "Tasks sent to the cluster.", dict(known.sent)),
             ("gablework_task_bytes_sent", "Bytes of these tasks.", dict(known.sent_bytes)),
             ("gablework_task_seconds", "Seconds that tasks of this process took.", dict(known.seconds)),
         ):
-            by_stage = CounterMetricFamily(name, told, labels=["stage"])
+            by_stage = CounterMetricFamily(name, meaning, labels=["stage"])
             for stage, value in counts.items():
                 by_stage.add_metric([stage], value)
             yield by_stage
-        for name, told, outcomes in (
+        for name, meaning, outcomes in (
             ("gablework_tasks_landed", "Tasks that came back from the cluster.", dict(known.landed)),
             ("gablework_tasks_worked", "Tasks that this process worked off.", dict(known.worked)),
         ):
-            by_outcome = CounterMetricFamily(name, told, labels=["stage", "outcome"])
+            by_outcome = CounterMetricFamily(name, meaning, labels=["stage", "outcome"])
             for (stage, outcome), value in outcomes.items():
                 by_outcome.add_metric([stage, outcome], value)
             yield by_outcome
@@ -152,35 +152,35 @@ class TallyMetrics(Collector):
         )
 
 
-def both(*listeners: Listener) -> Listener:
-    """One listener that hands every event to several."""
+def combined(*listeners: Listener) -> Listener:
+    """One listener that passes every event to several."""
 
-    def tell(event: Event) -> None:
+    def pass_on(event: Event) -> None:
         for listener in listeners:
             listener(event)
 
-    return tell
+    return pass_on
 
 
 def serve_metrics(port: int, host: str = "127.0.0.1") -> Callable[[], None]:
-    """Show the figures of this process at `http://host:port/metrics`, from a thread of its own.
+    """Serve the figures of this process at `http://host:port/metrics` from a new thread.
 
     Parameters
     ----------
     port : int
-        To listen on.
+        Port to listen on.
     host : str
-        Address to listen on; nobody is asked for a key, so only where others may read the figures.
+        Address to listen on. No key is required, so everyone who can reach it can read the figures.
 
     Returns
     -------
     callable
-        Ends it.
+        Stops the server.
 
     Raises
     ------
     SettingsError
-        The port is taken, or the address is not this machine's.
+        The port is taken, or the address does not belong to this machine.
     """
     tallies = TallyMetrics()
     try:

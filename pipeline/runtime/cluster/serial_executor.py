@@ -1,7 +1,7 @@
-"""What a run needs of an engine, and the simplest one: one task after the other, in this process.
+"""The interface of executors, and the simplest one: one task after the other, in this process.
 
-A plan is data and tasks are plain functions of one argument; an executor maps a function over tasks
-and yields results as they come, in any order. Nothing else of the engine shows.
+A plan is data and tasks are plain functions of one argument. An executor maps a function over tasks and yields results
+as they come, in any order. It shows nothing else of the engine.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from pipeline.runtime.monitoring.measurement import Measured, Result, Task, meas
 
 
 class Executor(Protocol):
-    """What a run needs of an engine. One executor serves one run at a time."""
+    """Runs the tasks of a run. One executor serves one run at a time."""
 
     def prepare(self, stage: str, watch: Watch) -> None:
-        """Wait until tasks can run, and see that all processes run the same versions."""
+        """Wait until tasks can run, and check that all processes run the same versions."""
 
     def map(
         self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
@@ -26,11 +26,11 @@ class Executor(Protocol):
         """Results of all tasks, in the order in which they finish."""
 
     def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:
-        """The result of one step of the driver: worked out here, or where the libraries are that it needs."""
+        """Run one step of the driver, here or in a process with the libraries that it needs."""
 
     @property
     def memory_limit_bytes(self) -> int | None:
-        """Memory of one worker; None where there is no limit."""
+        """Memory limit of one worker; None without a limit."""
 
     def __enter__(self) -> Self:
         """Start."""
@@ -50,19 +50,13 @@ class SerialExecutor:
     def map(
         self, stage: str, function: Callable[[Task], Result], tasks: Sequence[Task], watch: Watch
     ) -> Generator[Measured[Result], None, None]:
-        """Results in the order of the tasks.
-
-        Raises
-        ------
-        RunCancelledError
-            The watch called the run off.
-        """
+        """Results in the order of the tasks."""
         for task in tasks:
             watch.check_cancelled()
             yield measure(function, task, stage)
 
     def run_step(self, stage: str, function: Callable[[Task], Result], task: Task, watch: Watch) -> Result:  # noqa: ARG002
-        """The step's result, worked out here."""
+        """Run the step here."""
         return function(task)
 
     @property

@@ -1,13 +1,13 @@
-"""TLS for a cluster's own traffic: which files, whether they can be used, and why a connection did not come about.
+"""TLS for a cluster's own traffic: the files, whether they can be used, and why a connection failed.
 
-Whoever has a certificate of the CA can run code on the workers, and whoever has none cannot say a word: Dask asks both
-sides of every connection for one, and does not look at host names. So one CA serves one cluster, and nothing else.
+Everyone with a certificate of the CA can run code on the workers, and no one else can connect: Dask requires one from
+both sides of every connection and ignores host names. So use one CA for one cluster and nothing else.
 
 | where | names |
 | --- | --- |
 | options | `--tls-ca`, `--tls-cert`, `--tls-key` |
 | environment | `GABLEWORK_TLS_CA`, `GABLEWORK_TLS_CERT`, `GABLEWORK_TLS_KEY` |
-| Dask's own, where none of these is given | `distributed.comm.tls`, `DASK_DISTRIBUTED__COMM__TLS__…` |
+| Dask's own, if none of these is given | `distributed.comm.tls`, `DASK_DISTRIBUTED__COMM__TLS__…` |
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ DASK_VARIABLES: Mapping[str, tuple[str, ...]] = {
 _PROBE_S = 5.0
 _HOW = (
     "give --tls-ca, --tls-cert and --tls-key (or GABLEWORK_TLS_CA, GABLEWORK_TLS_CERT and GABLEWORK_TLS_KEY); "
-    "docs/how_to/clusters.md tells how to make them"
+    "docs/how_to/clusters.md explains how to make them"
 )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TlsFiles:
-    """The files of one process; every process of a cluster may have the same.
+    """The TLS files of one process; all processes of a cluster may share them.
 
     Raises
     ------
@@ -56,10 +56,10 @@ class TlsFiles:
     cert: str
     """This process's certificate, PEM."""
     key: str = ""
-    """Its private key, PEM, without a pass phrase; empty where it lies in the same file as the certificate."""
+    """Its private key, PEM, without a pass phrase; empty if the certificate's file contains it."""
 
     def __post_init__(self) -> None:
-        """See that the files can be used."""
+        """Check that the files can be used."""
         faults = [
             f"{VARIABLES[name].removeprefix('GABLEWORK_')} is {path}: {fault}"
             for name, path in dataclasses.asdict(self).items()
@@ -71,7 +71,7 @@ class TlsFiles:
 
     @property
     def security(self) -> dict[str, object]:
-        """Keyword arguments of `distributed.Security`: nothing but TLS, in every role."""
+        """Keyword arguments of `distributed.Security`: only TLS, in every role."""
         roles = ("scheduler", "worker", "client")
         certs = {f"tls_{role}_cert": self.cert for role in roles}
         keys = {f"tls_{role}_key": self.key or self.cert for role in roles}
@@ -79,17 +79,17 @@ class TlsFiles:
 
 
 def _unreadable(path: str) -> str:
-    """Why a file cannot be read; empty where it can."""
+    """Why a file cannot be read; empty if it can."""
     try:
         content = Path(path).read_bytes()
     except OSError as error:
         return f"{error.strerror or error} (user {os.getuid()})"
-    return "" if b"-----BEGIN " in content else "it is no PEM file (no line -----BEGIN …)"
+    return "" if b"-----BEGIN " in content else "it is not a PEM file (no line -----BEGIN …)"
 
 
 def _unusable(files: TlsFiles) -> list[str]:
-    """What is wrong with files that can be read."""
-    import ssl  # most runs speak no TLS
+    """Faults of readable files."""
+    import ssl  # most runs use no TLS
 
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     key = files.key or files.cert
@@ -105,34 +105,34 @@ def _unusable(files: TlsFiles) -> list[str]:
     if faults:
         return faults
     try:
-        # a pass phrase would be asked for on the terminal
+        # OpenSSL would ask for a pass phrase on the terminal
         context.load_cert_chain(files.cert, key, password=_no_pass_phrase)
     except ssl.SSLError as error:
         reason = str(error.reason or error)
         mismatch = f"the key {key} is not that of the certificate"
-        told = mismatch if reason == "KEY_VALUES_MISMATCH" else f"it and the key {key} cannot be used: {reason}"
-        faults.append(f"TLS_CERT is {files.cert}: {told}")
+        fault = mismatch if reason == "KEY_VALUES_MISMATCH" else f"it and the key {key} cannot be used: {reason}"
+        faults.append(f"TLS_CERT is {files.cert}: {fault}")
     except SettingsError as error:
         faults.extend(error.faults)
     return faults
 
 
 def _no_pass_phrase() -> str:
-    raise SettingsError(["TLS_KEY has a pass phrase, which nobody can type in a cluster: use a key without one"])
+    raise SettingsError(["TLS_KEY has a pass phrase, which cannot be typed in a cluster: use a key without one"])
 
 
 def given_tls(ca: str | None = None, cert: str | None = None, key: str | None = None) -> TlsFiles | None:
-    """The files that options or the environment name; None where they name none.
+    """The files named by options or the environment; None if there are none.
 
     Parameters
     ----------
     ca, cert, key : str or None
-        Paths from options; each that is missing is looked up in the environment.
+        Paths from options; a missing one is looked up in the environment.
 
     Raises
     ------
     SettingsError
-        Some are named and others not, or a file cannot be used.
+        A file is missing or cannot be used.
     """
     named = {
         name: given or os.environ.get(VARIABLES[name], "") for name, given in (("ca", ca), ("cert", cert), ("key", key))
@@ -147,14 +147,14 @@ def given_tls(ca: str | None = None, cert: str | None = None, key: str | None = 
 
 
 def check_address(address: str, tls: TlsFiles | None, *, configured: bool) -> None:
-    """Refuse an address that does not go with the files, before anything is tried.
+    """Refuse an address that does not match the files, before any connection.
 
     Parameters
     ----------
     address : str
-        A scheduler's, with or without a protocol.
+        The scheduler's address, with or without a protocol.
     tls : TlsFiles or None
-        The files that are given.
+        The given files.
     configured : bool
         Whether Dask's own configuration names a CA.
 
@@ -175,14 +175,14 @@ def check_address(address: str, tls: TlsFiles | None, *, configured: bool) -> No
 
 
 def explain_failure(address: str, tls: TlsFiles | None) -> str:
-    """What a look at the scheduler's port says after a connection failed; empty where it explains nothing.
+    """Probe the scheduler's port after a failed connection; returns the reason, or an empty text if unknown.
 
     Parameters
     ----------
     address : str
-        The scheduler's.
+        The scheduler's address.
     tls : TlsFiles or None
-        The files with which it was tried.
+        The files of the failed connection.
     """
     import ssl  # as above
 
@@ -212,13 +212,13 @@ def explain_failure(address: str, tls: TlsFiles | None) -> str:
             except ssl.SSLCertVerificationError as error:
                 return f"its certificate is not accepted ({error.verify_message}): TLS_CA must be the CA that signed it"
             except ssl.SSLError as error:
-                return _told(str(error.reason or error), wants_tls=wants_tls, host=host, port=port)
+                return _explain(str(error.reason or error), wants_tls=wants_tls, host=host, port=port)
     except OSError:
         return ""
     return ""
 
 
-def _told(reason: str, *, wants_tls: bool, host: str, port: int) -> str:
+def _explain(reason: str, *, wants_tls: bool, host: str, port: int) -> str:
     """An OpenSSL reason in words."""
     if reason in {"WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "UNEXPECTED_EOF_WHILE_READING"}:
         without = (

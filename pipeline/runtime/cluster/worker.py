@@ -1,7 +1,7 @@
-"""A Dask worker under a nanny that drains when it is told to end: the command `gablework worker`.
+"""A Dask worker under a nanny that drains on SIGTERM: the command `gablework worker`.
 
-`dask worker` closes on SIGTERM with its task half done, and the task runs again elsewhere. This one takes no new task,
-finishes what runs, hands its results over, and leaves then. Where the scheduler goes away it waits for it to come back.
+`dask worker` closes on SIGTERM in the middle of its task, which then runs again elsewhere. This one takes no new task,
+finishes the running one, hands over its results, and then leaves. If the scheduler goes away it waits for its return.
 """
 
 from __future__ import annotations
@@ -28,48 +28,48 @@ from pipeline.runtime.monitoring import logs
 
 _POLL_S = 0.1
 _HAND_OVER_S = 30.0
-"""Clients fetch results at once; longer than this they are not waited for."""
+"""Longest wait for clients to fetch results, which they do at once."""
 _RETRY_S = 2.0
 _STOPPING = (signal.SIGTERM, signal.SIGINT)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class WorkerOptions:
-    """How a worker runs."""
+    """Options of a worker."""
 
     scheduler: str
     """Address of the scheduler."""
     threads: int = 1
-    """Tasks at once. With one, a task that ends its process takes no other with it."""
+    """Number of concurrent tasks. With one, a task that kills its process harms no other task."""
     memory_limit: str = "auto"
     """Bytes or a text such as `4GiB`; `auto` takes the machine's share, 0 sets none."""
     local_directory: str | None = None
-    """Where the worker keeps its files; a temporary folder by default."""
+    """Folder for the worker's files; a temporary folder by default."""
     name: str | None = None
-    """Name in the scheduler's lists; its address by default. Two workers cannot share one."""
+    """Unique name in the scheduler's lists; its address by default."""
     host: str | None = None
-    """Address to listen on; by default the one that leads to the scheduler."""
+    """Address to listen on; by default that of the route to the scheduler."""
     drain_timeout_s: float | None = None
-    """Longest time that a running task is waited for when told to end; None waits for its end."""
+    """Longest wait for a running task on SIGTERM; None waits for its end."""
     give_up_after_s: float | None = None
-    """End when the scheduler was away for so long; None keeps trying."""
+    """Seconds without the scheduler after which the worker ends; None keeps trying."""
     tls: TlsFiles | None = None
-    """Certificates; without, Dask's own configuration is asked."""
+    """Certificates; None for those of Dask's own configuration."""
     log_json: bool = False
-    """Whether the lines of nanny and worker are JSON objects."""
+    """Whether nanny and worker log JSON."""
     metrics_port: int | None = None
-    """Where the worker shows its figures to Prometheus; None shows none."""
+    """Port of the worker's metrics for Prometheus; None for no metrics."""
     metrics_host: str = "127.0.0.1"
-    """On which address."""
+    """Address of the metrics."""
 
     @property
     def memory_bytes(self) -> int | None:
-        """The memory limit, of which tasks declare their share; None where there is none.
+        """The memory limit, of which tasks declare their share; None without a limit.
 
         Raises
         ------
         SettingsError
-            It is no number of bytes.
+            It is not a number of bytes.
         """
         try:
             limit = parse_memory_limit(self.memory_limit, self.threads, logger=logging.getLogger("distributed.worker"))
@@ -88,7 +88,7 @@ class DrainingWorker(Worker):
         self.handlers["drain"] = self.drain
 
     async def drain(self) -> int:
-        """Take no new task, finish what runs, hand the results over; how many tasks were waited for."""
+        """Take no new task, finish running ones, hand over the results; returns the number of finished tasks."""
         self.status = Status.closing_gracefully
         running = len(self.state.executing)
         while self.state.executing:
@@ -96,7 +96,7 @@ class DrainingWorker(Worker):
         deadline = time.monotonic() + _HAND_OVER_S
         while self.data and time.monotonic() < deadline:
             await asyncio.sleep(_POLL_S)
-        # results that nobody fetched are copied to others, tasks that only queued here go there without suspicion
+        # unfetched results are copied to other workers, and queued tasks go there without being suspects
         await self.scheduler.retire_workers(workers=[self.address], close_workers=False, remove=True)
         return running
 
@@ -109,15 +109,15 @@ def serve_worker(options: WorkerOptions, say: Callable[[str], None]) -> None:
     options : WorkerOptions
         How it runs.
     say : callable
-        Gets one line for people at every turn.
+        Gets one line of text at every change.
 
     Raises
     ------
     ClusterError
         The scheduler was away for longer than the options allow, the worker cannot start, or address and certificates
-        do not go together.
+        do not match.
     SettingsError
-        The memory limit is none.
+        The memory limit is not valid.
     """
     configured = bool(dask.config.get("distributed.comm.tls.ca-file", None))
     check_address(options.scheduler, options.tls, configured=configured)
@@ -134,7 +134,7 @@ def serve_worker(options: WorkerOptions, say: Callable[[str], None]) -> None:
 
 
 async def _serve(options: WorkerOptions, say: Callable[[str], None]) -> None:
-    """Keep a worker at the scheduler until told to stop."""
+    """Keep a worker connected to the scheduler until a signal stops it."""
     stop, hurry = asyncio.Event(), asyncio.Event()
 
     def on_signal() -> None:
@@ -143,7 +143,7 @@ async def _serve(options: WorkerOptions, say: Callable[[str], None]) -> None:
     for number in _STOPPING:
         asyncio.get_running_loop().add_signal_handler(number, on_signal)
     away_since_s = time.monotonic()
-    told = ""
+    reported = ""
     say(f"looking for the scheduler {options.scheduler}")
     while not stop.is_set():
         nanny = _nanny(options)
@@ -158,8 +158,8 @@ async def _serve(options: WorkerOptions, say: Callable[[str], None]) -> None:
         except OSError as error:
             away_s = time.monotonic() - away_since_s
             why = await asyncio.to_thread(explain_failure, options.scheduler, options.tls)
-            if why and why != told:
-                told = why
+            if why and why != reported:
+                reported = why
                 say(f"the scheduler {options.scheduler} cannot be used: {why}")
             if options.give_up_after_s is not None and away_s > options.give_up_after_s:
                 raise ClusterError(
@@ -195,15 +195,7 @@ def _nanny(options: WorkerOptions) -> Any:
 
 
 async def _start(nanny: Any, options: WorkerOptions) -> None:
-    """Start the worker's process and bring it to the scheduler.
-
-    Raises
-    ------
-    OSError
-        The scheduler is not there.
-    ClusterError
-        The process does not start.
-    """
+    """Start the worker's process and connect it; an OSError means that the scheduler does not answer."""
     try:
         await nanny
     except OSError:
@@ -212,7 +204,7 @@ async def _start(nanny: Any, options: WorkerOptions) -> None:
         cause = error.__cause__ or error
         if isinstance(cause, OSError):
             raise cause from error
-        # what TLS says of a scheduler that speaks first comes in many kinds
+        # TLS reports a scheduler without TLS by many kinds of errors
         why = await asyncio.to_thread(explain_failure, options.scheduler, options.tls)
         if why:
             raise ConnectionError(why) from error
@@ -220,9 +212,9 @@ async def _start(nanny: Any, options: WorkerOptions) -> None:
 
 
 async def _drain(nanny: Any, options: WorkerOptions, hurry: asyncio.Event, say: Callable[[str], None]) -> None:
-    """Let the worker finish what runs, then close it."""
-    say("told to end: no new tasks, what runs is finished (once more to end at once)")
-    # a worker that dies now is not started again
+    """Let the worker finish its running tasks, then close it."""
+    say("asked to end: no new tasks, running ones are finished (ask again to end at once)")
+    # a worker that dies now is not restarted
     nanny.close_gracefully(reason="drain")
 
     async def drained() -> None:
@@ -232,15 +224,15 @@ async def _drain(nanny: Any, options: WorkerOptions, hurry: asyncio.Event, say: 
 
     try:
         if not await _first(drained(), hurry):
-            say("ended at once: what ran will run again elsewhere")
+            say("ended at once: its tasks will run again elsewhere")
     except TimeoutError:
-        say(f"not drained within {options.drain_timeout_s:g} s: what ran will run again elsewhere")
+        say(f"not drained within {options.drain_timeout_s:g} s: its tasks will run again elsewhere")
     except OSError as error:
-        say(f"not drained ({error}): what ran will run again elsewhere")
+        say(f"not drained ({error}): its tasks will run again elsewhere")
 
 
 async def _first(work: Any, stop: asyncio.Event) -> bool:
-    """Wait for some work or a stop: True where the work ended first. Work that is stopped is cancelled."""
+    """Wait for some work or a stop: True if the work ended first. Otherwise the work is cancelled."""
     doing, stopping = asyncio.ensure_future(work), asyncio.ensure_future(stop.wait())
     try:
         await asyncio.wait({doing, stopping}, return_when=asyncio.FIRST_COMPLETED)

@@ -1,4 +1,4 @@
-"""Dask's workers on this machine come from a preloaded server, too: Python's own forkserver, which Dask can use."""
+"""The fork server of Dask's workers on this machine: Python's own forkserver, which Dask can use."""
 
 from __future__ import annotations
 
@@ -30,15 +30,12 @@ _environment: Mapping[str, str] | None = None
 
 @contextlib.contextmanager
 def forked_workers() -> Iterator[Mapping[str, Any]]:
-    """Dask's settings under which workers are forked from a server, which starts and loads at once; a context manager.
+    """Start a fork server; yields Dask's settings for forking workers from it. A context manager.
 
-    For processes that have imported Dask.
-
-    There is one server a process. It outlives its users, so that the next cluster's workers start fast, too, but not a
-    change of the environment between them. Where this system cannot fork there are no settings, and workers start the
-    long way.
+    For processes that have imported Dask. There is one server per process. It stays for the next cluster, unless the
+    environment changes in between. If this system cannot fork, there are no settings and workers are spawned.
     """
-    global _users  # noqa: PLW0603 - one server a process
+    global _users  # noqa: PLW0603 - one server per process
     if not can_fork():
         yield {}
         return
@@ -53,18 +50,18 @@ def forked_workers() -> Iterator[Mapping[str, Any]]:
 
 
 def _start() -> None:
-    """Start the server where it is not there, or has another environment and no workers."""
+    """Start the server if there is none, or replace one with another environment and no workers."""
     global _environment  # noqa: PLW0603 - as above
     now = read_at_start(os.environ)
     if now != _environment and not _users:
         _stop()
         _environment = now
     multiprocessing.set_forkserver_preload(list(_PRELOADED))
-    # Dask would import all that it can use, here and there, and have that loaded in place of ours
+    # Dask would otherwise import all optional packages and replace this list by its own
     vars(sys.modules["distributed.utils"])["_forkserver_preload_set"] = True
     before = dict(os.environ)
     special = {"PYTHONPATH": environment_with_this_package()["PYTHONPATH"], **WITHOUT_THREADS, **_SAFE_PATH}
-    # the server takes the environment of this process: there is no other way to give it one
+    # the server inherits the environment of this process: there is no other way to set it
     os.environ.update(special)
     try:
         forkserver.ensure_running()
@@ -77,9 +74,9 @@ def _start() -> None:
 
 
 def _stop() -> None:
-    """End the server, if there is one: by itself where all workers are gone, whose processor time it hands up.
+    """End the server, if there is one; by itself if all workers are gone, which counts their processor time.
 
-    Python has no public way.
+    Python has no public function for it.
     """
     server: Any = forkserver._forkserver  # noqa: SLF001
     pid = server._forkserver_pid  # noqa: SLF001
@@ -87,12 +84,12 @@ def _stop() -> None:
         return
     os.close(server._forkserver_alive_fd)  # noqa: SLF001
     server._forkserver_alive_fd = server._forkserver_address = server._forkserver_pid = None  # noqa: SLF001
-    lives = os.pidfd_open(pid)
+    pidfd = os.pidfd_open(pid)
     try:
-        if not select.select([lives], [], [], _END_S)[0]:
+        if not select.select([pidfd], [], [], _END_S)[0]:
             os.kill(pid, signal.SIGKILL)
     finally:
-        os.close(lives)
+        os.close(pidfd)
     os.waitpid(pid, 0)
 
 

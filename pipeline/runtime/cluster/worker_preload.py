@@ -1,7 +1,7 @@
-"""What Dask's workers are born with: the server that they are forked from imports this, and nobody else does.
+"""Modules loaded for Dask's workers before they are forked; only their fork server imports this module.
 
-It loads all that tasks need. Every worker, while it still has one thread, forks the server of its own children from
-itself (`pipeline.runtime.isolation.fork_server`), so that they begin with the same.
+Each new worker, while it still has one thread, forks itself as the server of its own children
+(`pipeline.runtime.isolation.fork_server`), which then begin with the same modules.
 """
 
 from __future__ import annotations
@@ -11,35 +11,31 @@ import os
 import signal
 
 from pipeline.runtime.cluster.compiled_kernels import kernels_are_compiled
-from pipeline.runtime.cluster.worker_setup import NAME, STAGES
+from pipeline.runtime.cluster.worker_setup import NAME, STAGES, ignore_signal
 from pipeline.runtime.isolation import child_main, child_pool, fork_server
 
 _METHOD = "arrangement"
-"""The default method; others are loaded by those who model by them."""
+"""The default method; children load other methods themselves."""
 
 
 def _prepare() -> None:
-    """Load, and be born again in every worker."""
+    """Load everything, and prepare each forked worker."""
     child_main.name_process(fork_server.NAME)
-    # the stop of a service goes to all its processes: workers, which finish their tasks, must not lose this one
-    signal.signal(signal.SIGTERM, _left_to_the_nanny)
+    # stopping a service signals all its processes; workers still finish their tasks and need this one
+    signal.signal(signal.SIGTERM, ignore_signal)
     loads = list(STAGES)
-    if kernels_are_compiled():  # or else each compiles what it needs, when the run tells that it does
+    if kernels_are_compiled():  # otherwise each worker compiles what it needs, and the run says so
         loads.append(f"pipeline.runtime.stages.model_batch:load_once:{_METHOD}")
     fork_server.load_all(loads)
-    gc.freeze()  # a collection would write to all objects, and so copy the memory that is shared
+    gc.freeze()  # a collection would write to all objects and thus copy the shared memory
     server = os.getpid()
 
-    def born() -> None:
+    def prepare_worker() -> None:
         if os.getppid() == server:
             child_main.name_process(NAME)
-            child_pool.fork_server()
+            child_pool.fork_own_server()
 
-    os.register_at_fork(after_in_child=born)
-
-
-def _left_to_the_nanny(number: int, frame: object) -> None:
-    """Do nothing on a signal."""
+    os.register_at_fork(after_in_child=prepare_worker)
 
 
 _prepare()

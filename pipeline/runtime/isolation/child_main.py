@@ -1,8 +1,8 @@
 """The child process that does the building work: `python -m MODULE PARENT [MODULE:FUNCTION ...]`.
 
-Started by `isolation.spawned_child`, never by hand, or forked by a `isolation.fork_server`. It calls the
-functions that it is told to load what it will need, says that it is ready, and then works off batches until its parent
-is gone. It knows nothing of buildings.
+Started by `isolation.spawned_child` or forked by `isolation.fork_server`, never by hand. It first calls the functions
+that load libraries and kernels, reports that it is ready, and then processes batches until its parent is gone. It knows
+nothing about buildings.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pipeline.runtime.isolation.messages import Batch, Begun, Finished, Frames, 
 from pipeline.runtime.isolation.start_up import start_own_process
 
 NAME = "gablework-child"
-"""Name of the process, as `ps` and `top` show it on Linux, which allows no longer one."""
+"""Name of the process in `ps` and `top`, as long as Linux allows."""
 _PIECE = 2**20
 _PR_SET_PDEATHSIG, _PR_SET_NAME = 1, 15
 _FIRST_VICTIM = "1000"
@@ -39,27 +39,27 @@ def main(arguments: Sequence[str]) -> None:
     Parameters
     ----------
     arguments : sequence of str
-        The parent's process id, then what is called before this process is ready: `module:function`,
-        `module:function:argument` where it takes a text, or `module` alone to be imported.
+        The parent's process id, then the loads, which run before this process is ready: `module:function`,
+        `module:function:argument` with a text, or a `module` to import.
     """
     start_own_process()
     serve_parent(int(arguments[0]), arguments[1:])
 
 
 def serve_parent(parent: int, loads: Sequence[str]) -> None:
-    """Work off what comes over standard input until the parent is gone.
+    """Process batches from standard input until the parent is gone.
 
     Parameters
     ----------
     parent : int
         Process id of the parent.
     loads : sequence of str
-        What is called before this process is ready.
+        Run before this process is ready, as in `main`.
     """
     incoming, outgoing = _private_pipes()
     end_with_parent(parent)
     name_process(NAME)
-    _be_the_first_victim()
+    _be_killed_first()
     faulthandler.enable(all_threads=False)
     faulthandler.register(signal.SIGUSR1, all_threads=True)
     batches: queue.SimpleQueue[Batch] = queue.SimpleQueue()
@@ -68,11 +68,11 @@ def serve_parent(parent: int, loads: Sequence[str]) -> None:
         load(name)
     _send(outgoing, Ready())
     while True:
-        _work(batches.get(), outgoing)
+        _process(batches.get(), outgoing)
 
 
 def load(name: str) -> None:
-    """Call a function, told as `module:function`, or as `module:function:argument`; or import a `module`."""
+    """Call `module:function` or `module:function:argument`, or import `module`."""
     module, *function = name.split(":", 2)
     loaded = importlib.import_module(module)
     if function:
@@ -80,7 +80,7 @@ def load(name: str) -> None:
 
 
 def _private_pipes() -> tuple[int, int]:
-    """The two pipes under new numbers; standard input is empty and standard output is standard error from here on.
+    """Move the two pipes to new numbers: standard input is then empty, and standard output is standard error.
 
     A library that prints must not write into the pipe.
     """
@@ -93,9 +93,9 @@ def _private_pipes() -> tuple[int, int]:
 
 
 def end_with_parent(parent: int) -> None:
-    """Have the system kill this process when its parent dies.
+    """Let the system kill this process when its parent dies.
 
-    Closed pipes would end it too, but not while a building holds the interpreter's lock.
+    Closed pipes would end it too, except while a building holds the interpreter's lock.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
@@ -104,13 +104,13 @@ def end_with_parent(parent: int) -> None:
 
 
 def name_process(name: str) -> None:
-    """Tell those who look at processes what this one is: a forked one has the command line of its server."""
+    """Set the process name: a forked process has the command line of its server."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
 
 
-def _be_the_first_victim() -> None:
-    """Where the machine's memory runs out, this process is to go, not its worker."""
+def _be_killed_first() -> None:
+    """If the machine runs out of memory, this process is killed, not its worker."""
     if sys.platform == "linux":
         try:
             Path("/proc/self/oom_score_adj").write_text(_FIRST_VICTIM, encoding="ascii")
@@ -119,27 +119,27 @@ def _be_the_first_victim() -> None:
 
 
 def _receive(incoming: int, batches: queue.SimpleQueue[Batch]) -> None:
-    """Read batches until the parent closes its end; then the process ends, whatever it does."""
+    """Read batches until the parent closes its end, then end the process."""
     frames = Frames()
     try:
         while received := os.read(incoming, _PIECE):
             for batch in frames.feed(received):
                 batches.put(batch)
-    except BaseException:  # noqa: BLE001 - told to the parent by the end of this process
+    except BaseException:  # noqa: BLE001 - the parent sees that this process ends
         traceback.print_exc()
         os._exit(1)
     os._exit(0)
 
 
 def _send(outgoing: int, message: object) -> None:
-    """Write a message whole."""
+    """Write a whole message."""
     rest = memoryview(frame(message))
     while rest:
         rest = rest[os.write(outgoing, rest) :]
 
 
-def _work(batch: Batch, outgoing: int) -> None:
-    """Work off a batch, every item announced before it is touched."""
+def _process(batch: Batch, outgoing: int) -> None:
+    """Process a batch, announcing each item before it begins."""
     if sys.platform == "linux":
         hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
         wanted = resource.RLIM_INFINITY if batch.data_limit_bytes is None else batch.data_limit_bytes
@@ -159,7 +159,7 @@ def _work(batch: Batch, outgoing: int) -> None:
 
 
 def _picklable(error: Exception) -> Exception:
-    """The error, or one that says the same where it does not survive the pipe."""
+    """The error, or one with the same text if it cannot be pickled."""
     try:
         copy: Any = pickle.loads(pickle.dumps(error))  # noqa: S301 - just made
     except Exception:  # noqa: BLE001 - whatever its class does when copied

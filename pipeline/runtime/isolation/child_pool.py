@@ -1,4 +1,4 @@
-"""The child processes of this process: one for each thread that is at work, kept from batch to batch."""
+"""The child processes of this process: one per working thread, reused from batch to batch."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from pipeline.runtime.monitoring.logs import LOG
 from pipeline.runtime.monitoring.measurement import charge
 
 FRUITLESS_STARTS = 3
-"""Children that die in a row before they begin anything: then it is nobody's building that is at fault."""
+"""Children that die in a row before they begin an item; then no building is to blame."""
 
 _LOADS = ("pipeline.runtime.stages.model_batch:load",)
 _START_TIMEOUT_S = 900.0
-"""With compiled kernels a child takes two seconds; without, it compiles them."""
+"""A child takes two seconds with compiled kernels; without them it compiles them first."""
 
 
-def start_failure(told: str, stderr: str, work: str = "models buildings") -> str:
-    """The message where children that do some work do not last."""
-    said = f". It said: {stderr}" if stderr else ""
-    return f"the process that {work} does not last, {FRUITLESS_STARTS} times in a row: {told}{said}"
+def start_failure(detail: str, stderr: str, work: str = "models buildings") -> str:
+    """The message if children die before they begin an item."""
+    output = f". Its output: {stderr}" if stderr else ""
+    return f"the process that {work} died {FRUITLESS_STARTS} times in a row before it began: {detail}{output}"
 
 
-class _Children:
-    """The children of this process: those that have nothing to do, and those that are lent out."""
+class _ChildPool:
+    """The children of this process, idle or borrowed."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -50,18 +50,10 @@ class _Children:
         self._closed = False
 
     @contextlib.contextmanager
-    def lent(
+    def borrowed(
         self, cancelled: Callable[[], bool], *, fresh: bool, loads: Sequence[str] | None
     ) -> Iterator[SupervisedChild]:
-        """A ready child, `fresh` where it must not have done anything yet; ended where its work broke off.
-
-        Raises
-        ------
-        RunCancelledError
-            `cancelled` turned true.
-        RunError
-            No child can be started.
-        """
+        """A ready child, with `fresh` one that has not begun any item; ended if its work breaks off."""
         child = self._ready_child(cancelled, fresh=fresh, loads=_LOADS if loads is None else loads)
         try:
             yield child
@@ -78,38 +70,38 @@ class _Children:
             self._end(child)
 
     def close(self) -> None:
-        """Kill all children and start no other; those that are lent out die under their users."""
+        """Kill all children, also borrowed ones, and start no others."""
         self._closed = True
         self.kill()
 
     def preload(self, loads: Sequence[str]) -> None:
-        """Start the server that children are forked from, where none is there."""
+        """Start the server that children are forked from, unless there is one."""
         with self._lock:
             if not self._closed:
                 self._serving(loads)
 
     def has_idle(self) -> bool:
-        """Whether a living child has nothing to do, and would do it with the environment of now."""
+        """Whether a living child with the present environment is idle."""
         environment = read_by_children(os.environ)
         with self._lock:
             return any(child.alive and child.environment == environment for child in self._idle)
 
     def kill(self) -> None:
-        """Kill all children; the next work starts others."""
+        """Kill all children; later work starts others."""
         with self._lock:
-            idle, lent = self._idle, self._all.difference(self._idle)
-            self._idle, self._all = [], set(lent)
+            idle, busy = self._idle, self._all.difference(self._idle)
+            self._idle, self._all = [], set(busy)
             for child in idle:
                 child.end()
-            for child in lent:
+            for child in busy:
                 child.kill()
             self._retire()
             for server in self._retired:
                 server.end()
             self._retired.clear()
 
-    def take(self, server: ForkServer) -> None:
-        """Have children forked from a server."""
+    def use_server(self, server: ForkServer) -> None:
+        """Fork children from a server."""
         with self._lock:
             self._retire()
             self._server = server
@@ -118,7 +110,7 @@ class _Children:
         """An idle child or a new one."""
         fault = ""
         for start in range(FRUITLESS_STARTS):
-            # where a forked one does not last, it may be for the server's sake
+            # if a forked child dies at once, its server may be the cause
             child = self._idle_or_new(fresh=fresh, loads=loads, forked=start == 0)
             try:
                 problem = child.wait_until_ready(_START_TIMEOUT_S, cancelled)
@@ -127,14 +119,14 @@ class _Children:
                 raise
             if problem is None:
                 return child
-            fault = start_failure(problem, child.last_words)
+            fault = start_failure(problem, child.last_output)
             self._end(child)
         raise RunError(fault)
 
     def _idle_or_new(self, *, fresh: bool, loads: Sequence[str], forked: bool) -> SupervisedChild:
         with self._lock:
             if self._closed:
-                raise RunError("this process is about to end: it models no buildings any more")
+                raise RunError("this process is about to end and starts no more children")
             environment = read_by_children(os.environ)
             for child in tuple(self._idle):
                 if not child.alive or child.environment != environment:
@@ -152,18 +144,18 @@ class _Children:
         server = self._serving(loads) if forked else None
         if server is not None:
             try:
-                return SupervisedChild(lambda stderr: server.forked(loads, stderr))
+                return SupervisedChild(lambda stderr: server.fork(loads, stderr))
             except OSError as error:
                 LOG.warning("no process can be forked: %s", error)
                 self._retire()
         return SupervisedChild(lambda stderr: SpawnedChild(loads, stderr))
 
     def _serving(self, loads: Sequence[str]) -> ForkServer | None:
-        """The server, started where none is there that can serve; None where children have to be executed."""
+        """The server, started if necessary; None if children have to be spawned."""
         if self._server is not None and not self._server.serves:
             if fault := self._server.fault:
                 LOG.warning("the server that processes are forked from ended: %s", fault)
-                # one that ended by itself will do so again; one that was killed will not
+                # a server that ended by itself would do so again, one that was killed would not
                 self._can_fork = self._server.was_killed
             self._retire()
         self._retired = [server for server in self._retired if server.alive]
@@ -184,23 +176,23 @@ class _Children:
             self._all.discard(child)
 
 
-_children = _Children()
+_pool = _ChildPool()
 
 
 def borrowed_child(
     cancelled: Callable[[], bool], *, fresh: bool, loads: Sequence[str] | None = None
 ) -> contextlib.AbstractContextManager[SupervisedChild]:
-    """A ready child of this process, for the time of a `with` block.
+    """A ready child of this process for a `with` block.
 
     Parameters
     ----------
     cancelled : callable
-        Asked while the child gets ready.
+        Polled while the child gets ready.
     fresh : bool
-        Whether it must not have done anything yet.
+        Whether it must not have begun any item.
     loads : sequence of str, optional
-        What a new child calls before it is ready, as `isolation.child_main` takes it; all methods by default. A
-        child that is there already loads what else it needs when it needs it.
+        Loads of a new child, as in `isolation.child_main`; all methods by default. An existing child loads what else it
+        needs when it needs it.
 
     Raises
     ------
@@ -209,40 +201,40 @@ def borrowed_child(
     RunError
         No child can be started.
     """
-    return _children.lent(cancelled, fresh=fresh, loads=loads)
+    return _pool.borrowed(cancelled, fresh=fresh, loads=loads)
 
 
 def preload(loads: Sequence[str]) -> None:
-    """Have the server that children are forked from load what they will need, while this process does something else.
+    """Start the server that children are forked from, and let it load what they need in the meantime.
 
     Parameters
     ----------
     loads : sequence of str
-        What it loads, as `isolation.child_main` takes it. Without this call the first child's loads are those of the
-        server; a server that is there already loads nothing more: what is missing each child loads by itself.
+        Its loads, as in `isolation.child_main`. Without this call the server has the first child's loads. An existing
+        server loads nothing else; each child then loads what is missing.
     """
-    _children.preload(loads)
+    _pool.preload(loads)
 
 
-def fork_server() -> None:
-    """Have this process forked to be the server of its children, with all that it has loaded; it has one thread."""
-    _children.take(ForkServer(functools.partial(fork_server_here, ())))
+def fork_own_server() -> None:
+    """Fork this process, which has one thread, as the server of its children, with everything that it has loaded."""
+    _pool.use_server(ForkServer(functools.partial(fork_server_here, ())))
 
 
 def has_idle_child() -> bool:
-    """Whether a child of this process is there and has nothing to do."""
-    return _children.has_idle()
+    """Whether a child of this process is idle."""
+    return _pool.has_idle()
 
 
 def kill_children() -> None:
-    """Kill the children of this process and the server that they were forked from; the next work starts others."""
-    _children.kill()
+    """Kill the children of this process and their server; later work starts others."""
+    _pool.kill()
 
 
 def _forget_children() -> None:
-    """A forked copy of this process leaves the children to the original."""
-    global _children  # noqa: PLW0603 - one pool a process
-    _children = _Children()
+    """Leave the children to the original process after a fork."""
+    global _pool  # noqa: PLW0603 - one pool per process
+    _pool = _ChildPool()
 
 
 os.register_at_fork(after_in_child=_forget_children)
@@ -250,5 +242,5 @@ os.register_at_fork(after_in_child=_forget_children)
 
 @atexit.register
 def close_children() -> None:
-    """End the children of this process and start no others; a process that ends without `atexit` calls it itself."""
-    _children.close()
+    """End the children of this process and start no others; processes that end without `atexit` call it."""
+    _pool.close()

@@ -1,22 +1,22 @@
 """The server that child processes are forked from: `python -m MODULE OWNER SOCKET [LOAD ...]`.
 
-Started by `isolation.forked_child`, never by hand. It loads what children will need, once, and forks one whenever its
-owner asks: a child then begins with all of that, in memory that it shares with its siblings. It does nothing else, has
-one thread, and never sees an item of work.
+Started by `isolation.forked_child`, never by hand. It loads what children need, once, and forks a child whenever its
+owner orders one: the child begins with everything loaded, in memory shared with its siblings. The server does nothing
+else, has one thread, and never sees an item of work.
 
 ```
 owner                               server
     over the socket:
-    control, stdin, stdout, stderr ▶         four descriptors of a child to be
+    control, stdin, stdout, stderr ▶         four descriptors of the new child
     over the child's control:
     Order(environment, ...) ──────▶
-                           ◀──────  its process id           once it is forked
-                           ◀──────  its return code          once it ended, however; it stays a zombie until then
-    (closes) ─────────────────────▶          it is killed if it lives, and waited for
+                           ◀──────  its process id           after the fork
+                           ◀──────  its return code          after its end; it remains a zombie until then
+    (closes) ─────────────────────▶          the child is killed if it lives, and reaped
 ```
 
-Linux ends it when its owner dies, and its children when it dies (`PR_SET_PDEATHSIG`). Where the owner closes the socket
-it forks no more, and ends after its last child.
+Linux ends the server when its owner dies, and its children when it dies (`PR_SET_PDEATHSIG`). After the owner closes
+the socket, the server forks no more and ends after its last child.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from pipeline.runtime.isolation.messages import NUMBER, Frames, Order
 from pipeline.runtime.isolation.start_up import start_own_process
 
 NAME = "gablework-fork"
-"""Name of the process, as `ps` and `top` show it."""
+"""Name of the process in `ps` and `top`."""
 THREADED = 75
-"""Exit code of a server that has more than one thread: a forked child would wait for locks that nobody lets go."""
+"""Exit code of a server with more than one thread: a forked child could wait forever for a lock."""
 _PIECE = 2**16
 _DESCRIPTORS = 4
 _STANDARD = 3
@@ -54,8 +54,7 @@ def main(arguments: Sequence[str]) -> None:
     Parameters
     ----------
     arguments : sequence of str
-        The owner's process id, the descriptor of the socket to it, then what is loaded, as `isolation.child_main`
-        takes it. What cannot be loaded is left to the children, who tell why.
+        The owner's process id, the descriptor of the socket to it, then the loads, as in `isolation.child_main`.
     """
     start_own_process()
     child_main.end_with_parent(int(arguments[0]))
@@ -64,9 +63,9 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _close_all_but(orders: int) -> None:
-    """Close all descriptors but the standard ones, one more, and files that are read.
+    """Close all descriptors except the standard ones, `orders`, and files open for reading.
 
-    A library that was loaded before the fork, such as PROJ with its data base, goes on to read them by their numbers.
+    Libraries loaded before the fork, such as PROJ with its database, continue to read these files by number.
     """
     for number in sorted(int(name) for name in os.listdir("/proc/self/fd")):  # noqa: PTH208 - numbers, no paths
         if number < _STANDARD or number == orders:
@@ -78,27 +77,27 @@ def _close_all_but(orders: int) -> None:
 
 
 def load_all(loads: Sequence[str]) -> None:
-    """Load what children will need; what cannot be loaded is left to them, who tell why."""
+    """Load what children need; a load that fails is repeated by each child, which reports the fault."""
     for name in loads:
         try:
             child_main.load(name)
-        except Exception:  # noqa: BLE001 - told by the child that needs it
+        except Exception:  # noqa: BLE001 - the child that needs it reports it
             traceback.print_exc()
 
 
 def serve_forked(owner: int, orders: socket.socket, stderr: int, loads: Sequence[str] = ()) -> NoReturn:
-    """Be the server of the process that this one was just forked from, and of which it keeps nothing but the memory.
+    """Become the server of the process that this one was just forked from, keeping only its memory.
 
     Parameters
     ----------
     owner : int
-        Process id of the other.
+        Its process id.
     orders : socket
-        To it.
+        Connected to it.
     stderr : int
-        Descriptor that gets what this process has to say.
+        Descriptor for the standard error of this process.
     loads : sequence of str
-        What is loaded besides, as `pipeline.runtime.isolation.child_main` takes it.
+        Additional loads, as in `isolation.child_main`.
     """
     try:
         start_own_process()
@@ -120,27 +119,27 @@ def serve_forked(owner: int, orders: socket.socket, stderr: int, loads: Sequence
 
 
 def serve(owner: socket.socket) -> NoReturn:
-    """Fork children for an owner; for a process with one thread, which ends here."""
+    """Fork children for an owner, then end this process, which has one thread."""
     child_main.name_process(NAME)
-    # the stop of a service goes to all its processes: this one ends with its owner, not before
+    # stopping a service signals all its processes; this one ends with its owner, not before
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    gc.freeze()  # a collection in a child would write to all objects, and so copy the memory that is shared
+    gc.freeze()  # a collection in a child would write to all objects and thus copy the shared memory
     _Server(owner).serve()
     os._exit(0)
 
 
 class _Child:
-    """A child as the server knows it."""
+    """A child, seen from the server."""
 
     def __init__(self, pid: int, control: socket.socket) -> None:
         self.pid = pid
         self.control = control
-        self.lives = os.pidfd_open(pid)
+        self.pidfd = os.pidfd_open(pid)
         self.ended = False
 
 
 class _Server:
-    """The loop: orders, ends of children, and children that nobody wants any more."""
+    """The loop: orders, ends of children, and children that the owner drops."""
 
     def __init__(self, owner: socket.socket) -> None:
         self._owner: socket.socket | None = owner
@@ -149,20 +148,20 @@ class _Server:
         self._children: dict[int, _Child] = {}  # by both descriptors
 
     def serve(self) -> None:
-        """Serve until the owner closed the socket and the last child is gone."""
+        """Serve until the owner has closed the socket and the last child is gone."""
         while self._owner is not None or self._children:
             for descriptor, _ in self._poll.poll():
                 if self._owner is not None and descriptor == self._owner.fileno():
                     self._take_order(self._owner)
                 elif descriptor in self._children:
                     known = self._children[descriptor]
-                    if descriptor == known.lives:
-                        self._tell_end(known)
+                    if descriptor == known.pidfd:
+                        self._report_end(known)
                     else:
-                        self._let_go(known)
+                        self._drop(known)
 
     def _take_order(self, owner: socket.socket) -> None:
-        """Fork a child; hear that there will be no more orders."""
+        """Fork a child, or note that there will be no more orders."""
         word, descriptors, _, _ = socket.recv_fds(owner, 1, _DESCRIPTORS)
         if not word:
             self._poll.unregister(owner)
@@ -176,7 +175,7 @@ class _Server:
         else:
             try:
                 self._fork(order, control, descriptors[1:])
-            except OSError:  # no room for one more process: its owner hears that it is gone, the others go on
+            except OSError:  # no room for another process: its owner sees that it is gone, the others continue
                 traceback.print_exc()
                 control.close()
         for descriptor in descriptors[1:]:
@@ -195,13 +194,13 @@ class _Server:
             kill_with_group(pid)
             os.waitpid(pid, 0)
             raise
-        self._children |= {control.fileno(): known, known.lives: known}
-        self._poll.register(known.lives, select.POLLIN)
+        self._children |= {control.fileno(): known, known.pidfd: known}
+        self._poll.register(known.pidfd, select.POLLIN)
         self._poll.register(control, select.POLLIN)
-        _tell(control, pid)
+        _send(control, pid)
 
     def _be_child(self, server: int, order: Order, control: socket.socket, standard: Sequence[int]) -> NoReturn:
-        """The forked process: as one that was started by `exec`, but all is loaded."""
+        """Run the forked process like a spawned one, with everything loaded."""
         code = 1
         try:
             os.setsid()
@@ -216,7 +215,7 @@ class _Server:
                 os.close(descriptor)
             os.environ.clear()
             os.environ.update(order.environment)
-            with contextlib.suppress(OSError):  # a folder that is gone cannot be entered, and nobody needs it
+            with contextlib.suppress(OSError):  # a folder that is gone cannot be entered, and no child needs it
                 os.chdir(order.folder)
             child_main.serve_parent(server, order.loads)
         except SystemExit as ended:
@@ -226,35 +225,35 @@ class _Server:
         finally:
             os._exit(code)
 
-    def _tell_end(self, known: _Child) -> None:
-        """Tell the return code, and leave the process's number taken as long as somebody may signal it."""
-        self._poll.unregister(known.lives)
+    def _report_end(self, known: _Child) -> None:
+        """Send the return code; the process id stays taken as long as the owner may signal it."""
+        self._poll.unregister(known.pidfd)
         known.ended = True
         found = os.waitid(os.P_PID, known.pid, os.WEXITED | os.WNOWAIT)
         assert found is not None
-        _tell(known.control, found.si_status if found.si_code == os.CLD_EXITED else -found.si_status)
+        _send(known.control, found.si_status if found.si_code == os.CLD_EXITED else -found.si_status)
 
-    def _let_go(self, known: _Child) -> None:
-        """The owner closed the child's control: nobody waits for it any more."""
+    def _drop(self, known: _Child) -> None:
+        """End a child whose control the owner has closed."""
         self._poll.unregister(known.control)
         if not known.ended:
-            self._poll.unregister(known.lives)
+            self._poll.unregister(known.pidfd)
             kill_with_group(known.pid)
         os.waitpid(known.pid, 0)
-        del self._children[known.control.fileno()], self._children[known.lives]
+        del self._children[known.control.fileno()], self._children[known.pidfd]
         known.control.close()
-        os.close(known.lives)
+        os.close(known.pidfd)
 
 
 def kill_with_group(pid: int) -> None:
-    """Kill a process that was not waited for yet and all that it started, also one that has no group of its own yet."""
+    """Kill a process that was not reaped yet and all that it started, also if it has no group of its own yet."""
     for kill in (os.killpg, os.kill):
         with contextlib.suppress(ProcessLookupError):
             kill(pid, signal.SIGKILL)
 
 
 def _order(control: socket.socket) -> Order | None:
-    """The order for a child; None where the owner is gone meanwhile."""
+    """The order for a child; None if the owner is gone."""
     frames = Frames()
     while received := control.recv(_PIECE):
         for order in frames.feed(received):
@@ -263,8 +262,8 @@ def _order(control: socket.socket) -> Order | None:
     return None
 
 
-def _tell(control: socket.socket, number: int) -> None:
-    with contextlib.suppress(BrokenPipeError):  # it was closed: the loop comes to that
+def _send(control: socket.socket, number: int) -> None:
+    with contextlib.suppress(BrokenPipeError):  # it was closed: the loop handles that
         control.sendall(NUMBER.pack(number))
 
 

@@ -1,4 +1,4 @@
-"""Processes that are forked from a preloaded server, on the side of the one who asks for them."""
+"""The owner's side of a fork server: starting it, and the children that it forks."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ _READ_AT_START = (
     *("PYTHON", "LD_", "LC_", "LANG", "TZ"),
     *("NUMBA_", "GABLEWORK_", "ARROW_", "GDAL_", "PROJ_"),
 )
-"""Beginnings of variables that the interpreter or a library reads once: with others a server is no use any more."""
+"""Prefixes of variables that the interpreter or a library reads once: if they change, a new server is needed."""
 _READ_LATER = (
     *("GABLEWORK_WORKER_", "PYTHONSAFEPATH", "PYTHONHASHSEED"),
     *("GDAL_CURL_CA_BUNDLE", "PROJ_CURL_CA_BUNDLE"),
 )
-"""Beginnings of variables that look like those, but matter to no child: Dask sets one, and pyogrio the last two as it
-is loaded."""
+"""Prefixes of variables that look like those and matter to no child: Dask sets one, and pyogrio the last two when it is
+loaded."""
 
 
-_SAID_BYTES = 2000
+_OUTPUT_BYTES = 2000
 _END_S = 1.0
 
 
 def can_fork() -> bool:
-    """Whether this system has what a server needs: Linux, in a sandbox that forbids none of it."""
+    """Whether a server can run here: Linux, without a sandbox that forbids its system calls."""
     if sys.platform != "linux" or not hasattr(os, "pidfd_open"):
         return False
     try:
@@ -50,41 +50,41 @@ def can_fork() -> bool:
 
 
 class ForkedChild:
-    """A process that a server forks for this one, as soon as it has loaded; see `isolation.spawned_child.Started`."""
+    """A process that a server forks for this one after loading; see `isolation.spawned_child.ChildProcess`."""
 
     def __init__(self, control: socket.socket, stdin: int, stdout: int) -> None:
         self.stdin, self.stdout = stdin, stdout
         self._control = control
         self._lock = threading.Lock()
-        self._told = bytearray()
+        self._received = bytearray()
         self._pid: int | None = None
         self._code: int | None = None
 
     @property
     def pid(self) -> int | None:
-        """Its number; None as long as it is not there."""
+        """Its process id; None until it exists."""
         if self._pid is None and self._code is None:
-            self._hear(0.0)
+            self._receive(0.0)
         return self._pid
 
     def poll(self) -> int | None:
-        """Its return code; None as long as it lives, or is to come."""
+        """Its return code; None until its end."""
         if self._code is None:
-            self._hear(0.0)
+            self._receive(0.0)
         return self._code
 
     def wait(self, timeout_s: float | None = None) -> int | None:
-        """Wait for its end; its return code, or None after the time."""
+        """Wait for its end; returns its return code, or None after the time-out."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while self.poll() is None:
             left_s = None if deadline is None else deadline - time.monotonic()
             if left_s is not None and left_s <= 0.0:
                 break
-            self._hear(left_s)
+            self._receive(left_s)
         return self._code
 
     def kill(self) -> None:
-        """Kill it and all that it started; harmless where it is gone."""
+        """Kill it and all that it started; harmless if it is gone."""
         if self.poll() is not None:
             return
         if self._pid is not None:
@@ -95,13 +95,13 @@ class ForkedChild:
         self._code = -signal.SIGKILL
 
     def close(self) -> None:
-        """Let go of one that ended."""
+        """Release an ended process."""
         self._control.close()
         os.close(self.stdin)
         os.close(self.stdout)
 
-    def _hear(self, timeout_s: float | None) -> None:
-        """What the server says of it within some time."""
+    def _receive(self, timeout_s: float | None) -> None:
+        """Take what the server sends about it within some time."""
         poll = select.poll()
         poll.register(self._control, select.POLLIN)
         if not poll.poll(None if timeout_s is None else 1e3 * timeout_s):
@@ -109,23 +109,23 @@ class ForkedChild:
         with self._lock:
             try:
                 received = self._control.recv(2 * NUMBER.size, socket.MSG_DONTWAIT)
-            except BlockingIOError:  # another thread heard it
+            except BlockingIOError:  # another thread took it
                 return
             except ConnectionResetError:
                 received = b""
             if not received:
-                # the server is gone, and takes its children with it
+                # the server is gone, and its children with it
                 self._code = -signal.SIGKILL if self._code is None else self._code
                 return
-            self._told += received
-            numbers = [number for (number,) in NUMBER.iter_unpack(self._told[: len(self._told) // 8 * 8])]
+            self._received += received
+            numbers = [number for (number,) in NUMBER.iter_unpack(self._received[: len(self._received) // 8 * 8])]
             self._pid = numbers[0] if numbers else None
             if len(numbers) > 1:
                 self._code = numbers[1]
 
 
 class ForkedServer:
-    """A process that this one forked, asked as `subprocess.Popen` is."""
+    """A server forked from this process, with the methods of `subprocess.Popen`."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -136,20 +136,20 @@ class ForkedServer:
         return self._waited(os.WNOHANG)
 
     def wait(self, timeout: float | None = None) -> int | None:
-        """Wait for its end; its return code.
+        """Wait for its end; returns its return code.
 
         Raises
         ------
         TimeoutError
-            It lives still.
+            It still lives.
         """
         if timeout is not None and self._code is None:
-            lives = os.pidfd_open(self._pid)
+            pidfd = os.pidfd_open(self._pid)
             try:
-                if not select.select([lives], [], [], timeout)[0]:
+                if not select.select([pidfd], [], [], timeout)[0]:
                     raise TimeoutError
             finally:
-                os.close(lives)
+                os.close(pidfd)
         return self._waited(0)
 
     def kill(self) -> None:
@@ -166,7 +166,7 @@ class ForkedServer:
 
 
 def spawn_server(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes]) -> subprocess.Popen[bytes]:
-    """Start a server that loads things, as `pipeline.runtime.isolation.child_main` takes them."""
+    """Start a server in a new interpreter, with loads as in `isolation.child_main`."""
     command = [sys.executable, "-P", "-m", "pipeline.runtime.isolation.fork_server", str(os.getpid())]
     return run_in_starter_thread(
         subprocess.Popen,
@@ -181,7 +181,7 @@ def spawn_server(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes])
 
 
 def fork_server_here(loads: Sequence[str], orders: socket.socket, stderr: IO[bytes]) -> ForkedServer:
-    """Fork a server with all that this process has loaded, to load more; for one that has a single thread."""
+    """Fork a server from this process, which has one thread, with everything loaded here and further loads."""
     owner = os.getpid()
     pid = os.fork()
     if not pid:
@@ -191,17 +191,17 @@ def fork_server_here(loads: Sequence[str], orders: socket.socket, stderr: IO[byt
 
 
 def has_one_thread() -> bool:
-    """Whether nothing in this process could hold a lock while it is forked; also no thread of a library."""
+    """Whether this process has no second thread, not even one of a library, that could hold a lock during a fork."""
     return sum(1 for _ in Path("/proc/self/task").iterdir()) == 1
 
 
 class ForkServer:
-    """A server, started and asked for processes.
+    """A server, seen from its owner.
 
     Parameters
     ----------
     start : callable
-        Starts it, with a socket for its orders and a file for what it has to say: `spawn_server`, `fork_server_here`.
+        Starts it, with a socket for orders and a file for its standard error: `spawn_server`, `fork_server_here`.
     """
 
     def __init__(self, start: Callable[[socket.socket, IO[bytes]], subprocess.Popen[bytes] | ForkedServer]) -> None:
@@ -210,44 +210,44 @@ class ForkServer:
         self._socket, there = socket.socketpair()
         with there:
             self._process = start(there, self._stderr)
-        self._asked = False
+        self._used = False
 
     @property
     def alive(self) -> bool:
-        """Whether it is there."""
+        """Whether it runs."""
         return self._process.poll() is None
 
     @property
     def fault(self) -> str:
-        """Why it is gone; empty where it is there."""
+        """Why it is gone; empty while it runs."""
         code = self._process.poll()
         if code is None:
             return ""
         if code == THREADED:
-            return "what it loaded has started threads"
+            return "a module that it loaded has started threads"
         size = os.fstat(self._stderr.fileno()).st_size
-        said = os.pread(self._stderr.fileno(), _SAID_BYTES, max(0, size - _SAID_BYTES))
-        return f"return code {code}. It said: {said.decode(errors='replace').strip()}"
+        output = os.pread(self._stderr.fileno(), _OUTPUT_BYTES, max(0, size - _OUTPUT_BYTES))
+        return f"return code {code}. Its output: {output.decode(errors='replace').strip()}"
 
     @property
     def was_killed(self) -> bool:
-        """Whether somebody killed it, or the system for lack of memory."""
+        """Whether it was killed, for example by the system for lack of memory."""
         return self._process.poll() == -signal.SIGKILL
 
     @property
     def serves(self) -> bool:
-        """Whether it is there, and its children would be as those that are started now."""
+        """Whether it runs, and was started with the present environment."""
         return self.alive and self._environment == read_at_start(os.environ)
 
-    def forked(self, loads: Sequence[str], stderr: int) -> ForkedChild:
-        """A process that runs `pipeline.runtime.isolation.child_main`; forked when the server has loaded.
+    def fork(self, loads: Sequence[str], stderr: int) -> ForkedChild:
+        """Order a process that runs `isolation.child_main`, forked after the server has loaded.
 
         Raises
         ------
         OSError
             The server is gone.
         """
-        self._asked = True
+        self._used = True
         order = Order(environment=environment_with_this_package(), folder=_folder(), loads=tuple(loads))
         theirs: list[int] = []
         control, there = socket.socketpair()
@@ -270,13 +270,13 @@ class ForkServer:
         return process
 
     def retire(self) -> None:
-        """Ask it for nothing more; it ends after its last child."""
+        """Order nothing more; it ends after its last child."""
         self._socket.close()
 
     def end(self) -> None:
-        """End it: by itself where its children are gone, whose processor time it then hands up, else with them."""
+        """End it: by itself if its children are gone, which counts their processor time, otherwise with them."""
         self.retire()
-        if self._asked:
+        if self._used:
             with contextlib.suppress(TimeoutError, subprocess.TimeoutExpired):
                 self._process.wait(_END_S)
         self._process.kill()
@@ -284,7 +284,7 @@ class ForkServer:
 
 
 def _folder() -> str:
-    """The working directory; empty where it is gone."""
+    """The working directory; empty if it is gone."""
     try:
         return str(Path.cwd())
     except FileNotFoundError:
@@ -292,12 +292,12 @@ def _folder() -> str:
 
 
 def read_by_children(environment: Mapping[str, str]) -> dict[str, str]:
-    """The variables that may matter to a child: keys of an object store, say, which it reads when it works."""
+    """The variables that may matter to a child, such as the keys of an object store, which it reads at work."""
     return {name: value for name, value in environment.items() if not name.startswith(_READ_LATER)}
 
 
 def read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
-    """The variables that count once only, when a process starts."""
+    """The variables that are read only once, when a process starts."""
     return {
         name: value
         for name, value in environment.items()

@@ -1,9 +1,8 @@
-"""Building work in supervised child processes, so that a building can cost only itself.
+"""Items modelled in supervised child processes, so a bad building harms only itself.
 
-A process keeps the children that it started, one for each thread that is at work; they live from batch to batch. A
-child announces every item before it touches it and sends every result as soon as it is done. When it dies, or is ended
-for its memory, the announced item is tried once more, alone in a fresh child: memory may have been piled up, and
-structures broken, by those before it. Only an item that fails again is given up, and nothing else is lost.
+A child announces each item before it begins and sends each result at once. If the child dies, or is ended for its
+memory, the announced item is tried once more, alone in a fresh child, since earlier items may have used up memory or
+corrupted it. Only an item that fails again is given up; nothing else is lost.
 """
 
 from __future__ import annotations
@@ -17,63 +16,65 @@ from typing import TypeVar
 from pipeline.errors import RunError, SettingsError
 from pipeline.model import Reason
 from pipeline.runtime.isolation.child_pool import FRUITLESS_STARTS, borrowed_child, start_failure
-from pipeline.runtime.isolation.supervision import Cause, End
+from pipeline.runtime.isolation.supervision import ChildEnd, EndCause
 from pipeline.runtime.monitoring.events import never
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 MIN_MEMORY_BYTES = 2**29
-"""A child has a quarter of this in use before it begins."""
+"""A child uses a quarter of this before it begins."""
 
 _WORN_SHARE = 0.5
-"""A child that keeps more than this share of its limit between batches is not used again."""
+"""A child that holds more than this share of its limit between batches is not used again."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class IsolationLimits:
-    """What one building may take before its process is ended.
+    """Limits of one building, above which its process is ended.
 
     Raises
     ------
     SettingsError
-        A limit under which no building could be modelled.
+        A limit is too small to model any building.
     """
 
     timeout_s: float = 600.0
-    """Wall-clock seconds of one building; protects the run, and is told as such."""
+    """Wall-clock seconds of one building; protects the run."""
     memory_bytes: int = 4 * 2**30
     """Private resident size of the child process."""
 
     def __post_init__(self) -> None:
-        """Refuse limits that no building can keep."""
+        """Refuse limits that are too small."""
         faults = []
         if not (math.isfinite(self.timeout_s) and self.timeout_s > 0.0):
             faults.append(f"the time-out of a building is {self.timeout_s:g} s: use more than 0")
         if self.memory_bytes < MIN_MEMORY_BYTES:
-            least = MIN_MEMORY_BYTES / 2**30
-            faults.append(f"the memory of a building is {self.memory_bytes / 2**30:g} GiB: use at least {least:g} GiB")
+            minimum = MIN_MEMORY_BYTES / 2**30
+            faults.append(
+                f"the memory of a building is {self.memory_bytes / 2**30:g} GiB: use at least {minimum:g} GiB"
+            )
         if faults:
             raise SettingsError(faults)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Loss:
-    """Why there is no result of an item."""
+    """Why an item has no result."""
 
     reason: Reason
     """crashed, timed_out or out_of_memory."""
     detail: str
-    """What happened and the limit; the same whenever it happens again."""
+    """What happened and the limit; the same text each time it happens."""
     seconds: float
-    """From its beginning to its end."""
+    """Time from its beginning to its end."""
     memory_bytes: int
-    """Largest private memory of its child that was seen."""
+    """Largest observed private memory of its child."""
     stderr: str
-    """The last lines that its child wrote."""
+    """The last lines of its child's standard error."""
 
 
-_REASONS = {Cause.DIED: Reason.CRASHED, Cause.TIME: Reason.TIMED_OUT, Cause.MEMORY: Reason.OUT_OF_MEMORY}
+_REASONS = {EndCause.DIED: Reason.CRASHED, EndCause.TIME: Reason.TIMED_OUT, EndCause.MEMORY: Reason.OUT_OF_MEMORY}
 
 
 def supervise(
@@ -85,52 +86,52 @@ def supervise(
     second_chance: bool = True,
     loads: Sequence[str] | None = None,
 ) -> Iterator[tuple[int, Result | Loss]]:
-    """Call a function on items in a child process, and outlive whatever they do to it.
+    """Call a function on items in a child process and survive the death of the child.
 
     Parameters
     ----------
     function : callable
-        Of one item; both travel as pickles.
+        Takes one item; both are pickled.
     items : sequence
-        What it is called with.
+        Its arguments.
     limits : IsolationLimits
-        For each item.
+        Limits of each item.
     cancelled : callable
-        Asked four times a second; once it is true the child is killed.
+        Polled four times a second; the child is killed once it is true.
     second_chance : bool
-        Whether an item that cost its process is tried once more, alone in a fresh one, before it is given up.
+        Whether an item that killed its process is tried once more, alone in a fresh one, before it is given up.
     loads : sequence of str, optional
-        What new children call before they begin, as `pipeline.runtime.isolation.child_main` takes it.
+        Loads of new children, as in `isolation.child_main`.
 
     Yields
     ------
     int, Result or Loss
-        The item's index, and what became of it; each item once, in any order.
+        The item's index and its outcome; each item once, in any order.
 
     Raises
     ------
     RunCancelledError
         `cancelled` turned true.
     RunError
-        Children die before they begin, so no item is to blame.
+        Children die before they begin an item.
     Exception
-        What `function` raised; only MemoryError counts as the item's own.
+        `function` raised it; only MemoryError is a loss of the item.
     """
     lots = deque([(tuple(enumerate(items)), False)] if items else [])
     fruitless = 0
     while lots:
         lot, alone = lots.popleft()
-        end: End | None = None
+        end: ChildEnd | None = None
         with borrowed_child(cancelled, fresh=alone, loads=loads) as child:
-            for said in child.work(
+            for message in child.work(
                 function, lot, timeout_s=limits.timeout_s, memory_bytes=limits.memory_bytes, cancelled=cancelled
             ):
-                if isinstance(said, End):
-                    end = said
+                if isinstance(message, ChildEnd):
+                    end = message
                     break
-                lot = tuple(entry for entry in lot if entry[0] != said.index)
+                lot = tuple(entry for entry in lot if entry[0] != message.index)
                 fruitless = 0
-                yield said.index, said.result
+                yield message.index, message.result
             if end is not None or child.memory_bytes > _WORN_SHARE * limits.memory_bytes:
                 child.end()
         if end is None:
@@ -138,23 +139,23 @@ def supervise(
         if end.index is None:
             fruitless += 1
             if fruitless == FRUITLESS_STARTS:
-                raise RunError(start_failure(end.told, end.stderr))
+                raise RunError(start_failure(end.detail, end.stderr))
             lots.appendleft((lot, alone))
             continue
         guilty = tuple(entry for entry in lot if entry[0] == end.index)
         rest = tuple(entry for entry in lot if entry[0] != end.index)
         if rest:
             lots.appendleft((rest, False))
-        if alone or end.cause is Cause.TIME or not second_chance:
+        if alone or end.cause is EndCause.TIME or not second_chance:
             yield end.index, _loss(end, alone=alone)
         else:
             lots.appendleft((guilty, True))
 
 
-def _loss(end: End, *, alone: bool) -> Loss:
+def _loss(end: ChildEnd, *, alone: bool) -> Loss:
     return Loss(
         reason=_REASONS[end.cause],
-        detail=end.told + (", also alone in a fresh process" if alone and end.cause is Cause.DIED else ""),
+        detail=end.detail + (", also alone in a fresh process" if alone and end.cause is EndCause.DIED else ""),
         seconds=end.seconds,
         memory_bytes=end.memory_bytes,
         stderr=end.stderr,

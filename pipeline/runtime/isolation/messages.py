@@ -1,13 +1,13 @@
-"""What a supervisor and its child process say to one another: pickles behind their length, over two pipes.
+"""Messages between a supervisor and its child process: pickles behind their length, over two pipes.
 
 ```
 supervisor                          child
     Batch(function, items) ──────▶
-                           ◀──────  Ready                    once, when all that it needs is loaded
-                           ◀──────  Begun(index)             before an item is touched: who is at work when it dies
-                           ◀──────  Finished(index, result)  as soon as it is done, so nothing finished is lost
+                           ◀──────  Ready                    once, after loading
+                           ◀──────  Begun(index)             before an item begins: the one to blame if the child dies
+                           ◀──────  Finished(index, result)  at once, so no finished item is lost
                            ◀──────  OutOfMemory(index)       the item raised MemoryError; the child is not used again
-                           ◀──────  Raised(index, error)     the function raised: not the item's fault but the run's
+                           ◀──────  Raised(index, error)     the function raised: a fault of the run, not of the item
 ```
 """
 
@@ -20,21 +20,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 NUMBER = struct.Struct("<q")
-"""How a process server tells a process id and a return code."""
+"""Format of process ids and return codes from a fork server."""
 _LENGTH = struct.Struct("<Q")
 _LONGEST = 2**40
 
 
 @dataclasses.dataclass(frozen=True)
 class Order:
-    """What a process server is to fork."""
+    """Order of a child from a fork server."""
 
     environment: Mapping[str, str]
     """Environment of the child."""
     folder: str
     """Its working directory."""
     loads: tuple[str, ...]
-    """What it calls before it is ready, as `pipeline.runtime.isolation.child_main` takes it."""
+    """Its loads, as in `isolation.child_main`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,21 +42,21 @@ class Batch:
     """Work for the child."""
 
     function: Callable[[Any], Any]
-    """Called with one item after the other; must be picklable."""
+    """Called with each item; must be picklable."""
     items: Sequence[tuple[int, Any]]
     """Indices and items."""
     data_limit_bytes: int | None
-    """Private memory that the child may ask its system for; None does not limit it."""
+    """Limit of the private memory that the child may reserve; None for no limit."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Ready:
-    """The child has loaded what it needs."""
+    """The child has loaded everything."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Begun:
-    """An item is about to be touched."""
+    """An item begins."""
 
     index: int
 
@@ -79,20 +79,20 @@ class OutOfMemory:
 
 @dataclasses.dataclass(frozen=True)
 class Raised:
-    """The function raised what it should not."""
+    """The function raised another error."""
 
     index: int
     error: Exception
 
 
 def frame(message: object) -> bytes:
-    """A message as it goes over the pipe."""
+    """The bytes of a message on the pipe."""
     body = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
     return _LENGTH.pack(len(body)) + body
 
 
 class Frames:
-    """Takes the pipe's bytes as they come and gives whole messages.
+    """Splits the bytes of a pipe into messages.
 
     Examples
     --------
@@ -105,12 +105,12 @@ class Frames:
         self._held = bytearray()
 
     def feed(self, received: bytes) -> Iterator[Any]:
-        """The messages that are whole now.
+        """Add bytes; yields the messages that are now complete.
 
         Raises
         ------
         ValueError
-            The bytes are no messages: something else wrote into the pipe.
+            The bytes are not messages: something else wrote into the pipe.
         """
         self._held += received
         while len(self._held) >= _LENGTH.size:

@@ -1,6 +1,6 @@
-"""What a command starts before it does anything else: the server that the children of a small job are forked from.
+"""An early start of the fork server for the children of a small job. Cheap to import.
 
-The server loads what they need while the command itself reads its options, imports and plans. Cheap to import.
+The server loads what the children need while the command itself reads its options, imports and plans.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Literal
 Job = Literal["reconstruct", "classify"]
 
 _METHOD = "arrangement"
-"""The default method; a child loads another one by itself."""
+"""The default method; a child loads other methods itself."""
 _STAGES = ("numpy.ma", "pipeline.runtime.stages.ingest", "pipeline.runtime.stages.split_window")
 _LOADS = {
     "reconstruct": ("pipeline.runtime.stages.publish", "pipeline.export.tile", "pipeline.runtime.digest"),
@@ -22,17 +22,17 @@ _SCENE = "pipeline.runtime.stages.rehearsal:rehearse_scene"
 
 
 _SMALL_BYTES = 500_000
-"""About 120 thousand points as LAZ, which one process classifies in half a second (`engine.ALONE_S`)."""
+"""About 120 thousand LAZ points, which one process classifies in half a second (`engine.ALONE_S`)."""
 
 
 def is_surely_small(inputs: Sequence[str]) -> bool:
-    """Whether inputs without buildings to model are files of this machine so small that no children will be needed."""
+    """Whether inputs of `classify` are local files so small that no children will be needed."""
     paths = [Path(name) for name in inputs]
     return all(path.is_file() for path in paths) and sum(path.stat().st_size for path in paths) < _SMALL_BYTES
 
 
 def loads_of(job: Job, *, footprints: bool, method: str | None = None) -> list[str]:
-    """What the children of a job need, as `isolation.child_main` takes it; `footprints` and `method` as below."""
+    """Loads of the children of a job, as in `isolation.child_main`; `footprints` and `method` as in `start_early`."""
     loads = [*_STAGES, *_LOADS[job], f"{_SCENE}:given" if footprints else _SCENE]
     if job == "reconstruct":
         loads.append(f"pipeline.runtime.stages.model_batch:load_once:{method or _METHOD}")
@@ -40,26 +40,26 @@ def loads_of(job: Job, *, footprints: bool, method: str | None = None) -> list[s
 
 
 def start_early(job: Job, *, workers: int | None, scheduler: str | None, footprints: bool, method: str | None) -> None:
-    """Start the server of a job that may be small; nothing where it was told to run elsewhere, or was started before.
+    """Start the server of a job that may be small, unless it runs elsewhere or a server exists.
 
     Parameters
     ----------
     job : {'reconstruct', 'classify'}
-        Whose stages it is to load.
+        Its stages are loaded.
     workers, scheduler
-        As asked for.
+        As given by the user.
     footprints : bool
-        Whether outlines are given: then no surfaces are looked for.
+        Whether footprints are given: then no surfaces are searched.
     method : str or None
         Name of the method; None for the default one.
     """
     if workers is not None or scheduler is not None:
         return
-    # what this process needs, too, is loaded before the server is forked from it: nearly every job reads LAS
+    # loaded before the fork because this process needs it, too: nearly every job reads LAS
     import pipeline.io.las  # noqa: F401
     from pipeline.runtime.isolation.child_pool import preload
 
     if job == "reconstruct" and footprints:
-        import pyarrow as pa  # noqa: F401 - what reads footprints loads both
+        import pyarrow as pa  # noqa: F401 - reading footprints loads both
 
     preload(loads_of(job, footprints=footprints, method=method))

@@ -1,8 +1,8 @@
-"""Quarantine bundles: one building with all that modelling it needs, in one small file that can be mailed.
+"""Quarantine bundles: one building with everything needed to model it, in one small file.
 
-A zip of `bundle.json` (names, settings, what happened), `points.npy`, `ground.npy`, `split_returns.npy`,
-`beside.npy` and `beside_later.npy` (for outlines at the walls) and `stderr.txt`. Reading one executes nothing of it: no
-pickles, sizes are checked before anything is unpacked.
+A zip of `bundle.json` (names, settings, incident), `points.npy`, `ground.npy`, `split_returns.npy`, `beside.npy` and
+`beside_later.npy` (for outlines at the walls) and `stderr.txt`. Reading a bundle executes nothing from it: there are no
+pickles, and sizes are checked before anything is unpacked.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SUFFIX = ".bundle"
 
 _FORMAT = "gablework bundle 2"
 _OPTIONAL = ("beside", "beside_later")
-"""Points of a candidate that a bundle holds where there are any."""
+"""Points of a candidate that a bundle holds only if there are any."""
 _LARGEST_BYTES = 2 * 2**30
 _LARGEST_TEXT_BYTES = 64 * 2**20
 _FIX = "Use a file of a run's quarantine folder, whole and unchanged"
@@ -48,43 +48,43 @@ class Incident:
     detail: str
     """As in its record."""
     engine_version: str = __version__
-    """Of the gablework that it happened to."""
+    """Version of gablework."""
     seconds: float = math.nan
-    """From its beginning to its end; nan where it was not measured."""
+    """Time from its beginning to its end; nan if not measured."""
     memory_bytes: int = 0
-    """Largest private memory seen; 0 where it was not measured."""
+    """Largest private memory; 0 if not measured."""
     stderr: str = ""
-    """The last lines that its process wrote: where Python was, if it could still be told."""
+    """The last lines of its process's standard error, with the traceback if available."""
     platform: str = dataclasses.field(default_factory=platform.platform)
-    """The machine's system."""
+    """Operating system of the machine."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bundle:
-    """One building with all that modelling it needs."""
+    """One building with everything needed to model it."""
 
     candidate: Candidate
     method: str
     settings: ReconstructSettings
     incident: Incident
     reference: SpatialReference = dataclasses.field(default_factory=SpatialReference)
-    """For its coordinates and units on the way out."""
+    """CRS and units of its outputs."""
 
 
 def write_bundle(folder: str, bundle: Bundle) -> str:
-    """Write `<folder>/<building_id>.bundle`, whole or not at all; one that is there is replaced.
+    """Write `<folder>/<building_id>.bundle` atomically, replacing an existing one.
 
     Parameters
     ----------
     folder : str
         A path or URL.
     bundle : Bundle
-        What is kept.
+        Its content.
 
     Returns
     -------
     str
-        Where it is.
+        Path or URL of the file.
 
     Raises
     ------
@@ -135,14 +135,14 @@ def write_bundle(folder: str, bundle: Bundle) -> str:
 
 
 def read_bundle(path: str) -> Bundle:
-    """Read a bundle, also one that somebody else made: nothing of it is executed.
+    """Read a bundle from any source: nothing in it is executed.
 
     Raises
     ------
     UnreadableInputError
-        It is no bundle, broken, or larger than a building can be.
+        It is not a bundle, is broken, or is larger than a building can be.
     SettingsError
-        Its settings are none of this version's.
+        This version does not know its settings.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -165,13 +165,13 @@ def read_bundle(path: str) -> Bundle:
     except OSError as error:
         raise UnreadableInputError(path, f"it cannot be read: {error.strerror or error}", _FIX) from error
     except (zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        raise UnreadableInputError(path, f"it is no bundle, or broken: {error}", _FIX) from error
+        raise UnreadableInputError(path, f"it is not a bundle, or broken: {error}", _FIX) from error
     except (KeyError, ValueError, TypeError, AttributeError, OverflowError, shapely.errors.ShapelyError) as error:
         raise UnreadableInputError(path, f"its content is odd: {type(error).__name__}: {error}", _FIX) from error
 
 
 def _member(archive: zipfile.ZipFile, path: str, name: str, largest_bytes: int) -> bytes:
-    """A member's content, unpacked only up to a bound: its own promise of a size is not believed."""
+    """A member's content, unpacked up to a limit, whatever size the archive declares."""
     with archive.open(name) as member:
         content = member.read(largest_bytes + 1)
     if len(content) > largest_bytes:
@@ -180,7 +180,7 @@ def _member(archive: zipfile.ZipFile, path: str, name: str, largest_bytes: int) 
 
 
 def _array(content: bytes) -> FloatArray:
-    """Coordinates, shape (n, 3); what the header promises is compared with what is there before any memory is taken."""
+    """Coordinates, shape (n, 3); the header is checked against the content before memory is allocated."""
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     if version != (1, 0):
@@ -188,7 +188,7 @@ def _array(content: bytes) -> FloatArray:
     shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(stream)
     values = content[stream.tell() :]
     if dtype != np.float64 or len(shape) != 2 or shape[1] != 3 or fortran_order:
-        raise ValueError(f"coordinates are {dtype} of shape {shape}: float64 of shape (n, 3) is wanted")
+        raise ValueError(f"coordinates are {dtype} of shape {shape}: expected float64 of shape (n, 3)")
     if len(values) != dtype.itemsize * shape[0] * shape[1]:
         raise ValueError(f"coordinates of shape {shape} in {len(values)} bytes")
     coordinates: FloatArray = np.frombuffer(values, np.float64).reshape(shape).copy()
@@ -230,13 +230,13 @@ def _bundle(
     )
 
 
-def _incident(told: Mapping[str, Any], stderr: str) -> Incident:
+def _incident(document: Mapping[str, Any], stderr: str) -> Incident:
     return Incident(
-        reason=str(told["reason"]),
-        detail=str(told["detail"]),
-        engine_version=str(told["engine_version"]),
-        seconds=math.nan if told["seconds"] is None else float(told["seconds"]),
-        memory_bytes=int(told["memory_bytes"]),
+        reason=str(document["reason"]),
+        detail=str(document["detail"]),
+        engine_version=str(document["engine_version"]),
+        seconds=math.nan if document["seconds"] is None else float(document["seconds"]),
+        memory_bytes=int(document["memory_bytes"]),
         stderr=stderr,
-        platform=str(told["platform"]),
+        platform=str(document["platform"]),
     )

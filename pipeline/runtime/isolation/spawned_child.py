@@ -1,4 +1,4 @@
-"""Child processes that are started the long way: an interpreter of their own, which imports everything."""
+"""Child processes in new interpreters, which import everything; slower than forked ones."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ Arguments = ParamSpec("Arguments")
 Value = TypeVar("Value")
 
 
-class Started(Protocol):
-    """A child process, however it was started, and the pipes to its standard input and output."""
+class ChildProcess(Protocol):
+    """A forked or spawned child process, and the pipes to its standard input and output."""
 
     stdin: int
     stdout: int
 
     @property
     def pid(self) -> int | None:
-        """Its number; None as long as it is not there."""
+        """Its process id; None until it exists."""
 
     def poll(self) -> int | None:
-        """Its return code, as `subprocess` tells it; None as long as it lives, or is to come."""
+        """Its return code as in `subprocess`; None until its end."""
 
     def wait(self, timeout_s: float | None = None) -> int | None:
-        """Wait for its end; its return code, or None after the time."""
+        """Wait for its end; returns its return code, or None after the time-out."""
 
     def kill(self) -> None:
-        """Kill it and all that it started; harmless where it is gone."""
+        """Kill it and all that it started; harmless if it is gone."""
 
     def close(self) -> None:
-        """Let go of one that ended."""
+        """Release an ended process."""
 
 
 class SpawnedChild:
-    """A process that runs `pipeline.runtime.isolation.child_main` in an interpreter of its own; see `Started`."""
+    """A process that runs `isolation.child_main` in a new interpreter; see `ChildProcess`."""
 
     def __init__(self, loads: Sequence[str], stderr: int) -> None:
         self._process = run_in_starter_thread(
@@ -59,7 +59,7 @@ class SpawnedChild:
 
     @property
     def pid(self) -> int | None:
-        """Its number."""
+        """Its process id."""
         return self._process.pid
 
     def poll(self) -> int | None:
@@ -67,26 +67,26 @@ class SpawnedChild:
         return self._process.poll()
 
     def wait(self, timeout_s: float | None = None) -> int | None:
-        """Wait for its end; its return code, or None after the time."""
+        """Wait for its end; returns its return code, or None after the time-out."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             return self._process.wait(timeout_s)
         return None
 
     def kill(self) -> None:
-        """Kill it and all that it started; harmless where it is gone."""
+        """Kill it and all that it started; harmless if it is gone."""
         if self._process.poll() is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Let go of one that ended."""
+        """Release an ended process."""
         for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None
             pipe.close()
 
 
 def environment_with_this_package() -> dict[str, str]:
-    """The environment of this process, with the package that runs here before all others that may have its name."""
+    """The environment of this process, with this package first on Python's path."""
     root = str(Path(__file__).resolve().parents[3])
     paths = [root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
@@ -95,9 +95,9 @@ def environment_with_this_package() -> dict[str, str]:
 def run_in_starter_thread(
     start: Callable[Arguments, Value], *arguments: Arguments.args, **options: Arguments.kwargs
 ) -> Value:
-    """What a function gives in the one thread that lives as long as this process.
+    """Call a function in the one thread that lives as long as this process.
 
-    Linux ends a child with the *thread* that started it, and threads of a worker's pool may end any time.
+    Linux ends a child with the *thread* that started it, and threads of a worker's pool may end at any time.
     """
     return _starter.submit(start, *arguments, **options).result()
 
@@ -110,8 +110,8 @@ _starter = _new_starter()
 
 
 def _after_fork() -> None:
-    """A forked copy of this process has no starter thread."""
-    global _starter  # noqa: PLW0603 - threads do not survive a fork
+    """Make a new starter thread: threads do not survive a fork."""
+    global _starter  # noqa: PLW0603 - one per process
     _starter = _new_starter()
 
 

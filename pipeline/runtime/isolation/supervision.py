@@ -1,4 +1,4 @@
-"""One supervised child process: started, given work, watched, ended."""
+"""One supervised child process: its start, its work, its limits and its end."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from typing import Any
 from pipeline.errors import RunCancelledError
 from pipeline.runtime.isolation.forked_child import read_by_children
 from pipeline.runtime.isolation.messages import Batch, Begun, Finished, Frames, OutOfMemory, Raised, Ready, frame
-from pipeline.runtime.isolation.spawned_child import Started
+from pipeline.runtime.isolation.spawned_child import ChildProcess
 
 _PIECE = 2**20
 _TICK_S = 0.05
-"""Memory and time of the child are looked at this often."""
+"""Interval of the checks of the child's memory and time."""
 _CANCEL_TICK_S = 0.25
 _TRACE_WAIT_S = 2.0
 _STDERR_KEPT_BYTES = 8 * 2**20
-_STDERR_TOLD_BYTES = 6000
+_STDERR_REPORTED_BYTES = 6000
 _DATA_MARGIN_BYTES = 2**30
-"""What a child may ask for beyond its limit: address space is more than what is used of it."""
+"""Allowance above the limit: a process reserves more address space than it uses."""
 
 
-class Cause(StrEnum):
-    """What ended a child."""
+class EndCause(StrEnum):
+    """Why a child ended."""
 
     DIED = "died"
     TIME = "time"
@@ -40,21 +40,21 @@ class Cause(StrEnum):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class End:
-    """How a child came to its end while it had work."""
+class ChildEnd:
+    """The end of a child that had work."""
 
-    cause: Cause
-    """What ended it."""
+    cause: EndCause
+    """Why it ended."""
     index: int | None
-    """The item that it had announced and not finished; None where there was none."""
-    told: str
-    """What happened, in the same words whenever it happens again."""
+    """The item that it had announced and not finished; None if there was none."""
+    detail: str
+    """What happened; the same text each time it happens."""
     seconds: float
-    """Since that item was announced."""
+    """Time since that item was announced."""
     memory_bytes: int
-    """Largest private memory seen meanwhile."""
+    """Largest private memory observed during that time."""
     stderr: str
-    """The last lines of its standard error: the place where Python was, if it could still be told."""
+    """The last lines of its standard error, with the traceback if available."""
 
 
 class SupervisedChild:
@@ -63,12 +63,12 @@ class SupervisedChild:
     Parameters
     ----------
     start : callable
-        Starts it, with its standard error at a descriptor: `SpawnedChild`, or `ForkServer.forked`.
+        Starts it with a descriptor for its standard error: `SpawnedChild`, or `ForkServer.fork`.
     """
 
-    def __init__(self, start: Callable[[int], Started]) -> None:
+    def __init__(self, start: Callable[[int], ChildProcess]) -> None:
         self._stderr = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - closed in `end`
-        # both processes write behind the end, also after it was cut
+        # both processes append, also after the file was truncated
         fcntl.fcntl(self._stderr, fcntl.F_SETFL, fcntl.fcntl(self._stderr, fcntl.F_GETFL) | os.O_APPEND)
         self._process = start(self._stderr.fileno())
         self._watched: Any = None
@@ -78,37 +78,37 @@ class SupervisedChild:
         self._ready = False
         self._nonsense = ""
         self.environment = read_by_children(os.environ)
-        """What it was started with."""
+        """Environment at its start."""
         self.begun = 0
-        """Items that it announced so far."""
-        self._heard = 0
-        self._told_cpu_s = 0.0
+        """Number of items announced so far."""
+        self._read_bytes = 0
+        self._reported_cpu_s = 0.0
         self._seen_cpu_s = 0.0
 
     @property
     def alive(self) -> bool:
-        """Whether the process is there."""
+        """Whether the process runs."""
         return self._process.poll() is None
 
     @property
     def memory_bytes(self) -> int:
-        """Its private memory: resident, without what it shares with files; 0 where it is not there."""
-        info = self._seen("memory_info")
+        """Its resident memory without the pages shared with files; 0 if it is gone."""
+        info = self._psutil("memory_info")
         return 0 if info is None else int(info.rss) - int(getattr(info, "shared", 0))
 
     def spent_cpu_s(self) -> float:
-        """CPU seconds that it spent since this was last asked, its start included; of one that is gone as last seen."""
+        """CPU seconds since the last call, including its start; for a dead child up to the last look."""
         self._look_at_cpu()
-        spent, self._told_cpu_s = self._seen_cpu_s - self._told_cpu_s, self._seen_cpu_s
+        spent, self._reported_cpu_s = self._seen_cpu_s - self._reported_cpu_s, self._seen_cpu_s
         return spent
 
     def _look_at_cpu(self) -> None:
-        times = self._seen("cpu_times")
+        times = self._psutil("cpu_times")
         if times is not None:
             self._seen_cpu_s = max(self._seen_cpu_s, times.user + times.system)
 
-    def _seen(self, what: str) -> Any:
-        """What psutil tells of the process; None where it is not there."""
+    def _psutil(self, what: str) -> Any:
+        """The result of a method of `psutil.Process`; None if the process is gone."""
         import psutil  # type: ignore[import-untyped]  # slow to load, and a serial run has no child
 
         if self._watched is None and self._process.pid is None:
@@ -120,12 +120,12 @@ class SupervisedChild:
             return None
 
     def wait_until_ready(self, timeout_s: float, cancelled: Callable[[], bool]) -> str | None:
-        """Wait for the child to have loaded what it needs.
+        """Wait until the child has loaded what it needs.
 
         Returns
         -------
         str or None
-            Why it is not ready and never will be; None where it is.
+            Why it will never be ready; None if it is ready.
 
         Raises
         ------
@@ -152,20 +152,20 @@ class SupervisedChild:
         memory_bytes: int,
         cancelled: Callable[[], bool],
         one: str = "building",
-    ) -> Iterator[Finished | End]:
-        """Work off items; every result as it comes, and an `End` as the last one where the child did not last.
+    ) -> Iterator[Finished | ChildEnd]:
+        """Process items; yields each result as it comes, and finally a `ChildEnd` if the child died or was ended.
 
-        `one` is what an item is called where it took too much.
+        `one` is the word for an item in messages.
 
         Raises
         ------
         RunCancelledError
             `cancelled` turned true.
         Exception
-            What `function` raised.
+            `function` raised it.
         """
         batch = Batch(function=function, items=items, data_limit_bytes=memory_bytes + _DATA_MARGIN_BYTES)
-        with contextlib.suppress(BrokenPipeError):  # its end is told below
+        with contextlib.suppress(BrokenPipeError):  # its end is handled below
             self._write(frame(batch))
         allowed = f"the {memory_bytes / 2**30:g} GiB that a {one} may take"
         kills = _system_kills()
@@ -174,14 +174,14 @@ class SupervisedChild:
         began = time.monotonic()
         peak_bytes = 0
 
-        def ended(cause: Cause, told: str) -> End:
-            return End(
+        def ended(cause: EndCause, detail: str) -> ChildEnd:
+            return ChildEnd(
                 cause=cause,
                 index=at_work,
-                told=told,
+                detail=detail,
                 seconds=time.monotonic() - began,
                 memory_bytes=peak_bytes,
-                stderr=self.last_words,
+                stderr=self.last_output,
             )
 
         for message in self._messages(cancelled):
@@ -197,7 +197,7 @@ class SupervisedChild:
                         return
                 case OutOfMemory():
                     peak_bytes = max(peak_bytes, self.memory_bytes)
-                    yield ended(Cause.MEMORY, f"it asked for more than {allowed}")
+                    yield ended(EndCause.MEMORY, f"it asked for more than {allowed}")
                     return
                 case Raised():
                     raise message.error
@@ -205,25 +205,27 @@ class SupervisedChild:
                     used = self.memory_bytes
                     peak_bytes = max(peak_bytes, used)
                     if used > memory_bytes:
-                        yield ended(Cause.MEMORY, f"it took more than {allowed}")
+                        yield ended(EndCause.MEMORY, f"it took more than {allowed}")
                         return
                     if at_work is not None and time.monotonic() - began > timeout_s:
                         self._ask_for_trace()
-                        yield ended(Cause.TIME, f"it took longer than {timeout_s:g} s, the limit that protects a run")
+                        yield ended(
+                            EndCause.TIME, f"it took longer than {timeout_s:g} s, the limit that protects a run"
+                        )
                         return
-        told = self._how_it_ended()
+        detail = self._how_it_ended()
         if self._process.poll() == -signal.SIGKILL and _system_kills() > kills:
-            yield ended(Cause.MEMORY, "the system ran out of memory and ended its process")
+            yield ended(EndCause.MEMORY, "the system ran out of memory and ended its process")
         else:
-            yield ended(Cause.DIED, told)
+            yield ended(EndCause.DIED, detail)
 
     def kill(self) -> None:
-        """Kill the process and all that it started; harmless where it is gone."""
+        """Kill the process and all that it started; harmless if it is gone."""
         self._look_at_cpu()
         self._process.kill()
 
     def end(self) -> None:
-        """Kill the process, wait for its end and let go of all that belongs to it."""
+        """Kill the process, wait for its end and release its resources."""
         if self._stderr.closed:
             return
         self.kill()
@@ -232,13 +234,13 @@ class SupervisedChild:
         self._stderr.close()
 
     def _write(self, content: bytes) -> None:
-        """Write a message whole."""
+        """Write a whole message."""
         rest = memoryview(content)
         while rest:
             rest = rest[os.write(self._process.stdin, rest) :]
 
     def _messages(self, cancelled: Callable[[], bool]) -> Iterator[Any]:
-        """What the child says as it comes, and None every tick; ends when the child is gone."""
+        """Messages of the child as they come, and None every tick; ends when the child is gone."""
         cancel_at = 0.0
         tick_at = time.monotonic() + _TICK_S
         while True:
@@ -248,7 +250,7 @@ class SupervisedChild:
                     return
                 try:
                     messages = list(self._frames.feed(received))
-                except Exception as error:  # noqa: BLE001 - a wild building can write anywhere
+                except Exception as error:  # noqa: BLE001 - a building that corrupts memory can write anywhere
                     self._nonsense = f"its process sent what cannot be read: {type(error).__name__}"
                     return
                 yield from messages
@@ -280,7 +282,7 @@ class SupervisedChild:
         return f"its process was ended by signal {-code} ({name})"
 
     def _ask_for_trace(self) -> None:
-        """Have the child write where it is; faulthandler does that also while a building holds the interpreter."""
+        """Let the child write a traceback; faulthandler does so even while a building holds the interpreter."""
         before = os.fstat(self._stderr.fileno()).st_size
         deadline = time.monotonic() + _TRACE_WAIT_S
         assert self._process.pid is not None
@@ -291,7 +293,7 @@ class SupervisedChild:
             time.sleep(_TICK_S)
 
     def _cut_stderr(self) -> None:
-        """Keep a talkative child from filling the disk, but not from being heard: the end of what it said stays."""
+        """Keep a child from filling the disk: only the end of its standard error stays."""
         if os.fstat(self._stderr.fileno()).st_size > _STDERR_KEPT_BYTES:
             tail = self._end_of_stderr()
             os.ftruncate(self._stderr.fileno(), 0)
@@ -299,22 +301,22 @@ class SupervisedChild:
 
     def _end_of_stderr(self) -> bytes:
         size = os.fstat(self._stderr.fileno()).st_size
-        return os.pread(self._stderr.fileno(), _STDERR_TOLD_BYTES, max(0, size - _STDERR_TOLD_BYTES))
+        return os.pread(self._stderr.fileno(), _STDERR_REPORTED_BYTES, max(0, size - _STDERR_REPORTED_BYTES))
 
-    def new_words(self) -> str:
-        """What it wrote to its standard error since this was last asked."""
+    def new_output(self) -> str:
+        """What it wrote to its standard error since the last call."""
         size = os.fstat(self._stderr.fileno()).st_size
-        begin, self._heard = min(self._heard, size), size
+        begin, self._read_bytes = min(self._read_bytes, size), size
         return os.pread(self._stderr.fileno(), size - begin, begin).decode("utf-8", errors="replace")
 
     @property
-    def last_words(self) -> str:
+    def last_output(self) -> str:
         """The end of its standard error."""
         return self._end_of_stderr().decode("utf-8", errors="replace").strip()
 
 
 def _system_kills() -> int:
-    """How many processes Linux has ended for lack of memory since it started; 0 where that is not told."""
+    """Number of processes that Linux has ended for lack of memory since it started; 0 if unknown."""
     try:
         counts = dict(line.split() for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines())
     except OSError:

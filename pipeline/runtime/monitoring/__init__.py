@@ -1,1 +1,6 @@
-"""What a run reports about itself: events, log lines, timings, memory, versions."""
+"""Observation of runs: events, log lines, measured tasks, counts, the machine and the versions of its packages.
+
+*Where do I see what a run does?* Its driver sends events to a listener (`events`) and logs with the ids of run,
+tile and batch (`logs`). Each task is measured where it runs (`measurement`) and counted by its process (`tallies`);
+`pipeline.runtime.cluster.run_metrics` shows both to Prometheus.
+"""

@@ -1,4 +1,4 @@
-"""What a run tells while it runs."""
+"""Events of a run, and the interface for following and cancelling it."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ EventKind = Literal["run", "stage", "progress", "warning", "waiting", "finished"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Event:
-    """One thing that happened; carries no object of the engine, so that it can be logged, stored or sent."""
+    """Something that happened; has no object of the engine, so it can be logged, stored or sent."""
 
     kind: EventKind
-    """What happened; `waiting` means that no worker is there to go on."""
+    """Kind of the event; `waiting` means that no worker is there."""
     stage: str = ""
     """plan, ingest, split, join, reconstruct or publish; empty for the run as a whole."""
     done: int = 0
-    """Units done of this stage (files, tiles or candidates)."""
+    """Finished units of this stage (files, tiles or candidates)."""
     total: int = 0
     """Units of this stage; 0 where unknown."""
     message: str = ""
-    """One sentence for people; empty for mere progress."""
+    """One sentence of text; empty for mere progress."""
     kept: int = 0
-    """Of the units done, those that were kept from an earlier run; told once, as the stage begins."""
+    """Finished units taken from an earlier run; sent once, when the stage begins."""
     failed: int = 0
-    """Of the units done, those that failed."""
+    """Failed units, which are among the finished ones."""
 
 
 Listener = Callable[[Event], None]
@@ -40,7 +40,7 @@ def ignore(event: Event) -> None:
 
 
 def never() -> bool:
-    """Call nothing off."""
+    """Never cancel."""
     return False
 
 
@@ -50,22 +50,22 @@ def nothing() -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Watch:
-    """What an executor asks, tells and sets off while the tasks of a run are under way."""
+    """What an executor polls, calls and sends events to while the tasks of a run are in progress."""
 
     cancelled: Callable[[], bool] = never
-    """Whether the run was called off; asked several times a second."""
+    """Whether the run was cancelled; polled several times a second."""
     stop: Callable[[], None] = nothing
-    """Tells the tasks in flight to end, because nobody waits for them any more."""
+    """Asks the tasks in flight to end, because their results are not needed any more."""
     listener: Listener = ignore
-    """Gets events that no result tells: workers are missing, workers are back."""
+    """Gets events that do not come with a result: workers are missing or back."""
 
     def check_cancelled(self) -> None:
-        """End a run that was called off.
+        """Raise an error if the run was cancelled.
 
         Raises
         ------
         RunCancelledError
-            It was called off.
+            It was cancelled.
         """
         if self.cancelled():
             raise RunCancelledError("the run was called off")

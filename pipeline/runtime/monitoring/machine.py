@@ -1,4 +1,4 @@
-"""What this machine gives the process: cores and memory, by its affinity and its control group."""
+"""Cores and memory available to this process, by its affinity and its control group."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ def cores(cgroup: Path = _CGROUP) -> int:
     Parameters
     ----------
     cgroup : Path
-        Where the control group (version 2) tells its limits; a container's quota of two and a half cores counts as two.
+        Folder with the limits of the control group (version 2); a quota of two and a half cores counts as two.
     """
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    quota, _, period = _told(cgroup / "cpu.max").partition(" ")
+    quota, _, period = _text(cgroup / "cpu.max").partition(" ")
     if quota.isdigit() and period.isdigit() and int(period):
         count = min(count, math.floor(int(quota) / int(period)))
     return max(1, count)
@@ -27,12 +27,12 @@ def cores(cgroup: Path = _CGROUP) -> int:
 def memory_bytes(cgroup: Path = _CGROUP) -> int:
     """Memory that this process may use: the machine's, or the limit of its control group."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    limits = [_told(cgroup / name) for name in ("memory.max", "memory.high", "memory/memory.limit_in_bytes")]
+    limits = [_text(cgroup / name) for name in ("memory.max", "memory.high", "memory/memory.limit_in_bytes")]
     return min([total, *(int(limit) for limit in limits if limit.isdigit() and int(limit))])
 
 
-def _told(path: Path) -> str:
-    """The text of a file of the system; empty where there is none."""
+def _text(path: Path) -> str:
+    """The text of a system file; empty if it does not exist."""
     try:
         return path.read_text(encoding="ascii").strip()
     except OSError:

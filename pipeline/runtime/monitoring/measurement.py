@@ -1,4 +1,4 @@
-"""A task run and measured, in whichever process."""
+"""Running and measuring a task, in any process."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Result = TypeVar("Result")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Measured(Generic[Result]):
-    """A result and what it took."""
+    """A result with time and memory of its task."""
 
     result: Result
     seconds: float
     cpu_s: float
-    """CPU seconds of the task's own thread, and of the child processes that worked for it."""
+    """CPU seconds of the task's own thread and of its child processes."""
     began_s: float
-    """When it began, in seconds since 1970 by this machine's clock."""
+    """Start time, in seconds since 1970 by this machine's clock."""
     process: str
     """host:pid."""
     peak_bytes: int
@@ -39,7 +39,7 @@ class Measured(Generic[Result]):
 
 
 class _Account(threading.local):
-    """What child processes spent for the task that runs in this thread."""
+    """CPU time of child processes for the task of this thread."""
 
     cpu_s: float = 0.0
 
@@ -48,7 +48,7 @@ _spent_by_children = _Account()
 
 
 def charge(cpu_s: float) -> None:
-    """Charge the task that runs in this thread with CPU seconds of a child process that worked for it."""
+    """Add CPU seconds of a child process to the task of this thread."""
     _spent_by_children.cpu_s += cpu_s
 
 
@@ -58,7 +58,7 @@ def peak_of_process() -> tuple[str, int]:
 
 
 def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> Measured[Result]:
-    """Run one task, count and measure it; what is logged meanwhile names it."""
+    """Run, count and measure one task; log lines during it have its ids."""
     _spent_by_children.cpu_s = 0.0
     began_s, started, cpu_s = time.time(), time.perf_counter(), time.thread_time()
     outcome = "failed"
@@ -88,7 +88,7 @@ def measure(function: Callable[[Task], Result], task: Task, stage: str = "") -> 
 
 
 def measure_in_child(work: tuple[Callable[[Task], Result], Task, str]) -> Measured[Result]:
-    """Run one task in a child process of whoever waits for it; a fault of ours tells where it happened.
+    """Run one task in a child process; an unexpected error carries its traceback as a note.
 
     Parameters
     ----------
@@ -100,39 +100,39 @@ def measure_in_child(work: tuple[Callable[[Task], Result], Task, str]) -> Measur
     except GableworkError:
         raise
     except Exception as error:
-        # a traceback does not survive the pipe, a note does
+        # a traceback does not survive pickling, a note does
         error.add_note(traceback.format_exc())
         raise
 
 
-def packed(function: Callable[[Task], Result], task: Task) -> bytes:
-    """A task on its way to another process, opaque to whoever passes it on.
+def pack_task(function: Callable[[Task], Result], task: Task) -> bytes:
+    """A function and its task as bytes for another process.
 
-    A Dask scheduler unpacks what it passes on; from bytes it needs not import what only workers need.
+    A Dask scheduler unpickles what it passes on; with bytes it need not import what only workers need.
     """
     return pickle.dumps((function, task), protocol=pickle.HIGHEST_PROTOCOL)
 
 
 def measure_packed(client_fingerprint: str, task: bytes, stage: str = "") -> Measured[Any]:
-    """Run a packed task of a client and measure it, if this process runs what the client runs.
+    """Run and measure a client's packed task, if this process has the client's versions.
 
     Raises
     ------
     VersionMismatchError
-        It does not: a worker that came late must not mix other versions into a result. Told before the task is
-        unpacked, which may fail in strange ways then.
+        It has others: a late worker must not mix other versions into a result. Raised before the task is unpickled,
+        which could then fail in strange ways.
     """
     configure_once()
     if client_fingerprint != fingerprint():
         process, _ = peak_of_process()
-        told = differences(versions_of(client_fingerprint), versions_here())
-        raise VersionMismatchError(mismatch_message([f"worker {process}: {', '.join(told)}"]))
+        differing = differences(versions_of(client_fingerprint), versions_here())
+        raise VersionMismatchError(mismatch_message([f"worker {process}: {', '.join(differing)}"]))
     function, unpacked = pickle.loads(task)  # noqa: S301 - from the client, whose code the worker runs anyway
     return measure(function, unpacked, stage)
 
 
 def mismatch_message(faults: list[str]) -> str:
-    """The message of a version mismatch, from what is wrong in each process."""
+    """The message of a version mismatch, from the differences of each process."""
     return (
         f"the processes do not run the same versions: {'; '.join(faults)}. "
         "Install the same gablework with the same locks everywhere (one image), then start again"

@@ -1,4 +1,4 @@
-"""Which versions a process runs: those that can change a result, or that Dask's processes must share to talk."""
+"""Versions of the packages that can change a result or that Dask's processes must share to communicate."""
 
 from __future__ import annotations
 
@@ -11,19 +11,17 @@ from pipeline import __version__
 
 ENGINE = "gablework"
 TALKING = ("dask", "distributed", "msgpack", "cloudpickle", "tornado", "toolz")
-"""Packages that client, scheduler and workers must share, beside the engine, to understand one another."""
+"""Packages that client, scheduler and workers must share, beside the engine, to communicate."""
 WORKING = ("numpy", "scipy", "numba", "shapely", "pyproj", "pyarrow", "pyogrio", "laspy", "lazrs")
-"""Packages whose versions can change what a task finds; a scheduler runs no task and needs none of them."""
-
-
+"""Packages whose versions can change a result; a scheduler runs no task and needs none of them."""
 _METADATA = ".dist-info"
 
 
 @functools.cache
 def _installed() -> Mapping[str, str]:
-    """Versions of what is installed, by the names of the folders of their metadata; the first of each on the path.
+    """Versions of installed packages, from the names of their metadata folders; the first of each on the path.
 
-    The standard library would read and parse a file a package, which takes as long as the import of this program.
+    The standard library would parse one file per package, which takes as long as the import of gablework.
     """
     found: dict[str, str] = {}
     for folder in sys.path:
@@ -67,7 +65,7 @@ def fingerprint() -> str:
 
 
 def versions_of(line: str) -> dict[str, str]:
-    """The versions that a fingerprint tells.
+    """The versions in a fingerprint.
 
     >>> versions_of("gablework=0.1.0;numpy=2.1")
     {'gablework': '0.1.0', 'numpy': '2.1'}
@@ -76,17 +74,17 @@ def versions_of(line: str) -> dict[str, str]:
 
 
 def differences(ours: Mapping[str, str], theirs: Mapping[str, str]) -> list[str]:
-    """What differs, in words; only what both sides are asked about by `ours`.
+    """Differences in words, for the packages of `ours`.
 
     >>> differences({"numpy": "2.1", "numba": "0.63"}, {"numpy": "2.0", "numba": "0.63"})
     ['numpy 2.0 where the client has 2.1']
     >>> differences({"numba": "0.63"}, {})
     ['no numba where the client has 0.63']
     """
-    told = []
+    found = []
     for name, version in ours.items():
         other = theirs.get(name, "none")
         if other != version:
             has = f"no {name}" if other == "none" else f"{name} {other}"
-            told.append(f"{has} where the client has {'none' if version == 'none' else version}")
-    return told
+            found.append(f"{has} where the client has {'none' if version == 'none' else version}")
+    return found

@@ -44,7 +44,7 @@ def wait_for_mark(task: tuple[str, str]) -> str:
     end = time.monotonic() + DEADLINE_S
     while not Path(folder, "go").exists():
         if time.monotonic() > end:
-            raise TimeoutError(f"{name} was not let go")
+            raise TimeoutError(f"{name} was not released")
         time.sleep(0.02)
     return name
 
