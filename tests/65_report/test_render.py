@@ -108,7 +108,7 @@ def test_a_wide_run_shows_its_densest_square(make_run: Callable[..., Path], tmp_
 
 
 def test_a_directory_without_a_run_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="no folder"):
+    with pytest.raises(RunError, match="is not a folder"):
         render_run(tmp_path, tmp_path / "run.png", dpi=DPI)
 
 

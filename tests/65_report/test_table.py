@@ -67,5 +67,5 @@ def test_units_of_the_crs_do_not_change_the_figures(make_run: Callable[..., Path
 
 
 def test_a_folder_without_a_run_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="no folder"):
+    with pytest.raises(RunError, match="is not a folder"):
         run_statistics(str(tmp_path))
