@@ -1,8 +1,8 @@
-"""What a batch run will take: tiles, points, memory, time, disk, told before anything runs; and what cannot work.
+"""Estimates a batch run before anything runs: tiles, points, memory, time, disk, and reasons why it cannot work.
 
-Points and areas come from the headers of all inputs. How many buildings to expect is told by a few inputs that are
-read in whole. Times are those of `pipeline.runtime.expected`; the true ones depend on machine and scene, so they are
-told as a range.
+Points and areas come from the headers of all inputs. The number of buildings comes from a few inputs that are read
+completely. Times are those of `pipeline.runtime.expected`; the true ones depend on machine and scene, so they are given
+as a range.
 """
 
 from __future__ import annotations
@@ -30,62 +30,64 @@ from pipeline.runtime.monitoring.machine import cores, memory_bytes
 from pipeline.runtime.monitoring.progress import Progress
 from pipeline.runtime.plan import Plan, check_memory
 from pipeline.runtime.request import plan_inputs
+from pipeline.runtime.resources import Resources
 from pipeline.runtime.run import check_out
 from pipeline.runtime.scratch.folder import POINT
 from pipeline.runtime.scratch.work_folder import refuse_foreign
 from pipeline.runtime.stages.given_footprints import given_footprints
 from pipeline.tiling import MM
 
+# Constants of the estimate, measured; they decide nothing in a run, so they are not settings.
 _RANGE = 2.0
-"""Machines and scenes differ by about so much either way."""
+"""Factor by which machines and scenes differ, either way."""
 _RESULT_BYTES = 12_000
-"""Of a building in a run directory, meshes and all: 7 to 12 kB measured."""
+"""Bytes per building in a run directory, with meshes; 7 to 12 kB measured."""
 _KEPT_BYTES = 12_000
-"""Of a building in the work folder."""
+"""Bytes per building in the work folder."""
 _SPLIT_SHARE = 1.0
-"""Points of buildings over all points, at most: they are kept once more."""
+"""Points of buildings over all points, at most; they are stored a second time."""
 _TERRAIN_BYTES = 6.0
-"""A square metre: elevation, whether points are there, an apron."""
+"""Bytes per square metre of terrain: elevation, presence of points, an apron."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """What a run will take."""
+    """The estimate of a run."""
 
     files: int
-    """Inputs."""
+    """Number of inputs."""
     points: int
-    """That their headers promise, of a window by its share of their bounds."""
+    """Points by the headers; for a window, the share of its area in their bounds."""
     tiles: int
-    """Of the lattice, that the inputs' bounds meet."""
+    """Tiles of the lattice that the bounds of the inputs touch."""
     tile_size_m: float
     """Side of a tile."""
     buildings: int
-    """To be expected; raised objects of the inputs that were read, scaled up, or the given footprints."""
+    """Expected buildings: raised objects of the inputs that were read, scaled up, or the given footprints."""
     buildings_from: str
-    """How that was found."""
+    """Source of that number, in words."""
     workers: int
-    """Processes that work at once on this machine, or those that the scheduler has now."""
+    """Processes on this machine, or the workers that the scheduler has now."""
     worker_bytes: int
-    """Peak of a worker."""
+    """Peak memory of a worker."""
     worker_limit_bytes: int | None
-    """What it may take; None where nothing limits it, or no worker is there to ask."""
+    """Memory limit of a worker; None if there is none, or no worker to ask."""
     stage_s: Mapping[str, float]
     """Wall seconds by stage."""
     seconds: tuple[float, float]
-    """Least and most seconds of all."""
+    """Least and most seconds in total."""
     work_bytes: int
-    """Disk that the work folder takes."""
+    """Size of the work folder."""
     work_free_bytes: int | None
-    """Free there; None where it cannot be asked."""
+    """Free space there; None if unknown."""
     out_bytes: int
-    """Disk that the results take."""
+    """Size of the results."""
     out_free_bytes: int | None
-    """Free there; None where it cannot be asked."""
+    """Free space there; None if unknown."""
     warnings: tuple[str, ...]
-    """What is odd but usable."""
+    """Oddities that do not prevent a run."""
     refusals: tuple[str, ...]
-    """What cannot work, each with the fix; a run is not begun where there is any."""
+    """Reasons why it cannot work, each with the fix; a run does not begin if there is one."""
 
 
 def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Estimate:
@@ -94,11 +96,11 @@ def estimate(batch: Batch, read: int = 3, known: tuple[int, int] = (0, 0)) -> Es
     Parameters
     ----------
     batch : Batch
-        What is to be done.
+        The batch.
     read : int
-        Inputs that are read in whole to tell how many buildings there are.
+        Inputs that are read completely to find the number of buildings.
     known : tuple of int
-        Buildings that an earlier run of the batch had, and its points: where these are as many now, nothing is read.
+        Buildings and points of an earlier run of the batch: if the points are as many now, nothing is read.
 
     Raises
     ------
@@ -116,36 +118,32 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     progress = Progress(ignore)
     plan, paths = plan_inputs(request, progress)
     work = expected(plan)
-    points = work.points
     if not work.tiles:
         raise EmptyInputError(
             shown(paths[0]), f"all {len(paths)} inputs lie off --bbox and --aoi", "Check them, and their CRS"
         )
     if request.footprints is not None:
-        buildings, told = len(given_footprints(request.footprints, plan).polygons), "the given footprints"
-    elif known[0] and known[1] == points:
-        buildings, told = known[0], "as many as in the run before"
+        buildings, buildings_from = len(given_footprints(request.footprints, plan).polygons), "the given footprints"
+    elif known[0] and known[1] == work.points:
+        buildings, buildings_from = known[0], "as many as in the run before"
     else:
-        buildings, told = _objects(plan, points, [path for path in paths if shown(path) in work.points_by_file], read)
+        used = [path for path in paths if shown(path) in work.points_by_file]
+        buildings, buildings_from = _objects(plan, work.points, used, read)
     work = dataclasses.replace(work, buildings=buildings)
     resources = request.resources
-    engine, processes = engine_of(resources, expected_cpu_s=sum(work.cpu_s().values()), at=cores())
-    limit: int | None = memory_bytes()
-    workers = processes
-    if engine != "local":
-        embedded = processes if engine == "cluster" else 0
-        workers, limit = memory_of_workers(workers=embedded, scheduler=resources.scheduler, tls=resources.tls)
-    hands = workers if resources.scheduler is not None else min(workers, cores())
-    side = plan.grid.size_mm / MM
-    stages = work.wall_s(hands)
+    engine, workers, limit = _workers(resources, sum(work.cpu_s().values()))
+    stages = work.wall_s(workers if resources.scheduler is not None else min(workers, cores()))
     total = RATES.start_s + sum(stages.values()) + (RATES.cluster_start_s if engine == "cluster" else 0.0)
+    cold_s = RATES.compiling_s if resources.scheduler is None and not kernels_are_compiled() else 0.0
+    side = plan.grid.size_mm / MM
     work_bytes = int(
-        points * POINT.itemsize * (1.0 + _SPLIT_SHARE)
+        work.points * POINT.itemsize * (1.0 + _SPLIT_SHARE)
         + work.tiles * side * side * _TERRAIN_BYTES
         + buildings * _KEPT_BYTES
     )
     out_bytes = buildings * _RESULT_BYTES
     work_free, out_free = _free(batch.work_folder), _free(batch.out)
+    worker_bytes = int(RATES.process_gib * 2**30) + plan.window_bytes
     refusals = [
         *places_refused(batch),
         *_memory_refused(plan, limit),
@@ -154,26 +152,14 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     warnings = list(progress.warnings)
     if resources.scheduler is not None and workers == 0:
         warnings.append(f"the scheduler {resources.scheduler} has no worker now: the run would wait for one")
-    cold_s = 0.0
-    if resources.scheduler is None and not kernels_are_compiled():
-        cold_s = RATES.compiling_s
-        warnings.append(
-            "numba kernels are not compiled on this machine yet: this run compiles them, which may take "
-            f"{duration(cold_s)} on top; gablework warm-up does it ahead"
-        )
-    worker_bytes = int(RATES.process_gib * 2**30) + plan.window_bytes
-    if limit is not None and plan.window_bytes <= limit < worker_bytes:
-        warnings.append(
-            f"a worker may need up to {worker_bytes / 2**30:.1f} GiB, its limit is {limit / 2**30:.1f}: if workers are "
-            "ended for it, set a smaller tile_size_m, or give them more memory"
-        )
+    warnings += _warnings_of_workers(cold_s, limit, plan.window_bytes, worker_bytes)
     return Estimate(
         files=len(paths),
-        points=points,
+        points=work.points,
         tiles=work.tiles,
         tile_size_m=side,
         buildings=buildings,
-        buildings_from=told,
+        buildings_from=buildings_from,
         workers=workers,
         worker_bytes=worker_bytes,
         worker_limit_bytes=limit,
@@ -188,21 +174,45 @@ def _estimated(batch: Batch, read: int, known: tuple[int, int]) -> Estimate:
     )
 
 
+def _workers(resources: Resources, expected_cpu_s: float) -> tuple[str, int, int | None]:
+    """The engine, its number of workers, and their memory limit if there is one."""
+    engine, processes = engine_of(resources, expected_cpu_s=expected_cpu_s, at=cores())
+    if engine == "local":
+        return engine, processes, memory_bytes()
+    embedded = processes if engine == "cluster" else 0
+    return engine, *memory_of_workers(workers=embedded, scheduler=resources.scheduler, tls=resources.tls)
+
+
+def _warnings_of_workers(cold_s: float, limit: int | None, window_bytes: int, worker_bytes: int) -> list[str]:
+    warnings = []
+    if cold_s:
+        warnings.append(
+            "numba kernels are not compiled on this machine yet: this run compiles them, which may take "
+            f"{duration(cold_s)} on top; gablework warm-up does it ahead"
+        )
+    if limit is not None and window_bytes <= limit < worker_bytes:
+        warnings.append(
+            f"a worker may need up to {worker_bytes / 2**30:.1f} GiB, its limit is {limit / 2**30:.1f}: if workers are "
+            "ended for it, set a smaller tile_size_m, or give them more memory"
+        )
+    return warnings
+
+
 def _objects(plan: Plan, wanted: int, paths: Sequence[str], read: int) -> tuple[int, str]:
-    """Raised objects to be expected, from some inputs spread over all, and how that was found."""
+    """Expected raised objects, scaled up from some inputs spread over all, and the source of the number in words."""
     step = max(1, len(paths) // max(1, read))
     chosen = paths[step // 2 :: step][:read]
     objects = points = 0
     for path in chosen:
-        found = inspect(path, plan.options, lambda done, total: None)  # noqa: ARG005 - told by the command as a whole
+        found = inspect(path, plan.options, lambda done, total: None)  # noqa: ARG005 - the command shows its own progress
         objects += found.raised_objects
         points += found.used_points
-    told = f"raised objects in {len(chosen)} of {len(paths)} inputs, trees among them"
-    return round(objects * wanted / points) if points else 0, told
+    source = f"raised objects in {len(chosen)} of {len(paths)} inputs, trees among them"
+    return round(objects * wanted / points) if points else 0, source
 
 
 def _free(folder: str) -> int | None:
-    """Bytes that are free where a folder is or would be; None for an object store."""
+    """Free bytes on the disk of a folder that may not exist yet; None for an object store."""
     if "://" in folder:
         return None
     try:
@@ -212,7 +222,7 @@ def _free(folder: str) -> int | None:
 
 
 def _existing(folder: str) -> Path:
-    """The folder, or the nearest one above it that is there."""
+    """The folder, or the nearest one above it that exists."""
     there = Path(folder)
     while not there.exists():
         there = there.parent
@@ -220,12 +230,12 @@ def _existing(folder: str) -> Path:
 
 
 def _disk(folder: str) -> int:
-    """The file system on which a folder is or would be."""
+    """The file system of a folder that may not exist yet."""
     return _existing(folder).stat().st_dev
 
 
 def places_refused(batch: Batch) -> list[str]:
-    """What cannot be written where the batch says; nothing is made."""
+    """Reasons why the folders of a batch cannot be written; nothing is made."""
     work, out = Path(batch.work_folder).resolve(), batch.out
     if "://" not in out and (work.is_relative_to(Path(out).resolve()) or Path(out).resolve().is_relative_to(work)):
         return [f"the work folder {work} and the results {out} lie in one another: give another [work] path"]
@@ -255,7 +265,7 @@ def _memory_refused(plan: Plan, limit: int | None) -> list[str]:
 def _disk_refused(
     batch: Batch, work_bytes: int, work_free: int | None, out_bytes: int, out_free: int | None
 ) -> list[str]:
-    """What does not fit on a disk, what a run left there already counted as free."""
+    """Reasons why the files do not fit on a disk; files of an earlier run count as free."""
     if all(free is None or work_bytes + out_bytes <= free for free in (work_free, out_free)):
         return []
     work_bytes = max(0, work_bytes - _taken(batch.work_folder))
@@ -282,7 +292,7 @@ def _disk_refused(
 
 
 def _taken(folder: str) -> int:
-    """Bytes of the files in a folder; others may write and remove some meanwhile."""
+    """Bytes of the files in a folder; other processes may write and remove some meanwhile."""
     found = 0
     for place, _, names in os.walk(folder):
         for name in names:
@@ -292,16 +302,16 @@ def _taken(folder: str) -> int:
 
 
 class BatchRefusedError(RunError):
-    """A batch run cannot work as it is planned."""
+    """A batch run cannot work as planned."""
 
 
 def refuse(refusals: Sequence[str]) -> None:
-    """End what cannot work.
+    """End a run that cannot work.
 
     Raises
     ------
     BatchRefusedError
-        Naming all that cannot work.
+        Names all reasons.
     """
     if refusals:
         raise BatchRefusedError("; ".join(refusals))
